@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -285,7 +284,12 @@ def one(seed: int, n: int, kind: str | None, uniform: bool) -> dict[str, Any]:
     """One session: what was said of it."""
     camera = Camera(seed, n, uniform)
     fault = None if kind is None else Fault.of(kind, stripe_signs(n).shape[1], np.random.default_rng([seed, n, 3]))
-    row: dict[str, Any] = {"seed": seed, "n": n, **camera.traits, "fault": fault and [fault.kind, *fault.half, fault.other]}
+    row: dict[str, Any] = {
+        "seed": seed,
+        "n": n,
+        **camera.traits,
+        "fault": fault and [fault.kind, *fault.half, fault.other],
+    }
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
         try:
             factors = calibrate_frames(session(camera, Path(folder) / "frames", fault))
@@ -306,7 +310,12 @@ def rate(rows: list[dict[str, Any]], key: str) -> dict[str, float]:
     """How often, with its binomial standard error (that of one more of each outcome)."""
     count, total = sum(bool(row[key]) for row in rows), len(rows)
     part = (count + 1) / (total + 2)
-    return {"count": count, "of": total, "part": count / max(total, 1), "error": float(np.sqrt(part * (1 - part) / total))}
+    return {
+        "count": count,
+        "of": total,
+        "part": count / max(total, 1),
+        "error": float(np.sqrt(part * (1 - part) / total)),
+    }
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:

@@ -255,6 +255,7 @@ class _Side:
         self.faults: list[Fault] = []
         self.uncounted: set[int] = set()
         self.unknown: set[int] = set()
+        self.settled: set[int] = set()
         self.extra = 0.0
 
     @property
@@ -273,6 +274,10 @@ class _Side:
         if self.vectors is self.sums.vectors:
             self.vectors = self.vectors.copy()
         self.vectors[:, index] = vector
+
+    def rescale(self, factor: float) -> None:
+        """Make the uniform response's share in all vectors smaller by ``factor``, and them larger."""
+        self.vectors = self.vectors * factor
 
     def result(self) -> StripeSums:
         """The sums with what was changed."""
@@ -335,7 +340,7 @@ class _Side:
         by_distance = np.array([np.trace(covariance, lag) / (n - lag) for lag in range(n)])
         lags = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
         values, modes = np.linalg.eigh(by_distance[lags])
-        floor = max(self.noise / self.length / count, _SMOOTH_FLOOR**2 * by_distance[0] * n / count)
+        floor = max((self.noise + self.extra / count) / self.length / count, _SMOOTH_FLOOR**2 * by_distance[0] * n / count)
         if floor == 0:
             return np.eye(count)
         values = np.maximum(values, 0.0) + floor
@@ -375,37 +380,44 @@ class _Side:
     def _put_in_place(self) -> bool:
         """Whether a pattern was out of its place, the one whose exchange or swap makes columns most alike."""
         precision, gram = self._precision(), self.vectors.T @ self.vectors / self.length
-        alone = np.array([index in self.unknown for index in range(self.sums.done)])
-        flips, swaps = _by_exchange(precision, gram), _by_swap(precision, gram)
-        flips[alone], swaps[alone], swaps[:, alone] = -np.inf, -np.inf, -np.inf
-        flips[0], swaps[0], swaps[:, 0] = -np.inf, -np.inf, -np.inf
+        fixed = [0, *self.unknown, *self.settled]
+        if self.sums.pairs is not None:
+            flips = _by_exchange(precision, gram)
+            flips[fixed] = -np.inf
+        else:
+            flips = np.full(self.sums.done, -np.inf)
+        swaps = _by_swap(precision, gram)
+        swaps[fixed], swaps[:, fixed] = -np.inf, -np.inf
         flip = int(np.argmax(flips))
-        one, other = (int(number) for number in np.unravel_index(int(np.argmax(swaps)), swaps.shape))
-        gain = max(flips[flip], swaps[one, other])
-        if gain > _GAIN:
-            if flips[flip] >= swaps[one, other]:
-                if self.sums.pairs is None:
-                    return self._doubt(flip)
-                self.change(flip, -self.vectors[:, flip])
-                if self._turned(flip):
-                    return True
-                self._add(flip, "exchanged", "has its two frames exchanged", "they count in their right order")
-                return True
-            first, second = self.vectors[:, one].copy(), self.vectors[:, other].copy()
-            self.change(one, second)
-            self.change(other, first)
-            self._add(
-                one,
-                "swapped",
-                f"is swapped with {self.side} stripes {other}",
-                "both count in their right order",
-                (self.side, other, UNIFORM),
-            )
-            return True
+        pair = sorted(int(number) for number in np.unravel_index(int(np.argmax(swaps)), swaps.shape))
+        if max(flips[flip], swaps[*pair]) > _GAIN:
+            exchanged = flips[flip] >= swaps[*pair]
+            return self._moved([flip] if exchanged else pair)
         deviations = np.einsum("ij,jk,ik->i", precision, gram, precision) / np.diag(precision)
-        deviations[alone] = 0.0
+        deviations[fixed] = 0.0
         worst = int(np.argmax(deviations))
         return bool(deviations[worst] > _FAR**2) and self._doubt(worst)
+
+    def _moved(self, places: list[int]) -> bool:
+        """Exchange the halves of one of the ``places``, or swap two, unless the covariance of what results wants it
+        back; in either case there may be more."""
+        before = self.vectors
+        after = before.copy()
+        after[:, places] = -before[:, places] if len(places) == 1 else before[:, places[::-1]]
+        self.vectors = after
+        precision, gram = self._precision(), after.T @ after / self.length
+        first = places[0]
+        back = _by_exchange(precision, gram)[first] if len(places) == 1 else _by_swap(precision, gram)[*places]
+        self.settled.update(places)
+        if back > -_GAIN:
+            self.vectors = before
+            return True
+        if len(places) == 2:
+            detail = f"is swapped with {self.side} stripes {places[1]}"
+            self._add(first, "swapped", detail, "both count in their right order", (self.side, places[1], UNIFORM))
+        elif not self._turned(first):
+            self._add(first, "exchanged", "has its two frames exchanged", "they count in their right order")
+        return True
 
     def _turned(self, index: int) -> bool:
         """Whether a pattern's faulty frame is the other one of its pair: a frame may repeat the other, or that it."""
@@ -488,30 +500,62 @@ class _Pairs:
         self.rows = np.concatenate([own.rows.sum(axis=1) for own in self.pairs])
         self.columns = np.concatenate([own.columns.sum(axis=1) for own in self.pairs])
         both = np.hstack([self.rows, self.columns])
-        self.common = np.median(both, axis=0)
-        size = float(np.dot(self.common, self.common))
-        self.power = both @ self.common / size if size else np.ones(len(both))
-        self.trend, self.scatter, self.steady = _trend(self.times.mean(axis=1), self.power)
-        # The power of a pair's own sum: a frame that lost half its light is no lamp.
-        excess = np.square(both - self.power[:, None] * self.common).mean(axis=1)
-        self.floor = max(float(np.median(excess)), (_ROUNDING * float(np.sqrt(size / len(self.common)))) ** 2)
-        self.excess = excess / self.floor
-        # Means of rows and of columns share the frame's mean, and its noise: twice the variance of independent ones.
-        self.noise = float(np.sqrt(2 * self.floor / size)) if size else 0.0
+        self.ambient_and_all = np.median(both, axis=0)
+        self.common = self._uniform()
+        size = max(float(np.dot(self.common, self.common)), 1e-300)
+        away = both - self.ambient_and_all
+        # Ambient light is in every sum, and no part of the lamp's power.
+        self.power = 1 + away @ self.common / size
         self.lights = [np.median(own.light, axis=1) for own in self.pairs]
-        self.light_noise = []
+        self.uniforms = [other.sums.common for other in reversed(sides)]
+        self.trend, self.scatter, self.steady = _trend(self.times.mean(axis=1), self.power)
+        rests = [away - (self.power - 1)[:, None] * self.common]
+        differences = [
+            np.concatenate(
+                [
+                    np.hstack([own.rows[:, 0] - own.rows[:, 1], own.columns[:, 0] - own.columns[:, 1]])
+                    for own in self.pairs
+                ]
+            )
+        ]
         for number, own in enumerate(self.pairs):
-            away = own.light - self.lights[number][:, None] * self._powers(number)
-            each = np.square(away).mean(axis=0)
-            least = (_ROUNDING * float(np.sqrt(np.square(self.lights[number]).mean()))) ** 2
-            middle = max(float(np.median(each)), least)
-            self.light_noise.append(middle)
-            inside = slice(number * self.count, (number + 1) * self.count)
-            self.excess[inside] = np.maximum(self.excess[inside], each / middle)
+            moved = (self._of(number, self.power) - 1) * self.uniforms[number][:, None]
+            rests.append((own.light - self.lights[number][:, None] - moved).T)
+            differences.append(sides[number].sums.vectors.T)
+        least = (_ROUNDING * float(np.sqrt(np.square(self.ambient_and_all).mean()))) ** 2
+        self.flicker = 0.0
+        for _ in range(_TURNS):  # noise and flicker hang on each other
+            found = [
+                _unshaken(rest, difference, self.flicker, noise)
+                for rest, difference, noise in zip(
+                    rests, differences, [self.floor, *self.light_noise] if self.flicker else [1.0] * 3, strict=True
+                )
+            ]
+            self.floor, *self.light_noise = (max(float(np.median(each)), least) for each in found)
+            # Means of rows and of columns share the frame's mean, and its noise: twice the variance of independent ones.
+            self.noise = float(np.sqrt(2 * self.floor / size))
+            self.flicker = float(np.sqrt(max(self.scatter**2 - self.noise**2, 0.0)))
+            if self.scatter < _FLICKERS * self.noise:
+                self.flicker = 0.0
+                break
+        found = [
+            _unshaken(rest, difference, self.flicker, noise) / noise
+            for rest, difference, noise in zip(rests, differences, [self.floor, *self.light_noise], strict=True)
+        ]
+        self.excess = np.maximum(found[0], np.concatenate(found[1:]))
 
-    def _powers(self, number: int) -> FloatArray:
-        """(N,) power of the pairs of a side, as all of the session tell it."""
-        return np.asarray(self.power[number * self.count : (number + 1) * self.count])
+    def _uniform(self) -> FloatArray:
+        """Means of rows and columns of the lamp's light: the response to the uniform pattern, the larger of two, since
+        what is wrong with one most often takes light."""
+        found = []
+        for own in self.pairs:
+            light = np.concatenate([part[0, 0] - part[0, 1] for part in (own.rows, own.columns)])
+            found.append(light if light.sum() >= 0 else -light)
+        return max(found, key=lambda light: float(np.linalg.norm(light)))
+
+    def _of(self, number: int, values: FloatArray) -> FloatArray:
+        """Those of the ``values`` (2 N,) that belong to a side."""
+        return np.asarray(values[number * self.count : (number + 1) * self.count])
 
     def check(self) -> Lamp:
         """Find faulty frames, put what their pairs foretell in their place, and find how steady the lamp is."""
@@ -525,7 +569,7 @@ class _Pairs:
             self._refuse(int(bad.sum()))
         lamp = self._correct()
         for place in np.flatnonzero(bad):
-            self._repair(self.sides[place // self.count], int(place // self.count), int(place % self.count))
+            self._repair(self.sides[place // self.count], int(place // self.count), int(place % self.count), lamp)
         for own, pairs in zip(self.sides, self.pairs, strict=True):
             fluxes = pairs.rows.mean(axis=2)
             if self.good[self.sides.index(own) * self.count] and fluxes[0, 0] < fluxes[0, 1]:
@@ -559,35 +603,35 @@ class _Pairs:
 
     def _correct(self) -> Lamp:
         """How steady the lamp is; vectors are divided by its power where that matters."""
-        good = self.good
-        powers = self.power / float(self.power[good].mean())
-        trend = self.trend / float(self.power[good].mean())
+        good, mean = self.good, float(self.power[self.good].mean())
+        powers, trend = self.power / mean, self.trend / mean
         # A pair's sum shares both frames' flicker.
-        flicker = float(np.sqrt(2 * max(self.scatter**2 - self.noise**2, 0.0)))
-        flickers = self.scatter > _FLICKERS * self.noise and flicker > 0
-        slope = _end_to_end(self.times.mean(axis=1), trend)
-        drifts = np.ptp(trend) > _DEVIATIONS * self.steady
+        flicker = float(np.sqrt(2)) * self.flicker
         costs = []
         for number, own in enumerate(self.sides):
-            inside = slice(number * self.count, (number + 1) * self.count)
-            size = max(float(np.sum(np.square(own.vectors[:, good[inside]]))), 1e-300)
-            moved = np.sum(np.square(own.vectors * (trend[inside] - 1))[:, good[inside]])
+            inside = self._of(number, good)
+            vectors = own.vectors[:, inside]
+            size = max(float(np.sum(np.square(vectors))), 1e-300)
+            moved = float(np.sum(np.square(vectors * (self._of(number, trend) - 1)[inside])))
             # Each frame's own power: half of it scales the response, half adds the uniform frame to it.
-            added = good[inside].sum() * np.square(self.lights[number]).sum() / 2 * flicker**2
-            costs.append((moved / size, (added + size * flicker**2 / 2) / size, own.noise * self.count / size))
+            added = inside.sum() * float(np.square(self.uniforms[number]).sum()) * self.flicker**2
+            costs.append((moved / size, added / size + self.flicker**2, own.noise * self.count / size))
         moved, shaken, noise = (float(np.sqrt(np.sum(part))) for part in zip(*costs, strict=True))
-        drifts = bool(drifts and moved > _MATTERS * noise)
-        flickers = bool(flickers and shaken > _MATTERS * noise)
+        drifts = bool(np.ptp(trend) > _DEVIATIONS * self.steady and moved > _MATTERS * noise)
+        flickers = bool(flicker and shaken > _MATTERS * noise)
         if not drifts and not flickers:
             return Lamp()
+        used = powers if flickers else trend
+        # The uniform response is the mean of both sides' first ones, which had a power of their own.
+        scale = float(np.sqrt((used[0] + used[self.count]) / 2)) if good[0] and good[self.count] else 1.0
         remaining = 0.0
         for number, own in enumerate(self.sides):
-            inside = slice(number * self.count, (number + 1) * self.count)
-            left = self._divided(number, own, (powers if flickers else trend)[inside], flicker if flickers else 0.0)
+            left = self._divided(number, own, self._of(number, used), flicker if flickers else 0.0)
+            own.rescale(scale)
             own.extra += left
             remaining += left / float(np.sum(np.square(own.vectors)))
         return Lamp(
-            drift=slope if drifts else 0.0,
+            drift=_end_to_end(self.times.mean(axis=1), trend) if drifts else 0.0,
             flicker=flicker if flickers else 0.0,
             drift_cost=moved if drifts else 0.0,
             flicker_cost=shaken if flickers else 0.0,
@@ -601,25 +645,20 @@ class _Pairs:
         Y(+1) = (1 + d) g P and Y(-1) = (1 - d) g (U - P) add up to g (U + d u), which tells d by the vector u of the
         response, the better the longer that is; its least squares are taken with the flicker's own variance as prior.
         """
-        pairs, light = self.pairs[number], self.lights[number]
-        inside = slice(number * self.count, (number + 1) * self.count)
-        uniform = light / float(self.power[self.good].mean())
-        left = 0.0
-        per_number = self.light_noise[number]
-        for index in np.flatnonzero(self.good[inside]):
-            vector, power = own.vectors[:, index] / powers[index], powers[index]
-            if index == 0:
-                own.change(0, vector)
-                continue
-            if flicker:
-                rest = pairs.light[:, index] / power / float(self.power[self.good].mean()) - uniform
-                weight = 2 * per_number / flicker**2
+        pairs, uniform, left = self.pairs[number], self.uniforms[number], 0.0
+        noise = self.light_noise[number]
+        for index in np.flatnonzero(self._of(number, self.good)):
+            power = float(powers[index])
+            vector = own.vectors[:, index] / power
+            if index and flicker:
+                own_power = float(self._of(number, self.power)[index])
+                rest = (pairs.light[:, index] - self.lights[number] - (own_power - 1) * uniform) / power
+                weight = 2 * noise / flicker**2
                 squared = float(np.dot(vector, vector))
                 vector = vector - float(np.dot(rest, vector)) / (squared + weight) * uniform
-                left += per_number / (squared + weight) * float(np.dot(uniform, uniform))
-            else:
-                slope = self._slope(number, int(index))
-                vector = vector - slope * uniform
+                left += noise / (squared + weight) * float(np.dot(uniform, uniform))
+            elif index:
+                vector = vector - self._slope(number, int(index)) * uniform
             own.change(int(index), vector)
         return left
 
@@ -652,24 +691,20 @@ class _Pairs:
 
     def _expected(self, number: int, index: int, sign: int) -> _Shown:
         """What the other frame of its pair foretells of a frame."""
-        power = self.trend[number * self.count + index]
+        more = float(self._of(number, self.trend)[index]) - 1
         other = self._shown(number, index, -sign).parts
         rows = len(other[0])
         scale = 1 / np.sqrt(self.floor)
-        uniform = (
-            self.common[:rows] * scale,
-            self.common[rows:] * scale,
-            self.lights[number] / np.sqrt(self.light_noise[number]),
-        )
-        first, second, third = (power * whole - seen for whole, seen in zip(uniform, other, strict=True))
-        return _Shown((first, second, third))
+        both = (self.ambient_and_all + more * self.common) * scale
+        vector = (self.lights[number] + more * self.uniforms[number]) / np.sqrt(self.light_noise[number])
+        return _Shown((both[:rows] - other[0], both[rows:] - other[1], vector - other[2]))
 
     def _flux(self, number: int, index: int, sign: int) -> float:
         """Light of a frame over that of all light."""
-        power = self.trend[number * self.count + index]
+        more = float(self._of(number, self.trend)[index]) - 1
         rows = self.pairs[number].rows[index, 0 if sign > 0 else 1]
-        whole = self.common[: rows.size]
-        return float(rows.mean() / (power * whole.mean())) if whole.mean() else 0.0
+        whole = float((self.ambient_and_all + more * self.common)[: rows.size].mean())
+        return float(rows.mean() / whole) if whole else 0.0
 
     def _usual(self, number: int) -> tuple[float, float]:
         """The flux of half the light, and its robust deviation."""
@@ -679,7 +714,7 @@ class _Pairs:
         middle = float(np.median(fluxes)) if fluxes else 0.5
         return middle, max(1.4826 * float(np.median(np.abs(np.asarray(fluxes) - middle))) if fluxes else 0.0, 1e-3)
 
-    def _repair(self, own: _Side, number: int, index: int) -> None:
+    def _repair(self, own: _Side, number: int, index: int, lamp: Lamp) -> None:
         """Name the faulty frame of a pair, and take its vector from the other one."""
         usual, deviation = self._usual(number)
         found = []
@@ -708,11 +743,12 @@ class _Pairs:
                 )
             )
             return
-        power = float(self.trend[number * self.count + index] / self.power[self.good].mean())
-        uniform = self.lights[number] / float(self.power[self.good].mean())
+        power = float(self._of(number, self.trend)[index])
         light, vector = self.pairs[number].light[:, index], own.sums.vectors[:, index]
-        kept_half = (light - sign * vector) / 2 / power
-        own.change(index, -sign * (2 * kept_half - uniform))
+        kept = (light - sign * vector) / 2
+        whole = self.lights[number] + (power - 1) * self.uniforms[number]
+        corrected = power / float(self.power[self.good].mean()) if lamp.corrected else 1.0
+        own.change(index, -sign * (2 * kept - whole) / corrected)
         own.extra += own.noise
         own.faults.append(
             Fault(
@@ -794,9 +830,7 @@ class _Pairs:
                 other: Half = (own.side, nearest, signed)
                 yield float(away[nearest]) / numbers, "repeated", f"repeats {frame_words(other)}", other
 
-    def _shifted(
-        self, number: int, shown: _Shown, expected: _Shown
-    ) -> Iterator[tuple[float, str, str, Half | None]]:
+    def _shifted(self, number: int, shown: _Shown, expected: _Shown) -> Iterator[tuple[float, str, str, Half | None]]:
         """A frame that is moved by some rows or columns."""
         for axis, word in ((0, "rows"), (1, "columns")):
             length = len(shown.parts[axis])
@@ -827,6 +861,17 @@ _FITS = 4.0
 _BOTH = 36.0
 """Squared deviation of a frame's light from the usual, in four times its robust scatter, that makes it no frame to
 foretell the other by."""
+
+
+def _unshaken(rests: FloatArray, differences: FloatArray, flicker: float, noise: float) -> FloatArray:
+    """(pairs,) mean squared ``rests`` (pairs, numbers) of sums, less what flicker makes of the two frames'
+    ``differences`` (pairs, numbers): d of it, whose deviation is the ``flicker``, at a variance ``noise`` a number."""
+    squared = np.square(rests).sum(axis=1)
+    if flicker:
+        weight = noise / flicker**2
+        along = np.einsum("ij,ij->i", rests, differences)
+        squared = squared - np.square(along) / (np.square(differences).sum(axis=1) + weight)
+    return np.asarray(squared / rests.shape[1])
 
 
 def _trend(times: FloatArray, power: FloatArray) -> tuple[FloatArray, float, float]:
