@@ -23,14 +23,14 @@ from mitsim.reconstruct.calibration import Estimate, StripeSums, factors_of_sums
 from mitsim.rig.order import SIDES, UNIFORM, Half, Side
 
 MOST_FAULTS = 0.1
-"""Part of the patterns that may be wrong before the session is refused: with more, what most frames share is in doubt."""
+"""Part of the patterns that may be wrong before the session is refused: with more, what most share is in doubt."""
 _MATTERS = 0.5
 """Error by the lamp, over that by noise, from which it is corrected and said: both in quadrature are 12 % more."""
 _DEVIATIONS = 8.0
 """Deviations from the rest, by their own robust scatter, that make a fault: noise alone goes so far in one session of
 10^12, and sums of shot noise, whose tails are longer, in none of 10^6."""
 _LEAST = 2e-3
-"""Change of a pair's light that counts: a frame of 1/250 less light, which costs less than the noise of usual sessions."""
+"""Change of a pair's light that counts: that of one frame by 0.4 %, which costs less than most sessions' noise."""
 _EXCESS = 2.0
 """Squared deviation of a pair's sum, over that of the others, that counts at least."""
 _EXPLAINED = 0.05
@@ -42,14 +42,15 @@ _SHIFTS = 8
 _SMOOTH_FLOOR = 0.02
 """Relative error of a factor that its columns' covariance is taken to have at least: it is no exact law of any mask
 (light falls off, pixels have edges), and at 0.02 all of 400 patterns of six ideal cameras stand in their place."""
-_GAIN = 0.25
-"""Mean log-likelihood a sensor row, in squared deviations, that another order of patterns must gain. In clean sessions
-the best exchange or swap loses (-0.05 and -1); of 5000 planted ones 99 % gain more."""
+_GAIN, _REMOVED = 0.25, 0.55
+"""What putting patterns in their place must take off the summed squared deviations, a sensor row, and as a part of
+their own: 80 planted exchanges took off 0.76 to 1 of them, and swaps 0.78 to 1.24; the best of good patterns, in clean
+sessions and under a flickering lamp, 0.45."""
 _ENOUGH = 16, 64
 """Patterns, and sensor rows, from which a covariance of columns is known well enough."""
-_FAR = 3.0
+_FAR = 5.0
 """Root mean square deviation of a pattern from what others foretell, in that of its foretold error, that makes a fault;
-in clean sessions it stays below 1.5."""
+it is 2.7 at most in 100 clean sessions, and 8 and more where a frame of a session without pairs is wrong."""
 _UNEXPLAINED = 0.05
 """Part of a response's energy, beyond the others' noise, that no separable camera explains where it is a fault: 22 %
 of its amplitude."""
@@ -133,13 +134,13 @@ class Lamp:
         left = f"frames are divided by its power, and {self.remaining:.1e} is left"
         if self.drift:
             yield (
-                f"lamp: its power drifts by {self.drift:+.1%} over the session, a factor error of {self.drift_cost:.1e}; "
-                f"{left}: let it warm up"
+                f"lamp: its power drifts by {self.drift:+.1%} over the session, a factor error of {self.drift_cost:.1e} "
+                f"if nothing is done; {left}: let it warm up"
             )
         if self.flicker:
             yield (
                 f"lamp: its power flickers by {self.flicker:.2%} from frame to frame, a factor error of "
-                f"{self.flicker_cost:.1e}; {left}, as pairs do not tell how their two frames differ: use a steadier "
+                f"{self.flicker_cost:.1e} if nothing is done; {left}, as pairs do not tell how their two frames differ: use a steadier "
                 "one, or expose for whole periods"
             )
 
@@ -241,7 +242,7 @@ def checked(
         faults,
         lamp,
         (len(work[0].uncounted), len(work[1].uncounted)),
-        (work[0].extra, work[1].extra),
+        (float(work[0].extras.sum()), float(work[1].extras.sum())),
     )
 
 
@@ -256,7 +257,8 @@ class _Side:
         self.uncounted: set[int] = set()
         self.unknown: set[int] = set()
         self.settled: set[int] = set()
-        self.extra = 0.0
+        self.extras = np.zeros(sums.vectors.shape[1])
+        self.shaken = np.zeros(sums.vectors.shape[1])
 
     @property
     def length(self) -> int:
@@ -296,7 +298,7 @@ class _Side:
     def check_order(self) -> None:
         """Patterns that are out of their place, and those that others foretell otherwise."""
         self._check_misfits()
-        n, count = self.signs.shape
+        count = self.signs.shape[1]
         if count < _ENOUGH[0] or self.length < _ENOUGH[1]:
             for index in self.unknown:
                 self._forget(index)
@@ -332,36 +334,47 @@ class _Side:
             self.unknown.add(int(index))
             self.uncounted.add(int(index))
 
-    def _precision(self) -> FloatArray:
-        """(N, N) inverse covariance of the patterns' vectors, that of columns being a function of their distance."""
+    def _precision(self, errors: FloatArray) -> FloatArray:
+        """(N, N) inverse covariance of the patterns' vectors, that of columns being a function of their distance;
+        ``errors`` (N,) are variances beside their noise."""
         n, count = self.signs.shape
         columns = self.vectors @ self.signs.T / count
         covariance = columns.T @ columns / self.length
         by_distance = np.array([np.trace(covariance, lag) / (n - lag) for lag in range(n)])
         lags = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
         values, modes = np.linalg.eigh(by_distance[lags])
-        floor = max((self.noise + self.extra / count) / self.length / count, _SMOOTH_FLOOR**2 * by_distance[0] * n / count)
-        if floor == 0:
+        values = np.maximum(values, 0.0) + _SMOOTH_FLOOR**2 * by_distance[0] * n / count
+        shown = self.signs.T @ modes
+        whole = (shown * values) @ shown.T
+        if not whole.any():
             return np.eye(count)
-        values = np.maximum(values, 0.0) + floor
-        rows = self.signs.T @ modes
-        precision = (rows / values) @ rows.T / count**2
-        if count > n:  # directions of H that no column has hold noise alone
-            null = np.eye(count) - self.signs.T @ self.signs / count
-            precision += null / (floor * count)
-        return np.asarray(precision)
+        # Where H has more columns than rows and nothing is noise, patterns depend on each other to the last digit.
+        whole[np.diag_indices(count)] += self.noise / self.length + errors + 1e-9 * np.trace(whole) / count
+        return np.asarray(np.linalg.inv(whole))
+
+    def _parts(self) -> list[tuple[FloatArray, FloatArray]]:
+        """Inverse covariances and Gram matrices (N, N) a sensor row of the vectors across, and along, uniform light,
+        which is where flicker has its error."""
+        gram = self.vectors.T @ self.vectors / self.length
+        if not self.shaken.any():
+            return [(self._precision(self.extras / self.length), gram)]
+        uniform = self.vectors[:, 0] / np.linalg.norm(self.vectors[:, 0])
+        along = uniform @ self.vectors
+        alone = np.outer(along, along) / self.length
+        others = (self.extras - self.shaken) / self.length
+        return [(self._precision(others), gram - alone), (self._precision(others + self.shaken), alone)]
 
     def _forget(self, index: int) -> None:
         """Leave a pattern out where nothing foretells it; its error is then its own size, which the others' tells."""
         others = np.delete(self.vectors[:, 1:], index - 1, axis=1) if index else self.vectors[:, 1:]
-        self.extra += float(np.square(others).sum(axis=0).mean()) if others.size else 0.0
+        self.extras[index] = float(np.square(others).sum(axis=0).mean()) if others.size else 0.0
         self.change(index, np.zeros(self.length))
 
     def _foretell(self, index: int) -> None:
         """Leave a pattern out: in its place comes what the others foretell, and the error of that counts."""
         vector, variance = self._foretold(index)
         self.change(index, vector)
-        self.extra += variance * self.length
+        self.extras[index] = variance * self.length
 
     def _foretold(self, index: int) -> tuple[FloatArray, float]:
         """(m,) what the others foretell of a pattern's vector, and the variance of each number."""
@@ -370,7 +383,7 @@ class _Side:
         self.vectors[:, index] = 0.0
         variance = 0.0
         for _ in range(_TURNS):
-            precision = self._precision()
+            precision = self._precision(self.extras / self.length)
             row = precision[index].copy()
             variance, row[index] = 1 / row[index], 0.0
             self.vectors[:, index] = -self.vectors @ row * variance
@@ -379,21 +392,22 @@ class _Side:
 
     def _put_in_place(self) -> bool:
         """Whether a pattern was out of its place, the one whose exchange or swap makes columns most alike."""
-        precision, gram = self._precision(), self.vectors.T @ self.vectors / self.length
+        parts = self._parts()
         fixed = [0, *self.unknown, *self.settled]
-        if self.sums.pairs is not None:
-            flips = _by_exchange(precision, gram)
-            flips[fixed] = -np.inf
-        else:
-            flips = np.full(self.sums.done, -np.inf)
-        swaps = _by_swap(precision, gram)
+        flips, swaps = (sum(each(*part) for part in parts) for each in (_by_exchange, _by_swap))
+        if self.sums.pairs is None:
+            flips[:] = -np.inf
+        flips[fixed] = -np.inf
         swaps[fixed], swaps[:, fixed] = -np.inf, -np.inf
+        np.fill_diagonal(swaps, -np.inf)
+        deviations = np.zeros(self.sums.done)
+        for precision, gram in parts:
+            deviations += np.einsum("ij,jk,ik->i", precision, gram, precision) / np.diag(precision)
         flip = int(np.argmax(flips))
         pair = sorted(int(number) for number in np.unravel_index(int(np.argmax(swaps)), swaps.shape))
-        if max(flips[flip], swaps[*pair]) > _GAIN:
-            exchanged = flips[flip] >= swaps[*pair]
-            return self._moved([flip] if exchanged else pair)
-        deviations = np.einsum("ij,jk,ik->i", precision, gram, precision) / np.diag(precision)
+        for gain, places in sorted([(flips[flip], [flip]), (swaps[*pair], pair)], reverse=True):
+            if gain > max(_GAIN, _REMOVED * float(deviations[places].sum())):
+                return self._moved(places)
         deviations[fixed] = 0.0
         worst = int(np.argmax(deviations))
         return bool(deviations[worst] > _FAR**2) and self._doubt(worst)
@@ -402,12 +416,14 @@ class _Side:
         """Exchange the halves of one of the ``places``, or swap two, unless the covariance of what results wants it
         back; in either case there may be more."""
         before = self.vectors
-        after = before.copy()
-        after[:, places] = -before[:, places] if len(places) == 1 else before[:, places[::-1]]
-        self.vectors = after
-        precision, gram = self._precision(), after.T @ after / self.length
+        self.vectors = before.copy()
+        self.vectors[:, places] = -before[:, places] if len(places) == 1 else before[:, places[::-1]]
         first = places[0]
-        back = _by_exchange(precision, gram)[first] if len(places) == 1 else _by_swap(precision, gram)[*places]
+        parts = self._parts()
+        if len(places) == 1:
+            back = sum(float(_by_exchange(*part)[first]) for part in parts)
+        else:
+            back = sum(float(_by_swap(*part)[*places]) for part in parts)
         self.settled.update(places)
         if back > -_GAIN:
             self.vectors = before
@@ -626,10 +642,9 @@ class _Pairs:
         scale = float(np.sqrt((used[0] + used[self.count]) / 2)) if good[0] and good[self.count] else 1.0
         remaining = 0.0
         for number, own in enumerate(self.sides):
-            left = self._divided(number, own, self._of(number, used), flicker if flickers else 0.0)
+            self._divided(number, own, self._of(number, used), flicker if flickers else 0.0)
             own.rescale(scale)
-            own.extra += left
-            remaining += left / float(np.sum(np.square(own.vectors)))
+            remaining += float(own.extras.sum() / np.sum(np.square(own.vectors)))
         return Lamp(
             drift=_end_to_end(self.times.mean(axis=1), trend) if drifts else 0.0,
             flicker=flicker if flickers else 0.0,
@@ -639,13 +654,13 @@ class _Pairs:
             corrected=True,
         )
 
-    def _divided(self, number: int, own: _Side, powers: FloatArray, flicker: float) -> float:
-        """Divide a side's vectors by the power of their frames; the squared error that flicker leaves in them.
+    def _divided(self, number: int, own: _Side, powers: FloatArray, flicker: float) -> None:
+        """Divide a side's vectors by the power of their frames; what flicker leaves in them counts as their error.
 
         Y(+1) = (1 + d) g P and Y(-1) = (1 - d) g (U - P) add up to g (U + d u), which tells d by the vector u of the
         response, the better the longer that is; its least squares are taken with the flicker's own variance as prior.
         """
-        pairs, uniform, left = self.pairs[number], self.uniforms[number], 0.0
+        pairs, uniform = self.pairs[number], self.uniforms[number]
         noise = self.light_noise[number]
         for index in np.flatnonzero(self._of(number, self.good)):
             power = float(powers[index])
@@ -656,11 +671,11 @@ class _Pairs:
                 weight = 2 * noise / flicker**2
                 squared = float(np.dot(vector, vector))
                 vector = vector - float(np.dot(rest, vector)) / (squared + weight) * uniform
-                left += noise / (squared + weight) * float(np.dot(uniform, uniform))
+                own.shaken[index] = noise / (squared + weight) * float(np.dot(uniform, uniform))
+                own.extras[index] += own.shaken[index]
             elif index:
                 vector = vector - self._slope(number, int(index)) * uniform
             own.change(int(index), vector)
-        return left
 
     def _slope(self, number: int, index: int) -> float:
         """Half the difference of a drifting lamp's power in the two frames of a pair, as a part of it."""
@@ -749,7 +764,7 @@ class _Pairs:
         whole = self.lights[number] + (power - 1) * self.uniforms[number]
         corrected = power / float(self.power[self.good].mean()) if lamp.corrected else 1.0
         own.change(index, -sign * (2 * kept - whole) / corrected)
-        own.extra += own.noise
+        own.extras[index] += own.noise
         own.faults.append(
             Fault(
                 own.side,
