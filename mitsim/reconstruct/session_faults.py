@@ -405,7 +405,7 @@ class _Side:
             deviations += np.einsum("ij,jk,ik->i", precision, gram, precision) / np.diag(precision)
         flip = int(np.argmax(flips))
         pair = sorted(int(number) for number in np.unravel_index(int(np.argmax(swaps)), swaps.shape))
-        for gain, places in sorted([(flips[flip], [flip]), (swaps[*pair], pair)], reverse=True):
+        for gain, places in sorted([(flips[flip], [flip]), (swaps[tuple(pair)], pair)], reverse=True):
             if gain > max(_GAIN, _REMOVED * float(deviations[places].sum())):
                 return self._moved(places)
         deviations[fixed] = 0.0
@@ -423,7 +423,7 @@ class _Side:
         if len(places) == 1:
             back = sum(float(_by_exchange(*part)[first]) for part in parts)
         else:
-            back = sum(float(_by_swap(*part)[*places]) for part in parts)
+            back = sum(float(_by_swap(*part)[tuple(places)]) for part in parts)
         self.settled.update(places)
         if back > -_GAIN:
             self.vectors = before
@@ -538,6 +538,9 @@ class _Pairs:
             moved = (self._of(number, self.power) - 1) * self.uniforms[number][:, None]
             rests.append((own.light - self.lights[number][:, None] - moved).T)
             differences.append(sides[number].sums.vectors.T)
+        for number, along in enumerate((self.common, *self.uniforms)):
+            share = differences[number] @ along / max(float(np.dot(along, along)), 1e-300)
+            differences[number] = differences[number] - np.outer(share, along)
         least = (_ROUNDING * float(np.sqrt(np.square(self.ambient_and_all).mean()))) ** 2
         self.flicker = 0.0
         for _ in range(_TURNS):  # noise and flicker hang on each other
@@ -661,17 +664,19 @@ class _Pairs:
         response, the better the longer that is; its least squares are taken with the flicker's own variance as prior.
         """
         pairs, uniform = self.pairs[number], self.uniforms[number]
-        noise = self.light_noise[number]
+        noise, whole = self.light_noise[number], float(np.dot(uniform, uniform))
         for index in np.flatnonzero(self._of(number, self.good)):
-            power = float(powers[index])
-            vector = own.vectors[:, index] / power
+            vector = own.vectors[:, index] / float(powers[index])
             if index and flicker:
-                own_power = float(self._of(number, self.power)[index])
-                rest = (pairs.light[:, index] - self.lights[number] - (own_power - 1) * uniform) / power
-                weight = 2 * noise / flicker**2
-                squared = float(np.dot(vector, vector))
-                vector = vector - float(np.dot(rest, vector)) / (squared + weight) * uniform
-                own.shaken[index] = noise / (squared + weight) * float(np.dot(uniform, uniform))
+                rest = (pairs.light[:, index] - self.lights[number]) / float(powers[index])
+                rest = rest - float(np.dot(rest, uniform)) / whole * uniform
+                # The sum's power, which the response is divided by, has d times this share of the response in it.
+                share = float(np.dot(vector, uniform)) / whole
+                across = vector - share * uniform
+                known = float(np.dot(across, across)) + 2 * noise / flicker**2
+                half = float(np.dot(rest, across)) / known
+                vector = vector * (1 + half * share) - half * uniform
+                own.shaken[index] = noise / known * whole
                 own.extras[index] += own.shaken[index]
             elif index:
                 vector = vector - self._slope(number, int(index)) * uniform
