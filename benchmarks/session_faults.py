@@ -41,6 +41,8 @@ BLACK, DARK, CODES, BRIGHTEST = 200.0, 20.0, 2**16, 5e4
 """DN, electrons a frame, codes, and DN of the brightest pixel at most."""
 NAMES = {"half exposure": "dim"}
 """What the calibration calls a fault of another name."""
+FIRST = False
+"""Whether the uniform pattern is the one that is wrong."""
 FRAME_FAULTS = ("black", "half lost", "half exposure", "repeated", "shifted", "clipped")
 FAULTS = (*FRAME_FAULTS, "exchanged", "swapped", "drift", "flicker")
 
@@ -156,8 +158,10 @@ class Fault:
 
     @classmethod
     def of(cls, kind: str, count: int, rng: np.random.Generator) -> Fault:
-        """A fault of a ``kind`` at random."""
+        """A fault of a ``kind`` at random; what exchanges or swaps patterns leaves the uniform one alone."""
         first, other = (int(number) for number in rng.choice(np.arange(1, count), 2, replace=False))
+        if FIRST and kind in FRAME_FAULTS:
+            first = 0
         side: Side = SIDES[int(rng.integers(2))]
         return cls(kind, (side, first, int(rng.choice([1, -1]))), other, float(rng.uniform(0.3, 0.7)))
 

@@ -343,7 +343,7 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Ch
     found = checked(sums, signs, session.order, readings.clipped)
     if wrong := found.wrong_uniform():
         sums, variances = _sums(readings, signs.shape[1], job, found.other_uniform(wrong))
-        found = checked(sums, signs, session.order, readings.clipped)
+        found = checked(sums, signs, session.order, readings.clipped, uniform_given=True)
     noise = float(np.sqrt(np.mean(variances))) if session.listed.digital.noise_is_stated else None
     with job.clock.stage("estimate"):
         return found.estimate(signs, noise), noise, found

@@ -202,6 +202,7 @@ def checked(
     signs: FloatArray,
     order: Sequence[Half],
     clipped: Callable[[Half], bool] = lambda half: False,
+    uniform_given: bool = False,
 ) -> Checked:
     """What of a session can be believed.
 
@@ -215,6 +216,9 @@ def checked(
         frames as they were taken.
     clipped
         whether many of a frame's pixels share its largest number.
+    uniform_given
+        whether the sums were made with the uniform response of a side that is right. If not, and one of the two is
+        wrong, nothing else is judged.
 
     Raises
     ------
@@ -225,12 +229,15 @@ def checked(
     lamp = Lamp()
     if all(own.pairs is not None for own in sums):
         lamp = _Pairs(work, order, clipped).check()
+    first = [fault for own in work for fault in own.faults if fault.index == 0]
+    if first and not uniform_given:
+        return Checked(sums, first)
     for own in work:
         own.check_order()
     faults = [fault for own in work for fault in own.faults]
     count = signs.shape[1]
     wrong = {(fault.side, fault.index) for fault in faults}
-    if len(wrong) > max(1, MOST_FAULTS * 2 * count):
+    if len(wrong) > max(2, MOST_FAULTS * 2 * count):
         first = faults[0]
         raise MitsimError(
             f"{len(wrong)} of {2 * count} patterns of the session are not what they should be, first {first.side} "
@@ -518,6 +525,9 @@ class _Pairs:
         both = np.hstack([self.rows, self.columns])
         self.ambient_and_all = np.median(both, axis=0)
         self.common = self._uniform()
+        # Of a pair, what its dark frame has of ambient light.
+        light = float(self.ambient_and_all.sum())
+        self.dark = (1 - float(self.common.sum()) / light) / 2 if light else 0.0
         size = max(float(np.dot(self.common, self.common)), 1e-300)
         away = both - self.ambient_and_all
         # Ambient light is in every sum, and no part of the lamp's power.
@@ -564,13 +574,14 @@ class _Pairs:
         self.excess = np.maximum(found[0], np.concatenate(found[1:]))
 
     def _uniform(self) -> FloatArray:
-        """Means of rows and columns of the lamp's light: the response to the uniform pattern, the larger of two, since
-        what is wrong with one most often takes light."""
+        """Means of rows and columns of the lamp's light: the response to the uniform pattern, of two that which differs
+        less from all pairs' light, but for even ambient light."""
         found = []
         for own in self.pairs:
             light = np.concatenate([part[0, 0] - part[0, 1] for part in (own.rows, own.columns)])
-            found.append(light if light.sum() >= 0 else -light)
-        return max(found, key=lambda light: float(np.linalg.norm(light)))
+            light = light if light.sum() >= 0 else -light
+            found.append((float(np.std(light - self.ambient_and_all)), light))
+        return min(found, key=lambda one: one[0])[1]
 
     def _of(self, number: int, values: FloatArray) -> FloatArray:
         """Those of the ``values`` (2 N,) that belong to a side."""
@@ -584,7 +595,7 @@ class _Pairs:
         bad = away > max(_DEVIATIONS * max(self.scatter, self.noise), _LEAST)
         bad |= self.excess > max(_EXCESS * middle, middle + _DEVIATIONS * scatter)
         self.good = ~bad
-        if bad.sum() > max(1.0, MOST_FAULTS * len(bad)):
+        if bad.sum() > max(2.0, MOST_FAULTS * len(bad)):
             self._refuse(int(bad.sum()))
         lamp = self._correct()
         for place in np.flatnonzero(bad):
@@ -742,7 +753,7 @@ class _Pairs:
             kept = self._flux(number, index, -sign)
             right = usual if sign < 0 else 1 - usual
             if index == 0:
-                right = 1.0 if sign < 0 else 0.0
+                right = 1 - self.dark if sign < 0 else self.dark
             penalty = ((kept - right) / (4 * deviation)) ** 2
             rest, kind, detail, other = self._best(number, index, sign)
             found.append((rest + penalty, penalty, sign, kind, detail, other))
