@@ -761,7 +761,10 @@ class _Pairs:
         _, penalty, sign, kind, detail, other = found[0]
         own.uncounted.add(index)
         if penalty > _BOTH and found[1][1] > _BOTH:
-            own.unknown.add(index)
+            if index:
+                own.unknown.add(index)
+            else:  # by definition, where it is the other side's that all vectors are projected on
+                own.change(0, self.uniforms[number])
             own.faults.append(
                 Fault(
                     own.side,
@@ -801,8 +804,8 @@ class _Pairs:
         size = float(np.dot(expected.all, expected.all))
         part = float(np.dot(shown.all, expected.all)) / size if size else 0.0
         flux = float(shown.parts[0].sum() / expected.parts[0].sum()) if expected.parts[0].sum() else 0.0
-        if index == 0 and sign < 0:
-            flux = part = 1.0
+        if index == 0 and sign < 0 and self.dark < _DARK:
+            flux = part = 1.0  # a dark frame of a dark room
         if self.clipped((self.sides[number].side, index, sign)) and flux > _DARK:
             return 1.0, "clipped", "is clipped: many of its pixels share its largest number", None
         if flux < _DARK and all(
@@ -910,7 +913,8 @@ def _trend(times: FloatArray, power: FloatArray) -> tuple[FloatArray, float, flo
 
     A parabola, fitted again without what is far from it.
     """
-    kept = np.abs(power - np.median(power)) <= max(0.2, 1e-9)
+    away = np.abs(power - np.median(power))
+    kept = away <= max(6 * float(np.median(away)), 1e-12)
     degree = min(2, max(len(np.unique(times)) - 2, 0))
     found, scatter = np.full(power.shape, float(np.median(power))), 0.0
     for _ in range(8):
