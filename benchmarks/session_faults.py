@@ -71,7 +71,7 @@ class Camera:
             "gap_mm": float(rng.uniform(1.5, 3.0)),
             "feature_mm": float(rng.uniform(0.05, 0.1)),
             "read_noise_e": float(rng.uniform(2, 15)),
-            "ambient": float(rng.uniform(0, 0.2)),
+            "ambient": 0.0 if self.uniform else float(rng.uniform(0, 0.2)),
             "repeats": int(rng.choice([1, 1, 1, 2])),
             "level": float(np.exp(rng.uniform(0, np.log(10)))),
         }

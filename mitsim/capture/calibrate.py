@@ -303,7 +303,9 @@ def checked_estimates(
                 checkpoint.save(_STRIPES, stripes.arrays())
     with job.clock.stage("estimate"):
         judged = [
-            checked(stripes.sums[kind], session.signs, session.order) if kind == NOISY else Checked(stripes.sums[kind])
+            checked(stripes.sums[kind], session.signs, session.order, saturated=bool(stripes.saturated))
+            if kind == NOISY
+            else Checked(stripes.sums[kind])
             for kind in kinds
         ]
         found = [

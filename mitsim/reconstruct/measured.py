@@ -205,6 +205,26 @@ def _check_sizes(session: SessionFrames) -> None:
             )
 
 
+def _check_levels(session: SessionFrames, uniform: FloatArray) -> None:
+    """MitsimError where frames have no light by the levels that the list states.
+
+    Parameters
+    ----------
+    session
+        whose list it is.
+    uniform
+        (rows, columns) the brighter of both uniform responses [electrons/s].
+    """
+    first = session.repeated((SIDES[0], 0, 1 if session.pairs else UNIFORM))[0]
+    values, digital = read_image(session.folder / first.file, session.wanted), session.listed.digital
+    if digital.rate(values).max() <= 0 or not uniform.any():
+        raise MitsimError(
+            f"frames {session.folder}: no number of {first.file}, a uniform frame, is above {values.max():g}, and its "
+            f"list states digital.black_level_dn {digital.black_level_dn:g} and dark_current_e_per_s "
+            f"{digital.dark_current_e_per_s:g}, which leave no light; state levels in the numbers of the files"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class _Reading:
     """Mean of ``shots`` frames of each exposure: electrons a second, and how they were read."""
@@ -340,11 +360,13 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Ch
     session = readings.session
     signs = stripe_signs(session.listed.n).astype(np.float64)
     sums, variances = _sums(readings, signs.shape[1], job)
-    found = checked(sums, signs, session.order, readings.clipped)
+    found = checked(sums, signs, session.order, readings.clipped, saturated=bool(readings.saturated))
     if wrong := found.wrong_uniform():
         sums, variances = _sums(readings, signs.shape[1], job, found.other_uniform(wrong))
-        found = checked(sums, signs, session.order, readings.clipped, uniform_given=True)
-    noise = float(np.sqrt(np.mean(variances))) if session.listed.digital.noise_is_stated else None
+        found = checked(
+            sums, signs, session.order, readings.clipped, uniform_given=True, saturated=bool(readings.saturated)
+        )
+    noise = float(np.sqrt(max(np.mean(variances), 0.0))) if session.listed.digital.noise_is_stated else None
     with job.clock.stage("estimate"):
         return found.estimate(signs, noise), noise, found
 
@@ -366,6 +388,7 @@ def _sums(
     with job.clock.stage("frames"):
         first = [readings.response(side, 0) for side in SIDES]
     (left, *_), (right, *_) = first
+    _check_levels(readings.session, max((left, right), key=lambda response: float(response.mean())))
     alone = None if uniform is None else (left, right)[SIDES.index(uniform)]
     lights = [light for *_, light in first]
     sums = stripe_sums(left, right, count, readings.session.listed.centre, alone, lights)
