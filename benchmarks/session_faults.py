@@ -1,4 +1,4 @@
-"""How often a calibration session's faults are named, and good sessions flagged; the stated over the actual factor error.
+"""How often a calibration session's faults are named, and good sessions flagged; actual over stated factor error.
 
     python benchmarks/session_faults.py RESULT.json [--sessions 20] [--clean 200] [--faults ...] [--seed 0] [--n 64 128]
 
@@ -78,7 +78,7 @@ class Camera:
 
     @property
     def centre(self) -> bool:
-        return self.traits["mask"] != "separable"
+        return bool(self.traits["mask"] != "separable")
 
     def _code(self) -> np.ndarray:
         if self.traits["mask"] == "mura":
@@ -130,7 +130,7 @@ class Camera:
                 predicted_error(side, noise, float(np.linalg.norm(vector)), count)
                 for side, vector in zip(sides, reversed(vectors), strict=True)
             ]
-            return float(np.hypot(*each))
+            return float(np.hypot(each[0], each[1]))
 
         for _ in range(60):
             scale *= (error(scale) / wanted) ** 1.5
@@ -280,7 +280,7 @@ def ratio(camera: Camera, factors: Factors) -> float:
     for found, exact in zip((factors.left, factors.right), camera.exact(camera.scale), strict=True):
         sign = np.sign(np.vdot(found, exact))
         errors.append(float(np.linalg.norm(sign * found - exact) / np.linalg.norm(exact)))
-    return float(np.hypot(*errors) / np.hypot(*factors.estimate.predicted_error))
+    return float(np.hypot(errors[0], errors[1]) / np.hypot(*factors.estimate.predicted_error))
 
 
 @single_threaded_blas()

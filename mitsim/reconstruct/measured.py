@@ -366,7 +366,7 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Ch
         found = checked(
             sums, signs, session.order, readings.clipped, uniform_given=True, saturated=bool(readings.saturated)
         )
-    noise = float(np.sqrt(max(np.mean(variances), 0.0))) if session.listed.digital.noise_is_stated else None
+    noise = float(np.sqrt(max(float(np.mean(variances)), 0.0))) if session.listed.digital.noise_is_stated else None
     with job.clock.stage("estimate"):
         return found.estimate(signs, noise), noise, found
 

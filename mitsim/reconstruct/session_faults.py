@@ -134,14 +134,14 @@ class Lamp:
         left = f"frames are divided by its power, and {self.remaining:.1e} is left"
         if self.drift:
             yield (
-                f"lamp: its power drifts by {self.drift:+.1%} over the session, a factor error of {self.drift_cost:.1e} "
-                f"if nothing is done; {left}: let it warm up"
+                f"lamp: its power drifts by {self.drift:+.1%} over the session, a factor error of "
+                f"{self.drift_cost:.1e} if nothing is done; {left}: let it warm up"
             )
         if self.flicker:
             yield (
                 f"lamp: its power flickers by {self.flicker:.2%} from frame to frame, a factor error of "
-                f"{self.flicker_cost:.1e} if nothing is done; {left}, as pairs do not tell how their two frames differ: use a steadier "
-                "one, or expose for whole periods"
+                f"{self.flicker_cost:.1e} if nothing is done; {left}, as pairs "
+                "do not tell how their two frames differ: use a steadier one, or expose for whole periods"
             )
 
 
@@ -236,9 +236,9 @@ def checked(
         if saturated and pairs.many:
             return Checked(sums)
         lamp = pairs.check()
-    first = [fault for own in work for fault in own.faults if fault.index == 0]
-    if first and not uniform_given:
-        return Checked(sums, first)
+    at_first = [fault for own in work for fault in own.faults if fault.index == 0]
+    if at_first and not uniform_given:
+        return Checked(sums, at_first)
     for own in work:
         own.check_order()
     faults = [fault for own in work for fault in own.faults]
@@ -411,7 +411,8 @@ class _Side:
         """Whether a pattern was out of its place, the one whose exchange or swap makes columns most alike."""
         parts = self._parts()
         fixed = [0, *self.unknown, *self.settled]
-        flips, swaps = (sum(each(*part) for part in parts) for each in (_by_exchange, _by_swap))
+        flips = np.sum([_by_exchange(*part) for part in parts], axis=0)
+        swaps = np.sum([_by_swap(*part) for part in parts], axis=0)
         if self.sums.pairs is None:
             flips[:] = -np.inf
         flips[fixed] = -np.inf
@@ -430,8 +431,8 @@ class _Side:
         return bool(deviations[worst] > _FAR**2) and self._doubt(worst)
 
     def _check_fit(self) -> None:
-        """Of patterns without pairs, whether one does not fit the others. One that is black changes the covariance of all:
-        which one it is, is not sure, so that none is left out."""
+        """Of patterns without pairs, whether one does not fit the others. One that is black changes all of the
+        covariance: which one it is, is not sure, so that none is left out."""
         (precision, gram), *_ = self._parts()
         deviations = np.einsum("ij,jk,ik->i", precision, gram, precision) / np.diag(precision)
         deviations[0] = 0.0
@@ -441,8 +442,8 @@ class _Side:
                 worst,
                 "wrong",
                 "does not fit the other patterns, and of all it fits least",
-                "nothing is left out, and the stated factor error does not cover it: look at this frame and at those that "
-                "are far from their neighbours, and take the session again, in pairs if you can",
+                "nothing is left out, and the stated factor error does not cover it: look at this frame and at those "
+                "that are far from their neighbours, and take the session again, in pairs if you can",
             )
 
     def _moved(self, places: list[int]) -> bool:
@@ -577,7 +578,8 @@ class _Pairs:
             share = differences[number] @ along / max(float(np.dot(along, along)), 1e-300)
             differences[number] = differences[number] - np.outer(share, along)
         least = (_ROUNDING * float(np.sqrt(np.square(self.ambient_and_all).mean()))) ** 2
-        self.flicker = 0.0
+        self.flicker, self.floor = 0.0, 1.0
+        self.light_noise = [1.0, 1.0]
         for _ in range(_TURNS):  # noise and flicker hang on each other
             found = [
                 _unshaken(rest, difference, self.flicker, noise)
@@ -586,7 +588,7 @@ class _Pairs:
                 )
             ]
             self.floor, *self.light_noise = (max(float(np.median(each)), least) for each in found)
-            # Means of rows and of columns share the frame's mean, and its noise: twice the variance of independent ones.
+            # Means of rows and of columns share the frame's mean and its noise: twice independent ones' variance.
             self.noise = float(np.sqrt(2 * self.floor / size))
             self.flicker = float(np.sqrt(max(self.scatter**2 - self.noise**2, 0.0)))
             if self.scatter < _FLICKERS * self.noise:
@@ -976,7 +978,7 @@ def frame_words(half: Half) -> str:
 
 
 _TURNS = 3
-"""Steps in which a pattern that is left out is foretold with a covariance that is free of it: two change its last digit."""
+"""Steps that foretell a left-out pattern with a covariance free of it: a fourth changes no digit."""
 
 
 def _by_exchange(precision: FloatArray, gram: FloatArray) -> FloatArray:
