@@ -2,7 +2,7 @@
 
 import os
 
-from mitsim.core.worker import end_stopped, end_with, enter_worker, stopped
+from mitsim.core.worker import end_stopped, end_uncaught, end_with, enter_worker
 
 
 def main() -> None:
@@ -19,10 +19,8 @@ def main() -> None:
         raise
     except KeyboardInterrupt:  # before the command line is there to take it
         end_stopped()
-    except Exception:
-        if not stopped():
-            raise
-        end_stopped()  # what an interrupt became on its way, as of a class that was being made
+    except Exception as error:  # before the command line is there to take it
+        end_uncaught(error)
 
 
 if __name__ == "__main__":

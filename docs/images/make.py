@@ -1,8 +1,9 @@
 """The pictures of the README, from nothing but mitsim's own commands: a demo, and a scene of many depths.
 
-    python docs/images/make.py WORK
+    python docs/images/make.py WORK [demo] [depth]
 
-Commands run in the folder WORK, which is made; results of an earlier call found there are used again.
+Both, or those that are named. Commands run in the folder WORK, which is made; runs of an earlier call found there are
+used again.
 """
 
 from __future__ import annotations
@@ -30,42 +31,59 @@ Panel = tuple[str, np.ndarray]
 
 
 def main() -> None:
-    work = Path(sys.argv[1])
+    work, names = Path(sys.argv[1]), sys.argv[2:]
     work.mkdir(exist_ok=True)
-    for folder, command in COMMANDS.items():
-        if not (work / folder).exists():
-            mitsim(work, *command, "-o", folder)
-    psnr = {}
-    for run, focus in (("run-uniform", ()), ("run", ()), ("bag", ()), ("bag", ("--focus", "map"))):
-        folder = f"{run}-image{'-map' if focus else ''}"
-        mitsim(work, "reconstruct", run, "--calibration", "cal", *focus, "-o", folder)
-        psnr[folder] = json.loads((work / folder / "result.json").read_text())["psnr"]
+    for picture in (demo, depth):
+        if not names or picture.__name__ in names:
+            draw(picture.__name__, *picture(work))
 
-    def image(path: str, channel: str = "reflectance") -> np.ndarray:
-        return read_frame(work / path)[0][channel].astype(float)
 
-    frame = image("run/frame_00024.exr", "DN")
-    draw(
-        "demo",
-        ("The scene (truth)", lightness(image("run/truth.exr"))),
+def demo(work: Path) -> list[Panel]:
+    """One depth, and what dots gain over uniform light."""
+    made(work, "run-uniform", "run", "cal")
+    uniform, dots = (psnr(work, run) for run in ("run-uniform", "run"))
+    frame = image(work, "run/frame_00024.exr", "DN")
+    return [
+        ("The scene (truth)", lightness(image(work, "run/truth.exr"))),
         ("What the camera records: frame 25 of 49", frame / frame.max()),
-        (
-            f"Uniform light, 1 frame: {psnr['run-uniform-image']:.1f} dB",
-            lightness(image("run-uniform-image/image.exr")),
-        ),
-        (f"Shifting dots, 49 frames: {psnr['run-image']:.1f} dB", lightness(image("run-image/image.exr"))),
-    )
-    draw(
-        "depth",
-        ("The scene (truth)", lightness(image("bag/truth.exr"))),
-        (f"One depth: {psnr['bag-image']:.1f} dB", lightness(image("bag-image/image.exr"))),
-        (f"A depth for each pixel: {psnr['bag-image-map']:.1f} dB", lightness(image("bag-image-map/image.exr"))),
-        ("These depths [mm]", image("bag-image-map/depth.exr", "depth_mm")),
-    )
+        (f"Uniform light, 1 frame: {uniform:.1f} dB", lightness(image(work, "run-uniform-image/image.exr"))),
+        (f"Shifting dots, 49 frames: {dots:.1f} dB", lightness(image(work, "run-image/image.exr"))),
+    ]
+
+
+def depth(work: Path) -> list[Panel]:
+    """Many depths, reconstructed at one and at a depth for each pixel."""
+    made(work, "bag", "cal")
+    one, each = psnr(work, "bag"), psnr(work, "bag", "--focus", "map")
+    return [
+        ("The scene (truth)", lightness(image(work, "bag/truth.exr"))),
+        (f"One depth: {one:.1f} dB", lightness(image(work, "bag-image/image.exr"))),
+        (f"A depth for each pixel: {each:.1f} dB", lightness(image(work, "bag-image-map/image.exr"))),
+        ("These depths [mm]", image(work, "bag-image-map/depth.exr", "depth_mm")),
+    ]
+
+
+def made(work: Path, *folders: str) -> None:
+    """Run the commands of the ``folders`` that are not there yet."""
+    for folder in folders:
+        if not (work / folder).exists():
+            mitsim(work, *COMMANDS[folder], "-o", folder)
+
+
+def psnr(work: Path, run: str, *focus: str) -> float:
+    """PSNR [dB] of the image of a ``run``, which is made."""
+    folder = f"{run}-image{'-map' if focus else ''}"
+    mitsim(work, "reconstruct", run, "--calibration", "cal", *focus, "-o", folder)
+    return float(json.loads((work / folder / "result.json").read_text())["psnr"])
+
+
+def image(work: Path, path: str, channel: str = "reflectance") -> np.ndarray:
+    """A channel of an OpenEXR file."""
+    return read_frame(work / path)[0][channel].astype(float)
 
 
 def draw(name: str, *panels: Panel) -> None:
-    """The picture ``name`` of four ``panels``."""
+    """The picture ``name`` of four ``panels``, their titles as text in the file too."""
     figure = Figure(figsize=(12, 3.4), layout="constrained")
     FigureCanvasAgg(figure)
     for axes, (title, values) in zip(figure.subplots(1, len(panels)), panels, strict=True):
@@ -75,7 +93,8 @@ def draw(name: str, *panels: Panel) -> None:
             figure.colorbar(axes.imshow(values, cmap="viridis_r", interpolation="none"), ax=axes, shrink=0.8)
         axes.set_title(title, fontsize=10)
         axes.set_axis_off()
-    figure.savefig(Path(__file__).with_name(f"{name}.png"), dpi=120)
+    titles = {"Description": "; ".join(title for title, _ in panels)}
+    figure.savefig(Path(__file__).with_name(f"{name}.png"), dpi=120, metadata=titles)
 
 
 def mitsim(work: Path, *arguments: str) -> None:

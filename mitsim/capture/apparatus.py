@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
+
+from mitsim.core.arguments import checked
+from mitsim.core.errors import ArgumentError
 
 # What needs numpy, or the renderer, is imported where it is used: what opens a bench refuses a misspelt name first.
 if TYPE_CHECKING:
@@ -21,6 +25,13 @@ if TYPE_CHECKING:
 
 _SPECKLED_SHOTS = 8
 """Shots whose contrast stands for a family's: those of dots differ by less than a percent, by where the window ends."""
+
+
+def check_depth(depth: float) -> float:
+    """``depth`` [mm], or ArgumentError when it is not in front of the camera."""
+    if not 0 < depth < math.inf:
+        raise ArgumentError("depth", f"{depth:g}: give millimetres above 0")
+    return depth
 
 
 @dataclass(frozen=True)
@@ -112,8 +123,10 @@ class Apparatus:
         """Row and column tan-angles of the projector's window on the aligned plane."""
         return self.loaded.pixels.row_tan, self.loaded.pixels.column_tan
 
+    @checked
     def windows_at(self, depth: float) -> tuple[tuple[float, float], tuple[float, float]]:
-        """The same on a plane at ``depth`` [mm]."""
+        """The same on a plane at ``depth`` [mm]; ArgumentError for one that is not in front of the camera."""
+        check_depth(depth)
         if depth == self.geometry.scene_distance:
             return self.windows
         if depth not in self._windows:
@@ -134,6 +147,7 @@ class Apparatus:
         """How the factors of a calibration on the aligned plane move with depth, as its manifest states it."""
         return self.parallax_from(self.geometry.scene_distance)
 
+    @checked
     def parallax_from(self, depth: float) -> Parallax:
         """The same of a calibration at ``depth`` [mm]."""
         from mitsim.core.manifests import Parallax
@@ -176,6 +190,7 @@ class Apparatus:
             for window, half in zip(self.windows, geometry.half_sides, strict=True)
         )
 
+    @checked
     def family(self, patterns: str, seed: int = 0) -> PatternFamily:
         """The family ``patterns`` on this projector, ``seed`` for random ones; MitsimError when it does not fit."""
         from mitsim.rig.patterns import parse_patterns

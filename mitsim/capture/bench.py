@@ -7,7 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mitsim.capture.apparatus import Apparatus
+from mitsim.capture.apparatus import Apparatus, check_depth
+from mitsim.core.arguments import checked
+from mitsim.core.errors import ArgumentError
 
 # What needs numpy, or the renderer, is imported where it is used: what opens a bench refuses a misspelt name first.
 if TYPE_CHECKING:
@@ -32,6 +34,7 @@ class Bench(Apparatus):
         rig = f"{self.sensor.name} with {rows} x {columns} pixels, {self.projector.name}"
         return f"Bench({path.parent.name}/{path.name}: {rig})"
 
+    @checked
     def plan(self, patterns: str = "dots:7", **request: Any) -> Plan:
         """What will be simulated, why, and what it costs, by a short look at the scene.
 
@@ -52,6 +55,7 @@ class Bench(Apparatus):
 
         return plan_request(self, Request.of(patterns=patterns, **request))
 
+    @checked
     def light(self, patterns: str = "dots:7", job: Job | None = None, **request: Any) -> Light:
         """Light of the scene by projector pixel, traced once, from which any family can be exposed.
 
@@ -73,6 +77,7 @@ class Bench(Apparatus):
 
         return trace_request(self, self.plan(patterns, **request), job)
 
+    @checked
     def capture(
         self,
         plan: Plan | str = "dots:7",
@@ -111,6 +116,7 @@ class Bench(Apparatus):
         known = None if isinstance(plan, str) else plan
         return capture(self, request_of(plan, request), job, output, resume, known)
 
+    @checked
     def capture_lines(
         self,
         patterns: Plan | str = "dots:7",
@@ -151,6 +157,7 @@ class Bench(Apparatus):
         known = None if isinstance(patterns, str) else patterns
         return capture_lines(self, request_of(patterns, request), job, output, resume, known)
 
+    @checked
     def choose_colour(self, patterns: str = "dots:7", **request: Any) -> Coloured:
         """Mono, bands or lines: the cheapest that is predicted to leave at most half of the accuracy of the colours.
 
@@ -173,6 +180,7 @@ class Bench(Apparatus):
 
         return choose_colour(self, Request.of(patterns=patterns, **request))
 
+    @checked
     def in_variant(self, variant: str) -> Bench:
         """The same bench loaded anew into a ``variant``, which is set from then on; objects of the variant before must
         not be used with it. MitsimError as :func:`mitsim.open_bench`."""
@@ -180,11 +188,13 @@ class Bench(Apparatus):
 
         return reopened(self, variant)
 
+    @checked
     def in_bands(self, count: int) -> Bench:
         """The same bench whose projector has ``count`` bands of its lines as lines; MitsimError as
         :meth:`mitsim.rig.projector.ProjectorModel.in_bands`."""
         return replace(self, rig=replace(self.rig, projector=self.projector.in_bands(count)))
 
+    @checked
     def calibrate_lines(
         self,
         seed: int = 0,
@@ -216,6 +226,7 @@ class Bench(Apparatus):
 
         return calibrate_lines(self, seed, accuracy, recipe, output, resume, job)
 
+    @checked
     def capture_mosaic(
         self,
         patterns: str = "dots:7",
@@ -254,6 +265,7 @@ class Bench(Apparatus):
 
         return capture_mosaic(self, Request.of(patterns=patterns, **request), job, output, resume)
 
+    @checked
     def calibrate_mosaic(
         self,
         seed: int = 0,
@@ -288,6 +300,7 @@ class Bench(Apparatus):
 
         return calibrate_mosaic(self, seed, accuracy, recipe, output, resume, job)
 
+    @checked
     def calibrate(
         self,
         seed: int = 0,
@@ -327,6 +340,7 @@ class Bench(Apparatus):
 
         return calibrate(self, seed, accuracy, recipe, output, resume, job)
 
+    @checked
     def calibrate_depths(
         self,
         seed: int = 0,
@@ -354,6 +368,7 @@ class Bench(Apparatus):
 
         return calibrate_depths(self, seed, accuracy, recipe, output, resume, job)
 
+    @checked
     def write_session(
         self,
         frames: Path | str,
@@ -382,10 +397,11 @@ class Bench(Apparatus):
 
         return write_session(self, frames, output, seed, accuracy, recipe, job)
 
+    @checked
     def render(
         self,
         estimator: Literal["reference", "factored"] = "reference",
-        spp: int = 64,
+        spp: int | None = None,
         accuracy: float = 1e-3,
         seed: int = 0,
         effects: Mapping[str, bool] | None = None,
@@ -398,7 +414,7 @@ class Bench(Apparatus):
         estimator
             ``reference``: the scene's own integrator, path by path; ``factored``: what all captures are made with.
         spp
-            samples a pixel of the reference.
+            samples a pixel of the reference; None: the ``sample_count`` of the scene's sampler, or 64 without.
         accuracy, effects
             of the factored estimator: relative error, and effects switched on or off by name.
         seed
@@ -415,6 +431,7 @@ class Bench(Apparatus):
 
         return render(self, estimator, spp, accuracy, seed, effects, job)
 
+    @checked
     def with_board(self, reflectance: float, shape: BoardShape | None = None, depth: float | None = None) -> Bench:
         """The same rig before a diffuse board.
 
@@ -426,6 +443,11 @@ class Bench(Apparatus):
             its size, bow and tilt; None: flat, and larger than the view.
         depth
             distance of its middle [mm]; None: on the aligned plane.
+
+        Raises
+        ------
+        MitsimError
+            for a reflectance or a depth that no board has.
         """
         import mitsuba as mi
 
@@ -433,7 +455,10 @@ class Bench(Apparatus):
         from mitsim.rig.board import BoardShape
         from mitsim.scene.guard.estimators import Unfit
 
-        board = board_object(self, reflectance, shape or BoardShape(), depth or self.geometry.scene_distance)
+        if not 0 <= reflectance <= 1:
+            raise ArgumentError("reflectance", f"{reflectance:g}: give a number from 0 to 1")
+        where = self.geometry.scene_distance if depth is None else check_depth(depth)
+        board = board_object(self, reflectance, shape or BoardShape(), where)
         scene = mi.load_dict(
             {"type": "scene", "camera": self.loaded.camera, "projector": self.loaded.projector, "board": board}
         )

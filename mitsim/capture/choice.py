@@ -314,6 +314,7 @@ class _Table:
         lacking = {
             "light over sharp lobes": self.evidence.unresolved,
             "light over mirrors or curved glass both ways, or once and a sharp lobe (left out)": self.evidence.left_out,
+            "light over small mirrors alone (not resolved)": self.evidence.glint,
         }
         missing = min(sum(lacking.values()), 1.0)
         # Errors of the light that is there count for its part of all.

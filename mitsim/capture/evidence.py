@@ -347,6 +347,8 @@ class Evidence:
         as in :class:`Settings`, where that takes less for as little noise; ``indirect`` is then what that takes.
     left_out
         light that no tracer finds, over that and what is found (:mod:`mitsim.transport.left_out`).
+    glint
+        light over mirrors alone whose place on the sensor is not known, over all light.
     mirror
         place, among the scene's shapes, of what most of that comes over.
     reach, sharp, occluded
@@ -371,6 +373,7 @@ class Evidence:
     apart: Mapping[str, float] = field(default_factory=dict)
     unresolved: float = 0.0
     left_out: float = 0.0
+    glint: float = 0.0
     mirror: int | None = None
     shared: bool = False
     repeats: tuple[int, ...] = ()

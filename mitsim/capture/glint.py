@@ -45,6 +45,21 @@ class Glint:
             self._frames[key] = self._form(labels, geometry, spectrum)
         return self._frames[key]
 
+    def irradiance(self, geometry: CameraGeometry) -> tuple[float, float]:
+        """Mean irradiance on the sensor without its mask, and what of it lacks or may be off in each pixel [W m^-2].
+
+        Parameters
+        ----------
+        geometry
+            the camera.
+        """
+        beams = self.beams
+        area, pixels = math.prod(geometry.pitches), math.prod(geometry.frame_shape)
+        met = (np.abs(beams.sensor.mean(axis=(1, 2))) < geometry.half_width).all(axis=1)
+        # Points that edges leave lie in single pixels: their rms over all of them.
+        unsure = math.hypot(beams.unresolved, beams.error * math.sqrt(pixels))
+        return float(beams.delivered[met].sum()) / area / pixels, unsure / area / pixels
+
     def _form(self, labels: Labels, geometry: CameraGeometry, spectrum: Spectrum | None) -> ClassFrames:
         return glint_frames(self.beams, geometry, self._terms(geometry, spectrum), labels)
 
@@ -52,7 +67,8 @@ class Glint:
         """The mask for a virtual source at the beams' mean depth and direction."""
         if spectrum is None:
             return geometric_samplers(geometry)
-        near = float(np.mean(self.beams.inverse_depth))
+        wide = self.beams.wide
+        near = float(np.mean(self.beams.inverse_depth[wide])) if wide.any() else 0.0
         depth = 1 / near if near > 0 else math.inf
         tau = np.average(self.beams.tangent.mean(axis=(1, 2)), axis=0, weights=self.beams.delivered)
         return wave_samplers(geometry, spectrum, depth, (float(tau[0]), float(tau[1])))

@@ -16,6 +16,7 @@ from PIL import Image
 
 from mitsim.core.jsonfile import write_json
 from mitsim.core.manifests import Digital
+from mitsim.core.output import whole_file
 from mitsim.rig.framelist import LISTS, DarkFile, FrameList, StripeFile
 from mitsim.rig.order import SIDES, UNIFORM, Half
 from mitsim.sensor.chain import Digital as Numbers
@@ -51,10 +52,11 @@ class KeptFrames:
             options = dict(zip(names[2::2], names[3::2], strict=True))
             half = self._half(str(names[0]), int(names[1]))
             place = self._lit(half, int(options.get("exposure", 0)), int(options.get("repeat", 0)))
-        if self._tiff:
-            Image.fromarray(numbers.astype(np.uint16)).save(self.folder / place)
-        else:
-            np.save(self.folder / place, numbers)
+        with whole_file(self.folder / place) as part, part.open("wb") as file:
+            if self._tiff:
+                Image.fromarray(numbers.astype(np.uint16)).save(file, "TIFF")
+            else:
+                np.save(file, numbers)
 
     def finish(self, digital: Digital) -> None:
         """Write the list, when all frames are there; ``digital`` is of the shortest exposure."""

@@ -20,6 +20,7 @@ from mitsim.capture.prices import CHECKED_SHOTS, MOST_CHECKED, tells_all
 from mitsim.capture.rounds import first_samples, next_samples
 from mitsim.capture.simulation import Simulation, Stage, expected_of
 from mitsim.capture.truth import Truth, trace_truth
+from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.job import Progress, silent
 from mitsim.core.parallel import Behind, single_threaded_blas
@@ -207,6 +208,7 @@ class Light:
         probed = self.looked.at(self, rows, lighting.weights.shape[1]) if self.looked and seed == self.seed else None
         return self.simulation.expected(self.groups, rows, lighting, seed, leaking, probed)
 
+    @checked
     def rows_of(self, lighting: Lighting) -> Labels:
         """(rows,) class of ``lighting`` that each row of the light belongs to; ValueError as :meth:`frames`."""
         rows = np.zeros(int(self.labels.max()) + 1, dtype=np.int64)
@@ -215,6 +217,7 @@ class Light:
             raise ValueError("the light was traced for another family of patterns")
         return rows
 
+    @checked
     def expose(
         self, patterns: str = "dots:7", output: Path | str | None = None, job: Job | None = None, **request: Any
     ) -> Capture:
@@ -241,6 +244,7 @@ class Light:
         own = replace(self.plan, request=request_of(self.plan, {}).changed(patterns=patterns))
         return capture(self.bench, request_of(own, request), job, output, light=self)
 
+    @checked
     def save(self, path: Path | str) -> Path:
         """Write the light to the HDF5 file ``path``, which is replaced; returns it. Frames are formed of it without
         mitsim, as docs/exchange.md shows.
@@ -270,6 +274,7 @@ class Light:
             "warnings": [*self.warnings, *self.unreached],
         }
 
+    @checked
     def behind(self, bench: Bench) -> Light:
         """The same light before the camera of another ``bench``, of which only the mask may differ: light is traced up
         to it."""

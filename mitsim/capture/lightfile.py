@@ -20,7 +20,7 @@ from mitsim.capture.evidence import Estimate
 from mitsim.capture.filing import TRAYS, Tray
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.core.output import whole_file
+from mitsim.core.hdf5file import whole_hdf5
 from mitsim.optics.anchors import anchor_positions, anchor_weights
 from mitsim.optics.terms import shadow_terms
 from mitsim.sensor.chain import electrons_from_irradiance
@@ -54,13 +54,11 @@ def write_light(path: Path, light: Light) -> None:
     MitsimError
         for light by class, for too many projector pixels that shine over mirrors, and a file that cannot be written.
     """
-    import h5py  # here: it takes 50 ms to import, and few lights are written
-
     count = light.bench.n**2
     if not np.array_equal(light.labels, np.arange(count)):
         raise MitsimError(f"file {path}: the light was traced for one family alone; trace it by pixel, by bench.light")
     glint = _glint(path, light)
-    with whole_file(path) as part, h5py.File(part, "w", track_order=True) as file:
+    with whole_hdf5(path) as file:
         file.attrs.update(_facts(light))
         trays = file.create_group("light", track_order=True)
         for name in TRAYS:

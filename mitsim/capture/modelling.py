@@ -18,6 +18,7 @@ from mitsim.capture.fitting import GAIN_STEP, STEPS, Fitted, Shown, fit_placemen
 from mitsim.capture.responses import LitSession
 from mitsim.capture.run import digital_scale
 from mitsim.capture.session import Session
+from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
@@ -42,6 +43,7 @@ _SIGNIFICANT = 3.0
 """Standard errors from which a rotation of the mask counts."""
 
 
+@checked
 def calibrate_model(
     bench: Bench,
     modelling: Modelling,

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mitsim.capture.bench import Bench
+from mitsim.core.arguments import checked
 from mitsim.core.configuration import DEFAULT_CAMERA, load_model, locate
 from mitsim.core.environment import DEFAULT_VARIANT, load_variant
 from mitsim.core.errors import MitsimError
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from mitsim.rig.profile import MaskProfile
     from mitsim.rig.projector import ProjectorModel
     from mitsim.scene.load import LoadedScene
+    from mitsim.transport.contact import Contact
 
 _PITCH_TOLERANCE = 1e-3
 """Relative difference of the scene's pixel pitch from the camera's that is rounding in a data sheet."""
@@ -65,6 +67,7 @@ def check_devices(camera: Path | str | None, projector: Path | str | None) -> tu
     return first, second
 
 
+@checked
 def open_bench(
     scene: Path | str,
     variant: str = DEFAULT_VARIANT,
@@ -121,7 +124,8 @@ def open_bench(
         try:
             sensor.efficiency(light.effective_wavelength_nm)
         except MitsimError as error:
-            raise MitsimError(f"camera {sensor_path}: {error}") from None
+            pitch = f"{sensor.superpixel_pitch_um * 1e-3:g}"
+            raise MitsimError(f"camera {sensor_path}: {error}; its scene has a pixel_pitch of {pitch} mm") from None
     # Only now, with all else checked: the renderer takes a second to import.
     loaded = _loaded(variant, path, defines, needs_projector=not for_render, outside=allow_outside_files)
     row_um = (sensor.row_pitch_um or sensor.pixel_pitch_um) * sensor.binning
@@ -168,10 +172,30 @@ def _loaded(variant: str, path: Path, defines: Mapping[str, str], **options: boo
     mitsuba = load_variant(variant)
     from mitsim.scene.load import load_scene
     from mitsim.transport import plugins
+    from mitsim.transport.contact import contacts
 
     mitsuba.set_log_level(mitsuba.LogLevel.Error)
     plugins.register()
-    return load_scene(path, defines, **options)
+    loaded = load_scene(path, defines, **options)
+    of_factored, of_reference = contacts(loaded.scene)
+    factored = _in_contact(loaded, of_factored, "the factored estimator")
+    reference = _in_contact(loaded, of_reference, "the reference")
+    if factored is not None and options.get("needs_projector", True):
+        raise factored
+    unfit = replace(
+        loaded.unfit, factored=loaded.unfit.factored or factored, reference=loaded.unfit.reference or reference
+    )
+    return replace(loaded, unfit=unfit)
+
+
+def _in_contact(loaded: LoadedScene, contact: Contact | None, estimator: str) -> MitsimError | None:
+    """The refusal of a scene with a ``contact`` by an ``estimator``."""
+    if contact is None:
+        return None
+    got, rule = contact.words(estimator)
+    if loaded.shapes:
+        return loaded.shapes[contact.shape].refusal("shape", got, rule)
+    return MitsimError(f"{loaded.path}: shape {contact.shape}: got {got}; {rule}")
 
 
 def _text(value: object) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from mitsim.capture.evidence import Estimate, Settings
 from mitsim.capture.request import Request
+from mitsim.core.arguments import checked
 from mitsim.core.colours import MONO
 from mitsim.core.errors import MitsimError
 from mitsim.core.pictures import table
@@ -138,6 +139,7 @@ class Plan:
     asked_seconds: float | None = None
     colour: ColourChoice | None = None
 
+    @checked
     def row(self, name: str) -> PlanRow:
         """What is said of the effect or discretisation called ``name``; MitsimError when there is none."""
         rows = {row.name: row for row in self.effects}

@@ -16,7 +16,8 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.cost import frames_cost
 from mitsim.capture.light import Sampling, trace_light
 from mitsim.capture.planning import make_plan
-from mitsim.capture.request import FEWEST_PASSES, REFERENCE, check_samples
+from mitsim.capture.request import FEWEST_PASSES, REFERENCE, check_accuracy, check_samples
+from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import write_frame
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 _SAMPLERS = ("IndependentSampler", "OrthogonalSampler")
 """The others of Mitsuba 3.9.1 order their strata by a hash that is no random permutation of few of them: some two of a
 path's numbers correlate, over 2^19 paths by 0.8 (stratified), 0.26 (ldsampler) and 0.15 (multijitter) at 4 a pixel."""
+_SAMPLES = 64
+"""Samples a pixel where neither request nor scene states them, as the shipped scenes have it: a few seconds."""
 _SAMPLES_A_PASS = 64
 """Samples a pixel of one pass: 2^24 paths of a 512 x 512 sensor, which fit in memory."""
 
@@ -45,7 +48,7 @@ class Rendered:
     mean, error
         (m, m', channels) irradiance, and its standard error.
     facts
-        estimator, spp (None: factored), seconds, variant and seed.
+        estimator, spp (None: factored), seconds, variant, seed, and notes of what the scene's objects were changed in.
     warnings
         why the frame is flagged.
     """
@@ -66,6 +69,7 @@ class Rendered:
         """What the command line reports, but for the file's name."""
         return {**self.facts, "mean": float(self.mean.mean()), "mc_error": self.mc_error, "warnings": self.warnings}
 
+    @checked
     def save(self, path: Path | str) -> Path:
         """Write the frame and its error to the OpenEXR file ``path``, which is replaced; returns it.
 
@@ -120,6 +124,8 @@ def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) 
     """
     import mitsuba as mi
 
+    from mitsim.scene.guard.outline import one_line
+
     if loaded.unfit.reference is not None:
         raise loaded.unfit.reference
     if loaded.parting and mi.is_spectral:
@@ -138,9 +144,12 @@ def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) 
         try:
             image = np.array(mi.render(loaded.scene, sensor=loaded.camera, spp=each, seed=child), dtype=np.float64)
         except RuntimeError as error:
+            cause: BaseException = error
+            while cause.__cause__ is not None:  # what Dr.Jit raises says only that something below it failed
+                cause = cause.__cause__
             raise MitsimError(
-                f"{loaded.path}: the integrator cannot render this sensor ({' '.join(str(error).split())[-200:]}); "
-                "use path, direct or volpath"
+                f"{loaded.path}: Mitsuba cannot render this scene in {mi.variant()}: {one_line(cause)}; change what it "
+                "names, or try another --variant"
             ) from None
         finally:
             loaded.camera.stratify(None)
@@ -162,6 +171,19 @@ def _of_sampler(loaded: LoadedScene) -> tuple[str, ...]:
         f"{loaded.path}: the points of sampler {sampler} depend on each other (at 4 paths by 15 to 80 %), so light "
         'over several turns may come out wrong; use <sampler type="independent"/>, the first turn is stratified anyway',
     )
+
+
+def _samples(bench: Bench, estimator: str, spp: int | None) -> int:
+    """Samples a pixel: ``spp`` as asked for, or those of the scene; MitsimError for too few or too many."""
+    check_samples(estimator, spp)
+    stated = bench.loaded.samples
+    if spp is not None or stated is None:
+        return spp or _SAMPLES
+    try:
+        check_samples(estimator, stated)
+    except MitsimError as error:
+        raise MitsimError(f"{bench.loaded.path}: sample_count of its sampler, taken for {error}") from None
+    return stated
 
 
 @contextmanager
@@ -188,7 +210,7 @@ def projected(bench: Bench, pattern: FloatArray) -> Iterator[None]:
 def render(
     bench: Bench,
     estimator: str,
-    spp: int,
+    spp: int | None,
     accuracy: float,
     seed: int,
     effects: Mapping[str, bool] | None = None,
@@ -210,7 +232,8 @@ def render(
         as there.
     """
     job = job or Job()
-    check_samples(estimator, spp)
+    spp = _samples(bench, estimator, spp)
+    check_accuracy(accuracy)
     warnings: tuple[str, ...] = ()
     started = time.perf_counter()
     if estimator == REFERENCE:
@@ -234,5 +257,6 @@ def render(
         "seconds": time.perf_counter() - started,
         "variant": bench.variant,
         "seed": seed,
+        "notes": bench.loaded.notes,
     }
     return Rendered(mean, error, facts, warnings)

@@ -93,12 +93,12 @@ def check_psnr(psnr: float) -> float:
     return psnr
 
 
-def check_samples(estimator: str, spp: int) -> None:
+def check_samples(estimator: str, spp: int | None) -> None:
     """ArgumentError for an ``estimator`` that there is not, or too few or too many samples ``spp`` a pixel of the
-    reference."""
+    reference; None: those of the scene."""
     if estimator not in ESTIMATORS:
         raise ArgumentError("estimator", f"{estimator!r}: use {' or '.join(ESTIMATORS)}")
-    if estimator == REFERENCE and not FEWEST_PASSES <= spp <= MOST_SAMPLES:
+    if estimator == REFERENCE and spp is not None and not FEWEST_PASSES <= spp <= MOST_SAMPLES:
         raise ArgumentError("spp", f"{spp}: give at least {FEWEST_PASSES} samples a pixel, at most {MOST_SAMPLES}")
 
 

@@ -16,10 +16,13 @@ import numpy as np
 
 from mitsim.capture.request import Exposure
 from mitsim.capture.sensing import check_ending, check_f_number, check_image, check_wavelength
+from mitsim.core.arrayfile import Npy
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import Channel, finite_channel, read_frame, write_frame
 from mitsim.core.output import whole_file
+from mitsim.core.plainfile import MOST_SIDE
+from mitsim.core.resources import Cost, Limits
 from mitsim.core.seeds import stream
 from mitsim.core.versions import versions
 from mitsim.rig.sensor import EXPOSURE_S, SensorModel
@@ -27,6 +30,8 @@ from mitsim.sensor.chain import Digital, electrons_from_irradiance, expose, expo
 
 _LUMINANCE = {"R": 0.2126, "G": 0.7152, "B": 0.0722}
 """Weights of linear RGB in luminance (ITU-R BT.709)."""
+_PIXEL_BYTES = 100
+"""Of memory for a pixel: some ten arrays of double precision, as read, scaled, as electrons and as numbers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,11 +180,15 @@ def read_image(path: Path | str, channel: str | None = None) -> tuple[FloatArray
         if channel is not None:
             raise MitsimError(f"image {path}: an array has no channel {channel!r}; name none")
         try:
-            values = np.load(path, allow_pickle=False)
-            if not isinstance(values, np.ndarray) or values.dtype.kind not in "buif":
-                raise TypeError(f"{getattr(values, 'dtype', 'several')} are no real numbers")
-            return np.asarray(values, dtype=np.float64), ()
-        except (ValueError, TypeError, EOFError) as error:
+            with open(path, "rb") as file:
+                array = Npy.of(file, path.stat().st_size)
+                if array.dtype.kind not in "buif":
+                    raise ValueError(f"{array.dtype} are no real numbers")
+                if max(array.shape, default=0) > MOST_SIDE:
+                    raise ValueError(f"its shape is {array.shape}; at most {MOST_SIDE} pixels a side are allowed")
+                Cost(memory_bytes=_PIXEL_BYTES * math.prod(array.shape)).check(f"image {path}", Limits())
+                return np.asarray(array.part(file), dtype=np.float64), ()
+        except (OSError, ValueError) as error:
             raise MitsimError(f"image {path}: not an array of numbers ({error}); save one by numpy.save") from error
     channels = {name: values for name, values in read_frame(path)[0].items() if not name.startswith("error.")}
     return _light_of(channels, channel, path)

@@ -7,6 +7,7 @@ Errors of the library speak of arguments; :func:`~mitsim.cli.options.spoken` wri
 from __future__ import annotations
 
 import errno
+import signal
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -57,13 +58,15 @@ from mitsim.cli.options import (
     check_work,
     job_of,
     number_of,
+    refuse_both,
+    refuse_unused,
     request_of,
     spoken,
 )
 from mitsim.cli.screen import finish, print_plan
 from mitsim.core.environment import DEFAULT_VARIANT
-from mitsim.core.errors import MitsimError
-from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped, stopped
+from mitsim.core.errors import MitsimError, printable
+from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped, end_uncaught, stopped
 
 app = typer.Typer(
     name="mitsim",
@@ -74,29 +77,38 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
+_ONLY_OF = {"reference": ("accuracy", "effects"), "factored": ("spp",)}
+"""Options of `mitsim render` that the other estimator has."""
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def run() -> None:
-    """Serve the command line in this process: exit 0 done, 1 done but flagged, 2 refused, 128 + n ended by signal n."""
+    """Serve the command line in this process: exit 0 done, 1 done but flagged, 2 refused or failed, 128 + n ended by
+    signal n."""
     try:
         code = app(standalone_mode=False)
+    except SystemExit as ended:
+        if ended.code == 1:  # click's for a reader that went away
+            sys.exit(128 + signal.SIGPIPE)
+        raise
     except MitsimError as error:
         _fail(spoken(error))
-    except (typer.Abort, KeyboardInterrupt):
+    except (typer.Abort, KeyboardInterrupt) as error:
+        if isinstance(error.__cause__, EOFError):  # which click takes for Control-D
+            end_uncaught(error.__cause__)
         code = INTERRUPTED
     except MemoryError:
         _fail("out of memory; close other programs, or ask for fewer pixels, frames or less accuracy")
     except OSError as error:
         # What no check foresees: a full disk, a name too long, a file taken away. Other errors are faults of ours.
         if error.filename is None and error.errno not in _NO_ROOM:
-            raise
+            end_uncaught(error)
         _fail(f"{error.filename or 'output'}: {error.strerror}; choose another place")
     except Exception as error:
         # Usage errors of click (wherever typer keeps it) carry their own one-line message.
         if hasattr(error, "format_message") and hasattr(error, "exit_code"):
             _fail(_usage(error))
-        raise
+        end_uncaught(error)
     if code == INTERRUPTED:  # some versions of typer turn Control-C into this status without a word
         end_stopped()
     sys.exit(code if isinstance(code, int) else 0)
@@ -117,7 +129,7 @@ def _usage(error: Any) -> str:
 def _fail(message: str) -> None:
     if stopped():
         end_stopped()  # what an interrupt became on its way, as of a module that was being imported
-    print(f"mitsim: {' '.join(message.split())}", file=sys.stderr)
+    print(f"mitsim: {' '.join(printable(message).split())}", file=sys.stderr)
     sys.exit(2)
 
 
@@ -163,6 +175,7 @@ def demo(
 
 @app.command()
 def plan(
+    context: typer.Context,
     scene: Scene,
     patterns: Patterns = "dots:7",
     accuracy: AccuracyOrSeconds = None,
@@ -181,6 +194,7 @@ def plan(
     """What will be simulated, why, and what it costs, before any long work."""
     from mitsim.core.resources import running_seconds
 
+    refuse_both(context, "accuracy", "seconds")
     request = request_of(patterns=patterns, accuracy=accuracy, seconds=seconds, seed=seed, effects=effects)
     check_colour(colour, variant, projector, seconds)
     check_shown([patterns], scene, define, outside)
@@ -194,6 +208,7 @@ def plan(
 
 @app.command()
 def capture(
+    context: typer.Context,
     scene: Scene,
     output: Annotated[Path, typer.Option("-o", "--output", help="run folder to make", metavar="RUN")],
     patterns: Patterns,
@@ -228,6 +243,11 @@ def capture(
     from mitsim.core.manifests import MANIFEST
     from mitsim.core.resources import memory_from_here, memory_since
 
+    refuse_both(context, "accuracy", "seconds")
+    if exposure != "auto":
+        refuse_unused(context, ["exposure_fraction"], "on an --exposure in seconds")
+    if ambient_frame == "no":
+        refuse_unused(context, ["ambient_shots"], "with --ambient-frame no")
     request = request_of(
         patterns=patterns,
         accuracy=accuracy,
@@ -291,10 +311,14 @@ app.registered_commands += calibration.app.registered_commands + image.app.regis
 
 @app.command()
 def render(
+    context: typer.Context,
     scene: Scene,
     output: Annotated[Path, typer.Option("-o", "--output", help="frame to write", metavar="FRAME.exr")],
     estimator: Annotated[str, typer.Option(help="reference or factored")] = "reference",
-    spp: Annotated[int, typer.Option(help="samples a pixel of the reference")] = 64,
+    spp: Annotated[
+        int | None,
+        typer.Option(help="samples a pixel of the reference", show_default="the scene's sample_count, or 64"),
+    ] = None,
     accuracy: Accuracy = 1e-3,
     seed: Seed = 0,
     projector: Projector = None,
@@ -309,21 +333,25 @@ def render(
 ) -> int:
     """Expected irradiance under the scene's own light, by either estimator."""
     from mitsim.capture.request import check_samples
-    from mitsim.core.output import prepare_output
+    from mitsim.core.output import check_apart, check_output, output_file
 
     if output.suffix.lower() != ".exr":
         raise MitsimError(f"--output {output}: the frame is an OpenEXR file; give a name that ends in .exr")
     request = request_of(accuracy=accuracy, seed=seed, effects=effects)
     check_samples(estimator, spp)
+    refuse_unused(context, _ONLY_OF[estimator], f"on the {estimator} estimator")
+    check_output(output, overwrite=True, kind="file")
     method: Any = estimator
     with job_of(quiet or as_json, max_seconds, max_memory) as job:
-        place = prepare_output(output, overwrite=True, kind="file")
         bench = bench_of(scene, variant, None, projector, define, outside, for_render=True)
-        frame = bench.render(method, spp, accuracy, seed, request["effects"], job)
-        payload = {**frame.summary(), "output": str(frame.save(place))}
+        check_apart(output, bench.loaded.files)
+        with output_file(output, overwrite=True) as place:
+            frame = bench.render(method, spp, accuracy, seed, request["effects"], job)
+            payload = {**frame.summary(), "output": str(frame.save(place))}
     lines = [
         f"{estimator}: mean irradiance {payload['mean']:.4e} W/m^2, relative noise {payload['mc_error']:.1e}, "
-        f"{payload['seconds']:.2f} s: {payload['output']}"
+        f"{payload['seconds']:.2f} s: {payload['output']}",
+        *payload["notes"],
     ]
     return finish(as_json, payload, lines, frame.warnings)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,6 +15,7 @@ from mitsim.cli.colour import MOSAIC, NO, Colour, check_colour, in_colour, of_ca
 from mitsim.cli.modelling import calibrate_model, modelling_of
 from mitsim.cli.options import (
     DAY,
+    SPELLED,
     Accuracy,
     Camera,
     Defines,
@@ -53,8 +55,6 @@ _MODELS = "geometric|wave"
 """What --model may be."""
 _OF_FRAMES = {"frames", "camera", "output", "as_json", "quiet"}
 """Options of `mitsim calibrate` that go with --frames."""
-_SPELLED = {"scene": "SCENE", "define": "-D", "outside": "--allow-outside-files", "planning": "--plan"}
-"""Options that are not called like their parameter."""
 
 
 @app.command()
@@ -220,7 +220,7 @@ def _calibrate_frames(
         when there are such, and for frames that cannot be used.
     """
     if others:
-        name = _SPELLED.get(others[0], f"--{others[0].replace('_', '-')}")
+        name = SPELLED.get(others[0], f"--{others[0].replace('_', '-')}")
         raise MitsimError(f"--frames {folder}: frames and their list decide; leave out {name}")
     from mitsim.core.resources import memory_from_here, memory_since
     from mitsim.rig.framelist import load_frames
@@ -292,16 +292,17 @@ class Wanted:
         as_json
             one JSON object instead of text.
         """
-        from mitsim.core.output import whole_file
+        from mitsim.core.output import output_file, whole_file
         from mitsim.rig.recipe import recipe_text
         from mitsim.study.calibration_plan import plan_calibration
 
-        found = plan_calibration(bench, self.psnr, self.patterns, recipe, **request, job=job)
-        lines = found.lines()
-        if self.output is not None:
-            with whole_file(self.output) as part:
-                part.write_text(recipe_text(found.recipe), encoding="utf-8")
-            lines.append(f"Recipe: {self.output}")
+        with nullcontext() if self.output is None else output_file(self.output):
+            found = plan_calibration(bench, self.psnr, self.patterns, recipe, **request, job=job)
+            lines = found.lines()
+            if self.output is not None:
+                with whole_file(self.output) as part:
+                    part.write_text(recipe_text(found.recipe), encoding="utf-8")
+                lines.append(f"Recipe: {self.output}")
         payload = {**found.payload(), "output": None if self.output is None else str(self.output)}
         return finish(as_json, payload, lines, found.warnings)
 

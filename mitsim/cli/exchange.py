@@ -28,6 +28,8 @@ from mitsim.cli.options import (
     bench_of,
     check_shown,
     job_of,
+    refuse_both,
+    refuse_unused,
     request_of,
 )
 from mitsim.cli.screen import finish
@@ -38,9 +40,18 @@ from mitsim.rig.families import NAMES, read_name
 
 app = typer.Typer()
 
+_OF_BARE = ("shape", "bits", "byte_order")
+"""Options of `mitsim import` for files without a header."""
+_OF_FRAMES = (
+    *("patterns", "camera", "exposure", "calibration", "projector_pixels", "black_level"),
+    *("ambient_frame", "ambient_shots", *_OF_BARE, "seed"),
+)
+"""Those for frames, which a file of `mitsim export` does without."""
+
 
 @app.command("export")
 def export(
+    context: typer.Context,
     run: Annotated[Path, typer.Argument(help="folder of `mitsim capture`", metavar="RUN")],
     format: Annotated[str, typer.Option(help="hdf5, mat, flatcam, deepinv, torch or png", metavar="FORMAT")],
     output: Annotated[Path, typer.Option("-o", "--output", help="file to make; of png, a folder", metavar="FILE")],
@@ -56,6 +67,8 @@ def export(
     """Write a run in a format that other programs read."""
     from mitsim.exchange.export import export_run
 
+    if format == "png":
+        refuse_unused(context, ["overwrite"], "on a folder of pictures, which takes the place of none")
     payload = export_run(run, format, output, calibration, overwrite, projector)
     with_it = f" with {payload['calibration']}" if payload["calibration"] else ""
     lines = [f"{payload['frames']} frames{with_it} as {format}: {payload['output']}", *payload["notes"]]
@@ -64,6 +77,7 @@ def export(
 
 @app.command("import")
 def import_(
+    context: typer.Context,
     source: Annotated[
         Path, typer.Argument(help="file of `mitsim export`, or frames: a folder of them, or one file", metavar="SOURCE")
     ],
@@ -114,11 +128,10 @@ def import_(
     payload: dict[str, Any]
     of_frames = patterns, camera, exposure
     if source.suffix.lower() in READERS:
-        if any(value is not None for value in (*of_frames, calibration, shape, ambient_frame, black_level)):
-            raise MitsimError(f"{source}: says itself what its frames are; leave the options of frames out")
+        refuse_unused(context, _OF_FRAMES, f"on {source}, which says itself what its frames are")
         payload = import_file(source, output, calibration_output, channel)
     else:
-        from mitsim.core.imagelist import Raw
+        from mitsim.core.imagelist import BARE, Raw
         from mitsim.exchange.known import RealCapture
 
         if output is None or calibration_output is not None:
@@ -126,9 +139,14 @@ def import_(
         for name, value in zip(("patterns", "camera", "exposure"), of_frames, strict=True):
             if value is None:
                 raise ArgumentError(name, "is not given, and frames do not say it; give it")
-        raw = None if shape is None else Raw.of(shape, bits, byte_order)
         if patterns is None or camera is None or exposure is None:
             raise AssertionError  # refused above
+        bare = any(path.suffix.lower() in BARE for path in (source, *(source.iterdir() if source.is_dir() else ())))
+        if shape is None or not bare:
+            refuse_unused(context, _OF_BARE, "on files that have a header, or without --shape")
+        if not patterns.startswith("random"):
+            refuse_unused(context, ["seed"], "on patterns that are not drawn at random")
+        raw = None if shape is None else Raw.of(shape, bits, byte_order)
         more = calibration, projector_pixels, black_level, ambient_frame, ambient_shots, raw, channel, seed
         known = RealCapture(patterns, camera, exposure, *more)
         known.check(source)  # refused before numpy is imported
@@ -149,6 +167,7 @@ def import_(
 
 @app.command()
 def patterns(
+    context: typer.Context,
     family: Annotated[
         str, typer.Argument(help=f"{NAMES}; or stripes, those of a calibration", metavar="PATTERNS|stripes")
     ],
@@ -177,6 +196,10 @@ def patterns(
         read_name(family, projector_pixels)  # refused before numpy is imported
     from mitsim.exchange.drawn import SESSION, cells_told, draw_family, draw_stripes, session_of
 
+    if family != "stripes":
+        refuse_unused(context, ["signed_capture"], "on patterns, whose signed ones are pairs; it is for stripes")
+    if not family.startswith("random"):
+        refuse_unused(context, ["seed"], "on patterns that are not drawn at random")
     of_stripes = {"camera": camera, "exposure": exposure}
     if family == "stripes":
         for name, value in of_stripes.items():
@@ -206,6 +229,7 @@ def patterns(
 
 @app.command()
 def transport(
+    context: typer.Context,
     scene: Scene,
     output: Annotated[Path, typer.Option("-o", "--output", help="HDF5 file to make", metavar="FILE.h5")],
     patterns: Patterns = "dots:7",
@@ -225,14 +249,17 @@ def transport(
     quiet: Quiet = False,
 ) -> int:
     """Trace a scene's light by projector pixel and write it, for frames of any pattern without mitsim."""
-    from mitsim.core.output import prepare_output
+    from mitsim.core.configuration import locate
+    from mitsim.core.output import check_apart, output_file
 
+    refuse_both(context, "accuracy", "seconds")
     request = request_of(patterns=patterns, accuracy=accuracy, seconds=seconds, seed=seed, effects=effects)
-    prepare_output(output, overwrite, "file")
     check_shown([patterns], scene, define, outside)
-    with job_of(quiet or as_json, max_seconds, max_memory) as job:
+    with job_of(quiet or as_json, max_seconds, max_memory) as job, output_file(output, overwrite) as output:
         with job.clock.stage("open scene"):
             bench = bench_of(scene, variant, camera, projector, define, outside)
+        devices = (locate(each, "calibration", ".toml") for each in (camera, projector) if each)
+        check_apart(output, (*bench.loaded.files, *devices))
         light = bench.light(request.pop("patterns"), job, **request)
         with job.clock.stage("write"):
             light.save(output)

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 _OPTIONS = {"lam": "lambda"}
 """Options that are not called like the argument."""
+SPELLED = {"scene": "SCENE", "define": "-D", "outside": "--allow-outside-files", "planning": "--plan"}
+"""Options that are not called like their parameter."""
 _BENCH_ARGUMENTS = ("scene", "variant", "camera", "projector", "allow_outside_files", "for_render")
 
 Scene = Annotated[str, typer.Argument(help="scene XML, or the name of a shipped scene", metavar="SCENE")]
@@ -296,6 +298,49 @@ def is_given(context: typer.Context, name: str) -> bool:
     """Whether the command line of a ``context`` names the parameter ``name``."""
     source = context.get_parameter_source(name)
     return source is not None and source.name == "COMMANDLINE"
+
+
+def refuse_unused(context: typer.Context, names: Sequence[str], where: str) -> None:
+    """Refuse options that have no effect: one that is passed over would be taken for obeyed.
+
+    Parameters
+    ----------
+    context
+        of the command line.
+    names
+        parameters that have no effect.
+    where
+        they have none, for the message.
+
+    Raises
+    ------
+    MitsimError
+        when one of them is given.
+    """
+    for name in names:
+        if is_given(context, name):
+            option = SPELLED.get(name, f"--{name.replace('_', '-')}")
+            raise MitsimError(f"{option}: has no effect {where}; leave it out")
+
+
+def refuse_both(context: typer.Context, first: str, second: str) -> None:
+    """Refuse two options of which one decides.
+
+    Parameters
+    ----------
+    context
+        of the command line.
+    first, second
+        parameters.
+
+    Raises
+    ------
+    MitsimError
+        when both are given.
+    """
+    if is_given(context, first) and is_given(context, second):
+        told = " and ".join(f"--{name.replace('_', '-')}" for name in (first, second))
+        raise MitsimError(f"{told}: either decides; give one of them")
 
 
 @contextmanager

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
+
+from mitsim.core.errors import MitsimError, printable
 
 if TYPE_CHECKING:
     from mitsim.capture.plan import Plan
@@ -32,10 +36,10 @@ def showing_progress(hidden: bool) -> Iterator[Progress]:
         from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
         from rich.progress import Progress as Bar
 
-        columns = TextColumn("{task.description:<18}"), BarColumn(), TimeElapsedColumn()
+        columns = TextColumn("{task.description:<18}", markup=False), BarColumn(), TimeElapsedColumn()
         with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
             task = bar.add_task("starting", total=1.0)
-            yield lambda stage, fraction: bar.update(task, description=stage, completed=fraction)
+            yield lambda stage, fraction: bar.update(task, description=printable(stage), completed=fraction)
 
 
 def _logged() -> Progress:
@@ -47,13 +51,18 @@ def _logged() -> Progress:
         nonlocal written
         if time.monotonic() - written >= SECONDS_A_LINE:
             written = time.monotonic()
-            print(f"mitsim: {stage} ({fraction:.0%})", file=sys.stderr, flush=True)
+            print(f"mitsim: {printable(stage)} ({fraction:.0%})", file=sys.stderr, flush=True)
 
     return line
 
 
 def print_plan(plan: Plan) -> None:
     """Print the ``plan``'s effects, with reasons, and what it takes."""
+    with written():
+        _print_plan(plan)
+
+
+def _print_plan(plan: Plan) -> None:
     from rich.console import Console
     from rich.table import Table
 
@@ -62,8 +71,8 @@ def print_plan(plan: Plan) -> None:
         table.add_column(heading, justify="right" if heading in ("error if off", "seconds") else "left")
     for row in plan.effects:
         error = "-" if row.error_if_off is None else f"{row.error_if_off:.1e}"
-        table.add_row(row.name, row.state, row.reason, error, f"{row.seconds:.2f}")
-    console = Console()
+        table.add_row(row.name, row.state, printable(row.reason), error, f"{row.seconds:.2f}")
+    console = Console(markup=False)  # names of a scene stand in the reasons
     console.print(table)
     stages = ", ".join(f"{name} {seconds:.2f}" for name, seconds in plan.predicted.items())
     console.print(f"Predicted time from start to finish: {plan.predicted_seconds:.2f} s ({stages})")
@@ -88,13 +97,28 @@ def finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequence
     warnings
         on stderr, in either case.
     """
-    if as_json:
-        from mitsim.core.jsonfile import plain
+    with written():
+        if as_json:
+            from mitsim.core.jsonfile import plain
 
-        print(json.dumps(plain(payload), allow_nan=False))
-    else:
-        for line in lines:
-            print(line)
+            print(json.dumps(plain(payload), allow_nan=False))
+        else:
+            for line in lines:
+                print(printable(line))
     for warning in warnings:
-        print(f"mitsim: warning: {warning}", file=sys.stderr)
+        print(f"mitsim: warning: {printable(warning)}", file=sys.stderr)
     return 1 if warnings else 0
+
+
+@contextmanager
+def written() -> Iterator[None]:
+    """What is printed in this context is written when it ends. Where nobody reads any more, the program ends as by
+    SIGPIPE, quietly; MitsimError where standard output takes no more for another reason, such as a full disk."""
+    try:
+        yield
+        sys.stdout.flush()
+    except OSError as error:
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - what the exit writes has to go somewhere
+        if isinstance(error, BrokenPipeError):
+            sys.exit(128 + signal.SIGPIPE)
+        raise MitsimError(f"standard output: cannot be written ({error.strerror}); give it another place") from None

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from mitsim.cli.options import Json, Quiet, Seed, Variant, job_of, number_of
+from mitsim.cli.options import Json, Quiet, Seed, Variant, job_of, number_of, refuse_unused
 from mitsim.cli.screen import finish
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import MitsimError
@@ -18,6 +18,7 @@ app = typer.Typer()
 
 @app.command()
 def characterise(
+    context: typer.Context,
     camera: Annotated[str, typer.Argument(help="camera electronics: name or TOML file", metavar="CAMERA")],
     output: Annotated[Path, typer.Option("-o", "--output", help="folder of JSON and plots")] = Path(
         "characterise-output"
@@ -41,6 +42,8 @@ def characterise(
     procedure = Procedure(pixels, steps, frames, seed, wavelength)
     capacity_of(sensor)
     efficiency_of(sensor, procedure)
+    if sensor.quantum_efficiency_curve is None:
+        refuse_unused(context, ["wavelength"], f"on {camera}, whose file has no curve of quantum efficiency")
     check_study_folder(output, "characterise")
     from mitsim.study.characterise import characterise as run_characterise
 
@@ -51,6 +54,7 @@ def characterise(
 
 @app.command()
 def sense(
+    context: typer.Context,
     image: Annotated[Path, typer.Argument(help="irradiance [W/m^2], OpenEXR or NPY", metavar="IMAGE.exr")],
     camera: Annotated[str, typer.Option("--camera", help="camera electronics: name or TOML file", metavar="NAME|FILE")],
     output: Annotated[Path, typer.Option("-o", "--output", help="frame to write", metavar="FRAME.png|exr|npy")],
@@ -71,12 +75,14 @@ def sense(
     from mitsim.capture.request import Exposure
     from mitsim.capture.sensing import check_ending, check_f_number, check_image, check_wavelength
     from mitsim.core.configuration import locate
-    from mitsim.core.output import prepare_output
+    from mitsim.core.output import check_apart, output_file
     from mitsim.core.seeds import check_root
     from mitsim.rig.sensor import load_sensor
 
     sensor = load_sensor(locate(camera, "calibration", ".toml"))
     seconds = number_of("exposure", exposure)
+    if seconds != "auto":
+        refuse_unused(context, ["exposure_fraction"], "on an --exposure in seconds")
     asked = Exposure(None if seconds == "auto" else seconds, exposure_fraction)
     if not 0 < scale < math.inf:
         raise MitsimError(f"--scale {scale:g}: give a finite number above 0")
@@ -86,14 +92,15 @@ def sense(
         check_f_number(f_number)
     check_root(seed)
     check_image(image)
-    place = prepare_output(output, overwrite=True, kind="file")
-    from mitsim.capture.sense import irradiance_behind_lens, read_image
-    from mitsim.capture.sense import sense as run_sense
+    check_apart(output, [image])
+    with output_file(output, overwrite=True) as place:
+        from mitsim.capture.sense import irradiance_behind_lens, read_image
+        from mitsim.capture.sense import sense as run_sense
 
-    light, notes = read_image(image, channel)
-    light = light * scale if f_number is None else irradiance_behind_lens(light * scale, f_number)
-    frame = run_sense(light, sensor, asked, seed, wavelength, notes)
-    payload = {**frame.summary(), "output": str(frame.save(place))}
+        light, notes = read_image(image, channel)
+        light = light * scale if f_number is None else irradiance_behind_lens(light * scale, f_number)
+        frame = run_sense(light, sensor, asked, seed, wavelength, notes)
+        payload = {**frame.summary(), "output": str(frame.save(place))}
     lines = [
         f"{sensor.name}: {payload['shape'][0]}x{payload['shape'][1]} pixels, exposure {frame.exposure_s:.3g} s, "
         f"mean {payload['mean_dn']:.5g} DN, largest {payload['largest_dn']:.5g}: {payload['output']}",

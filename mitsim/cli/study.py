@@ -28,6 +28,7 @@ from mitsim.cli.options import (
     check_shown,
     job_of,
     recipe_for,
+    refuse_unused,
     scope_of,
     swept,
 )
@@ -37,12 +38,17 @@ from mitsim.core.errors import MitsimError
 
 app = typer.Typer()
 
+_OF_MERGE = ("name", "scenes", "output", "experiment", "variant", "as_json", "quiet")
+"""Parameters that `mitsim study merge` has."""
+_OF_SCENES = ("patterns", "camera", "projector", "define", "outside")
+"""Those of studies of a scene."""
 _WHOLE = "1/1"
 """The only part of a study that is not shared."""
 
 
 @app.command()
 def study(
+    context: typer.Context,
     name: Annotated[str, typer.Argument(help="of the study, or merge", metavar="NAME")],
     scenes: Annotated[
         list[str] | None,
@@ -66,6 +72,9 @@ def study(
     recipe: Annotated[
         Path | None, typer.Option(help="of calibration and drift: session recipe", metavar="FILE.toml")
     ] = None,
+    experiment: Annotated[
+        str | None, typer.Option(help="of merge: the module, where the study is one of your own", metavar="MODULE")
+    ] = None,
     variant: Variant = DEFAULT_VARIANT,
     as_json: Json = False,
     quiet: Quiet = False,
@@ -78,20 +87,29 @@ def study(
     from mitsim.study import EXPOSED, OF_NO_SCENE, find_study, is_experiment
     from mitsim.study.folder import check_study_folder
 
+    if name == "merge":
+        others = [each for each in context.params if each not in _OF_MERGE]
+        refuse_unused(context, others, "on parts, which say themselves what they are of")
+    else:
+        refuse_unused(context, ["experiment"], "but with merge; give the module as the study's NAME")
     session, request = recipe_for(name, recipe), mitsim.Request.of(patterns=patterns, seed=seed)
     warnings: Sequence[str] = ()
     with job_of(quiet or as_json) as job:
         if name == "merge":
             from mitsim.study.campaign import merge
 
-            result: Any = merge(scenes or (), output)
+            result: Any = merge(scenes or (), output, experiment)
         elif is_experiment(name):
             from mitsim.study.campaign import Where, run_experiment
             from mitsim.study.points import Shard
 
             scope = scope_of(_only(scenes), variant, camera, projector, define, outside, quick)
             scope = swept(name, replace(scope, seeds=(seed,)), patterns, over or (), measure)
+            if name not in ("sweep", "drift"):
+                refuse_unused(context, ["patterns"], f"on the study {name}, which has its own")
             scope = replace(scope, recipe=str(recipe) if recipe else None)
+            if scheduler is not None:
+                refuse_unused(context, ["jobs"], "with --scheduler, whose machines have processes of their own")
             where = Where(Shard.of(shard), jobs, scheduler)
             check_setup(scope, _only(scenes))
             result = run_experiment(name, scope, output, job, where)
@@ -101,10 +119,12 @@ def study(
                 raise MitsimError(
                     f"study {name}: is measured whole, here; leave out --over, --measure, --shard, --jobs, --scheduler"
                 )
+            refuse_unused(context, ["quick"], f"on the study {name}, which has no points to leave out")
             bench = None
             if name in OF_NO_SCENE:
                 if scenes:
                     raise MitsimError(f"study {name} {' '.join(scenes)}: it is of no scene; leave the scene out")
+                refuse_unused(context, _OF_SCENES, f"on the study {name}, which is of no scene")
             else:
                 check_study_folder(output, name)
                 if name in EXPOSED:

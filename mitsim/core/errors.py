@@ -28,7 +28,13 @@ class ArgumentError(MitsimError):
         self.argument = argument
 
 
+def printable(text: str) -> str:
+    """A ``text`` without what a terminal would obey: control characters and those that turn its direction are spaces,
+    line ends stay."""
+    return "".join(letter if letter.isprintable() or letter == "\n" else " " for letter in text)
+
+
 def cut(text: str, length: int = 60) -> str:
     """One printable line of ``text``, of at most ``length`` characters."""
-    shown = "".join(letter if letter.isprintable() else " " for letter in text[: length + 1])
+    shown = printable(text[: length + 1]).replace("\n", " ")
     return shown if len(text) <= length else shown[: length - 3] + "..."

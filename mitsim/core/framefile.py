@@ -9,9 +9,7 @@ import contextlib
 import hashlib
 import io
 import json
-import os
-import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +22,7 @@ from mitsim.core.errors import MitsimError, cut
 from mitsim.core.exr import read_header
 from mitsim.core.jsonfile import parse_json
 from mitsim.core.output import whole_file
-from mitsim.core.plainfile import check_plain
+from mitsim.core.plainfile import check_plain, stderr_silenced
 
 Value = str | int | float
 Channel = npt.NDArray[np.float32] | npt.NDArray[np.uint32]
@@ -32,7 +30,6 @@ Channels = Mapping[str, Channel]
 Metadata = Mapping[str, Value]
 
 _PREFIX = "mitsim."
-_stdout_lock = threading.Lock()
 
 
 def write_frame(path: Path | str, channels: Channels, metadata: Metadata) -> None:
@@ -182,20 +179,8 @@ def _scalar(value: Value) -> Value:
 def _open(path: Path) -> Any:
     # OpenEXR prints a warning to stdout for pixels it cannot read, where --json promises JSON alone, and its C++ part
     # one to stderr, past Python; it raises later on. The lock keeps two threads from restoring each other's streams.
-    with _stdout_lock, contextlib.redirect_stdout(io.StringIO()), _stderr_nowhere():
+    with stderr_silenced(), contextlib.redirect_stdout(io.StringIO()):
         return OpenEXR.File(str(path), separate_channels=True)
-
-
-@contextlib.contextmanager
-def _stderr_nowhere() -> Iterator[None]:
-    stderr = os.dup(2)
-    try:
-        with open(os.devnull, "wb") as nowhere:
-            os.dup2(nowhere.fileno(), 2)
-        yield
-    finally:
-        os.dup2(stderr, 2)
-        os.close(stderr)
 
 
 def _one_line(error: BaseException) -> str:

@@ -1,24 +1,30 @@
 """Pictures of other programs, as PNG, TIFF, NPY, OpenEXR or bare numbers: a path in; size, or numbers as stored, out.
 
-Nothing is scaled, inverted or made grey: a file whose numbers its reader would change is refused.
+Nothing is scaled, inverted, turned or made grey: a file whose numbers its reader would change is refused. What a header
+claims is bounded before pixels are read, and files are copied, not mapped: one that is cut short meanwhile is refused.
 """
 
 from __future__ import annotations
 
+import io
+import logging
 import math
+import os
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, BinaryIO, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
 
+from mitsim.core.arrayfile import Npy
 from mitsim.core.errors import MitsimError
 from mitsim.core.imagelist import BARE, FORMATS, FRAME, Wanted
-from mitsim.core.plainfile import check_plain
+from mitsim.core.plainfile import check_plain, stderr_silenced
+from mitsim.core.resources import Cost, Limits
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -31,8 +37,29 @@ _PNG_BITS = (1, 2, 4, 8, 16)
 """Of a grey number in a PNG."""
 _GREY, _COLOURS = 0, (2, 6)
 """Colour types of a PNG: one number a pixel; red, green, blue, without and with alpha."""
-_BITS, _PHOTOMETRIC, _SAMPLES = 258, 262, 339
-"""Tags of TIFF 6.0: BitsPerSample, PhotometricInterpretation, SampleFormat."""
+_ANIMATED = b"acTL"
+"""Chunk before the pixels of a PNG of several frames (ISO/IEC 15948:2023, 11.3.6.1)."""
+_MOST_CHUNKS = 1000
+"""Before the pixels of a PNG; programs write some ten."""
+_BITS, _COMPRESSION, _PHOTOMETRIC, _SAMPLES = 258, 259, 262, 339
+"""Tags of TIFF 6.0: BitsPerSample, Compression, PhotometricInterpretation, SampleFormat."""
+_BIG = 43
+"""Version of a TIFF whose places have 8 bytes, and numbers of entries too (BigTIFF)."""
+_PLAIN = 1
+"""Compression of a TIFF that has none."""
+_PAGE_KIND, _ORIENTATION, _TILES, _PARTS = 254, 274, (322, 323), 330
+"""Tags of TIFF 6.0: NewSubfileType, Orientation, TileWidth and TileLength; SubIFDs of TIFF/EP, where raw files keep
+the picture itself."""
+_NO_PAGE = 0b101
+"""Bits of NewSubfileType: a reduced picture of another page, a mask of one."""
+_TILE_MARGIN = 1024
+"""Pixels by which a tile may exceed a picture, chosen beyond usual tiles (64 to 512): readers allocate whole ones."""
+_UPRIGHT = 1
+"""Orientation of a picture whose row 0 is at the top and column 0 at the left, as stored."""
+_MOST_PAGES = 1 << 16
+"""Of a file: as many as shots of a run."""
+_PIXEL_BYTES = 24
+"""Of memory for a pixel while a page is read and checked; measured at most 21, of a PNG of 16 bits."""
 _BLACK_IS_ZERO, _RGB = 1, 2
 """PhotometricInterpretation of files that are read; 0 stores black as the largest number."""
 _UNSIGNED = 1
@@ -43,11 +70,27 @@ _CHANNEL = "DN"
 
 @dataclass(frozen=True)
 class _Found:
-    """What a file's header says: pages, size of the first, and what reads the numbers of each page."""
+    """What a file's header says: pages, size of the first, what reads the numbers of each page, and bytes of memory
+    that a pixel takes meanwhile."""
 
     pages: int
     size: tuple[int, int]
     read: Callable[[], Iterator[Numbers]]
+    pixel_bytes: float = _PIXEL_BYTES
+
+
+def image_pages(path: Path | str, wanted: Wanted = FRAME) -> tuple[int, tuple[int, int]]:
+    """How many pages a picture has, and rows and columns of the first, from its header.
+
+    Parameters
+    ----------
+    path, wanted
+        as for :func:`read_images`, whose errors it raises.
+    """
+    path = Path(path)
+    with _told(path, wanted):
+        found = _look(path, wanted)
+        return found.pages, found.size
 
 
 def image_size(path: Path | str, wanted: Wanted = FRAME) -> tuple[int, int]:
@@ -58,9 +101,7 @@ def image_size(path: Path | str, wanted: Wanted = FRAME) -> tuple[int, int]:
     path, wanted
         as for :func:`read_images`, whose errors it raises.
     """
-    path = Path(path)
-    with _told(path, wanted):
-        return _look(path, wanted).size
+    return image_pages(path, wanted)[1]
 
 
 def read_image(path: Path | str, wanted: Wanted = FRAME) -> Numbers:
@@ -77,8 +118,7 @@ def read_image(path: Path | str, wanted: Wanted = FRAME) -> Numbers:
         as there, and for several pages.
     """
     path = Path(path)
-    with _told(path, wanted):
-        pages = _look(path, wanted).pages
+    pages, _ = image_pages(path, wanted)
     if pages != 1:
         raise wanted.refusal(path, f"has {pages} pages; give each {wanted.what} a file of its own")
     return next(read_images(path, wanted))
@@ -100,12 +140,14 @@ def read_images(path: Path | str, wanted: Wanted = FRAME) -> Iterator[Numbers]:
     Raises
     ------
     MitsimError
-        for a file that is missing, damaged, of another kind or size, in colours that are not wanted, with numbers that
-        its reader would change, or that are not finite.
+        for a file that is missing, damaged, animated, to be shown turned, of another kind or size, in colours that are
+        not wanted, with numbers that its reader would change, that are not finite, or that memory does not hold.
     """
     path = Path(path)
     with _told(path, wanted):
-        for values in _look(path, wanted).read():
+        found = _look(path, wanted)
+        Cost(memory_bytes=found.pixel_bytes * math.prod(found.size)).check(f"{wanted.what} {path}", Limits())
+        for values in found.read():
             _check_size(path, wanted, values.shape[0], values.shape[1])
             bad = np.count_nonzero(~np.isfinite(values))
             if bad:
@@ -137,8 +179,10 @@ def _check_size(path: Path, wanted: Wanted, rows: int, columns: int) -> None:
 def _png(path: Path, wanted: Wanted) -> _Found:
     with open(path, "rb") as file:
         head = file.read(_HEAD)
-    if len(head) < _HEAD or not head.startswith(_SIGNATURE):
-        raise ValueError("it does not begin as a PNG")
+        if len(head) < _HEAD or not head.startswith(_SIGNATURE):
+            raise ValueError("it does not begin as a PNG")
+        if _ANIMATED in _kinds_of_chunks(file):
+            raise wanted.refusal(path, f"is an animated PNG of several; give each {wanted.what} a file of its own")
     columns, rows = (int.from_bytes(head[place : place + 4], "big") for place in (16, 20))
     bits, colour = head[24], head[25]
     if not (colour == _GREY and bits in wanted.bits) and not (wanted.colour and colour in _COLOURS and bits == 8):
@@ -152,27 +196,72 @@ def _png(path: Path, wanted: Wanted) -> _Found:
             if "transparency" in picture.info:
                 raise wanted.refusal(path, "names a number that is transparent; save it without transparency")
             # Some versions of Pillow give 16 bits of a PNG as 32.
-            yield np.array(picture).astype(bool if bits == 1 else np.uint8 if bits <= 8 else np.uint16)
+            values = np.array(picture).astype(bool if bits == 1 else np.uint8 if bits <= 8 else np.uint16)
+            _check_upright(path, picture, wanted)  # a PNG may say it behind its pixels
+            yield values
 
     return _Found(1, (rows, columns), read)
+
+
+def _kinds_of_chunks(file: BinaryIO) -> set[bytes]:
+    """Kinds of the chunks of a PNG ``file`` that stand before its pixels."""
+    kinds: set[bytes] = set()
+    file.seek(len(_SIGNATURE))
+    for _ in range(_MOST_CHUNKS):
+        length, kind = int.from_bytes(file.read(4), "big"), file.read(4)
+        if kind in (b"IDAT", b""):
+            return kinds
+        kinds.add(kind)
+        file.seek(length + 4, os.SEEK_CUR)
+    raise ValueError(f"it has over {_MOST_CHUNKS} chunks before its pixels")
+
+
+def _check_upright(path: Path, picture: Image, wanted: Wanted) -> None:
+    """MitsimError for a ``picture`` that is to be shown turned or mirrored: what is stored is then another picture."""
+    turned = picture.getexif().get(_ORIENTATION, _UPRIGHT)
+    if turned != _UPRIGHT:
+        raise wanted.refusal(
+            path, f"has the orientation {turned}: it is to be shown turned or mirrored; save it as it is to be read"
+        )
 
 
 def _tiff(path: Path, wanted: Wanted) -> _Found:
     def read() -> Iterator[Numbers]:
         """Its pages."""
-        from PIL import ImageSequence
-
-        with _opened(path, "TIFF") as file:
-            for picture in ImageSequence.Iterator(file):
+        with _opened(path, "TIFF", packed) as picture:
+            for page in range(pages):
+                picture.seek(page)
                 unsigned = _check_tags(path, picture, wanted)
                 _check_size(path, wanted, picture.height, picture.width)
-                values = np.array(picture)
+                with stderr_silenced():
+                    values = np.array(picture)
                 # Pillow holds 32 bits as if they had a sign.
                 yield values.view(np.uint32) if unsigned and values.dtype == np.int32 else values
 
     with _opened(path, "TIFF") as picture:
         _check_tags(path, picture, wanted)
-        return _Found(getattr(picture, "n_frames", 1), (picture.height, picture.width), read)
+        size = picture.height, picture.width
+        packed = picture.tag_v2.get(_COMPRESSION, _PLAIN) != _PLAIN  # type: ignore[attr-defined]
+    pages = _pages_of(path)
+    if pages > _MOST_PAGES:
+        raise wanted.refusal(path, f"has over {_MOST_PAGES} pages; give fewer")
+    held = path.stat().st_size / max(math.prod(size), 1) if packed else 0.0
+    return _Found(pages, size, read, held + _PIXEL_BYTES)
+
+
+def _pages_of(path: Path) -> int:
+    """How many pages a TIFF has, one more than :data:`_MOST_PAGES` at most. Pillow takes a millisecond for each."""
+    with open(path, "rb") as file:
+        order: Literal["little", "big"] = "little" if file.read(2) == b"II" else "big"
+        big = int.from_bytes(file.read(2), order) == _BIG
+        file.seek(8 if big else 4)
+        counted, entry, place = (8, 20, 8) if big else (2, 12, 4)
+        following, pages = int.from_bytes(file.read(place), order), 0
+        while following and pages <= _MOST_PAGES:
+            file.seek(following)
+            file.seek(int.from_bytes(file.read(counted), order) * entry, os.SEEK_CUR)
+            following, pages = int.from_bytes(file.read(place), order), pages + 1
+    return pages
 
 
 def _check_tags(path: Path, picture: Image, wanted: Wanted) -> bool:
@@ -182,17 +271,32 @@ def _check_tags(path: Path, picture: Image, wanted: Wanted) -> bool:
     grey = photometric == _BLACK_IS_ZERO and len(bits) == 1 and bits[0] in wanted.bits
     if not grey and not (wanted.colour and photometric == _RGB and set(bits) == {8}):
         raise wanted.refusal(path, f"is no {_allowed('TIFF', wanted.bits, wanted)}")
+    if tags.get(_PAGE_KIND, 0) & _NO_PAGE or _PARTS in tags:
+        raise wanted.refusal(path, "holds previews, masks or parts beside the picture; save the picture alone")
+    if any(tags.get(tag, 0) > max(picture.size) + _TILE_MARGIN for tag in _TILES):
+        raise wanted.refusal(path, "is of tiles larger than the picture; save it in strips")
+    _check_upright(path, picture, wanted)
     return bool(samples[0] == _UNSIGNED)
 
 
 def _npy(path: Path, wanted: Wanted) -> _Found:
-    array = np.load(path, mmap_mode="r", allow_pickle=False)
-    kinds = "buif" if 1 in wanted.bits else "uif"
-    if not isinstance(array, np.ndarray) or array.ndim not in (2, 3) or array.dtype.kind not in kinds:
-        told = f"{array.dtype} of shape {array.shape}" if isinstance(array, np.ndarray) else "several arrays"
+    with open(path, "rb") as file:
+        array = Npy.of(file, path.stat().st_size)
+    kinds, sides = "buif" if 1 in wanted.bits else "uif", array.shape[-2:]
+    if len(array.shape) not in (2, 3) or array.dtype.kind not in kinds:
+        told = f"{array.dtype} of shape {array.shape}"
         raise wanted.refusal(path, f"holds {told}; rows x columns of numbers are needed, or pages of them")
-    pages = array if array.ndim == 3 else array[None]
-    return _Found(len(pages), (pages.shape[1], pages.shape[2]), lambda: (np.array(page) for page in pages))
+    pages = array.shape[0] if len(array.shape) == 3 else 1
+    # Columns first, a page is scattered over the whole file.
+    at_once = array.bytes / max(math.prod(sides), 1) if array.fortran else float(array.dtype.itemsize)
+
+    def read() -> Iterator[Numbers]:
+        """Its pages."""
+        with open(path, "rb") as file:
+            for page in range(pages):
+                yield array.part(file, page if len(array.shape) == 3 else None)
+
+    return _Found(pages, (sides[0], sides[1]), read, at_once + _PIXEL_BYTES)
 
 
 def _exr(path: Path, wanted: Wanted) -> _Found:
@@ -227,7 +331,7 @@ def _bare(path: Path, wanted: Wanted) -> _Found:
 
     def read() -> Iterator[Numbers]:
         """Its one page."""
-        values = np.fromfile(path, raw.kind).reshape(raw.shape)
+        values = np.fromfile(path, raw.kind, math.prod(raw.shape)).reshape(raw.shape)
         if values.max() >= 2**raw.bits:
             most = values.max()
             raise wanted.refusal(path, f"has the number {most}, beyond {raw.bits} bits; correct bits or byte_order")
@@ -251,15 +355,31 @@ def _allowed(kind: str, bits: Any, wanted: Wanted) -> str:
 
 
 @contextmanager
-def _opened(path: Path, kind: str) -> Iterator[Image]:
-    """A picture file of that ``kind``, its pixels not yet read."""
-    from PIL import Image  # most work reads no picture
+def _opened(path: Path, kind: str, whole: bool = False) -> Iterator[Image]:
+    """A picture file of that ``kind``, its pixels not yet read; ``whole``: from a copy in memory, as the library for
+    packed TIFF would map the file, or read all of it for each page."""
+    from PIL import Image, UnidentifiedImageError  # most work reads no picture
 
-    with warnings.catch_warnings():
+    logs = logging.getLogger("PIL")
+    if not logs.handlers:  # where nobody listens, Python writes errors in a log to stderr
+        logs.addHandler(logging.NullHandler())
+    with open(path, "rb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # on metadata that is damaged; where pixels are, reading them raises
         warnings.simplefilter("error", Image.DecompressionBombWarning)
-        picture = Image.open(path, formats=(kind,))
-    with picture:
-        yield picture
+        source = io.BytesIO(file.read()) if whole else cast("IO[bytes]", _Copied(file))
+        try:
+            opened = Image.open(source, formats=(kind,))
+        except UnidentifiedImageError:
+            raise ValueError(f"its header is none of a {kind}") from None
+        with opened as picture:
+            yield picture
+
+
+class _Copied:
+    """A file that Pillow can read, but not map: it has no name and no descriptor."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.read, self.seek, self.tell = file.read, file.seek, file.tell
 
 
 @contextmanager

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+from mitsim.core.arguments import checked_fields
 from mitsim.core.resources import Limits
 
 Progress = Callable[[str, float], None]
@@ -17,6 +18,7 @@ def silent(stage: str, fraction: float) -> None:
     """Ignore the progress of ``stage``, its finished ``fraction``: the :data:`Progress` of who wants none."""
 
 
+@checked_fields
 class Clock:
     """Seconds by stage, in the order of first use.
 
@@ -47,6 +49,7 @@ class Clock:
         return {**self._stages, "total": time.perf_counter() - self._started}
 
 
+@checked_fields
 @dataclass(frozen=True)
 class Job:
     """How one piece of long work is watched and bounded; of no influence on its results.

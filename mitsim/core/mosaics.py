@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.colours import MosaicManifest, read_mosaic, write_colours
 from mitsim.core.framefile import finite_channel, read_frame, write_frame
@@ -74,6 +75,7 @@ class MosaicCapture:
         each = (self.truths[name] for name in self.manifest.names)
         return np.stack([one.reflectance * (one.board / (board or one.board)) for one in each], axis=-1)
 
+    @checked
     def save(self, folder: Path | str) -> Path:
         """Write the folder that `mitsim capture --colour mosaic` writes, to a new or empty ``folder``; returns it.
 
@@ -103,6 +105,7 @@ class MosaicCapture:
         return self.shots._repr_html_()
 
 
+@checked
 def load_mosaic(folder: Path | str) -> MosaicCapture:
     """The run behind colour filters in ``folder``. MitsimError when it is not a complete one."""
     folder = Path(folder)

@@ -3,9 +3,10 @@
 import json
 import os
 import shutil
+import stat
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal
@@ -14,7 +15,11 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.plainfile import read_text
 
 LOCK = ".mitsim.lock"
-"""Held, in a folder, by the process that writes there; a killed process leaves the file behind, but not the lock."""
+"""Held, in a folder, by the process that writes there; a killed process leaves the file behind, but not the lock. That
+of a file stands beside it, the file's name before this."""
+_NAME_BYTES = 120
+"""Of a file's name that hidden files beside it begin with, so that none of theirs passes the 255 of a file system."""
+_KINDS = {stat.S_IFCHR: "a device", stat.S_IFBLK: "a device", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket"}
 _LONGEST_HEAD = 1 << 20
 """An unfinished manifest is a few kB; what is larger is not looked into."""
 FRAMES, PARTS = "frame_*.exr", "*.part.npz"
@@ -25,13 +30,15 @@ FRAMES, PARTS = "frame_*.exr", "*.part.npz"
 def whole_file(path: Path | str) -> Iterator[Path]:
     """A name beside ``path`` to write to; on leaving it takes the place of ``path``, and after an error it is removed.
 
-    MitsimError when the file cannot be written.
+    MitsimError when the file cannot be written, or is no plain file; a link stays, and its file is replaced.
     """
     path = Path(path)
-    part = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.part")
+    _check_plain(path)
+    target = path.resolve()
+    part = _beside(target, f".{os.getpid()}-{threading.get_ident()}.part")
     try:
         yield part
-        os.replace(part, path)
+        os.replace(part, target)
     except OSError as error:
         raise MitsimError(
             f"file {path}: cannot be written ({error.strerror or error}); choose a writable folder with room"
@@ -39,6 +46,12 @@ def whole_file(path: Path | str) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             part.unlink(missing_ok=True)
+
+
+def write_text(path: Path | str, text: str) -> None:
+    """Write ``text`` to ``path`` in UTF-8, all or nothing. MitsimError when it cannot be written."""
+    with whole_file(path) as part:
+        part.write_text(text, encoding="utf-8")
 
 
 def sweep(folder: Path) -> None:
@@ -111,7 +124,7 @@ def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     new = not Path(path).exists()
     folder = prepare_output(path, overwrite)
     try:
-        with _locked(folder):
+        with _locked(folder, folder / LOCK):
             prepare_output(path, overwrite)  # nobody finished a work there between the first look and the lock
             yield folder
     except BaseException:
@@ -119,6 +132,40 @@ def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
             with suppress(OSError):  # not empty: what was written stays
                 folder.rmdir()
         raise
+
+
+@contextmanager
+def output_file(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
+    """The file ``path`` for the time of a work, in which no other process may claim it; ``overwrite`` allows one that
+    exists.
+
+    MitsimError as for :func:`prepare_output`, and when another process holds the file.
+    """
+    path = prepare_output(path, overwrite, "file")
+    with _locked(path, _beside(path.resolve(), LOCK)):
+        yield prepare_output(path, overwrite, "file")  # nobody wrote it between the first look and the lock
+
+
+def check_apart(path: Path | str, inputs: Iterable[Path | str]) -> None:
+    """Refuse to replace what a work reads.
+
+    Parameters
+    ----------
+    path
+        its output.
+    inputs
+        files that it reads, and folders of which it reads files.
+
+    Raises
+    ------
+    MitsimError
+        when the output is one of the files, by whatever name, or a file in one of the folders.
+    """
+    place = Path(path).resolve()
+    for each in map(Path, inputs):
+        same = place == each.resolve() or (place.exists() and each.exists() and place.samefile(each))
+        if same or (each.is_dir() and place.exists() and place.is_relative_to(each.resolve())):
+            raise MitsimError(f"output {path}: would replace {each}, which is read; choose another name")
 
 
 @contextmanager
@@ -137,25 +184,44 @@ def whole_folder(path: Path | str) -> Iterator[Path]:
             raise
 
 
+def _beside(path: Path, ending: str) -> Path:
+    """A hidden name in the folder of ``path`` that begins as its own."""
+    name = path.name.encode()[:_NAME_BYTES].decode(errors="ignore")
+    return path.with_name(f".{name}{ending}")
+
+
+def _check_plain(path: Path) -> None:
+    """MitsimError where ``path`` leads to a device, a named pipe or a socket, which a file would replace."""
+    try:
+        mode = path.stat().st_mode
+    except OSError:
+        return
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        kind = _KINDS.get(stat.S_IFMT(mode), "no plain file")
+        raise MitsimError(f"output {path}: is {kind}, which a file would replace; give the name of a file")
+
+
 @contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def _locked(path: Path, name: Path) -> Iterator[None]:
+    """Hold the lock of the output ``path``, whose file has this ``name``; MitsimError where another process does."""
     from filelock import FileLock, Timeout  # here: it takes 20 ms to import, and no refusal needs it
 
-    lock = FileLock(folder / LOCK)
+    lock = FileLock(name)
     try:
         lock.acquire(blocking=False)
     except Timeout:
-        raise MitsimError(f"output {folder}: another mitsim is writing there; wait for it, or choose another") from None
+        raise MitsimError(f"output {path}: another mitsim is writing there; wait for it, or choose another") from None
     try:
         yield
     finally:
-        (folder / LOCK).unlink(missing_ok=True)  # before the lock is given back: who waits for it looks for the name
+        name.unlink(missing_ok=True)  # before the lock is given back: who waits for it looks for the name
         lock.release()
 
 
 def _prepare_file(path: Path, overwrite: bool) -> None:
     if path.is_dir():
         raise MitsimError(f"output {path}: is a folder, but a file is to be written; give a file name")
+    _check_plain(path)
     if path.exists() and not overwrite:
         raise MitsimError(f"output {path}: exists already; remove it or choose another name")
     _try_writing(path, path.parent)

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import os
 import stat
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from mitsim.core.errors import MitsimError
 
+_silence = threading.RLock()
 MOST_SIDE = 16384
 """Pixels a side of the largest picture that is read: of the largest sensor and environment map that are simulated."""
 
@@ -25,6 +29,21 @@ def check_plain(path: Path | str, what: str = "file") -> os.stat_result:
     if not stat.S_ISREG(status.st_mode):
         raise MitsimError(f"{what} {path}: cannot be read (a pipe or device, no plain file); check the path")
     return status
+
+
+@contextmanager
+def stderr_silenced() -> Iterator[None]:
+    """What native code writes to stderr of a damaged file, past Python, goes nowhere: it raises too. One thread at a
+    time, so that two do not restore each other's stream."""
+    with _silence:
+        stderr = os.dup(2)
+        try:
+            with open(os.devnull, "wb") as nowhere:
+                os.dup2(nowhere.fileno(), 2)
+            yield
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
 
 
 def read_text(path: Path | str, most: int) -> str:

@@ -10,6 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from mitsim.core.arguments import checked_fields
 from mitsim.core.errors import ArgumentError, MitsimError
 
 _CGROUPS = (
@@ -22,6 +23,7 @@ _USABLE = 0.9
 """Part of the free memory that work may take: the rest is for what estimates and other programs add."""
 
 
+@checked_fields
 @dataclass(frozen=True)
 class Limits:
     """What one command may take: wall seconds, and bytes of memory (None: nine tenths of what is free)."""

@@ -34,6 +34,8 @@ _SPACE_BYTES_PER_PROCESSOR = 85e6
 _AGAIN_S = 0.01
 """After which an interrupt that was lost comes again, and again: the callback that dropped it is over by then, and
 one that comes just before Python waits for something would not wake it."""
+_LONGEST_FAULT = 300
+"""Characters of an uncaught error's message: some have whole files in them."""
 _LONGEST_ADVICE = 256
 """Bytes; chosen so that any sentence fits."""
 
@@ -56,6 +58,7 @@ def enter_worker() -> None:
         return
     if "drjit" in sys.modules:
         raise RuntimeError("enter_worker: Dr.Jit is imported already, and its threads do not survive a fork")
+    _check_descriptors()
     _check_address_space()
     # Until both processes know what to do with them.
     signal.pthread_sigmask(signal.SIG_BLOCK, {*_STOPS, signal.SIGCHLD})
@@ -93,7 +96,7 @@ def _leave() -> None:
         sys.stdout.flush()
         sys.stderr.flush()
     except (OSError, ValueError):
-        return  # a closed pipe: the interpreter says so, and has a status of its own for it
+        os._exit(2)  # what was printed is lost; the interpreter would say so with a traceback
     os._exit(_status)
 
 
@@ -140,6 +143,31 @@ def end_stopped() -> NoReturn:
     sys.exit(128 + number)
 
 
+def end_uncaught(error: BaseException) -> NoReturn:
+    """Say in one line what nobody caught, with the file that has its traceback, and exit with 2: 1 would say that there
+    is a result. Of an ``error`` that an interrupt became on its way, as of a module that was being imported, the
+    interrupt is said."""
+    if stopped():
+        end_stopped()
+    import tempfile
+    import traceback
+
+    from mitsim.core.errors import cut
+
+    log = "could not be kept"
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="mitsim-", suffix=".log", delete=False, encoding="utf-8", errors="backslashreplace"
+        ) as file:
+            file.write("".join(traceback.format_exception(type(error), error, error.__traceback__)))
+            log = f"is in {file.name}"
+    except OSError:
+        pass
+    fault = cut(f"{type(error).__name__}: {error}", _LONGEST_FAULT)
+    _say(f"a fault of mitsim's own, {fault}; its traceback {log}; please report it with the command")
+    sys.exit(2)
+
+
 def _ending(number: signal.Signals) -> str:
     return "interrupted" if number == signal.SIGINT else f"ended by {number.name}"
 
@@ -150,8 +178,24 @@ def _with_advice(text: str) -> str:
 
 
 def _say(text: str) -> None:
-    sys.stderr.write(f"mitsim: {text}\n")
-    sys.stderr.flush()
+    if sys.stderr is not None:
+        sys.stderr.write(f"mitsim: {text}\n")
+        sys.stderr.flush()
+
+
+def _check_descriptors() -> None:
+    """Exit when standard output is closed: a file that is opened later would get its number, and what is printed.
+    Closed standard input and error lead to nothing instead."""
+    for number, mode in ((0, os.O_RDONLY), (1, os.O_WRONLY), (2, os.O_WRONLY)):
+        try:
+            os.fstat(number)
+        except OSError:
+            if number == 1:
+                _say("standard output is closed; give it a file, a pipe or /dev/null")
+                sys.exit(2)
+            os.open(os.devnull, mode)  # which takes the lowest number that is free
+            if number == 2:
+                sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115
 
 
 def _check_address_space() -> None:

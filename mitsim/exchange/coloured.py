@@ -25,7 +25,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import Channels, Metadata, read_frame, write_frame
 from mitsim.core.jsonfile import MOST_BYTES, parse_json
 from mitsim.core.manifests import MANIFEST, CalibrationManifest, RunManifest
-from mitsim.core.output import LOCK
+from mitsim.core.output import LOCK, write_text
 from mitsim.core.plainfile import read_text
 from mitsim.core.recorders import TRUTH
 from mitsim.exchange.packed import Manifest, Packed, packed_calibration, packed_run
@@ -54,7 +54,7 @@ class Coloured(Generic[Manifest]):
         for name, held in self.lines.items():
             (folder / name).mkdir()
             held.fill(folder / name)
-        (folder / COLOUR).write_text(self.text, encoding="utf-8")
+        write_text(folder / COLOUR, self.text)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ class Filtered:
         for name, truth in self.truths.items():
             (folder / name).mkdir()
             write_frame(folder / name / TRUTH, *truth)
-        (folder / COLOUR).write_text(self.text, encoding="utf-8")
+        write_text(folder / COLOUR, self.text)
 
 
 def filtered_run(folder: Path) -> Filtered:

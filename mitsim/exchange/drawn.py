@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,8 @@ from mitsim.core.configuration import load_model, locate, validated
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.jsonfile import write_json
 from mitsim.core.manifests import Patterns
-from mitsim.core.output import whole_folder
+from mitsim.core.output import whole_file, whole_folder
+from mitsim.core.resources import Cost, Limits
 from mitsim.rig.digital import digital_of
 from mitsim.rig.framelist import FrameList
 from mitsim.rig.order import UNIFORM, taken
@@ -30,6 +31,9 @@ SESSION = "session.json"
 SQUARE = 0.01
 """How far a cell's width on the scene may be off its height, as a logarithm, to count as square: a hundredth, which
 nobody sees in an image."""
+_SECONDS_PER_PIXEL, _PIXEL_BYTES = 2e-8, 3
+"""Of drawing a picture: measured 6e-9 s of dots:7 in a raster of 720 x 1920, and some three times that for a slow
+disk. Bytes of cells, picture and file."""
 _WHITE = 255
 """Of a picture for the projector; black is 0, so that its gamma plays no part."""
 
@@ -96,10 +100,11 @@ def draw_family(folder: Path, name: str, n: int, projector: str, seed: int = 0) 
     names = [frame_name(index) for index in range(len(family.shots))]
     patterns, raster = Patterns.of(family, names), Raster.of(projector)
     light = pictures_of(patterns, f"patterns {name}")
+    _check_cost(raster, len(names))
     with whole_folder(folder) as place:
-        where = draw(place, light, raster, f"projector {projector}")
+        where = draw(place, light, raster, (n, n), f"projector {projector}")
         write_json(place / PATTERNS, described(patterns, names, where))
-    return {"patterns": name, "n": n, "pictures": len(light), "projector": where, "output": str(folder)}
+    return {"patterns": name, "n": n, "pictures": len(names), "projector": where, "output": str(folder)}
 
 
 def draw_stripes(folder: Path, projector: str, listed: FrameList) -> dict[str, Any]:
@@ -133,8 +138,9 @@ def draw_stripes(folder: Path, projector: str, listed: FrameList) -> dict[str, A
         shots.append(
             {"file": frame_name(number), "pattern": picture_name(number), "side": side, "index": index, "sign": sign}
         )
+    _check_cost(raster, len(light))
     with whole_folder(folder) as place:
-        where = draw(place, light, raster, f"projector {projector}")
+        where = draw(place, light, raster, (n, n), f"projector {projector}")
         write_json(place / PATTERNS, {"projector": where, "shots": shots})
         write_json(place / SESSION, listed.model_dump(mode="json", exclude_defaults=True))
     return {"patterns": "stripes", "n": n, "pictures": len(light), "projector": where, "output": str(folder)}
@@ -175,7 +181,16 @@ def picture_name(index: int) -> str:
     return f"patterns/pattern_{index:05d}.png"
 
 
-def draw(folder: Path, light: Sequence[npt.NDArray[Any]], raster: Raster, place: str) -> dict[str, Any]:
+def _check_cost(raster: Raster, pictures: int) -> None:
+    """MitsimError where so many ``pictures`` of a ``raster`` take more than a day, or than the memory that is free."""
+    pixels = raster.rows * raster.columns
+    cost = Cost(pictures * pixels * _SECONDS_PER_PIXEL, _PIXEL_BYTES * pixels)
+    cost.check(f"{pictures} pictures of {raster.rows} x {raster.columns} pixels", Limits())
+
+
+def draw(
+    folder: Path, light: Iterable[npt.NDArray[Any]], raster: Raster, sides: tuple[int, int], place: str
+) -> dict[str, Any]:
     """Write a picture for each shot to `patterns/` in a folder that this process holds, and a black and a white one.
 
     Parameters
@@ -186,6 +201,8 @@ def draw(folder: Path, light: Sequence[npt.NDArray[Any]], raster: Raster, place:
         (n, n') of 0 and 1 for each shot.
     raster
         of the projector.
+    sides
+        n and n'.
     place
         what the grid is of, for messages.
 
@@ -199,7 +216,6 @@ def draw(folder: Path, light: Sequence[npt.NDArray[Any]], raster: Raster, place:
     MitsimError
         where a cell would have no pixel.
     """
-    sides = light[0].shape[0], light[0].shape[1]
     grid = grid_in(raster, sides, place)
     (folder / "patterns").mkdir()
     for index, shot in enumerate(light):
@@ -285,8 +301,8 @@ def shown(light: npt.NDArray[Any], grid: Mapping[str, Any], raster: Raster) -> n
     return picture
 
 
-def pictures_of(patterns: Patterns, place: str) -> list[npt.NDArray[Any]]:
-    """What the projector shows for each shot, (n, n') of 0 and 1.
+def pictures_of(patterns: Patterns, place: str) -> Iterator[npt.NDArray[Any]]:
+    """What the projector shows for each shot, (n, n') of 0 and 1, one at a time.
 
     Parameters
     ----------
@@ -305,14 +321,12 @@ def pictures_of(patterns: Patterns, place: str) -> list[npt.NDArray[Any]]:
         raise MitsimError(
             f"{place}: patterns have values other than 0, 1 and -1, whose light a projector's gamma changes"
         )
-    found = []
     for shot in patterns.captures:
         pattern = np.outer(left[:, shot.row], right[:, shot.column])
         light = (1 + shot.sign * pattern) / 2 if shot.sign else pattern
         if not np.isin(light, (0, 1)).all():
             raise MitsimError(f"{place}: {shot.file} shows light other than 0 and 1, which a projector's gamma changes")
-        found.append(light)
-    return found
+        yield light
 
 
 def described(patterns: Patterns, names: Sequence[str], where: Mapping[str, Any]) -> dict[str, Any]:
@@ -346,9 +360,5 @@ def write_png(path: Path, values: npt.NDArray[Any]) -> None:
     """Write ``values`` (rows, columns) of 8 or 16 bits to ``path``. MitsimError where that is not possible."""
     from PIL import Image
 
-    try:
-        Image.fromarray(values).save(path, format="png")
-    except OSError as error:
-        raise MitsimError(
-            f"file {path}: cannot be written ({error.strerror or error}); choose a folder with room"
-        ) from error
+    with whole_file(path) as part:
+        Image.fromarray(values).save(part, format="png")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from mitsim.core.colours import RUN, check_lines, is_coloured, is_mosaic, read_colours, read_mosaic, same_lines
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
-from mitsim.core.output import prepare_output
+from mitsim.core.output import check_apart, output_file
 
 if TYPE_CHECKING:
     from mitsim.exchange.coloured import Coloured, Filtered
@@ -223,28 +224,16 @@ def export_run(
             f"output {place}: {ending} is of {' and '.join(_ENDINGS[ending])}, not of {format}; rename it"
         )
     lines = _lines(folder, factors)
-    filtered = is_mosaic(folder)
-    if filtered and not chosen.filters:
+    if is_mosaic(folder) and not chosen.filters:
         able = ", ".join(name for name, other in FORMATS.items() if other.filters)
         raise MitsimError(f"{folder}: is behind colour filters, of which {format} knows nothing; use {able}")
     for line in lines or ("",):  # refused before numpy is imported
-        read_manifest(folder if filtered else folder / line, RunManifest)
+        read_manifest(folder if is_mosaic(folder) else folder / line, RunManifest)
         if factors is not None:
             read_manifest(factors / line, CalibrationManifest)
-    if chosen.kind == "file":
-        prepare_output(place, overwrite, "file")
-    if lines:
-        from mitsim.exchange.coloured import coloured_calibration, coloured_run, filtered_run, run_parts
-
-        coloured = filtered_run(folder) if filtered else coloured_run(folder)
-        shots = [*run_parts(coloured).values()]
-        calibrated = None if factors is None else coloured_calibration(factors)
-        notes = chosen.write_lines(place, coloured, calibrated, projector)
-    else:
-        from mitsim.exchange.packed import packed_calibration, packed_run
-
-        shots = [packed_run(folder)]
-        notes = chosen.write(place, shots[0], None if factors is None else packed_calibration(factors), projector)
+    check_apart(place, [folder, *([factors] if factors else [])])
+    with output_file(place, overwrite) if chosen.kind == "file" else nullcontext():
+        shots, notes = _write(place, chosen, folder, factors, lines, projector)
     return {
         "format": format,
         "frames": sum(len(part.manifest.patterns.captures) for part in shots),
@@ -252,6 +241,22 @@ def export_run(
         "notes": list(notes),
         "output": str(place),
     }
+
+
+def _write(
+    place: Path, chosen: Format, folder: Path, factors: Path | None, lines: Sequence[str], projector: str | None
+) -> tuple[list[Run], Written]:
+    """Write a run of these ``lines`` to ``place``; returns its parts, and what is said about them."""
+    if lines:
+        from mitsim.exchange.coloured import coloured_calibration, coloured_run, filtered_run, run_parts
+
+        coloured = filtered_run(folder) if is_mosaic(folder) else coloured_run(folder)
+        calibrated = None if factors is None else coloured_calibration(factors)
+        return [*run_parts(coloured).values()], chosen.write_lines(place, coloured, calibrated, projector)
+    from mitsim.exchange.packed import packed_calibration, packed_run
+
+    shots = packed_run(folder)
+    return [shots], chosen.write(place, shots, None if factors is None else packed_calibration(factors), projector)
 
 
 def _lines(run: Path, calibration: Path | None) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ The layout stands in docs/exchange.md. Shots are chunks of their own, so that on
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,11 +19,12 @@ from mitsim import __version__
 from mitsim.core.colours import CALIBRATION, MOSAIC, RUN, ColourManifest
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.framefile import Channels, Metadata, Value
-from mitsim.core.jsonfile import parse_json
+from mitsim.core.hdf5file import whole_hdf5
+from mitsim.core.jsonfile import MOST_BYTES, parse_json
 from mitsim.core.manifests import CalibrationManifest, RunManifest
-from mitsim.core.output import whole_file
 from mitsim.core.plainfile import MOST_SIDE, check_plain
 from mitsim.core.recorders import TRUTH
+from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import Capture
 from mitsim.exchange.coloured import Coloured, Filtered, line_of, run_parts, unpacked_colours, unpacked_filters
 from mitsim.exchange.packed import (
@@ -44,6 +46,8 @@ Run = Packed[RunManifest] | Coloured[RunManifest] | Filtered
 Calibration = Packed[CalibrationManifest] | Coloured[CalibrationManifest]
 _LINES = "lines"
 """Group that has a group of each line."""
+_MOST_CHUNK = 4 * MOST_SIDE**2
+"""Bytes that are unpacked at once: of the largest frame."""
 LAYOUT = 1
 """Number of the layout that is written here, and the newest that is read: attribute `mitsim_exchange` of the file."""
 _PACKED: dict[str, Any] = {"shuffle": True, "compression": "gzip", "compression_opts": 1, "fletcher32": True}
@@ -200,9 +204,7 @@ class _Lazily(Mapping[str, tuple[Channels, Metadata]]):
 @contextmanager
 def _begun(path: Path) -> Iterator[h5py.File]:
     """A file of this layout that takes its place at ``path`` when all is written."""
-    import h5py
-
-    with whole_file(path) as part, h5py.File(part, "w", track_order=True) as file:
+    with whole_hdf5(path) as file:
         file.attrs["mitsim_exchange"] = LAYOUT
         file.attrs["mitsim_version"] = __version__
         yield file
@@ -347,17 +349,28 @@ def _calibration(file: h5py.Group, path: Path) -> Packed[CalibrationManifest]:
 
 
 def _text_in(group: h5py.Group, name: str, path: Path) -> str:
-    return str(np.asarray(_dataset(group, name, path)[()], dtype=np.uint8).tobytes().decode("utf-8"))
+    text = _dataset(group, name, path)
+    if text.dtype != np.uint8 or text.size > MOST_BYTES:
+        raise MitsimError(
+            f"{path}: {text.name} is {text.dtype} of shape {text.shape}; a text of at most {MOST_BYTES} bytes is needed"
+        )
+    return str(text[()].tobytes().decode("utf-8"))
 
 
 def _frame(group: h5py.Group, path: Path) -> tuple[Channels, Metadata]:
     names = [name for name in group if name != "metadata"]
     arrays = {name: _dataset(group, name, path) for name in names}
-    channels = {name: checked_channel(array[()], f"{group.name}/{name}", path) for name, array in arrays.items()}
+    channels = {
+        name: checked_channel(_whole(array, path), f"{group.name}/{name}", path) for name, array in arrays.items()
+    }
     return channels, _metadata(_dataset(group, "metadata", path), 0, path)
 
 
 def _metadata(texts: h5py.Dataset, number: int, path: Path) -> dict[str, Value]:
+    """Of a frame whose channels were read before."""
+    # What is beyond the end of a file that was cut short after it was opened is read as zeros.
+    if path.stat().st_size < texts.file.id.get_filesize():
+        raise ValueError("it was cut short while it was read")
     known = parse_json(texts[number].decode("utf-8"))
     if not isinstance(known, dict) or not all(isinstance(value, (str, int, float)) for value in known.values()):
         raise MitsimError(f"{path}: metadata of a frame is no object of texts and numbers; export it again")
@@ -376,9 +389,29 @@ def _dataset(parent: h5py.Group, name: str, path: Path) -> h5py.Dataset:
     dataset = _inside(parent, name, h5py.Dataset, path)
     if dataset.is_virtual or dataset.external:
         raise MitsimError(f"{path}: {dataset.name} lies in another file; export it again")
-    if max(dataset.shape[1:], default=0) > MOST_SIDE:
+    if dataset.shape is None or max(dataset.shape[1:], default=0) > MOST_SIDE:
         raise MitsimError(f"{path}: {dataset.name} claims {dataset.shape}; at most {MOST_SIDE} a side are allowed")
+    filters = dataset.id.get_create_plist()
+    used = {filters.get_filter(index)[0] for index in range(filters.get_nfilters())}
+    if not used <= {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}:
+        raise MitsimError(f"{path}: {dataset.name} is packed by filters other than gzip; export it again")
+    # What was never stored is read as the fill value: black frames, of any size.
+    if dataset.chunks is None:
+        stored = dataset.id.get_storage_size() >= dataset.nbytes
+    else:
+        wanted = math.prod(-(-side // chunk) for side, chunk in zip(dataset.shape, dataset.chunks, strict=True))
+        stored = dataset.id.get_num_chunks() == wanted
+        if math.prod(dataset.chunks) * dataset.dtype.itemsize > _MOST_CHUNK:
+            raise MitsimError(f"{path}: {dataset.name} is stored in pieces of over 1 GiB; export it again")
+    if not stored:
+        raise MitsimError(f"{path}: {dataset.name} claims {dataset.shape}, of which not all is stored; export it again")
     return dataset
+
+
+def _whole(dataset: h5py.Dataset, path: Path) -> Any:
+    """All of a ``dataset``; MitsimError where that takes more memory than is free."""
+    Cost(memory_bytes=dataset.nbytes).check(f"{path}: {dataset.name}", Limits())
+    return dataset[()]
 
 
 def _inside(parent: h5py.Group, name: str, kind: Callable[..., Any], path: Path) -> Any:

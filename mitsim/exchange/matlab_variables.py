@@ -16,7 +16,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import Channel, Channels, Metadata
 from mitsim.core.manifests import SIDES, CalibrationManifest, Digital, RunManifest
 from mitsim.core.recorders import TRUTH
-from mitsim.exchange.matlab_file import Variables, matrix_in, text_in
+from mitsim.exchange.matlab_file import Variables, array_in, matrix_in, text_in
 from mitsim.exchange.packed import FACTORS, Packed, checked_channel, manifest_text, unpacked
 
 
@@ -73,8 +73,11 @@ def truth_in(variables: Variables, path: Path) -> tuple[Channels, Metadata]:
     """
     channels = {"reflectance": _image_in(variables, "truth", path)}
     if "truth_standard_error" in variables:
+        array_in(variables, "truth_standard_error", channels["reflectance"].shape, path)
         channels["standard_error"] = _image_in(variables, "truth_standard_error", path)
-    board = float(np.asarray(variables.get("truth_board_reflectance", math.nan)).item())
+    board = math.nan
+    if "truth_board_reflectance" in variables:
+        board = float(array_in(variables, "truth_board_reflectance", (1,), path)[0])
     return channels, {} if math.isnan(board) else {"board_reflectance": board}
 
 

@@ -22,7 +22,7 @@ from mitsim.core.manifests import (
     read_manifest,
     write_manifest,
 )
-from mitsim.core.output import LOCK, whole_folder
+from mitsim.core.output import LOCK, whole_folder, write_text
 from mitsim.core.plainfile import MOST_SIDE, read_text
 from mitsim.core.recorders import TRUTH
 from mitsim.core.runs import load_run
@@ -78,7 +78,7 @@ class Packed(Generic[Manifest]):
         stated = self.manifest.checksums
         sums = {name: checksum(folder / name) for name in stated if name in self.names}
         if sums == stated and self.text:
-            (folder / MANIFEST).write_text(self.text, encoding="utf-8")
+            write_text(folder / MANIFEST, self.text)
         else:
             write_manifest(folder, self.manifest.model_copy(update={"checksums": sums}))
 

@@ -11,7 +11,7 @@ from mitsim.core.colours import COLOUR
 from mitsim.core.errors import MitsimError
 from mitsim.core.jsonfile import write_json
 from mitsim.core.manifests import RunManifest
-from mitsim.core.output import whole_folder
+from mitsim.core.output import whole_file, whole_folder, write_text
 from mitsim.exchange.coloured import Coloured
 from mitsim.exchange.drawn import (
     PATTERNS,
@@ -83,7 +83,7 @@ def write_pngs_lines(folder: Path, run: Coloured[RunManifest], projector: str | 
         for name, shots in run.lines.items():
             (place / name).mkdir()
             where = _fill(place / name, shots, _raster(shots, projector))
-        (place / COLOUR).write_text(run.text, encoding="utf-8")
+        write_text(place / COLOUR, run.text)
     again = (_read_again(folder / name, f"RUN/{name}", f"CAL/{name}", run.lines[name].manifest) for name in run.lines)
     return f"Begin with: mkdir RUN; cp {folder / COLOUR} RUN", *again, f"Patterns in cells of {cells_told(where)}"
 
@@ -91,7 +91,9 @@ def write_pngs_lines(folder: Path, run: Coloured[RunManifest], projector: str | 
 def _fill(place: Path, run: Packed[RunManifest], raster: Raster) -> dict[str, Any]:
     """Write a run's pictures to a folder that this process holds; returns the grid's place as :func:`draw` does."""
     manifest = run.manifest
-    where = draw(place, pictures_of(manifest.patterns, str(run.place)), raster, str(run.place))
+    sides = tuple(len(matrix) for matrix in manifest.patterns.matrices)
+    pictures = pictures_of(manifest.patterns, str(run.place))
+    where = draw(place, pictures, raster, (sides[0], sides[1]), str(run.place))
     (place / "frames").mkdir()
     names = []
     for index, (shot, channels, _) in enumerate(shots_of(run)):
@@ -104,7 +106,8 @@ def _fill(place: Path, run: Packed[RunManifest], raster: Raster) -> dict[str, An
         names.append(frame_name(index))
         write_png(place / "frames" / names[-1], dn.astype(np.uint16))
     if manifest.ambient_frame is not None:
-        np.save(place / "ambient.npy", run.read(manifest.ambient_frame.file)[0]["DN"])
+        with whole_file(place / "ambient.npy") as part, part.open("wb") as file:
+            np.save(file, run.read(manifest.ambient_frame.file)[0]["DN"])
     write_json(place / PATTERNS, described(manifest.patterns, names, where))
     return where
 

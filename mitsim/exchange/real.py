@@ -5,7 +5,10 @@ What a real capture lacks - truth, scene, expected electrons, predicted error - 
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +18,12 @@ import numpy.typing as npt
 from mitsim.core.configuration import locate, validated
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.framefile import Channel, Channels, Metadata, checksum
-from mitsim.core.imagefile import Numbers, read_images
+from mitsim.core.imagefile import Numbers, image_pages, read_images
 from mitsim.core.imagelist import image_files
 from mitsim.core.jsonfile import read_json
 from mitsim.core.manifests import AmbientFile, CalibrationManifest, Digital, Patterns, RunHead, RunManifest
 from mitsim.core.recorders import AMBIENT, frame_name
+from mitsim.core.resources import Cost, Limits
 from mitsim.core.versions import versions
 from mitsim.exchange.known import RealCapture
 from mitsim.exchange.packed import FACTORS, Packed, packed_calibration
@@ -28,6 +32,8 @@ from mitsim.rig.digital import digital_of
 from mitsim.rig.patterns import PatternFamily, parse_patterns
 from mitsim.rig.sensor import SensorModel, load_sensor
 
+_SECONDS_PER_PIXEL = 1e-7
+"""Of an import, which reads every frame twice and writes it once: some 30 s for 256 megapixels on a slow disk."""
 LEFT_OUT = ("truth", "scene", "expected electrons", "plan and predicted error")
 """What nobody knows of a real capture."""
 
@@ -65,13 +71,16 @@ def import_frames(source: Path, output: Path, known: RealCapture) -> dict[str, A
         digital = validated(Digital, stated, "black_level")
     patterns = _patterns(known, fit.scene)
     files = image_files(source, known.wanted)
-    shots = _Shots(files, known, sensor, fit)
-    count = len(patterns.captures)
-    if len(shots.places) != count:
+    pages, count = [image_pages(path, known.wanted) for path in files], len(patterns.captures)
+    if (held := sum(number for number, _ in pages)) != count:
         raise MitsimError(
-            f"{source}: holds {len(shots.places)} frames, but patterns {known.patterns!r} take {count}, in the order "
+            f"{source}: holds {held} frames, but patterns {known.patterns!r} take {count}, in the order "
             "(row, column), of signed ones + before -; give all of them and no others"
         )
+    pixels = sum(number * math.prod(size) for number, size in pages)
+    cost = Cost(seconds=pixels * _SECONDS_PER_PIXEL, disk_bytes=pixels * np.dtype(np.uint32).itemsize)
+    cost.check(f"import of {count} frames", Limits(), output)
+    shots = _Shots(files, known, sensor, fit)
     ambient = None if known.ambient is None else _ambient(known, sensor, fit)
     names = (*(shot.file for shot in patterns.captures), *((AMBIENT,) if ambient else ()))
     head = RunHead.of(_configuration(known, sensor, files))
@@ -141,6 +150,7 @@ class _Shots:
 
     def __init__(self, files: tuple[Path, ...], known: RealCapture, sensor: SensorModel, fit: _Fit) -> None:
         self._known, self._sensor, self._fit = known, sensor, fit
+        self._pages: tuple[int, Iterator[Numbers]] = (0, iter(()))
         self.places: list[tuple[Path, int]] = []
         self.shape: tuple[int, int] = (0, 0)
         for path in files:
@@ -156,8 +166,13 @@ class _Shots:
 
     def read(self, index: int) -> Channel:
         """The frame number ``index``, (rows, columns) digital numbers."""
-        path, wanted = self.places[index]
-        frame = next(frame for number, frame in enumerate(read_images(path, self._known.wanted)) if number == wanted)
+        (path, page), (expected, pages) = self.places[index], self._pages
+        if page == 0 or index != expected:
+            pages = islice(read_images(path, self._known.wanted), page, None)
+        self._pages = index + 1, pages  # of one file, page after page is asked for
+        frame = next(pages, None)
+        if frame is None:
+            raise MitsimError(f"{path}: has fewer frames than before; leave it alone while it is read")
         return self._digital(path, frame)
 
     def _digital(self, path: Path, frame: Numbers) -> Channel:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray, SeparableTerm
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.framefile import Channels, Metadata, checksum, finite_channel, read_frame, verify, write_frame
@@ -112,6 +113,7 @@ class Factors:
         centre = str(self.manifest.centre).encode()
         return hashlib.sha256(self.left.tobytes() + self.right.tobytes() + centre).hexdigest()
 
+    @checked
     def save(self, folder: Path | str) -> Path:
         """Write the CAL folder that `mitsim calibrate` writes, to a new or empty ``folder``; returns it.
 
@@ -120,6 +122,7 @@ class Factors:
         with output_folder(folder) as place:
             return self.write(place)
 
+    @checked
     def write(self, folder: Path) -> Path:
         """The same in a ``folder`` that this process holds already (:func:`mitsim.core.output.output_folder`)."""
         metadata: dict[str, str | float] = {"unit": "sqrt(e-/s)"}
@@ -133,6 +136,7 @@ class Factors:
         write_manifest(folder, self.manifest.model_copy(update={"checksums": checksums, "status": "complete"}))
         return folder
 
+    @checked
     def check_fit(self, shots: Capture) -> None:
         """MitsimError when ``shots`` are of another camera, mask, distance, projector or light: the first thing that
         differs."""
@@ -153,6 +157,7 @@ class Factors:
                     f"{factor.shape[1]}; calibrate with this projector"
                 )
 
+    @checked
     def operator(self, patterns: str | PatternFamily, seed: int = 0) -> LinearOperator:
         """The whole model as a linear operator, with its adjoint.
 
@@ -247,6 +252,7 @@ def _factor_noise(estimate: Estimate) -> FactorNoise | None:
     return FactorNoise(left=float(left), right=float(right), unexplained=estimate.unexplained)
 
 
+@checked
 def load_calibration(folder: Path | str) -> Factors:
     """The factors in the CAL folder ``folder``. MitsimError when it is not a complete calibration."""
     folder = Path(folder)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import locate
 from mitsim.core.errors import MitsimError
@@ -42,6 +43,7 @@ _CLIPPED, _FEW = 2e-3, 10
 """Part of a frame's pixels, and how many, at its largest number that are no chance: of noisy ones a few are."""
 
 
+@checked
 def calibrate_frames(
     folder: Path | str | SessionFrames,
     output: Path | str | None = None,

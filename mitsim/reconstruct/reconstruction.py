@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.measurement import Measurement
 from mitsim.core.parallel import single_threaded_blas
@@ -22,6 +23,7 @@ from mitsim.reconstruct.depth import Depth, best_depth
 from mitsim.reconstruct.depthmap import DepthMap, depth_map
 from mitsim.reconstruct.detail import Model, print_energy
 from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.faults import FrameCheck
 from mitsim.reconstruct.focus import focused
 from mitsim.reconstruct.lacking import Lack
 from mitsim.reconstruct.margin import Margin
@@ -33,8 +35,20 @@ from mitsim.reconstruct.status import Verdict
 from mitsim.reconstruct.tv import TVSolution, solve_tv
 from mitsim.reconstruct.uncertainty import Propagation, Uncertainty, uncertainty
 
+_LAMBDA_OF_TV = 1e-3
+"""Lambda, over the largest sigma^2, by which frames are foretold beside an image of total variation, whose own weight
+says nothing of it: chosen, between those of bright and of dim runs."""
+
+_DEFECT_ROUNDS = 6
+"""Times that defective pixels are looked for: beside bright ones dim ones show when these are left out, of a tenth of
+their energy each time."""
+_BETTER = 0.5
+"""Part of what was unexplained, rms, that frames may leave without pixels that count as defective though the rest does
+not fit either."""
+
 
 @single_threaded_blas()
+@checked
 def reconstruct(
     shots: Capture,
     factors: Factors,
@@ -92,12 +106,12 @@ def reconstruct(
     prepared, frames = data.prepared, data.frames
     added = time.perf_counter()
     solution: DepthMap | Solution | TVSolution
-    if isinstance(depth, DepthMap) and not depth.doubt:
-        solution = depth
-    else:
-        solution = solve_tv(prepared, frames, lam) if method == TV else prepared.solve(frames, lam)
+    solution = depth if isinstance(depth, DepthMap) and not depth.doubt else data.solution(lam, method)
     solved = time.perf_counter()
     misfit = data.misfit(shots, factors, solution)
+    if misfit and misfit.defects:
+        shots, data, solution, misfit = _without_defects(shots, factors, lam, method, data, misfit)
+        prepared, frames = data.prepared, data.frames
     separable = factors.status.verdict is not Verdict.NOT_SEPARABLE
     if isinstance(solution, Solution) and lam == "auto" and not (separable and (misfit is None or not misfit.flagged)):
         solution = prepared.solve(frames, lam, explained=False)
@@ -109,7 +123,7 @@ def reconstruct(
     if beside:
         image = beside.inside(image)
         uncertainties = uncertainties and Uncertainty(
-            {name: beside.inside(values) for name, values in uncertainties.sources.items()}
+            {name: beside.inside(values) for name, values in uncertainties.sources.items()}, uncertainties.bias_factor
         )
     return Reconstruction(
         image=image,
@@ -133,6 +147,8 @@ def reconstruct(
         inputs=asked,
         focus=depth,
         predicted=cost,
+        objective=getattr(solution, "objective", None),
+        relative_gap=getattr(solution, "relative_gap", None),
     )
 
 
@@ -160,11 +176,29 @@ class Accumulated:
         """The factorised model."""
         return self.model.prepared
 
+    @property
+    def weights(self) -> FloatArray:
+        """(r, r') W of all frames."""
+        problem = self.prepared.problem(self.frames)
+        return np.where(problem.sigma > 0, problem.projected, 0.0)
+
+    def solution(self, lam: float | Literal["auto"], method: str) -> Solution | TVSolution:
+        """Their image at ``lam`` by a ``method``."""
+        if method == TV:
+            return solve_tv(self.prepared, self.frames, lam)
+        return self.prepared.solve(self.frames, lam)
+
     def lack(self, factors: Factors, image: FloatArray) -> Lack | None:
         """What ``factors`` are known to lack of the camera, of an ``image`` (n, n'); None where nothing is known."""
         return Lack(self.model, factors.lacking, image) if factors.lacking else None
 
-    def misfit(self, shots: Capture, factors: Factors, solution: DepthMap | Solution | TVSolution) -> Misfit | None:
+    def misfit(
+        self,
+        shots: Capture,
+        factors: Factors,
+        solution: DepthMap | Solution | TVSolution,
+        with_defects: bool = True,
+    ) -> Misfit | None:
         """What of the measurements the model leaves unexplained, or None; reads frames again that were not kept.
 
         Parameters
@@ -173,20 +207,29 @@ class Accumulated:
             that these sums are of.
         solution
             of them, for what the factors' noise adds to the frames.
+        with_defects
+            whether defective pixels are looked for, and no cause where there are some.
         """
         problem, stated, image = self.prepared.problem(self.frames), factors.manifest.noise, solution.image
         added = factor_energy(self.prepared, shots.patterns, stated, image) if stated else None
         lack = self.lack(factors, image)
         if isinstance(solution, DepthMap):
             return solution.misfit(self.noise, added, print_energy(self.model, image))
+        lam = _LAMBDA_OF_TV * problem.scale if isinstance(solution, TVSolution) else solution.lam
         return judge(
-            self.prepared,
-            np.where(problem.sigma > 0, problem.projected, 0.0),
-            self.kept or shots.measured(),
-            self.noise,
+            FrameCheck(
+                self.prepared,
+                self.weights,
+                lam,
+                shots.patterns,
+                shots.manifest,
+                self.noise,
+                lambda: self.kept or shots.measured(),
+            ),
             added,
             print_energy(self.model, image),
             Evidence(factors, shots.patterns, lack.energy if lack else None),
+            with_defects,
         )
 
     def uncertainty(self, shots: Capture, factors: Factors, solution: Solution) -> Uncertainty:
@@ -209,6 +252,42 @@ class Accumulated:
             self.prepared.problem(self.frames),
             self.lack(factors, solution.image),
         )
+
+
+def _without_defects(
+    shots: Capture,
+    factors: Factors,
+    lam: float | Literal["auto"],
+    method: str,
+    data: Accumulated,
+    misfit: Misfit,
+) -> tuple[Capture, Accumulated, Solution | TVSolution, Misfit | None]:
+    """Shots without the readings of defective pixels, their sums, solution and misfit; all as it was where the frames
+    fit no better so.
+
+    Parameters
+    ----------
+    shots, factors, lam, method
+        as :func:`reconstruct` takes them.
+    data, misfit
+        sums of ``shots``, and their misfit with the first defects.
+    """
+    found, now, without = None, misfit, data
+    for _ in range(_DEFECT_ROUNDS):
+        if now.defects is None:
+            break
+        found = now.defects.with_others(found)
+        rest = found.left_out(shots, data.prepared, data.weights)
+        without = accumulated(rest, factors, method)
+        solution = without.solution(lam, method)
+        again = without.misfit(rest, factors, solution)
+        now = again or now
+    if now.flagged:
+        now = without.misfit(rest, factors, solution, with_defects=False) or now
+    if now.flagged and now.unexplained > _BETTER * misfit.unexplained:
+        solution = data.solution(lam, method)
+        return shots, data, solution, data.misfit(shots, factors, solution, with_defects=False)
+    return rest, without, solution, replace(now, defects=found)
 
 
 def accumulated(shots: Capture, factors: Factors, method: str = TIKHONOV) -> Accumulated:

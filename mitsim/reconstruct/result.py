@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import write_frame
@@ -63,6 +64,9 @@ class Reconstruction:
         the depth whose factors were used, or a depth for each pixel; None: the calibrated one.
     predicted
         seconds by stage and memory, before it was begun; None where nobody could tell.
+    objective, relative_gap
+        of ``tv``: what was minimised, and how far above its minimum it may be at most, relative
+        (:class:`mitsim.reconstruct.tv.TVSolution`); None for other methods.
     """
 
     image: FloatArray
@@ -80,6 +84,8 @@ class Reconstruction:
     inputs: dict[str, str | float]
     focus: Depth | DepthMap | None = None
     predicted: Predicted | None = None
+    objective: float | None = None
+    relative_gap: float | None = None
 
     @property
     def ok(self) -> bool:
@@ -116,6 +122,8 @@ class Reconstruction:
             "condition_whole": self.condition_whole,
             "condition_sides": self.condition_sides,
             "residual": self.residual,
+            "objective": self.objective,
+            "relative_gap": self.relative_gap,
             "focus_mm": self.focus.mm if isinstance(self.focus, Depth) else None,
             "focus_error_mm": self.focus.error_mm if isinstance(self.focus, Depth) else None,
             "depths": self.depths.summary() if self.depths else None,
@@ -128,6 +136,7 @@ class Reconstruction:
             "predicted_memory_bytes": self.predicted and self.predicted.memory_bytes,
         }
 
+    @checked
     def save(self, folder: Path | str, overwrite: bool = False, more: Mapping[str, Any] | None = None) -> Path:
         """Write image.exr, image.png (for display), result.json, and where known uncertainty.exr and depth.exr.
 
@@ -148,6 +157,7 @@ class Reconstruction:
         with output_folder(folder, overwrite=may_replace(Path(folder), self.inputs, overwrite)) as place:
             return self.write(place, more)
 
+    @checked
     def write(self, folder: Path, more: Mapping[str, Any] | None = None) -> Path:
         """The same in a ``folder`` that this process holds already (:func:`mitsim.core.output.output_folder`); ``more``
         are further entries of result.json."""

@@ -41,6 +41,13 @@ def read_name(text: str, n: int | None) -> tuple[str, list[int]]:
     return name, periods
 
 
+def shot_count(text: str) -> int:
+    """How many shots the patterns ``text`` take, two of each with the value -1. MitsimError as :func:`read_name`."""
+    name, periods = read_name(text, None)
+    signs = 2 if name == "hadamard" and periods[0] > 1 else 1
+    return periods[0] * periods[-1] * signs
+
+
 def _period(text: str, size: str, n: int | None) -> int:
     """K of the patterns ``text``, written as ``size``, for ``n`` projector pixels a side, or any number of them."""
     most = "the projector's pixels a side" if n is None else n

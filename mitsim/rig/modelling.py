@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal, get_args
 
+from mitsim.core.arguments import checked_fields
 from mitsim.core.errors import ArgumentError
 from mitsim.rig.order import Side
 
@@ -29,6 +30,7 @@ FITTED = ("mask_distance", "mask_shift_row", "mask_shift_column", "mask_rotation
 """Those that are, where nothing is said: a shift of the projector's window looks like one of the mask."""
 
 
+@checked_fields
 @dataclass(frozen=True)
 class Modelling:
     """Which model is fitted to how many frames.
@@ -51,7 +53,7 @@ class Modelling:
     accuracy: float = 1e-3
 
     def __post_init__(self) -> None:
-        if self.model not in get_args(Model):
+        if not isinstance(self.model, str) or self.model not in get_args(Model):
             raise ArgumentError("model", f"{self.model!r}: use {' or '.join(get_args(Model))}")
         if self.frames < 2:
             raise ArgumentError("frames_used", f"{self.frames}: give 2 or more; a +-1 pattern is two frames")

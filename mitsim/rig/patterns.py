@@ -15,8 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, Labels
+from mitsim.core.errors import MitsimError
+from mitsim.core.manifests import MOST_SHOTS
 from mitsim.core.seeds import stream
-from mitsim.rig.families import read_name
+from mitsim.rig.families import read_name, shot_count
 from mitsim.rig.hadamard import stripe_count, way_to
 
 PatternFactor = npt.NDArray[np.int8]
@@ -204,9 +206,11 @@ def parse_patterns(text: str, n: int, seed: int = 0) -> PatternFamily:
     Raises
     ------
     MitsimError
-        for an unknown family, a K that is not a whole number, or K outside 1..n.
+        for an unknown family, a K that is not a whole number, K outside 1..n, or more shots than a run has.
     """
     name, periods = read_name(text, n)
+    if (count := shot_count(text)) > MOST_SHOTS:
+        raise MitsimError(f"patterns {text!r}: are {count} shots; a run has at most {MOST_SHOTS}, give a smaller K")
     if name == "random":
         return PatternFamily(text, *(_random_binary(n, periods[0], seed, side) for side in ("left", "right")))
     if len(periods) == 2:

@@ -169,12 +169,7 @@ class MaskProfile(BaseModel):
                 f"mask psf: psf_distance_mm is {distance:g}; the point must lie beyond the mask, at "
                 f"{mask_distance_mm:g} mm"
             )
-        light = load_psf(path, self.psf_reduce)
-        if max(light.shape) > LARGEST // 2:
-            raise MitsimError(
-                f"point spread function {path}: {light.shape[0]} x {light.shape[1]} pixels; at most {LARGEST // 2} a "
-                "side make a mask, so set a larger psf_reduce"
-            )
+        light = load_psf(path, self.psf_reduce, LARGEST // 2)
         feature, values = squared(light, self.feature_mm * self.psf_reduce * (1 - mask_distance_mm / distance))
         values *= float(self.aperture_mm2 or 0.0) / (values.sum() * feature**2)
         words = f"point spread function {path.name} of {distance:g} mm, aperture {self.aperture_mm2:g} mm2"

@@ -16,16 +16,19 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.imagefile import image_size, read_image
 from mitsim.core.imagelist import Wanted
+from mitsim.core.resources import Cost, Limits
 
 _PICTURE = Wanted("point spread function", colour=True)
 _MOST_PIXELS = 2**26
-"""Of a picture: four times what cameras for such measurements have; it is held as 8 bytes each."""
+"""Of a picture: four times what cameras for such measurements have."""
+_PIXEL_BYTES = 64
+"""Of memory for a pixel: four colours of double precision, and as many arrays of their mean."""
 _BORDER = 16
 """Width [pixels] of the frame along the picture's edges that shows the background, where the light of a point that
 is centred does not reach."""
 
 
-def load_psf(path: Path | str, reduce: int = 4) -> FloatArray:
+def load_psf(path: Path | str, reduce: int = 4, most: int | None = None) -> FloatArray:
     """The point spread function in a picture (PNG, TIFF, NPY, OpenEXR).
 
     Colours are averaged, the median of a frame along the edges is taken off as background, ``reduce`` x ``reduce``
@@ -37,6 +40,8 @@ def load_psf(path: Path | str, reduce: int = 4) -> FloatArray:
         of the picture; rows first, any depth of grey, or colours of 8 bits.
     reduce
         pixels a side that become one; rows and columns that remain at the far edges are left out.
+    most
+        pixels a side that there may be then; None: any number.
 
     Raises
     ------
@@ -45,14 +50,19 @@ def load_psf(path: Path | str, reduce: int = 4) -> FloatArray:
         background.
     """
     path = Path(path)
-    values = _grey(path)
-    rows, columns = (size // reduce for size in values.shape) if reduce >= 1 else (0, 0)
-    if min(rows, columns) < 1 or min(values.shape) <= 2 * _BORDER:
+    size = image_size(path, _PICTURE)
+    rows, columns = (side // reduce for side in size) if reduce >= 1 else (0, 0)
+    if min(rows, columns) < 1 or min(size) <= 2 * _BORDER:
         raise _PICTURE.refusal(
             path,
-            f"{values.shape[0]} x {values.shape[1]} pixels, reduce {reduce}; it needs "
+            f"{size[0]} x {size[1]} pixels, reduce {reduce}; it needs "
             f"more than {2 * _BORDER} pixels a side, and reduce from 1 to its shorter side",
         )
+    if most is not None and max(rows, columns) > most:
+        raise _PICTURE.refusal(
+            path, f"{rows} x {columns} pixels; at most {most} a side make a mask, so set a larger psf_reduce"
+        )
+    values = _grey(path, size)
     inside = np.zeros(values.shape, dtype=bool)
     inside[_BORDER:-_BORDER, _BORDER:-_BORDER] = True
     above = values - np.median(values[~inside])
@@ -64,9 +74,10 @@ def load_psf(path: Path | str, reduce: int = 4) -> FloatArray:
     return np.asarray(light / total)
 
 
-def _grey(path: Path) -> FloatArray:
-    rows, columns = image_size(path, _PICTURE)
+def _grey(path: Path, size: tuple[int, int]) -> FloatArray:
+    rows, columns = size
     if rows * columns > _MOST_PIXELS:
         raise _PICTURE.refusal(path, f"{rows} x {columns} pixels; at most {_MOST_PIXELS} in all are read")
+    Cost(memory_bytes=rows * columns * _PIXEL_BYTES).check(f"point spread function {path}", Limits())
     values = np.asarray(read_image(path, _PICTURE), dtype=np.float64)
     return values if values.ndim == 2 else np.asarray(values[..., :3].mean(axis=2))

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
+from mitsim.core.arguments import checked
 from mitsim.core.configuration import load_model, shipped
 from mitsim.core.errors import MitsimError
 from mitsim.rig.board import BoardShape
@@ -91,6 +92,7 @@ class SessionRecipe(BaseModel):
         return self
 
 
+@checked
 def load_recipe(path: Path | str | None = None) -> SessionRecipe:
     """The recipe in the TOML file at ``path``, or the shipped one; MitsimError names the field that breaks a rule."""
     return load_model(Path(path) if path is not None else shipped("calibration", "session.toml"), SessionRecipe)

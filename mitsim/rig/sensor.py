@@ -219,7 +219,7 @@ class SensorModel(BaseModel):
         if (self.mosaic is None) != (plane is None):
             filters = f"a mosaic {self.mosaic}" if self.mosaic else "no mosaic"
             asked = f"plane {plane}" if plane else "monochrome frames"
-            remedy = "use a monochrome camera, or colour mosaic" if self.mosaic else "leave the plane out"
+            remedy = "use a monochrome camera, or --colour mosaic" if self.mosaic else "leave the plane out"
             raise MitsimError(f"sensor {self.name!r}: has {filters}, and {asked} was asked for; {remedy}")
         curve = getattr(self.mosaic_curves, plane) if plane else self.quantum_efficiency_curve
         try:
@@ -229,7 +229,7 @@ class SensorModel(BaseModel):
         if found is None:
             raise MitsimError(
                 f"sensor {self.name!r}: its file states no quantum_efficiency, so light makes no known number of "
-                "electrons; give one, with its source"
+                "electrons; put one, with its source, into a copy of the file (characterise works without)"
             )
         return float(found)
 

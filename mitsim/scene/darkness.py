@@ -1,7 +1,7 @@
 """Why a scene is dark: a loaded scene in, the sentence out that says what keeps the projector's light from the camera.
 
-A few hundred rays go from the projector through its window, and from what they meet to the sensor's centre; holes,
-filters and glass let them pass.
+A few hundred rays go from the projector through its window, or, where they miss all, through the part of it that the
+scene lies in, and from what they meet to the sensor's centre; holes, filters and glass let them pass.
 """
 
 from __future__ import annotations
@@ -33,21 +33,25 @@ def why_dark(loaded: LoadedScene) -> str:
     """
     geometry, grid = loaded.camera.geometry, loaded.pixels
     to_world = loaded.camera.world_transform()
-    rows, columns = (
-        low + (high - low) * (np.arange(_RAYS) + 0.5) / _RAYS for low, high in (grid.row_tan, grid.column_tan)
-    )
-    y, x = (-geometry.scene_distance * part.ravel() for part in np.meshgrid(rows, columns, indexing="ij"))
     projector_to_world = mi.traverse(loaded.projector)["to_world"]
     start = projector_to_world @ mi.Point3f(0)
-    plane = to_world @ mi.Point3f(x, y, geometry.scene_distance)
-    if not _any((projector_to_world.inverse() @ plane).z > 0):
-        return "the projector looks away from the scene, whose aligned plane lies behind it; turn the projector"
-    towards = plane - start
-    si = _opaque(loaded.scene, mi.Ray3f(start, dr.normalize(towards)), None)
-    met = np.array(si.is_valid()).ravel()
-    if not met.any():
-        if _any(loaded.scene.ray_test(mi.Ray3f(start, dr.normalize(towards)))):
+    window = grid.row_tan, grid.column_tan
+    for part in (window, _part_with_scene(loaded, to_world.inverse() @ start)):
+        if part is None:
+            return _missed(loaded, to_world)
+        rows, columns = (low + (high - low) * (np.arange(_RAYS) + 0.5) / _RAYS for low, high in part)
+        y, x = (-geometry.scene_distance * edges.ravel() for edges in np.meshgrid(rows, columns, indexing="ij"))
+        plane = to_world @ mi.Point3f(x, y, geometry.scene_distance)
+        if not _any((projector_to_world.inverse() @ plane).z > 0):
+            return "the projector looks away from the scene, whose aligned plane lies behind it; turn the projector"
+        towards = dr.normalize(plane - start)
+        si = _opaque(loaded.scene, mi.Ray3f(start, towards), None)
+        met = np.array(si.is_valid()).ravel()
+        if met.any():
+            break
+        if _any(loaded.scene.ray_test(mi.Ray3f(start, towards))):
             return "all that the projector's rays meet lets light pass; put something opaque behind it"
+    else:
         return _missed(loaded, to_world)
     back = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.BackSide)
     centre = to_world @ mi.Point3f(0)
@@ -70,7 +74,44 @@ def why_dark(loaded: LoadedScene) -> str:
         )
     if not _any(facing & ~_opaque(loaded.scene, si.spawn_ray_to(centre), centre).is_valid()):
         return "something hides from the camera what is lit; move it out of the way"
+    if part is not window:
+        extents = [(own[1] - own[0]) / (whole[1] - whole[0]) for own, whole in zip(part, window, strict=True)]
+        return (
+            f"what is lit spans {min(extents):.1e} of the window only, {min(extents) * grid.n:.1e} projector pixels: "
+            "too few rays meet it; give the projector a narrower fov, or a larger target"
+        )
     return "what is lit lies edge-on, is hidden or reflects nothing; turn it, move it or check its material"
+
+
+_Edges = tuple[tuple[float, float], tuple[float, float]]
+"""First and last tan-angle of rows and of columns on the aligned plane."""
+
+
+def _part_with_scene(loaded: LoadedScene, start: mi.Point3f) -> _Edges | None:
+    """The part of the window through which rays from ``start``, in the camera's frame, may meet the scene's box; None
+    where there is none."""
+    box, distance = loaded.scene.bbox(), loaded.camera.geometry.scene_distance
+    if not box.valid():
+        return None
+    corners = _corners(box, loaded.camera.world_transform())
+    origin = np.array(start).reshape(3, 1)
+    ahead = corners[2] > origin[2]
+    if not ahead.all() or distance <= origin[2, 0] or corners[2].min() > _FAR * distance:
+        return None
+    on_plane = origin + (corners - origin) * (distance - origin[2]) / (corners[2] - origin[2])
+    grid, part = loaded.pixels, []
+    for (low, high), tangents in zip((grid.row_tan, grid.column_tan), -on_plane[[1, 0]] / distance, strict=True):
+        first, last = max(low, float(tangents.min())), min(high, float(tangents.max()))
+        if first > last:
+            return None
+        part.append((first, last))
+    return part[0], part[1]
+
+
+def _corners(box: mi.BoundingBox3f, to_world: mi.Transform4f) -> FloatArray:
+    """(3, 8) corners of a ``box`` in the camera's frame."""
+    corners = np.array([list(box.corner(i)) for i in range(8)]).T
+    return np.array(to_world.inverse() @ mi.Point3f(corners)).reshape(3, -1)
 
 
 def _opaque(scene: mi.Scene, ray: mi.Ray3f, target: mi.Point3f | None) -> mi.SurfaceInteraction3f:
@@ -91,8 +132,7 @@ def _missed(loaded: LoadedScene, to_world: mi.Transform4f) -> str:
     distance, box = loaded.camera.geometry.scene_distance, loaded.scene.bbox()
     if not box.valid():
         return "the scene has no surfaces; add a shape"
-    corners = np.array([list(box.corner(i)) for i in range(8)]).T
-    low, high = _extent(np.array(to_world.inverse() @ mi.Point3f(corners)).reshape(3, -1))
+    low, high = _extent(_corners(box, to_world))
     place = ", ".join(f"{axis} = {a:.4g} to {b:.4g}" for axis, a, b in zip("xyz", low, high, strict=True))
     where = f"no ray of the projector's window meets the scene, which lies at {place} mm of the camera"
     if np.abs([low, high]).max() < _SMALL * distance:

@@ -21,6 +21,11 @@ _NO_KEYSTONE = 1e-3
 """Projector pixels: chosen so that what rounding makes of a shifted lens is none; it shows in no frame."""
 
 
+_MOST_ACROSS = 16384
+"""Projector pixels across the camera's field: light is collected in cells of their size, and the shadow of so many
+takes 67 MB for a sensor of 512 pixels and one layer. The paper's geometry has 150; a fov of 1e-6 degrees took 24 GB."""
+
+
 @dataclass(frozen=True)
 class ProjectorGrid:
     """Window of n x n projector pixels in a canvas, and where it lands on the camera's aligned plane.
@@ -86,6 +91,13 @@ def locate_projector(where: str, projector: mi.Emitter, camera: mi.Sensor) -> Pr
     z = camera.geometry.scene_distance
     corners = _window_corners(where, projector, camera, lit.shape, (int(rows[0]), int(columns[0])), width, z)
     low, high = corners.min(axis=0), corners.max(axis=0)
+    span = float((high - low).min())
+    across = 2 * camera.geometry.tan_half_fov * width / span if span > 0 else np.inf
+    if across > _MOST_ACROSS:
+        raise MitsimError(
+            f"{where}: the camera's field is {across:.3g} pixels of the projector wide; at most {_MOST_ACROSS} are "
+            "simulated, so widen the projector's fov, or narrow the camera's"
+        )
     ideal = np.array([[low[0], low[1]], [low[0], high[1]], [high[0], low[1]], [high[0], high[1]]])
     keystone = float(np.abs((corners - ideal) / (high - low)).max()) * width
     return ProjectorGrid(

@@ -21,6 +21,7 @@ from mitsim.capture.foreseen import Foreseen
 from mitsim.capture.request import Exposure, check_psnr
 from mitsim.capture.session import Session
 from mitsim.capture.session_cost import session_seconds
+from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
@@ -158,6 +159,7 @@ class CalibrationPlan:
         ]
 
 
+@checked
 def plan_calibration(
     bench: Bench,
     psnr: float,

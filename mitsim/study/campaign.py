@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import TypeAdapter, ValidationError
 
 from mitsim.capture.opening import check_scene
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import MitsimError, cut
 from mitsim.core.job import Job
 from mitsim.core.jsonfile import read_json, write_json
 from mitsim.core.resources import workers
@@ -135,10 +135,21 @@ def run_experiment(
         return campaign.finished(folder, store, time.perf_counter() - started)
 
 
-def merge(parts: Sequence[Path | str], output: Path | str) -> CampaignResult:
+def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | None = None) -> CampaignResult:
     """One study of the points of several ``parts``, folders of the same study, in the folder ``output``.
 
-    MitsimError for parts of different studies, parts that hold none, and an output that holds something else.
+    Parameters
+    ----------
+    parts, output
+        folders of parts, and the one to make.
+    experiment
+        module of a study of the user's own; no module is imported because a file names it.
+
+    Raises
+    ------
+    MitsimError
+        for parts of different studies, of one that neither ships nor is ``experiment``, parts that hold none, and an
+        output that holds something else.
     """
     started, heads = time.perf_counter(), [_head(Path(part)) for part in parts]
     if not heads:
@@ -148,10 +159,21 @@ def merge(parts: Sequence[Path | str], output: Path | str) -> CampaignResult:
             raise MitsimError(
                 f"study merge: {part} is of another study, scope or version than {parts[0]}; run it again"
             )
-    study, scope = heads[0]["study"], _scope(heads[0]["scope"], parts[0])
+    study, scope = _known(heads[0]["study"], parts[0], experiment), _scope(heads[0]["scope"], parts[0])
     if study == ALL:
-        return _all(scope, output, lambda name, folder: merge([Path(part) / name for part in parts], folder))
+        for part in parts:
+            for name in PAPER:
+                _head(Path(part) / name)  # before there is a folder
+        return _all(
+            scope, output, lambda name, folder: merge([Path(part) / name for part in parts], folder, experiment)
+        )
+    if heads[0]["versions"] != versions():
+        raise MitsimError(
+            f"study merge: {parts[0]} was measured by other versions ({cut(str(heads[0]['versions']))}), by which it "
+            "can be merged"
+        )
     campaign = _Campaign.of(study, scope, output)
+    _ = campaign.points  # which a scope that is none refuses, before there is a folder
     with campaign.folder(output) as (folder, store):
         for part in parts:
             store.take(Store(Path(part) / POINTS))
@@ -252,6 +274,18 @@ def _head(folder: Path) -> dict[str, Any]:
         if whole and (head["study"] == ALL or (folder / POINTS).is_dir()):
             return dict(head)
     raise MitsimError(f"study merge: {folder} holds no part of a study; give folders that `mitsim study` wrote")
+
+
+def _known(study: Any, part: Path | str, experiment: str | None) -> str:
+    """The name of a ``study`` as the file of a ``part`` has it, where it ships or was named as ``experiment`` too."""
+    known = (*PAPER, *EXPERIMENTS, ALL) if experiment is None else (experiment, ALL)
+    if not isinstance(study, str) or study not in known:
+        asked = "none that ships" if experiment is None else f"not {experiment}"
+        raise MitsimError(
+            f"study merge: {part} is of the study {cut(str(study))!r}, {asked}; a study of your own is merged by its "
+            "name, --experiment MODULE"
+        )
+    return study
 
 
 def _scope(found: Any, part: Path | str) -> Scope:

@@ -104,8 +104,8 @@ HEADS = "Paper", "Idealised", "Rendered"
 class Claim:
     """A claim of the paper, its number there, in the idealised model and rendered, and what becomes of it.
 
-    ``verdict`` is "confirmed", "confirmed only if ...", or "not confirmed"; what the paper does not say, or the
-    idealised model does not have, is empty.
+    ``verdict`` is "confirmed", "confirmed only if ...", "not confirmed", or "not decided at this size"
+    (:mod:`mitsim.study.verdicts`); what the paper does not say, or the idealised model does not have, is empty.
     """
 
     claim: str
@@ -150,6 +150,12 @@ class Scope:
     measures: tuple[str, ...] = ()
     patterns: str = "dots:7"
     recipe: str | None = None
+
+    @property
+    def repeats(self) -> tuple[int, ...]:
+        """Seeds of what has no prints to take means over: three of a whole study, so that its means have errors."""
+        three = (self.seeds[0] + more for more in range(3))
+        return self.chosen(tuple(dict.fromkeys((*self.seeds, *three))), self.seeds)
 
     def chosen(self, everything: Sequence[Any], few: Sequence[Any]) -> tuple[Any, ...]:
         """``few`` where the study is quick, otherwise ``everything``."""

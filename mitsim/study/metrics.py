@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.runs import Capture
 
 _LIMITED = ", which limits the PSNR"
@@ -136,8 +136,7 @@ def _rescaling(shots: Capture, board_reflectance: float | None) -> float:
 
 
 def _pair(image: Image, truth: Image) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    a: NDArray[np.float64] = np.asarray(image, dtype=np.float64)
-    b: NDArray[np.float64] = np.asarray(truth, dtype=np.float64)
+    a, b = (_real(values, name) for values, name in ((image, "image"), (truth, "truth")))
     if a.ndim != 2 or a.shape != b.shape:
         raise MitsimError(
             f"image quality: image is {_size(a)}, truth {_size(b)}; both must have the same rows x columns"
@@ -147,6 +146,16 @@ def _pair(image: Image, truth: Image) -> tuple[NDArray[np.float64], NDArray[np.f
         if bad:
             raise MitsimError(f"image quality: {name} has {bad} values that are not finite; see the solver's status")
     return a, b
+
+
+def _real(values: Image, name: str) -> NDArray[np.float64]:
+    try:
+        found = np.asarray(values)
+    except ValueError as error:
+        raise ArgumentError(name, f"is no array ({error}); give rows of real numbers") from None
+    if found.dtype.kind not in "biuf":
+        raise ArgumentError(name, f"has numbers of type {found.dtype}; give real ones")
+    return np.asarray(found, dtype=np.float64)
 
 
 def _size(image: Image) -> str:

@@ -8,10 +8,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from zipfile import BadZipFile
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.output import sweep, whole_file
+from mitsim.core.plainfile import check_plain
 from mitsim.study.experiment import Found, Point, Results
 
 _ROWS = "rows"
@@ -37,21 +37,28 @@ class Store:
 
     def load(self, point: Point) -> Found:
         """What was found at a ``point``; MitsimError when the file is damaged."""
-        import numpy as np
+        from mitsim.core.arrayfile import read_npz
 
+        path = self._file(point)
         try:
-            with np.load(self._file(point), allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files if name != _ROWS}
-                return Found(tuple(json.loads(file[_ROWS].tobytes())), arrays)
-        except (OSError, ValueError, KeyError, BadZipFile) as error:
+            if not check_plain(path).st_size:
+                raise ValueError("it is empty: the disk was full, or the machine stopped")
+            with path.open("rb") as file:
+                arrays = read_npz(file, path)
+            rows = json.loads(arrays.pop(_ROWS).tobytes())
+            if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+                raise ValueError("its rows are none")
+            return Found(tuple(rows), arrays)
+        except (OSError, ValueError, KeyError, RecursionError) as error:
             raise MitsimError(
-                f"file {self._file(point)}: cannot be read as a point of a study ({error}); remove it and run again"
+                f"file {path}: cannot be read as a point of a study ({error}); remove it and run again"
             ) from error
 
     def take(self, other: Store) -> None:
         """Copy what an ``other`` store has and this one has not."""
         for file in sorted(other.folder.glob("*.npz")):
             if not (self.folder / file.name).exists():
+                check_plain(file)
                 with whole_file(self.folder / file.name) as part:
                     shutil.copyfile(file, part)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,10 +27,23 @@ class Mean(NamedTuple):
     of: int
 
     def __str__(self) -> str:
+        return format(self)
+
+    def __format__(self, sign: str) -> str:
+        """With its error; ``sign`` is "+" for a number that always shows its own."""
         if math.isnan(self.error):
-            return f"{self.value:.1f}"
+            return f"{self.value:{sign}.1f}"
         places = 1 if self.error >= _SEEN else 2
-        return f"{self.value:.{places}f} \N{PLUS-MINUS SIGN} {self.error:.{places}f}"
+        return f"{self.value:{sign}.{places}f} \N{PLUS-MINUS SIGN} {self.error:.{places}f}"
+
+    @classmethod
+    def of_numbers(cls, numbers: Sequence[float], what: str) -> Mean:
+        """Of independent ``numbers``; MitsimError that nothing was measured of ``what`` where there are none."""
+        if not numbers:
+            raise MitsimError(f"study: nothing was measured of {what}")
+        array = np.array(numbers)
+        error = float(array.std(ddof=1) / math.sqrt(len(array))) if len(array) > 1 else math.nan
+        return cls(float(array.mean()), error, len(array))
 
 
 @dataclass(frozen=True)
@@ -60,13 +73,8 @@ class Table:
 
         MitsimError where there is none.
         """
-        numbers = self.numbers(name, **values)
-        if not numbers:
-            wanted = ", ".join(f"{key} = {value}" for key, value in values.items())
-            raise MitsimError(f"study: nothing was measured of {name} with {wanted}")
-        array = np.array(numbers)
-        spread = float(array.std(ddof=1) / math.sqrt(len(array))) if len(array) > 1 else math.nan
-        return Mean(float(array.mean()), spread, len(array))
+        wanted = ", ".join(f"{key} = {value}" for key, value in values.items())
+        return Mean.of_numbers(self.numbers(name, **values), f"{name} with {wanted}" if wanted else name)
 
     def numbers(self, name: str, **values: Value) -> list[float]:
         """Column ``name`` of the rows with these ``values``, where it has a number."""

@@ -170,4 +170,5 @@ class FluxTracer:
         area = 4 * dr.square(dr.opaque(mi.Float, self._sensor.half_width))
         # As a spectrum: by a number, Dr.Jit would multiply with the reciprocal, which is rounded.
         share = mi.UnpolarizedSpectrum(1 + area * density * reception.solid_angle(point))
-        return dr.select(value > 0, value / share, 0)
+        # A choice between a spectrum and a number is a plain array, which loops of spectral variants refuse.
+        return mi.UnpolarizedSpectrum(dr.select(value > 0, value / share, 0))

@@ -50,6 +50,19 @@ def test_a_name_that_no_file_can_have(refused: Refused, to: Callable[[str], tupl
     mentions(refused(*to("n" * 300 + ".exr")), "nnn", "name too long")
 
 
+def test_no_input_is_replaced(refused: Refused, lab: Any, tmp_path: Path) -> None:
+    """By verbs that replace files, with --overwrite or without. (Planted: each check left out.)"""
+    frame = lab.copy("run", tmp_path / "run") / "frame_00000.exr"
+    mentions(refused("sense", frame, "--camera", lab.camera, "--channel", "DN", "-o", frame), str(frame), "is read")
+    link = tmp_path / "link.exr"
+    link.symlink_to(frame)
+    mentions(refused("sense", frame, "--camera", lab.camera, "--channel", "DN", "-o", link), str(link), "is read")
+    for place in (lab.scene, lab.camera):
+        mentions(refused("transport", *lab.rig, "-o", place, "--overwrite"), str(place), "is read")
+    manifest = tmp_path / "run" / "manifest.json"
+    mentions(refused("export", manifest.parent, "--format", "hdf5", "-o", manifest, "--overwrite"), "is read")
+
+
 @pytest.mark.parametrize("verb", ["capture", "calibrate", "demo", "reconstruct"])
 def test_a_folder_that_holds_something(refused: Refused, lab: Any, tmp_path: Path, verb: str) -> None:
     (tmp_path / "mine").mkdir()

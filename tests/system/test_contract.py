@@ -247,13 +247,20 @@ def test_an_under_determined_image_is_flagged(call: Callable[..., Any], lab: Any
     assert "Under-determined" in outcome.payload["status"] and "Under-determined" in outcome.err
 
 
-def test_a_program_error_is_not_hidden(call: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, lab: Any) -> None:
+def test_a_fault_of_the_program_is_one_line_and_its_traceback_is_kept(
+    call: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, lab: Any, tmp_path: Path
+) -> None:
+    """Status 2: 1 would say that there is a result. (Planted: the exception raised on; the log left out.)"""
+
     def broken(*arguments: object) -> None:
-        raise ZeroDivisionError("planted")
+        raise ZeroDivisionError("planted\x1b[31m\nand more")
 
     monkeypatch.setattr("mitsim.capture.run.make_plan", broken)
-    with pytest.raises(ZeroDivisionError, match="planted"):
-        call("plan", *lab.rig)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    line = call("plan", *lab.rig).refusal
+    assert line.startswith("a fault of mitsim's own, ZeroDivisionError: planted [31m and more; its traceback is in /")
+    (log,) = tmp_path.glob("mitsim-*.log")
+    assert str(log) in line and "in broken" in log.read_text() and "planted\x1b[31m" in log.read_text()
 
 
 # ---- the installed program -------------------------------------------------------------------------------------------

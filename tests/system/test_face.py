@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import inspect
 import json
 import math
 import subprocess
@@ -192,7 +193,7 @@ def test_images_from_memory_and_from_disk_are_equal(shots: ms.Capture, factors: 
 
 @pytest.mark.parametrize("lam", [-1.0, math.nan, math.inf, "automatic"])
 def test_lambda_out_of_range(shots: ms.Capture, factors: ms.Factors, lam: Any) -> None:
-    with pytest.raises(ms.ArgumentError, match=r"lam .*at least 0, or auto") as caught:
+    with pytest.raises(ms.ArgumentError, match=r"lam .*(at least 0, or auto|a number or 'auto')") as caught:
         ms.reconstruct(shots, factors, lam)
     assert caught.value.argument == "lam" and str(lam) in str(caught.value)
 
@@ -398,3 +399,45 @@ for arguments, _ in json.loads(sys.argv[1]):
         assert fragment in said, (arguments, said)
         assert heavy == [], f"{arguments} imported {heavy}"
     assert not list(tmp_path.iterdir())
+
+
+NO_KIND: list[Any] = [object(), b"x", np.array([]), 1j]
+"""What no argument of the face may be."""
+
+
+@pytest.mark.parametrize("of", ["ms", "bench", "shots", "factors"])
+def test_every_wrong_argument_is_refused_in_a_line(
+    of: str, bench: ms.Bench, shots: ms.Capture, factors: ms.Factors
+) -> None:
+    """By functions of the package and methods of what they make. (Planted: one method that checks nothing.)"""
+    owner: Any = {"ms": ms, "bench": bench, "shots": shots, "factors": factors}[of]
+    names = [name for name in (ms.__all__ if of == "ms" else dir(owner)) if name in FACE[of]]
+    assert sorted(names) == sorted(FACE[of])
+    given = {"scene": bench.loaded.path, "shots": shots, "factors": factors, "bench": bench, "psnr": 30.0}
+    given |= {
+        "image": np.ones((2, 2)),
+        "truth": np.ones((2, 2)),
+        "modelling": ms.Modelling("wave"),
+        "patterns": "dots:2",
+    }
+    given |= {name: "new" for name in ("folder", "run", "calibration", "output", "path", "frames")}
+    given |= {"reflectance": 0.5, "count": 1, "variant": "llvm_ad_mono", "depth": 400.0, "model": "wave"}
+    for name in names:
+        parameters = inspect.signature(getattr(owner, name)).parameters.values()
+        needed = {each.name: given[each.name] for each in parameters if each.default is each.empty and each.kind < 2}
+        for parameter in (each for each in parameters if each.kind < 2 and each.annotation != "object"):
+            for value in NO_KIND:
+                with pytest.raises(ms.MitsimError) as refusal:
+                    getattr(owner, name)(**{**needed, parameter.name: value})
+                assert len(str(refusal.value).splitlines()) == 1
+
+
+FACE = {
+    "ms": [name for name in ms.__all__ if not name[0].isupper()] + ["Limits", "Modelling", "Clock", "Job"],
+    "bench": ["plan", "light", "capture", "capture_lines", "choose_colour", "in_variant", "in_bands", "calibrate_lines",
+              "capture_mosaic", "calibrate_mosaic", "calibrate", "calibrate_depths", "write_session", "render",
+              "with_board", "family", "windows_at", "parallax_from"],
+    "shots": ["save"],
+    "factors": ["save", "operator", "check_fit"],
+}  # fmt: skip
+"""Public functions, classes and methods that take arguments."""

@@ -36,7 +36,10 @@ def test_parts_merge_on_the_command_line(study: Callable[..., Any], tmp_path: Pa
     for number in (1, 2):
         part = study("-o", tmp_path / f"p{number}", "--quick", "--shard", f"{number}/2", "--jobs", 1)
         assert part.code == 0 and "4 points measured, 4 of other parts are missing" in part.out
-    joined = study(tmp_path / "p1", tmp_path / "p2", "-o", tmp_path / "whole", name="merge")
+    parts = tmp_path / "p1", tmp_path / "p2"
+    refused = study(*parts, "-o", tmp_path / "whole", name="merge")
+    assert refused.code == 2 and "--experiment MODULE" in refused.err and not (tmp_path / "whole").exists()
+    joined = study(*parts, "-o", tmp_path / "whole", "--experiment", TOY, name="merge")
     assert joined.code == 0 and "confirmed: Two squared is four" in joined.out, joined.err
 
 

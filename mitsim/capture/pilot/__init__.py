@@ -72,6 +72,12 @@ _FEWEST_MET = 3.0
 run samples until it knows the light; else neither may."""
 _FAINT = 1e-3
 """Part of the mean light on the sensor below which its centre sees nothing but rounding."""
+_MOST_RAYS = 2**26
+"""Rays that look for what a scene shows while few have met it, some 0.5 s: they meet 2e-4 of the window's width."""
+_MORE = 4
+"""Times as many rays as before: a power of two keeps the places of each pixel's rays even."""
+_FEWEST_IN_LOOK = 8.0
+"""Hits that a look at a small target must count on: the looks then tell its light to a fifth."""
 _ALIGNED = 1e-6
 """Relative distance from the aligned plane that is rounding: the plane keeps its exact cells."""
 
@@ -104,7 +110,7 @@ class Look:
         first_look = frozenset(self.present) & effects.names(lambda effect: effect.first_look)
         first = Simulation(bench, Settings(depth=bench.geometry.scene_distance, effects=first_look))
         self._sharp = _sharp(first, seed)
-        depth, centre = _depth(first, seed, self._sharp)
+        depth, centre, hits = _first_light(first, seed, self._sharp)
         # A connection that meets a sharp lobe by chance may be all that the centre sees.
         self._light = self._sharp.rest if self._sharp.irradiance else centre
         seen = Simulation(bench, Settings(depth=depth, effects=first_look))
@@ -112,7 +118,10 @@ class Look:
         own = integer(seed, "pilot", "sharp")
         apart = sharp_pixels(seen, self._sharp, self._light, accuracy, own)
         self._base = Settings(depth=depth, effects=first_look, reach=reach, sharp=apart)
-        self.samples = dict.fromkeys(STAGES, Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors))
+        sample = Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
+        if not bench.loaded.mirrors and not self._sharp.irradiance:
+            sample = _enough(sample, hits, bench)
+        self.samples = dict.fromkeys(STAGES, sample)
         self.occluded: OccludedLight | None = None
         for stage in STAGES:
             self._measure(stage)
@@ -220,6 +229,16 @@ class Look:
     def _left_out(self) -> LeftOut:
         return _left_out(self.switched.simulation, self.seed)
 
+    def _unsure_glint(self, other: float) -> float:
+        """Part of all light that comes over mirrors alone and is in no frame, or may be in the wrong pixels.
+
+        ``other``: irradiance of all other light [W m^-2].
+        """
+        if not self.bench.loaded.mirrors:
+            return 0.0
+        found, unsure = self.bench.glint.irradiance(self.bench.geometry)
+        return unsure / (other + found + unsure) if unsure else 0.0
+
     @cached_property
     def evidence(self) -> Evidence:
         """What has been found."""
@@ -249,6 +268,7 @@ class Look:
             apart=switched.apart,
             unresolved=sharp.irradiance / (self._light + sharp.irradiance) if few else 0.0,
             left_out=left_out / (left_out + found) if left_out else 0.0,
+            glint=self._unsure_glint(found),
             mirror=mirror,
             reach=self._base.reach,
             sharp=apart,
@@ -277,6 +297,23 @@ def stage_of(part: Part) -> str:
     return _STAGE_OF.get(part.name, "effects")
 
 
+def _enough(sample: Sample, hits: float, bench: Bench) -> Sample:
+    """The ``sample`` with so many rays that some meet what the camera sees, where one of each pixel has few ``hits``.
+
+    MitsimError where that takes more than a look may trace.
+    """
+    effort = math.ceil(_FEWEST_IN_LOOK / (hits * sample.direct)) if hits else 1
+    more = replace(sample, effort=effort * sample.effort)
+    if effort > 1 and hits * more.direct < _FEWEST_IN_LOOK:
+        n, side = bench.n, math.sqrt(hits)
+        raise MitsimError(
+            f"what the camera sees is too small for the projector's light: all that it lights fills {hits:.1e} of a "
+            f"projector pixel ({side:.1e} of one a side), of {n} x {n}, and would be met by too few rays; give the "
+            "projector a narrower fov, or a larger target"
+        )
+    return more
+
+
 def _sharp(simulation: Simulation, seed: int) -> SharpLight:
     """Direct light over lobes that are too sharp to be met by connections."""
     loaded = simulation.bench.loaded
@@ -297,14 +334,24 @@ def _left_out(simulation: Simulation, seed: int) -> LeftOut:
     return left_out_light(*parts, physics.geometry, own, samples)
 
 
-def _depth(simulation: Simulation, seed: int, sharp: SharpLight) -> tuple[float, float]:
-    """Where the light is seen, 1 / mean(1/z) [mm], and how much of it, from one ray of each projector pixel."""
+def _first_light(simulation: Simulation, seed: int, sharp: SharpLight) -> tuple[float, float, float]:
+    """Where light is seen, 1 / mean(1/z) [mm], how much of it, and how many rays bring some if each pixel sends one.
+
+    From one ray of each projector pixel, or, where hardly one meets what the camera sees, from more.
+    """
     bench, own = simulation.bench, integer(seed, "pilot", "depth")
+    enough = min(_FEWEST_HITS, simulation.bench.n**2 / 4)
+    first, samples = 0, 1
     deposits = simulation.direct.trace(own)
-    total = float(deposits.value.sum())
+    while len(deposits.value) < enough and not bench.loaded.mirrors and not sharp.irradiance:
+        if _MORE * (first + samples) * bench.n**2 > _MOST_RAYS:
+            break
+        first, samples = first + samples, (_MORE - 1) * (first + samples)
+        deposits = simulation.direct.trace(own, first, samples)
+    total = float(deposits.value.sum()) / samples
     if not bench.loaded.mirrors and not sharp.irradiance:
-        everywhere = Simulation(bench, replace(simulation.settings, anchors=2)).direct.trace(own)
-        if total < _FAINT * float(everywhere.value.sum()):
+        everywhere = Simulation(bench, replace(simulation.settings, anchors=2)).direct.trace(own, first, samples)
+        if total < _FAINT * float(everywhere.value.sum()) / samples:
             raise MitsimError(
                 "the sensor's centre sees no light of the projector, though other parts of the sensor do: "
                 + why_dark(bench.loaded)
@@ -312,7 +359,8 @@ def _depth(simulation: Simulation, seed: int, sharp: SharpLight) -> tuple[float,
     if not total and not bench.loaded.mirrors:
         raise MitsimError(f"no light of the projector reaches the camera: {why_dark(bench.loaded)}")
     # Sums by numpy, here and elsewhere: those of BLAS depend on the number of its threads in the last bits.
-    mean = float((deposits.inverse_depth * deposits.value).sum()) / total if total else 0.0
+    mean = float((deposits.inverse_depth * deposits.value).sum()) / (samples * total) if total else 0.0
     # A plane is met at its own depth but for rounding; the aligned plane keeps its exact cells.
     flat = abs(mean * bench.geometry.scene_distance - 1) < _ALIGNED
-    return bench.geometry.scene_distance if flat or mean <= 0 else 1 / mean, total
+    depth = bench.geometry.scene_distance if flat or mean <= 0 else 1 / mean
+    return depth, total, np.count_nonzero(deposits.value) / samples

@@ -26,7 +26,7 @@ from mitsim.scene.guard.files import SceneFiles
 from mitsim.scene.guard.headers import MOST_TEXELS, check_image, check_obj, check_ply, is_grey
 from mitsim.scene.guard.limits import Range
 from mitsim.scene.guard.outline import DEEPEST, MOST_ELEMENTS, Outline, Tag
-from mitsim.scene.guard.vocabulary import PLUGINS, check_plugin
+from mitsim.scene.guard.vocabulary import PLUGINS, check_plugin, check_variant
 
 _IMAGES = ("bitmap", "envmap")
 _READERS = (*_IMAGES, "ply", "obj")
@@ -36,6 +36,10 @@ _COLOURED = ("blackbody", "d65", "irregular", "mesh_attribute", "mitsim_glass", 
 """Plugins whose light or reflectance is one by wavelength, lies in a mesh that may hold colours, or turns with it."""
 _PARTING = "mitsim_glass"
 """The material that bends each wavelength by an index of its own."""
+_ON_SHAPES = ("area", "mitsim_projector")
+"""Emitters that are a shape's surface."""
+_RIGID = ("mitsim_lensless", "mitsim_projector", "projector")
+"""What is turned and moved only."""
 _METALS = ("conductor", "roughconductor")
 """Materials that are copper where nothing else is said."""
 _Type = mi.Properties.Type
@@ -48,7 +52,8 @@ class CheckedScene:
     ``files`` lists what it reads, the scene first; ``limits`` what bitmaps and the attributes of meshes may hold, by
     the name of the parameter, of the bitmap's file or of the attribute; ``unfit`` which estimators must refuse it;
     ``shapes`` and ``small_lamps`` are the tags, in the scene's order, of its shapes and of its lamps that no path runs
-    into; ``coloured`` those of what may differ by wavelength, ``parting`` of glass that sends each its own way.
+    into; ``coloured`` those of what may differ by wavelength, ``parting`` of glass that sends each its own way;
+    ``samples`` is the ``sample_count`` of the camera's sampler, None where it has none.
     """
 
     outline: Outline
@@ -61,9 +66,12 @@ class CheckedScene:
     small_lamps: tuple[Tag, ...]
     coloured: tuple[Tag, ...]
     parting: tuple[Tag, ...]
+    samples: int | None
 
 
-def check_file(path: Path, defines: Mapping[str, str], outside: bool = False) -> CheckedScene:
+def check_file(
+    path: Path, defines: Mapping[str, str], outside: bool = False, variant: str | None = None
+) -> CheckedScene:
     """Read a scene, and refuse it when it must not become objects or lacks a parameter named by ``defines``.
 
     Parameters
@@ -74,6 +82,8 @@ def check_file(path: Path, defines: Mapping[str, str], outside: bool = False) ->
         values of parameters by name, which replace those of ``<default>``.
     outside
         allows files outside the scene's folder.
+    variant
+        of Mitsuba, that objects will be made in; None: any.
 
     Raises
     ------
@@ -89,7 +99,7 @@ def check_file(path: Path, defines: Mapping[str, str], outside: bool = False) ->
     with looking_beside(outline):
         state = mi.parser.parse_file(config, str(path), **defines)
         mi.parser.transform_all(config, state)
-    tree = _Tree(outline, files, [mi.parser.SceneNode(node) for node in state.nodes])
+    tree = _Tree(outline, files, variant, [mi.parser.SceneNode(node) for node in state.nodes])
     tree.check()
     unfit = Unfit.of(outline, tree.nodes)
     # Groups are in the scene by their instances alone.
@@ -97,7 +107,9 @@ def check_file(path: Path, defines: Mapping[str, str], outside: bool = False) ->
     listed = (tuple(tree.listed(plugins)) for plugins in (shapes, SMALL_LAMPS))
     facts = tuple(files.used), tree.limits, unfit
     shown, small = listed
-    return CheckedScene(outline, config, state, *facts, shown, small, tuple(tree.coloured), tuple(tree.parting))
+    return CheckedScene(
+        outline, config, state, *facts, shown, small, tuple(tree.coloured), tuple(tree.parting), tree.samples
+    )
 
 
 @contextmanager
@@ -121,17 +133,21 @@ class _Tree:
 
     outline: Outline
     files: SceneFiles
+    variant: str | None
     nodes: list[mi.parser.SceneNode]
     limits: dict[str, Range] = field(default_factory=lambda: dict(limits.LIMITS))
     texels: int = 0
     coloured: list[Tag] = field(default_factory=list)
     parting: list[Tag] = field(default_factory=list)
+    samples: int | None = None
 
     def check(self) -> None:
         """MitsimError for the first object that a scene cannot have."""
         for node in self.nodes:
             tag, plugin = self.outline.tag(node), node.props.plugin_name()
             check_plugin(tag, plugin)
+            if self.variant is not None:
+                check_variant(tag, plugin, node.props, self.variant)
             if plugin in _COLOURED or (plugin in _METALS and not _is_plain(node)):
                 self.coloured.append(tag)
             if plugin == _PARTING:
@@ -157,14 +173,14 @@ class _Tree:
         tag, kind, plugin = self.outline.tag(node, name), node.props.type(name), node.props.plugin_name()
         if kind == _Type.Transform:
             matrix = np.array(_words(node, name), dtype=np.float64).reshape(4, 4)
-            limits.check_transform(tag, name, matrix, name == "to_world" and plugin in ("mitsim_lensless", "projector"))
+            limits.check_transform(tag, name, matrix, name == "to_world" and plugin in _RIGID)
         elif kind == _Type.ResolvedReference:
             inner = self._child(node, name)
             within = inner.props.plugin_name()
-            if plugin in PLUGINS["shape"].split() and within in PLUGINS["emitter"].split() and within != "area":
-                raise self.outline.tag(inner).refusal(
-                    "type", repr(within), "a shape holds an area emitter only; put other lamps beside the shapes"
-                )
+            shape, emitter = (PLUGINS[kind].split() for kind in ("shape", "emitter"))
+            if plugin in shape and within in emitter and within not in _ON_SHAPES:
+                rule = f"a shape holds {' or '.join(_ON_SHAPES)} only; put other lamps beside the shapes"
+                raise self.outline.tag(inner).refusal("type", repr(within), rule)
             if name in limits.LIMITS:
                 self._check_texture(self._child(node, name), name, limits.LIMITS[name])
             if plugin == "projector" and name == "irradiance" and "to_uv" in self._child(node, name).props:
@@ -220,6 +236,10 @@ class _Tree:
             raise tag.refusal("texels", self.texels, f"all bitmaps together may have {MOST_TEXELS}")
 
     def _check_camera(self, node: mi.parser.SceneNode) -> None:
+        for below in self._below(node):
+            props = self.nodes[below].props
+            if props.plugin_name() in PLUGINS["sampler"].split() and "sample_count" in props:
+                self.samples = int(props["sample_count"])
         values = {name: node.props[name] for name in CameraGeometry.model_fields if name in node.props}
         try:
             CameraGeometry(**values)

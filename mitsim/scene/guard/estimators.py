@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 STRAIGHT = ("circular", "mask", "null", "polarizer", "retarder", "thindielectric")
 """Materials that let light straight on."""
+_BUMPS = ("bumpmap", "normalmap")
+"""Materials that turn another's frame, and do not tell which light it lets straight on."""
 _MIRRORS = ("conductor", "dielectric", "mitsim_glass", "plastic", "thindielectric")
 """Materials that reflect or bend light into single directions."""
 SMALL_LAMPS = ("directional", "point", "spot")
@@ -55,7 +57,7 @@ class Unfit:
         tree = _References(nodes)
         medium = next(tree.to(PLUGINS["medium"].split()), None)
         if medium is None:
-            factored = None
+            factored = _blurred(outline, tree)
         else:
             node, name = medium
             rule = (
@@ -63,9 +65,10 @@ class Unfit:
                 "the integrator volpath"
             )
             factored = outline.tag(node).refusal(name, "a medium", rule)
+        opaque = _under_bumps(outline, tree)
         return cls(
-            factored,
-            _lost_by_integrator(outline, tree, medium or next(tree.to(STRAIGHT), None)),
+            factored or opaque,
+            _lost_by_integrator(outline, tree, medium or next(tree.to(STRAIGHT), None)) or opaque,
             _caustics(outline, tree, ("projector", *SMALL_LAMPS), "the reference"),
             _caustics(outline, tree, SMALL_LAMPS, "the factored estimator"),
             _in_instances(outline, tree),
@@ -86,6 +89,22 @@ def _caustics(outline: Outline, tree: _References, lights: Sequence[str], estima
     return str(outline.tag(light).refusal("light", repr(str(light.props.plugin_name())), rule))
 
 
+def _blurred(outline: Outline, tree: _References) -> MitsimError | None:
+    """The refusal of a projector whose picture blends its texels: the factored estimator takes pixels for even."""
+    for node in tree.nodes:
+        picture = tree.child(node, "irradiance") if node.props.plugin_name() == "projector" else None
+        if picture is None or picture.props.plugin_name() != "bitmap":
+            continue
+        kind = picture.props.get("filter_type", "bilinear")  # Mitsuba's default
+        if kind != "nearest":
+            rule = (
+                "the projector's pixels would run into each other, where patterns need them even; give its bitmap "
+                '<string name="filter_type" value="nearest"/>, and blur_pixels of the projector\'s TOML file for a blur'
+            )
+            return outline.tag(picture, "filter_type").refusal("filter_type", repr(kind), rule)
+    return None
+
+
 def _in_instances(outline: Outline, tree: _References) -> str | None:
     for node in tree.nodes:
         if node.props.plugin_name() != "shapegroup":
@@ -100,13 +119,33 @@ def _in_instances(outline: Outline, tree: _References) -> str | None:
     return None
 
 
+def _under_bumps(outline: Outline, tree: _References) -> MitsimError | None:
+    """The refusal of a hole or pane inside a material that hides from connections what passes it."""
+    for node, name in tree.to(_BUMPS):
+        bumps = tree.nodes[node.props[name].index()]
+        hidden = next(tree.below(bumps, STRAIGHT), None)
+        if hidden is not None:
+            what = str(hidden.props.plugin_name())
+            rule = (
+                f"inside of a {bumps.props.plugin_name()} Mitsuba takes it for opaque wherever it connects a surface "
+                "to a light, so that is missing; turn them round: the mask, or other material that light passes, "
+                "outermost"
+            )
+            return outline.tag(hidden).refusal("bsdf", repr(what), rule)
+    return None
+
+
 def _lost_by_integrator(
     outline: Outline, tree: _References, cause: tuple[mi.parser.SceneNode, str] | None
 ) -> MitsimError | None:
-    """The refusal of an integrator that loses light at the ``cause``, a node and the name of its property."""
+    """The refusal of an integrator that has no paths from the camera, or that loses light at the ``cause``, a node and
+    the name of its property."""
     found = (node for node in tree.nodes if node.props.plugin_name() in PLUGINS["integrator"].split())
     integrator = next(found, None)
     plugin = integrator.props.plugin_name() if integrator is not None else "path"  # Mitsuba's own default
+    if integrator is not None and plugin == "ptracer":
+        rule = "it starts paths at lamps alone, and mitsim_lensless needs those of the camera; use path or volpath"
+        return outline.tag(integrator).refusal("integrator", repr(plugin), rule)
     if cause is None or plugin in _VOLUMETRIC:
         return None
     place, what = outline.tag(cause[0]), tree.plugin(*cause)
@@ -142,8 +181,13 @@ class _References:
                     yield other
                 yield from self.below(other, plugins)
 
+    def child(self, node: mi.parser.SceneNode, name: str) -> mi.parser.SceneNode | None:
+        """What the property refers to; None unless there is one, and an object."""
+        if name not in node.props or node.props.type(name) != mi.Properties.Type.ResolvedReference:
+            return None
+        return self.nodes[node.props[name].index()]
+
     def plugin(self, node: mi.parser.SceneNode, name: str) -> str:
-        """What the property refers to; nothing unless it is an object."""
-        if node.props.type(name) != mi.Properties.Type.ResolvedReference:
-            return ""
-        return str(self.nodes[node.props[name].index()].props.plugin_name())
+        """The plugin that the property refers to; nothing unless it is an object."""
+        child = self.child(node, name)
+        return "" if child is None else str(child.props.plugin_name())

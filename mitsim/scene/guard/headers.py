@@ -6,8 +6,10 @@ Each function raises ValueError with a sentence that completes "the file ...", o
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +23,8 @@ MOST_TEXELS = 1 << 25
 """An environment map of 8192 x 4096."""
 FARTHEST = 1e7
 """Largest coordinate [mm], 10 km: single precision resolves 1 mm there."""
+_ORIENTATION = 274
+"""Tag of Exif (JEITA CP-3451, 4.6.4): how a picture is turned when it is shown; 1 is as stored."""
 _HEADER = 1 << 16
 """Bytes in which a header must end; those of meshes and Radiance pictures have some 500."""
 _GREY = ("1", "L", "LA", "I", "I;16")
@@ -43,6 +47,8 @@ _PLY_TYPES = {
     "float32": "f4",
     "float64": "f8",
 }
+_CORNERS, _INDICES = "corner count", "corner indices"
+"""A triangle's list as fields of an array: names with a blank, which no property has."""
 _MOST_TEXT = 64 << 20
 """Chosen so that its words, some ten million Python objects, stay below 1 GiB."""
 
@@ -80,7 +86,8 @@ def is_grey(path: Path) -> bool:
 def check_ply(path: Path) -> None:
     """Refuse ``path`` unless it is a PLY mesh of triangles whose corners exist and lie within ``FARTHEST``.
 
-    Mitsuba would read beyond its arrays. Raises ValueError or OSError.
+    Mitsuba would read beyond its arrays. Elements and properties beside those of triangles may be there, in any order.
+    Raises ValueError or OSError.
     """
     with open(path, "rb") as file:
         start = file.read(_HEADER)
@@ -89,14 +96,11 @@ def check_ply(path: Path) -> None:
             raise ValueError("is no PLY mesh; its header must end within 64 KiB")
         file.seek(found.end())
         body = file.read()
-    order, vertices, faces = _ply_header(found[0])
-    count, corners = (vertices[0], faces[0])
-    if order is None:
-        points, indices = _ply_text(body, vertices, faces)
-    else:
-        points, indices = _ply_binary(body, order, vertices, faces)
+    order, parts = _ply_header(found[0])
+    points, indices = _ply_text(body, parts) if order is None else _ply_binary(body, order, parts)
     _check_points(points)
-    if corners and (indices.min() < 0 or indices.max() >= count):
+    count = parts["vertex"].count
+    if indices.min() < 0 or indices.max() >= count:
         named = f"{indices.min()} to {indices.max()}"
         raise ValueError(f"has faces with vertices {named}, but {count} vertices; mend the mesh")
 
@@ -122,8 +126,20 @@ def _check_points(points: npt.NDArray[np.float64]) -> None:
 
 
 def _pillow_size(path: Path, start: bytes) -> tuple[int, int]:
-    """Width and height in the header of a PNG or JPEG file."""
+    """Width and height in the header of a PNG or JPEG file, of which what is stored is what is seen."""
+    from PIL.Image import Exif
+
     with _pillow(path, start) as image:
+        exif = Exif()  # not by getexif, which looks for it behind a PNG's pixels too, and decodes them
+        try:
+            exif.load(image.info.get("exif", b""))
+            turned = exif.get(_ORIENTATION, 1)
+        except Exception:  # of a damaged one, whatever its reader stumbles over
+            raise ValueError("has damaged Exif data; save it again") from None
+        if turned != 1:
+            raise ValueError(f"has the orientation {turned}, which Mitsuba passes over; save it turned as it is seen")
+        if getattr(image, "custom_mimetype", None) == "image/apng":
+            raise ValueError("is animated, and Mitsuba shows its first picture alone; save that")
         return image.size
 
 
@@ -155,82 +171,136 @@ def _two_numbers(pattern: bytes, header: bytes) -> tuple[int, int]:
 
 _Mesh = tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]
 """Coordinates, and the corners of each triangle."""
-_Part = tuple[int, list[tuple[str, str]]]
-"""Number of an element and its properties: name and type; a list has the types of its length and of its items."""
 
 
-def _ply_header(header: bytes) -> tuple[str | None, _Part, _Part]:
-    """Byte order (None: text), vertices and faces as the header says."""
+@dataclass(frozen=True)
+class _Element:
+    """An element of a PLY file: how many there are, and its properties: name and type, of the list of a triangle's
+    corners the types of its length and of its items."""
+
+    count: int
+    properties: list[tuple[str, str]]
+
+    def dtype(self, order: str) -> np.dtype[np.void]:
+        """Of one of them in a binary file of that byte ``order``, its list three items long."""
+        fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
+        for name, kind in self.properties:
+            if " " in kind:
+                length, item = kind.split()
+                fields += [(_CORNERS, order + length), (_INDICES, order + item, (3,))]
+            else:
+                fields.append((name, order + kind))
+        return np.dtype(fields)
+
+    def column(self, name: str) -> int:
+        """Words before the property ``name`` in one of them."""
+        before = self.properties[: [other for other, _ in self.properties].index(name)]
+        return len(before) + 3 * any(" " in kind for _, kind in before)
+
+    @property
+    def words(self) -> int:
+        """Of one of them in a text."""
+        return len(self.properties) + 3 * any(" " in kind for _, kind in self.properties)
+
+    @property
+    def lists(self) -> list[str]:
+        """Names of its lists."""
+        return [name for name, kind in self.properties if " " in kind]
+
+
+def _ply_header(header: bytes) -> tuple[str | None, dict[str, _Element]]:
+    """Byte order (None: text), and the elements in their order, as the header says.
+
+    Refused is what Mitsuba would not load, or not as it is meant: whole numbers as coordinates, which it divides by
+    their type's largest.
+    """
     order: str | None = ""
-    parts: dict[str, _Part] = {}
+    parts: dict[str, _Element] = {}
     for line in header.split(b"\n")[1:-2]:
         # Split as C does: text has further blanks and line ends, which Mitsuba would not take for such.
         words = [word.decode("ascii", "replace") for word in line.split()]
         kinds = words[2:4] if words[:2] == ["property", "list"] else words[1:2]
         match words:
-            case ["comment" | "obj_info", *_] | []:
+            case ["comment", *_] | []:
                 continue
             case ["format", name, _]:
                 order = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}.get(name, "")
             case ["element", name, count] if re.fullmatch(r"[0-9]{1,9}", count) and name not in parts:
-                parts[name] = int(count), []
+                parts[name] = _Element(int(count), [])
             case ["property", *_, name] if parts and len(words) in (3, 5) and {*kinds} <= _PLY_TYPES.keys():
-                parts[[*parts][-1]][1].append((name, " ".join(_PLY_TYPES[kind] for kind in kinds)))
+                parts[[*parts][-1]].properties.append((name, " ".join(_PLY_TYPES[kind] for kind in kinds)))
             case _:
                 raise ValueError(
-                    f"has a header line that is not understood ({' '.join(words)[:40]!r}); export the mesh again"
+                    f"has a header line that is not understood ({' '.join(words)[:40]!r}); remove it, or export "
+                    "the mesh again"
                 )
-    if order == "" or [*parts] != ["vertex", "face"]:
-        raise ValueError("has elements other than vertex and face, or no format; export vertices and triangles alone")
-    vertices, faces = parts["vertex"], parts["face"]
-    names = [name for name, _ in (*vertices[1], *faces[1])]
-    lists = [name for name, kind in faces[1] if " " in kind]
-    if len({*names}) != len(names) or names[:3] != ["x", "y", "z"] or any(" " in kind for _, kind in vertices[1]):
-        raise ValueError("has properties other than x, y, z and further numbers for a vertex; export the mesh again")
-    if lists not in (["vertex_index"], ["vertex_indices"]):
-        raise ValueError("has faces without one list vertex_indices; export triangles")
-    return order, vertices, faces
+    if order == "" or not {"vertex", "face"} <= parts.keys():
+        raise ValueError("has no format, or no elements vertex and face; export vertices and triangles")
+    for element, part in parts.items():
+        names = [name for name, _ in part.properties]
+        if len({*names}) != len(names):
+            raise ValueError(f"has two properties of one name in element {element[:40]}; export the mesh again")
+        if part.count and not names:
+            raise ValueError(f"has an element {element[:40]} without properties; export the mesh again")
+        if part.lists and element != "face":
+            raise ValueError(f"has a list in element {element[:40]}; export vertices and triangles alone")
+    kinds_of = dict(parts["vertex"].properties)
+    if not all(kinds_of.get(axis, "") in ("f4", "f8") for axis in "xyz"):
+        raise ValueError("has vertices without x, y, z of type float or double; export the mesh again")
+    if parts["face"].lists not in (["vertex_index"], ["vertex_indices"]):
+        raise ValueError("has faces without one list vertex_indices, or with others; export triangles alone")
+    if not parts["face"].count:
+        raise ValueError("has no triangles: it is a cloud of points; export a mesh")
+    return order, parts
 
 
-def _ply_binary(body: bytes, order: str, vertices: _Part, faces: _Part) -> _Mesh:
-    vertex = np.dtype([(name, order + kind) for name, kind in vertices[1]])
-    fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
-    for name, kind in faces[1]:
-        if " " in kind:
-            length, item = kind.split()
-            fields += [("corners", order + length), ("indices", order + item, (3,))]
-        else:
-            fields.append((name, order + kind))
-    face = np.dtype(fields)
-    middle = vertices[0] * vertex.itemsize
-    if middle + faces[0] * face.itemsize > len(body):
-        raise ValueError(
-            f"claims {vertices[0]} vertices and {faces[0]} triangles, more than its bytes hold; export the mesh again"
-        )
-    points = np.frombuffer(body, vertex, vertices[0])
-    triangles = np.frombuffer(body, face, faces[0], offset=middle)
-    if (triangles["corners"] != 3).any():
+def _check_claim(parts: Mapping[str, _Element], claimed: int, held: int, what: str) -> None:
+    """Refuse a body that ends before what its header claims, in words or bytes."""
+    if claimed > held:
+        counts = f"{parts['vertex'].count} vertices and {parts['face'].count} triangles"
+        raise ValueError(f"claims {counts}, more than its {what} hold{'s' * (what == 'text')}; export the mesh again")
+
+
+def _check_triangles(corners: npt.NDArray[Any], more: int) -> None:
+    """Refuse faces of other than three ``corners``, and what a body holds beyond its header's claim."""
+    if (corners != 3).any():
         raise ValueError("has faces that are no triangles; export triangles")
+    if more:
+        raise ValueError("holds more than its header claims; export the mesh again")
+
+
+def _ply_binary(body: bytes, order: str, parts: Mapping[str, _Element]) -> _Mesh:
+    types = {name: part.dtype(order) for name, part in parts.items()}
+    sizes = {name: part.count * types[name].itemsize for name, part in parts.items()}
+    starts = dict(zip(parts, np.cumsum([0, *sizes.values()]).tolist(), strict=False))
+    claimed = sum(sizes.values())
+    _check_claim(parts, claimed, len(body), "bytes")
+    points, triangles = (
+        np.frombuffer(body, types[name], parts[name].count, offset=starts[name]) for name in ("vertex", "face")
+    )
+    _check_triangles(triangles[_CORNERS], len(body) - claimed)
     coordinates = np.stack([points[axis].astype(np.float64) for axis in "xyz"])
-    return coordinates, triangles["indices"].astype(np.int64)
+    return coordinates, triangles[_INDICES].astype(np.int64)
 
 
-def _ply_text(body: bytes, vertices: _Part, faces: _Part) -> _Mesh:
+def _ply_text(body: bytes, parts: Mapping[str, _Element]) -> _Mesh:
     if len(body) > _MOST_TEXT:
         raise ValueError(f"is a text of over {_MOST_TEXT >> 20} MiB; export it as binary")
-    middle = vertices[0] * len(vertices[1])
-    after = [kind for _, kind in faces[1]]
-    width = len(after) + 3
-    words = body.split()
-    if len(words) < middle + faces[0] * width or " " not in after[0]:
-        raise ValueError(
-            f"claims {vertices[0]} vertices and {faces[0]} triangles, more than its text holds; export the mesh again"
-        )
-    try:
-        points = np.array(words[:middle], dtype=np.float64).reshape(vertices[0], -1)
-        triangles = np.array(words[middle : middle + faces[0] * width]).astype(np.float64).reshape(faces[0], width)
-    except ValueError:
-        raise ValueError("holds words that are no numbers; export the mesh again") from None
-    if (triangles[:, 0] != 3).any() or not np.isfinite(triangles).all():
-        raise ValueError("has faces that are no triangles; export triangles")
-    return points[:, :3].T, triangles[:, 1:4].astype(np.int64)
+    words, start, tables = body.split(), 0, dict[str, npt.NDArray[np.float64]]()
+    claimed = sum(part.count * part.words for part in parts.values())
+    _check_claim(parts, claimed, len(words), "text")
+    for name, part in parts.items():
+        end = start + part.count * part.words
+        if name in ("vertex", "face"):
+            try:
+                tables[name] = np.array(words[start:end]).astype(np.float64).reshape(part.count, part.words)
+            except ValueError:
+                raise ValueError("holds words that are no numbers; export the mesh again") from None
+        start = end
+    first = parts["face"].column(parts["face"].lists[0])
+    triangles = tables["face"][:, first : first + 4]
+    _check_triangles(triangles[:, 0], len(words) - claimed)
+    if not np.isfinite(triangles).all():
+        raise ValueError("has corners that are no numbers; export the mesh again")
+    coordinates = [tables["vertex"][:, parts["vertex"].column(axis)] for axis in "xyz"]
+    return np.stack(coordinates), triangles[:, 1:].astype(np.int64)

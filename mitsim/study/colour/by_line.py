@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.colours import COLOUR, IMAGE, ColourManifest, is_mosaic, read_colours, same_lines, write_colours
 from mitsim.core.errors import MitsimError
@@ -116,6 +117,7 @@ class JudgedColours:
         return self.colours._repr_html_()
 
 
+@checked
 def reconstruct_colours(
     run: Path | str,
     calibration: Path | str,

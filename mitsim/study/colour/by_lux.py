@@ -24,6 +24,7 @@ from mitsim.study.colour.lit import LitLine
 from mitsim.study.compare import label
 from mitsim.study.experiment import Claim, Found, PageTable, Point, Scope, Setup
 from mitsim.study.table import Mean, Table
+from mitsim.study.verdicts import verdict, within
 
 GOAL = 0.5
 """Most that 49 dots may add to the floor's mean Delta E."""
@@ -119,11 +120,11 @@ def claim_of(rows: Table, patterns: str) -> Claim:
     kept, last = kept_lx(by_lux, goal), max(by_lux)
     limit = f"the brightest tried, {last:g} lx" if kept == last else f"{_digits(kept)} lx"
     least = own.mean("kept_lx", method=LEAST).value
+    holds = within(by_lux[last if kept == last else min(by_lux)], high=goal) if kept in (0, last) else True
     return Claim(
         f"{label(patterns)} add at most {GOAL:g} to the floor's mean Delta E 2000 beside D65 ({MARKOV})", "", "",
         f"kept up to {limit}; without bias at best up to {_digits(least)} lx",
-        "confirmed" if kept == last else f"confirmed only if D65 has at most {_digits(kept)} lx" if kept else
-        "not confirmed",
+        verdict(holds) if kept in (0, last) else f"confirmed only if D65 has at most {_digits(kept)} lx",
     )  # fmt: skip
 
 

@@ -13,9 +13,10 @@ from mitsim.study.charts import curves, image_grid
 from mitsim.study.compare import label
 from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Scope
 from mitsim.study.exposures import EQUAL_PEAK, MODELS
-from mitsim.study.paper.measure import by_patterns, by_print, found, judged, panels, pictured
+from mitsim.study.paper.measure import by_patterns, by_print, found, panels, pictured
 from mitsim.study.studio import Image, Studio
-from mitsim.study.table import Table
+from mitsim.study.table import Mean, Table
+from mitsim.study.verdicts import Holds, difference, judged, sampled, within
 
 BINNINGS = (1, 2, 4, 8)
 """Pixels a side that are averaged: the paper's 512 to 64 pixels a side."""
@@ -47,22 +48,23 @@ def _measure(studio: Studio, point: Point) -> Found:
 
 
 def _claims(results: Results) -> Sequence[Claim]:
-    def lost(family: str, rows: Table) -> tuple[str, float]:
-        fine, coarse = (rows.mean("psnr_db", patterns=family, binning=binning) for binning in (_FINE, _COARSE))
-        return f"{fine} to {coarse} dB", fine.value - coarse.value
+    def lost(family: str, rows: Table) -> tuple[str, Mean]:
+        fine, coarse = (rows.where(patterns=family, binning=binning) for binning in (_FINE, _COARSE))
+        loss = difference(fine, coarse, "psnr_db")
+        return f"{sampled(fine, 'psnr_db')} to {sampled(coarse, 'psnr_db')} dB: {loss} dB lost", loss
 
-    def stable(rows: Table) -> tuple[str, bool]:
+    def stable(rows: Table) -> tuple[str, Holds]:
         said, loss = lost("dots:7", rows)
-        return said, loss <= _STABLE_DB
+        return said, within(loss, high=_STABLE_DB)
 
-    def degrades(rows: Table) -> tuple[str, bool]:
+    def degrades(rows: Table) -> tuple[str, Holds]:
         said, loss = lost("uniform", rows)
-        return said, loss > 0
+        return said, within(loss, low=0)
 
-    def better(rows: Table) -> tuple[str, bool]:
-        dots = rows.mean("psnr_db", patterns="dots:7", binning=_COARSE).value
-        gain = dots - rows.mean("psnr_db", patterns="uniform", binning=_FINE).value
-        return f"{gain:+.1f} dB", gain > 0
+    def better(rows: Table) -> tuple[str, Holds]:
+        dots, uniform = rows.where(patterns="dots:7", binning=_COARSE), rows.where(patterns="uniform", binning=_FINE)
+        gain = difference(dots, uniform, "psnr_db")
+        return f"{gain:+} dB", within(gain, low=0)
 
     table = results.table
     return [

@@ -1,8 +1,8 @@
-"""What experiments of the paper share: findings at a point, curves and rows of images, and verdicts on claims."""
+"""What experiments of the paper share: findings at a point, curves and rows of images, and claims of PSNR."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from mitsim.core.arrays import FloatArray
 from mitsim.study.charts import Curve
@@ -12,6 +12,7 @@ from mitsim.study.exposures import EQUAL_PEAK, IDEALISED, MODELS, RENDERED
 from mitsim.study.pictures import QUICK_IMAGES
 from mitsim.study.studio import Studio
 from mitsim.study.table import Mean, Table, Value
+from mitsim.study.verdicts import Holds, judged, sampled, within
 
 TOLERANCE_DB = 2.0
 """How far from the paper's figures ours may be: it states neither its images, nor how bright they are."""
@@ -118,41 +119,6 @@ def pictured(
     return grid
 
 
-def judged(table: Table, claim: str, paper: str, judge: Callable[[Table], tuple[str, bool]]) -> Claim:
-    """What becomes of a claim at each way of exposing, in each model.
-
-    Parameters
-    ----------
-    table
-        what was measured.
-    claim, paper
-        what the paper says.
-    judge
-        from the rows of one model and exposure: what they say, and whether the claim holds for them.
-    """
-    exposures: list[Value] = table.distinct("exposure") or [None]
-    said = {
-        (model, each): judge(table.where(model=model) if each is None else table.where(model=model, exposure=each))
-        for model in MODELS
-        for each in exposures
-    }
-    at = [str(each) for each in exposures if all(said[model, each][1] for model in MODELS)]
-    of = [model for model in MODELS if all(said[model, each][1] for each in exposures)]
-    told = {
-        model: "; ".join(
-            said[model, each][0] if len(exposures) == 1 else f"{each}: {said[model, each][0]}" for each in exposures
-        )
-        for model in MODELS
-    }
-    if len(at) == len(exposures):
-        verdict = "confirmed"
-    elif at:
-        verdict = f"confirmed only at {' and '.join(at)}"
-    else:
-        verdict = f"confirmed only {of[0]}" if of else "not confirmed"
-    return Claim(claim, paper, told[IDEALISED], told[RENDERED], verdict)
-
-
 def stated(table: Table, claim: str, band: tuple[float, float]) -> Claim:
     """A claim of PSNR within a band.
 
@@ -164,16 +130,16 @@ def stated(table: Table, claim: str, band: tuple[float, float]) -> Claim:
         what the paper says [dB].
     """
 
-    def judge(rows: Table) -> tuple[str, bool]:
-        mean = rows.mean("psnr_db")
-        return f"{mean} dB", band[0] - TOLERANCE_DB <= mean.value <= band[1] + TOLERANCE_DB
+    def judge(rows: Table) -> tuple[str, Holds]:
+        mean = sampled(rows, "psnr_db")
+        return f"{mean} dB", near(mean, band)
 
     return judged(table, claim, f"{band[0]:g} to {band[1]:g} dB", judge)
 
 
-def verdict(holds: bool) -> str:
-    """On a claim that ``holds`` or not."""
-    return "confirmed" if holds else "not confirmed"
+def near(psnr_db: Mean, band: tuple[float, float]) -> Holds:
+    """Whether a mean ``psnr_db`` is within a ``band`` of the paper's [dB], or no more than TOLERANCE_DB beside it."""
+    return within(psnr_db, band[0] - TOLERANCE_DB, band[1] + TOLERANCE_DB)
 
 
 def bars(lines: Lines, column: str = "psnr_db") -> Mapping[str, tuple[Mean, Mean]]:

@@ -30,6 +30,7 @@ from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Sc
 from mitsim.study.exposures import EQUAL_PEAK, LitScene
 from mitsim.study.paper.measure import found
 from mitsim.study.studio import Image, Studio
+from mitsim.study.verdicts import difference, sampled, verdict, within
 
 OFF_MM = {"mask_distance": 0.05, "mask_offset_row": 0.037, "mask_offset_column": -0.021}
 """How the camera differs from its plan: as a mask that is glued on by hand, under a microscope."""
@@ -131,20 +132,24 @@ def _claims(results: Results) -> Sequence[Claim]:
         rows = results.table.where(exposure_fraction=fraction)
         measured = rows.where(factors=MEASURED)
         most = max(measured.distinct("frames"))
-        best = measured.mean("psnr_db", frames=most)
+        longest = measured.where(frames=most)
         for model in (WAVE, GEOMETRIC):
             own = rows.where(factors=model)
-            means = {frames: own.mean("psnr_db", frames=frames) for frames in sorted(own.distinct("frames"))}
-            enough = [frames for frames, mean in means.items() if mean.value >= best.value - _SUFFICES_DB]
-            reached = means[enough[0] if enough else max(means)]
+            gains = {
+                frames: difference(own.where(frames=frames), longest, "psnr_db")
+                for frames in sorted(own.distinct("frames"))
+            }
+            suffices = {frames: within(gain, low=-_SUFFICES_DB) for frames, gain in gains.items()}
+            few = next((frames for frames, holds in suffices.items() if holds), max(gains))
+            holds = True if suffices[few] else None if None in suffices.values() else False
             told.append(
                 Claim(
                     f"A few frames suffice for the {model} model, brightest pixel at {fraction:g} of the full well",
                     "",
                     "",
-                    f"{reached} dB with {enough[0] if enough else max(means)} frames; measured factors {best} dB with "
-                    f"{most}",
-                    "confirmed" if enough else "not confirmed",
+                    f"{sampled(own.where(frames=few), 'psnr_db')} dB with {few} frames; measured factors "
+                    f"{sampled(longest, 'psnr_db')} dB with {most}: {gains[few]:+} dB",
+                    verdict(holds),
                 )
             )
     return told

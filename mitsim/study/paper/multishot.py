@@ -19,11 +19,12 @@ from mitsim.rig.patterns import PatternFamily
 from mitsim.study.charts import curves, image_grid
 from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Scope
 from mitsim.study.exposures import EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED, LitScene, Unexposed
-from mitsim.study.paper.measure import TOLERANCE_DB, by_print, judged, panels, pictured, shown, stated
+from mitsim.study.paper.measure import by_print, near, panels, pictured, shown, stated
 from mitsim.study.pictures import QUICK_IMAGES
 from mitsim.study.studio import Image, Studio, reason_of
 from mitsim.study.sweepcam import MovedMask, Places, ideal_places
 from mitsim.study.table import Table
+from mitsim.study.verdicts import Holds, difference, every, judged, sampled, verdict, within
 
 REACH = 15.0
 """Features that the mask moves either way."""
@@ -107,13 +108,14 @@ def _spread(count: int, feature_mm: float) -> tuple[float, ...]:
 def _claims(results: Results) -> Sequence[Claim]:
     table = results.table
     many = table.where(frames=_FRAMES)
-    line = {each: many.mean("psnr_db", patterns=LINE, exposure=each) for each in EXPOSURES}
+    line = {each: sampled(many.where(patterns=LINE, exposure=each), "psnr_db") for each in EXPOSURES}
+    on_the_line = every(*(near(mean, _SWEPT_DB) for mean in line.values()))
 
     def gain(claim: str, paper: str, better: Table, other: Table) -> Claim:
-        def judge(rows: Table) -> tuple[str, bool]:
+        def judge(rows: Table) -> tuple[str, Holds]:
             same = {"model": rows.rows[0]["model"], "exposure": rows.rows[0]["exposure"]}
-            more = better.mean("psnr_db", **same).value - other.mean("psnr_db", **same).value
-            return f"{more:+.1f} dB", more > _TELLS_DB
+            more = difference(rows, other.where(**same), "psnr_db")
+            return f"{more:+} dB", within(more, low=_TELLS_DB)
 
         return judged(better, claim, paper, judge)
 
@@ -125,17 +127,12 @@ def _claims(results: Results) -> Sequence[Claim]:
         stated(swept, "SweepCam with 49 frames gives 24.9 to 26.8 dB, here on a grid", _SWEPT_DB),
         Claim(
             "The same on a line along the rows", "24.9 to 26.8 dB", on_a_line, "",
-            "confirmed only idealised" if all(_as_stated(mean.value) for mean in line.values()) else "not confirmed",
+            "confirmed only idealised" if on_the_line else verdict(on_the_line),
         ),
         stated(dots, "49 shifting dots give 34 to 35.5 dB", (34.0, 35.5)),
         gain("49 dots beat SweepCam's 49 frames", "higher", dots, swept),
         gain("SweepCam's 49 frames beat 49 frames through a mask that rests", "", swept, still),
     ]  # fmt: skip
-
-
-def _as_stated(psnr_db: float) -> bool:
-    """Whether SweepCam's decibels are near the paper's."""
-    return _SWEPT_DB[0] - TOLERANCE_DB <= psnr_db <= _SWEPT_DB[1] + TOLERANCE_DB
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:

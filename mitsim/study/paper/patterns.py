@@ -14,10 +14,11 @@ from mitsim.study.charts import curves, image_grid
 from mitsim.study.compare import label
 from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Scope
 from mitsim.study.exposures import CONVENTIONS, DIM, EQUAL_FRAME, MODELS, RENDERED
-from mitsim.study.paper.measure import by_print, imaged, judged, panels, pictured, stated
+from mitsim.study.paper.measure import by_print, imaged, panels, pictured, stated
 from mitsim.study.plots import singular_values
 from mitsim.study.studio import Studio
 from mitsim.study.table import Table
+from mitsim.study.verdicts import Holds, difference, judged, within
 
 FAMILIES = (
     "uniform", "random:2", "random:4", "random:5", "random:7", "random:8", "dots:2", "dots:3", "dots:4", "dots:5",
@@ -68,9 +69,9 @@ def _claims(results: Results) -> Sequence[Claim]:
 def _better(table: Table, claim: str, better: str, other: str) -> Claim:
     """A claim that one family is ``better`` than an ``other``."""
 
-    def judge(rows: Table) -> tuple[str, bool]:
-        one, two = (rows.mean("psnr_db", patterns=name).value for name in (better, other))
-        return f"{one - two:+.1f} dB", one > two
+    def judge(rows: Table) -> tuple[str, Holds]:
+        gain = difference(rows.where(patterns=better), rows.where(patterns=other), "psnr_db")
+        return f"{gain:+} dB", within(gain, low=0)
 
     return judged(table, claim, "higher", judge)
 

@@ -22,9 +22,10 @@ from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Sc
 from mitsim.study.exposures import EQUAL_PEAK, RENDERED, peak_time
 from mitsim.study.gloss import CAUSES, INTERREFLECTION, PIXELS, REST, SATURATION, SENSOR, split
 from mitsim.study.metrics import psnr
-from mitsim.study.paper.measure import single, verdict
+from mitsim.study.paper.measure import single
 from mitsim.study.studio import Studio
 from mitsim.study.table import Mean, Table, Value
+from mitsim.study.verdicts import Holds, difference, every, sampled, verdict_at, within
 
 CARD, BLADE, DISC = SHIPPED = ("gift_card", "metal_blade", "compact_disc")
 SHAPES = {"plate": {"shape": "rectangle", "z": "400"}, "ball": {"shape": "sphere", "z": "440"}}
@@ -47,6 +48,8 @@ _ROUNDING = 1e-12
 """Mean square of an error that is rounding: factors of a condition of 1e7 leave 1e-28 to 1e-14 of the image's."""
 _PLAIN_DB = 20.0
 """Artefacts of a tenth of white are plainly seen."""
+_ARTEFACTS = "artefacts_db"
+"""PSNR that the errors by gloss alone would leave."""
 _NAMES = {
     PIXELS: "gloss over pixels", SENSOR: "gloss over sensor", INTERREFLECTION: INTERREFLECTION,
     SATURATION: SATURATION, REST: "rest",
@@ -58,7 +61,7 @@ _DRAWN = ("dots:7", EQUAL_PEAK)
 def _points(scope: Scope) -> Sequence[Point]:
     base = replace(scope.setup, accuracy=max(scope.setup.accuracy, _ACCURACY))
     if scope.pictures == (None,):
-        return [Point.of(base, subject=base.scene, seed=seed) for seed in scope.seeds]
+        return [Point.of(base, subject=base.scene, seed=seed) for seed in scope.repeats]
     setups = {name: [replace(base, scene=name)] for name in scope.chosen(SHIPPED, (CARD, DISC))}
     for name, shape in () if scope.quick else SHAPES.items():
         setups[name] = [
@@ -68,7 +71,7 @@ def _points(scope: Scope) -> Sequence[Point]:
         Point.of(setup, subject=name, seed=seed)
         for name, each in setups.items()
         for setup in each
-        for seed in scope.seeds
+        for seed in scope.repeats
     ]
 
 
@@ -117,31 +120,32 @@ def _claims(results: Results) -> Sequence[Claim]:
     there = [name for name in SHIPPED if name in table.distinct("subject")]
     if not {CARD, DISC} <= set(there):
         return []
-    found = {
-        exposure: {name: table.mean("artefacts_db", subject=name, exposure=exposure).value for name in there}
-        for exposure in EXPOSURES
-    }
+    found = {exposure: {name: table.where(subject=name, exposure=exposure) for name in there} for exposure in EXPOSURES}
     told = [
-        f"{exposure}: {', '.join(f'{name} {level:.1f} dB' for name, level in levels.items())}".replace("_", " ")
-        for exposure, levels in found.items()
+        f"{exposure}: {', '.join(f'{name} {_artefacts(rows)} dB' for name, rows in by_name.items())}".replace("_", " ")
+        for exposure, by_name in found.items()
     ]
 
-    def claim(text: str, paper: str, holds: Callable[[Mapping[str, float]], bool]) -> Claim:
-        at = [exposure for exposure, levels in found.items() if holds(levels)]
-        decided = f"confirmed only exposed at {at[0]}" if len(at) == 1 else verdict(bool(at))
+    def claim(text: str, paper: str, holds: Callable[[Mapping[str, Table]], Holds]) -> Claim:
+        decided = verdict_at({exposure: holds(by_name) for exposure, by_name in found.items()})
         return Claim(f"{text} (artefacts of gloss, 49 dots)", paper, "", "; ".join(told), decided)
 
-    def well(levels: Mapping[str, float]) -> bool:
-        return min(level for name, level in levels.items() if name != DISC) > _PLAIN_DB
+    def well(by_name: Mapping[str, Table]) -> Holds:
+        return every(*(within(_artefacts(rows), low=_PLAIN_DB) for name, rows in by_name.items() if name != DISC))
 
-    def worst(levels: Mapping[str, float]) -> bool:
-        return levels[DISC] < _PLAIN_DB and levels[DISC] == min(levels.values())
+    def worst(by_name: Mapping[str, Table]) -> Holds:
+        more = (difference(by_name[DISC], rows, _ARTEFACTS) for name, rows in by_name.items() if name != DISC)
+        return every(within(_artefacts(by_name[DISC]), high=_PLAIN_DB), *(within(each, high=0) for each in more))
 
     plain = " and ".join(name.replace("_", " ") for name in there if name != DISC)  # a quick study has no blade
     return [
         claim(f"{plain.capitalize()} come{'s' * (len(there) == 2)} out well", "quite good", well),
         claim("The compact disc is the worst, with severe artefacts", "severe artefacts", worst),
     ]
+
+
+def _artefacts(rows: Table) -> Mean:
+    return sampled(rows, _ARTEFACTS)
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 import tracemalloc
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,10 +18,11 @@ from mitsim.study.compare import in_text, label
 from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Scope
 from mitsim.study.exposures import EQUAL_FRAME, LAMBDAS, MODELS
 from mitsim.study.metrics import psnr
-from mitsim.study.paper.measure import bars, by_print, found, judged, pictured
+from mitsim.study.paper.measure import bars, by_print, found, pictured
 from mitsim.study.plots import quality_bars
 from mitsim.study.studio import Studio
 from mitsim.study.table import Table
+from mitsim.study.verdicts import Holds, Judge, difference, judged, sampled, within
 
 FAMILIES = ("uniform", "dots:4", "dots:7")
 _SHOWN = ("uniform", "dots:7")
@@ -32,7 +33,7 @@ _WEIGHTS = tuple(float(weight) for weight in np.logspace(-1.5, 1.5, 7))
 _COLUMNS = {"psnr_db": "automatic", "psnr_best_db": "best"}
 """Which weight, by column."""
 _VISIBLE_DB = 1.0
-"""A gain that may be seen: a fifth of the squared error."""
+"""A difference that may be seen: a fifth of the squared error."""
 
 
 def _points(scope: Scope) -> Sequence[Point]:
@@ -70,25 +71,27 @@ def _measure(studio: Studio, point: Point) -> Found:
 
 
 def _claims(results: Results) -> Sequence[Claim]:
-    def not_better(column: str) -> Callable[[Table], tuple[str, bool]]:
-        def judge(rows: Table) -> tuple[str, bool]:
-            plain, tv = (rows.mean(column, method=method) for method in METHODS)
-            return f"Tikhonov {plain} dB, total variation {tv} dB", tv.value - plain.value < _VISIBLE_DB
+    def alike(column: str) -> Judge:
+        def judge(rows: Table) -> tuple[str, Holds]:
+            plain, tv = (rows.where(method=method) for method in METHODS)
+            gain = difference(tv, plain, column)
+            means = f"Tikhonov {sampled(plain, column)} dB, total variation {sampled(tv, column)} dB"
+            return f"{means}: {gain:+} dB", within(gain, -_VISIBLE_DB, _VISIBLE_DB)
 
         return judge
 
-    def faster(rows: Table) -> tuple[str, bool]:
+    def faster(rows: Table) -> tuple[str, Holds]:
         plain, tv = (rows.where(method=method) for method in METHODS)
         costs = [f"{each.mean('seconds').value:.2g} s, {each.mean('peak_mib').value:.2g} MiB" for each in (plain, tv)]
-        return " against ".join(costs), plain.mean("seconds").value < tv.mean("seconds").value
+        return " against ".join(costs), within(difference(plain, tv, "seconds"), high=0)
 
     table = results.table
     told = [
         judged(
             table.where(patterns=family),
-            f"Total variation is not visibly better, {in_text(family)}, {which} weight",
-            "not better",
-            not_better(column),
+            f"Total variation is as good (within {_VISIBLE_DB:g} dB), {in_text(family)}, {which} weight",
+            "not visibly better",
+            alike(column),
         )
         for column, which in _COLUMNS.items()
         for family in _SHOWN

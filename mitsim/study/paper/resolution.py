@@ -19,11 +19,12 @@ from mitsim.core.errors import MitsimError
 from mitsim.study.charts import curves, image_grid
 from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Scope
 from mitsim.study.exposures import EQUAL_FRAME, MODELS, LitScene
-from mitsim.study.paper.measure import by_patterns, judged, panels, pictured, shown
+from mitsim.study.paper.measure import by_patterns, panels, pictured, shown
 from mitsim.study.pictures import PRINT_MM
 from mitsim.study.studio import Studio
 from mitsim.study.table import Table
 from mitsim.study.transfer import contrast, modulation, slanted_edge
+from mitsim.study.verdicts import Holds, difference, every, judged, sampled, within
 
 PAIRS_A_MM = (0.13, 0.17, 0.21, 0.26, 0.35, 0.43, 0.52, 0.6)
 """The paper's groups 20 to 5, and one that no pixel of 0.9375 mm can tell."""
@@ -45,7 +46,7 @@ def _points(scope: Scope) -> Sequence[Point]:
     return [
         Point.of(scope.setup.printed(name), model=model, patterns=family, exposure=EQUAL_FRAME, seed=seed)
         for name in prints
-        for seed in scope.seeds
+        for seed in scope.repeats
         for family in scope.chosen(FAMILIES, ("uniform", "dots:7"))
         for model in MODELS
     ]
@@ -92,17 +93,20 @@ def _contrast(image: FloatArray, cycles: float) -> float:
 def _claims(results: Results) -> Sequence[Claim]:
     table = results.table
 
-    def rises(rows: Table) -> tuple[str, bool]:
+    def rises(rows: Table) -> tuple[str, Holds]:
         limits = {name: _limit(of_family) for name, of_family in by_patterns(rows).items()}
         fine = by_patterns(rows.where(pairs_a_mm=_FINEST))
-        kept = {name: of_family.mean("contrast").value for name, of_family in fine.items()}
+        kept = {name: sampled(of_family, "contrast").value for name, of_family in fine.items()}
         said = ", ".join(f"{name[:1].lower()}{name[1:]} {limits[name]:g} ({kept[name]:.2f})" for name in limits)
-        one, *_, most = kept.values()
-        return said, all(fewer <= more for fewer, more in pairwise(limits.values())) and one < most
+        gains = [within(difference(more, fewer, "contrast"), low=0) for fewer, more in pairwise(fine.values())]
+        families = list(fine.values())
+        gain = within(difference(families[-1], families[0], "contrast"), low=0)
+        return said, False if False in gains else gain
 
-    def apart(rows: Table) -> tuple[str, bool]:
+    def apart(rows: Table) -> tuple[str, Holds]:
         dots = rows.where(patterns="dots:7")
-        return f"contrast {dots.mean('contrast', pairs_a_mm=_FINEST).value:.2f}", _limit(dots) >= _FINEST
+        seen = {pairs: sampled(dots.where(pairs_a_mm=pairs), "contrast") for pairs in _bars(dots) if pairs <= _FINEST}
+        return f"contrast {seen[_FINEST].value:.2f}", every(*(within(each, low=_TOLD) for each in seen.values()))
 
     resolution = (
         f"Resolution rises with the number of patterns (finest bars of 10 % contrast, line pairs a mm; contrast at "
@@ -117,11 +121,16 @@ def _claims(results: Results) -> Sequence[Claim]:
 def _limit(rows: Table) -> float:
     """Finest bars up to which all are told apart; 0 for none."""
     limit = 0.0
-    for pairs, mean in sorted(rows.means("contrast", "pairs_a_mm").items()):
-        if mean.value < _TOLD:
+    for pairs in _bars(rows):
+        if sampled(rows.where(pairs_a_mm=pairs), "contrast").value < _TOLD:
             break
-        limit = float(pairs)
+        limit = pairs
     return limit
+
+
+def _bars(rows: Table) -> list[float]:
+    """Line pairs a mm of all bars that a contrast was measured of."""
+    return sorted(rows.means("contrast", "pairs_a_mm"))
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:

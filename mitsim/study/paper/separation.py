@@ -27,8 +27,9 @@ from mitsim.study.experiment import Claim, Experiment, Found, Point, Results, Sc
 from mitsim.study.exposures import EQUAL_PEAK, RENDERED, LitScene, Unexposed
 from mitsim.study.gloss import direct_of
 from mitsim.study.metrics import psnr
-from mitsim.study.paper.measure import single, verdict
+from mitsim.study.paper.measure import single
 from mitsim.study.studio import Studio
+from mitsim.study.verdicts import every, sampled, verdict, within
 
 SCENES = ("corner", "cookie_bag")
 FAMILIES = ("dots:4", "dots:7", "dots:10")
@@ -52,7 +53,7 @@ def _points(scope: Scope) -> Sequence[Point]:
     return [
         Point.of(setup, subject=setup.scene, patterns=family, seed=seed)
         for setup in setups
-        for seed in scope.seeds
+        for seed in scope.repeats
         for family in scope.chosen(FAMILIES, FAMILIES[1:2])
     ]
 
@@ -150,9 +151,11 @@ def _claims(results: Results) -> Sequence[Claim]:
 
     def claim(depth: str) -> Claim:
         rows = table.where(depth=depth)
-        gains = {name: rows.mean("gain_db", subject=name, patterns="dots:7") for name in table.distinct("subject")}
+        gains = {
+            name: sampled(rows.where(subject=name, patterns="dots:7"), "gain_db") for name in table.distinct("subject")
+        }
         told = ", ".join(f"{name.replace('_', ' ')} {gain} dB" for name, gain in gains.items())
-        gained = all(gain.value > 0 for gain in gains.values())
+        gained = every(*(within(gain, low=0) for gain in gains.values()))
         text = f"49 dots tell global light apart in scenes {_DEPTHS[depth]}, and the image gains (Nayar et al. 2006)"
         return Claim(text, "", "", told, verdict(gained))
 

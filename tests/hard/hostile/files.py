@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import os
 import struct
 from pathlib import Path
+
+from PIL import Image
 
 from tests.hard.hostile import (
     GOOD,
@@ -238,6 +241,14 @@ def _contents() -> list[Case]:
 
     points = struct.pack("<9f", 0, 0, 500, 9, 0, 500, 0, 9, 500)
     good = header() + points + struct.pack("<B3i", 3, 0, 1, 2)
+
+    def saved(kind: str, **more: object) -> bytes:
+        held, exif = io.BytesIO(), Image.Exif()
+        exif[274] = 6
+        Image.new("L", (4, 8), 128).save(held, kind, **{"exif": exif, **more})
+        return held.getvalue()
+
+    frames = {"exif": b"", "save_all": True, "append_images": [Image.new("L", (4, 8))]}
     large = b"PF\n30000 30000\n-1.0\n"
     return [
         shown("claims 2^31 texels", png(4, 4, (65535, 32769)), "65535x32769"),
@@ -252,6 +263,9 @@ def _contents() -> list[Case]:
         shown(
             "JPEG of two sizes", jpeg(4, 4).replace(b"\xff\xda", jpeg(20000, 20000)[2:-8] + b"\xff\xda"), "20000x20000"
         ),
+        shown("turned JPEG", saved("JPEG"), "orientation 6"),
+        shown("turned PNG", saved("PNG"), "orientation 6"),
+        shown("animated PNG", saved("PNG", **frames), "animated"),
         shown("huge PFM", large, "30000x30000"),
         shown("huge HDR", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 90000 +X 90000\n", "90000x90000"),
         shown(
@@ -298,15 +312,25 @@ def _contents() -> list[Case]:
         meshed("unknown format", good.replace(b"binary_little_endian", b"binary_odd"), "no format"),
         meshed("unknown type", good.replace(b"float x", b"quad x"), "not understood"),
         meshed(
-            "faces first",
+            "vertices with a list",
             good.replace(b"element face", b"element vertex").replace(b"element vertex", b"element face", 1),
-            "other than vertex and face",
+            "a list in element vertex",
         ),
         meshed(
-            "further elements",
-            MESH.replace("end_header", "element tristrips 1\nproperty int a\nend_header"),
-            "other than vertex and face",
+            "further elements with a list",
+            MESH.replace("end_header", "element tristrips 1\nproperty list int int a\nend_header"),
+            "a list in element tristrips",
         ),
+        meshed(
+            "a billion of further elements",
+            MESH.replace("end_header", "element nothing 999999999\nend_header"),
+            "element nothing without properties",
+        ),
+        meshed("two properties of a name", MESH.replace("float y", "float x", 1), "two properties of one name"),
+        meshed("whole numbers for coordinates", MESH.replace("float x", "int x"), "of type float or double"),
+        meshed("no faces", header(3, 0) + points, "cloud of points"),
+        meshed("bytes after the last face", good + b"\0", "more than its header"),
+        meshed("words after the last face", f"{MESH} 7", "more than its header"),
         meshed(
             "line ends of another kind",
             good.replace(b"float z\n", b"float z\ncomment \x85property float w\n").replace(points, points[:-4]),

@@ -1,6 +1,7 @@
 """`mitsim sense`: an image of irradiance or radiance behind a camera's sensor."""
 
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -129,3 +130,23 @@ def test_a_png_holds_16_bits(tmp_path: Path) -> None:
             check_ending(tmp_path / "x.png", model)
     with pytest.raises(MitsimError, match="ends in"):
         check_ending(tmp_path / "x.jpg", sensor())
+
+
+def test_an_array_that_claims_is_held_against_its_file(tmp_path: Path) -> None:
+    """Sparse, cut in its header, or of more pixels than a sensor has. (Planted: numpy's reader, which raises a
+    TokenError for the second.)"""
+    np.save(tmp_path / "image.npy", IMAGE)
+    whole = (tmp_path / "image.npy").read_bytes()
+    for content, size, words in (
+        (whole, 1 << 40, "and 1099511627648 follow"),
+        (whole.replace(b"'shape': (", b"'shape'  (("), len(whole), "not an array of numbers"),
+        (whole.replace(b"}", b"{"), len(whole), "header is damaged|not an array"),
+        (whole[:-1], len(whole) - 1, "its header claims"),
+    ):
+        (tmp_path / "bad.npy").write_bytes(content)
+        os.truncate(tmp_path / "bad.npy", size)
+        with pytest.raises(MitsimError, match=words):
+            read_image(tmp_path / "bad.npy")
+    np.lib.format.open_memmap(tmp_path / "wide.npy", "w+", np.float64, (1, 20000)).flush()
+    with pytest.raises(MitsimError, match="at most 16384 pixels a side"):
+        read_image(tmp_path / "wide.npy")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any, cast
 
 import pytest
 
 from mitsim.cli import screen
+from mitsim.core.errors import MitsimError
 
 
 @pytest.fixture
@@ -36,3 +38,56 @@ def test_hidden_progress_leaves_no_line(capsys: pytest.CaptureFixture[str], ever
         for point in range(6):
             progress("transport", point / 6)
     assert capsys.readouterr().err == ""
+
+
+HOSTILE = "a\x1b]0;title\x07\u202eb\x9bc [bold]d[/] \\x1b"
+HARMLESS = "a ]0;title  b c [bold]d[/] \\x1b"
+
+
+def test_no_control_character_of_a_file_reaches_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    """Escape, bell, C1's CSI and a turn of direction; line ends of results stay. JSON escapes them by itself. (Planted:
+    warnings as they are.)"""
+    assert screen.finish(False, {}, [f"{HOSTILE}\nnext"], [HOSTILE]) == 1
+    out, err = capsys.readouterr()
+    assert out == f"{HARMLESS}\nnext\n" and err == f"mitsim: warning: {HARMLESS}\n"
+    screen.finish(True, {"name": HOSTILE}, [], [])
+    assert capsys.readouterr().out.isascii()
+    with screen.showing_progress(hidden=False) as progress:
+        progress(HOSTILE, 0.5)
+    assert "\x1b" not in capsys.readouterr().err
+
+
+def test_names_in_a_plan_are_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
+    """A surface that a scene calls "[/]" was an error of rich. (Planted: markup read.)"""
+
+    class Row:
+        name, state, reason, error_if_off, seconds = "gloss", "exact", f"of {HOSTILE}", 0.1, 1.0
+
+    class Plan:
+        accuracy, effects, predicted, predicted_seconds = 1e-3, (Row,), {"plan": 1.0}, 1.0
+        colour = asked_seconds = cost = None
+
+    screen.print_plan(cast(Any, Plan))
+    out = capsys.readouterr().out
+    assert "\x1b]" not in out and "[/]" in out.replace("\n", "")
+
+
+def test_output_that_nobody_reads_ends_as_by_a_signal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A closed pipe is SIGPIPE's status, a full disk one line. (Planted: either passed over.)"""
+
+    class Full:
+        def __init__(self, number: int) -> None:
+            self.number = number
+
+        def write(self, text: str) -> int:
+            raise OSError(self.number, "No space left on device")
+
+        flush = write
+
+    monkeypatch.setattr(screen.sys, "stdout", Full(32))
+    with pytest.raises(SystemExit) as ended, screen.written():
+        print("result")
+    assert ended.value.code == 141
+    monkeypatch.setattr(screen.sys, "stdout", Full(28))
+    with pytest.raises(MitsimError, match="standard output: cannot be written"), screen.written():
+        print("result")

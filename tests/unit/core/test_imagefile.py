@@ -5,7 +5,9 @@ What a file's reader may do to numbers (scale, invert, swap bytes) is tried on n
 
 from __future__ import annotations
 
+import os
 import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,7 +18,7 @@ from PIL import Image, PngImagePlugin
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import write_frame
-from mitsim.core.imagefile import image_size, own_end, read_image, read_images
+from mitsim.core.imagefile import _look, _told, image_size, own_end, read_image, read_images
 from mitsim.core.imagelist import Raw, Wanted, image_files
 
 NUMBERS = (np.arange(35).reshape(5, 7) * 113).astype(np.uint16)
@@ -207,3 +209,136 @@ def test_files_are_ordered_by_their_numbers(tmp_path: Path) -> None:
     headless = Wanted(raw=Raw.of("1x1", 8, "little"))
     assert [path.name for path in image_files(tmp_path, headless)] == ["f1.png", "f3.raw", "f9.png", "f10.png"]
     assert image_files(tmp_path / "notes.txt") == (tmp_path / "notes.txt",)
+
+
+def turned(number: int) -> Image.Exif:
+    """Metadata that asks for a picture to be shown turned or mirrored."""
+    exif = Image.Exif()
+    exif[274] = number
+    return exif
+
+
+def chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def png_with(kind: bytes, data: bytes, behind: bool = False) -> Write:
+    """A good PNG with one more chunk, before its pixels or behind them."""
+
+    def write(path: Path) -> None:
+        Image.fromarray(NUMBERS).save(path)
+        whole = path.read_bytes()
+        at = whole.index(b"IEND" if behind else b"IDAT") - 4
+        path.write_bytes(whole[:at] + chunk(kind, data) + whole[at:])
+
+    return write
+
+
+def pages(count: int) -> Write:
+    """A TIFF of 8 bits whose pages, so many, share their pixels and all but the place of the next."""
+
+    def write(path: Path) -> None:
+        tags = {256: 7, 257: 5, 258: 8, 259: 1, 262: 1, 273: 8, 277: 1, 278: 5, 279: 35}
+        entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags.items())
+        size, first = 2 + len(entries) + 4, 8 + 36
+        places = [*(first + size * (page + 1) for page in range(count - 1)), 0]
+        parts = (struct.pack("<H", len(tags)) + entries + struct.pack("<I", place) for place in places)
+        path.write_bytes(b"II*\0" + struct.pack("<I", first) + bytes(36) + b"".join(parts))
+
+    return write
+
+
+def raw_photograph(path: Path) -> None:
+    """A preview, and the picture itself in a part of it, as DNG has it."""
+    with tifffile.TiffWriter(path) as file:
+        file.write(NUMBERS[::2, ::2], subifds=1)
+        file.write(NUMBERS)
+
+
+@pytest.mark.parametrize("number", range(2, 9))
+@pytest.mark.parametrize("name", ["a.png", "a.tif"])
+def test_a_picture_to_be_shown_turned_is_refused(tmp_path: Path, name: str, number: int) -> None:
+    """Pillow turns the pixels of a TIFF and not those of a PNG; what is stored is another picture than what is seen.
+    An orientation of 1 says nothing. (Planted: no look at the orientation.)"""
+    saved(NUMBERS, exif=turned(number))(tmp_path / name)
+    for wanted in (Wanted(), Wanted("mask drawing"), Wanted("point spread function", colour=True)):
+        with pytest.raises(MitsimError, match=f"has the orientation {number}: it is to be shown turned"):
+            read_image(tmp_path / name, wanted)
+    saved(NUMBERS, exif=turned(1))(tmp_path / name)
+    assert np.array_equal(read_image(tmp_path / name), NUMBERS)
+
+
+@pytest.mark.parametrize(
+    ("name", "write", "words"),
+    [
+        (
+            "a.png",
+            saved(NUMBERS.astype(np.uint8), save_all=True, append_images=[Image.new("L", (7, 5))] * 3),
+            "animated",
+        ),
+        # One frame besides the picture, which then is none of them.
+        ("a.png", png_with(b"acTL", struct.pack(">II", 1, 0)), "animated"),
+        ("a.png", png_with(b"eXIf", turned(3).tobytes()[6:], behind=True), "orientation 3"),
+        ("a.tif", lambda path: tifffile.imwrite(path, NUMBERS, subfiletype=1), "previews"),
+        ("a.tif", raw_photograph, "previews"),
+        ("a.tif", lambda path: tifffile.imwrite(path, NUMBERS, tile=(2048, 2048), compression="zlib"), "tiles larger"),
+        ("a.tif", pages(2**16 + 1), "over 65536 pages"),
+        (
+            "a.npy",
+            lambda path: (np.save(path, NUMBERS), os.truncate(path, 1 << 40)),
+            "numbers, and 1099511627648 follow",
+        ),
+    ],
+    ids=["animated", "one frame", "turned behind", "preview", "parts", "tiles", "pages", "sparse"],
+)
+def test_a_picture_that_holds_another_is_refused(tmp_path: Path, name: str, write: Write, words: str) -> None:
+    """(Planted: each of the checks left out.)"""
+    write(tmp_path / name)
+    with pytest.raises(MitsimError, match=words):
+        next(read_images(tmp_path / name))
+
+
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [
+        ("a.npy", lambda path: np.save(path, np.zeros((3, 500, 500)))),
+        ("a.npy", lambda path: np.save(path, np.asfortranarray(np.zeros((3, 500, 500))))),
+        ("a.tif", lambda path: tifffile.imwrite(path, np.zeros((3, 500, 500), np.uint16), photometric="minisblack")),
+        (
+            "a.tif",
+            lambda path: tifffile.imwrite(
+                path, np.zeros((3, 500, 500), np.uint16), photometric="minisblack", compression="zlib"
+            ),
+        ),
+        ("a.raw", lambda path: np.zeros((500, 500), np.uint16).tofile(path)),
+        ("a.png", lambda path: Image.effect_noise((500, 500), 50).save(path)),
+    ],
+    ids=["npy", "npy columns first", "tif", "tif packed", "raw", "png"],
+)
+def test_a_file_that_is_cut_while_it_is_read_is_refused(tmp_path: Path, name: str, write: Write) -> None:
+    """Between header and pixels: a map of the file would end the process. (Planted: NPY mapped, which it did.)"""
+    write(tmp_path / name)
+    wanted = Wanted(raw=Raw.of("500x500", 16, "little"))
+    with _told(tmp_path / name, wanted):
+        found = _look(tmp_path / name, wanted)
+    os.truncate(tmp_path / name, 600)
+    with pytest.raises(MitsimError, match="cannot be read"), _told(tmp_path / name, wanted):
+        list(found.read())
+
+
+def test_no_picture_is_mapped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pillow maps plain TIFFs that it is given by name."""
+    import mmap
+
+    monkeypatch.setattr(mmap, "mmap", lambda *_, **__: pytest.fail("mapped"))
+    for name in ("a.tif", "a.png", "a.npy"):
+        np.save(tmp_path / name, NUMBERS) if name == "a.npy" else saved(NUMBERS)(tmp_path / name)
+        assert np.array_equal(read_image(tmp_path / name), NUMBERS)
+
+
+def test_a_picture_beyond_free_memory_is_refused_by_its_header(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sparse files cost nothing on disk."""
+    np.lib.format.open_memmap(tmp_path / "a.npy", "w+", np.float64, (16000, 16000)).flush()
+    monkeypatch.setattr("mitsim.core.resources.free_memory", lambda: 2**30)
+    with pytest.raises(MitsimError, match=r"a\.npy: would take about .* GiB of memory; allowed are 922 MiB"):
+        read_image(tmp_path / "a.npy")

@@ -1,5 +1,7 @@
 """Output places are refused before work, held against other processes, and filled with whole files only."""
 
+import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -8,7 +10,7 @@ import pytest
 
 from mitsim.core import output
 from mitsim.core.errors import MitsimError
-from mitsim.core.output import LOCK, output_folder, whole_file
+from mitsim.core.output import LOCK, check_apart, output_file, output_folder, prepare_output, whole_file
 
 
 def test_prepare_output_makes_the_folder(tmp_path: Path) -> None:
@@ -136,3 +138,66 @@ def test_an_unfinished_calibration_is_not_to_be_emptied(tmp_path: Path) -> None:
         (tmp_path / "manifest.json").write_text(text)
         with pytest.raises(MitsimError, match="holds files already; choose a new one or empty it"):
             output.prepare_output(tmp_path)
+
+
+def test_no_device_pipe_or_socket_is_replaced(tmp_path: Path) -> None:
+    """`-o /dev/null` as root made a file of it, for the whole machine. (Planted: the check left out of either.)"""
+    os.mkfifo(tmp_path / "pipe")
+    with socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(str(tmp_path / "socket"))
+        (tmp_path / "link").symlink_to("/dev/null")
+        places = {"pipe": "a named pipe", "socket": "a socket", "link": "a device", "/dev/null": "a device"}
+        for name, kind in places.items():
+            path = tmp_path / name
+            with pytest.raises(MitsimError, match=f"is {kind}, which a file would replace"):
+                prepare_output(path, overwrite=True, kind="file")
+            with pytest.raises(MitsimError, match=f"is {kind}"), whole_file(path) as part:
+                part.write_text("x")
+            assert not path.is_file()
+
+
+def test_a_link_stays_and_its_file_is_written(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    (tmp_path / "link").symlink_to("there/frame")
+    with whole_file(tmp_path / "link") as part:
+        part.write_text("new")
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "there" / "frame").read_text() == "new"
+    assert [path.name for path in (tmp_path / "there").iterdir()] == ["frame"]
+
+
+@pytest.mark.parametrize("name", ["n" * 251 + ".exr", "\u00e9" * 125 + ".exr"])
+def test_the_longest_names_are_written(tmp_path: Path, name: str) -> None:
+    """255 bytes: hidden files beside it have to be shorter. (Planted: the whole name in theirs, which failed once the
+    work was done.)"""
+    with output_file(tmp_path / name) as place, whole_file(place) as part:
+        part.write_text("new")
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_one_of_two_writers_of_a_file_is_refused(tmp_path: Path) -> None:
+    """By whatever name. (Planted: no lock, so that the later one won in silence.)"""
+    (tmp_path / "link").symlink_to(tmp_path / "frame.exr")
+    with output_file(tmp_path / "frame.exr", overwrite=True) as place:
+        for name in ("frame.exr", "link"):
+            with pytest.raises(MitsimError, match="another mitsim is writing there"), output_file(tmp_path / name):
+                pass
+        with output_file(tmp_path / "other.exr"):
+            place.write_text("ours")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["frame.exr", "link"]
+    with pytest.raises(MitsimError, match="exists already"), output_file(place):
+        pass
+
+
+def test_what_is_read_is_not_replaced(tmp_path: Path) -> None:
+    """(Planted: names compared.)"""
+    (tmp_path / "run").mkdir()
+    for name in ("frame.exr", "run/manifest.json"):
+        (tmp_path / name).write_text("mine")
+    (tmp_path / "hard").hardlink_to(tmp_path / "frame.exr")
+    (tmp_path / "soft").symlink_to("frame.exr")
+    inputs = tmp_path / "frame.exr", tmp_path / "run"
+    for name in ("frame.exr", "hard", "soft", "run/../frame.exr", "run/manifest.json"):
+        with pytest.raises(MitsimError, match="would replace"):
+            check_apart(tmp_path / name, inputs)
+    for name in ("new.exr", "run/new.h5"):
+        check_apart(tmp_path / name, inputs)

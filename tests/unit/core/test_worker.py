@@ -378,3 +378,47 @@ def test_control_c_while_mitsuba_is_imported_waits_for_it() -> None:
     process = start(IMPORT)
     signal.signal(signal.SIGINT, before)
     assert (*process.communicate(), process.returncode) == ("True True\n", "mitsim: interrupted\n", 130)
+
+
+CLOSED = """
+import os, sys
+os.close({number})
+os.execv(sys.executable, [sys.executable, "-c", {program!r}])
+"""
+PRINTS = """
+import sys
+from mitsim.core.worker import enter_worker
+enter_worker()
+with open("kept", "w"):
+    print("out")
+    print("err", file=sys.stderr)
+"""
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_a_closed_stream_is_no_file(tmp_path: Path, number: int) -> None:
+    """A file would get its number, and whatever is printed. (Planted: nothing in its place: "err" came out on stdout,
+    and "out" in the file.)"""
+    done = subprocess.run(
+        [sys.executable, "-c", CLOSED.format(number=number, program=PRINTS)],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        check=False,
+    )
+    if number == 1:
+        line = "mitsim: standard output is closed; give it a file, a pipe or /dev/null\n"
+        assert (done.returncode, done.stdout, done.stderr) == (2, "", line) and not (tmp_path / "kept").exists()
+    else:
+        assert (done.returncode, done.stdout, done.stderr) == (0, "out\n", "err\n" if number == 0 else "")
+        assert (tmp_path / "kept").read_text() == ""
+
+
+def test_a_fault_without_a_place_for_its_traceback(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "nowhere"))
+    with pytest.raises(SystemExit) as ended:
+        worker.end_uncaught(ValueError("x" * 1000))
+    (line,) = capsys.readouterr().err.splitlines()
+    assert ended.value.code == 2 and "its traceback could not be kept" in line and len(line) < 500

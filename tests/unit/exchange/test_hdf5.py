@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -158,3 +160,62 @@ def test_checksums_follow_the_bytes_that_were_written(bench: Made, tmp_path: Pat
     shots = ms.load_run(other.save(tmp_path / "run 2"))
     assert np.array_equal(shots.dn, ms.load_run(bench.run).dn)
     assert shots.manifest.checksums != run.manifest.checksums
+
+
+@pytest.mark.parametrize(
+    ("name", "made_so", "words"),
+    [
+        ("run/shots/DN", {"shape": (6, 16000, 16000), "dtype": "u4", "chunks": (1, 16000, 16000)}, "not all is stored"),
+        ("run/shots/DN", {"shape": (6, 16000, 16000), "dtype": "u4"}, "not all is stored"),
+        ("run/manifest", {"shape": (1 << 40,), "dtype": "u1", "chunks": (1 << 20,)}, "not all is stored"),
+        ("run/manifest", {"data": np.array(["{}"] * 40, object), "dtype": h5py.string_dtype()}, "a text of at most"),
+        ("run/manifest", {"shape": None, "dtype": "u1"}, "claims None"),
+        ("run/truth/reflectance", {"shape": (1 << 33, 4), "dtype": "f4", "chunks": (1, 4)}, "not all is stored"),
+        ("run/truth/reflectance", {"data": np.zeros((9, 9), "f4"), "compression": "lzf"}, "filters other than gzip"),
+        ("run/truth/reflectance", {"data": np.zeros((9, 9), "f4"), "scaleoffset": 3}, "filters other than gzip"),
+        (
+            "run/truth/reflectance",
+            {"shape": (9, 9), "dtype": "f4", "chunks": (16000, 16000), "maxshape": (None, None)},
+            "not all is stored|over 1 GiB",
+        ),
+    ],
+)
+def test_what_is_not_stored_takes_no_memory(
+    bench: Made, tmp_path: Path, name: str, made_so: dict[str, Any], words: str
+) -> None:
+    """It would be read as zeros, terabytes of them. (Planted: read as h5py gives it; one test took 6 GB.)"""
+    path = exported(bench, tmp_path)
+    with h5py.File(path, "r+") as file:
+        del file[name]
+        file.create_dataset(name, **made_so)
+    with pytest.raises(MitsimError, match=words):
+        import_file(path, tmp_path / "run 2")
+    assert not (tmp_path / "run 2").exists()
+
+
+def test_a_frame_that_was_never_stored_is_no_black_one(bench: Made, tmp_path: Path) -> None:
+    """The third of six. (Planted: a dataset with any chunk counts as stored.)"""
+    path = exported(bench, tmp_path)
+    with h5py.File(path, "r+") as file:
+        frames = file["run/shots/DN"][()]
+        del file["run/shots/DN"]
+        stack = file.create_dataset("run/shots/DN", frames.shape, frames.dtype, chunks=(1, *frames.shape[1:]))
+        for number in (0, 1, 3, 4, 5):
+            stack[number] = frames[number]
+    with pytest.raises(MitsimError, match=r"/run/shots/DN claims \(6, 40, 52\), of which not all is stored"):
+        import_file(path, tmp_path / "run 2")
+
+
+def test_a_file_that_is_cut_while_it_is_read_is_refused(bench: Made, tmp_path: Path) -> None:
+    """Packed or plain: HDF5 reads zeros behind the end. (Planted: no look at the size; the last frames are black.)"""
+    path = exported(bench, tmp_path)
+    with h5py.File(path, "r+") as file:
+        frames = file["run/shots/DN"][()]
+        del file["run/shots/DN"]
+        file["run/shots/DN"] = frames
+    with open_hdf5(path) as file:
+        names = file.run.names
+        file.run.read(names[5])
+        os.truncate(path, path.stat().st_size - 100)
+        with pytest.raises(MitsimError, match="cut short while it was read"):
+            file.run.read(names[5])

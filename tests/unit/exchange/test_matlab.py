@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
+import struct
 import subprocess
+import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.io import loadmat, savemat
+from scipy.io import loadmat, savemat, whosmat
 
 import mitsim as ms
 from mitsim.core.errors import MitsimError
@@ -162,6 +164,9 @@ def test_files_that_are_none_are_refused_and_no_folder_is_left(tmp_path: Path) -
     changed("phi_left is no matrix", phi_left="none")
     changed("phi_right is missing", phi_right=None)
     changed("truth is no matrix", truth="none")
+    changed("truth_board_reflectance is .* numbers of shape", truth_board_reflectance=np.ones(3))
+    changed("truth_board_reflectance is .* numbers of shape", truth_board_reflectance="none")
+    changed("truth_standard_error is .* numbers of shape", truth_standard_error=np.ones((1, 1)))
     changed("not valid JSON", run_manifest="{")
     (tmp_path / "text.mat").write_text("phi_left")
     with pytest.raises(MitsimError, match="no MATLAB file"):
@@ -203,3 +208,109 @@ def test_a_plane_of_a_real_flatcams_calibration(angle: float, tmp_path: Path) ->
         import_file(tmp_path / "calib.mat", None, tmp_path / "cal 2", "green")
     with pytest.raises(MitsimError, match="holds no run"):
         import_file(tmp_path / "calib.mat", tmp_path / "run", None, "r")
+
+
+def element(kind: int, content: bytes, order: str = "<") -> bytes:
+    """An element of a MATLAB file of version 5."""
+    return struct.pack(f"{order}2I", kind, len(content)) + content + bytes(-len(content) % 8)
+
+
+def matrix(name: bytes, kind: int, sides: tuple[int, ...], content: bytes, flags: int = 0, order: str = "<") -> bytes:
+    """An array of a class; its ``content`` are elements."""
+    shape = struct.pack(f"{order}{len(sides)}i", *sides)
+    head = element(6, struct.pack(f"{order}2I", flags << 8 | kind, 0), order)
+    return element(14, head + element(5, shape, order) + element(1, name, order) + content, order)
+
+
+def mat(*parts: bytes, packed: bool = False, order: str = "<") -> bytes:
+    """A MATLAB file of these elements."""
+    mark = b"IM" if order == "<" else b"MI"
+    held = [element(15, zlib.compress(part))[: 8 + len(zlib.compress(part))] if packed else part for part in parts]
+    return b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack(f"{order}H", 0x100) + mark + b"".join(held)
+
+
+def nested(depth: int) -> bytes:
+    """A cell in a cell in a cell."""
+    held = b""
+    for _ in range(depth):
+        held = matrix(b"", 1, (1, 1), held)
+    return held
+
+
+NUMBER = element(9, struct.pack("<d", 2.5))
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_what_is_no_array_is_not_looked_into(tmp_path: Path, packed: bool) -> None:
+    """SciPy calls itself for every cell in a cell until the process ends. (Planted: all variables read, which did.)"""
+    deep = matrix(b"deep", 1, (1, 1), nested(8000)) if packed else matrix(b"deep", 1, (1, 1), nested(3000))
+    others = (
+        deep,
+        matrix(b"record", 2, (1, 1), element(5, struct.pack("<i", 8)) + element(1, b"a\0\0\0\0\0\0\0") + NUMBER),
+        element(14, element(6, struct.pack("<2I", 17, 0)) + element(1, b"opaque") + element(1, b"MCOS")),
+        matrix(b"call", 16, (1, 1), matrix(b"", 6, (1, 1), NUMBER)),
+        matrix(b"wave", 6, (1, 1), NUMBER + NUMBER, flags=0x08),
+        matrix(b"scarce", 5, (1, 1), NUMBER),
+    )
+    (tmp_path / "a.mat").write_bytes(mat(*others, matrix(b"P1b", 6, (1, 1), NUMBER), packed=packed))
+    assert matlab_file.names_in(tmp_path / "a.mat") == {"P1b"}
+    assert {
+        name: value for name, value in matlab_file.read_variables(tmp_path / "a.mat").items() if name[0] != "_"
+    } == {"P1b": [[2.5]]}
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_arrays_are_listed_as_scipy_lists_them(tmp_path: Path, order: str) -> None:
+    arrays = {
+        "a": np.arange(6.0).reshape(2, 3),
+        "text": "one \u00b5m",
+        "small": np.int8([[3]]),
+        "a_very_long_name_of_a_variable_as_of_a_line_phi_left_638nm": np.zeros((3, 4, 5), np.float32),
+        "yes": np.array([[True, False]]),
+        "none": np.zeros((0, 4)),
+    }
+    for packed in (False, True):
+        savemat(tmp_path / "a.mat", arrays, do_compression=packed, long_field_names=True)
+        assert matlab_file.names_in(tmp_path / "a.mat") == {name for name, *_ in whosmat(tmp_path / "a.mat")}
+        found = matlab_file.read_variables(tmp_path / "a.mat")
+        assert all(
+            np.array_equal(found[name], np.atleast_2d(value)) or name == "text" for name, value in arrays.items()
+        )
+    number = element(9, struct.pack(f"{order}d", 2.5), order)
+    (tmp_path / "b.mat").write_bytes(mat(matrix(b"P1b", 6, (1, 1), number, order=order), order=order))
+    assert matlab_file.read_variables(tmp_path / "b.mat")["P1b"] == [[2.5]]
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize(
+    ("part", "reason"),
+    [
+        (matrix(b"P1b", 6, (1 << 20, 1 << 20), NUMBER), "claims a shape"),
+        (matrix(b"P1b", 6, (1, -1), NUMBER), "claims a shape"),
+        (matrix(b"P1b", 6, (1, 1), element(9, bytes(1 << 24))), "more bytes than its shape"),
+        (matrix(b"P1b", 6, (1, 1), struct.pack("<2I", 9, 1 << 31) + bytes(8)), "more bytes than its shape"),
+        (matrix(b"P" * 5000, 6, (1, 1), NUMBER), "takes 5000 bytes"),
+        (matrix(b"P1b", 6, (1,) * 2000, NUMBER), "takes 8000 bytes"),
+        (matrix(b"P1b", 6, (1, 1), NUMBER) * 2, "twice"),
+        (element(3, b"abcd"), "of the kind 3"),
+        (struct.pack("<2I", 14, 1 << 30), "ends within a variable"),
+    ],
+)
+def test_what_claims_more_than_it_holds_is_refused(tmp_path: Path, part: bytes, reason: str, packed: bool) -> None:
+    """Some kB that would become gigabytes. (Planted: SciPy's reader alone.)"""
+    parts = (part[: len(part) // 2], part[len(part) // 2 :]) if reason == "twice" else (part,)
+    if packed and reason.startswith("ends"):
+        return  # packed, the claim is of an array without a beginning
+    (tmp_path / "a.mat").write_bytes(mat(*parts, packed=packed))
+    with pytest.raises(MitsimError, match=f"no MATLAB file .*{reason}"):
+        import_file(tmp_path / "a.mat", None, tmp_path / "cal", "b")
+
+
+def test_a_packed_bomb_is_refused_by_what_it_claims(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """16 MiB of zeros in 32 kB, all of it true."""
+    sides = {f"{stem}b": np.zeros((1 << 10, 1 << 10)) for stem in ("P1", "Q1")}
+    savemat(tmp_path / "a.mat", sides, do_compression=True)
+    assert (tmp_path / "a.mat").stat().st_size < 1 << 15
+    monkeypatch.setattr("mitsim.core.resources.free_memory", lambda: 2**25)
+    with pytest.raises(MitsimError, match=r"a\.mat: would take about 48 MiB of memory; allowed are 28.8 MiB"):
+        import_file(tmp_path / "a.mat", None, tmp_path / "cal", "b")

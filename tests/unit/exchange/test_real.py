@@ -7,17 +7,20 @@ The frames are numpy's, of a camera and a scene of which nothing is square; what
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 from PIL import Image
 
 import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import write_frame
-from mitsim.core.imagelist import Raw
+from mitsim.core.imagelist import Raw, Wanted
 from mitsim.core.manifests import CalibrationManifest
+from mitsim.exchange import real
 from mitsim.exchange.export import export_run
 from mitsim.exchange.known import RealCapture
 from mitsim.exchange.real import LEFT_OUT, import_frames
@@ -202,6 +205,33 @@ def test_what_does_not_fit_is_refused_and_no_folder_is_left(tmp_path: Path) -> N
     refused("they were scaled", tmp_path, tmp_path / "scaled", scaled)
     written(tmp_path / "eight", "npy", (dn >> 8).astype(np.uint8))
     refused("holds numbers of 8 bits, but camera bench 3 counts to 4095", tmp_path, tmp_path / "eight", scaled)
+
+
+def test_a_stack_of_many_pages_is_read_page_after_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twice in all, not once for every frame before. (Planted: each frame found from the first page on.)"""
+    bench = made(tmp_path)
+    dn = ms.load_run(bench.run).dn
+    tifffile.imwrite(tmp_path / "stack.tif", dn.astype(np.uint16))
+    seen: list[int] = []
+    looked = real.read_images
+
+    def counted(path: Path, wanted: Wanted) -> Iterator[np.ndarray]:
+        """Pages, each noted as it is read."""
+        for page in looked(path, wanted):
+            seen.append(1)
+            yield page
+
+    monkeypatch.setattr(real, "read_images", counted)
+    import_frames(tmp_path / "stack.tif", tmp_path / "run 2", known(bench))
+    assert len(seen) == 2 * len(dn)
+    assert np.array_equal(ms.load_run(tmp_path / "run 2").dn, dn)
+
+
+def test_frames_are_counted_by_their_headers(tmp_path: Path) -> None:
+    """A sparse array of 4096 frames of 256 megapixels is refused at once. (Planted: counted as they are read.)"""
+    bench = made(tmp_path)
+    np.lib.format.open_memmap(tmp_path / "a.npy", "w+", np.uint16, (4096, 16000, 16000)).flush()
+    refused("holds 4096 frames", tmp_path, tmp_path / "a.npy", known(bench))
 
 
 def test_pictures_as_large_as_flatcams_give_their_scene(tmp_path: Path) -> None:

@@ -78,6 +78,18 @@ def test_the_grid_moves_with_the_rig(small_scene: Callable[..., Path]) -> None:
     assert grid.keystone == 0
 
 
+@pytest.mark.parametrize("fov", ["1e-9", "1e-6", "0.01"])
+def test_a_window_of_no_width_is_refused(small_scene: Callable[..., Path], fov: str) -> None:
+    """Light is collected in cells of the projector's pixels: 24 GB of them at 1e-6 degrees. (Planted: no limit.)"""
+    path = small_scene()
+    text = path.read_text()
+    start = text.index('name="fov"', text.index('type="projector"'))
+    end = text.index("/>", start)
+    path.write_text(f'{text[:start]}name="fov" value="{fov}"{text[end:]}')
+    with pytest.raises(MitsimError, match=r"the camera's field is .* pixels of the projector wide; at most 16384"):
+        load_scene(path)
+
+
 def test_no_bitmap(small_scene: Callable[..., Path]) -> None:
     path = small_scene()
     text = path.read_text()

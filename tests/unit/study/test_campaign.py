@@ -1,15 +1,19 @@
 """Studies of many points: every point once, resumed, sharded and merged to the same bytes, a killed worker's loss."""
 
 import csv
+import io
 import json
 import os
+import pickle
 import shutil
 import sys
 import tempfile
+import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
@@ -103,10 +107,10 @@ def test_shards_share_the_points_and_merge_to_the_same(run: Run, tmp_path: Path,
         found = run(part.name, shard=Shard(number, count))
         assert found.missing == 12 - found.points and not found.claims and "merge" in found.lines()[1]
     assert begun(tmp_path) == sorted(ALL), "each point in one part"
-    joined = merge(parts, tmp_path / "joined")
+    joined = merge(parts, tmp_path / "joined", TOY)
     assert begun(tmp_path) == [] and not joined.missing
     assert contents(tmp_path / "joined") == contents(whole[1])
-    assert merge(parts[1:], tmp_path / "half").missing == len(list((parts[0] / "points").iterdir()))
+    assert merge(parts[1:], tmp_path / "half", TOY).missing == len(list((parts[0] / "points").iterdir()))
 
 
 def test_all_studies_are_sharded_and_merged_too(
@@ -118,7 +122,7 @@ def test_all_studies_are_sharded_and_merged_too(
     for number, part in enumerate(parts, start=1):
         found = run_experiment("all", SCOPE, part, where=Where(Shard(number, 2), jobs=1))
         assert found.missing == 6 and not (part / "all.html").exists()
-    joined = merge(parts, tmp_path / "whole")
+    joined = merge(parts, tmp_path / "whole", TOY)
     assert not joined.missing and begun(tmp_path) == sorted(ALL)
     assert [claim.verdict for claim in joined.claims] == ["confirmed"] and joined.figures == (f"{TOY}/squares.png",)
     assert "Two squared is four" in (tmp_path / "whole" / "all.html").read_text()
@@ -174,9 +178,84 @@ def test_what_a_point_refuses_is_one_line_and_the_rest_is_kept(run: Run, tmp_pat
 def test_a_damaged_point_is_named(run: Run, tmp_path: Path, whole: Whole) -> None:
     shutil.copytree(whole[1], tmp_path / "out")
     file = sorted((tmp_path / "out" / "points").iterdir())[0]
-    file.write_bytes(file.read_bytes()[:100])
-    with pytest.raises(MitsimError, match=f"{file.name}: cannot be read as a point of a study .* remove it"):
+    for content, reason in ((file.read_bytes()[:100], "not a zip"), (b"", "it is empty: the disk was full")):
+        file.write_bytes(content)
+        with pytest.raises(MitsimError, match=f"{file.name}: cannot be read as a point of a study .*{reason}.* remove"):
+            run()
+
+
+def test_no_module_is_imported_because_a_file_names_it(
+    run: Run, tmp_path: Path, whole: Whole, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither of a study, nor of one among all. (Planted: the file's name taken.)"""
+    folder = tmp_path / "modules"
+    folder.mkdir()
+    (folder / "harmless.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
+    (folder / "lab").mkdir()
+    (folder / "lab" / "study.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
+    monkeypatch.syspath_prepend(str(folder))
+    part = tmp_path / "part"
+    shutil.copytree(whole[1], part)
+    told = json.loads((part / "toy.json").read_text())
+    for name in ("lab.study", "harmless", "..harmless", "os.path", ["lab.study"], {"a": 1}, None, 3, "\x1b[2J.a"):
+        (part / "toy.json").write_text(json.dumps({**told, "study": name}))
+        for experiment in (None, TOY):
+            with pytest.raises(MitsimError, match=r"is of the study .*merged by its name") as refusal:
+                merge([part], tmp_path / "joined", experiment)
+            assert str(refusal.value).isprintable()
+    assert not (tmp_path / "ran").exists() and not (tmp_path / "joined").exists()
+
+
+def test_parts_of_other_versions_are_not_signed_by_this_one(run: Run, tmp_path: Path, whole: Whole) -> None:
+    """Though all parts are of the same. (Planted: parts held against each other alone.)"""
+    parts = [tmp_path / "a", tmp_path / "b"]
+    for part in parts:
+        shutil.copytree(whole[1], part)
+        told = json.loads((part / "toy.json").read_text())
+        (part / "toy.json").write_text(json.dumps({**told, "versions": {"mitsim": "0.1"}}))
+    with pytest.raises(MitsimError, match="measured by other versions"):
+        merge(parts, tmp_path / "joined", TOY)
+    assert not (tmp_path / "joined").exists()
+
+
+def test_a_point_of_a_hostile_part_takes_no_memory(run: Run, tmp_path: Path, whole: Whole) -> None:
+    """Half a terabyte claimed by a header, many arrays, objects of Python. (Planted: read by numpy, which allocates
+    what a header claims.)"""
+    shutil.copytree(whole[1], tmp_path / "out")
+    file = sorted((tmp_path / "out" / "points").iterdir())[0]
+    claims = npy_header((1 << 36,), "<f8") + bytes(1 << 20)
+    many = npy_header((1 << 20,), "|u1") + bytes(1 << 20)
+    for parts, reason in (
+        ({"rows.npy": claims}, "claims 549755813888 bytes"),
+        ({f"{number}.npy": b"" for number in range(10_001)}, "more than 10000 arrays"),
+        ({"rows.npy": npy_header((1,), "|O") + pickle.dumps([1])}, "objects of Python"),
+        ({"rows.npy": b"hello"}, "magic string"),
+        ({"other.npy": many}, "rows"),
+    ):
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
+            for name, content in parts.items():
+                packed.writestr(name, content)
+        with pytest.raises(MitsimError, match=f"cannot be read as a point of a study .*{reason}"):
+            run()
+
+
+def test_a_zip_bomb_is_refused_before_it_is_unpacked(
+    run: Run, tmp_path: Path, whole: Whole, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(whole[1], tmp_path / "out")
+    file = sorted((tmp_path / "out" / "points").iterdir())[0]
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
+        packed.writestr("rows.npy", npy_header((1 << 25,), "|u1") + bytes(1 << 25))
+    monkeypatch.setattr("mitsim.core.resources.free_memory", lambda: 2**26)
+    with pytest.raises(MitsimError, match=f"{file.name}: would take about 64 MiB of memory"):
         run()
+
+
+def npy_header(shape: tuple[int, ...], kind: str) -> bytes:
+    """The beginning of an NPY file that claims such an array."""
+    held = io.BytesIO()
+    np.lib.format.write_array_header_1_0(held, {"descr": kind, "fortran_order": False, "shape": shape})
+    return held.getvalue()
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ from mitsim.study.colour.by_lux import BY_LUX, LEAST, METHODS, claim_of, kept_lx
 from mitsim.study.colour.daylight import DaylitLine, expected, most
 from mitsim.study.experiment import Scope, Setup
 from mitsim.study.table import Mean, Table
+from mitsim.study.verdicts import UNDECIDED
 
 N, PIXELS = 8, 15
 BOXES = ((0, 2, 1, 4), (3, 8, 5, 7), *[(0, 1, 0, 1)] * 22)
@@ -105,7 +106,7 @@ def rows_of(measured: float, kept: float | None) -> Table:
             own = {"way": BY_LUX, "patterns": patterns, "lux": lux, "goal_delta_e": 4.5}
             for method in METHODS[:2]:
                 rows += [
-                    {**own, "method": method, "draw": k, "mean_delta_e": 4 + share * measured + 0.1 * k}
+                    {**own, "method": method, "draw": k, "mean_delta_e": 4 + share * measured + 0.01 * k}
                     for k in (-1, 1)
                 ]
             told = {"kept_lx": kept or 0.0, "repeats": 3.0 if kept else None, "power": lux / kept if kept else None}
@@ -121,12 +122,14 @@ def test_claims_say_up_to_which_illuminance_they_hold() -> None:
     assert claim_of(rows_of(0.1, 900.0), "hadamard:8").verdict == "confirmed"
     dim = Table(tuple({**row, "goal_delta_e": 3.0} for row in rows_of(1.0, None).rows))
     assert claim_of(dim, "dots:7").verdict == "not confirmed"
+    # 0.01 of two exposures are an interval of 0.13 either way.
+    assert claim_of(rows_of(0.4, 900.0), "dots:7").verdict == UNDECIDED
 
 
 def test_tables_have_every_illuminance_and_what_it_takes() -> None:
     ladder, needed = by_lux.tables(rows_of(2.0, 30.0))
     assert [row[0] for row in ladder.rows] == ["0", "60", "600"] and len(ladder.headings) == 7
-    assert ladder.rows[2][1:4] == ("6.00 \N{PLUS-MINUS SIGN} 0.10", "6.00 \N{PLUS-MINUS SIGN} 0.10", "5.00")
+    assert ladder.rows[2][1:4] == ("6.00 \N{PLUS-MINUS SIGN} 0.01", "6.00 \N{PLUS-MINUS SIGN} 0.01", "5.00")
     assert "of 2 exposures" in ladder.title
     assert needed.rows[0] == ("49 dots", "30", "30", "3; 2", "3; 20")
     assert by_lux.tables(rows_of(2.0, None))[1].rows[1][3:] == ("never", "never")

@@ -12,10 +12,12 @@ from mitsim.study import EXPERIMENTS, PAPER, find_experiment
 from mitsim.study.asked import measures_of, values_of
 from mitsim.study.campaign import Where, run_experiment
 from mitsim.study.experiment import IMAGE, Point, Results, Scope, Setup
+from mitsim.study.exposures import MODELS
 from mitsim.study.page import Section, build_page, flagged
-from mitsim.study.paper.measure import judged, pictured, stated
+from mitsim.study.paper.measure import pictured, stated
 from mitsim.study.points import batches
 from mitsim.study.table import Table
+from mitsim.study.verdicts import UNDECIDED, judged
 
 TIMES = "\N{MULTIPLICATION SIGN}"
 WHOLE = Scope(Setup(), ("coins", "page"))
@@ -34,42 +36,50 @@ def test_points_differ_and_share_light(name: str) -> None:
 
 
 def table(**means: float) -> Table:
-    """Two prints a decibel apart of each ``model__exposure``."""
+    """Two prints a tenth of a decibel apart of each ``model__exposure``."""
     rows = [
-        {"model": name.split("__")[0], "exposure": name.split("__")[1], "psnr_db": mean + side, "patterns": "dots:7"}
+        {"model": name.split("__")[0], "exposure": name.split("__")[1], "psnr_db": mean + side, "picture": f"{side}"}
         for name, mean in means.items()
-        for side in (-0.5, 0.5)
+        for side in (-0.05, 0.05)
     ]
     return Table(tuple(rows))
 
 
 def test_a_claim_holds_where_both_models_are_near_the_papers_figure() -> None:
     """Two decibels beside a band count as it. (Planted: the rendered model alone.)"""
-    found = table(idealised__peak=36.9, rendered__peak=40.0, idealised__frame=32.1, rendered__frame=37.4)
+    found = table(idealised__peak=36.8, rendered__peak=40.0, idealised__frame=32.7, rendered__frame=36.8)
     claim = stated(found, "49 dots give 34 to 35.5 dB", (34, 35.5))
     assert claim.verdict == "confirmed only at frame" and claim.paper == "34 to 35.5 dB"
-    assert claim.idealised == "peak: 36.9 ± 0.5 dB; frame: 32.1 ± 0.5 dB"
-    near = table(idealised__peak=36.9, rendered__peak=33.0)
+    assert claim.idealised == "peak: 36.80 ± 0.05 dB; frame: 32.70 ± 0.05 dB"
+    near = table(idealised__peak=36.8, rendered__peak=33.0)
     assert stated(near, "", (34, 35.5)).verdict == "confirmed"
-    far = table(idealised__peak=31.9, rendered__peak=37.6)
+    far = table(idealised__peak=31.2, rendered__peak=38.2)
     assert stated(far, "", (34, 35.5)).verdict == "not confirmed"
 
 
 @pytest.mark.parametrize(
-    ("above", "verdict"),
+    ("peak", "frame", "verdict"),
     [
-        ("", "not confirmed"),
-        ("idealised__peak rendered__frame", "not confirmed"),
-        ("idealised__peak rendered__peak", "confirmed only at peak"),
-        ("rendered__peak rendered__frame", "confirmed only rendered"),
-        ("idealised__peak rendered__peak idealised__frame rendered__frame", "confirmed"),
+        ("--", "--", "not confirmed"),
+        ("+-", "-+", "not confirmed"),
+        ("++", "--", "confirmed only at peak"),
+        ("++", "+?", f"confirmed only at peak, {UNDECIDED} at frame"),
+        ("-+", "-+", "confirmed only rendered"),
+        ("?+", "?+", f"confirmed only rendered, idealised {UNDECIDED}"),
+        ("+?", "-+", UNDECIDED),
+        ("??", "--", UNDECIDED),
+        ("?-", "-?", "not confirmed"),
+        ("++", "++", "confirmed"),
     ],
 )
-def test_verdicts(above: str, verdict: str) -> None:
-    """(Planted: exposures of which one model holds.)"""
-    cases = ("idealised__peak", "idealised__frame", "rendered__peak", "rendered__frame")
-    found = table(**{case: 10.0 if case in above.split() else 0.0 for case in cases})
-    claim = judged(found, "", "", lambda rows: ("", rows.mean("psnr_db").value > 5))
+def test_verdicts(peak: str, frame: str, verdict: str) -> None:
+    """What holds, does not, or is not decided of both models at two exposures. (Planted: exposures of which one model
+    holds; what is not decided taken for what fails.)"""
+    holds = {"+": True, "-": False, "?": None}
+    signs = {(model, name): holds[sign] for name, two in (("peak", peak), ("frame", frame))
+             for model, sign in zip(MODELS, two, strict=True)}  # fmt: skip
+    found = table(**{f"{model}__{name}": 0.0 for model, name in signs})
+    claim = judged(found, "", "", lambda rows: ("", signs[rows.rows[0]["model"], rows.rows[0]["exposure"]]))
     assert claim.verdict == verdict
 
 

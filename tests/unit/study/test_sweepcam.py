@@ -173,8 +173,16 @@ def test_a_gain_within_the_noise_is_none(gain: float, verdict: str) -> None:
     frames = {("uniform frames", 1): 22.0, ("uniform frames", 49): 25.0, ("SweepCam", 49): 25.0 + gain}
     frames |= {("shifting dots", 49): 34.0, ("SweepCam, along rows alone", 49): 25.0}
     rows = [
-        {"model": model, "exposure": exposure, "patterns": name, "frames": count, "psnr_db": decibels}
+        {
+            "model": model,
+            "exposure": exposure,
+            "patterns": name,
+            "frames": count,
+            "psnr_db": decibels,
+            "picture": print_,
+        }
         for (name, count), decibels in frames.items()
+        for print_ in ("coins", "page")
         for model in MODELS
         for exposure in (EQUAL_PEAK, EQUAL_FRAME)
     ]

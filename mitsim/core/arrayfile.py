@@ -1,0 +1,108 @@
+"""NumPy's files, NPY and NPZ: an open file in; the header, or numbers, out, and never more than the file itself holds.
+
+NumPy maps an NPY file into memory, where a file that is cut short meanwhile ends the process, and allocates what the
+header of one in an NPZ claims. Here what a header claims is held against the file first, and numbers are copied.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.resources import Cost, Limits
+
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+"""Readers by version; later versions are of names of fields alone, which no array of numbers has."""
+_PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""What NumPy writes."""
+_MOST_ARRAYS = 10_000
+"""In an NPZ; a point of a study has some ten."""
+_AGAIN = 2
+"""Bytes of memory that a byte of an NPZ takes: as it is unpacked, and as an array."""
+
+
+@dataclass(frozen=True)
+class Npy:
+    """What an NPY file's header says: shape and type of its array, whether columns come first, and where it begins."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    fortran: bool
+    start: int
+
+    @classmethod
+    def of(cls, file: BinaryIO, size: int) -> Npy:
+        """The header at the beginning of ``file``, of ``size`` bytes. ValueError where it is none, of Python objects,
+        or claims other than the file has."""
+        read = _HEADERS.get(np.lib.format.read_magic(file))
+        if read is None:
+            raise ValueError("it is no array of numbers")
+        try:
+            shape, fortran, dtype = read(file)
+        except ValueError:
+            raise
+        except Exception:  # of a damaged header NumPy raises whatever Python does on reading it as a literal
+            raise ValueError("its header is damaged") from None
+        found = cls(shape, dtype, fortran, file.tell())
+        if dtype.hasobject:
+            raise ValueError("it holds objects of Python, which are code")
+        if found.bytes != size - found.start:
+            raise ValueError(f"its header claims {found.bytes} bytes of numbers, and {size - found.start} follow it")
+        return found
+
+    @property
+    def bytes(self) -> int:
+        """Of its numbers."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+    def part(self, file: BinaryIO, index: int | None = None) -> npt.NDArray[Any]:
+        """The numbers in ``file``, or those of one ``index`` of the first axis. ValueError where it ends before."""
+        several = index is not None and not self.fortran
+        shape = self.shape[1:] if several else self.shape
+        count = math.prod(shape)
+        file.seek(self.start + (count * self.dtype.itemsize * index if several and index else 0))
+        data = bytearray(count * self.dtype.itemsize)
+        if file.readinto(data) != len(data):  # type: ignore[attr-defined]
+            raise ValueError("it ended while it was read")
+        values = np.frombuffer(data, self.dtype).reshape(shape, order="F" if self.fortran else "C")
+        return np.array(values[index]) if index is not None and self.fortran else values
+
+
+def read_npz(file: BinaryIO, name: Path | str) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of an NPZ ``file``.
+
+    Parameters
+    ----------
+    file
+        open for reading.
+    name
+        of it, for messages.
+
+    Raises
+    ------
+    ValueError
+        for a file that is damaged, or holds anything but arrays of numbers and texts.
+    MitsimError
+        where unpacking it would take more memory than is free.
+    """
+    try:
+        with zipfile.ZipFile(file) as packed:
+            parts = packed.infolist()
+            if len(parts) > _MOST_ARRAYS or any(part.compress_type not in _PACKINGS for part in parts):
+                raise ValueError(f"it holds more than {_MOST_ARRAYS} arrays, or such as NumPy does not write")
+            Cost(memory_bytes=_AGAIN * sum(part.file_size for part in parts)).check(f"file {name}", Limits())
+            arrays = {}
+            for part in parts:
+                data = io.BytesIO(packed.read(part))
+                arrays[part.filename.removesuffix(".npy")] = Npy.of(data, part.file_size).part(data)
+            return arrays
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OverflowError) as error:
+        raise ValueError(" ".join(str(error).split()) or type(error).__name__) from error

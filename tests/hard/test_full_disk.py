@@ -1,0 +1,82 @@
+"""Every kind of file that is written, where there is no room: one line that names it, and nothing is left of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.core.errors import MitsimError
+from mitsim.core.framefile import write_frame
+from mitsim.core.jsonfile import write_json
+from mitsim.core.output import write_text
+from mitsim.exchange.drawn import draw_family
+from mitsim.exchange.export import export_run
+from mitsim.exchange.load import import_file
+from mitsim.rig.sensor import SensorModel, load_sensor
+from mitsim.study.experiment import Found, Point, Setup
+from mitsim.study.points import Store
+from mitsim.study.table import Table
+from tests.exchanged import Made, made
+from tests.unit.core.test_hdf5file import room
+
+pytestmark = pytest.mark.robustness("Output")
+
+ROOM = 2000
+"""Bytes; each file below is larger."""
+NOISE = np.random.default_rng(4).random((64, 64))
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    folder = tmp_path_factory.mktemp("bench")
+    bench = made(folder, ambient=True)
+    export_run(bench.run, "hdf5", folder / "run.h5", bench.calibration)
+    return bench
+
+
+def sensor() -> SensorModel:
+    return load_sensor(Path(__file__).parents[2] / "calibration" / "imx249.toml")
+
+
+def sensed(path: Path) -> None:
+    from mitsim.capture.sense import sense
+
+    sense(NOISE, sensor()).save(path)
+
+
+def exported(format: str, name: str, **more: str) -> Callable[[Made, Path], object]:
+    calibrated = format in ("hdf5", "mat")
+    return lambda bench, place: export_run(
+        bench.run, format, place / name, bench.calibration if calibrated else None, **more
+    )
+
+
+WRITERS: dict[str, Callable[[Made, Path], object]] = {
+    "HDF5 of export": exported("hdf5", "a.h5"),
+    "MAT of export": exported("mat", "a.mat"),
+    "pictures of export": exported("png", "a", projector="mp_cl1"),
+    "folder of import": lambda bench, place: import_file(bench.run.parent / "run.h5", place / "a"),
+    "pictures of patterns": lambda _, place: draw_family(place / "a", "dots:3", 96, "mp_cl1"),
+    "OpenEXR": lambda _, place: write_frame(place / "a.exr", {"Y": NOISE.astype(np.float32)}, {}),
+    "OpenEXR of sense": lambda _, place: sensed(place / "a.exr"),
+    "NPY of sense": lambda _, place: sensed(place / "a.npy"),
+    "PNG of sense": lambda _, place: sensed(place / "a.png"),
+    "NPZ of a study": lambda _, place: Store(place).save(Point.of(Setup("a"), b=1), Found((), {"a": NOISE})),
+    "CSV": lambda _, place: Table(tuple({"number": number} for number in range(2000))).write(place / "a.csv"),
+    "JSON": lambda _, place: write_json(place / "a.json", NOISE),
+    "HTML": lambda _, place: write_text(place / "a.html", "a" * (ROOM + 1)),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_full_disk(bench: Made, tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str) -> None:
+    """(Planted: a writer that leaves what it began; numpy's own sentence, which names neither file nor cause.)"""
+    with room(ROOM), pytest.raises(MitsimError, match="cannot be written") as told:
+        WRITERS[name](bench, tmp_path)
+    message = str(told.value)
+    assert str(tmp_path) in message and "room" in message and message.isprintable()
+    assert not [*tmp_path.iterdir()]
+    assert capfd.readouterr().err == ""

@@ -1,0 +1,90 @@
+"""Options that have no effect are refused: what is passed over in silence is taken for obeyed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mitsim.exchange.export import export_run
+from tests.exchanged import Made, made
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """A run and a calibration, the same as files, a picture, and an image of irradiance."""
+    bench = made(tmp_path_factory.mktemp("bench"))
+    folder = bench.run.parent
+    export_run(bench.run, "hdf5", folder / "run.h5", bench.calibration)
+    export_run(bench.run, "mat", folder / "run.mat", bench.calibration)
+    Image.new("L", (8, 8)).save(folder / "a.png")
+    np.zeros(64, np.uint16).tofile(folder / "a.raw")
+    np.save(folder / "light.npy", np.ones((4, 4)))
+    return bench
+
+
+FRAMES = "--camera imx249 --patterns uniform --exposure 1 --projector-pixels 4"
+CASES = [
+    ("export {run} --format png -o {out}", "--overwrite"),
+    *(
+        (f"import {{folder}}/run.{ending} -o {{out}}", option)
+        for ending in ("h5", "mat")
+        for option in (
+            *("--patterns uniform", "--camera imx249", "--exposure 1", "--calibration {cal}", "--projector-pixels 128"),
+            *("--black-level 3", "--ambient-frame {folder}/a.png", "--ambient-shots 2", "--shape 8x8", "--bits 8"),
+            *("--byte-order little", "--seed 0"),
+        )
+    ),
+    (f"import {{folder}}/a.png {FRAMES} -o {{out}}", "--bits 8"),
+    (f"import {{folder}}/a.png {FRAMES} -o {{out}}", "--byte-order big"),
+    (f"import {{folder}}/a.png {FRAMES} -o {{out}}", "--shape 8x8"),
+    (f"import {{folder}}/a.raw {FRAMES} --shape 8x8 --bits 16 -o {{out}}", "--seed 3"),
+    ("patterns dots:3 -o {out}", "--seed 1"),
+    ("patterns dots:3 -o {out}", "--signed-capture pair"),
+    ("patterns stripes --camera imx249 --exposure 1 -o {out}", "--seed 1"),
+    ("capture photograph --patterns dots:3 --exposure 0.1 -o {out}", "--exposure-fraction 0.5"),
+    ("capture photograph --patterns dots:3 --ambient-frame no -o {out}", "--ambient-shots 4"),
+    ("render photograph -o {out}.exr", "--accuracy 0.01"),
+    ("render photograph -o {out}.exr", "--effects +mirrors"),
+    ("render photograph --estimator factored -o {out}.exr", "--spp 64"),
+    ("characterise imx249 -o {out}", "--wavelength 550"),
+    ("sense {folder}/light.npy --camera imx249 --exposure 1 -o {out}.npy", "--exposure-fraction 0.8"),
+    *(
+        ("study merge {folder} -o {out}", option)
+        for option in (
+            *("--patterns dots:7", "--seed 0", "--camera imx249", "--projector mp_cl1", "-D a=1", "--quick"),
+            *("--allow-outside-files", "--shard 1/1", "--jobs 1", "--scheduler tcp://a:1", "--over seed=1:2:2"),
+            *("--measure psnr", "--recipe {folder}/a.toml"),
+        )
+    ),
+    ("study distance -o {out}", "--experiment a.b"),
+    ("study distance -o {out}", "--patterns dots:7"),
+    ("study distance --scheduler tcp://a:1 -o {out}", "--jobs 1"),
+    ("study accuracy -o {out}", "--quick"),
+    ("study solver -o {out}", "--camera imx249"),
+    ("study solver -o {out}", "-D a=1"),
+]
+
+
+@pytest.mark.parametrize(("command", "option"), CASES, ids=[f"{c.split(' -o ')[0]} {o}" for c, o in CASES])
+def test_an_option_without_effect_is_refused(
+    call: Callable[..., Any], bench: Made, tmp_path: Path, command: str, option: str
+) -> None:
+    """In a line that names it, before any work. (Planted: one left out of its verb's list.)"""
+    places = {"run": bench.run, "cal": bench.calibration, "folder": bench.run.parent, "out": tmp_path / "out"}
+    found = call(*f"{command} {option}".format(**places).split())
+    assert found.code == 2 and len(found.err.strip().splitlines()) == 1, found.err
+    assert option.split()[0] in found.err and "has no effect" in found.err and "leave it out" in found.err
+    assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize("verb", ["plan photograph", "capture photograph -o {out}", "transport photograph -o {out}.h5"])
+def test_time_or_accuracy_decides(call: Callable[..., Any], tmp_path: Path, verb: str) -> None:
+    """(Planted: an accuracy passed over where there are seconds.)"""
+    line = f"{verb} --patterns dots:3 --seconds 5 --accuracy 0.01".format(out=tmp_path / "out")
+    found = call(*line.split())
+    assert found.code == 2 and "--accuracy and --seconds: either decides" in found.err
