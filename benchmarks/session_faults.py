@@ -111,7 +111,7 @@ class Camera:
         if self.centre:
             frame = frame + shown.sum() * np.ones_like(frame)
             frame = frame / 2
-        return frame
+        return np.asarray(frame)
 
     @cached_property
     def scale(self) -> float:
@@ -208,7 +208,7 @@ def session(camera: Camera, folder: Path, fault: Fault | None) -> Path:
         )
         if fault is not None and half == fault.half and fault.kind == "clipped":
             electrons = np.minimum(electrons, np.quantile(electrons, 0.8))
-        return np.clip(np.rint(electrons * gain + BLACK), 0, CODES - 1).astype(np.uint16)
+        return np.asarray(np.clip(np.rint(electrons * gain + BLACK), 0, CODES - 1), np.uint16)
 
     for place, half in enumerate(order):
         power = 1.0

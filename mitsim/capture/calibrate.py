@@ -45,7 +45,7 @@ from mitsim.reconstruct.calibration import (
     stripe_sums,
 )
 from mitsim.reconstruct.factors import Factors, load_calibration
-from mitsim.reconstruct.session_faults import Checked, checked, frame_words
+from mitsim.reconstruct.session_faults import Checked, check_session, frame_words
 from mitsim.rig.order import SIDES
 from mitsim.rig.recipe import SessionRecipe, load_recipe
 
@@ -262,8 +262,13 @@ def estimate(
 def estimates(
     lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Checkpoint | None = None
 ) -> tuple[list[Estimate], int]:
-    """Factors from each kind of responses to a session, and its saturated shots; parameters as
-    :func:`checked_estimates`."""
+    """Factors from each kind of responses to a session, and its saturated shots.
+
+    Parameters
+    ----------
+    lit, job, kinds, checkpoint
+        as for :func:`checked_estimates`.
+    """
     found, saturated, _ = checked_estimates(lit, job, kinds, checkpoint)
     return found, saturated
 
@@ -303,7 +308,7 @@ def checked_estimates(
                 checkpoint.save(_STRIPES, stripes.arrays())
     with job.clock.stage("estimate"):
         judged = [
-            checked(stripes.sums[kind], session.signs, session.order, saturated=bool(stripes.saturated))
+            check_session(stripes.sums[kind], session.signs, session.order, saturated=bool(stripes.saturated))
             if kind == NOISY
             else Checked(stripes.sums[kind])
             for kind in kinds

@@ -136,7 +136,7 @@ class PairSums:
         )
 
     def put(self, number: int, seen: PairSeen) -> None:
-        """Keep what was ``seen`` of a pair."""
+        """Keep what was ``seen`` of the pair of a ``number``."""
         self.light[:, number], self.rows[number], self.columns[number] = seen.light, seen.rows, seen.columns
 
 
@@ -183,10 +183,18 @@ class StripeSums:
         self.put(self.seen(response, self.done))
 
     def seen(self, response: npt.ArrayLike, number: int, light: FloatArray | None = None) -> Seen:
-        """What the ``response`` (rows, columns) of this ``number`` adds; MitsimError as :meth:`add`.
+        """What a response adds; MitsimError as :meth:`add`.
 
-        Changes nothing, so that responses are looked at in several threads. ``light`` (rows, columns) is the sum of
-        the two frames whose difference the response is.
+        Changes nothing, so that responses are looked at in several threads.
+
+        Parameters
+        ----------
+        response
+            (rows, columns).
+        number
+            of its pattern.
+        light
+            (rows, columns) the sum of the two frames whose difference it is; None: not known.
         """
         shape = len(self.vectors), len(self.common)
         shape = shape if self.side == "horizontal" else shape[::-1]

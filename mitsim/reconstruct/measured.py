@@ -27,7 +27,7 @@ from mitsim.core.versions import versions
 from mitsim.reconstruct.calibration import Estimate, Seen, StripeSums, stripe_sums
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.ladder import Chosen, Ladder
-from mitsim.reconstruct.session_faults import Checked, checked
+from mitsim.reconstruct.session_faults import Checked, check_session
 from mitsim.rig.digital import digital_of
 from mitsim.rig.framelist import DarkFile, SessionFrames, StripeFile, load_frames
 from mitsim.rig.order import SIDES, UNIFORM, Half, Side
@@ -362,10 +362,10 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Ch
     session = readings.session
     signs = stripe_signs(session.listed.n).astype(np.float64)
     sums, variances = _sums(readings, signs.shape[1], job)
-    found = checked(sums, signs, session.order, readings.clipped, saturated=bool(readings.saturated))
+    found = check_session(sums, signs, session.order, readings.clipped, saturated=bool(readings.saturated))
     if wrong := found.wrong_uniform():
         sums, variances = _sums(readings, signs.shape[1], job, found.other_uniform(wrong))
-        found = checked(
+        found = check_session(
             sums, signs, session.order, readings.clipped, uniform_given=True, saturated=bool(readings.saturated)
         )
     noise = float(np.sqrt(max(float(np.mean(variances)), 0.0))) if session.listed.digital.noise_is_stated else None

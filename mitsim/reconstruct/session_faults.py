@@ -96,7 +96,7 @@ class Fault:
         return f"frames: {names}: {self.detail}{other}; {self.repair}"
 
     def listed(self, name: Callable[[Half], str]) -> dict[str, Any]:
-        """The same for a manifest."""
+        """The same for a manifest; ``name`` says which frame it is."""
         return {"frames": self._names(name), **asdict(self)}
 
 
@@ -175,7 +175,7 @@ class Checked:
 
     @staticmethod
     def other_uniform(wrong: set[Side]) -> Side:
-        """The side whose uniform response is right; MitsimError where both are wrong."""
+        """The side whose uniform response is right; MitsimError where both are ``wrong``."""
         right = [side for side in SIDES if side not in wrong]
         if not right:
             raise MitsimError(
@@ -185,7 +185,15 @@ class Checked:
         return right[0]
 
     def estimate(self, signs: FloatArray, noise: float | None) -> Estimate:
-        """Factors of what can be believed; parameters as :func:`mitsim.reconstruct.calibration.factors_of_sums`."""
+        """Factors of what can be believed.
+
+        Parameters
+        ----------
+        signs
+            (n, N) H.
+        noise
+            as ``stated_noise`` of :func:`mitsim.reconstruct.calibration.factors_of_sums`.
+        """
         return factors_of_sums(*self.sums, signs, noise, self.left_out, self.extra)
 
     def warnings(self, name: Callable[[Half], str]) -> tuple[str, ...]:
@@ -193,11 +201,11 @@ class Checked:
         return (*(fault.words(name) for fault in self.faults), *self.lamp.warnings())
 
     def listed(self, name: Callable[[Half], str]) -> list[dict[str, Any]]:
-        """Faults for a manifest."""
+        """Faults for a manifest; ``name`` says which frame it is."""
         return [fault.listed(name) for fault in self.faults]
 
 
-def checked(
+def check_session(
     sums: tuple[StripeSums, StripeSums],
     signs: FloatArray,
     order: Sequence[Half],
@@ -812,10 +820,10 @@ class _Pairs:
             return
         power = float(self._of(number, self.trend)[index])
         light, vector = self.pairs[number].light[:, index], own.sums.vectors[:, index]
-        kept = (light - sign * vector) / 2
-        whole = self.lights[number] + (power - 1) * self.uniforms[number]
+        sound = (light - sign * vector) / 2
+        both = self.lights[number] + (power - 1) * self.uniforms[number]
         corrected = power / float(self.power[self.good].mean()) if lamp.corrected else 1.0
-        own.change(index, -sign * (2 * kept - whole) / corrected)
+        own.change(index, -sign * (2 * sound - both) / corrected)
         own.extras[index] += own.noise
         own.faults.append(
             Fault(
@@ -972,7 +980,7 @@ def _end_to_end(times: FloatArray, trend: FloatArray) -> float:
 
 
 def frame_words(half: Half) -> str:
-    """Which frame of a session it is, in words."""
+    """Which frame of a session a ``half`` is, in words."""
     side, index, sign = half
     return f"{side} stripes {index} of sign {sign:+d}" if sign != UNIFORM else f"{side} stripes {index}"
 

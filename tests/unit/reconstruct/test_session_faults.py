@@ -9,7 +9,7 @@ import pytest
 
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.calibration import StripeSums, stripe_sums
-from mitsim.reconstruct.session_faults import Checked, checked
+from mitsim.reconstruct.session_faults import Checked, check_session
 from mitsim.rig.camera import centred_edges
 from mitsim.rig.mask import mls_mask
 from mitsim.rig.order import SIDES, Half, taken
@@ -52,7 +52,7 @@ def judged(shown: Frames) -> Checked:
         for index in range(1, N):
             response, light = pair(own.side, index)
             own.put(own.seen(response, index, light))
-    return checked(sums, SIGNS, ORDER)
+    return check_session(sums, SIGNS, ORDER)
 
 
 def error(found: Checked) -> tuple[float, float]:
