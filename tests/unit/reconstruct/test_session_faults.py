@@ -99,10 +99,10 @@ def test_a_wrong_frame_is_named_and_foretold_by_the_other_of_its_pair(
 
 def test_exchanged_frames_and_swapped_patterns_are_put_back() -> None:
     shown, clean = frames(), error(judged(frames()))[0]
-    one, other = ("vertical", 13, 1), ("vertical", 13, -1)
+    one, other = ("vertical", 6, 1), ("vertical", 6, -1)
     shown[one], shown[other] = shown[other], shown[one]
     (fault,) = (found := judged(shown)).faults
-    assert (fault.side, fault.index, fault.kind) == ("vertical", 13, "exchanged") and error(found)[0] < 1.1 * clean
+    assert (fault.side, fault.index, fault.kind) == ("vertical", 6, "exchanged") and error(found)[0] < 1.1 * clean
     shown = frames()
     for sign in (1, -1):
         one, other = ("horizontal", 9, sign), ("horizontal", 21, sign)
