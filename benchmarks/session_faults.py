@@ -157,13 +157,13 @@ class Fault:
     part: float
 
     @classmethod
-    def of(cls, kind: str, count: int, rng: np.random.Generator) -> Fault:
+    def of(cls, kind: str, count: int, rng: np.random.Generator, uniform: bool) -> Fault:
         """A fault of a ``kind`` at random; what exchanges or swaps patterns leaves the uniform one alone."""
         first, other = (int(number) for number in rng.choice(np.arange(1, count), 2, replace=False))
         if FIRST and kind in FRAME_FAULTS:
             first = 0
         side: Side = SIDES[int(rng.integers(2))]
-        return cls(kind, (side, first, int(rng.choice([1, -1]))), other, float(rng.uniform(0.3, 0.7)))
+        return cls(kind, (side, first, 1 if uniform else int(rng.choice([1, -1]))), other, float(rng.uniform(0.3, 0.7)))
 
     def named(self, factors: Factors) -> bool:
         """Whether a calibration names it, and nothing else."""
@@ -287,7 +287,9 @@ def ratio(camera: Camera, factors: Factors) -> float:
 def one(seed: int, n: int, kind: str | None, uniform: bool) -> dict[str, Any]:
     """One session: what was said of it."""
     camera = Camera(seed, n, uniform)
-    fault = None if kind is None else Fault.of(kind, stripe_signs(n).shape[1], np.random.default_rng([seed, n, 3]))
+    fault = (
+        None if kind is None else Fault.of(kind, stripe_signs(n).shape[1], np.random.default_rng([seed, n, 3]), uniform)
+    )
     row: dict[str, Any] = {
         "seed": seed,
         "n": n,

@@ -351,17 +351,9 @@ class _Side:
                 continue
             if np.median(misfits / np.maximum(energies, 1e-300)) > _UNEXPLAINED and misfits[index] < 4 * middle:
                 continue
-            self.faults.append(
-                Fault(
-                    self.side,
-                    int(index),
-                    None,
-                    "wrong",
-                    f"shows no {self.side} stripes: {misfits[index] / energies[index]:.0%} of its response is of other "
-                    "shape",
-                    "it is left out",
-                )
-            )
+            part = misfits[index] / energies[index]
+            detail = f"shows no {self.side} stripes: {part:.0%} of its response is of other shape"
+            self._add(int(index), "wrong", detail, "it is left out")
             self.unknown.add(int(index))
             self.uncounted.add(int(index))
 
@@ -458,8 +450,8 @@ class _Side:
         if deviations[worst] > _FAR**2:
             raise MitsimError(
                 f"{self.side} stripes {worst} do not fit the other patterns, and of all they fit least; patterns "
-                "against one uniform frame do not tell which frame is wrong: look at this one and at those that are far from "
-                "their neighbours, and take the session again, in pairs if you can"
+                "against one uniform frame do not tell which frame is wrong: look at this one and at those that are far "
+                "from their neighbours, and take the session again, in pairs if you can"
             )
 
     def _likelihood(self) -> float:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from mitsim.core.errors import MitsimError
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.calibration import StripeSums, stripe_sums
 from mitsim.reconstruct.session_faults import Checked, check_session
@@ -41,10 +42,12 @@ def frames(power: Callable[[int], float] = lambda place: 1.0, noise: float = 1e-
     return found
 
 
-def judged(shown: Frames) -> Checked:
-    def pair(side: str, index: int) -> tuple[np.ndarray, np.ndarray]:
+def judged(shown: Frames, pairs: bool = True) -> Checked:
+    """What is said of frames; not ``pairs``: each response is of its +1 frame and that of all light."""
+
+    def pair(side: str, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         one, other = shown[side, index, 1], shown[side, index, -1]
-        return one - other, one + other
+        return (one - other, one + other) if pairs else (2 * one - shown[side, 0, 1], None)
 
     first = [pair(side, 0) for side in SIDES]
     sums = stripe_sums(first[0][0], first[1][0], N, lights=[light for _, light in first])
@@ -110,6 +113,22 @@ def test_exchanged_frames_and_swapped_patterns_are_put_back() -> None:
     (fault,) = (found := judged(shown)).faults
     assert (fault.kind, fault.index, fault.other) == ("swapped", 9, ("horizontal", 21, 0))
     assert error(found)[0] < 1.1 * clean
+
+
+def test_a_wrong_frame_without_pairs_is_left_out_or_refused() -> None:
+    """What is of other shape is left out; of a black frame's response, all light reversed, only its size is wrong."""
+    shown = frames()
+    clean = judged(shown, pairs=False)
+    assert not clean.faults and error(clean)[0] < 1.3 * error(clean)[1]
+    half = "vertical", 20, 1
+    shown[half] = np.where(np.arange(PIXELS[0])[:, None] < 50, shown[half], 0.0)
+    (fault,) = (found := judged(shown, pairs=False)).faults
+    assert (fault.side, fault.index, fault.kind) == (*half[:2], "wrong")
+    actual, stated = error(found)
+    assert 2 * error(clean)[1] < actual < 1.3 * stated
+    shown[half] = 0 * shown[half]
+    with pytest.raises(MitsimError, match="do not fit the other patterns"):
+        judged(shown, pairs=False)
 
 
 def test_a_drifting_lamp_is_divided_out() -> None:
