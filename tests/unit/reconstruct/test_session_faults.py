@@ -91,7 +91,7 @@ def test_a_good_session_is_left_as_it_is_to_the_bit() -> None:
 def test_a_wrong_frame_is_named_and_foretold_by_the_other_of_its_pair(
     kind: str, change: Callable[[np.ndarray], np.ndarray], half: Half
 ) -> None:
-    """(Planted: the other frame of the pair is named; its vector's sign not turned: an error of 0.2.)"""
+    """(Planted: the other frame of the pair is named; the sign of the vector that it foretells is not turned.)"""
     shown = frames()
     shown[half] = change(shown[half])
     (fault,) = (found := judged(shown)).faults
@@ -101,6 +101,7 @@ def test_a_wrong_frame_is_named_and_foretold_by_the_other_of_its_pair(
 
 
 def test_exchanged_frames_and_swapped_patterns_are_put_back() -> None:
+    """(Planted: the covariance with the fault in it decides, which takes pattern 5 for 6.)"""
     shown, clean = frames(), error(judged(frames()))[0]
     one, other = ("vertical", 6, 1), ("vertical", 6, -1)
     shown[one], shown[other] = shown[other], shown[one]
@@ -116,7 +117,8 @@ def test_exchanged_frames_and_swapped_patterns_are_put_back() -> None:
 
 
 def test_a_wrong_frame_without_pairs_is_left_out_or_refused() -> None:
-    """What is of other shape is left out; of a black frame's response, all light reversed, only its size is wrong."""
+    """What is of other shape is left out; of a black frame's response, all light reversed, only its size is wrong.
+    (Planted: no check of the fit; no error of the foretold pattern.)"""
     shown = frames()
     clean = judged(shown, pairs=False)
     assert not clean.faults and error(clean)[0] < 1.3 * error(clean)[1]
