@@ -28,7 +28,7 @@ _MATTERS = 0.5
 """Error by the lamp, over that by noise, from which it is corrected and said: both in quadrature are 12 % more."""
 _DEVIATIONS = 8.0
 """Deviations from the rest, by their own robust scatter, that make a fault: noise alone goes so far in one session of
-10^12, and sums of shot noise, whose tails are longer, in none of 10^6."""
+10^12."""
 _LEAST = 2e-3
 """Change of a pair's light that counts: that of one frame by 0.4 %, which costs less than most sessions' noise."""
 _EXCESS = 2.0
