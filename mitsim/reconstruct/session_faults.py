@@ -49,6 +49,8 @@ _LIKELIER, _ALIKE = 2.0, 0.8
 """Logarithm of the likelihood, a sensor row, that an exchange or swap must add to be said where nothing else shows it,
 and by which the next one must be worse for it to be put back: in 192 good sides of ideal cameras of 32 to 128
 pixels none adds more than 1.3, and in 768 with one exchange or swap a wrong one was ahead by 0.6 at most."""
+_SEEN = 64.0
+"""Squared length of a vector, over its noise, from which another that equals it is no chance: both are seen."""
 _TRIED = 6
 """Exchanges, and swaps, that are tried."""
 _ENOUGH = 16, 64
@@ -440,8 +442,22 @@ class _Side:
         return bool(deviations[worst] > _FAR**2) and self._doubt(worst)
 
     def _check_fit(self) -> None:
-        """MitsimError where a pattern without pairs does not fit the others: a wrong one changes the covariance, and
-        the uniform frame is in all, so that which one it is, is not sure enough to leave it out."""
+        """MitsimError where a pattern without pairs is black, shows what another does or does not fit.
+
+        A wrong one changes the covariance, and the uniform frame is in all, so that which one it is, is not sure enough
+        to leave it out.
+        """
+        sizes = np.square(self.vectors).sum(axis=0)
+        away = sizes[:, None] + sizes - 2 * self.vectors.T @ self.vectors
+        away[:, sizes < _SEEN * self.noise] = np.inf
+        away[np.tril_indices(len(away))] = np.inf
+        one, other = (int(k) for k in np.unravel_index(int(np.argmin(away)), away.shape))
+        if away[one, other] < 4 * self.noise:
+            raise MitsimError(f"{self.side} stripes {one} and {other} show the same: take the session again")
+        dark = np.square(self.vectors + self.vectors[:, :1]).sum(axis=0) / 4
+        black = int(np.argmin(dark))
+        if dark[black] < _DARK**2 * sizes[0]:
+            raise MitsimError(f"{self.side} stripes {black}: the frame is black; take the session again")
         (precision, gram), *_ = self._parts()
         deviations = np.einsum("ij,jk,ik->i", precision, gram, precision) / np.diag(precision)
         deviations[0] = 0.0
