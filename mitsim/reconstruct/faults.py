@@ -524,7 +524,7 @@ class FrameCheck:
         for each in self.measured():
             residual = self._centred(each.frame) - self._frame(weights, each.row, each.column)
             pattern = each.row, each.column
-            sums.residual[pattern], sums.power[pattern] = _energy(residual), float(each.power.sum())
+            sums.residual[pattern], sums.power[pattern] = _energy(residual), each.power
             sums.light[pattern] = float(each.light.sum())
             if self._signed:
                 sums.sums[pattern] = _energy((each.light * others - total) / (others - 1))
