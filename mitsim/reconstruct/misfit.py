@@ -213,7 +213,8 @@ class Residuals:
             power = (power + (energy if frame is measurement.frame else self._squares(measurement.frame))) / 2
         self.energy += energy
         self.power += power
-        self.by_pattern.add(measurement, float(np.dot(flat, flat)), float(power.sum()), self._noise.light)
+        left_over, given = float(np.dot(flat, flat)), float(energy.sum())
+        self.by_pattern.add(measurement, left_over, float(power.sum()), given, self._noise.light)
         # The variance is linear in the light: that of a tile's mean light is the tile's mean variance.
         light = self._sums(measurement.light) / self.pixels
         variance = self._noise.of(light, measurement.shots) * self.pixels
