@@ -1,6 +1,6 @@
 """How often frames that are not what they say are named, and how often fitting runs are: by fault, family and light.
 
-    python benchmarks/frame_faults.py RESULT.json [--rounds 4] [--fitting 240] [--sizes 64 128] [--peaks ...]
+    python benchmarks/frame_faults.py RESULT.json [--rounds 4] [--fitting 240] [--seed 0] [--sizes 64 128] [--peaks ...]
 
 Runs are of the tests' ideal cameras (tests/ideal_sessions.py): frames of the paper's model with drawn noise, before
 masks of several kinds, of prints that are shipped and of some drawn here. Each round lays one fault of every kind into
@@ -314,6 +314,7 @@ def main() -> None:
     parser.add_argument("--fitting", type=int, default=240)
     parser.add_argument("--sizes", nargs="+", type=int, default=tuple(PIXELS))
     parser.add_argument("--peaks", nargs="+", type=float, default=PEAKS)
+    parser.add_argument("--seed", type=int, default=0, help="another draws other runs")
     parser.add_argument("--faults", nargs="+", default=tuple(FAULTS))
     parser.add_argument("--families", nargs="+", default=FAMILIES)
     options = parser.parse_args()
@@ -324,7 +325,11 @@ def main() -> None:
     for number, (turn, n, peak, family, fault) in enumerate(cases):
         if family == "uniform" and fault in SINGLE:
             continue
-        mask, name, seed = MASKS[(turn + number) % len(MASKS)], plain[number % len(plain)], 100 * turn + number % 97
+        mask, name, seed = (
+            MASKS[(turn + number) % len(MASKS)],
+            plain[number % len(plain)],
+            options.seed + 100 * turn + number % 97,
+        )
         right, said = faulty(fault, mask, name, family, n, peak, seed)
         if right is None:
             continue
@@ -337,15 +342,16 @@ def main() -> None:
     alarms = 0
     for number in range(options.fitting):
         family, name = options.families[number % len(options.families)], SCENES[number % len(SCENES)]
+        seed = options.seed + 5000 + number
         mask, n = MASKS[number // 5 % len(MASKS)], options.sizes[number // 7 % len(options.sizes)]
         peak = options.peaks[number // 3 % len(options.peaks)]
-        said = verdict(*run_of(mask, name, family, n, peak, 5000 + number))
+        said = verdict(*run_of(mask, name, family, n, peak, seed))
         blamed = {Cause.FRAMES, *CAUSES.values(), Cause.RIG}
         alarm = bool(said["faults"] or said["defects"] or said["cause"] in {cause.name for cause in blamed})
         alarm |= not said["ok"] and name not in GLOSSY
         alarms += alarm
         if alarm:
-            wrong.append({"fault": None, "case": [mask, name, family, n, peak, 5000 + number], **said})
+            wrong.append({"fault": None, "case": [mask, name, family, n, peak, seed], **said})
             print(json.dumps(wrong[-1]), flush=True)
     rates: dict[str, dict[str, Any]] = {
         key: {"named": right, "of": of, "rate": interval(right, of)} for key, (right, of) in counts.items()

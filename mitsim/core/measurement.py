@@ -70,7 +70,8 @@ class Measurement:
         return Measurement(frame, self.row, self.column, light, shots, saturated, factor, digests)
 
     @property
-    def power(self) -> FloatArray:
-        """(rows, columns) sum of the squares of its shots [(electrons/s)^2]."""
+    def power(self) -> float:
+        """Sum of the squares of its shots [(electrons/s)^2]."""
         # For halves p and q, p^2 + q^2 = ((p - q)^2 + (p + q)^2) / 2.
-        return np.square(self.light) if self.shots == 1 else (np.square(self.frame) + np.square(self.light)) / 2
+        halves = (self.light,) if self.shots == 1 else (self.frame, self.light)
+        return float(sum(np.vdot(values, values) for values in halves)) / len(halves)

@@ -19,6 +19,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.measurement import Ambient, Measurement
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulator import centred
+from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.sides import IndexArray
 from mitsim.reconstruct.solver import Prepared
 
@@ -71,7 +72,7 @@ class Defects:
         rows, columns = np.array(places, dtype=np.intp).T
         return Defects(rows, columns)
 
-    def left_out(self, shots: Capture, prepared: Prepared, weights: FloatArray) -> Capture:
+    def left_out(self, shots: Capture, prepared: Prepared, weights: FloatArray) -> _LeftOut:
         """The capture whose readings at these pixels are those that all others tell.
 
         Parameters
@@ -111,13 +112,31 @@ class Defects:
         moved = {pattern: (values[pattern] - first[pattern]) / gain for pattern in values}
         return _LeftOut(shots, self, moved)
 
+    def beyond_chance(self, rest: _LeftOut, noise: FrameNoise) -> Defects | None:
+        """Those of them whose readings differ by more than noise from what all others tell; None where none does.
+
+        Parameters
+        ----------
+        rest
+            the capture without these.
+        noise
+            of the capture with them.
+        """
+        count = len(rest.moved)
+        variance = noise.of(noise.light[self.rows, self.columns] / count, noise.shots)
+        variance = np.maximum(variance, noise.of(float(noise.light.mean()) / count, noise.shots))
+        off = sum(np.square(moved) for moved in rest.moved.values()) / variance / count
+        # What the others tell has noise of its own: as much, at a leverage of a half.
+        kept = off > 2 * _limit(count)
+        return Defects(self.rows[kept], self.columns[kept]) if kept.any() else None
+
 
 class _LeftOut(Capture):
     """A capture whose readings at some pixels are ``moved``, by pattern."""
 
     def __init__(self, whole: Capture, defects: Defects, moved: dict[tuple[int, int], FloatArray]) -> None:
         super().__init__(whole.manifest, whole.folder)
-        self._whole, self._defects, self._moved = whole, defects, moved
+        self._whole, self._defects, self.moved = whole, defects, moved
 
     @cached_property
     def patterns(self) -> tuple[FloatArray, FloatArray]:
@@ -134,7 +153,7 @@ class _LeftOut(Capture):
         places = self._defects.rows, self._defects.columns
         for each in self._whole.measured(shape):
             frame, light = each.frame.copy(), each.light.copy()
-            frame[places] += self._moved[each.row, each.column]
+            frame[places] += self.moved[each.row, each.column]
             # Of a pair's sum nothing is told but that it is no less than the difference.
             light[places] = np.abs(frame[places])
             yield replace(each, frame=frame, light=light)
@@ -151,8 +170,7 @@ def defects_of(squares: FloatArray, variance: FloatArray, count: int) -> Defects
         of the measurements.
     """
     ratio = squares / np.maximum(variance, _LEAST_VARIANCE * float(variance.mean()) or 1.0)
-    # Quantile of a chi-square of that many degrees of freedom over their number, after Wilson and Hilferty (1931).
-    limit = (1 - 2 / (9 * count) + _SPREADS * np.sqrt(2 / (9 * count))) ** 3
+    limit = _limit(count)
     typical = (1 - 2 / (9 * count)) ** 3
     off = ratio > limit * max(1.0, float(np.median(ratio)) / typical)
     # What bright ones are off by leaks into others: these first.
@@ -170,3 +188,8 @@ def defects_of(squares: FloatArray, variance: FloatArray, count: int) -> Defects
     kept &= maximum_filter(crowd, width)[places[:, 0], places[:, 1]] < _CROWD
     places = places[kept]
     return Defects(places[:, 0], places[:, 1]) if len(places) else None
+
+
+def _limit(count: int) -> float:
+    """Quantile of a chi-square of ``count`` degrees of freedom over their number, after Wilson and Hilferty (1931)."""
+    return float((1 - 2 / (9 * count) + _SPREADS * np.sqrt(2 / (9 * count))) ** 3)

@@ -45,6 +45,9 @@ _EXPLAINS = 0.2
 """Part of what a frame is off by that a fault may leave: chosen, with room for what the others foretell badly."""
 _MOST_BAD = 0.25
 """Of all patterns: above it the run is another than it says, and no single frames are at fault."""
+_SETTLED, _MOST_STEPS = 0.1, 100
+"""Of :data:`CHANCE`, the energy below which a step of foretelling changes nothing that counts; and the most steps,
+which patterns that know nothing of each other do not need: chosen."""
 _STEPS = 12
 """Rounds in which patterns left out are foretold from the rest: each brings what overlapping patterns know to a half or
 less of its distance."""
@@ -128,37 +131,39 @@ class FrameFault:
 class FrameSums:
     """Energies by pattern, (K, K') each, gathered as measurements are held against a model.
 
-    ``residual``, ``power``: what is left of a pattern's measurement, and sum of the squares of its shots. ``light``:
-    sum of its light. ``sums``: of signed patterns, energy by which the halves' sum differs from that of all others.
-    ``halves``: light of a signed pattern's shots. ``digests``: patterns, and which of their shots, by a number that
-    frames which are one and the same share.
+    ``residual``, ``power``, ``energy``: what is left of a pattern's measurement, sum of the squares of its shots, and
+    of the measurement as the solver takes it. ``light``: sum of its light. ``sums``: of signed
+    patterns, energy by which the halves' sum differs from that of all others. ``halves``: light of a signed pattern's
+    shots. ``digests``: patterns, and which of their shots, by a number that frames which are one and the same share.
     """
 
     counts: tuple[int, int]
     residual: FloatArray = field(init=False)
     power: FloatArray = field(init=False)
+    energy: FloatArray = field(init=False)
     light: FloatArray = field(init=False)
     sums: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
-        self.residual, self.power, self.light, self.sums = (np.zeros(self.counts) for _ in range(4))
+        self.residual, self.power, self.energy = (np.zeros(self.counts) for _ in range(3))
+        self.light, self.sums = (np.zeros(self.counts) for _ in range(2))
         self.digests: dict[int, list[tuple[Pattern, int]]] = {}
         self.halves: dict[Pattern, tuple[float, float]] = {}
 
-    def add(self, measurement: Measurement, residual: float, power: float, total: FloatArray) -> None:
+    def add(self, measurement: Measurement, residual: float, power: float, energy: float, total: FloatArray) -> None:
         """Count in one measurement.
 
         Parameters
         ----------
         measurement
             which pattern it is of.
-        residual, power
-            energies of what is left of it and of its shots.
+        residual, power, energy
+            of what is left of it, of its shots, and of itself as the solver takes it.
         total
             (rows, columns) light of all patterns' shots.
         """
         pattern = measurement.row, measurement.column
-        self.residual[pattern], self.power[pattern] = residual, power
+        self.residual[pattern], self.power[pattern], self.energy[pattern] = residual, power, energy
         for half, digest in enumerate(measurement.digests):
             self.digests.setdefault(digest, []).append((pattern, half))
         self.light[pattern] = light = float(measurement.light.sum())
@@ -319,14 +324,16 @@ class FrameCheck:
         noise = self.noise.variance * self._size
         chance = CHANCE * self.noise.variance * np.sqrt(2 * self._size)
         share = beside_noise * sums.power / max(float(sums.power.sum()), np.finfo(float).tiny)
-        power = np.maximum(sums.power, np.median(sums.power[good]))
         others = max(good.sum() - 1, 1)
-        tests = [(sums.residual, noise * self._spare + share, chance)]
+        # Behind a mask with a constant term most of a frame's light says nothing, and is no part of what it is off by.
+        whole = sums.energy if self.prepared.centre else sums.power
+        tests = [(sums.residual, whole, noise * self._spare + share, chance)]
         if self._signed:
             mean = float(noise[good].mean())
-            tests.append((sums.sums, noise + mean / others + share, 2 * chance))
+            tests.append((sums.sums, sums.power, noise + mean / others + share, 2 * chance))
         worst: tuple[float, Pattern, bool] | None = None
-        for energy, expected, allowed in tests:
+        for energy, whole, expected, allowed in tests:
+            power = np.maximum(whole, np.median(whole[good]))
             beyond = np.where(good, np.maximum(energy - expected, 0.0), 0.0)
             part = beyond / np.maximum(power, np.finfo(float).tiny)
             usual = float(np.median(part[good])) if good.sum() > 2 else 0.0
@@ -506,12 +513,33 @@ class FrameCheck:
             )
             for pattern in bad
         }
-        for _ in range(1 if self._exclusive else _STEPS):
-            now = rest.copy()
+
+        def of_bad(values: FloatArray) -> FloatArray:
+            own = np.zeros_like(values)
             for pattern, (left, right) in grams.items():
                 places = self._columns(*pattern)
-                now[places] += left @ weights[places] @ right
-            weights = now
+                own[places] += left @ values[places] @ right
+            return own
+
+        if self._exclusive:
+            return np.asarray(rest + of_bad(weights))
+        # W - of_bad(W) = rest are the normal equations of the good ones: conjugate gradients after Hestenes and Stiefel
+        # (1952), until a step brings these frames less than chance does.
+        enough = _SETTLED * CHANCE * float(self.noise.variance.mean()) * np.sqrt(2 * self._size)
+        left_over = rest + of_bad(weights) - weights
+        step, squared = left_over.copy(), _energy(left_over)
+        for _ in range(_MOST_STEPS):
+            moved = step - of_bad(step)
+            curvature = float(np.vdot(step, moved))
+            if not curvature > 0:
+                break
+            length = squared / curvature
+            weights = weights + length * step
+            if length * squared < enough:
+                break
+            left_over -= length * moved
+            before, squared = squared, _energy(left_over)
+            step = left_over + squared / before * step
         return weights
 
     def _gathered(self, weights: FloatArray, bad: Iterable[Pattern]) -> FrameSums:
@@ -522,9 +550,10 @@ class FrameCheck:
             total = sum((each.light for each in self._measurements(self._good(bad)).values()), start=np.zeros(()))
         others = max(self.noise.variance.size - len(set(bad)), 2)
         for each in self.measured():
-            residual = self._centred(each.frame) - self._frame(weights, each.row, each.column)
-            pattern = each.row, each.column
-            sums.residual[pattern], sums.power[pattern] = _energy(residual), float(each.power.sum())
+            pattern, frame = (each.row, each.column), self._centred(each.frame)
+            residual = frame - self._frame(weights, each.row, each.column)
+            sums.residual[pattern], sums.power[pattern] = _energy(residual), each.power
+            sums.energy[pattern] = _energy(frame)
             sums.light[pattern] = float(each.light.sum())
             if self._signed:
                 sums.sums[pattern] = _energy((each.light * others - total) / (others - 1))
@@ -633,7 +662,9 @@ class _Namer:
             weights = self._together({one.pattern: frame})
             fit = self._check._frame(weights, *one.pattern)
         left = self._left({one.pattern: frame}, weights) - self._least
-        return left - float(known.sum()) * one.variance * self._check._spare
+        # The noise of a frame is that of its mean light, which what is lost makes too little.
+        variance = max(one.variance, float(self._check.noise.of(float(raw[known].mean()), 1)))
+        return left - float(known.sum()) * variance * self._check._spare
 
     # ---- what was read
 
@@ -851,12 +882,17 @@ class _Namer:
         if shift == (0, 0):
             return
         if one.foretold is not None and not self._check._signed:
-            back = np.roll(one.raw, (-shift[0], -shift[1]), (0, 1))
-            known = [np.zeros(size, dtype=np.bool_) for size in back.shape]
-            for line, step in zip(known, shift, strict=True):
-                line[max(-step, 0) : len(line) - max(step, 0)] = True
-            left = self._filled(one, back, np.outer(*known))
-            rows, columns = shift
+            # Frames of a smooth mask correlate beside their shift: from there on it is what leaves least.
+            left, (rows, columns) = self._put_back(one, shift), shift
+            for _ in range(reach):
+                beside = [(rows + down, columns + across) for down in (-1, 0, 1) for across in (-1, 0, 1)]
+                within = [each for each in beside if each != (rows, columns) and max(map(abs, each)) <= reach]
+                best, place = min((self._put_back(one, each), each) for each in within)
+                if best >= left:
+                    break
+                left, (rows, columns) = best, place
+            if (rows, columns) == (0, 0):
+                return
             words = f"is shifted by {rows} rows and {columns} columns of the sensor"
             yield left, Fault.SHIFTED, one.numbers, words
             return
@@ -867,6 +903,13 @@ class _Namer:
             rows, columns = shift
             words = f"is shifted by {rows} rows and {columns} columns of the sensor"
             yield moved / unmoved * one.off, Fault.SHIFTED, one.numbers, words
+
+    def _put_back(self, one: _Seen, shift: tuple[int, int]) -> float:
+        """Energy beyond noise that a frame leaves that is moved back by a ``shift``, rows and columns."""
+        known = [np.zeros(size, dtype=np.bool_) for size in one.raw.shape]
+        for line, step in zip(known, shift, strict=True):
+            line[max(-step, 0) : len(line) - max(step, 0)] = True
+        return self._filled(one, np.roll(one.raw, (-shift[0], -shift[1]), (0, 1)), np.outer(*known))
 
     # ---- fits
 

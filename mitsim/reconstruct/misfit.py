@@ -193,7 +193,8 @@ class Residuals:
         self.pixels: FloatArray = np.outer(*(np.diff(edge) for edge in edges)).astype(np.float64)
         self.energy, self.power, self.variance = (np.zeros(self.pixels.shape) for _ in range(3))
         self.squares: FloatArray = np.zeros(sizes)
-        self._own: FloatArray = np.zeros(sizes)  # of one frame: to make it anew takes longer than to fill it
+        # Of one frame: to make them anew takes longer than to fill them.
+        self._residual, self._squared = np.zeros(sizes), np.zeros(sizes)
         self.by_pattern = FrameSums((prepared.left.pattern_count, prepared.right.pattern_count))
 
     def add(self, measurement: Measurement) -> None:
@@ -201,12 +202,19 @@ class Residuals:
         prepared = self._prepared
         frame = centred(measurement.frame) if prepared.centre else measurement.frame
         left, right = prepared.left.slabs[measurement.row], prepared.right.slabs[measurement.column]
-        residual = frame - (left.matrix @ self._weights[left.columns][:, right.columns]) @ right.matrix.T
-        flat, power = residual.ravel(), self._sums(measurement.power)
-        self.squares += np.multiply(residual, residual, out=self._own)
-        self.energy += self._squares(frame)
+        modelled = left.matrix @ self._weights[left.columns][:, right.columns]
+        residual = np.matmul(modelled, right.matrix.T, out=self._residual)
+        np.subtract(frame, residual, out=residual)
+        flat = residual.ravel()
+        self.squares += np.multiply(residual, residual, out=self._squared)
+        energy = self._squares(frame)
+        power = energy if frame is measurement.light else self._squares(measurement.light)
+        if measurement.shots == 2:  # as Measurement.power has it
+            power = (power + (energy if frame is measurement.frame else self._squares(measurement.frame))) / 2
+        self.energy += energy
         self.power += power
-        self.by_pattern.add(measurement, float(np.dot(flat, flat)), float(power.sum()), self._noise.light)
+        left_over, given = float(np.dot(flat, flat)), float(energy.sum())
+        self.by_pattern.add(measurement, left_over, float(power.sum()), given, self._noise.light)
         # The variance is linear in the light: that of a tile's mean light is the tile's mean variance.
         light = self._sums(measurement.light) / self.pixels
         variance = self._noise.of(light, measurement.shots) * self.pixels

@@ -88,9 +88,10 @@ class FrameNoise:
             self.rows, self.columns = (np.zeros((*self.variance.shape, size)) for size in light.shape)
             self.light = np.zeros(light.shape)
         self.light += light
-        self.variance[pattern] = self._own(light.mean(), shots)
-        self.rows[pattern], self.columns[pattern] = (self._own(light.mean(axis=axis), shots) for axis in (1, 0))
-        self.power += float(measurement.power.sum())
+        by_row, by_column = light.mean(axis=1), light.mean(axis=0)
+        self.variance[pattern] = self._own(float(by_row.mean()), shots)
+        self.rows[pattern], self.columns[pattern] = self._own(by_row, shots), self._own(by_column, shots)
+        self.power += measurement.power
         self.shots = shots
         self.factor = math.gcd(self.factor, measurement.factor)
         self.saturated += measurement.saturated

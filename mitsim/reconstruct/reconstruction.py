@@ -283,6 +283,12 @@ def _without_defects(
         solution = without.solution(lam, method)
         again = without.misfit(rest, factors, solution)
         now = again or now
+    # What bright ones put into other pixels is none of these: they are taken in again.
+    while found and (own := found.beyond_chance(rest, data.noise)) and len(own.rows) < len(found.rows):
+        found, rest = own, own.left_out(shots, data.prepared, data.weights)
+        without = accumulated(rest, factors, method)
+        solution = without.solution(lam, method)
+        now = without.misfit(rest, factors, solution, with_defects=False) or now
     if now.flagged:
         now = without.misfit(rest, factors, solution, with_defects=False) or now
     if now.flagged and now.unexplained > _BETTER * misfit.unexplained:

@@ -172,3 +172,22 @@ def test_a_flat_capture_of_unstated_noise_says_nothing_of_noise() -> None:
     clean = with_frames(shots, lambda frames: [BLACK + GAIN * (light + DARK)])
     misfit = reconstruct(clean, plain.calibrated(1)).misfit
     assert misfit is not None and not misfit.faults
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda frame: np.where(np.arange(PIXELS)[:, None] < 52, 0.0, frame), "no light in sensor rows 0 to 51"),
+        (dark, "no light"),
+    ],
+    ids=["half_lost", "black"],
+)
+def test_of_a_constant_term_nothing_is_told(change: Callable[[np.ndarray], np.ndarray], words: str) -> None:
+    """Even light in front of all frames, which the solver takes out as it does behind a FlatCam's mask."""
+    even = replace(bench(), optics=lambda light: light / 50 + 0.98 * light.mean())
+    shots, factors = even.run("random:4", picture(1), 1), bench().calibrated(1)
+    factors = replace(factors, manifest=factors.manifest.model_copy(update={"centre": True}))
+    assert reconstruct(shots, factors).ok
+    found = reconstruct(with_frames(shots, lambda frames: [*frames[:3], change(frames[3]), *frames[4:]]), factors)
+    assert found.misfit is not None and [fault.numbers for fault in found.misfit.faults] == [(3,)]
+    assert words in found.misfit.faults[0].words

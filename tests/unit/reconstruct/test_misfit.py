@@ -231,7 +231,7 @@ def test_both_halves_of_a_pair_count_alike() -> None:
     for each in shots.measured():
         positive, negative = rate[each.row, each.column, 1], rate[each.row, each.column, -1]
         assert np.array_equal(each.frame, positive - negative) and np.array_equal(each.light, positive + negative)
-        assert each.shots == 2 and each.power == pytest.approx(positive**2 + negative**2, rel=1e-12)
+        assert each.shots == 2 and each.power == pytest.approx(np.sum(positive**2 + negative**2), rel=1e-12)
 
 
 @pytest.mark.parametrize(
