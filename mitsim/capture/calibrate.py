@@ -35,8 +35,17 @@ from mitsim.core.seeds import integer
 from mitsim.core.versions import deciding_versions, versions
 from mitsim.optics.frames import Frame
 from mitsim.optics.separable import Lacking, lacking
-from mitsim.reconstruct.calibration import SEPARABLE_RESIDUAL, Estimate, Seen, StripeSums, factors_of_sums, stripe_sums
+from mitsim.reconstruct.calibration import (
+    SEPARABLE_RESIDUAL,
+    Estimate,
+    PairSeen,
+    PairSums,
+    Seen,
+    StripeSums,
+    stripe_sums,
+)
 from mitsim.reconstruct.factors import Factors, load_calibration
+from mitsim.reconstruct.session_faults import Checked, check_session, frame_words
 from mitsim.rig.order import SIDES
 from mitsim.rig.recipe import SessionRecipe, load_recipe
 
@@ -181,11 +190,12 @@ def calibrate_session(
         lit = session.lit(_light(session, plan, checkpoint, job), job)
         if frames is not None:
             lit = replace(lit, kept=KeptFrames(session, frames))
-        (noisy, clean), saturated = estimates(lit, job, (NOISY, NOISE_FREE), checkpoint)
+        (noisy, clean), saturated, found = checked_estimates(lit, job, (NOISY, NOISE_FREE), checkpoint)
         if lit.kept is not None:
             lit.kept.finish(digital_scale(bench, lit.exposure_s))
         lacks = _lacking(lit, clean)
         warnings = lit.light.warnings + session.warnings + (() if noisy.ok else (str(noisy.status),))
+        warnings += found.warnings(frame_words)
         if saturated:
             warnings += (
                 f"saturation: {saturated} of {session.shots} frames have pixels at the full well or the ADC's end, "
@@ -199,6 +209,8 @@ def calibrate_session(
             "unexplained_residual": noisy.unexplained,
             "noise_free_residual": clean.separability_residual,
             "phi_error": _factor_error(noisy, clean),
+            "faults": found.listed(frame_words),
+            "lamp": found.lamp.listed(),
             "shadow_residual": lacks and lacks.residual,
             "condition": noisy.condition,
             "exposure_s": lit.exposure_s,
@@ -247,11 +259,26 @@ def estimate(
     return found, saturated
 
 
-@single_threaded_blas()
 def estimates(
     lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Checkpoint | None = None
 ) -> tuple[list[Estimate], int]:
-    """Factors from each kind of responses to a session, whose frames are formed once, and its saturated shots.
+    """Factors from each kind of responses to a session, and its saturated shots.
+
+    Parameters
+    ----------
+    lit, job, kinds, checkpoint
+        as for :func:`checked_estimates`.
+    """
+    found, saturated, _ = checked_estimates(lit, job, kinds, checkpoint)
+    return found, saturated
+
+
+@single_threaded_blas()
+def checked_estimates(
+    lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Checkpoint | None = None
+) -> tuple[list[Estimate], int, Checked]:
+    """Factors from each kind of responses to a session, whose frames are formed once, its saturated shots, and what its
+    noisy frames show of faults.
 
     Parameters
     ----------
@@ -266,7 +293,10 @@ def estimates(
     if stripes is None:
         with job.clock.stage("sensor"):
             first = [list(_responses(lit, kinds, side, 0, lit.white)) for side in SIDES]
-        both = [stripe_sums(left.rate, right.rate, count, session.centre) for left, right in zip(*first, strict=True)]
+        both = [
+            stripe_sums(left.rate, right.rate, count, session.centre, lights=(left.light, right.light))
+            for left, right in zip(*first, strict=True)
+        ]
         stripes = _Stripes(dict(zip(kinds, both, strict=True)), sum(each.saturated for side in first for each in side))
         del first
     for side, sums in zip(SIDES, zip(*stripes.sums.values(), strict=True), strict=True):
@@ -277,11 +307,17 @@ def estimates(
             if sums[0].done % _SAVED_EVERY == 0 or sums[0].done == count:
                 checkpoint.save(_STRIPES, stripes.arrays())
     with job.clock.stage("estimate"):
-        found = [
-            factors_of_sums(*stripes.sums[kind], session.signs, lit.response_noise if kind == NOISY else None)
+        judged = [
+            check_session(stripes.sums[kind], session.signs, session.order, saturated=bool(stripes.saturated))
+            if kind == NOISY
+            else Checked(stripes.sums[kind])
             for kind in kinds
         ]
-    return found, stripes.saturated
+        found = [
+            each.estimate(session.signs, lit.response_noise if kind == NOISY else None)
+            for kind, each in zip(kinds, judged, strict=True)
+        ]
+    return found, stripes.saturated, judged[0]
 
 
 def _responses(lit: LitSession, kinds: Sequence[str], side: str, number: int, frame: Frame) -> Iterator[Response]:
@@ -295,7 +331,9 @@ def _looked(
 ) -> list[tuple[Seen, int]]:
     """What the responses to a pattern add to the ``sums`` of each kind, and their saturated shots."""
     responses = _responses(lit, kinds, sums[0].side, *shown)
-    return [(own.seen(each.rate, shown[0]), each.saturated) for own, each in zip(sums, responses, strict=True)]
+    return [
+        (own.seen(each.rate, shown[0], each.light), each.saturated) for own, each in zip(sums, responses, strict=True)
+    ]
 
 
 def _lacking(lit: LitSession, clean: Estimate) -> Lacking | None:
@@ -371,6 +409,14 @@ class _Stripes:
                 name = f"{kind}_{sums.side}"
                 arrays[f"{name}_common"], arrays[f"{name}_vectors"] = sums.common, sums.vectors[:, : sums.done]
                 arrays[f"{name}_sums"] = [sums.misfit, sums.energy]
+                arrays[f"{name}_each"] = [sums.misfits[: sums.done], sums.energies[: sums.done]]
+                if sums.pairs is not None:
+                    pairs = sums.pairs
+                    arrays[f"{name}_light"] = pairs.light[:, : sums.done]
+                    arrays[f"{name}_rows"], arrays[f"{name}_columns"] = (
+                        pairs.rows[: sums.done],
+                        pairs.columns[: sums.done],
+                    )
         return arrays
 
 
@@ -385,7 +431,15 @@ def _restored(arrays: Mapping[str, FloatArray] | None, kinds: Sequence[str], ses
         vectors[:, : finished.shape[1]] = finished
         misfit, energy = map(float, arrays[f"{kind}_{side}_sums"])
         common = arrays[f"{kind}_{side}_common"]
-        return StripeSums(side, session.centre, common, vectors, misfit, energy, finished.shape[1])
+        sums = StripeSums(side, session.centre, common, vectors, misfit, energy, finished.shape[1])
+        sums.misfits[: sums.done], sums.energies[: sums.done] = arrays[f"{kind}_{side}_each"]
+        if f"{kind}_{side}_light" in arrays:
+            light, rows, columns = (arrays[f"{kind}_{side}_{part}"] for part in ("light", "rows", "columns"))
+            seen = [PairSeen(*parts) for parts in zip(light.T, rows, columns, strict=True)]
+            sums.pairs = PairSums.empty(seen[0], vectors.shape[1])
+            for number, each in enumerate(seen):
+                sums.pairs.put(number, each)
+        return sums
 
     return _Stripes(
         {kind: (restored(kind, SIDES[0]), restored(kind, SIDES[1])) for kind in kinds}, int(arrays["saturated"])

@@ -6,10 +6,11 @@ import math
 
 from mitsim.capture.bench import Bench
 from mitsim.capture.effects import names
-from mitsim.capture.evidence import GROUPS, LANES_AT_ONCE, Settings
+from mitsim.capture.evidence import GROUPS, Settings
 from mitsim.capture.exposer import frames_at_once
 from mitsim.capture.prices import Numbers, entries
 from mitsim.capture.rasters import raster_bytes
+from mitsim.capture.simulation import Simulation
 from mitsim.core.resources import Cost, workers
 from mitsim.optics.frames import PROBES, frames_in_memory
 from mitsim.rig.patterns import Lighting
@@ -24,7 +25,10 @@ _ENTRY_BYTES = 45.0
 """An entry of a sparse matrix of light (12), the sum that it is added to, and what frames are formed of; measured 32 to
 45 where matrices are large."""
 _DEPOSIT_BYTES = 500.0
-"""A path's light while it is filed; measured."""
+"""A path's light while it is filed in one cell or two; measured."""
+_PATH_BYTES, _PART_BYTES = 200.0, 75.0
+"""The same where it is shared between more: the light of a path that is filed, and of one that is traced meanwhile (74
+each); and each cell's part of it, its place, row and light, sorted (64; 382 in all for four, glossy balls)."""
 _TERM_BYTES = 3 * 16.0
 """A pixel and cell of a term of a mask of many: both sides in the shadow, stacked, and picked for a frame."""
 _EXPOSED = 6
@@ -102,7 +106,7 @@ def light_bytes(bench: Bench, classes: int, settings: Settings, lines: int = 1) 
         that share the paths: the light of each is held.
     """
     filed = float(entries(bench.n**2, classes, Numbers.of(settings), settings))
-    paths = min(LANES_AT_ONCE, _paths(bench.n**2, settings))
+    paths = Simulation(bench, settings).paths_at_once
     followed = bool(settings.effects & names(lambda effect: effect.followed))
     geometry, cells = bench.geometry, bench.n * max(settings.subdivision, settings.coarse_cells) * settings.anchors
     terms = geometry.mask_terms if geometry.mask_terms > FEW else 0
@@ -112,15 +116,11 @@ def light_bytes(bench: Bench, classes: int, settings: Settings, lines: int = 1) 
             0.0 if settings.raster else factors,
             raster_bytes(geometry.model_copy(update={"mask_cells": settings.raster_cells})),
         )
-    held = lines * GROUPS * filed * _ENTRY_BYTES + min(lines, workers()) * paths * _DEPOSIT_BYTES
+    held = lines * GROUPS * filed * _ENTRY_BYTES + min(lines, workers()) * paths * deposit_bytes(settings)
     return factors + _LANES_BYTES + _FOLLOWED_BYTES * followed + held
 
 
-def _paths(pixels: int, settings: Settings) -> float:
-    """Paths of one group's largest stage, about."""
-    anchored = settings.anchors**2 * max(settings.anchored_samples, 1.0) * (settings.anchors > 1)
-    most = max(settings.followed_samples, settings.followed_from_camera_samples, 1.0)
-    followed = settings.followed_anchors**2 * most * (settings.followed_anchors > 1)
-    part = len(settings.with_own_anchors) / pixels
-    occluded = part * settings.occluded_anchors**2 * max(settings.occluded_samples, 1.0)
-    return pixels * max(settings.direct_samples, 1.0, anchored, followed, occluded, settings.indirect_samples)
+def deposit_bytes(settings: Settings) -> float:
+    """Memory of a path's light while it is filed: that of sharp pixels lies in four cells of two layers at most."""
+    parts = min(len(settings.depths), 2) * (4 if settings.sharp else 1)
+    return max(_DEPOSIT_BYTES, _PATH_BYTES + parts * _PART_BYTES)

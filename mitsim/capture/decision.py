@@ -8,6 +8,7 @@ what is left out, what is made coarse, and sampling. The cheapest settings that 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -30,6 +31,7 @@ from mitsim.capture.prices import (
     truth_seconds,
 )
 from mitsim.capture.request import check_accuracy
+from mitsim.transport.glint import polished_shapes
 
 if TYPE_CHECKING:
     from mitsim.capture.bench import Bench
@@ -55,6 +57,8 @@ class SceneFacts:
         what the model of the devices does not cover, and which of the scene's light frames are known to lack.
     shapes
         where the scene's shapes are written, if that is known.
+    mirrors
+        those of them that reflect or bend light into single directions.
     spectrum
         what to say of colours.
     """
@@ -63,6 +67,7 @@ class SceneFacts:
     keystone: float
     warnings: tuple[str, ...] = ()
     shapes: tuple[Tag, ...] = ()
+    mirrors: tuple[Tag, ...] = ()
     spectrum: PlanRow = field(default_factory=lambda: PlanRow("spectrum", "off", _GREY, 0.0, 0.0))
 
     @classmethod
@@ -104,7 +109,10 @@ class SceneFacts:
                 "of masks needs features above it, so the shadow is a guess"
             )
         notes = {name: effect.note(bench) for name, effect in EFFECTS.items()}
-        return cls(notes, bench.loaded.pixels.keystone, tuple(warnings), bench.loaded.shapes, _spectrum(bench))
+        loaded = bench.loaded
+        polished = polished_shapes(loaded.scene) if loaded.mirrors and loaded.shapes else ()
+        mirrors = tuple(loaded.shapes[number] for number in polished)
+        return cls(notes, loaded.pixels.keystone, tuple(warnings), loaded.shapes, mirrors, _spectrum(bench))
 
 
 def decide(
@@ -195,10 +203,23 @@ class _Words:
         shapes, mirror = self.facts.shapes, self.evidence.mirror
         if mirror is not None and shapes and self.evidence.left_out >= min(accuracy, parts[largest]):
             said.append(self._left_out(shapes[mirror]))
+        if self.facts.mirrors and self.evidence.glint >= min(accuracy, parts[largest]):
+            said.append(self._unresolved_glint(self.facts.mirrors))
         return tuple(said) or (
             f"the predicted total error, up to {chosen.total.bound:.1e}, exceeds the requested {accuracy:g}; "
             f"largest: {largest}, {parts[largest]:.1e}",
         )
+
+    def _unresolved_glint(self, mirrors: tuple[Tag, ...]) -> str:
+        """What is lost of light over ``mirrors`` alone."""
+        kinds = Counter(str(mirror.attributes.get("type", "shape")) for mirror in mirrors)
+        among = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
+        rule = (
+            f"{self.evidence.glint:.2g} of the light comes over the scene's mirrors and curved glass alone ({among}; "
+            "this is the first), in beams too fine to be placed on the sensor: it is left out, or in the wrong pixels; "
+            "use fewer or larger ones, move them apart, or make them rough"
+        )
+        return str(mirrors[0].refusal("shape", repr(mirrors[0].attributes.get("type", "")), rule))
 
     def _left_out(self, mirror: Tag) -> str:
         """What is lost over a ``mirror`` or curved glass."""

@@ -183,7 +183,8 @@ def _diffraction(bench: Bench) -> str:
 def _lamps(bench: Bench) -> str:
     counted = ", counted from {:g} to {:g} nm".format(*bench.lamplight.range_nm) if bench.lamplight else ""
     lamps = len(bench.loaded.lamps)
-    return f"{lamps} emitter{'s' if lamps > 1 else ''} beside the projector{counted}"
+    counted = f"{lamps} emitter{'s' if lamps > 1 else ''} beside the projector{counted}"
+    return "; ".join((counted, *bench.loaded.notes))
 
 
 def _lens(bench: Bench) -> str:

@@ -347,6 +347,8 @@ class Evidence:
         as in :class:`Settings`, where that takes less for as little noise; ``indirect`` is then what that takes.
     left_out
         light that no tracer finds, over that and what is found (:mod:`mitsim.transport.left_out`).
+    glint
+        light over mirrors alone whose place on the sensor is not known, over all light.
     mirror
         place, among the scene's shapes, of what most of that comes over.
     reach, sharp, occluded
@@ -357,6 +359,8 @@ class Evidence:
         what is followed takes at several anchors beyond its mean, from either side (paths: to one of them).
     raster
         what a shadow on a raster leaves of the frames, without diffraction and with it (:class:`Drawn`).
+    hits
+        rays that bring all direct light if each projector pixel sends one, where these are few; else infinite.
     """
 
     depth: float
@@ -371,6 +375,7 @@ class Evidence:
     apart: Mapping[str, float] = field(default_factory=dict)
     unresolved: float = 0.0
     left_out: float = 0.0
+    glint: float = 0.0
     mirror: int | None = None
     shared: bool = False
     repeats: tuple[int, ...] = ()
@@ -382,6 +387,7 @@ class Evidence:
     occluded: tuple[int, ...] = ()
     occluded_light: Effort = field(default_factory=lambda: Effort.none())
     raster: tuple[Drawn, Drawn] = (Drawn(), Drawn())
+    hits: float = math.inf
 
     def forms(self, waves: bool) -> tuple[int, ...]:
         """Raster cells along a pixel that frames may be formed of, 0 for a sum of terms; with ``waves`` or not."""

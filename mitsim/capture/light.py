@@ -558,6 +558,7 @@ class _Group:
             what light is filed by while the next is traced: filing takes one processor, and a tracer waits for its last
             paths. All is there when it has been waited for.
         """
+        at_once = min(LANES_AT_ONCE, self.simulation.paths_at_once)
         for name, stage in self.simulation.tracers().items():
             samples = wanted.get(name, 0)
             if self.done.get(name, 0) >= samples:
@@ -567,7 +568,7 @@ class _Group:
                 filing.wait()
                 self._spread(name, samples / self.done[name])
             while (done := self.done.get(name, 0)) < samples:
-                count = min(max(1, LANES_AT_ONCE // stage.tracer.lanes), samples - done)
+                count = min(max(1, at_once // stage.tracer.lanes), samples - done)
                 deposits = stage.trace(seed, done, count, ledgers)
                 lights = enumerate(deposits.by_line(self._lines))
                 filing.give([partial(self._file, name, stage, light, line, samples) for line, light in lights])

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from mitsim.rig.profile import MaskProfile
     from mitsim.rig.projector import ProjectorModel
     from mitsim.scene.load import LoadedScene
+    from mitsim.transport.contact import Contact
 
 _PITCH_TOLERANCE = 1e-3
 """Relative difference of the scene's pixel pitch from the camera's that is rounding in a data sheet."""
@@ -171,10 +172,30 @@ def _loaded(variant: str, path: Path, defines: Mapping[str, str], **options: boo
     mitsuba = load_variant(variant)
     from mitsim.scene.load import load_scene
     from mitsim.transport import plugins
+    from mitsim.transport.contact import contacts
 
     mitsuba.set_log_level(mitsuba.LogLevel.Error)
     plugins.register()
-    return load_scene(path, defines, **options)
+    loaded = load_scene(path, defines, **options)
+    of_factored, of_reference = contacts(loaded.scene)
+    factored = _in_contact(loaded, of_factored, "the factored estimator")
+    reference = _in_contact(loaded, of_reference, "the reference")
+    if factored is not None and options.get("needs_projector", True):
+        raise factored
+    unfit = replace(
+        loaded.unfit, factored=loaded.unfit.factored or factored, reference=loaded.unfit.reference or reference
+    )
+    return replace(loaded, unfit=unfit)
+
+
+def _in_contact(loaded: LoadedScene, contact: Contact | None, estimator: str) -> MitsimError | None:
+    """The refusal of a scene with a ``contact`` by an ``estimator``."""
+    if contact is None:
+        return None
+    got, rule = contact.words(estimator)
+    if loaded.shapes:
+        return loaded.shapes[contact.shape].refusal("shape", got, rule)
+    return MitsimError(f"{loaded.path}: shape {contact.shape}: got {got}; {rule}")
 
 
 def _text(value: object) -> str:

@@ -12,11 +12,12 @@ import drjit as dr
 from mitsim.capture import pilot
 from mitsim.capture.affordable import FIRST_LOOK, affordable, told
 from mitsim.capture.bench import Bench
-from mitsim.capture.choice import Candidates, cheapest, doubt
+from mitsim.capture.choice import Candidates, cheapest, doubt, predicted
 from mitsim.capture.cost import frame_seconds
 from mitsim.capture.decision import SceneFacts, decide
-from mitsim.capture.evidence import GROUPS, Evidence
+from mitsim.capture.evidence import GROUPS, LOOKS, Evidence, Settings
 from mitsim.capture.plan import Plan
+from mitsim.capture.prices import paces_of, tracing_seconds
 from mitsim.capture.request import check_accuracy
 from mitsim.capture.simulation import AT_ANCHORS, Simulation, Stage
 from mitsim.core.arrays import Labels
@@ -38,6 +39,16 @@ _SELDOM = 3.0
 _LONG, _MORE = 5.0, 4
 """Seconds of a stage from which its pace is told by what so many times as many paths take longer: the cost of launches
 does not count as if it grew with the paths."""
+
+_HEAVY_PATHS, _MOST_HEAVY_PATHS = 2**19, 2**21
+"""Paths from the camera that are looked at for rare heavy ones, 0.1 s, and while they show more of them than was known:
+ten glossy balls of alpha 0.02 need a million to tell their noise to a factor of two (25 thousand: 3000 too little)."""
+_HEAVIER = 1.25
+"""Tracing that takes so many times as long as planned is told; less is what predictions are good to."""
+
+_STOPPED_LATE = 1.5
+"""Samples that heavy paths take over those that their noise asks for: sampling stops by a bound that lies further above
+it than that of light paths, and rounds overshoot (the glossy balls: 1.1, 1.7 and 2.1 by three seeds of looks)."""
 
 _FIELDS = MappingProxyType(
     {
@@ -142,8 +153,43 @@ def _decided(look: pilot.Look, accuracy: float, switches: Mapping[str, bool]) ->
     """The plan at an ``accuracy`` of what a ``look`` found, with the paces of its choice measured."""
     evidence, bench = look.evidence, look.bench
     chosen = cheapest(accuracy, evidence, switches)
-    timed = _timed(evidence, Simulation(bench, chosen.settings), look.lighting.labels, look.seed)
-    return decide(accuracy, timed, SceneFacts.of(bench, switches), switches, chosen)
+    simulation = Simulation(bench, chosen.settings)
+    timed = _timed(evidence, simulation, look.lighting.labels, look.seed)
+    plan = decide(accuracy, timed, SceneFacts.of(bench, switches), switches, chosen)
+    if simulation.physics.mirrors:
+        # The pilot formed the frames of other shots, or of fewer effects, from the same beams.
+        plan = plan.taking(optics=plan.predicted["optics"] + bench.glint.seconds)
+    if simulation.from_camera is None or evidence.sharp is None:
+        return plan
+    more = _of_heavy_paths(look, accuracy, timed, chosen.settings, switches)
+    return plan.taking(transport=plan.predicted["transport"] + more) if more else plan
+
+
+def _of_heavy_paths(
+    look: pilot.Look, accuracy: float, evidence: Evidence, settings: Settings, switches: Mapping[str, bool]
+) -> float:
+    """Seconds that ``settings`` take more than with their samples, where rare paths over gloss make most of the noise.
+
+    Settings stay: that light is followed so far is known only while it is sampled. Of looks of ever more paths the
+    noisiest counts: what few paths see of such light is nearly always too little.
+    """
+    pace, known = paces_of(evidence), evidence
+    already = sum(tracing_seconds(evidence, settings, pace).values())
+    paths, needed = _HEAVY_PATHS, 0.0
+    while paths <= _MOST_HEAVY_PATHS:
+        found = look.heavy(max(1, paths // (LOOKS * evidence.from_camera.paths)))
+        noisier = {
+            name: replace(getattr(evidence, name), noise=effort.noise)
+            for name, effort in found.items()
+            if effort.variance > getattr(known, name).variance
+        }
+        known = replace(known, **noisier)
+        before = needed
+        needed = sum(tracing_seconds(known, predicted(accuracy, known, settings, switches).settings, pace).values())
+        if needed <= max(_HEAVIER * already, before):
+            break
+        paths *= _MORE
+    return _STOPPED_LATE * needed - already if needed > _HEAVIER * already else 0.0
 
 
 def _seconds(stage: Stage, seed: int, labels: Labels, samples: int) -> float:

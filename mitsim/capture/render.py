@@ -48,7 +48,7 @@ class Rendered:
     mean, error
         (m, m', channels) irradiance, and its standard error.
     facts
-        estimator, spp (None: factored), seconds, variant and seed.
+        estimator, spp (None: factored), seconds, variant, seed, and notes of what the scene's objects were changed in.
     warnings
         why the frame is flagged.
     """
@@ -257,5 +257,6 @@ def render(
         "seconds": time.perf_counter() - started,
         "variant": bench.variant,
         "seed": seed,
+        "notes": bench.loaded.notes,
     }
     return Rendered(mean, error, facts, warnings)

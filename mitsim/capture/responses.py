@@ -38,10 +38,12 @@ SHOT, DARK, READ, ROUNDING = "shot noise", "dark current", "read noise", "quanti
 
 @dataclass(frozen=True)
 class Response:
-    """Response (m, m') to a +-1 pattern [electrons / s], and how many of its shots had saturated pixels."""
+    """Response (m, m') to a +-1 pattern [electrons / s], how many of its shots had saturated pixels, and, of a pair,
+    the sum of its two shots."""
 
     rate: FloatArray
     saturated: int = 0
+    light: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,8 +196,15 @@ class LitSession:
             # Rounding leaves pixels that see the +1 stripes alone a little below zero.
             self._exposed(np.maximum(negative, 0.0, out=negative), side, 2 * number + 1),
         )
-        rate = self._rates(lambda rows: self._rate(shots[0], rows) - self._rate(shots[1], rows), shots[0])
-        return Response(rate, sum(shot.saturated for shot in shots))
+        light: FloatArray = np.empty(frame.irradiance.shape)
+
+        def difference(rows: slice) -> FloatArray:
+            one, other = self._rate(shots[0], rows), self._rate(shots[1], rows)
+            np.add(one, other, out=light[rows])
+            return one - other
+
+        rate = self._rates(difference, shots[0])
+        return Response(rate, sum(shot.saturated for shot in shots), light)
 
     def noise_free(self, frame: Frame) -> FloatArray:
         """(m, m') the same of the expected ``frame``: 2 Y((1 + P)/2) - Y(1)."""

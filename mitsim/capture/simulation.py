@@ -15,6 +15,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from mitsim.capture.effects import Physics
+from mitsim.capture.evidence import LANES_AT_ONCE, whole
 from mitsim.capture.filing import FiledLight, Trays
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.optics.frames import ClassFrames, ExpectedFrames
@@ -33,6 +34,8 @@ FromCamera = FromCameraTracer | Together
 """What follows light from the camera's side."""
 AT_ANCHORS = ("indirect at anchors", "from camera at anchors")
 """Names of the stages that follow light to every anchor."""
+_FEWEST_AT_ONCE = 2**18
+"""Paths that are held in memory at a time at least, 130 MB: so many take far longer than launching them."""
 
 
 @dataclass(frozen=True)
@@ -253,6 +256,15 @@ class Simulation(Trays):
             if from_camera is not None:
                 stages[names[1]] = Stage(from_camera, settings.followed_from_camera_samples, file, names[1])
         return stages
+
+    @cached_property
+    def paths_at_once(self) -> int:
+        """Paths whose light is held in memory at a time: as many as a stage is predicted to need, within limits; rounds
+        that turn out to need more take no more memory."""
+        stages = self.tracers().items()
+        most = max(int(whole(name, stage.predicted)) * stage.tracer.lanes for name, stage in stages)
+        lanes = max(stage.tracer.lanes for _, stage in stages)
+        return max(min(max(most, _FEWEST_AT_ONCE), LANES_AT_ONCE), lanes)
 
     def glint_frames(self, labels: Labels) -> ClassFrames | None:
         """Frames of the projector's glint by class in ``labels`` (n^2,); None without such light.

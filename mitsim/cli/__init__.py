@@ -93,7 +93,9 @@ def run() -> None:
         raise
     except MitsimError as error:
         _fail(spoken(error))
-    except (typer.Abort, KeyboardInterrupt):
+    except (typer.Abort, KeyboardInterrupt) as error:
+        if isinstance(error.__cause__, EOFError):  # which click takes for Control-D
+            end_uncaught(error.__cause__)
         code = INTERRUPTED
     except MemoryError:
         _fail("out of memory; close other programs, or ask for fewer pixels, frames or less accuracy")
@@ -348,7 +350,8 @@ def render(
             payload = {**frame.summary(), "output": str(frame.save(place))}
     lines = [
         f"{estimator}: mean irradiance {payload['mean']:.4e} W/m^2, relative noise {payload['mc_error']:.1e}, "
-        f"{payload['seconds']:.2f} s: {payload['output']}"
+        f"{payload['seconds']:.2f} s: {payload['output']}",
+        *payload["notes"],
     ]
     return finish(as_json, payload, lines, frame.warnings)
 

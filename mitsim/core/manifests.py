@@ -208,7 +208,13 @@ class Patterns(_Part):
     def _every_pattern_is_captured(self) -> Patterns:
         rows, columns = len(self.P_L[0]), len(self.P_R[0])
         signs: dict[tuple[int, int], list[int]] = {}
+        first_of: dict[str, int] = {}
         for number, shot in enumerate(self.captures):
+            earlier = first_of.setdefault(shot.file, number)
+            if earlier != number:
+                raise ValueError(
+                    f"captures.{number}: names {cut(shot.file)!r}, as captures.{earlier} does; give each its own frame"
+                )
             if shot.row >= rows or shot.column >= columns:
                 raise ValueError(
                     f"captures.{number}: got pattern ({shot.row}, {shot.column}); "
@@ -317,6 +323,13 @@ class RunManifest(RunHead):
     predicted_memory_bytes: float | None = Field(
         default=None, description="memory that this was predicted to take at most, beyond what the program held before"
     )
+
+    @model_validator(mode="after")
+    def _ambient_frame_is_no_capture(self) -> RunManifest:
+        ambient = self.ambient_frame and self.ambient_frame.file
+        if ambient and any(shot.file == ambient for shot in self.patterns.captures):
+            raise ValueError(f"ambient_frame: names {cut(ambient)!r}, a capture's file; give the frame without light")
+        return self
 
 
 class FactorNoise(_Part):

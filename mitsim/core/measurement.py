@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,6 +47,10 @@ class Measurement:
         their number.
     saturated
         readings of them at the full well or the ADC's end.
+    factor
+        largest whole number that divides all of their digital numbers; 1 where they are not whole.
+    digests
+        of each shot, which no two that were read apart share; 0 where all of its numbers are equal.
     """
 
     frame: FloatArray
@@ -54,14 +59,19 @@ class Measurement:
     light: FloatArray
     shots: int
     saturated: int
+    factor: int = 1
+    digests: tuple[int, ...] = ()
 
     def __add__(self, other: Measurement) -> Measurement:
         """Both halves of a signed pattern as one measurement."""
         shots, saturated = self.shots + other.shots, self.saturated + other.saturated
-        return Measurement(self.frame + other.frame, self.row, self.column, self.light + other.light, shots, saturated)
+        light, factor = self.light + other.light, math.gcd(self.factor, other.factor)
+        frame, digests = self.frame + other.frame, self.digests + other.digests
+        return Measurement(frame, self.row, self.column, light, shots, saturated, factor, digests)
 
     @property
-    def power(self) -> FloatArray:
-        """(rows, columns) sum of the squares of its shots [(electrons/s)^2]."""
+    def power(self) -> float:
+        """Sum of the squares of its shots [(electrons/s)^2]."""
         # For halves p and q, p^2 + q^2 = ((p - q)^2 + (p + q)^2) / 2.
-        return np.square(self.light) if self.shots == 1 else (np.square(self.frame) + np.square(self.light)) / 2
+        halves = (self.light,) if self.shots == 1 else (self.frame, self.light)
+        return float(sum(np.vdot(values, values) for values in halves)) / len(halves)

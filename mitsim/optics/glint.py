@@ -17,6 +17,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
@@ -50,7 +51,10 @@ class Beams:
     throughput
         (q, 2, 2) part of the light left at each corner.
     unresolved
-        flux near the sensor in beams that an edge cuts and that were not divided further; it is in no frame.
+        flux on the sensor that is in no beam, because where it lands was not found out.
+    error
+        standard error of the flux on the sensor, from beams that an edge cuts and that were not divided further: these
+        are points.
     """
 
     pixel: IntArray
@@ -59,6 +63,7 @@ class Beams:
     tangent: FloatArray
     throughput: FloatArray
     unresolved: float
+    error: float = 0.0
 
     def __len__(self) -> int:
         return len(self.pixel)
@@ -67,6 +72,11 @@ class Beams:
     def delivered(self) -> FloatArray:
         """(q,) flux that arrives at the sensor plane, on the sensor or beside it [W m^-2 mm^2]."""
         return np.asarray(self.flux * self.throughput.mean(axis=(1, 2)))
+
+    @property
+    def wide(self) -> npt.NDArray[np.bool_]:
+        """(q,) whether beams are more than points."""
+        return np.asarray((np.ptp(self.sensor.reshape(len(self), 4, 2), axis=1) > 0).any(axis=1))
 
     @property
     def inverse_depth(self) -> FloatArray:
@@ -84,13 +94,14 @@ class GlintFrames(ClassFrames):
         (p,) projector pixels whose light meets the sensor, behind the mask or not.
     flux
         flux on the sensor without the mask, all classes at full power [W m^-2 mm^2].
-    unresolved
-        flux left out because an edge cuts it, an estimate of the error; same unit.
+    unresolved, error
+        flux that is left out, and the standard error of what is not, from what edges cut; same unit.
     """
 
     lit_pixels: IntArray
     flux: float
     unresolved: float
+    error: float
 
 
 def glint_frames(
@@ -136,7 +147,7 @@ def glint_frames(
     used = np.isin(classes, labels[lit])
     area = math.prod(geometry.active_sides)
     return GlintFrames(
-        classes[used].astype(np.int64), frames[used] / area, np.flatnonzero(lit), total, beams.unresolved
+        classes[used].astype(np.int64), frames[used] / area, np.flatnonzero(lit), total, beams.unresolved, beams.error
     )
 
 
@@ -189,7 +200,9 @@ def _cuts(beams: Beams, reached: IntArray, box: float) -> Iterator[_Cut]:
     corners = beams.sensor[reached]
     sides = [np.diff(corners, axis=axis).reshape(len(reached), 2, 2) for axis in (1, 2)]
     length = np.stack([np.linalg.norm(side, axis=-1).max(axis=1) for side in sides], axis=1)
-    askew = np.max([np.abs(side).min(axis=-1).max(axis=1) for side in sides], axis=0) / length.max(axis=1)
+    longest = length.max(axis=1)
+    askew = np.max([np.abs(side).min(axis=-1).max(axis=1) for side in sides], axis=0)
+    askew /= np.where(longest > 0, longest, 1)
     need = np.maximum(length / box * (1 + _ASKEW_BOXES * np.minimum(4 * askew, 1))[:, None], 1)
     quarter = 2 ** np.maximum(np.floor(np.log2(need)) - 2, 0)
     counts = (np.ceil(need / quarter) * quarter).astype(np.int64)

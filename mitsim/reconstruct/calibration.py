@@ -9,8 +9,8 @@ balanced, |Phi_L 1| = |Phi_R 1|, and their product reproduces the absolute respo
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +33,8 @@ LARGEST_ERROR = 0.1
 """Relative error of a factor, as its noise predicts it, above which the status warns: a tenth is 20 dB."""
 _NUMBERS_AT_ONCE = 2**15
 """Numbers of a response whose misfit is summed at a time: they and what is subtracted stay in the cache."""
+_BINS = 512
+"""Groups of rows, and of columns, whose light is kept of every frame: all of the anchor camera, 16 KiB a pair."""
 _TURNS, _TURNED = 30, 1e-13
 """Steps of the power iteration that splits a uniform response, and the change at which it has converged: where it has,
 each step took away 63 % or more, so that no more than the last change is left. A board's responses take four."""
@@ -90,11 +92,52 @@ class Seen:
         (m,) u_i, or w_i: least squares in Y_i = u_i common^T.
     misfit, energy
         ||Y_i - u_i common^T||^2 and ||Y_i||^2.
+    pair
+        of its two frames, where their sum is known.
     """
 
     vector: FloatArray
     misfit: float
     energy: float
+    pair: PairSeen | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PairSeen:
+    """What :mod:`mitsim.reconstruct.session_faults` needs of a pair's two frames.
+
+    Attributes
+    ----------
+    light
+        (m,) their sum, projected as the response is.
+    rows, columns
+        (2, bins) mean light of groups of rows, and of columns, of the +1 and of the -1 frame.
+    """
+
+    light: FloatArray
+    rows: FloatArray
+    columns: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class PairSums:
+    """The same of all pairs of a side: ``light`` (m, N), ``rows`` (N, 2, bins), ``columns`` (N, 2, bins)."""
+
+    light: FloatArray
+    rows: FloatArray
+    columns: FloatArray
+
+    @classmethod
+    def empty(cls, first: PairSeen, count: int) -> PairSums:
+        """Room for ``count`` pairs like the ``first``."""
+        return cls(
+            np.empty((len(first.light), count)),
+            *(np.empty((count, *part.shape)) for part in (first.rows, first.columns)),
+        )
+
+    def put(self, number: int, seen: PairSeen) -> None:
+        """Keep what was ``seen`` of the pair of a ``number``."""
+        self.light[:, number], self.rows[number], self.columns[number] = seen.light, seen.rows, seen.columns
 
 
 @dataclass
@@ -115,6 +158,10 @@ class StripeSums:
         sums of ||Y_i - u_i v^T||^2 and of ||Y_i||^2.
     done
         responses that are in.
+    misfits, energies
+        (N,) what each response added.
+    pairs
+        of its two frames; None where a response is not the difference of two, or their sum is not known.
     """
 
     side: str
@@ -124,19 +171,47 @@ class StripeSums:
     misfit: float = 0.0
     energy: float = 0.0
     done: int = 0
+    misfits: FloatArray = field(init=False)
+    energies: FloatArray = field(init=False)
+    pairs: PairSums | None = None
+
+    def __post_init__(self) -> None:
+        self.misfits, self.energies = np.zeros(self.vectors.shape[1]), np.zeros(self.vectors.shape[1])
 
     def add(self, response: npt.ArrayLike) -> None:
         """Add the next ``response`` (rows, columns); MitsimError for another shape or values that are not finite."""
         self.put(self.seen(response, self.done))
 
-    def seen(self, response: npt.ArrayLike, number: int) -> Seen:
-        """What the ``response`` (rows, columns) of this ``number`` adds; MitsimError as :meth:`add`.
+    def seen(self, response: npt.ArrayLike, number: int, light: FloatArray | None = None) -> Seen:
+        """What a response adds; MitsimError as :meth:`add`.
 
         Changes nothing, so that responses are looked at in several threads.
+
+        Parameters
+        ----------
+        response
+            (rows, columns).
+        number
+            of its pattern.
+        light
+            (rows, columns) the sum of the two frames whose difference it is; None: not known.
         """
         shape = len(self.vectors), len(self.common)
         shape = shape if self.side == "horizontal" else shape[::-1]
-        return self.seen_checked(_response(response, f"{self.side} response {number}", shape, self.centre))
+        checked = _response(response, f"{self.side} response {number}", shape, self.centre)
+        seen = self.seen_checked(checked)
+        return seen if light is None else replace(seen, pair=self._pair_seen(np.asarray(response), light))
+
+    def _pair_seen(self, response: FloatArray, light: FloatArray) -> PairSeen:
+        across = self.side == "horizontal"
+        vector = (light if across else light.T) @ (self.common / np.dot(self.common, self.common))
+        # Both factors' means are zero where frames are centred; what centring takes off the other side, v does.
+        vector = vector - vector.mean() if self.centre else vector
+        sums = [_marginals(part) for part in (light, response)]
+        rows, columns = (
+            np.stack([both + difference, both - difference]) / 2 for both, difference in zip(*sums, strict=True)
+        )
+        return PairSeen(vector, rows, columns)
 
     def seen_checked(self, response: FloatArray) -> Seen:
         """The same of a ``response`` that is checked and centred."""
@@ -157,6 +232,10 @@ class StripeSums:
         self.vectors[:, self.done] = seen.vector
         self.misfit += seen.misfit
         self.energy += seen.energy
+        self.misfits[self.done], self.energies[self.done] = seen.misfit, seen.energy
+        if seen.pair is not None:
+            self.pairs = self.pairs or PairSums.empty(seen.pair, self.vectors.shape[1])
+            self.pairs.put(self.done, seen.pair)
         self.done += 1
 
 
@@ -166,6 +245,7 @@ def stripe_sums(
     count: int,
     centre: bool = False,
     uniform: npt.ArrayLike | None = None,
+    lights: Sequence[FloatArray | None] = (None, None),
 ) -> tuple[StripeSums, StripeSums]:
     """Sums of horizontal and of vertical stripes, with the first response of each.
 
@@ -177,6 +257,8 @@ def stripe_sums(
         N, the responses of each side.
     centre, uniform
         as :func:`estimate_factors`, which also says what is refused.
+    lights
+        (rows, columns) sums of the two frames that each of both responses is the difference of.
     """
     first = _response(horizontal, "horizontal response 0", None, centre)
     second = _response(vertical, "vertical response 0", first.shape, centre)
@@ -186,8 +268,11 @@ def stripe_sums(
     a, v = _rank_one_split(mean)
     left = StripeSums("horizontal", centre, v, np.empty((len(a), count)))
     right = StripeSums("vertical", centre, a, np.empty((len(v), count)))
-    left.put(left.seen_checked(first))
-    right.put(right.seen_checked(second))
+    for sums, checked, response, light in zip(
+        (left, right), (first, second), (horizontal, vertical), lights, strict=True
+    ):
+        seen = sums.seen_checked(checked)
+        sums.put(seen if light is None else replace(seen, pair=sums._pair_seen(np.asarray(response), light)))
     return left, right
 
 
@@ -238,7 +323,12 @@ def estimate_factors(
 
 
 def factors_of_sums(
-    left: StripeSums, right: StripeSums, signs: FloatArray, stated_noise: float | None = None
+    left: StripeSums,
+    right: StripeSums,
+    signs: FloatArray,
+    stated_noise: float | None = None,
+    left_out: tuple[int, int] = (0, 0),
+    extra: tuple[float, float] = (0.0, 0.0),
 ) -> Estimate:
     """Factors from finished sums.
 
@@ -250,6 +340,10 @@ def factors_of_sums(
         H (n, N), as :func:`estimate_factors` takes it.
     stated_noise
         root mean square sensor noise of a response [frame unit]; None: unknown.
+    left_out
+        responses of each side whose misfit and energy are not in the sums.
+    extra
+        squared error of each side's vectors, all in all, that is not the noise of their responses.
     """
     v, a = left.common, right.common
     count = signs.shape[1]
@@ -257,7 +351,8 @@ def factors_of_sums(
     energy = left.energy + right.energy
     residual = float(np.sqrt((left.misfit + right.misfit) / energy))
     # Each response of m m' numbers spends one fitted number a sensor row (or column).
-    spare = count * (len(a) * (len(v) - 1) + len(v) * (len(a) - 1))
+    counted = count - left_out[0], count - left_out[1]
+    spare = counted[0] * len(a) * (len(v) - 1) + counted[1] * len(v) * (len(a) - 1)
     noise = float(np.sqrt((left.misfit + right.misfit) / spare))
     expected = spare * (stated_noise or 0.0) ** 2 / energy
     unexplained = float(np.sqrt(max(residual**2 - expected, 0.0)))
@@ -265,8 +360,11 @@ def factors_of_sums(
     singular = _singular(phi[0]), _singular(phi[1])
     condition = max(map(_squared_condition, singular))
     predicted, rank = [], []
-    for factor, common, values in zip(phi, (v, a), singular, strict=True):
-        predicted.append(predicted_error(factor, noise, float(np.linalg.norm(common)), count))
+    for factor, common, values, more in zip(phi, (v, a), singular, extra, strict=True):
+        error = predicted_error(factor, noise, float(np.linalg.norm(common)), count)
+        if more:
+            error = float(np.hypot(error, np.sqrt(more / count) / np.linalg.norm(factor)))
+        predicted.append(error)
         rank.append(_rank(factor, values, predicted[-1]))
     n = phi[0].shape[1], phi[1].shape[1]
     figures = (
@@ -309,6 +407,19 @@ def predicted_error(factor: FloatArray, noise: float, common_norm: float, count:
     deviation = noise / (np.sqrt(count) * common_norm)
     norm = float(np.linalg.norm(factor))
     return float(deviation * np.sqrt(factor.size) / norm) if norm else float("inf")
+
+
+def _marginals(frame: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Means of a ``frame`` (rows, columns) over groups of rows, and over groups of columns, ``_BINS`` at most."""
+    rows, columns = frame.shape
+    return _grouped(frame @ np.full(columns, 1 / columns)), _grouped(np.full(rows, 1 / rows) @ frame)
+
+
+def _grouped(values: FloatArray) -> FloatArray:
+    if len(values) <= _BINS:
+        return values
+    starts = np.arange(_BINS) * len(values) // _BINS
+    return np.asarray(np.add.reduceat(values, starts) / np.diff(np.append(starts, len(values))))
 
 
 def decibels(part: float) -> float:

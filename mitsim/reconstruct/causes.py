@@ -40,6 +40,26 @@ _ALL = 0.3
 class Cause(Enum):
     """Why measurements do not fit; the value is its sentence and the remedy."""
 
+    FRAMES = (
+        "frames that are not what they say",
+        "capture these frames again",
+    )
+    ORIENTATION = (
+        "frames that are turned or mirrored",
+        "turn them back, or calibrate with the camera as it is",
+    )
+    ORDER = (
+        "frames in another order than their patterns",
+        "bring the frames into the order of the patterns",
+    )
+    GAMMA = (
+        "numbers that are not proportional to the light",
+        "save the camera's raw numbers, without gamma or tone curve",
+    )
+    SCALE = (
+        "numbers that were multiplied, as of few bits left-aligned in more",
+        "divide the numbers by that factor, or give a camera file of these numbers",
+    )
     SATURATION = (
         "readings at the full well or the ADC's end",
         "expose for less",

@@ -24,9 +24,10 @@ from mitsim.core.output import output_folder
 from mitsim.core.parallel import in_threads, single_threaded_blas
 from mitsim.core.resources import workers
 from mitsim.core.versions import versions
-from mitsim.reconstruct.calibration import Estimate, Seen, StripeSums, factors_of_sums, stripe_sums
+from mitsim.reconstruct.calibration import Estimate, Seen, StripeSums, stripe_sums
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.ladder import Chosen, Ladder
+from mitsim.reconstruct.session_faults import Checked, check_session
 from mitsim.rig.digital import digital_of
 from mitsim.rig.framelist import DarkFile, SessionFrames, StripeFile, load_frames
 from mitsim.rig.order import SIDES, UNIFORM, Half, Side
@@ -38,6 +39,8 @@ _FILLED = ("read_noise_e", "step_dn", "saturation_dn")
 _COMPARED = {"gain_dn_per_e": (0.05, 0.0), "black_level_dn": (0.02, 1.0), "saturation_dn": (0.02, 1.0)}
 """What both state, and from which relative and absolute difference they contradict: published gains are good to a few
 percent, level and end are settings, true to a digital number."""
+_CLIPPED, _FEW = 2e-3, 10
+"""Part of a frame's pixels, and how many, at its largest number that are no chance: of noisy ones a few are."""
 
 
 @checked
@@ -113,7 +116,7 @@ def chosen_responses(session: SessionFrames, chosen: Iterable[tuple[Side, int]])
     _check_sizes(session)
     readings = _Readings(session)
     for side, index in chosen:
-        rate, variance = readings.response(side, index)
+        rate, variance, _ = readings.response(side, index)
         if readings.saturated:
             raise MitsimError(
                 f"frames {session.folder}: {min(readings.saturated)} has pixels at the full well or the ADC's end; "
@@ -125,8 +128,9 @@ def chosen_responses(session: SessionFrames, chosen: Iterable[tuple[Side, int]])
 def _calibrated(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -> Factors:
     listed = session.listed
     readings = _Readings(session)
-    estimate, noise = _estimate(readings, job)
+    estimate, noise, found = _estimate(readings, job)
     warnings: tuple[str, ...] = doubts if estimate.ok else (*doubts, str(estimate.status))
+    warnings += found.warnings(session.frame_name)
     if readings.saturated:
         warnings += (
             f"saturation: {len(readings.saturated)} of {len(session.files)} frames have pixels at the full well or the "
@@ -142,6 +146,8 @@ def _calibrated(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) 
         "phi_error": None,
         "predicted_phi_error": error,
         "response_noise": noise,
+        "faults": found.listed(session.frame_name),
+        "lamp": found.lamp.listed(),
         "condition": estimate.condition,
         "exposure_s": listed.digital.exposure_s,
         "saturated_frames": len(readings.saturated),
@@ -201,6 +207,26 @@ def _check_sizes(session: SessionFrames) -> None:
             )
 
 
+def _check_levels(session: SessionFrames, uniform: FloatArray) -> None:
+    """MitsimError where frames have no light by the levels that the list states.
+
+    Parameters
+    ----------
+    session
+        whose list it is.
+    uniform
+        (rows, columns) the brighter of both uniform responses [electrons/s].
+    """
+    first = session.repeated((SIDES[0], 0, 1 if session.pairs else UNIFORM))[0]
+    values, digital = read_image(session.folder / first.file, session.wanted), session.listed.digital
+    if digital.rate(values).max() <= 0 or not uniform.any():
+        raise MitsimError(
+            f"frames {session.folder}: no number of {first.file}, a uniform frame, is above {values.max():g}, and its "
+            f"list states digital.black_level_dn {digital.black_level_dn:g} and dark_current_e_per_s "
+            f"{digital.dark_current_e_per_s:g}, which leave no light; state levels in the numbers of the files"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class _Reading:
     """Mean of ``shots`` frames of each exposure: electrons a second, and how they were read."""
@@ -230,8 +256,9 @@ class _Readings:
     session: SessionFrames
     saturated: set[str] = field(default_factory=set)
 
-    def response(self, side: Side, index: int) -> tuple[FloatArray, float]:
-        """Response (rows, columns) to a +-1 pattern [electrons/s], and its mean noise variance.
+    def response(self, side: Side, index: int) -> tuple[FloatArray, float, FloatArray | None]:
+        """Response (rows, columns) to a +-1 pattern [electrons/s], its mean noise variance, and the sum of its two
+        frames (rows, columns); None where it is not their difference.
 
         Parameters
         ----------
@@ -242,7 +269,7 @@ class _Readings:
         if self.session.pairs:
             negative = self._merged((side, index, -1))
             light = positive.rate + negative.rate
-            return positive.rate - negative.rate, positive.ladder.variance(light, 2) / positive.shots
+            return positive.rate - negative.rate, positive.ladder.variance(light, 2) / positive.shots, light
         uniform = self._uniform[side]
         response = 2 * positive.rate - uniform.rate
         variance = 4 * positive.variance + uniform.variance
@@ -256,7 +283,7 @@ class _Readings:
                 dark = self._dark_of[side][exposure]
                 response -= weight * dark.rate
                 variance += weight**2 * dark.variance
-        return response, variance
+        return response, variance, None
 
     @cached_property
     def _uniform(self) -> dict[Side, _Reading]:
@@ -294,6 +321,15 @@ class _Readings:
             for side, ladder in self._ladders.items()
         }
 
+    def clipped(self, half: Half) -> bool:
+        """Whether many pixels of a frame share its largest number."""
+        for exposure in range(len(self.session.listed.exposure_ladder)):
+            for frame in self.session.repeated(half, exposure):
+                values = read_image(self.session.folder / frame.file, self.session.wanted)
+                if np.count_nonzero(values == values.max()) > max(_CLIPPED * values.size, _FEW):
+                    return True
+        return False
+
     def _merged(self, half: Half) -> _Reading:
         """What shows a ``half`` of a pattern, of all exposures and repeats."""
         if self._ladders is None:
@@ -320,21 +356,51 @@ class _Readings:
 
 
 @single_threaded_blas()
-def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None]:
-    """Factors, and the rms noise of the responses [electrons/s] where the list states the sensor's."""
+def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Checked]:
+    """Factors, the rms noise of the responses [electrons/s] where the list states the sensor's, and which frames are
+    wrong."""
     session = readings.session
     signs = stripe_signs(session.listed.n).astype(np.float64)
-    count = signs.shape[1]
+    sums, variances = _sums(readings, signs.shape[1], job)
+    found = check_session(sums, signs, session.order, readings.clipped, saturated=bool(readings.saturated))
+    if wrong := found.wrong_uniform():
+        sums, variances = _sums(readings, signs.shape[1], job, found.other_uniform(wrong))
+        found = check_session(
+            sums, signs, session.order, readings.clipped, uniform_given=True, saturated=bool(readings.saturated)
+        )
+    noise = float(np.sqrt(max(float(np.mean(variances)), 0.0))) if session.listed.digital.noise_is_stated else None
+    with job.clock.stage("estimate"):
+        return found.estimate(signs, noise), noise, found
+
+
+def _sums(
+    readings: _Readings, count: int, job: Job, uniform: Side | None = None
+) -> tuple[tuple[StripeSums, StripeSums], list[float]]:
+    """Sums over all responses, and the noise variance of each.
+
+    Parameters
+    ----------
+    readings, job
+        as for :func:`_estimate`.
+    count
+        patterns of a side.
+    uniform
+        the side whose first response is the uniform one; None: the mean of both.
+    """
     with job.clock.stage("frames"):
         first = [readings.response(side, 0) for side in SIDES]
-    sums = stripe_sums(first[0][0], first[1][0], count, session.listed.centre)
-    variances = [variance for _, variance in first]
+    (left, *_), (right, *_) = first
+    _check_levels(readings.session, max((left, right), key=lambda response: float(response.mean())))
+    alone = None if uniform is None else (left, right)[SIDES.index(uniform)]
+    lights = [light for *_, light in first]
+    sums = stripe_sums(left, right, count, readings.session.listed.centre, alone, lights)
+    variances = [variance for _, variance, _ in first]
     step = 4 * workers()
     for side, own in zip(SIDES, sums, strict=True):
 
         def looked(index: int, side: Side = side, own: StripeSums = own) -> tuple[Seen, float]:
-            response, variance = readings.response(side, index)
-            return own.seen(response, index), variance
+            response, variance, light = readings.response(side, index)
+            return own.seen(response, index, light), variance
 
         for start in range(1, count, step):
             with job.clock.stage("frames"):
@@ -343,6 +409,4 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None]:
                 own.put(seen)
                 variances.append(variance)
             job.progress(f"{side} stripes", own.done / count)
-    noise = float(np.sqrt(np.mean(variances))) if session.listed.digital.noise_is_stated else None
-    with job.clock.stage("estimate"):
-        return factors_of_sums(*sums, signs, noise), noise
+    return sums, variances

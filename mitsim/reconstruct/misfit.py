@@ -8,7 +8,6 @@ distance sends.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -20,7 +19,10 @@ from mitsim.core.measurement import Measurement
 from mitsim.reconstruct.accumulator import centred
 from mitsim.reconstruct.calibration import decibels
 from mitsim.reconstruct.causes import Cause, Evidence, Signatures, likely_cause
+from mitsim.reconstruct.defects import Defects, defects_of
+from mitsim.reconstruct.faults import FrameCheck, FrameFault, FrameSums
 from mitsim.reconstruct.noise import FrameNoise
+from mitsim.reconstruct.readings import Reading, Readings, multiple
 from mitsim.reconstruct.solver import Prepared
 from mitsim.reconstruct.status import Status, Verdict
 
@@ -37,6 +39,8 @@ GROSS = 0.1
 the part has to be four times the energy of their shot noise, too."""
 _GROSS_CHI_SQUARE = 4.0
 """The same as a chi-square, of shot noise alone: read noise of as many electrons makes 2."""
+_SHOWN = 4
+"""Faults that a sentence holds; result.json has them all."""
 _TINY = 1e-300
 """Stands for 0 in a denominator."""
 _TILES = 8
@@ -69,6 +73,12 @@ class Misfit:
     foretold
         what the calibration foretells of ``unexplained``, print apart, from what its factors lack of the camera; None
         where it does not know.
+    faults
+        frames that are not what they say; with any the image is flagged.
+    reading
+        of a flagged image: how else its frames fit; None where they do not.
+    defects
+        pixels of the sensor whose readings were left out, or are to be; None: there are none.
     """
 
     chi_square: float
@@ -80,11 +90,25 @@ class Misfit:
     cause: Cause | None
     signatures: Signatures | None
     foretold: float | None = None
+    faults: tuple[FrameFault, ...] = ()
+    reading: Reading | None = None
+    defects: Defects | None = None
 
     def __str__(self) -> str:
         noise = "" if self.stated else " of shot noise alone, as no other was stated"
-        cause = f"; likely cause: {self.cause.value[0]}" if self.cause else ""
-        return f"misfit: chi-square {shown(self.chi_square)} a datum{noise}, {self.unexplained:.1e} unexplained{cause}"
+        cause = f"; likely cause: {self.reason}" if self.cause else ""
+        defects = f"; {self.defects}" if self.defects else ""
+        return (
+            f"misfit: chi-square {shown(self.chi_square)} a datum{noise}, {self.unexplained:.1e} unexplained{cause}"
+            f"{defects}"
+        )
+
+    @property
+    def reason(self) -> str:
+        """The cause in words; empty where none is known."""
+        if self.reading:
+            return self.reading.words
+        return self.cause.value[0] if self.cause else ""
 
     def summary(self) -> dict[str, Any]:
         """What result.json and the command line's JSON say of it."""
@@ -97,6 +121,9 @@ class Misfit:
             "cause": self.cause.name.lower() if self.cause else None,
             "signatures": asdict(self.signatures) if self.signatures else None,
             "foretold": self.foretold,
+            "defective_pixels": self.defects.summary() if self.defects else None,
+            "reading": self.reading.words if self.reading else None,
+            "faults": [fault.summary() for fault in self.faults],
             "map": self.tiles.tolist(),
         }
 
@@ -104,17 +131,26 @@ class Misfit:
         """The ``status`` of a solution with this misfit."""
         if not self.flagged or self.cause is None:
             return status
+        if self.faults:
+            return self._faulty(status)
         times = f", {shown(self.chi_square)} times what its noise makes" if self.stated else ""
         foretold = ""
         if self.foretold:
             foretold = f"; its calibration foretells up to {self.foretold:.1%} ({decibels(self.foretold):.1f} dB)"
         sentence = (
-            f"{self.unexplained:.1%} of the measurements fit no image{times}{foretold}; "
-            f"likely cause: {self.cause.value[0]}"
+            f"{self.unexplained:.1%} of the measurements fit no image{times}{foretold}; likely cause: {self.reason}"
         )
         if not status.verdict.good:
             return replace(status, flags=(*status.flags, f"Misfit: {sentence}; {self.cause.value[1]}."))
         return replace(status, verdict=Verdict.MISFIT, sentence=f"Misfit: {sentence}", remedy=self.cause.value[1])
+
+    def _faulty(self, status: Status) -> Status:
+        """The ``status`` of a solution of faulty frames."""
+        more = f"; and {len(self.faults) - _SHOWN} more" if len(self.faults) > _SHOWN else ""
+        sentence = f"Faulty frames: {'; '.join(map(str, self.faults[:_SHOWN]))}{more}"
+        if not status.verdict.good:
+            return replace(status, flags=(*status.flags, f"{sentence}; {Cause.FRAMES.value[1]}."))
+        return replace(status, verdict=Verdict.MISFIT, sentence=sentence, remedy=Cause.FRAMES.value[1])
 
 
 def shown(chi_square: float) -> str:
@@ -138,10 +174,14 @@ class Residuals:
 
     Attributes
     ----------
-    residual, energy, power, variance
-        (tiles, tiles) sums of the squares of residuals, of measurements and of shots, and of the noise's variance.
+    energy, power, variance
+        (tiles, tiles) sums of the squares of measurements and of shots, and of the noise's variance.
     pixels
         (tiles, tiles) pixels of each tile.
+    by_pattern
+        energies by pattern.
+    squares
+        (m, m') sum of the squares of residuals of each sensor pixel.
     """
 
     def __init__(self, prepared: Prepared, weights: FloatArray, noise: FrameNoise, evidence: Evidence) -> None:
@@ -151,22 +191,48 @@ class Residuals:
         self._strips = [slice(*ends) for ends in pairwise(edges[0])]
         self._starts = edges[1][:-1]
         self.pixels: FloatArray = np.outer(*(np.diff(edge) for edge in edges)).astype(np.float64)
-        self.residual, self.energy, self.power, self.variance = (np.zeros(self.pixels.shape) for _ in range(4))
+        self.energy, self.power, self.variance = (np.zeros(self.pixels.shape) for _ in range(3))
+        self.squares: FloatArray = np.zeros(sizes)
+        # Of one frame: to make them anew takes longer than to fill them.
+        self._residual, self._squared = np.zeros(sizes), np.zeros(sizes)
+        self.by_pattern = FrameSums((prepared.left.pattern_count, prepared.right.pattern_count))
 
     def add(self, measurement: Measurement) -> None:
         """Count in one ``measurement``."""
         prepared = self._prepared
         frame = centred(measurement.frame) if prepared.centre else measurement.frame
         left, right = prepared.left.slabs[measurement.row], prepared.right.slabs[measurement.column]
-        residual = frame - (left.matrix @ self._weights[left.columns][:, right.columns]) @ right.matrix.T
-        self.residual += self._squares(residual)
-        self.energy += self._squares(frame)
-        self.power += self._sums(measurement.power)
+        modelled = left.matrix @ self._weights[left.columns][:, right.columns]
+        residual = np.matmul(modelled, right.matrix.T, out=self._residual)
+        np.subtract(frame, residual, out=residual)
+        flat = residual.ravel()
+        self.squares += np.multiply(residual, residual, out=self._squared)
+        energy = self._squares(frame)
+        power = energy if frame is measurement.light else self._squares(measurement.light)
+        if measurement.shots == 2:  # as Measurement.power has it
+            power = (power + (energy if frame is measurement.frame else self._squares(measurement.frame))) / 2
+        self.energy += energy
+        self.power += power
+        left_over, given = float(np.dot(flat, flat)), float(energy.sum())
+        self.by_pattern.add(measurement, left_over, float(power.sum()), given, self._noise.light)
         # The variance is linear in the light: that of a tile's mean light is the tile's mean variance.
         light = self._sums(measurement.light) / self.pixels
         variance = self._noise.of(light, measurement.shots) * self.pixels
         self.variance += variance
         self.evidence.add(measurement, frame, residual, float(variance.sum()) / frame.size)
+
+    @property
+    def residual(self) -> FloatArray:
+        """(tiles, tiles) sum of the squares of residuals."""
+        return self._sums(self.squares)
+
+    def defects(self) -> Defects | None:
+        """Pixels that are off in all measurements, where the sensor's noise is stated."""
+        if not self._noise.stated:
+            return None
+        count = self._noise.variance.size
+        variance = count * self._noise.of(self._noise.light / count, self._noise.shots)
+        return defects_of(self.squares, variance, count)
 
     def expected(self, factor_energy: float) -> FloatArray:
         """(tiles, tiles) energy that is expected of the residual: the sensor's noise less what the fit takes up, the
@@ -186,41 +252,62 @@ class Residuals:
 
 
 def judge(
-    prepared: Prepared,
-    weights: FloatArray,
-    measured: Iterable[Measurement],
-    noise: FrameNoise,
+    check: FrameCheck,
     factor_energy: float | None,
     print_energy: float,
     evidence: Evidence,
+    with_defects: bool = True,
 ) -> Misfit | None:
     """Hold all measurements against the model; None where there are no more data than unknowns.
 
     Parameters
     ----------
-    prepared, weights
-        the factorised model, and W of all measurements.
-    measured
-        all of them once more.
-    noise
-        of them, summed up already.
+    check
+        of the factorised model and of all measurements, which are read once more.
     factor_energy
         what noisy factors add to the frames; None: not stated.
     print_energy
         what print within a pixel may add: left to a fitting scene, but no part of the chi-square.
     evidence
         empty, of the same model.
+    with_defects
+        whether defective pixels are looked for, and no cause where there are some.
     """
+    prepared, noise = check.prepared, check.noise
     if prepared.rank >= prepared.left.data_rows * prepared.right.data_rows:
         return None
-    sums = Residuals(prepared, weights, noise, evidence)
-    for measurement in measured:
+    sums = Residuals(prepared, check.weights, noise, evidence)
+    for measurement in check.measured():
         sums.add(measurement)
     expected = sums.expected(factor_energy or 0.0)
     balance = Balance(sums.residual, sums.energy, expected, sums.pixels, factor_energy is not None)
     found, excess = balance.misfit(noise, print_energy)
     if evidence.foretold is not None:
         found = replace(found, foretold=float(np.sqrt(evidence.foretold / max(float(sums.energy.sum()), _TINY))))
+    beside_noise = noise.rendering + (factor_energy or 0.0) + print_energy
+    scaled = multiple(noise, found.chi_square)
+    if scaled:
+        return replace(found, flagged=True, cause=scaled.cause, reading=scaled)
+    step = check.out_of_step(sums.by_pattern)
+    if step:
+        return replace(
+            found, flagged=True, cause=Cause.ORDER, reading=Reading(Cause.ORDER, f"the frames are {step}", 0.0)
+        )
+    if found.flagged:
+        beside = beside_noise / max(float(sums.energy.sum()), _TINY)
+        readings = Readings(prepared, check.manifest, noise, check.measured)
+        reading = readings.fitting(found.unexplained, beside, check.all_off(sums.by_pattern, beside_noise))
+        if reading:
+            return replace(found, cause=reading.cause, reading=reading)
+    faults = check.faults(sums.by_pattern, beside_noise)
+    if faults:
+        return replace(found, flagged=True, cause=Cause.FRAMES, faults=faults)
+    defects = sums.defects() if with_defects else None
+    if defects:
+        return replace(found, defects=defects)
+    negative = check.negative()
+    if negative:
+        return replace(found, flagged=True, cause=Cause.ORDER, reading=Reading(Cause.ORDER, negative, 0.0))
     if not found.flagged:
         return found
     signatures = evidence.signatures(excess, noise.saturated / max(noise.readings, 1))

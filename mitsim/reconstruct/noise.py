@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -31,11 +32,12 @@ class FrameNoise:
         (K, K', m) and (K, K', m') the same of each sensor row, and of each sensor column.
     light_error
         standard error of single projector pixels' light in simulated frames, 1 is the board's; 0: not stated.
-    power
-        sum of the squares of all shots [(electrons/s)^2].
+    power, light
+        sum of the squares of all shots [(electrons/s)^2], and (m, m') of all shots [electrons/s].
     shots, saturated, readings
         shots of a pattern; readings at the full well or the ADC's end, and all of them.
-
+    factor
+        largest whole number that divides all digital numbers; 1 where they are not whole.
     """
 
     def __init__(self, manifest: RunManifest, ambient: tuple[FloatArray, FloatArray] | None = None) -> None:
@@ -49,6 +51,8 @@ class FrameNoise:
         self.columns: FloatArray
         self.rows, self.columns = (np.zeros((*counts, 0)) for _ in range(2))
         self.power, self.shots, self.saturated, self.readings = 0.0, 1, 0, 0
+        self.factor = 0
+        self.light: FloatArray = np.zeros((0, 0))
 
     @property
     def stated(self) -> bool:
@@ -82,10 +86,14 @@ class FrameNoise:
         pattern, light, shots = (measurement.row, measurement.column), measurement.light, measurement.shots
         if not self.rows.size:
             self.rows, self.columns = (np.zeros((*self.variance.shape, size)) for size in light.shape)
-        self.variance[pattern] = self._own(light.mean(), shots)
-        self.rows[pattern], self.columns[pattern] = (self._own(light.mean(axis=axis), shots) for axis in (1, 0))
-        self.power += float(measurement.power.sum())
+            self.light = np.zeros(light.shape)
+        self.light += light
+        by_row, by_column = light.mean(axis=1), light.mean(axis=0)
+        self.variance[pattern] = self._own(float(by_row.mean()), shots)
+        self.rows[pattern], self.columns[pattern] = self._own(by_row, shots), self._own(by_column, shots)
+        self.power += measurement.power
         self.shots = shots
+        self.factor = math.gcd(self.factor, measurement.factor)
         self.saturated += measurement.saturated
         self.readings += shots * measurement.frame.size
 

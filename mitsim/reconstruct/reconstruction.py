@@ -23,6 +23,7 @@ from mitsim.reconstruct.depth import Depth, best_depth
 from mitsim.reconstruct.depthmap import DepthMap, depth_map
 from mitsim.reconstruct.detail import Model, print_energy
 from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.faults import FrameCheck
 from mitsim.reconstruct.focus import focused
 from mitsim.reconstruct.lacking import Lack
 from mitsim.reconstruct.margin import Margin
@@ -33,6 +34,17 @@ from mitsim.reconstruct.solver import Prepared, Solution, prepare
 from mitsim.reconstruct.status import Verdict
 from mitsim.reconstruct.tv import TVSolution, solve_tv
 from mitsim.reconstruct.uncertainty import Propagation, Uncertainty, uncertainty
+
+_LAMBDA_OF_TV = 1e-3
+"""Lambda, over the largest sigma^2, by which frames are foretold beside an image of total variation, whose own weight
+says nothing of it: chosen, between those of bright and of dim runs."""
+
+_DEFECT_ROUNDS = 6
+"""Times that defective pixels are looked for: beside bright ones dim ones show when these are left out, of a tenth of
+their energy each time."""
+_BETTER = 0.5
+"""Part of what was unexplained, rms, that frames may leave without pixels that count as defective though the rest does
+not fit either."""
 
 
 @single_threaded_blas()
@@ -90,24 +102,24 @@ def reconstruct(
         Cost(sum(cost.seconds.values()), cost.memory_bytes).check(f"{shots.name}: its image", Limits())
     started = time.perf_counter()
     depth = _depth(shots, factors, lam, focus, depth_range)
-    flags = (depth.doubt,) if depth and depth.doubt else ()
+    doubts = [depth.doubt] if depth else []
     found = time.perf_counter()
     if isinstance(depth, Depth):
         of_depth = focused(factors, depth.mm)
         shots, factors = of_depth.of(shots), of_depth.factors
         if of_depth.hidden:
             hidden = f"{of_depth.hidden:.1%} of the scene's pixels, which come out dark"
-            flags = (*flags, f"At {depth.mm:.4g} mm the field stop takes most of the light of {hidden}.")
+            doubts.append(f"At {depth.mm:.4g} mm the field stop takes most of the light of {hidden}.")
     data = accumulated(shots, factors, method)
     prepared, frames = data.prepared, data.frames
     added = time.perf_counter()
     solution: DepthMap | Solution | TVSolution
-    if isinstance(depth, DepthMap) and not depth.doubt:
-        solution = depth
-    else:
-        solution = solve_tv(prepared, frames, lam) if method == TV else prepared.solve(frames, lam)
+    solution = depth if isinstance(depth, DepthMap) and not depth.doubt else data.solution(lam, method)
     solved = time.perf_counter()
     misfit = data.misfit(shots, factors, solution)
+    if misfit and misfit.defects:
+        shots, data, solution, misfit = _without_defects(shots, factors, lam, method, data, misfit)
+        prepared, frames = data.prepared, data.frames
     if misfit and misfit.flagged and isinstance(depth, Depth) and depth.at_end:
         misfit = replace(misfit, cause=Cause.DEPTH)
     separable = factors.status.verdict is not Verdict.NOT_SEPARABLE
@@ -116,13 +128,14 @@ def reconstruct(
     judged = time.perf_counter()
     uncertainties = data.uncertainty(shots, factors, solution) if isinstance(solution, Solution) else None
     status = misfit.judged(solution.status) if misfit else solution.status
-    flags = (*status.flags, *flags, *_flags(shots, factors))
     image = solution.image
     if beside:
         image = beside.inside(image)
         uncertainties = uncertainties and Uncertainty(
-            {name: beside.inside(values) for name, values in uncertainties.sources.items()}
+            {name: beside.inside(values) for name, values in uncertainties.sources.items()}, uncertainties.bias_factor
         )
+    doubts.append(uncertainties.loss(image) if uncertainties else "")
+    flags = (*status.flags, *(doubt for doubt in doubts if doubt), *_flags(shots, factors))
     return Reconstruction(
         image=image,
         lam=solution.lam,
@@ -145,6 +158,8 @@ def reconstruct(
         inputs=asked,
         focus=depth,
         predicted=cost,
+        objective=getattr(solution, "objective", None),
+        relative_gap=getattr(solution, "relative_gap", None),
     )
 
 
@@ -172,11 +187,29 @@ class Accumulated:
         """The factorised model."""
         return self.model.prepared
 
+    @property
+    def weights(self) -> FloatArray:
+        """(r, r') W of all frames."""
+        problem = self.prepared.problem(self.frames)
+        return np.where(problem.sigma > 0, problem.projected, 0.0)
+
+    def solution(self, lam: float | Literal["auto"], method: str) -> Solution | TVSolution:
+        """Their image at ``lam`` by a ``method``."""
+        if method == TV:
+            return solve_tv(self.prepared, self.frames, lam)
+        return self.prepared.solve(self.frames, lam)
+
     def lack(self, factors: Factors, image: FloatArray) -> Lack | None:
         """What ``factors`` are known to lack of the camera, of an ``image`` (n, n'); None where nothing is known."""
         return Lack(self.model, factors.lacking, image) if factors.lacking else None
 
-    def misfit(self, shots: Capture, factors: Factors, solution: DepthMap | Solution | TVSolution) -> Misfit | None:
+    def misfit(
+        self,
+        shots: Capture,
+        factors: Factors,
+        solution: DepthMap | Solution | TVSolution,
+        with_defects: bool = True,
+    ) -> Misfit | None:
         """What of the measurements the model leaves unexplained, or None; reads frames again that were not kept.
 
         Parameters
@@ -185,20 +218,29 @@ class Accumulated:
             that these sums are of.
         solution
             of them, for what the factors' noise adds to the frames.
+        with_defects
+            whether defective pixels are looked for, and no cause where there are some.
         """
         problem, stated, image = self.prepared.problem(self.frames), factors.manifest.noise, solution.image
         added = factor_energy(self.prepared, shots.patterns, stated, image) if stated else None
         lack = self.lack(factors, image)
         if isinstance(solution, DepthMap):
             return solution.misfit(self.noise, added, print_energy(self.model, image))
+        lam = _LAMBDA_OF_TV * problem.scale if isinstance(solution, TVSolution) else solution.lam
         return judge(
-            self.prepared,
-            np.where(problem.sigma > 0, problem.projected, 0.0),
-            self.kept or shots.measured(),
-            self.noise,
+            FrameCheck(
+                self.prepared,
+                self.weights,
+                lam,
+                shots.patterns,
+                shots.manifest,
+                self.noise,
+                lambda: self.kept or shots.measured(),
+            ),
             added,
             print_energy(self.model, image),
             Evidence(factors, shots.patterns, lack.energy if lack else None),
+            with_defects,
         )
 
     def uncertainty(self, shots: Capture, factors: Factors, solution: Solution) -> Uncertainty:
@@ -221,6 +263,48 @@ class Accumulated:
             self.prepared.problem(self.frames),
             self.lack(factors, solution.image),
         )
+
+
+def _without_defects(
+    shots: Capture,
+    factors: Factors,
+    lam: float | Literal["auto"],
+    method: str,
+    data: Accumulated,
+    misfit: Misfit,
+) -> tuple[Capture, Accumulated, Solution | TVSolution, Misfit | None]:
+    """Shots without the readings of defective pixels, their sums, solution and misfit; all as it was where the frames
+    fit no better so.
+
+    Parameters
+    ----------
+    shots, factors, lam, method
+        as :func:`reconstruct` takes them.
+    data, misfit
+        sums of ``shots``, and their misfit with the first defects.
+    """
+    found, now, without = None, misfit, data
+    for _ in range(_DEFECT_ROUNDS):
+        if now.defects is None:
+            break
+        found = now.defects.with_others(found)
+        rest = found.left_out(shots, data.prepared, data.weights)
+        without = accumulated(rest, factors, method)
+        solution = without.solution(lam, method)
+        again = without.misfit(rest, factors, solution)
+        now = again or now
+    # What bright ones put into other pixels is none of these: they are taken in again.
+    while found and (own := found.beyond_chance(rest, data.noise)) and len(own.rows) < len(found.rows):
+        found, rest = own, own.left_out(shots, data.prepared, data.weights)
+        without = accumulated(rest, factors, method)
+        solution = without.solution(lam, method)
+        now = without.misfit(rest, factors, solution, with_defects=False) or now
+    if now.flagged:
+        now = without.misfit(rest, factors, solution, with_defects=False) or now
+    if now.flagged and now.unexplained > _BETTER * misfit.unexplained:
+        solution = data.solution(lam, method)
+        return shots, data, solution, data.misfit(shots, factors, solution, with_defects=False)
+    return rest, without, solution, replace(now, defects=found)
 
 
 def accumulated(shots: Capture, factors: Factors, method: str = TIKHONOV) -> Accumulated:

@@ -149,7 +149,8 @@ def _believable(problem: DiagonalProblem, noise: FloatArray) -> FloatArray:
     """``noise`` (r, r') of a ``problem``, raised by the part of it that both halves of the sensor agree on.
 
     By octaves of sigma: what little exceeds the noise stands, at small sigma, for a scene of any brightness. Where that
-    is brighter than the mean of all octaves before, there is noise alone, there and in all octaves beyond.
+    is brighter than the mean of all octaves before, there is noise alone, there and in all octaves beyond; unless one
+    of these is clearly seen, as the brightness is behind a mask whose constant term is centred away.
     """
     measured = problem.sigma > 0
     sigma, found = problem.sigma[measured], noise[measured]
@@ -162,7 +163,9 @@ def _believable(problem: DiagonalProblem, noise: FloatArray) -> FloatArray:
     power = np.divide(np.maximum(data - level, 0.0), square, out=np.zeros_like(square), where=square > 0)
     before = np.cumsum(sizes * power) / np.cumsum(sizes)
     faint = (data < _FAINT * level) & (sizes >= _FEWEST)
+    clear = np.flatnonzero((data >= _FAINT * level) & (sizes >= _FEWEST))
     doubtful = faint[1:] & (power[1:] > before[:-1])
+    doubtful[: clear.max(initial=0)] = False
     if not doubtful.any():
         return noise
     beyond = octave > int(np.argmax(doubtful))
@@ -176,7 +179,7 @@ def automatic_lambda(problem: DiagonalProblem, explained: bool = True) -> float:
 
     Where the model does not explain the frames, as they say themselves or as is known before (``explained`` is False),
     that is a lower bound: what both halves agree on is then an error that follows no law, and the image that
-    :func:`movement` says to be the steadiest is taken.
+    :func:`movement` says to be the steadiest is taken, short of black.
 
     Returns lambda in the unit of sigma^2; 0 when no regularisation at all scores best. MitsimError when there
     are no more data than unknowns (the noise is then unknown) or no signal.
@@ -189,8 +192,21 @@ def automatic_lambda(problem: DiagonalProblem, explained: bool = True) -> float:
     if is_misfit(problem) or not explained:
         # Beyond the largest sigma^2 all that still moves is the brightness, on its way to black.
         candidates = problem.scale * 10.0 ** exponents[exponents <= 0]
-        lam = min([lam, *candidates[candidates > lam]], key=lambda lam: movement(problem, lam))
+        lam = _steadiest(problem, [lam, *candidates[candidates > lam].tolist()])
     return lam
+
+
+def _steadiest(problem: DiagonalProblem, lambdas: list[float]) -> float:
+    """That of rising ``lambdas`` at which the image of a ``problem`` moves least before it goes to black.
+
+    Where the brightness has the largest sigma, as behind a mask that passes light, it holds the image up to there.
+    Where a mask's constant term is centred away, all goes to black before, and moves less and less: the last fall of
+    :func:`movement` tells of no image.
+    """
+    moved = [movement(problem, lam) for lam in lambdas]
+    while len(moved) > 1 and moved[-1] < moved[-2]:
+        moved.pop()
+    return lambdas[int(np.argmin(moved))]
 
 
 def _least(score: Callable[[float], float], scale: float, exponents: FloatArray) -> float:

@@ -64,6 +64,9 @@ class Reconstruction:
         the depth whose factors were used, or a depth for each pixel; None: the calibrated one.
     predicted
         seconds by stage and memory, before it was begun; None where nobody could tell.
+    objective, relative_gap
+        of ``tv``: what was minimised, and how far above its minimum it may be at most, relative
+        (:class:`mitsim.reconstruct.tv.TVSolution`); None for other methods.
     """
 
     image: FloatArray
@@ -81,6 +84,8 @@ class Reconstruction:
     inputs: dict[str, Any]
     focus: Depth | DepthMap | None = None
     predicted: Predicted | None = None
+    objective: float | None = None
+    relative_gap: float | None = None
 
     @property
     def ok(self) -> bool:
@@ -117,6 +122,8 @@ class Reconstruction:
             "condition_whole": self.condition_whole,
             "condition_sides": self.condition_sides,
             "residual": self.residual,
+            "objective": self.objective,
+            "relative_gap": self.relative_gap,
             "focus_mm": self.focus.mm if isinstance(self.focus, Depth) else None,
             "focus_error_mm": self.focus.error_mm if isinstance(self.focus, Depth) else None,
             "focus_range_mm": self.focus.range_mm if self.focus else None,

@@ -29,7 +29,7 @@ is the least. Finer print is told by what halves of the sensor disagree on (:mod
 
 Simulated light is off by its sampling, projector pixel by projector pixel: an error of the image that is kept as the
 image is. What lambda takes away, lambda x / (sigma^2 + lambda) of each coefficient x, is no noise, but as large as the
-scene has energy there, which is told by the data or follows from them (:func:`scene_energy`).
+scene has energy there, by the power spectrum that the data tell (:mod:`mitsim.reconstruct.spectrum`).
 """
 
 from __future__ import annotations
@@ -50,19 +50,24 @@ from mitsim.reconstruct.lacking import Lack
 from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.regularisation import DiagonalProblem, coefficient_noise
 from mitsim.reconstruct.sides import Side
+from mitsim.reconstruct.spectrum import scene_spectrum
 
 _LOST = 1e-5
 """Part of the energy of G that its few products may leave out: 0.3 % of its norm, less than 1 % of a variance."""
-_FITTED = 4
-"""Octaves of sigma that the power of the scene's energy is fitted to: chosen, of some ten that a camera tells."""
-_TOLD = 0.5
-"""Part of an octave's noise that its signal must have, so that an error of that noise does not pass for a scene: the
-calibration's noise, which :mod:`mitsim.reconstruct.halves` tells to a third, strikes some octaves."""
-_SIGNIFICANT = 3.0
-"""Standard deviations of the noise's energy that an octave's signal must have."""
+_CAUTION = 0.75
+"""Variances of the logarithm of what lambda takes away by which it is stated above its likeliest value: 0.5 is its
+mean; 0.5 and 0.75 pass twice the error alike, and this one covers more (docs/physics.md, uncertainty)."""
+_EXTRAPOLATED = 1.35
+"""Factor by which a stated uncertainty may be off from which that is said: data then hold less than frequencies of half
+the detail that is lost."""
 _NEAR = 2.0
 """Scene pixels around a place whose detail tells of lost detail there: of 1, 2 and 4 that which covers best."""
-NO_UNCERTAINTY = {"uncertainty": None, "uncertainty_budget": None}
+NO_UNCERTAINTY = {
+    "uncertainty": None,
+    "uncertainty_budget": None,
+    "uncertainty_extrapolated": None,
+    "regularisation_bias_factor": None,
+}
 """Entries of result.json where it is not known."""
 
 
@@ -72,9 +77,11 @@ RANDOM = ("frame_noise", "ambient_frame", "rendering")
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """Standard uncertainty of an image: (n, n') by source, ``regularisation_bias`` among them."""
+    """Standard uncertainty of an image: (n, n') by source, ``regularisation_bias`` among them; and the factor, either
+    way, that this one is known to."""
 
     sources: dict[str, FloatArray]
+    bias_factor: float = 1.0
 
     @property
     def random(self) -> FloatArray:
@@ -97,10 +104,29 @@ class Uncertainty:
         """Root mean square over the image by source."""
         return {name: _rms(values) for name, values in self.sources.items()}
 
+    @property
+    def extrapolated(self) -> bool:
+        """Whether most of it is detail that lambda takes away and that the data hardly tell: it then follows from
+        coarser detail and from scenes as they are."""
+        lost = self.budget.get("regularisation_bias", 0.0)
+        return self.bias_factor > _EXTRAPOLATED and 2 * lost**2 > _rms(self.total) ** 2
+
+    def loss(self, image: FloatArray) -> str:
+        """A sentence where lambda takes away more of an ``image`` (n, n') than it leaves; otherwise empty."""
+        lost, left = self.budget.get("regularisation_bias", 0.0), _rms(image)
+        if lost <= left:
+            return ""
+        return (
+            f"Lambda takes away more of the image ({lost:.1e} rms of reflectance, as the uncertainty has it) than it "
+            f"leaves ({left:.1e}), so what is dark may be lost; expose longer, take more patterns or shots, or give a "
+            "smaller lambda."
+        )
+
     def __str__(self) -> str:
         parts = sorted(((value, name) for name, value in self.budget.items() if value), reverse=True)
         by_source = ", ".join(f"{name.replace('_', ' ')} {value:.1e}" for value, name in parts)
-        return f"standard uncertainty {_rms(self.total):.1e} rms: {by_source or 'no noise is stated'}"
+        known = f"; extrapolated: it is known to a factor of {self.bias_factor:.1f}" if self.extrapolated else ""
+        return f"standard uncertainty {_rms(self.total):.1e} rms: {by_source or 'no noise is stated'}{known}"
 
     def channels(self) -> dict[str, Channel]:
         """(n, n') channels of uncertainty.exr."""
@@ -109,7 +135,12 @@ class Uncertainty:
 
     def summary(self) -> dict[str, Any]:
         """What result.json and the command line's JSON say of it."""
-        return {"uncertainty": _rms(self.total), "uncertainty_budget": self.budget}
+        return {
+            "uncertainty": _rms(self.total),
+            "uncertainty_budget": self.budget,
+            "uncertainty_extrapolated": self.extrapolated,
+            "regularisation_bias_factor": self.bias_factor,
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,18 +229,38 @@ class Propagation:
             products.append(taken @ taken.transpose(0, 2, 1))
         return np.asarray(np.einsum("pkl,qkl->pq", *products, optimize=True))
 
-    def of_regularisation(self, problem: DiagonalProblem, variance: float) -> FloatArray:
+    def of_regularisation(self, problem: DiagonalProblem, variance: float) -> tuple[FloatArray, float]:
         """(n, n') mean square of what lambda takes away of the image of a ``problem``, whose data have the stated
-        ``variance``.
+        ``variance`` where no more data than unknowns tell it; and the factor, either way, that its root is known to.
 
-        Detail is lost where there is detail: the mean over the image is told by the scene's energy, and its place by
-        what lambda would take away of the image itself.
+        A coefficient's mean square is told by its datum and by the scene's spectrum, each as well as it knows. A mean
+        is lost everywhere, detail where there is detail: its place is told by what lambda would take away of the image.
         """
+        told_by_data = problem.data_count > np.count_nonzero(problem.sigma)
+        noise = coefficient_noise(problem) if told_by_data else variance
+        estimate = self.gain * problem.projected
+        mean = float(self.model.prepared.image(estimate).mean())
+        spectrum = scene_spectrum(self.model.sides, problem, noise, mean)
         lost = 1 - problem.kept(self.lam)
-        everywhere = self._seen(np.square(lost) * scene_energy(problem, variance))
-        seen = np.square(self.model.prepared.image(lost * self.gain * problem.projected))
+        if spectrum is None or not lost.any():
+            return np.zeros((len(self.model.sides[0].basis), len(self.model.sides[1].basis))), 1.0
+        power = np.square(self._sigma)
+
+        def seen_part(energy: FloatArray) -> FloatArray:
+            """(r, r') share of each coefficient that its own datum tells where its mean square is ``energy``."""
+            return np.divide(power * energy, power * energy + noise, out=np.zeros_like(power), where=power > 0)
+
+        spread = spectrum.spread(np.square(lost) * (1 - seen_part(spectrum.energy)))
+        energy = spectrum.energy * np.exp(_CAUTION * spread)
+        part = seen_part(energy)
+        told = np.divide(part * problem.projected, self._sigma, out=np.zeros_like(power), where=power > 0)
+        squares = np.square(lost) * (np.square(told) + energy * (1 - part))
+        of_mean = np.square(lost) * (1 - part) * spectrum.of_mean * np.exp(_CAUTION * spread)
+        even, detail = self._seen(of_mean), self._seen(squares - of_mean)
+        seen = np.square(self.model.prepared.image(lost * estimate))
         near = gaussian_filter(seen, _NEAR, mode="nearest")
-        return everywhere * near / near.mean() if near.any() else everywhere
+        placed = detail * near / near.mean() if near.any() else detail
+        return even + placed, float(np.exp(np.sqrt(spread) / 2))
 
     def of_factors(self, noise: FactorNoise, image: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(n, n') variances of an ``image`` by ``noise`` of the left factor, and of the right one."""
@@ -293,6 +344,7 @@ def uncertainty(
     frames = propagation.of_frames(noise.rows, noise.columns)
     left, right = propagation.of_factors(factors, image) if factors else (zero, zero)
     told = propagation.of_disagreement(problem.halves, frames + left, frames + right) if problem.halves else zero
+    lost, factor = propagation.of_regularisation(problem, float(noise.variance.mean()))
     variances = {
         "frame_noise": frames,
         "ambient_frame": propagation.of_ambient_frame(*noise.ambient) if noise.ambient else zero,
@@ -301,42 +353,9 @@ def uncertainty(
         "print_detail": np.maximum(propagation.of_print(image), told),
         "exposure": np.square(exposure * image),
         "inseparability": propagation.of_lack(lack.struck) if lack else zero,
-        "regularisation_bias": propagation.of_regularisation(problem, float(noise.variance.mean())),
+        "regularisation_bias": lost,
     }
-    return Uncertainty({name: np.sqrt(np.maximum(variance, 0.0)) for name, variance in variances.items()})
-
-
-def scene_energy(problem: DiagonalProblem, variance: float) -> FloatArray:
-    """(r, r') mean square that is expected of each coefficient of the scene, in the diagonal basis of a ``problem``,
-    whose noise has the stated ``variance`` where no more data than unknowns tell it.
-
-    Over an octave of sigma it is sum(W^2 - noise) / sum(sigma^2) while that tells a signal. Beyond, the scene's energy
-    falls on with the number of coefficients that a camera sees better: that number is the square of the detail's
-    fineness, and scenes have spectra that fall with a power of it. sigma itself falls ever faster with fineness, and so
-    is no guide. Where fewer octaves are told it goes on as it is.
-    """
-    measured = problem.sigma > 0
-    sigma, data = problem.sigma[measured], np.square(problem.projected[measured])
-    told_by_data = problem.data_count > np.count_nonzero(measured)
-    noise = np.broadcast_to(coefficient_noise(problem) if told_by_data else variance, problem.sigma.shape)[measured]
-    octave = np.log2(sigma.max() / sigma).astype(np.intp)
-    sizes = np.bincount(octave)
-    count = np.maximum(sizes, 1)
-    signal, level = (np.bincount(octave, values) / count for values in (data - noise, noise))
-    chance = np.sqrt(2 * np.bincount(octave, np.square(noise))) / count
-    told = (signal > _SIGNIFICANT * chance) & (signal > _TOLD * level)
-    end = int(np.argmin(np.append(told | (sizes == 0), False)))  # beyond the first that is not told, chance may tell
-    energies = np.zeros_like(problem.sigma)
-    known = np.flatnonzero(told[:end])
-    if not known.size:
-        return energies
-    square = np.bincount(octave, np.square(sigma)) / count
-    energy = np.where(told, signal, 0.0) / np.where(square > 0, square, 1.0)
-    middle, last, fitted = np.cumsum(sizes) - sizes / 2, known[-1], known[-_FITTED:]
-    power = np.polyfit(np.log(middle[fitted]), np.log(energy[fitted]), 1)[0] if fitted.size == _FITTED else 0.0
-    beyond = energy[last] * np.power(middle[octave] / middle[last], min(float(power), 0.0))
-    energies[measured] = np.where(octave > last, beyond, energy[octave])
-    return energies
+    return Uncertainty({name: np.sqrt(np.maximum(each, 0.0)) for name, each in variances.items()}, factor)
 
 
 def common_response(side: Side) -> FloatArray:

@@ -139,6 +139,19 @@ class SessionFrames:
         """Names of all frames, dark ones last."""
         return (*(shot.file for shot in self.shots.values()), *(frame.file for frame in self.dark))
 
+    @cached_property
+    def order(self) -> list[Half]:
+        """What the frames show, as they were taken: in the order of the list."""
+        keys = [(f.side, f.index, f.sign) for f in self.listed.frames or self.shots.values()]
+        return list(dict.fromkeys(keys))
+
+    def frame_name(self, half: Half) -> str:
+        """Names of the files that show a ``half`` of a pattern, and which it is."""
+        files = [shot.file for key, shot in self.shots.items() if key[:3] == half]
+        side, index, sign, *_ = half
+        more = f" and {len(files) - 1} more" if len(files) > 1 else ""
+        return f"{files[0]}{more} ({_words((side, index, sign, 0, 0))})"
+
     def exposure_s(self, frame: StripeFile | DarkFile) -> float:
         """Exposure of a ``frame`` [s]."""
         return frame.exposure_s or self.listed.digital.exposure_s * self.listed.exposure_ladder[frame.exposure]

@@ -13,8 +13,11 @@ from mitsim.core.errors import MitsimError
 from mitsim.scene.guard.check import check_file, looking_beside
 from mitsim.scene.guard.estimators import Unfit
 from mitsim.scene.guard.outline import Tag
+from mitsim.scene.mesh_lamps import emit_by_faces
+from mitsim.scene.origin import check_meshes, move_to_camera
 from mitsim.scene.projector import ProjectorGrid, locate_projector
 from mitsim.scene.texels import check_texels
+from mitsim.scene.thin import holding_thin_cylinders
 
 SENSOR_PLUGIN = "mitsim_lensless"
 _SMALL_LAMPS = ("DirectionalEmitter", "PointLight", "SpotLight")
@@ -32,7 +35,8 @@ class LoadedScene:
     estimators must refuse it; ``shapes`` are the tags of ``scene.shapes()``, in that order, or none where one tag gave
     several; ``small_lamps`` are lamps that no path runs into, with their tags; ``coloured`` are tags of what may
     differ by wavelength, none of a scene in greys, ``parting`` of glass that sends each wavelength its own way;
-    ``samples`` is the ``sample_count`` of the camera's sampler, None where it has none.
+    ``samples`` is the ``sample_count`` of the camera's sampler, None where it has none; ``notes`` say what was changed
+    of the scene to render it rightly.
     """
 
     path: Path
@@ -50,6 +54,7 @@ class LoadedScene:
     coloured: tuple[Tag, ...]
     parting: tuple[Tag, ...] = ()
     samples: int | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def pixels(self) -> ProjectorGrid:
@@ -84,9 +89,13 @@ def load_scene(
     if needs_projector and checked.unfit.factored is not None:
         raise checked.unfit.factored
     checked.config.variant = mi.variant()
+    moved = move_to_camera(checked.outline, checked.state)
     with looking_beside(checked.outline):
-        scene = mi.parser.instantiate(checked.config, checked.state)
+        notes = emit_by_faces(checked)  # before thin cylinders are meshes, too
+        with holding_thin_cylinders(checked.outline, checked.state):
+            scene = mi.parser.instantiate(checked.config, checked.state)
     check_texels(path, scene, checked.limits)
+    check_meshes(moved, scene)
     cameras = [sensor for sensor in scene.sensors() if hasattr(sensor, "geometry")]
     if len(cameras) != 1:
         raise MitsimError(f'{path}: {len(cameras)} sensors of type "{SENSOR_PLUGIN}"; a scene needs exactly one')
@@ -118,6 +127,7 @@ def load_scene(
         checked.coloured,
         checked.parting,
         checked.samples,
+        notes,
     )
     if grid is None:
         return LoadedScene(path, checked.files, scene, cameras[0], None, None, tuple(emitters), *facts)

@@ -17,7 +17,7 @@ from mitsim.core.arrays import FloatArray
 
 QUANTISATION = 1 / 12
 """Variance of rounding [DN^2] (EMVA 1288, "noise model")."""
-_LEAST_DARK = 0.24
+LEAST_DARK = 0.24
 """Variance [DN^2] of dark frames below which rounding hides their noise: it counts as this much, an upper limit of
 0.4 DN for the noise (EMVA 1288 4.0, "limit for minimal temporal standard deviation")."""
 _FITTED, _LEAST, _MOST = 0.7, 0.05, 0.95
@@ -166,7 +166,7 @@ def figures(session: Session) -> dict[str, FloatArray]:
     gain = _slope(signal, noise, fitted)
     efficiency = _slope(np.broadcast_to(photons, signal.shape), signal, fitted) / gain
     low, high = _linearity(photons, signal, (signal >= _LEAST * full) & (signal <= _MOST * full))
-    still = np.maximum(dark.variance, _LEAST_DARK) - QUANTISATION if session.rounded else dark.variance
+    still = np.maximum(dark.variance, LEAST_DARK) - QUANTISATION if session.rounded else dark.variance
     times, series = session.dark_times, session.dark_series
     about = times - times.mean()
     slopes = [(values * about).sum(axis=-1) / np.square(about).sum() for values in (series.mean, series.variance)]

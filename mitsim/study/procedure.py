@@ -200,13 +200,14 @@ def drawn(frames: Frames, expected: Session) -> Session:
     specimen make them.
 
     A variance of n pixels whose rows share v_r of v has the variance (2 v_o^2 + k_4 / 2)/n + 4 v_o v_r/n + 2 v_r^2/M,
-    v_o = v - v_r, k_4 = K^4 mu the fourth cumulant of the counts.
+    v_o = v - v_r, k_4 = K^4 mu the fourth cumulant of the counts, dark ones among them.
     """
     sensor, rng = frames.sensor, stream(frames.procedure.seed, "characterise", "sessions")
     m, n = frames.shape
     gain, (pixel, row, column) = sensor.gain_dn_per_e, sensor.response_parts
     response = rng.standard_normal((_SESSIONS, 1)) * math.sqrt(row**2 / m + column**2 / n + pixel**2 / m / n)
     leak = rng.standard_normal((_SESSIONS, 1)) * math.sqrt(dark_current_variance(sensor) / m / n)
+    dark_electrons = mean_dark_current(sensor)
 
     def pairs(pair: Pair, electrons: FloatArray, times: FloatArray | float) -> Pair:
         mean, variance, rows = (np.atleast_1d(part)[None, :] for part in (pair.mean, pair.variance, pair.rows))
@@ -214,7 +215,7 @@ def drawn(frames: Frames, expected: Session) -> Session:
         z = rng.standard_normal((3, _SESSIONS, mean.shape[1]))
         specimen = gain * (electrons * response + np.asarray(times) * leak) * (own > 0)
         mean = mean + specimen + z[0] * np.sqrt((own / m / n + rows / m) / 2)
-        fourth = gain**4 * electrons / 2
+        fourth = gain**4 * (electrons + dark_electrons * np.asarray(times)) / 2
         spread = (2 * own**2 + fourth + 4 * own * rows) / m / n
         shared = np.sqrt(2.0 / m) * rows * z[2]
         alone = np.sqrt(2.0 / m) * own / n * rng.standard_normal(z[2].shape)

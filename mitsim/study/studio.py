@@ -97,7 +97,7 @@ class Image:
 
 def reason_of(status: Status, misfit: Misfit | None = None) -> str:
     """What an image of this ``status`` and ``misfit`` is flagged for, reasons apart by "; "; empty where it is not."""
-    cause = f", likely cause: {misfit.cause.value[0]}" if misfit and misfit.flagged and misfit.cause else ""
+    cause = f", likely cause: {misfit.reason}" if misfit and misfit.flagged and misfit.cause else ""
     own = () if status.verdict.good else (f"{status.verdict.value}{cause}",)
     return "; ".join((*own, *(text.partition(". ")[0].rstrip(".").replace("; ", ", ") for text in status.flags)))
 

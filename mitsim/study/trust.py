@@ -39,7 +39,7 @@ class Trust:
         if image.uncertainty is None:
             return None
         misfit = image.misfit
-        cause = misfit.cause.value[0] if misfit and misfit.cause else ""
+        cause = misfit.reason if misfit else ""
         chi_square = misfit.chi_square if misfit else None
         return cls(image.uncertainty, np.abs(image.image - truth), chi_square, cause)
 

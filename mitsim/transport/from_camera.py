@@ -322,7 +322,7 @@ class CameraWalk(Walk):
         self.came_from = dr.select(passing, self.came_from, si.p)
         self.came_pdf = dr.select(passing, self.came_pdf, sample.pdf)
         self.by_delta = dr.select(passing, self.by_delta, delta)
-        self.ray = self._onward(si, si.to_world(sample.wo), passing)
+        self.ray = self.passage.leaving(si, si.to_world(sample.wo))
         return passing
 
     # ---- light that is kept -----------------------------------------------------------------------------------------

@@ -3,12 +3,13 @@
 Rays are traced in Mitsuba's float32, which is good to about 1e-4 mm at the sensor: 1 % of a pixel, and as much error
 in a masked frame. So each hit is polished in float64: the ray is met with the tangent plane of the surface that was
 hit, and reflection or refraction is worked out again there. What is left is the surface's own place and normal in
-float32: nothing for a mirror that faces the axis squarely, 1e-4 mm for a steel ball of 20 mm at 400 mm.
+float32: nothing for a mirror that faces the axis squarely; round ones and smooth meshes are met in float64
+(:mod:`mitsim.transport.exact_hits`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -18,8 +19,9 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.transport.coordinates import rows_columns, turn_and_origin
+from mitsim.transport.exact_hits import ExactHits, Hits
 from mitsim.transport.host import channels, per_lane, vectors
-from mitsim.transport.passage import Passage
+from mitsim.transport.passage import CLEAR, Passage, transmits
 from mitsim.transport.projector import PinholeRays, ProjectorOptics, wavelength_sets
 
 IntArray = npt.NDArray[np.int64]
@@ -111,11 +113,15 @@ class GlintRays:
             surfaces that a ray may meet between the two.
         """
         self._scene, self._max_depth = scene, max_depth
+        self._clear = CLEAR if transmits(scene) else _OFFSET
         self._wavelengths = wavelength_sets(projector.lines)
         self.rays = PinholeRays(projector, self._wavelengths)
         mean = self.rays.power.mean(axis=0)
         self._colour = mean / mean.sum() if mean.sum() > 0 else np.full(len(mean), 1 / len(mean))
-        self._lobes = [lobe for bsdf in delta_bsdfs(scene, int(mi.BSDFFlags.Delta)) for lobe in _lobes(bsdf)]
+        self._lobes = _by_choice(lobe for bsdf in delta_bsdfs(scene, int(mi.BSDFFlags.Delta)) for lobe in _lobes(bsdf))
+        polished = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
+        self.mirrors = [s for s in scene.shapes() if s.bsdf() is not None and s.bsdf().flags() & polished]
+        self._exact = ExactHits(self.mirrors)
         self._camera_turn, self._camera_place = turn_and_origin(camera.world_transform())
 
     def follow(self, points: FloatArray) -> Crossings:
@@ -171,22 +177,32 @@ class GlintRays:
     def _bounce(self, rays: _Rays, si: mi.SurfaceInteraction3f, active: Mask) -> list[_Rays]:
         """The rays that go on, polished, by lobe; see the module."""
         count = len(active)
-        point, geometric, normal = _polished(rays, si)
+        hits = _polished(rays, si)
+        shaded = hits.normal.copy()
         shapes = per_lane(dr.reinterpret_array(mi.UInt32, si.shape), count).astype(np.uint64)
+        numbers = shapes.astype(np.int64), per_lane(si.prim_index, count).astype(np.int64)
+        self._exact.refine(rays.origin, rays.direction, hits, *numbers)
+        point, geometric, normal = hits.point, hits.geometric, hits.normal
         onward: list[_Rays] = []
-        for lobe in self._lobes:
-            here = mi.Bool(active) & (si.bsdf() == mi.BSDFPtr(lobe.bsdf))
-            if not dr.any(here):
+        materials = per_lane(dr.reinterpret_array(mi.UInt32, si.bsdf()), count)
+        for lobe, own in self._lobes:
+            met = active & np.isin(materials, own)
+            if not met.any():
                 continue
+            here = mi.Bool(met)
             sample, weight = self._sampled(lobe, si, here)
             kind, eta = per_lane(sample.sampled_type, count), per_lane(sample.eta, count)
             single = (kind & int(mi.BSDFFlags.Delta)) != 0
             spectrum = rays.spectrum * np.nan_to_num(weight)
-            chosen = np.flatnonzero(per_lane(here, count) & single & ((spectrum @ self._colour) > _FAINTEST))
+            chosen = np.flatnonzero(met & single & ((spectrum @ self._colour) > _FAINTEST))
             traced = vectors(si.to_world(sample.wo), count)[chosen]
-            direction = _redirected(rays.direction[chosen], normal[chosen], kind[chosen], eta[chosen], traced)
+            turn = kind[chosen], eta[chosen], rays.direction[chosen]
+            # What Mitsuba did with its own normal tells which law it is; the better normal is for where light goes.
+            lawful = np.linalg.norm(_redirected(shaded[chosen], *turn) - traced, axis=1) < _AGREEMENT
+            direction = np.where(lawful[:, None], _redirected(normal[chosen], *turn), traced)
+            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
             slope = np.abs((direction * geometric[chosen]).sum(axis=1))
-            clear = _OFFSET * (1 + np.abs(point[chosen]).max(axis=1, initial=0)) / np.maximum(slope, _GRAZING)
+            clear = self._clear * (1 + np.abs(point[chosen]).max(axis=1, initial=0)) / np.maximum(slope, _GRAZING)
             reflected = (kind[chosen] & int(mi.BSDFFlags.DeltaReflection)) != 0
             code = shapes[chosen] * np.uint64(2) + reflected.astype(np.uint64) + np.uint64(1)
             straight = lobe.kind == int(mi.BSDFFlags.Null)
@@ -203,11 +219,11 @@ class GlintRays:
         for wavelengths in self._wavelengths:
             if wavelengths is not None:
                 si.wavelengths = wavelengths
-            sample, weight = lobe.bsdf.sample(lobe.context, si, choice, mi.Point2f(0.5), active)
+            sample, weight = si.bsdf().sample(lobe.context, si, choice, mi.Point2f(0.5), active)
             weight = weight * sample.pdf if lobe.by_chance else weight
             if lobe.kind == int(mi.BSDFFlags.Null):
                 # Whatever was sampled, light that passes keeps its direction.
-                weight, sample.wo = lobe.bsdf.eval_null_transmission(si, active), -si.wi
+                weight, sample.wo = si.bsdf().eval_null_transmission(si, active), -si.wi
                 sample.sampled_type, sample.eta = mi.UInt32(lobe.kind), mi.Float(1)
             weight = dr.select((sample.sampled_type & lobe.kind) != 0, weight, 0)
             weights.append(channels(mi.unpolarized_spectrum(weight), dr.width(si.t)))
@@ -226,6 +242,16 @@ class _Lobe:
     kind: int
     choice: float = 0.5
     by_chance: bool = False
+
+
+def _by_choice(lobes: Iterable[_Lobe]) -> list[tuple[_Lobe, list[int]]]:
+    """One of all ``lobes`` that are chosen alike, and the numbers of their materials in Dr.Jit's registry."""
+    found: dict[tuple[object, ...], tuple[_Lobe, list[int]]] = {}
+    for lobe in lobes:
+        key = lobe.kind, lobe.choice, lobe.by_chance, lobe.context.type_mask, lobe.context.component
+        number = int(np.array(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(lobe.bsdf))).ravel()[0])
+        found.setdefault(key, (lobe, []))[1].append(number)
+    return list(found.values())
 
 
 def _lobes(bsdf: mi.BSDF) -> list[_Lobe]:
@@ -259,8 +285,8 @@ def _context() -> mi.BSDFContext:
     return mi.BSDFContext(mi.TransportMode.Importance)
 
 
-def _polished(rays: _Rays, si: mi.SurfaceInteraction3f) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Hit point, geometric and shading normal (k, 3), the ray met in float64 with the surface's tangent plane."""
+def _polished(rays: _Rays, si: mi.SurfaceInteraction3f) -> Hits:
+    """Where rays met surfaces, in float64 with the tangent plane of each."""
     count = len(rays.index)
     hit, geometric, normal = (vectors(v, count) for v in (si.p, si.n, si.sh_frame.n))
     with np.errstate(all="ignore"):
@@ -269,26 +295,17 @@ def _polished(rays: _Rays, si: mi.SurfaceInteraction3f) -> tuple[FloatArray, Flo
         point = rays.origin + rays.direction * along[:, None]
         good = np.linalg.norm(point - hit, axis=1) < 10 * _OFFSET * (1 + np.abs(hit).max(axis=1))
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    return np.where(good[:, None], point, hit), geometric, normal
+    return Hits(np.where(good[:, None], point, hit), geometric, normal)
 
 
-def _redirected(
-    direction: FloatArray, normal: FloatArray, kind: IntArray, eta: FloatArray, traced: FloatArray
-) -> FloatArray:
-    """(k, 3) unit directions after the surface in float64: reflected, refracted by ``eta`` (Snell) or straight on.
-
-    Where that disagrees with Mitsuba's own direction ``traced`` (a material that bends light in another way), Mitsuba's
-    stands.
-    """
+def _redirected(normal: FloatArray, kind: IntArray, eta: FloatArray, direction: FloatArray) -> FloatArray:
+    """(k, 3) directions after a surface in float64: reflected, refracted by ``eta`` (Snell) or straight on."""
     cosine = (direction * normal).sum(axis=1, keepdims=True)
     reflected = direction - 2 * cosine * normal
     inside = 1 - (1 - cosine**2) / eta[:, None] ** 2
     refracted = (direction - cosine * normal) / eta[:, None] + np.sign(cosine) * np.sqrt(np.maximum(inside, 0)) * normal
     polished = np.where((kind & int(mi.BSDFFlags.DeltaTransmission))[:, None] != 0, refracted, direction)
-    polished = np.where((kind & int(mi.BSDFFlags.DeltaReflection))[:, None] != 0, reflected, polished)
-    agrees = np.linalg.norm(polished - traced, axis=1, keepdims=True) < _AGREEMENT
-    chosen = np.where(agrees, polished, traced)
-    return np.asarray(chosen / np.linalg.norm(chosen, axis=1, keepdims=True))
+    return np.asarray(np.where((kind & int(mi.BSDFFlags.DeltaReflection))[:, None] != 0, reflected, polished))
 
 
 def _rows_columns(points: FloatArray) -> FloatArray:

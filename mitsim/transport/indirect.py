@@ -219,7 +219,7 @@ class IndirectWalk(Walk):
         self.scattered += dr.select(delta | passing, mi.UInt32(0), mi.UInt32(1))
         self.active &= self._goes_on(self.scattered + 1)
         self.straight &= passing
-        self.ray = self._onward(si, onward, passing)
+        self.ray = self.passage.leaving(si, onward)
 
 
 class AnchorsWalk(IndirectWalk):

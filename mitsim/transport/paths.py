@@ -285,13 +285,6 @@ class Walk(ABC):
             self.strength *= dr.rcp(dr.maximum(chance, _LEAST_CHANCE))
         self.active = going & (dr.max(self.strength) > 0)
 
-    def _onward(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, passing: mi.Bool) -> mi.Ray3f:
-        """The ray that leaves each vertex."""
-        ray = si.spawn_ray(direction)
-        if self.passage.open:
-            ray.o = dr.select(passing, self.passage.onward(si, direction).o, ray.o)
-        return ray
-
     def deposits(self, further: bool) -> list[Deposits]:
         """Light on the host of every path, followed to its end or, unless ``further``, to the first surface only."""
         self.follow(further)

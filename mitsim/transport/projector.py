@@ -274,6 +274,16 @@ class PinholeRays:
         world = self._local(points) @ self._map.turn.T
         return np.asarray(world / np.linalg.norm(world, axis=1, keepdims=True))
 
+    def points(self, places: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Where ``places`` (k, 3) in world coordinates are seen: window points (row, column) (k, 2) in projector
+        pixels, and depths (k,) [mm]; of places behind the projector, at depths below 0, points mean nothing."""
+        local = np.linalg.solve(self._map.turn, (places - self.origin).T)
+        depth, canvas = local[2], self._projector.canvas
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = ((local[i] / depth - axis[1]) / axis[0] for i, axis in enumerate((self._map.x, self._map.y)))
+        row = v * canvas[0] - self._projector.first_row
+        return np.stack([row, u * canvas[1] - self._projector.first_column], axis=1), depth
+
     def _local(self, points: FloatArray) -> FloatArray:
         tangents = self._map.tangents(*self._projector.canvas_point(points[:, 0], points[:, 1]))
         return np.stack([*tangents, np.ones(len(points))], axis=1)

@@ -22,7 +22,7 @@ from mitsim.study.table import Table
 from tests.exchanged import Made, made
 from tests.unit.core.test_hdf5file import room
 
-pytestmark = pytest.mark.robustness("Output")
+pytestmark = pytest.mark.robustness("Faults")
 
 ROOM = 2000
 """Bytes; each file below is larger."""

@@ -243,8 +243,8 @@ def test_a_mirror_that_shows_the_projector_to_part_of_the_sensor(variant: str) -
     # Sensor x meets the mirror at (60 + x) / 2: dark where x < 0, columns of s > 0.
     expected = REFLECTANCE * light * (u < 0)
     assert relative(found.irradiance[0], expected) < 1e-3
-    assert found.irradiance[0].sum() + found.unresolved / PITCH**2 / 2 == pytest.approx(expected.sum(), rel=2e-3)
-    assert found.unresolved < 5e-3 * found.flux
+    assert found.irradiance[0].sum() == pytest.approx(expected.sum(), rel=2e-4)
+    assert found.unresolved == 0 and found.error < 2e-4 * found.flux
 
 
 def test_a_mirror_out_of_view_gives_nothing(variant: str) -> None:
@@ -288,24 +288,33 @@ def ball(tangent: np.ndarray, source: np.ndarray, centre: np.ndarray, radius: fl
     return -x[..., 1::-1], -(d / d[..., 2:])[..., 1::-1]
 
 
-def test_a_ball_of_steel(variant: str) -> None:
-    """A convex mirror spreads the light: flux over the area on which it lands, by the derivative of the exact map."""
-    pixels = 128
-    rig, centre, radius = Rig((60, 0, 0)), np.array([12.0, 5.0, 420.0]), 20.0
-    shape = {"type": "sphere", "center": centre.tolist(), "radius": radius, "bsdf": mirror((0, 0, 1), BACK)["bsdf"]}
-    found = rig.frames(rig.scene(pixels=pixels, ball=shape), UNIFORM)
+def by_ball(rig: "Rig", centre: np.ndarray, radius: float, pixels: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Irradiance without mask, and tan-angles and places of the light (pixels, pixels, 2), by the exact map."""
     u = np.stack(np.meshgrid(centres(pixels), centres(pixels), indexing="ij"), axis=-1)
     reach = lambda tangent: ball(tangent, rig.place, centre, radius)  # noqa: E731
-    tangent = np.broadcast_to((centre - rig.place)[:2] / (centre[2] - radius), u.shape).copy()
-    step = 1e-6
+    start = centre - rig.place
+    # First the point that halves the angle between projector and sensor.
+    towards = start / np.linalg.norm(start) + centre / np.linalg.norm(centre)
+    start = start - radius * towards / np.linalg.norm(towards)
+    tangent = np.broadcast_to(start[:2] / start[2], u.shape).copy()
+    step = 1e-6 * min(1.0, radius / 2)
     for _ in range(12):  # Newton's method, for every pixel the ray that meets its centre
         place, seen = reach(tangent)
         jacobian = np.stack(
             [(reach(tangent + step * e)[0] - reach(tangent - step * e)[0]) / (2 * step) for e in np.eye(2)], axis=-1
         )
         tangent += np.linalg.solve(jacobian, (u - place)[..., None])[..., 0]
-    assert np.abs(place - u).max() < 1e-8
-    light = np.pi * SCALE * REFLECTANCE / np.abs(np.linalg.det(jacobian))
+    assert np.abs(place - u).max() < 1e-8 + 2e-8 / radius**2  # b^2 - (d^2 - r^2) keeps so much in float64
+    return np.pi * SCALE * REFLECTANCE / np.abs(np.linalg.det(jacobian)), seen, u
+
+
+def test_a_ball_of_steel(variant: str) -> None:
+    """A convex mirror spreads the light: flux over the area on which it lands, by the derivative of the exact map."""
+    pixels = 128
+    rig, centre, radius = Rig((60, 0, 0)), np.array([12.0, 5.0, 420.0]), 20.0
+    shape = {"type": "sphere", "center": centre.tolist(), "radius": radius, "bsdf": mirror((0, 0, 1), BACK)["bsdf"]}
+    found = rig.frames(rig.scene(pixels=pixels, ball=shape), UNIFORM)
+    light, seen, u = by_ball(rig, centre, radius, pixels)
     s = u + D * seen
     slope = 1 + D * np.gradient(seen[:, 0, 0], PITCH).mean()
     masks = [code_mean(s[..., i] - slope * PITCH / 2, s[..., i] + slope * PITCH / 2) for i in (0, 1)]
@@ -313,12 +322,45 @@ def test_a_ball_of_steel(variant: str) -> None:
     assert found.flux == pytest.approx(light.sum() * PITCH**2, rel=1e-3)
 
 
+@pytest.mark.parametrize("radius", [1.0, 0.2, 0.05])
+def test_small_balls(variant: str, radius: float) -> None:
+    """Balls that lie between the rays of the first grid, 0.9 mm apart: each spreads E R r^2 / 4 evenly, to r / d.
+
+    (Planted: no squares divided for them, and all of their light is missing; hits in float32, 3e-4 to 5e-2 off.)
+    """
+    pixels, rig = 64, Rig((60, 0, 0))
+    places = np.array([[12.3, 5.1, 371.0], [-31.7, 20.9, 388.3], [2.6, -33.2, 362.9]], np.float32).astype(float)
+    bsdf, held = mirror((0, 0, 1), BACK)["bsdf"], float(np.float32(radius))
+    shapes = {
+        f"ball{i}": {"type": "sphere", "center": c.tolist(), "radius": held, "bsdf": bsdf} for i, c in enumerate(places)
+    }
+    found = rig.frames(rig.scene("open", pixels, **shapes), UNIFORM)
+    light = sum(by_ball(rig, centre, held, pixels)[0] for centre in places)
+    assert relative(found.irradiance[0], light) < 2e-4
+    assert found.unresolved < 1e-6 * found.flux
+    from_projector = places - rig.place
+    cosine = from_projector[:, 2] / np.linalg.norm(from_projector, axis=1)
+    intensity = np.pi * SCALE / from_projector[:, 2] ** 2 / cosine * REFLECTANCE * held**2 / 4
+    far = np.linalg.norm(places, axis=1)
+    assert found.irradiance.mean() == pytest.approx((intensity * places[:, 2] / far**3).sum(), rel=1e-3 + radius / 100)
+
+
+@pytest.mark.parametrize("side", [0.3, 0.05])
+def test_a_small_facet(variant: str, side: float) -> None:
+    """A plane mirror between the rays of the first grid: pi scale R / z^2 times its area, on a patch twice as large."""
+    rig, place = Rig((60, 0, 0)), (30.12, 0.07, 400.0)
+    found = rig.frames(rig.scene("open", 128, 0.05, facet=mirror(place, BACK, side / 2)), UNIFORM)
+    assert found.flux == pytest.approx(np.pi * SCALE * REFLECTANCE / 400**2 * side**2, rel=2e-2)
+    lit = np.argwhere(found.irradiance[0] > 0.2 * found.irradiance[0].max())
+    assert np.abs((lit - 63.5) * 0.05 - [-0.14, -0.24]).max() < side + 0.05
+
+
 def test_rays_are_better_than_float32(variant: str) -> None:
     """Mitsuba's own rays land some 1e-4 mm off by a plane mirror, more by this ball; polished ones do not."""
     rig, centre, radius = Rig((60, 0, 0)), np.array([12.0, 5.0, 420.0]), 20.0
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (500, 2)) + [58.7, 51.2]
     ball_shape = {"type": "sphere", "center": centre.tolist(), "radius": radius, "bsdf": {"type": "conductor"}}
-    for shape, off in ((mirror((0, 0, 400), BACK, 120), 1e-6), (ball_shape, 4e-4)):
+    for shape, off in ((mirror((0, 0, 400), BACK, 120), 1e-6), (ball_shape, 1e-6)):
         scene = rig.scene(shape=shape)
         tracer = GlintRays(scene, scene.sensors()[0], ProjectorOptics(scene.emitters()[0], N, 0, N, (N, 2 * N)), 1)
         found = tracer.follow(points)

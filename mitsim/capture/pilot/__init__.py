@@ -23,6 +23,7 @@ from mitsim.capture.pilot.sharp import sharp_pixels
 from mitsim.capture.pilot.switched import SwitchedEffects
 from mitsim.capture.prices import FIXED, Numbers, forming_seconds
 from mitsim.capture.simulation import Simulation
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.rig.patterns import Lighting
@@ -118,9 +119,10 @@ class Look:
         own = integer(seed, "pilot", "sharp")
         apart = sharp_pixels(seen, self._sharp, self._light, accuracy, own)
         self._base = Settings(depth=depth, effects=first_look, reach=reach, sharp=apart)
-        sample = Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
+        sample, self._hits = Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors), math.inf
         if not bench.loaded.mirrors and not self._sharp.irradiance:
             sample = _enough(sample, hits, bench)
+            self._hits = hits if hits < _FEWEST_HITS else math.inf
         self.samples = dict.fromkeys(STAGES, sample)
         self.occluded: OccludedLight | None = None
         for stage in STAGES:
@@ -188,6 +190,15 @@ class Look:
         few = Changes.between(self.anchored.few, self.switched.light**2).estimate([Part("anchors", SMOOTH)])
         return few.bound > _ROUGH * self.accuracy
 
+    def heavy(self, samples: int) -> dict[str, Effort]:
+        """What is followed from the camera takes, by its name in the evidence, as looks of more ``samples`` see it: a
+        lobe that is met in one of a million paths, and brings most of the noise, is in none of the short ones."""
+        found = {
+            "from_camera": self.switched.with_more(samples),
+            "followed_from_camera": self.followed.with_more(self.switched.light, samples),
+        }
+        return {name: effort for name, effort in found.items() if effort.noise.error}
+
     def _finer(self, stage: str) -> Sample:
         sample = self.samples[stage]
         return replace(sample, effort=FINER * sample.effort)
@@ -229,6 +240,16 @@ class Look:
     def _left_out(self) -> LeftOut:
         return _left_out(self.switched.simulation, self.seed)
 
+    def _unsure_glint(self, other: float) -> float:
+        """Part of all light that comes over mirrors alone and is in no frame, or may be in the wrong pixels.
+
+        ``other``: irradiance of all other light [W m^-2].
+        """
+        if not self.bench.loaded.mirrors:
+            return 0.0
+        found, unsure = self.bench.glint.irradiance(self.bench.geometry)
+        return unsure / (other + found + unsure) if unsure else 0.0
+
     @cached_property
     def evidence(self) -> Evidence:
         """What has been found."""
@@ -258,6 +279,7 @@ class Look:
             apart=switched.apart,
             unresolved=sharp.irradiance / (self._light + sharp.irradiance) if few else 0.0,
             left_out=left_out / (left_out + found) if left_out else 0.0,
+            glint=self._unsure_glint(found),
             mirror=mirror,
             reach=self._base.reach,
             sharp=apart,
@@ -267,6 +289,7 @@ class Look:
             occluded=self._base.occluded,
             occluded_light=self.occluded.effort(light) if self.occluded else Effort.none(),
             raster=self._raster,
+            hits=self._hits,
         )
 
 
@@ -324,15 +347,16 @@ def _left_out(simulation: Simulation, seed: int) -> LeftOut:
 
 
 def _first_light(simulation: Simulation, seed: int, sharp: SharpLight) -> tuple[float, float, float]:
-    """Where light is seen, 1 / mean(1/z) [mm], how much of it, and how many rays bring some if each pixel sends one.
+    """Where light is seen, 1 / mean(1/z) [mm], how much of it, and how many rays bring it if each pixel sends one.
 
-    From one ray of each projector pixel, or, where hardly one meets what the camera sees, from more.
+    From one ray of each projector pixel, or, where hardly one meets what the camera sees, from more. Rays count by
+    their light, as so many equal ones.
     """
     bench, own = simulation.bench, integer(seed, "pilot", "depth")
     enough = min(_FEWEST_HITS, simulation.bench.n**2 / 4)
     first, samples = 0, 1
     deposits = simulation.direct.trace(own)
-    while len(deposits.value) < enough and not bench.loaded.mirrors and not sharp.irradiance:
+    while _equal(deposits.value) < enough and not bench.loaded.mirrors and not sharp.irradiance:
         if _MORE * (first + samples) * bench.n**2 > _MOST_RAYS:
             break
         first, samples = first + samples, (_MORE - 1) * (first + samples)
@@ -352,4 +376,10 @@ def _first_light(simulation: Simulation, seed: int, sharp: SharpLight) -> tuple[
     # A plane is met at its own depth but for rounding; the aligned plane keeps its exact cells.
     flat = abs(mean * bench.geometry.scene_distance - 1) < _ALIGNED
     depth = bench.geometry.scene_distance if flat or mean <= 0 else 1 / mean
-    return depth, total, np.count_nonzero(deposits.value) / samples
+    return depth, total, _equal(deposits.value) / samples
+
+
+def _equal(values: FloatArray) -> float:
+    """How many equal ``values`` would scatter as much about their sum as these."""
+    squares = float(np.square(values, dtype=np.float64).sum())
+    return float(values.sum(dtype=np.float64)) ** 2 / squares if squares else 0.0

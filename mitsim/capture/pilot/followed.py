@@ -98,6 +98,16 @@ class FollowedLight:
         )
         return indirect, camera
 
+    def with_more(self, light: float, samples: int) -> Effort:
+        """That of what is followed from the camera, by looks of so many ``samples``; ``light`` as for those."""
+        simulation = self._simulation(followed_anchors=_FEW_ANCHORS)
+        tracer = simulation.at_anchors[1]
+        if tracer is None or not self.changes or not light:
+            return Effort.none()
+        seen = [tracer.trace(integer(seed, "heavy"), 0, samples) for seed in self._seeds]
+        error = noise(self._beyond(simulation, seen, samples=samples)) / light
+        return Effort(Noise(error, samples, 0.5), self._simulation().at_anchors[1].lanes)  # type: ignore[union-attr]
+
     @property
     def _widths(self) -> dict[Part, FloatArray]:
         """Change of the frames by every width of cells for what a few anchors see beyond their mean."""
@@ -113,13 +123,19 @@ class FollowedLight:
         simulation = self._simulation(followed_anchors=_FEW_ANCHORS, **cells)
         return self._beyond(simulation, self._few, None if cells else self._frames(_FEW_ANCHORS))
 
-    def _beyond(self, simulation: Simulation, looks: list[Deposits], frames: FloatArray | None = None) -> FloatArray:
+    def _beyond(
+        self,
+        simulation: Simulation,
+        looks: list[Deposits],
+        frames: FloatArray | None = None,
+        samples: int | None = None,
+    ) -> FloatArray:
         """Frames of light to a few anchors beyond its mean, in a ``simulation``; of all of it, where they are known."""
         weights = simulation.mean_weights(_FEW_ANCHORS)
         mean = [look.averaged(weights) for look in looks]
         trays = simulation.followed, simulation.followed_ambient
-        frames = self._formed(trays, looks) if frames is None else frames
-        return frames - self._formed((trays[0].of_mean, trays[1].of_mean), mean)
+        frames = self._formed(trays, looks, samples) if frames is None else frames
+        return frames - self._formed((trays[0].of_mean, trays[1].of_mean), mean, samples)
 
     @cached_property
     def _few(self) -> list[Deposits]:
@@ -166,7 +182,9 @@ class FollowedLight:
     def _tracers(simulation: Simulation) -> list[Tracer | Together]:
         return [tracer for tracer in simulation.at_anchors if tracer is not None]
 
-    def _formed(self, trays: tuple[Tray, Tray], looks: list[Deposits]) -> FloatArray:
-        """(looks, shots, places, places) frames of the projector's light, and lamps', in ``trays``."""
-        frames = self.sample.frames(trays[0], looks, self.sample.followed)
-        return frames + self.sample.lamps(trays[1], looks, self.sample.followed) if self.bench.loaded.lamps else frames
+    def _formed(self, trays: tuple[Tray, Tray], looks: list[Deposits], samples: int | None = None) -> FloatArray:
+        """(looks, shots, places, places) frames of the projector's light, and lamps', in ``trays``; of so many
+        ``samples``, if not of as many as others."""
+        samples = samples or self.sample.followed
+        frames = self.sample.frames(trays[0], looks, samples)
+        return frames + self.sample.lamps(trays[1], looks, samples) if self.bench.loaded.lamps else frames

@@ -144,6 +144,15 @@ class SwitchedEffects:
         relative = error / self.light if self.light else 0.0
         return Effort(Noise(relative, samples, 0.5), lanes)
 
+    def with_more(self, samples: int) -> Effort:
+        """The same of what is followed from the camera, by looks of so many ``samples`` of their own."""
+        tracer = self.simulation.from_camera
+        if tracer is None or not self.light:
+            return Effort.none()
+        seen = [tracer.trace(integer(seed, "heavy"), 0, samples) for seed in self.seeds]
+        frames = self._form(self.simulation, followed=self._by_kind({"from_camera": seen}), samples=samples)
+        return Effort(Noise(noise(frames) / self.light, samples, 0.5), tracer.lanes)
+
     def indirect_effort(self) -> tuple[Effort, bool, tuple[int, ...]]:
         """What light over several surfaces takes, whether that is less where neighbouring pixels share it, and how
         often each block of pixels is followed in a sample."""

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 STRAIGHT = ("circular", "mask", "null", "polarizer", "retarder", "thindielectric")
 """Materials that let light straight on."""
+_BUMPS = ("bumpmap", "normalmap")
+"""Materials that turn another's frame, and do not tell which light it lets straight on."""
 _MIRRORS = ("conductor", "dielectric", "mitsim_glass", "plastic", "thindielectric")
 """Materials that reflect or bend light into single directions."""
 SMALL_LAMPS = ("directional", "point", "spot")
@@ -63,9 +65,10 @@ class Unfit:
                 "the integrator volpath"
             )
             factored = outline.tag(node).refusal(name, "a medium", rule)
+        opaque = _under_bumps(outline, tree)
         return cls(
-            factored,
-            _lost_by_integrator(outline, tree, medium or next(tree.to(STRAIGHT), None)),
+            factored or opaque,
+            _lost_by_integrator(outline, tree, medium or next(tree.to(STRAIGHT), None)) or opaque,
             _caustics(outline, tree, ("projector", *SMALL_LAMPS), "the reference"),
             _caustics(outline, tree, SMALL_LAMPS, "the factored estimator"),
             _in_instances(outline, tree),
@@ -113,6 +116,22 @@ def _in_instances(outline: Outline, tree: _References) -> str | None:
                 "projector is missing; place the shape itself"
             )
             return str(outline.tag(mirror).refusal("bsdf", repr(str(mirror.props.plugin_name())), rule))
+    return None
+
+
+def _under_bumps(outline: Outline, tree: _References) -> MitsimError | None:
+    """The refusal of a hole or pane inside a material that hides from connections what passes it."""
+    for node, name in tree.to(_BUMPS):
+        bumps = tree.nodes[node.props[name].index()]
+        hidden = next(tree.below(bumps, STRAIGHT), None)
+        if hidden is not None:
+            what = str(hidden.props.plugin_name())
+            rule = (
+                f"inside of a {bumps.props.plugin_name()} Mitsuba takes it for opaque wherever it connects a surface "
+                "to a light, so that is missing; turn them round: the mask, or other material that light passes, "
+                "outermost"
+            )
+            return outline.tag(hidden).refusal("bsdf", repr(what), rule)
     return None
 
 

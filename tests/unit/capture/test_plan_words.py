@@ -27,7 +27,13 @@ def bench(cuts: bool = False, shift: float = 0.0, feature: float = 0.06) -> Benc
         geometry=geometry,
         spectrum=SimpleNamespace(wavelengths_nm=np.array([450.0, 620.0])),
         loaded=SimpleNamespace(
-            pixels=SimpleNamespace(keystone=2.5), unfit=Unfit(), shapes=(), small_lamps=(), coloured=(), parting=()
+            pixels=SimpleNamespace(keystone=2.5),
+            unfit=Unfit(),
+            shapes=(),
+            mirrors=False,
+            small_lamps=(),
+            coloured=(),
+            parting=(),
         ),
         lines=None,
         sensor=SimpleNamespace(quantum_efficiency_curve=None),
@@ -54,6 +60,15 @@ def test_devices_are_flagged_where_their_model_ends(
     assert facts.keystone == 2.5 and len(facts.warnings) == len(words)
     for warning, part in zip(facts.warnings, words, strict=True):
         assert part in warning
+
+
+def test_light_over_mirrors_that_is_not_resolved_is_told_with_their_kinds_and_the_first() -> None:
+    mirrors = tuple(Tag(Path("a.xml"), line, "shape", {"type": kind}) for line, kind in ((7, "disk"), (9, "sphere")))
+    facts = SceneFacts({}, 0.0, mirrors=(*mirrors, mirrors[1]))
+    (warning,) = decide(1e-2, replace(EVIDENCE, glint=0.2), facts).warnings
+    assert warning.startswith("a.xml:7: shape: got 'disk'")
+    assert "0.2 of the light" in warning and "2 sphere, 1 disk" in warning
+    assert not decide(1e-2, replace(EVIDENCE, glint=1e-4), facts).warnings
 
 
 def test_light_that_is_lost_over_a_mirror_is_told_with_its_place() -> None:

@@ -3,10 +3,25 @@
 import signal
 
 import pytest
+import typer
 
 from mitsim import cli
 from mitsim.core import worker
 from mitsim.core.errors import MitsimError
+
+
+def test_a_file_that_ends_too_early_is_no_interrupt(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Click takes any EOFError for Control-D. (Planted: "interrupted", 130.)"""
+
+    def app(standalone_mode: bool) -> int:
+        raise typer.Abort from EOFError("no data left")
+
+    monkeypatch.setattr(cli, "app", app)
+    with pytest.raises(SystemExit) as ended:
+        cli.run()
+    assert ended.value.code == 2 and "EOFError: no data left" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("by", "status", "said"), [(None, 2, "no variant"), (signal.SIGINT, 130, "interrupted")])

@@ -89,6 +89,18 @@ def test_a_folder_without_a_format_is_read_as_version_0_3_0_did(tmp_path: Path, 
         read(tmp_path, {**old, "warnings": 3})
 
 
+def test_captures_of_one_file_are_refused(tmp_path: Path) -> None:
+    """Two shots cannot be one frame, nor a shot the ambient frame."""
+    captures = [{"file": "a.exr", "row": row, "column": 0, "sign": 0} for row in range(2)]
+    patterns = {"P_L": [[1.0, 0.0], [0.0, 1.0]], "P_R": [[1.0], [1.0]], "captures": captures}
+    with pytest.raises(MitsimError, match=r"captures.1: names 'a.exr', as captures.0 does"):
+        read(tmp_path, {**RUN, "patterns": patterns})
+    captures[1]["file"] = "b.exr"
+    read(tmp_path, {**RUN, "patterns": patterns})
+    with pytest.raises(MitsimError, match=r"ambient_frame: names 'b.exr', a capture's file"):
+        read(tmp_path, {**RUN, "patterns": patterns, "ambient_frame": {"file": "b.exr", "shots": 1}})
+
+
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     run = read(tmp_path, RUN)
     write_json(tmp_path / "manifest.json", run)

@@ -328,7 +328,7 @@ def test_the_ambient_frame_loses_the_same_rows(monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.parametrize(
-    ("focus", "fragment"), [(0.0, "above 0"), (-5.0, "above 0"), ("near", "auto' or 'map"), (np.nan, "above 0")]
+    ("focus", "fragment"), [(0.0, "above 0"), (-5.0, "above 0"), ("near", "'auto' or 'map'"), (np.nan, "above 0")]
 )
 def test_a_focus_that_is_none_is_refused(focus: object, fragment: str) -> None:
     with pytest.raises(ArgumentError, match=fragment) as caught:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.manifests import Digital
@@ -192,6 +193,21 @@ def test_folders_with_a_mistake_are_refused(tmp_path: Path) -> None:
     (folder / "session.toml").unlink()
     (folder / "session.json").unlink()
     assert "holds neither session.toml nor session.json" in refusal()
+
+
+@pytest.mark.parametrize("mode", ["pair", "uniform"])
+def test_a_black_level_above_all_numbers_is_refused(tmp_path: Path, mode: str) -> None:
+    """Frames of 8 bits, and a level of the same camera's 12 bits."""
+    session = RealSession()
+    folder = session.write(tmp_path / "frames", mode)
+    for number, (*_, light) in enumerate(session.shown(mode)):
+        Image.fromarray((session.frame(light) / 16).astype(np.uint8)).save(folder / f"f_{number}.png")
+    write_list(folder, signed_capture=mode, digital={**DIGITAL, "black_level_dn": 300})
+    with pytest.raises(MitsimError) as told:
+        calibrate_frames(folder, tmp_path / "cal")
+    message = str(told.value)
+    assert "f_0.png" in message and "black_level_dn 300" in message and "\n" not in message
+    assert not (tmp_path / "cal").exists()
 
 
 def test_one_uniform_exposure_without_a_dark_frame_is_refused(tmp_path: Path) -> None:

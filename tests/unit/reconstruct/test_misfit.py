@@ -25,6 +25,8 @@ DATA = PIXELS**2
 SHIFT = 0.3
 """Projector pixels that light moves by when a sheet is 2 mm off 400 mm, seen from 60 mm beside."""
 PLACE = np.linspace(-1, 1, PIXELS)
+OTHER = Bench(*(np.roll(shadow()[::-1], 31, axis=0) * np.linspace(1, 3, N),) * 2)
+"""Another camera, its mask turned and moved."""
 
 
 def recovered(
@@ -117,8 +119,8 @@ def test_saturation_is_named() -> None:
 
 
 def test_another_rig_is_named() -> None:
-    """Factors of another camera that goes by the same name: the mask the other way round."""
-    image = recovered(bench(), calibrated=Bench(shadow()[::-1] * np.linspace(1, 3, N), shadow()[::-1]))
+    """Factors of another camera that goes by the same name: its mask's features in another order."""
+    image = recovered(bench(), calibrated=OTHER)
     assert not image.ok and misfit(image).cause is Cause.RIG
 
 
@@ -141,7 +143,7 @@ def test_without_stated_noise_only_gross_misfit_is_flagged() -> None:
     image = recovered(bench(SHIFT / 3, stated=False), calibrated=plain)
     found = misfit(image)
     assert image.ok and not found.stated and found.chi_square > 2
-    gross = recovered(plain, calibrated=Bench(shadow()[::-1] * np.linspace(1, 3, N), shadow()[::-1], stated=False))
+    gross = recovered(plain, calibrated=replace(OTHER, stated=False))
     assert not gross.ok and misfit(gross).cause is Cause.RIG
     # Few photons leave more than a tenth of the frames unexplained, and are no misfit.
     assert recovered(bench(peak=40.0, stated=False), calibrated=plain).ok
@@ -229,7 +231,7 @@ def test_both_halves_of_a_pair_count_alike() -> None:
     for each in shots.measured():
         positive, negative = rate[each.row, each.column, 1], rate[each.row, each.column, -1]
         assert np.array_equal(each.frame, positive - negative) and np.array_equal(each.light, positive + negative)
-        assert each.shots == 2 and each.power == pytest.approx(positive**2 + negative**2, rel=1e-12)
+        assert each.shots == 2 and each.power == pytest.approx(np.sum(positive**2 + negative**2), rel=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -83,6 +83,63 @@ def test_predicted_standard_errors_are_the_spread_over_seeds_and_specimens() -> 
     assert np.square(off).mean() == pytest.approx(1, abs=0.45)
 
 
+COARSE: dict[str, tuple[dict[str, object], str]] = {
+    "8 bits, a fifth of dark readings 0": (
+        {"bits": 8, "read_noise_e": 25.0, "gain_dn_per_e": 0.0235, "black_level_dn": 1.0}, "dark readings are 0 DN"
+    ),
+    "10 bits, no black level": (
+        {"bits": 10, "read_noise_e": 10.0, "gain_dn_per_e": 0.1, "black_level_dn": 0.0}, "raise black_level_dn"
+    ),
+    "16 bits, no black level": (
+        {"bits": 16, "read_noise_e": 60.0, "gain_dn_per_e": 5.0, "black_level_dn": 0.0}, "raise black_level_dn"
+    ),
+    "6 bits, next to no noise": (
+        {"bits": 6, "read_noise_e": 4.0, "gain_dn_per_e": 0.006, "black_level_dn": 2.0}, "rounding to whole DN"
+    ),
+    "8 bits, black between two codes": (
+        {"bits": 8, "read_noise_e": 4.0, "gain_dn_per_e": 0.024, "black_level_dn": 2.5}, "rounding to whole DN"
+    ),
+    "8 bits, noise of 0.6 DN": ({"bits": 8, "read_noise_e": 25.0, "gain_dn_per_e": 0.0235, "black_level_dn": 3.0}, ""),
+    "16 bits, counts of one dark electron": (
+        {"bits": 16, "read_noise_e": 0.1, "gain_dn_per_e": 5.0, "black_level_dn": 100.0}, ""
+    ),
+    "12 bits, noise of 60 electrons": ({"read_noise_e": 60.0, "gain_dn_per_e": 0.3, "black_level_dn": 100.0}, ""),
+}  # fmt: skip
+
+
+def coarse(name: str) -> SensorModel:
+    return sensor(**{**PLAIN, "full_well_e": 10_000.0, **COARSE[name][0]})
+
+
+@pytest.mark.parametrize("name", COARSE)
+def test_few_bits_and_clipped_darks_are_expected_and_flagged(name: str) -> None:
+    """Where the ADC's ends and steps mislead the procedure, that is said with its cause; and nowhere else.
+
+    (Planted: `bias` left at 0.)
+    """
+    done = characterise(coarse(name), Procedure(128, 20, 4))
+    cause = COARSE[name][1]
+    assert (cause in done.warnings[0]) if cause else not done.warnings
+    for row in done.rows:
+        assert abs(row.deviations) < 4.5, row
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(COARSE)[::2])
+def test_few_bits_and_clipped_darks_leave_the_predicted_spread(name: str) -> None:
+    """Twenty seeds: the deviations of gain, dark noise and full well are standard normal: |mean| below 0.9 (4 of its
+    standard errors), mean square below 2.5 (a chance of 2e-4), the largest below 4."""
+    names = ("system_gain", "dark_noise", "full_well")
+    off = np.array(
+        [
+            [row.deviations for row in characterise(coarse(name), Procedure(64, 20, 4, seed)).rows if row.name in names]
+            for seed in range(20)
+        ]
+    )
+    assert np.all(np.abs(off.mean(axis=0)) < 0.9) and np.all(np.square(off).mean(axis=0) < 2.5), off
+    assert np.abs(off).max() < 4
+
+
 def test_a_camera_that_is_not_as_its_file_says_is_flagged(monkeypatch: pytest.MonkeyPatch) -> None:
     from mitsim.study import procedure as module
 

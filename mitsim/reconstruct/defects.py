@@ -1,0 +1,195 @@
+"""Residuals of all measurements by sensor pixel in, pixels that are dead or hot out, and a capture without them.
+
+A pixel that reads nothing of the light, or more than it, is off in every frame, and its neighbours are not. A separable
+solver cannot weigh single pixels, so their readings are replaced by what the model tells of them from all others:
+setting y - r / (1 - h) at a datum of leverage h leaves an image as if it had not been measured. Pixels that share
+frames are set in rounds, each of which leaves the part h of the step before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.ndimage import maximum_filter, uniform_filter
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.measurement import Ambient, Measurement
+from mitsim.core.runs import Capture
+from mitsim.reconstruct.accumulator import centred
+from mitsim.reconstruct.noise import FrameNoise
+from mitsim.reconstruct.sides import IndexArray
+from mitsim.reconstruct.solver import Prepared
+
+_SPREADS = 7.0
+"""Standard deviations of noise, 1e-12 for a pixel, beyond which its residual's energy is no chance."""
+_AROUND = 3
+"""Pixels to each side whose median energy is what a pixel's is compared with: 7 x 7, so that a dead row and column are
+less than a third of them."""
+_CROWD = 0.35
+"""Part of these 7 x 7 that are off at most: two dead lines side by side, or two that cross, are less than a third."""
+_MOST = 0.02
+"""Part of the sensor that may be defective: where more is off, the scene does not fit."""
+_LEAST_VARIANCE = 1e-3
+"""Part of the mean variance that a pixel's counts as at least: one that reads nothing has none of light."""
+_LEAKS = 0.1
+"""Part of the largest energy of a pixel that others may have by it: the square of what the fit takes from one reading
+for the next, 0.03 where the scene has 0.4 of the sensor's pixels a side."""
+_ROUNDS = 8
+"""Rounds in which defective readings are replaced: leverages are below 1/4 where the sensor has twice the scene's
+pixels a side, and 4^-8 of a reading is below noise."""
+_SHOWN = 5
+"""Places that a sentence names."""
+
+
+@dataclass(frozen=True, eq=False)
+class Defects:
+    """Defective pixels of a sensor, in ``rows`` and ``columns``, 1 or more."""
+
+    rows: IndexArray
+    columns: IndexArray
+
+    def __str__(self) -> str:
+        places = ", ".join(f"({row}, {column})" for row, column in self.places[:_SHOWN])
+        many = len(self.rows) > 1
+        more = ", ..." if len(self.rows) > _SHOWN else ""
+        return f"{len(self.rows)} defective pixel{'s' if many else ''} left out, at (row, column) {places}{more}"
+
+    @property
+    def places(self) -> list[tuple[int, int]]:
+        """Row and column of each."""
+        return [(int(row), int(column)) for row, column in zip(self.rows, self.columns, strict=True)]
+
+    def summary(self) -> dict[str, object]:
+        """For result.json."""
+        return {"count": len(self.rows), "first": self.places[:_SHOWN]}
+
+    def with_others(self, others: Defects | None) -> Defects:
+        """These and ``others``."""
+        places = sorted({*self.places, *(others.places if others else ())})
+        rows, columns = np.array(places, dtype=np.intp).T
+        return Defects(rows, columns)
+
+    def left_out(self, shots: Capture, prepared: Prepared, weights: FloatArray) -> _LeftOut:
+        """The capture whose readings at these pixels are those that all others tell.
+
+        Parameters
+        ----------
+        shots
+            with these pixels.
+        prepared, weights
+            the factorised model, and W of ``shots``.
+        """
+        readings = {(each.row, each.column): each.frame for each in shots.measured()}
+        values = {
+            pattern: (centred(frame) if prepared.centre else frame)[self.rows, self.columns]
+            for pattern, frame in readings.items()
+        }
+        # Of a reading that is changed the means of its row and column take up their part.
+        gain = (1 - 1 / prepared.left.sensor_size) * (1 - 1 / prepared.right.sensor_size) if prepared.centre else 1.0
+        first = {pattern: value.copy() for pattern, value in values.items()}
+        weights = weights.copy()
+        for _ in range(_ROUNDS):
+            change = np.zeros_like(weights)
+            for (row, column), value in values.items():
+                left, right = prepared.left.slabs[row], prepared.right.slabs[column]
+                own, other = left.matrix[self.rows], right.matrix[self.columns]
+                told = np.einsum("pc,cd,pd->p", own, weights[left.columns][:, right.columns], other, optimize=True)
+                leverage = np.square(own).sum(axis=1) * np.square(other).sum(axis=1)
+                step = (told - value) / np.maximum(1 - leverage / gain, 0.5)
+                value += step
+                step /= gain
+                places = np.ix_(
+                    *(
+                        np.arange(len(change.T if axis else change))[slab.columns]
+                        for axis, slab in enumerate((left, right))
+                    )
+                )
+                change[places] += own.T @ (step[:, None] * other)
+            weights += change
+        moved = {pattern: (values[pattern] - first[pattern]) / gain for pattern in values}
+        return _LeftOut(shots, self, moved)
+
+    def beyond_chance(self, rest: _LeftOut, noise: FrameNoise) -> Defects | None:
+        """Those of them whose readings differ by more than noise from what all others tell; None where none does.
+
+        Parameters
+        ----------
+        rest
+            the capture without these.
+        noise
+            of the capture with them.
+        """
+        count = len(rest.moved)
+        variance = noise.of(noise.light[self.rows, self.columns] / count, noise.shots)
+        variance = np.maximum(variance, noise.of(float(noise.light.mean()) / count, noise.shots))
+        off = sum(np.square(moved) for moved in rest.moved.values()) / variance / count
+        # What the others tell has noise of its own: as much, at a leverage of a half.
+        kept = off > 2 * _limit(count)
+        return Defects(self.rows[kept], self.columns[kept]) if kept.any() else None
+
+
+class _LeftOut(Capture):
+    """A capture whose readings at some pixels are ``moved``, by pattern."""
+
+    def __init__(self, whole: Capture, defects: Defects, moved: dict[tuple[int, int], FloatArray]) -> None:
+        super().__init__(whole.manifest, whole.folder)
+        self._whole, self._defects, self.moved = whole, defects, moved
+
+    @cached_property
+    def patterns(self) -> tuple[FloatArray, FloatArray]:
+        """As of the capture itself."""
+        return self._whole.patterns
+
+    @cached_property
+    def ambient(self) -> Ambient | None:
+        """As of the capture itself."""
+        return self._whole.ambient
+
+    def measured(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
+        """As of the capture itself, with other readings at its defective pixels."""
+        places = self._defects.rows, self._defects.columns
+        for each in self._whole.measured(shape):
+            frame, light = each.frame.copy(), each.light.copy()
+            frame[places] += self.moved[each.row, each.column]
+            # Of a pair's sum nothing is told but that it is no less than the difference.
+            light[places] = np.abs(frame[places])
+            yield replace(each, frame=frame, light=light)
+
+
+def defects_of(squares: FloatArray, variance: FloatArray, count: int) -> Defects | None:
+    """Pixels whose residual is beyond noise, and beyond that of their neighbours; None where there are none.
+
+    Parameters
+    ----------
+    squares, variance
+        (rows, columns) energy that the model leaves of all measurements at each pixel, and that of their noise.
+    count
+        of the measurements.
+    """
+    ratio = squares / np.maximum(variance, _LEAST_VARIANCE * float(variance.mean()) or 1.0)
+    limit = _limit(count)
+    typical = (1 - 2 / (9 * count)) ** 3
+    off = ratio > limit * max(1.0, float(np.median(ratio)) / typical)
+    # What bright ones are off by leaks into others: these first.
+    off &= ratio > _LEAKS * float(ratio.max())
+    places = np.argwhere(off)
+    if not 0 < len(places) <= _MOST * ratio.size:
+        return None
+    padded = np.pad(ratio, _AROUND, mode="reflect")
+    width = 2 * _AROUND + 1
+    around = np.array([np.median(padded[row : row + width, column : column + width]) for row, column in places])
+    own = ratio[places[:, 0], places[:, 1]]
+    kept = own > limit * np.maximum(around / typical, 1.0)
+    # A spot of light is off in pixels side by side, and so are its edges.
+    crowd = np.where(off, uniform_filter(off.astype(np.float64), width, mode="constant"), 0.0)
+    kept &= maximum_filter(crowd, width)[places[:, 0], places[:, 1]] < _CROWD
+    places = places[kept]
+    return Defects(places[:, 0], places[:, 1]) if len(places) else None
+
+
+def _limit(count: int) -> float:
+    """Quantile of a chi-square of ``count`` degrees of freedom over their number, after Wilson and Hilferty (1931)."""
+    return float((1 - 2 / (9 * count) + _SPREADS * np.sqrt(2 / (9 * count))) ** 3)

@@ -1,0 +1,45 @@
+"""Scenes of simple shapes against the third judge: direct light at the sensor's centre, and whole frames.
+
+Both estimators intersect in float32 and start rays off their surfaces, so they can lose the same light; the judge does
+neither (:mod:`tests.physics.third_judge`). Quick tests follow direct light alone, whose standard error over SEEDS
+groups is a few thousandths; ``benchmarks/third_judge.py`` holds whole frames of all thirty scenes.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.capture.opening import open_bench
+from mitsim.transport.direct import DirectTracer
+from tests.physics import third_judge as judge
+from tests.physics.judged_scenes import OPEN, opened, scenes, verdict
+
+pytestmark = pytest.mark.usefixtures("variant")
+SEEDS, SIGMAS, MIDDLE = 4, 8.6, (63.5, 63.5)
+"""Groups, the gate of their standard errors that stands for three of the normal distribution, the centre as a pixel."""
+DIRECT = {"wires of 0.15 mm": (16, 0.04), "print 0.005 mm behind glass": (4, 0.01)}
+"""Samples of a projector pixel in a group, and how far the gate may be open. (Seen failing: 7 % less light of the wires
+as Mitsuba's own cylinders, none of the print by Mitsuba's offsets.)"""
+
+
+@pytest.mark.parametrize("name", DIRECT)
+def test_direct_light(tmp_path: Path, name: str) -> None:
+    judged, (samples, most) = scenes()[name], DIRECT[name]
+    loaded = (bench := opened(judged, tmp_path, open_bench)).loaded
+    tracer = DirectTracer(loaded.scene, loaded.camera, bench.projector_optics, 1)
+    light = [tracer.trace(seed, 0, samples).value.sum() / samples for seed in range(SEEDS)]
+    found, error = float(np.mean(light)), float(np.std(light, ddof=1) / SEEDS**0.5)
+    right = judge.direct(replace(judged.scene, camera=OPEN), MIDDLE, fine=8)
+    gate = SIGMAS * error + 2e-3 * right
+    assert gate < most * right
+    assert abs(found - right) < gate, f"{found / right - 1:+.2%}, gate {gate / right:.2%}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["print 0.03 mm behind glass", "wires, coded", "drawn 3"])
+def test_frames(tmp_path: Path, name: str) -> None:
+    judged = scenes()[name]
+    found = verdict(judged, opened(judged, tmp_path, open_bench))
+    assert found.agrees, found

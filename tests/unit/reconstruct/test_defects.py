@@ -1,0 +1,76 @@
+"""Dead and hot pixels: named, left out, and the image as good as without them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mitsim.reconstruct.defects import Defects, defects_of
+from mitsim.reconstruct.reconstruction import accumulated, reconstruct
+from tests.ideal_sessions import BLACK, CODES, bench, picture
+from tests.unit.reconstruct.test_faults import Frames, with_frames
+
+
+def broken(frames: Frames) -> Frames:
+    """A dead pixel, and a hot one that hides it at first."""
+    changed = [frame.copy() for frame in frames]
+    for frame in changed:
+        frame[40, 51], frame[10, 11] = BLACK, CODES - 1
+    return changed
+
+
+@pytest.mark.parametrize("patterns", ["uniform", "dots:4", "hadamard:4", "random:4"])
+def test_single_pixels(patterns: str) -> None:
+    """As what they are; a good run says nothing."""
+    shots, factors = bench().run(patterns, picture(1), 1), bench().calibrated(1)
+    good, mended = reconstruct(shots, factors), reconstruct(with_frames(shots, broken), factors)
+    assert mended.ok and mended.misfit is not None and mended.misfit.defects is not None
+    assert mended.misfit.defects.places == [(10, 11), (40, 51)]
+    assert mended.summary()["misfit"]["defective_pixels"] == {"count": 2, "first": [(10, 11), (40, 51)]}
+    assert "2 defective pixels left out, at (row, column) (10, 11), (40, 51)" in mended.trust[0]
+    errors = [float(np.sqrt(np.mean(np.square(each.image - picture(1))))) for each in (good, mended)]
+    assert errors[1] < 1.02 * errors[0]
+    assert good.uncertainty is not None and mended.uncertainty is not None
+    assert np.sqrt(np.mean(np.square(mended.uncertainty))) == pytest.approx(
+        np.sqrt(np.mean(np.square(good.uncertainty))), rel=0.02
+    )
+
+
+def test_a_dead_line() -> None:
+    def dead(frames: Frames) -> Frames:
+        return [np.where(np.arange(96)[None, :] == 51, BLACK, frame) for frame in frames]
+
+    shots = bench().run("dots:4", picture(1), 1)
+    mended = reconstruct(with_frames(shots, dead), bench().calibrated(1))
+    assert mended.ok and mended.misfit is not None and mended.misfit.defects is not None
+    assert mended.misfit.defects.places == [(row, 51) for row in range(96)]
+
+
+def test_only_readings_that_differ_from_what_others_tell_are_defects() -> None:
+    """A bright pixel's part in the fit makes others be off, which are right."""
+    shots, factors = with_frames(bench().run("uniform", picture(1), 1), broken), bench().calibrated(1)
+    data = accumulated(shots, factors)
+    looked_at = Defects(np.array([10, 10, 40, 40]), np.array([11, 51, 11, 51]))
+    rest = looked_at.left_out(shots, data.prepared, data.weights)
+    found = looked_at.beyond_chance(rest, data.noise)
+    assert found is not None and found.places == [(10, 11), (40, 51)]
+
+
+def test_noise_alone_makes_no_defects() -> None:
+    """A chi-square of one degree of freedom has the longest tail."""
+    rng = np.random.default_rng(1)
+    for count in (1, 4, 49):
+        squares = np.square(rng.standard_normal((count, 512, 512))).sum(axis=0)
+        assert defects_of(squares, np.full((512, 512), float(count)), count) is None
+        squares[100, 200] += 120.0 + 8 * np.sqrt(2 * count)
+        found = defects_of(squares, np.full((512, 512), float(count)), count)
+        assert found is not None and found.places == [(100, 200)]
+
+
+def test_a_spot_of_light_is_no_defect() -> None:
+    """Pixels side by side, and more of the sensor than breaks."""
+    squares = np.full((64, 64), 4.0)
+    squares[20:26, 30:36] = 400.0
+    assert defects_of(squares, np.full((64, 64), 4.0), 4) is None
+    many = np.where(np.random.default_rng(2).random((64, 64)) < 0.05, 400.0, 4.0)
+    assert defects_of(many, np.full((64, 64), 4.0), 4) is None

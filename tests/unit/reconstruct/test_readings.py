@@ -1,0 +1,98 @@
+"""Frames that fit only when they are read otherwise: turned, in another order, of another scale or curve."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from mitsim.core.runs import Capture
+from mitsim.reconstruct.causes import Cause
+from mitsim.reconstruct.reconstruction import reconstruct
+from tests.ideal_sessions import BLACK, CODES, Bench, bench, picture, shadow
+from tests.unit.reconstruct.test_faults import Frames, with_frames
+
+CAMERA = Bench(shadow(), shadow(1.3))
+"""Not alike along rows and columns, so that frames on their side are seen under uniform light, too."""
+TURNS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "upside down": np.flipud,
+    "mirrored": np.fliplr,
+    "180": lambda frame: np.rot90(frame, 2),
+    "transposed, their rows": np.transpose,
+    "90 degrees counter-clockwise": np.rot90,
+    "90 degrees clockwise": lambda frame: np.rot90(frame, -1),
+    "other diagonal": lambda frame: np.rot90(frame, 2).T,
+}
+
+
+def said(patterns: str, change: Callable[[Frames], Frames]) -> tuple[Cause | None, str]:
+    shots = with_frames(CAMERA.run(patterns, picture(1), 1), change)
+    misfit = reconstruct(shots, CAMERA.calibrated(1)).misfit
+    assert misfit is not None
+    return misfit.cause, misfit.reason
+
+
+@pytest.mark.parametrize("patterns", ["uniform", "dots:4", "hadamard:4", "random:4"])
+@pytest.mark.parametrize("turn", TURNS)
+def test_turned_frames(patterns: str, turn: str) -> None:
+    """As what they are; a good run says nothing."""
+    cause, words = said(patterns, lambda frames: [TURNS[turn](frame) for frame in frames])
+    assert cause is Cause.ORIENTATION and turn in words
+
+
+@pytest.mark.parametrize("patterns", ["dots:4", "hadamard:4", "random:4"])
+def test_another_order(patterns: str) -> None:
+    assert said(patterns, lambda frames: [frames[-1], *frames[:-1]])[1].startswith("the frames are one step late")
+    assert said(patterns, lambda frames: [*frames[1:], frames[0]])[1].startswith("the frames are one step early")
+    cause, words = said(patterns, lambda frames: frames[::-1])
+    # Signed patterns in the reverse order are others of the family, of a scene with negative pixels.
+    assert cause is Cause.ORDER and ("negative" if patterns == "hadamard:4" else "reverse order") in words
+
+
+def test_all_halves_exchanged() -> None:
+    cause, words = said("hadamard:4", lambda frames: [frames[number ^ 1] for number in range(len(frames))])
+    assert cause is Cause.ORDER and "negative" in words
+
+
+@pytest.mark.parametrize("patterns", ["uniform", "dots:4", "hadamard:4", "random:4"])
+def test_a_tone_curve(patterns: str) -> None:
+    span = CODES - 1 - BLACK
+    cause, _ = said(
+        patterns, lambda frames: [BLACK + span * (np.maximum(f - BLACK, 0) / span) ** (1 / 2.2) for f in frames]
+    )
+    assert cause is Cause.GAMMA
+
+
+def left_aligned(gain: float) -> Capture:
+    """Numbers of 13 bits moved up by 4, in a file whose camera has ``gain`` times the numbers an electron."""
+    shots = bench(peak=2e3).run("dots:4", picture(1), 1)
+    digital = shots.manifest.digital
+    known = digital.model_copy(
+        update={
+            "saturation_dn": 16.0 * CODES,
+            "gain_dn_per_e": digital.gain_dn_per_e * gain,
+            "black_level_dn": digital.black_level_dn * gain,
+        }
+    )
+    memory = {
+        shot.file: ({"DN": 16 * shots._memory[shot.file][0]["DN"]}, {}) for shot in shots.manifest.patterns.captures
+    }
+    return Capture(shots.manifest.model_copy(update={"digital": known}), memory=memory)
+
+
+def test_numbers_that_were_multiplied() -> None:
+    """An image 16 times too bright fits; its noise does not. Where the camera file knows of it, all is well."""
+    found = reconstruct(left_aligned(1.0), bench().calibrated(1))
+    assert not found.ok and found.misfit is not None and found.misfit.cause is Cause.SCALE
+    assert "multiples of 16" in str(found.status) and "divide" in str(found.status)
+    assert reconstruct(left_aligned(16.0), bench().calibrated(1)).ok
+
+
+def test_a_scene_that_does_not_fit_is_no_other_reading() -> None:
+    """Gloss and depth as before."""
+    place = np.linspace(-1, 1, 96)
+    glossy = Bench(shadow(), shadow(), lambda light: light * (1 + 0.1 * np.outer(place, place)))
+    for camera, cause in ((glossy, Cause.GLOSS), (bench(0.3), Cause.DEPTH)):
+        misfit = reconstruct(camera.run("dots:4", picture(1), 1), bench().calibrated(1)).misfit
+        assert misfit is not None and misfit.cause is cause and misfit.reading is None and not misfit.faults

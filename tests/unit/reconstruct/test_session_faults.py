@@ -1,0 +1,145 @@
+"""Sums of a session with planted faults: each is named, and what is left has the error that is stated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from mitsim.core.errors import MitsimError
+from mitsim.optics.shadow import scene_factor
+from mitsim.reconstruct.calibration import StripeSums, stripe_sums
+from mitsim.reconstruct.session_faults import Checked, check_session
+from mitsim.rig.camera import centred_edges
+from mitsim.rig.mask import mls_mask
+from mitsim.rig.order import SIDES, Half, taken
+from mitsim.rig.patterns import stripe_signs
+
+N, PIXELS = 32, (90, 100)
+SIGNS = stripe_signs(N).astype(float)
+ORDER = taken(N, True)
+Frames = dict[Half, np.ndarray]
+
+
+def shadow(pixels: int) -> np.ndarray:
+    edges = centred_edges(pixels, 5.0 / pixels)
+    return scene_factor(mls_mask().terms[0][1], 0.06, edges, centred_edges(N, 120 / N), 2.0, 400.0)
+
+
+EXACT = [shadow(pixels) for pixels in PIXELS]
+
+
+def frames(power: Callable[[int], float] = lambda place: 1.0, noise: float = 1e-3) -> Frames:
+    rng, found = np.random.default_rng(3), {}
+    whole = [factor.sum(axis=1) for factor in EXACT]
+    scale = 1 / np.outer(*whole).max()
+    for place, half in enumerate(ORDER):
+        side, index, sign = half
+        lines = (1 + sign * SIGNS[:, index]) / 2
+        sides = (EXACT[0] @ lines, whole[1]) if side == SIDES[0] else (whole[0], EXACT[1] @ lines)
+        found[half] = power(place) * scale * np.outer(*sides) + noise * rng.standard_normal(PIXELS)
+    return found
+
+
+def judged(shown: Frames, pairs: bool = True) -> Checked:
+    """What is said of frames; not ``pairs``: each response is of its +1 frame and that of all light."""
+
+    def pair(side: str, index: int) -> tuple[np.ndarray, np.ndarray | None]:
+        one, other = shown[side, index, 1], shown[side, index, -1]
+        return (one - other, one + other) if pairs else (2 * one - shown[side, 0, 1], None)
+
+    first = [pair(side, 0) for side in SIDES]
+    sums = stripe_sums(first[0][0], first[1][0], N, lights=[light for _, light in first])
+    for own in sums:
+        for index in range(1, N):
+            response, light = pair(own.side, index)
+            own.put(own.seen(response, index, light))
+    return check_session(sums, SIGNS, ORDER)
+
+
+def error(found: Checked) -> tuple[float, float]:
+    """Actual and stated relative error of both factors."""
+    estimate = found.estimate(SIGNS, None)
+    whole = [factor.sum(axis=1) for factor in EXACT]
+    scale = np.sqrt(1 / np.outer(*whole).max())
+    balance = np.sqrt(np.linalg.norm(whole[1]) / np.linalg.norm(whole[0]))
+    exact = EXACT[0] * scale * balance, EXACT[1] * scale / balance
+    actual = [
+        np.linalg.norm(one - other) / np.linalg.norm(other)
+        for one, other in zip((estimate.left, estimate.right), exact, strict=True)
+    ]
+    return float(np.hypot(*actual)), float(np.hypot(*estimate.predicted_error))
+
+
+def test_a_good_session_is_left_as_it_is_to_the_bit() -> None:
+    found = judged(frames())
+    assert not found.faults and found.lamp.listed() is None and found.extra == (0, 0)
+    assert all(isinstance(own, StripeSums) and own.done == N for own in found.sums)
+
+
+@pytest.mark.parametrize(
+    ("kind", "change"),
+    [
+        ("black", lambda frame: 0 * frame),
+        ("dim", lambda frame: frame / 2),
+        ("half lost", lambda frame: np.where(np.arange(PIXELS[1]) < 50, frame, 0.0)),
+        ("shifted", lambda frame: np.roll(frame, 3, 0)),
+    ],
+)
+@pytest.mark.parametrize("half", [("horizontal", 5, 1), ("vertical", 20, -1)])
+def test_a_wrong_frame_is_named_and_foretold_by_the_other_of_its_pair(
+    kind: str, change: Callable[[np.ndarray], np.ndarray], half: Half
+) -> None:
+    """(Planted: the other frame of the pair is named; the sign of the vector that it foretells is not turned.)"""
+    shown = frames()
+    shown[half] = change(shown[half])
+    (fault,) = (found := judged(shown)).faults
+    assert (fault.side, fault.index, fault.sign, fault.kind) == (*half, kind)
+    actual, stated = error(found)
+    assert actual < 1.3 * stated < 0.05
+
+
+def test_exchanged_frames_and_swapped_patterns_are_put_back() -> None:
+    """(Planted: the covariance with the fault in it decides, which takes pattern 5 for 6.)"""
+    shown, clean = frames(), error(judged(frames()))[0]
+    one, other = ("vertical", 6, 1), ("vertical", 6, -1)
+    shown[one], shown[other] = shown[other], shown[one]
+    (fault,) = (found := judged(shown)).faults
+    assert (fault.side, fault.index, fault.kind) == ("vertical", 6, "exchanged") and error(found)[0] < 1.1 * clean
+    shown = frames()
+    for sign in (1, -1):
+        one, other = ("horizontal", 9, sign), ("horizontal", 21, sign)
+        shown[one], shown[other] = shown[other], shown[one]
+    (fault,) = (found := judged(shown)).faults
+    assert (fault.kind, fault.index, fault.other) == ("swapped", 9, ("horizontal", 21, 0))
+    assert error(found)[0] < 1.1 * clean
+
+
+def test_a_wrong_frame_without_pairs_is_left_out_or_refused() -> None:
+    """What is of other shape is left out; other faults change all of the covariance, and are refused.
+    (Planted: no check of the fit; no error of the foretold pattern.)"""
+    shown = frames()
+    clean = judged(shown, pairs=False)
+    assert not clean.faults and error(clean)[0] < 1.3 * error(clean)[1]
+    half = "vertical", 20, 1
+    shown[half] = np.where(np.arange(PIXELS[0])[:, None] < 50, shown[half], 0.0)
+    (fault,) = (found := judged(shown, pairs=False)).faults
+    assert (fault.side, fault.index, fault.kind) == (*half[:2], "wrong")
+    actual, stated = error(found)
+    assert 2 * error(clean)[1] < actual < 1.3 * stated
+    good = frames()
+    for frame, words in (
+        (good[half] / 2, "do not fit the other patterns"),
+        (0 * good[half], "20: the frame is black"),
+        (good["vertical", 19, 1], "19 and 20 show the same"),
+    ):
+        with pytest.raises(MitsimError, match=words):
+            judged({**good, half: frame}, pairs=False)
+
+
+def test_a_drifting_lamp_is_divided_out() -> None:
+    found = judged(frames(lambda place: 1 + 0.05 * (place / len(ORDER) - 0.5)))
+    assert not found.faults and found.lamp.drift == pytest.approx(0.05, rel=0.05)
+    actual, stated = error(found)
+    assert actual < 1.3 * stated

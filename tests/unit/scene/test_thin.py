@@ -1,0 +1,98 @@
+"""Thin cylinders as prisms: where they lie, what is refused, and that nothing else is touched."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsim.core.errors import MitsimError
+from mitsim.scene import thin
+from mitsim.scene.load import LoadedScene, load_scene
+
+pytestmark = pytest.mark.usefixtures("variant")
+MATT = '<bsdf type="diffuse"/>'
+TURNED = """<transform name="to_world"><rotate y="1" angle="40"/><rotate x="1" angle="-70"/><scale value="1.5"/>
+    <translate x="3" y="-2" z="7"/></transform>"""
+CYLINDER = f"""<shape type="cylinder"><point name="p0" x="1" y="2" z="-1"/><point name="p1" x="2" y="-3" z="4"/>
+    <float name="radius" value="1"/>{TURNED}</shape>"""
+
+
+def wire(radius: float, bsdf: str = MATT, z: float = 380, more: str = "") -> str:
+    return f"""<shape type="cylinder"><point name="p0" x="-40" y="-30" z="{z}"/><point name="p1" x="40" y="30" z="{z}"/>
+        <float name="radius" value="{radius}"/>{bsdf}{more}</shape>"""
+
+
+def ball(radius: float) -> str:
+    return f"""<shape type="sphere"><point name="center" x="0" y="0" z="380"/>
+        <float name="radius" value="{radius}"/></shape>"""
+
+
+@pytest.fixture
+def loaded(small_scene: Callable[..., Path]) -> Callable[[str], LoadedScene]:
+    return lambda extra: load_scene(small_scene(extra=extra, integrator="volpath"))
+
+
+def test_a_prism_is_where_mitsuba_has_the_cylinder() -> None:
+    """Rays inwards, a little beside its corners, meet the cylinder at the same place, normal and uv."""
+    config = mi.parser.ParserConfig(mi.variant())
+    config.parallel = config.merge_equivalent = config.merge_meshes = False
+    state = mi.parser.parse_string(config, f'<scene version="3.0.0">{CYLINDER}</scene>')
+    mi.parser.transform_all(config, state)
+    points, normals, uv, triangles = thin.prism(state.nodes[1].props)
+    scene = mi.parser.instantiate(config, state)
+    chosen = np.flatnonzero((uv[:, 0] > 0) & (uv[:, 0] < 1))  # off the seam
+    along = 0.02 * (points.mean(axis=0) - points[chosen])  # from an end's edge
+    start, inward = (
+        np.ascontiguousarray(each.T, dtype=np.float32) for each in (points[chosen] + along, -normals[chosen])
+    )
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(start - inward), mi.Vector3f(inward)))
+    assert np.array(si.is_valid()).all()
+    # The prism stands out a little, so that its mean width is that of the cylinder, and ``along`` leads inwards.
+    assert np.abs(np.array(si.t) - 1).max() < 0.04
+    assert np.abs(np.array(si.n).T - normals[chosen]).max() < 0.03
+    assert np.abs(np.array(si.uv).T[:, 0] - uv[chosen, 0]).max() < 6e-3
+    corner = points[triangles]
+    double = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    assert (np.einsum("ij,ij->i", double, normals[triangles].mean(axis=1)) > 0).all()
+    assert np.linalg.norm(double, axis=1).sum() / 2 == pytest.approx(2 * np.pi * 1.5 * 1.5 * np.sqrt(51), rel=1e-9)
+
+
+def test_only_what_is_thin_for_its_distance(loaded: Callable[[str], LoadedScene]) -> None:
+    kinds = [shape.class_name() for shape in loaded(wire(0.15) + wire(2.0) + ball(0.01)).scene.shapes()]
+    assert kinds == ["Rectangle", "PLYMesh", "Cylinder", "Sphere"]
+
+
+def test_a_wire_that_shines_has_no_vertex_normals(loaded: Callable[[str], LoadedScene]) -> None:
+    """By them it would lose light."""
+    lamp = '<emitter type="area"><spectrum name="radiance" value="1"/></emitter>'
+    shining, matt = loaded(wire(0.15, more=lamp) + wire(0.15)).scene.shapes()[1:]
+    assert shining.has_face_normals() and matt.has_vertex_normals() and not matt.has_face_normals()
+
+
+def test_a_mirror_stays_round(loaded: Callable[[str], LoadedScene]) -> None:
+    mirror = '<bsdf type="twosided"><bsdf type="conductor"/></bsdf>'
+    assert loaded(wire(0.15, mirror)).scene.shapes()[1].class_name() == "Cylinder"
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [
+        (wire(0.001), r"radius: got 0.001 mm at a distance of .* holds 0.0039 mm there; take a larger radius"),
+        (ball(3e-4), r"radius: got 0.0003 mm at .* holds 0.00038 mm there; take a larger radius"),
+        (wire(0.1, '<bsdf type="plastic"/>'), r"radius: got 0.1 mm at .* holds 0.99 mm there; take roughplastic"),
+    ],
+)
+def test_what_cannot_be_held_is_refused(loaded: Callable[[str], LoadedScene], shape: str, words: str) -> None:
+    with pytest.raises(MitsimError, match=words):
+        loaded(shape)
+
+
+def test_a_full_disk_is_a_line(loaded: Callable[[str], LoadedScene], monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(thin, "_write", full)
+    with pytest.raises(MitsimError, match=r"thin cylinders: .*No space left on device; free some space"):
+        loaded(wire(0.15))
