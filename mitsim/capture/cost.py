@@ -121,6 +121,7 @@ def light_bytes(bench: Bench, classes: int, settings: Settings, lines: int = 1) 
 
 
 def deposit_bytes(settings: Settings) -> float:
-    """Memory of a path's light while it is filed: that of sharp pixels lies in four cells of two layers at most."""
+    """Memory of a path's light while it is filed with these ``settings``: that of sharp pixels lies in four cells of
+    two layers at most."""
     parts = min(len(settings.depths), 2) * (4 if settings.sharp else 1)
     return max(_DEPOSIT_BYTES, _PATH_BYTES + parts * _PART_BYTES)

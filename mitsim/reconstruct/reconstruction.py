@@ -47,6 +47,10 @@ _BETTER = 0.5
 not fit either."""
 
 
+_OF_THE_SCENE = Cause.GLOSS, Cause.INDIRECT, Cause.UNKNOWN, Cause.RIG
+"""Causes that light of a depth beyond the searched range is taken for."""
+
+
 @single_threaded_blas()
 @checked
 def reconstruct(
@@ -120,7 +124,7 @@ def reconstruct(
     if misfit and misfit.defects:
         shots, data, solution, misfit = _without_defects(shots, factors, lam, method, data, misfit)
         prepared, frames = data.prepared, data.frames
-    if misfit and misfit.flagged and isinstance(depth, Depth) and depth.at_end:
+    if misfit and misfit.cause in _OF_THE_SCENE and isinstance(depth, Depth) and depth.at_end:
         misfit = replace(misfit, cause=Cause.DEPTH)
     separable = factors.status.verdict is not Verdict.NOT_SEPARABLE
     if isinstance(solution, Solution) and lam == "auto" and not (separable and (misfit is None or not misfit.flagged)):
