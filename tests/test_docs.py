@@ -39,8 +39,8 @@ EXAMPLES = [page for page in PAGES if page not in ("CHANGELOG.md", "CONTRIBUTING
 FIRST_SCREEN = 40
 """Lines of README that a browser shows before one scrolls; chosen."""
 
-ELSEWHERE = {"--check", "--strict"}
-"""Options in the docs that are not mitsim's: of scenes/generate.py and mypy."""
+ELSEWHERE = {"--check", "--closed-form", "--strict"}
+"""Options in the docs that are not mitsim's: of scenes/generate.py, benchmarks/coverage.py and mypy."""
 
 ELSEWHERE_RUN = {"docs/bench.md"}
 """Pages whose commands need files that a camera writes between them: tests/system/test_real_bench.py."""

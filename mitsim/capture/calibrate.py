@@ -306,10 +306,13 @@ def checked_estimates(
                 stripes.saturated += saturated
             if sums[0].done % _SAVED_EVERY == 0 or sums[0].done == count:
                 checkpoint.save(_STRIPES, stripes.arrays())
+    drift = session.recipe.drift
+    # Who states that the lamp drifts asks what that costs, which is gone once it is divided out.
+    steady = not (drift.session_ramp or drift.session_flicker)
     with job.clock.stage("estimate"):
         judged = [
             check_session(stripes.sums[kind], session.signs, session.order, saturated=bool(stripes.saturated))
-            if kind == NOISY
+            if kind == NOISY and steady
             else Checked(stripes.sums[kind])
             for kind in kinds
         ]

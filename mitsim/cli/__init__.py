@@ -56,9 +56,9 @@ from mitsim.cli.options import (
     check_camera,
     check_shown,
     check_work,
+    is_given,
     job_of,
     number_of,
-    refuse_both,
     refuse_unused,
     request_of,
     spoken,
@@ -77,8 +77,8 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-_ONLY_OF = {"reference": ("accuracy", "effects"), "factored": ("spp",)}
-"""Options of `mitsim render` that the other estimator has."""
+_OF_OTHER = {"reference": ("accuracy", "effects"), "factored": ("spp",)}
+"""Options of `mitsim render` that an estimator does not have: a note says so, for programs give both of them all."""
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -175,7 +175,6 @@ def demo(
 
 @app.command()
 def plan(
-    context: typer.Context,
     scene: Scene,
     patterns: Patterns = "dots:7",
     accuracy: AccuracyOrSeconds = None,
@@ -194,7 +193,6 @@ def plan(
     """What will be simulated, why, and what it costs, before any long work."""
     from mitsim.core.resources import running_seconds
 
-    refuse_both(context, "accuracy", "seconds")
     request = request_of(patterns=patterns, accuracy=accuracy, seconds=seconds, seed=seed, effects=effects)
     check_colour(colour, variant, projector, seconds)
     check_shown([patterns], scene, define, outside)
@@ -243,7 +241,6 @@ def capture(
     from mitsim.core.manifests import MANIFEST
     from mitsim.core.resources import memory_from_here, memory_since
 
-    refuse_both(context, "accuracy", "seconds")
     if exposure != "auto":
         refuse_unused(context, ["exposure_fraction"], "on an --exposure in seconds")
     if ambient_frame == "no":
@@ -339,7 +336,7 @@ def render(
         raise MitsimError(f"--output {output}: the frame is an OpenEXR file; give a name that ends in .exr")
     request = request_of(accuracy=accuracy, seed=seed, effects=effects)
     check_samples(estimator, spp)
-    refuse_unused(context, _ONLY_OF[estimator], f"on the {estimator} estimator")
+    ignored = [f"--{name} has no effect on the {estimator}" for name in _OF_OTHER[estimator] if is_given(context, name)]
     check_output(output, overwrite=True, kind="file")
     method: Any = estimator
     with job_of(quiet or as_json, max_seconds, max_memory) as job:
@@ -348,6 +345,7 @@ def render(
         with output_file(output, overwrite=True) as place:
             frame = bench.render(method, spp, accuracy, seed, request["effects"], job)
             payload = {**frame.summary(), "output": str(frame.save(place))}
+    payload["notes"] = [*payload["notes"], *ignored]
     lines = [
         f"{estimator}: mean irradiance {payload['mean']:.4e} W/m^2, relative noise {payload['mc_error']:.1e}, "
         f"{payload['seconds']:.2f} s: {payload['output']}",

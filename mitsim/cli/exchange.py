@@ -28,7 +28,6 @@ from mitsim.cli.options import (
     bench_of,
     check_shown,
     job_of,
-    refuse_both,
     refuse_unused,
     request_of,
 )
@@ -229,7 +228,6 @@ def patterns(
 
 @app.command()
 def transport(
-    context: typer.Context,
     scene: Scene,
     output: Annotated[Path, typer.Option("-o", "--output", help="HDF5 file to make", metavar="FILE.h5")],
     patterns: Patterns = "dots:7",
@@ -252,7 +250,6 @@ def transport(
     from mitsim.core.configuration import locate
     from mitsim.core.output import check_apart, output_file
 
-    refuse_both(context, "accuracy", "seconds")
     request = request_of(patterns=patterns, accuracy=accuracy, seconds=seconds, seed=seed, effects=effects)
     check_shown([patterns], scene, define, outside)
     with job_of(quiet or as_json, max_seconds, max_memory) as job, output_file(output, overwrite) as output:

@@ -323,26 +323,6 @@ def refuse_unused(context: typer.Context, names: Sequence[str], where: str) -> N
             raise MitsimError(f"{option}: has no effect {where}; leave it out")
 
 
-def refuse_both(context: typer.Context, first: str, second: str) -> None:
-    """Refuse two options of which one decides.
-
-    Parameters
-    ----------
-    context
-        of the command line.
-    first, second
-        parameters.
-
-    Raises
-    ------
-    MitsimError
-        when both are given.
-    """
-    if is_given(context, first) and is_given(context, second):
-        told = " and ".join(f"--{name.replace('_', '-')}" for name in (first, second))
-        raise MitsimError(f"{told}: either decides; give one of them")
-
-
 @contextmanager
 def job_of(silent_progress: bool, seconds: float = DAY, gibibytes: float | None = None) -> Iterator[Job]:
     """A job with limits, and progress on stderr while the context lasts.

@@ -204,7 +204,7 @@ class Fuzz:
         pixels = {"DN": rng.integers(0, 4095, (16, 16), dtype=np.uint32), "e": rng.random((16, 16), dtype=np.float32)}
         write_frame(folder / "a.exr", pixels, {"run": "x", "index": 3})
         self.frame = (folder / "a.exr").read_bytes()
-        captures = [{"file": "a.exr", "row": i, "column": j, "sign": 0} for i in range(2) for j in range(2)]
+        captures = [{"file": f"{i}{j}.exr", "row": i, "column": j, "sign": 0} for i in range(2) for j in range(2)]
         self.manifest = {
             "kind": "capture",
             "status": "complete",

@@ -106,7 +106,7 @@ RUN = {
     ),
     "60000 captures of one pattern": (
         put("patterns", "captures", value=[{"file": "a", "row": 0, "column": 0, "sign": 0}] * 60_000),
-        "frames of signs",
+        "give each its own frame",
     ),
     "a million captures": (raw('{"patterns": {"captures": [' + "0," * 1_000_000 + "0]}}"), "holds a None"),
     "a million false captures": (text('"captures": [', '"captures": [' + "0," * 1_000_000), "captures.0: got 0"),

@@ -93,6 +93,8 @@ def test_reconstruct(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None
     assert found.keys() == keys | {
         *("truth_error", "rank_sides", "condition_whole", "condition_sides"),
         *("misfit", "uncertainty", "uncertainty_budget", "focus_mm", "focus_error_mm", "depths"),
+        *("uncertainty_extrapolated", "regularisation_bias_factor", "focus_range_mm", "focus_alternatives"),
+        *("objective", "relative_gap"),
         *("predicted", "predicted_seconds", "predicted_memory_bytes", "memory_bytes"),
     }
     assert found["focus_mm"] is None and found["focus_error_mm"] is None
@@ -108,6 +110,9 @@ def test_reconstruct(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None
             "signatures",
             "foretold",
             "map",
+            "faults",
+            "reading",
+            "defective_pixels",
         ),
     }
     assert number(found["misfit"]["chi_square"], 0.5, 1.2) and found["misfit"]["noise_stated"]

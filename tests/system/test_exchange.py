@@ -64,9 +64,9 @@ def test_refusals(refused: Callable[..., str], lab: Any) -> None:
     mentions(refused(*frames, "-o", "new", *given), "--exposure is not given")
     mentions(refused(*frames, "-o", "new", *given, "--exposure", 0), "--exposure 0")
     mentions(refused(*frames, "-o", "new", *given, "--exposure", 1), "--calibration is not given", "--projector-pixels")
-    mentions(refused(*frames, "-o", "new", *given, "--exposure", 1, "--shape", "3"), "--shape '3'")
+    mentions(refused(*frames, "-o", "new", *given, "--exposure", 1, "--shape", "3"), "--shape")
     mentions(refused("import", "none.h5", "-o", "new"), "none.h5", "cannot be read")
-    mentions(refused("import", "none.h5", "-o", "new", "--exposure", 1), "leave the options of frames out")
+    mentions(refused("import", "none.h5", "-o", "new", "--exposure", 1), "--exposure", "leave it out")
 
 
 def test_light_in_a_file_makes_the_frames_of_a_capture(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:

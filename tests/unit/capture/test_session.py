@@ -18,7 +18,7 @@ from mitsim.capture.calibrate import calibrate
 from mitsim.capture.checkpoint import Checkpoint
 from mitsim.capture.cost import frame_seconds
 from mitsim.capture.effects import EFFECTS
-from mitsim.capture.evidence import Settings
+from mitsim.capture.evidence import LANES_AT_ONCE, Settings
 from mitsim.capture.exposer import FRAMES_AT_ONCE, Exposer
 from mitsim.capture.opening import open_bench
 from mitsim.capture.plan import Plan
@@ -208,11 +208,14 @@ def test_what_a_session_takes_is_predicted(session: Callable[..., Done]) -> None
 
 
 @pytest.mark.parametrize(("pixels", "mixed"), [(1024, True), (2048, False)])
-def test_memory_of_large_sensors_stays_below_four_gib(pixels: int, mixed: bool) -> None:
+def test_memory_of_large_sensors_stays_below_four_gib(
+    monkeypatch: pytest.MonkeyPatch, pixels: int, mixed: bool
+) -> None:
     """By prediction, with 128 and 512 stripes a side, whether frames of single lines are held or not.
     (Planted: all shots of a side held.)"""
     assert mixes(128, 128, pixels) == mixed
     large = SimpleNamespace(n=128, geometry=CameraGeometry(pixels=pixels))
+    monkeypatch.setattr("mitsim.capture.cost.Simulation", lambda *_: SimpleNamespace(paths_at_once=LANES_AT_ONCE))
     for n in (128, 512):
         large.n = n
         assert 5e8 < session_cost(large, n, Settings(400.0), 1.0).memory_bytes < 3.6 * 2**30

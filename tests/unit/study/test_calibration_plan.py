@@ -82,10 +82,10 @@ def test_a_recipe_that_a_plan_does_not_know_is_refused(bench: Any, change: dict[
         ms.plan_calibration(bench, 30.0, recipe=recipe)
 
 
-def test_a_quality_that_no_image_has_is_refused() -> None:
+def test_a_quality_that_no_image_has_is_refused(bench: Any) -> None:
     for psnr in (0.0, 101.0, float("nan")):
         with pytest.raises(ArgumentError, match="give 1 to 100 dB"):
-            ms.plan_calibration(None, psnr)  # type: ignore[arg-type]
+            ms.plan_calibration(bench, psnr)
 
 
 @pytest.fixture(scope="module")
