@@ -160,6 +160,9 @@ def test_render(call: Callable[..., Any], lab: Any, tmp_path: Path, estimator: s
     found = call("render", lab.scene, "-o", tmp_path / "frame.exr", *options).payload
     assert (found["estimator"], found["seed"], found["output"]) == (estimator, 3, str(tmp_path / "frame.exr"))
     assert number(found["mean"], 1e-6, 1) and number(found["mc_error"], 1e-9, 10) and number(found["seconds"])
+    # Programs give both estimators all options; what has no effect is said, and refuses nothing.
+    unused = "--accuracy" if estimator == "reference" else "--spp"
+    assert found["notes"] == [f"{unused} has no effect on the {estimator}"]
     assert [path.name for path in tmp_path.iterdir()] == ["frame.exr"]
 
 
