@@ -128,7 +128,8 @@ def reconstruct(
         misfit = replace(misfit, cause=Cause.DEPTH)
     separable = factors.status.verdict is not Verdict.NOT_SEPARABLE
     if isinstance(solution, Solution) and lam == "auto" and not (separable and (misfit is None or not misfit.flagged)):
-        solution = prepared.solve(frames, lam, explained=False)
+        lack = data.lack(factors, solution.image)
+        solution = prepared.solve(frames, lam, explained=False, struck=lack.struck if lack else 0.0)
     judged = time.perf_counter()
     uncertainties = data.uncertainty(shots, factors, solution) if isinstance(solution, Solution) else None
     status = misfit.judged(solution.status) if misfit else solution.status

@@ -24,6 +24,10 @@ docs/decisions/0002-automatic-lambda.md."""
 MISFIT_RATIO = 1.2
 """Noise outside the model's range over the noise within, above which the model does not explain the frames: 0.92 to
 1.02 in the captures of flat prints that benchmarks/lambda_losses.py makes, 1.4 and more with depth and gloss."""
+_TAKEN, _TAKEN_RISE = 5.0, 4
+"""What lambda may take away within the range, each number, over the noise outside, where the model does not explain the
+frames, and the power that rises with of noise outside over noise within: misfit that hardly shows outside does not make
+up most of what is within (docs/decisions/0004-lambda-by-halves.md)."""
 _FAINT, _FEWEST = 2.0, 20
 """An octave's energy over its noise below which its signal may be noise that was not told, and numbers that tell it:
 twenty vary by a third."""
@@ -56,7 +60,11 @@ class DiagonalProblem:
     def residual_energy(self, lam: float) -> float:
         """||Y - model||^2 of the Tikhonov solution at ``lam``; rounding leaves about 1e-16 of ``energy``."""
         outside = max(self.energy - float(np.sum(np.square(self.projected))), 0.0)
-        return outside + float(np.sum(np.square((1 - self.kept(lam)) * self.projected)))
+        return outside + self.taken_energy(lam)
+
+    def taken_energy(self, lam: float) -> float:
+        """Energy within the model's range that the Tikhonov solution at ``lam`` leaves out."""
+        return float(np.sum(np.square((1 - self.kept(lam)) * self.projected)))
 
     def kept(self, lam: float) -> FloatArray:
         """(r, r') share sigma^2 / (sigma^2 + ``lam``) of each coefficient that is kept; 0 beyond the rank."""
@@ -174,17 +182,18 @@ def _believable(problem: DiagonalProblem, noise: FloatArray) -> FloatArray:
     return raised
 
 
-def automatic_lambda(problem: DiagonalProblem, explained: bool = True) -> float:
-    """Lambda that minimises :func:`risk_score` of a ``problem``, with the noise that halves of the sensor tell.
+def automatic_lambda(problem: DiagonalProblem, explained: bool = True, struck: FloatArray | float = 0.0) -> float:
+    """Lambda that minimises :func:`risk_score` of a ``problem``, with the noise that halves of the sensor tell and
+    what is known to be in its data beside the image, ``struck`` (r, r').
 
     Where the model does not explain the frames, as they say themselves or as is known before (``explained`` is False),
     that is a lower bound: what both halves agree on is then an error that follows no law, and the image that
-    :func:`movement` says to be the steadiest is taken, short of black.
+    :func:`movement` says to be the steadiest is taken, short of black and of more than misfit can explain.
 
     Returns lambda in the unit of sigma^2; 0 when no regularisation at all scores best. MitsimError when there
     are no more data than unknowns (the noise is then unknown) or no signal.
     """
-    noise = coefficient_noise(problem)
+    noise = coefficient_noise(problem) + np.square(struck)
     if problem.energy == 0:
         raise MitsimError("all frames are zero: lambda cannot be chosen; check exposure and black level")
     exponents = np.arange(np.log10(np.finfo(np.float64).eps), 1.01, 0.25)
@@ -201,11 +210,18 @@ def _steadiest(problem: DiagonalProblem, lambdas: list[float]) -> float:
 
     Where the brightness has the largest sigma, as behind a mask that passes light, it holds the image up to there.
     Where a mask's constant term is centred away, all goes to black before, and moves less and less: the last fall of
-    :func:`movement` tells of no image.
+    :func:`movement` tells of no image. Nor does any that takes away more than misfit like that outside of the range
+    puts within: a dark print without its stars is as steady as one of which nothing is lost.
     """
     moved = [movement(problem, lam) for lam in lambdas]
     while len(moved) > 1 and moved[-1] < moved[-2]:
         moved.pop()
+    if problem.halves and np.isfinite(problem.halves.typical):
+        noise = noise_variance(problem)
+        excess = max(noise / problem.halves.typical, 1.0)
+        most = _TAKEN * excess**_TAKEN_RISE * noise * np.count_nonzero(problem.sigma)
+        while len(moved) > 1 and problem.taken_energy(lambdas[len(moved) - 1]) > most:
+            moved.pop()
     return lambdas[int(np.argmin(moved))]
 
 

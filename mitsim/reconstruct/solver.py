@@ -170,7 +170,13 @@ class Prepared:
         """Adjoint of :meth:`image`: coefficients (r, r') V_L^T ``image`` V_R of an image (n, n')."""
         return np.asarray(self.left.basis.T @ np.asarray(image) @ self.right.basis)
 
-    def solve(self, frames: Accumulator, lam: float | Literal["auto"] = "auto", explained: bool = True) -> Solution:
+    def solve(
+        self,
+        frames: Accumulator,
+        lam: float | Literal["auto"] = "auto",
+        explained: bool = True,
+        struck: FloatArray | float = 0.0,
+    ) -> Solution:
         """Tikhonov solution of the added ``frames``.
 
         Parameters
@@ -183,6 +189,8 @@ class Prepared:
             :func:`mitsim.reconstruct.regularisation.automatic_lambda`.
         explained
             False where factors are known not to explain what the camera sees, which ``auto`` then heeds.
+        struck
+            (r, r') what the data in the diagonal basis are known to have beside the image, which ``auto`` heeds too.
 
         Raises
         ------
@@ -193,7 +201,7 @@ class Prepared:
         if isinstance(lam, str):
             if lam != "auto":
                 raise MitsimError(f"lambda is {lam!r}; give a number of at least 0, or auto")
-            lam = automatic_lambda(problem, explained)
+            lam = automatic_lambda(problem, explained, struck)
         lam = float(lam)
         if not (np.isfinite(lam) and lam >= 0):
             raise MitsimError(f"lambda is {lam}; give a finite number of at least 0, or auto")

@@ -54,14 +54,13 @@ from mitsim.reconstruct.spectrum import scene_spectrum
 
 _LOST = 1e-5
 """Part of the energy of G that its few products may leave out: 0.3 % of its norm, less than 1 % of a variance."""
-_CAUTION = 0.75
-"""Variances of the logarithm of what lambda takes away by which it is stated above its likeliest value: 0.5 is its
-mean; 0.5 and 0.75 pass twice the error alike, and this one covers more (docs/physics.md, uncertainty)."""
 _EXTRAPOLATED = 1.35
 """Factor by which a stated uncertainty may be off from which that is said: data then hold less than frequencies of half
 the detail that is lost."""
 _NEAR = 2.0
 """Scene pixels around a place whose detail tells of lost detail there: of 1, 2 and 4 that which covers best."""
+_UNSURE = 0.1
+"""Detail near a place, in parts of its mean, that places are alike by before any is seen; 0.3 and 1 cover as well."""
 NO_UNCERTAINTY = {
     "uncertainty": None,
     "uncertainty_budget": None,
@@ -187,7 +186,9 @@ class Propagation:
         """
         left, right = self.model.sides
         squares = [np.square(slab.matrix) for slab in right.slabs]
-        means = np.maximum(rows.mean(axis=2), np.finfo(np.float64).tiny)
+        # Clipped at 0, rows and columns of frames that are darker than nothing have means of their own.
+        means = np.maximum(rows.mean(axis=2), columns.mean(axis=2))
+        means = np.where(means > 0, means, 1.0)
         total = np.zeros_like(self.gain)
         for slab, own_rows, own_columns, mean in zip(left.slabs, rows, columns, means, strict=True):
             seen = np.zeros((len(own_columns), len(right.singular)))
@@ -206,7 +207,8 @@ class Propagation:
         """
         sides = zip(self.model.sides, (rows, columns), strict=True)
         left, right = (common_response(side) * np.sqrt(variance)[:, None] for side, variance in sides)
-        return np.asarray(self._taken(left, right) / rows.mean())
+        mean = max(float(rows.mean()), float(columns.mean()))
+        return np.asarray(self._taken(left, right) / (mean or 1.0))
 
     def of_light(self, variance: float) -> FloatArray:
         """(n, n') variance of the image by an independent error of this ``variance`` in every scene pixel's light."""
@@ -233,34 +235,36 @@ class Propagation:
         """(n, n') mean square of what lambda takes away of the image of a ``problem``, whose data have the stated
         ``variance`` where no more data than unknowns tell it; and the factor, either way, that its root is known to.
 
-        A coefficient's mean square is told by its datum and by the scene's spectrum, each as well as it knows. A mean
-        is lost everywhere, detail where there is detail: its place is told by what lambda would take away of the image.
+        A coefficient's mean square is told by its datum and by the scene's spectrum, each as well as it knows. The mean
+        is lost as an image of ones is, detail where there is more of it than of noise and detail everywhere: that is
+        told by what lambda would take away of the image.
         """
         told_by_data = problem.data_count > np.count_nonzero(problem.sigma)
         noise = coefficient_noise(problem) if told_by_data else variance
-        estimate = self.gain * problem.projected
-        mean = float(self.model.prepared.image(estimate).mean())
-        spectrum = scene_spectrum(self.model.sides, problem, noise, mean)
+        spectrum = scene_spectrum(self.model.sides, problem, noise)
         lost = 1 - problem.kept(self.lam)
         if spectrum is None or not lost.any():
             return np.zeros((len(self.model.sides[0].basis), len(self.model.sides[1].basis))), 1.0
-        power = np.square(self._sigma)
+        power, image = np.square(self._sigma), self.model.prepared.image
+        detail = problem.projected - spectrum.mean * self._sigma * spectrum.even
 
         def seen_part(energy: FloatArray) -> FloatArray:
             """(r, r') share of each coefficient that its own datum tells where its mean square is ``energy``."""
             return np.divide(power * energy, power * energy + noise, out=np.zeros_like(power), where=power > 0)
 
         spread = spectrum.spread(np.square(lost) * (1 - seen_part(spectrum.energy)))
-        energy = spectrum.energy * np.exp(_CAUTION * spread)
+        energy = spectrum.energy * np.exp(spread / 2)  # the mean of what has a logarithm of that variance
         part = seen_part(energy)
-        told = np.divide(part * problem.projected, self._sigma, out=np.zeros_like(power), where=power > 0)
-        squares = np.square(lost) * (np.square(told) + energy * (1 - part))
-        of_mean = np.square(lost) * (1 - part) * spectrum.of_mean * np.exp(_CAUTION * spread)
-        even, detail = self._seen(of_mean), self._seen(squares - of_mean)
-        seen = np.square(self.model.prepared.image(lost * estimate))
-        near = gaussian_filter(seen, _NEAR, mode="nearest")
-        placed = detail * near / near.mean() if near.any() else detail
-        return even + placed, float(np.exp(np.sqrt(spread) / 2))
+        told = np.divide(part * detail, self._sigma, out=np.zeros_like(power), where=power > 0)
+        squares = self._seen(np.square(lost) * (np.square(told) + energy * (1 - part)))
+        of_mean = (spectrum.mean**2 + spectrum.mean_variance) * np.square(image(lost * spectrum.even))
+        seen = gaussian_filter(np.square(image(lost * told)), _NEAR, mode="nearest")
+        usual = gaussian_filter(self._seen(np.square(lost) * energy * part), _NEAR, mode="nearest")
+        doubt = max(_UNSURE * float(usual.mean()), 1e-300)
+        near = (seen + doubt) / (usual + doubt)
+        placed = squares * near
+        placed *= squares.mean() / max(float(placed.mean()), 1e-300)
+        return of_mean + placed, float(np.exp(np.sqrt(spread * spectrum.departure) / 2))
 
     def of_factors(self, noise: FactorNoise, image: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(n, n') variances of an ``image`` by ``noise`` of the left factor, and of the right one."""
