@@ -126,10 +126,10 @@ def reconstruct(
         prepared, frames = data.prepared, data.frames
     if misfit and misfit.cause in _OF_THE_SCENE and isinstance(depth, Depth) and depth.at_end:
         misfit = replace(misfit, cause=Cause.DEPTH)
-    separable = factors.status.verdict is not Verdict.NOT_SEPARABLE
-    if isinstance(solution, Solution) and lam == "auto" and not (separable and (misfit is None or not misfit.flagged)):
+    explained = factors.status.verdict is not Verdict.NOT_SEPARABLE and (misfit is None or not misfit.flagged)
+    if isinstance(solution, Solution) and lam == "auto" and (factors.lacking or not explained):
         lack = data.lack(factors, solution.image)
-        solution = prepared.solve(frames, lam, explained=False, struck=lack.struck if lack else 0.0)
+        solution = prepared.solve(frames, lam, explained, (lack.struck, lack.energy) if lack else None)
     judged = time.perf_counter()
     uncertainties = data.uncertainty(shots, factors, solution) if isinstance(solution, Solution) else None
     status = misfit.judged(solution.status) if misfit else solution.status

@@ -24,10 +24,11 @@ docs/decisions/0002-automatic-lambda.md."""
 MISFIT_RATIO = 1.2
 """Noise outside the model's range over the noise within, above which the model does not explain the frames: 0.92 to
 1.02 in the captures of flat prints that benchmarks/lambda_losses.py makes, 1.4 and more with depth and gloss."""
-_TAKEN, _TAKEN_RISE = 5.0, 4
-"""What lambda may take away within the range, each number, over the noise outside, where the model does not explain the
-frames, and the power that rises with of noise outside over noise within: misfit that hardly shows outside does not make
-up most of what is within (docs/decisions/0004-lambda-by-halves.md)."""
+_TAKEN, _TAKEN_RISE = 30.0, 4
+"""What lambda may take away within the range where the model does not explain the frames, over the noise outside, and
+the power of noise outside over noise within that this rises with: misfit that hardly shows outside is not most of what
+is within. 15 to 60 and 4 lose alike, 3 and less too little of heavy misfit
+(docs/decisions/0004-lambda-by-halves.md)."""
 _FAINT, _FEWEST = 2.0, 20
 """An octave's energy over its noise below which its signal may be noise that was not told, and numbers that tell it:
 twenty vary by a third."""
@@ -49,6 +50,8 @@ class DiagonalProblem:
         number of independent data.
     halves
         ``projected`` by quarters of the sensor, which tell its noise; None: the noise is taken for white.
+    struck
+        (r, r') what ``projected`` is known to have beside the image and noise, up to its sign.
     """
 
     sigma: FloatArray
@@ -56,6 +59,7 @@ class DiagonalProblem:
     energy: float
     data_count: int
     halves: Halves | None = None
+    struck: FloatArray | float = 0.0
 
     def residual_energy(self, lam: float) -> float:
         """||Y - model||^2 of the Tikhonov solution at ``lam``; rounding leaves about 1e-16 of ``energy``."""
@@ -65,6 +69,11 @@ class DiagonalProblem:
     def taken_energy(self, lam: float) -> float:
         """Energy within the model's range that the Tikhonov solution at ``lam`` leaves out."""
         return float(np.sum(np.square((1 - self.kept(lam)) * self.projected)))
+
+    def image_energy(self, lam: float) -> float:
+        """||X||^2 of the Tikhonov image X at ``lam``."""
+        kept = self.kept(lam)
+        return float(np.sum(np.square((kept * self.projected)[kept > 0] / self.sigma[kept > 0])))
 
     def kept(self, lam: float) -> FloatArray:
         """(r, r') share sigma^2 / (sigma^2 + ``lam``) of each coefficient that is kept; 0 beyond the rank."""
@@ -144,13 +153,14 @@ def coefficient_noise(problem: DiagonalProblem) -> float | FloatArray:
 
     Most have the noise that is outside the model's range, where there are more data to tell it, or what the halves of
     the sensor disagree on where that is more: noise of the factors lies within the range alone. Where the model does
-    not explain the frames, the halves know. What strikes single rows and columns comes on top.
+    not explain the frames, the halves know. What strikes single rows and columns comes on top, and what is known to
+    strike single numbers.
     """
     white, halves = noise_variance(problem), problem.halves
     if not halves:
-        return white
+        return white + np.square(problem.struck)
     level = halves.typical if is_misfit(problem) else float(np.fmax(white, halves.typical))
-    return _believable(problem, level + halves.excess)
+    return _believable(problem, level + halves.excess + np.square(problem.struck))
 
 
 def _believable(problem: DiagonalProblem, noise: FloatArray) -> FloatArray:
@@ -182,47 +192,50 @@ def _believable(problem: DiagonalProblem, noise: FloatArray) -> FloatArray:
     return raised
 
 
-def automatic_lambda(problem: DiagonalProblem, explained: bool = True, struck: FloatArray | float = 0.0) -> float:
-    """Lambda that minimises :func:`risk_score` of a ``problem``, with the noise that halves of the sensor tell and
-    what is known to be in its data beside the image, ``struck`` (r, r').
+def automatic_lambda(problem: DiagonalProblem, explained: bool = True) -> float:
+    """Lambda that minimises :func:`risk_score` of a ``problem``, with the noise that halves of the sensor tell.
 
     Where the model does not explain the frames, as they say themselves or as is known before (``explained`` is False),
     that is a lower bound: what both halves agree on is then an error that follows no law, and the image that
-    :func:`movement` says to be the steadiest is taken, short of black and of more than misfit can explain.
+    :func:`movement` says to be the steadiest is taken, as far as misfit explains what that takes away.
 
     Returns lambda in the unit of sigma^2; 0 when no regularisation at all scores best. MitsimError when there
     are no more data than unknowns (the noise is then unknown) or no signal.
     """
-    noise = coefficient_noise(problem) + np.square(struck)
+    noise = coefficient_noise(problem)
     if problem.energy == 0:
         raise MitsimError("all frames are zero: lambda cannot be chosen; check exposure and black level")
     exponents = np.arange(np.log10(np.finfo(np.float64).eps), 1.01, 0.25)
     lam = _least(lambda lam: risk_score(problem, lam, noise), problem.scale, exponents)
     if is_misfit(problem) or not explained:
-        # Beyond the largest sigma^2 all that still moves is the brightness, on its way to black.
+        # Beyond the largest sigma^2 all goes to black.
         candidates = problem.scale * 10.0 ** exponents[exponents <= 0]
         lam = _steadiest(problem, [lam, *candidates[candidates > lam].tolist()])
     return lam
 
 
 def _steadiest(problem: DiagonalProblem, lambdas: list[float]) -> float:
-    """That of rising ``lambdas`` at which the image of a ``problem`` moves least before it goes to black.
+    """That of rising ``lambdas`` at which the image of a ``problem`` moves least, of those that misfit explains.
 
     Where the brightness has the largest sigma, as behind a mask that passes light, it holds the image up to there.
-    Where a mask's constant term is centred away, all goes to black before, and moves less and less: the last fall of
-    :func:`movement` tells of no image. Nor does any that takes away more than misfit like that outside of the range
-    puts within: a dark print without its stars is as steady as one of which nothing is lost.
+    Where a mask's constant term is centred away, all goes to black before, and moves less and less: movement then
+    counts by what is left of the image. What lambda takes away is bounded by the misfit that is seen outside of the
+    range, as a dark print without its stars is as steady as one of which nothing is lost; below that bound, a movement
+    that still falls tells of no image either.
     """
-    moved = [movement(problem, lam) for lam in lambdas]
-    while len(moved) > 1 and moved[-1] < moved[-2]:
-        moved.pop()
+    moved = np.array([movement(problem, lam) for lam in lambdas])
+    if len(moved) > 1 and moved[-1] < moved[-2]:
+        moved /= [problem.image_energy(lam) for lam in lambdas]
+    count = len(moved)
     if problem.halves and np.isfinite(problem.halves.typical):
         noise = noise_variance(problem)
         excess = max(noise / problem.halves.typical, 1.0)
         most = _TAKEN * excess**_TAKEN_RISE * noise * np.count_nonzero(problem.sigma)
-        while len(moved) > 1 and problem.taken_energy(lambdas[len(moved) - 1]) > most:
-            moved.pop()
-    return lambdas[int(np.argmin(moved))]
+        while count > 1 and problem.taken_energy(lambdas[count - 1]) > most:
+            count -= 1
+        while 1 < count < len(moved) and moved[count] < moved[count - 1]:
+            count -= 1
+    return lambdas[int(np.argmin(moved[:count]))]
 
 
 def _least(score: Callable[[float], float], scale: float, exponents: FloatArray) -> float:

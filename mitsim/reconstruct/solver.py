@@ -175,7 +175,7 @@ class Prepared:
         frames: Accumulator,
         lam: float | Literal["auto"] = "auto",
         explained: bool = True,
-        struck: FloatArray | float = 0.0,
+        lack: tuple[FloatArray, float] | None = None,
     ) -> Solution:
         """Tikhonov solution of the added ``frames``.
 
@@ -189,8 +189,9 @@ class Prepared:
             :func:`mitsim.reconstruct.regularisation.automatic_lambda`.
         explained
             False where factors are known not to explain what the camera sees, which ``auto`` then heeds.
-        struck
-            (r, r') what the data in the diagonal basis are known to have beside the image, which ``auto`` heeds too.
+        lack
+            what the frames are known to have beside the image, (r, r') in the diagonal basis and as energy beyond it,
+            which ``auto`` takes for noise.
 
         Raises
         ------
@@ -201,7 +202,8 @@ class Prepared:
         if isinstance(lam, str):
             if lam != "auto":
                 raise MitsimError(f"lambda is {lam!r}; give a number of at least 0, or auto")
-            lam = automatic_lambda(problem, explained, struck)
+            known = replace(problem, struck=lack[0], energy=max(problem.energy - lack[1], 0.0)) if lack else problem
+            lam = automatic_lambda(known, explained)
         lam = float(lam)
         if not (np.isfinite(lam) and lam >= 0):
             raise MitsimError(f"lambda is {lam}; give a finite number of at least 0, or auto")

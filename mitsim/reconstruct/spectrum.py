@@ -10,9 +10,9 @@ patterns that leave dark pixels between lit ones, well-seen coefficients hold th
 S is linear, in the logarithm of frequency, between octaves, apart for frequencies along rows and columns, where prints
 have most of their edges, and between these. It is chosen by the data's likelihood and what is known of scenes before:
 log S falls with the square of frequency, as spectra of photographs do (Field, J. Opt. Soc. Am. A 4, 1987), and departs
-from that by a normal process that forgets itself over octaves. So where data tell nothing, S goes on as the last octaves
-that are told, and further on as scenes do. How far off that may be, the curvature of the likelihood says (Laplace's
-method), and how well such a spectrum fits the data at all (Birge's ratio).
+from that by a normal process that forgets itself over octaves. So where data tell nothing, S goes on as the last
+octaves that are told, and further on as scenes do. How far off that may be, the curvature of the likelihood says
+(Laplace's method), and how well such a spectrum fits the data at all (Birge's ratio).
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.detail import Model
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.lacking import Lack
-from mitsim.reconstruct.reconstruction import reconstruct
+from mitsim.reconstruct.reconstruction import accumulated, reconstruct
 from mitsim.reconstruct.solver import prepare
 from mitsim.rig.patterns import parse_patterns
 from tests.ideal_sessions import Bench, picture, shadow
@@ -126,3 +126,17 @@ def test_terms_lie_in_the_factors_files(tmp_path: Path) -> None:
     replace(factors, lacking=()).save(tmp_path / "plain")
     assert set(read_frame(tmp_path / "plain" / "left.exr")[0]) == {"factor"}
     assert load_calibration(tmp_path / "plain").lacking == ()
+
+
+def test_lambda_heeds_what_factors_lack() -> None:
+    """A reconstruction's lambda is that of the known terms, of the image at the lambda of noise alone, as noise.
+    (Planted: known terms not passed on.)"""
+    camera, factors = doubled()
+    shots = camera.run("dots:3", picture(), 0)
+    sums = accumulated(shots, factors)
+    first = sums.prepared.solve(sums.frames)
+    lack = sums.lack(factors, first.image)
+    image = reconstruct(shots, factors)
+    assert lack and image.misfit
+    known = sums.prepared.solve(sums.frames, "auto", not image.misfit.flagged, (lack.struck, lack.energy))
+    assert image.lam == known.lam > 1.1 * first.lam
