@@ -129,7 +129,8 @@ def reconstruct(
     explained = factors.status.verdict is not Verdict.NOT_SEPARABLE and (misfit is None or not misfit.flagged)
     if isinstance(solution, Solution) and lam == "auto" and (factors.lacking or not explained):
         lack = data.lack(factors, solution.image)
-        solution = prepared.solve(frames, lam, explained, (lack.struck, lack.energy) if lack else None)
+        known = (lack.struck, lack.energy) if lack else None
+        solution = prepared.solve(frames, lam, explained=explained, lack=known)
     judged = time.perf_counter()
     uncertainties = data.uncertainty(shots, factors, solution) if isinstance(solution, Solution) else None
     status = misfit.judged(solution.status) if misfit else solution.status
