@@ -126,7 +126,8 @@ def scene_spectrum(sides: tuple[Side, Side], problem: DiagonalProblem, noise: fl
     place = step * (np.arange(len(nodes)) % (len(nodes) // 2))
     fall = np.exp2(_FALL * place)
     frequencies = np.outer(bands[0][2], bands[1][2])
-    usual = np.square(_CONTRAST) * frequencies.sum() / float(fall @ np.tensordot(nodes, frequencies)) * fall
+    detail_energy = float(fall @ np.tensordot(nodes, frequencies)) or 1.0  # a single pixel has none
+    usual = np.square(_CONTRAST) * frequencies.sum() / detail_energy * fall
 
     def mean(power: FloatArray) -> tuple[float, float]:
         """The mean and its variance, by least squares weighted for the spectrum S = ``power`` (J,)."""

@@ -226,6 +226,23 @@ def test_nothing_seen_has_no_spectrum() -> None:
     assert scene_spectrum((prepared.left, prepared.right), dark, 1.0) is None
 
 
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (33, 2)])
+def test_scenes_of_few_pixels_have_a_spectrum_too(shape: tuple[int, int]) -> None:
+    """A single pixel has no detail, a row one direction; lambda of the largest sigma^2 takes half and
+    more away. (Planted: the usual detail divided by that of a scene without any.)"""
+    rng = np.random.default_rng(0)
+    factors, patterns = tuple(rng.random((2 * size + 3, size)) for size in shape), [np.ones((n, 1)) for n in shape]
+    prepared, image = prepare(*factors, *patterns), rng.uniform(0.5, 1.0, shape)
+    sums = prepared.accumulator()
+    with np.errstate(all="raise"):
+        sums.add(factors[0] @ image @ factors[1].T + 1e-3 * rng.standard_normal([len(side) for side in factors]), 0, 0)
+        problem = prepared.problem(sums)
+        propagation = Propagation(Model(prepared, factors, tuple(patterns)), problem.scale)
+        found, factor = propagation.of_regularisation(problem, 1e-6)
+    assert np.isfinite(found).all() and factor >= 1
+    assert np.sqrt(found.mean()) > 0.2
+
+
 def test_what_lambda_takes_away() -> None:
     """Over all of the image, the lost part of the energy; more where the image has detail than where it is even."""
     shots, factors = bench().run("uniform", picture(), 0), bench().calibrated(0)
