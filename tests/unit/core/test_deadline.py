@@ -84,9 +84,9 @@ def test_a_lost_alarm_comes_again() -> None:
 def test_plans_are_held_against_the_job() -> None:
     """The whole work's seconds count, and the plan's own are kept."""
     job = Job(limits=Limits(seconds=LIMIT))
-    with pytest.raises(MitsimError, match=r"dots:3: was not planned within the 0.1 s that are allowed.*max_seconds"):
-        with job.planning("dots:3"):
-            spin()
+    refused = r"dots:3: was not planned within the 0.1 s that are allowed.*max_seconds"
+    with pytest.raises(MitsimError, match=refused), job.planning("dots:3"):
+        spin()
     assert LIMIT / 2 < job.clock.seconds()["plan"] < LATE
     with pytest.raises(MitsimError, match="was not planned"), job.planning("dots:3"):
         pytest.fail("began after all seconds were over")
