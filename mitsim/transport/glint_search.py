@@ -36,9 +36,8 @@ _MARGIN = 1.5
 """Radius of a spot in the window over its radius at the axis: perspective stretches by 1 / cos^2, 1.3 at 30 degrees."""
 _AT_ONCE = 2**20
 """Squares that boxes cover, looked up at a time: some tens of MB."""
-_ACROSS, _FEWEST_ACROSS = 2**16, 2**10
-"""Rays across all balls of glass together, and across one at least: they turn by a third of a degree from ray to ray,
-which moves light by the width of a sensor."""
+_ACROSS = 2**10
+"""Rays across a ball of glass: their light turns by a third of a degree from ray to ray, half a sensor at 400 mm."""
 _TO_RIM = 0.25
 """Step of the finer grid where light comes from near a rim, over the distance to it."""
 _TOO_CLOSE = 1 / 64
@@ -124,8 +123,7 @@ def grazing(tracer: GlintRays, half_width: float, unit: int) -> tuple[list[Boxes
     balls = [s for s in tracer.mirrors if s.class_name() == "Sphere" and s.bsdf().flags() & glass]
     if not balls:
         return [], 0.0
-    count = max(_FEWEST_ACROSS, _ACROSS // len(balls))
-    across = np.sin((np.arange(count) + 0.5) / count * np.pi - np.pi / 2)
+    across = np.sin((np.arange(_ACROSS) + 0.5) / _ACROSS * np.pi - np.pi / 2)
     planes = [_Plane.of(ball, tracer) for ball in balls]
     met = tracer.follow(np.concatenate([tracer.rays.points(plane.places(across, 0 * across))[0] for plane in planes]))
     found, left = [], 0.0
@@ -133,12 +131,12 @@ def grazing(tracer: GlintRays, half_width: float, unit: int) -> tuple[list[Boxes
         own = np.flatnonzero(met.chain == chain)
         order = own[np.argsort(met.ray[own], kind="stable")]
         one, other = order[:-1], order[1:]
-        beside = (met.ray[other] == met.ray[one] + 1) & (met.ray[other] % count != 0)
+        beside = (met.ray[other] == met.ray[one] + 1) & (met.ray[other] % _ACROSS != 0)
         one, other = one[beside], other[beside]
         apart = np.linalg.norm(met.sensor[other] - met.sensor[one], axis=1)
         near = np.linalg.norm((met.sensor[one] + met.sensor[other]) / 2, axis=1) < apart / 2 + math.sqrt(2) * half_width
         for first, width in zip(one[near], apart[near], strict=True):
-            ball, place = divmod(int(met.ray[first]), count)
+            ball, place = divmod(int(met.ray[first]), _ACROSS)
             plane, part = planes[ball], across[place : place + 2]
             arc = plane.arc(part, half_width, tracer.rays, unit)
             if 1 - np.abs(part).max() > _TOO_CLOSE and arc[2].min() > _FINEST:
