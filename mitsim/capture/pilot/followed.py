@@ -105,8 +105,8 @@ class FollowedLight:
         if tracer is None or not self.changes or not light:
             return Effort.none()
         seen = [tracer.trace(integer(seed, "heavy"), 0, samples) for seed in self._seeds]
-        error = noise(self._beyond(simulation, seen, samples=samples)) / light
-        return Effort(Noise(error, samples, 0.5), self._simulation().at_anchors[1].lanes)  # type: ignore[union-attr]
+        frames = self._beyond(simulation, seen, samples=samples)
+        return Effort(Noise.among(frames, light, samples), self._simulation().at_anchors[1].lanes)  # type: ignore[union-attr]
 
     @property
     def _widths(self) -> dict[Part, FloatArray]:

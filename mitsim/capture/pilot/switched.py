@@ -151,7 +151,7 @@ class SwitchedEffects:
             return Effort.none()
         seen = [tracer.trace(integer(seed, "heavy"), 0, samples) for seed in self.seeds]
         frames = self._form(self.simulation, followed=self._by_kind({"from_camera": seen}), samples=samples)
-        return Effort(Noise(noise(frames) / self.light, samples, 0.5), tracer.lanes)
+        return Effort(Noise.among(frames, self.light, samples), tracer.lanes)
 
     def indirect_effort(self) -> tuple[Effort, bool, tuple[int, ...]]:
         """What light over several surfaces takes, whether that is less where neighbouring pixels share it, and how
