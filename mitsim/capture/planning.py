@@ -16,7 +16,7 @@ from mitsim.capture.bench import Bench
 from mitsim.capture.choice import Candidates, Choice, cheapest, doubt, predicted
 from mitsim.capture.cost import frame_seconds
 from mitsim.capture.decision import SceneFacts, decide
-from mitsim.capture.evidence import GROUPS, LANES_AT_ONCE, LOOKS, MOST_PATHS, Evidence, whole
+from mitsim.capture.evidence import GROUPS, LOOKS, MOST_PATHS, Evidence, whole
 from mitsim.capture.plan import Plan
 from mitsim.capture.prices import FIXED, tracing_seconds
 from mitsim.capture.request import check_accuracy
@@ -40,9 +40,9 @@ _MORE, _OF_ALL = 4, 0.1
 """Times as many paths as before that tell a pace, or noise, next, and the part of all planned that they are at most."""
 _LEAST_SLOPE = 0.25
 """Part of a path's seconds in a launch that are its own at least, whatever shorter launches seem to say."""
-_HEAVY_PATHS, _MOST_HEAVY_PATHS = 2**19, LANES_AT_ONCE
-"""Paths from the camera that are looked at for rare heavy ones, 0.1 s, and at most, as many as a run holds at a time:
-ten glossy balls of alpha 0.02 need a million to tell their noise to a factor of two (25 thousand: 3000 too little)."""
+_HEAVY_PATHS, _MOST_HEAVY_PATHS = 2**19, 2**23
+"""Paths from the camera that are looked at for rare heavy ones, 0.1 s, and at most, 1 s: ten glossy balls of alpha 0.02
+need millions to tell their noise to a factor of two (25 thousand: 3000 too little; two million: 4 once)."""
 _HEAVIER = 1.25
 """Tracing that takes so many times as long as planned is planned anew; less is what predictions are good to."""
 

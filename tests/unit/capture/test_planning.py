@@ -206,7 +206,7 @@ def test_rare_heavy_paths_are_sampled_from_the_first() -> None:
     target = after.target
     left = math.sqrt(look.variance / after.settings.from_camera_samples / GROUPS)
     assert after.settings.from_camera_samples > 20 * before.settings.from_camera_samples and left < target
-    assert look.looked == sorted(look.looked) and look.looked[-1] * LOOKS * look.evidence.from_camera.paths <= 2**21
+    assert look.looked == sorted(look.looked) and look.looked[-1] * LOOKS * look.evidence.from_camera.paths <= 2**23
     _, more = planned_with(Heavy(400 * plain, spread=4.0))
     assert more.settings.from_camera_samples > 1.02 * after.settings.from_camera_samples
     _, most = planned_with(Heavy(1e9 * plain))
