@@ -159,8 +159,17 @@ class Noise:
 
     @classmethod
     def among(cls, seen: FloatArray, light: float, samples: int) -> Noise:
-        """Of frames ``seen`` by independent looks of so many ``samples``, relative to all ``light``, by random paths of
-        which few may be heavy."""
+        """Of one of several looks, by random paths of which few may be heavy.
+
+        Parameters
+        ----------
+        seen
+            (looks, ...) frames.
+        light
+            norm of the frames of all light, which the error is relative to.
+        samples
+            of a look.
+        """
         energies = np.square(seen - seen.mean(axis=0)).reshape(len(seen), -1).sum(axis=1)
         mean = float(energies.mean())
         spread = float(energies.var(ddof=1)) / mean**2 if mean else 0.0

@@ -634,8 +634,15 @@ def bound_of(parts: FloatArray, energy: float) -> float:
 
 
 def bound_over_error(variance: float, count: int) -> float:
-    """How far :func:`bound_of` lies above the error, by the relative ``variance`` of the energy of the noise among so
-    many groups."""
+    """How far :func:`bound_of` lies above the error, as a ratio.
+
+    Parameters
+    ----------
+    variance
+        relative variance of the energy of the noise among groups.
+    count
+        of groups.
+    """
     return math.sqrt(1 + math.sqrt(variance) * _deviations(count))
 
 

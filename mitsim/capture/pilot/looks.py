@@ -345,8 +345,13 @@ def norm(seen: FloatArray) -> float:
 
 
 def heavy_paths(tracer: FromCameraTracer | Together, seed: int, samples: int) -> Deposits:
-    """The projector's light in so many ``samples`` of a ``tracer``, some at a time: few paths bring any, but lamps
-    shine on all of them."""
+    """The projector's light, a few samples at a time: few paths bring any, but lamps shine on all of them.
+
+    Parameters
+    ----------
+    tracer, seed, samples
+        from the camera's side, the root of its random numbers, and how many are traced.
+    """
     each = max(1, _AT_ONCE // tracer.lanes)
     parts = [tracer.trace(seed, first, min(each, samples - first)) for first in range(0, samples, each)]
     return Deposits.joined([part.where(part.kind != AMBIENT) for part in parts])
