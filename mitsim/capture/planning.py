@@ -209,18 +209,18 @@ def _timed(evidence: Evidence, simulation: Simulation, labels: Labels, seed: int
     """The ``evidence`` with the seconds that a path takes to be traced and filed in a ``simulation`` of the choice."""
     own, found = integer(seed, "pilot", "paces"), {}
     for name, stage in simulation.tracers().items():
-        seconds, slope = _pace(stage, simulation.paths_at_once, int(whole(name, stage.predicted)), labels, own)
+        seconds, longest = _pace(stage, simulation.paths_at_once, int(whole(name, stage.predicted)), labels, own)
         field = _FIELDS.get(name, name)
         effort = getattr(evidence, field)
         # A path of shared light counts for several.
         found[field] = replace(effort, seconds=seconds / (effort.paths if name == "indirect" else stage.tracer.lanes))
         if name == "direct":
-            found["spread"] = replace(evidence.spread, seconds=slope / stage.tracer.lanes)
+            found["spread"] = replace(evidence.spread, seconds=longest / stage.tracer.lanes)
     return replace(evidence, **found)
 
 
 def _pace(stage: Stage, at_once: int, planned: int, labels: Labels, seed: int) -> tuple[float, float]:
-    """Seconds of a sample of a ``stage`` in a run, and in one endless launch.
+    """Seconds of a sample of a ``stage`` in a run, and in the longest launches that were timed.
 
     Launches of more and more paths, up to those of the run itself, tell what each launch takes besides its paths.
 
@@ -251,4 +251,4 @@ def _pace(stage: Stage, at_once: int, planned: int, labels: Labels, seed: int) -
         least = min(least, longest / samples)
     slope = min(max((longest - launch) / (samples - 1), _LEAST_SLOPE * least), least) if samples > 1 else launch
     launches = math.ceil(planned / max(1, at_once // lanes))
-    return slope + max(launch - slope, 0.0) * launches / planned, slope
+    return slope + max(launch - slope, 0.0) * launches / planned, least
