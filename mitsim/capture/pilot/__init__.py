@@ -297,7 +297,7 @@ class Look:
             from_camera=switched.effort("from_camera"),
             forming=replace(self.forming, lines=self._lines),
             apart=switched.apart,
-            unresolved=unresolved / (found + unmet) if unresolved else 0.0,
+            unresolved=unresolved / (self._light + sharp.irradiance + unmet) if unresolved else 0.0,
             left_out=left_out / (left_out + found) if left_out else 0.0,
             glint=self._unsure_glint(found),
             mirror=mirror,
