@@ -74,8 +74,12 @@ class Bench(Apparatus):
             as :meth:`plan`.
         """
         from mitsim.capture.run import trace_request
+        from mitsim.core.job import Job
 
-        return trace_request(self, self.plan(patterns, **request), job)
+        job = job or Job()
+        with job.planning(patterns):
+            plan = self.plan(patterns, **request)
+        return trace_request(self, plan, job)
 
     @checked
     def capture(

@@ -207,7 +207,7 @@ def traced_lines(
         for what is not simulated in colour, and work beyond the limits.
     """
     lighting = colours.whole.family(request.patterns, request.seed).lighting
-    with job.clock.stage("plan"):
+    with job.planning(request.patterns):
         plan = plan or plan_lines(colours, request)
     if plan.cost:
         plan.cost.check(request.patterns, job.limits)

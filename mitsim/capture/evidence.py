@@ -30,6 +30,8 @@ GROUPS = 4
 many kinds, four tell it as well as more (docs/physics.md), and each takes its own filing, forming and probing."""
 LANES_AT_ONCE = 2**21
 """Paths whose light is held in memory at a time."""
+MOST_PATHS = 2**32
+"""Limit of one light's paths: half an hour on two cores, at which sampling stops and says so."""
 LOOKS = 4
 """Independent looks of the pilot, the fewest whose spread tells a standard error worth its name."""
 SURE = 2.35
@@ -147,11 +149,31 @@ class Settings:
 
 @dataclass(frozen=True)
 class Noise:
-    """Monte Carlo error of one estimate: ``error`` at ``samples`` a cell, falling with samples^-rate."""
+    """Monte Carlo error of one estimate: ``error`` at ``samples`` a cell, falling with samples^-rate; ``spread`` is the
+    relative variance of its square among estimates, 0 where many paths make it."""
 
     error: float
     samples: float
     rate: float
+    spread: float = 0.0
+
+    @classmethod
+    def among(cls, seen: FloatArray, light: float, samples: int) -> Noise:
+        """Of one of several looks, by random paths of which few may be heavy.
+
+        Parameters
+        ----------
+        seen
+            (looks, ...) frames.
+        light
+            norm of the frames of all light, which the error is relative to.
+        samples
+            of a look.
+        """
+        energies = np.square(seen - seen.mean(axis=0)).reshape(len(seen), -1).sum(axis=1)
+        mean = float(energies.mean())
+        spread = float(energies.var(ddof=1)) / mean**2 if mean else 0.0
+        return cls(math.sqrt(float(energies.sum()) / (len(seen) - 1)) / light, samples, 0.5, spread)
 
     def samples_for(self, target: Number) -> Number:
         """Samples a cell at which the error is ``target``."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitsim.capture.bench import Bench
-from mitsim.capture.evidence import GROUPS, LANES_AT_ONCE, Settings
+from mitsim.capture.evidence import GROUPS, LANES_AT_ONCE, MOST_PATHS, Settings
 from mitsim.capture.filing import TRAYS, FiledLight
 from mitsim.capture.plan import Plan
 from mitsim.capture.prices import CHECKED_SHOTS, MOST_CHECKED, tells_all
@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 
 Target = Callable[[ExpectedFrames], float]
 """The relative Monte Carlo error to stop at, from the frames seen so far."""
-_MOST_PATHS = 2**32
-"""Limit of one light's paths: half an hour on two cores, at which sampling stops and says so."""
 _TOLD, _OF_HEAVY = 1.2, 0.55
 """Bound over error beyond which a few heavy paths make most of either, so that both tell little of the light: four
 groups of many paths have 1.04 to 1.3, 1.15 in the middle. A heavy path counts for less among more of them, so the bound
@@ -366,7 +364,7 @@ def trace_lines(
     while True:
         _trace(groups, samples)
         lines = [_line_of(groups, line, each, plan, seed) for line, each in enumerate(own)]
-        last = lines[0].paths >= _MOST_PATHS
+        last = lines[0].paths >= MOST_PATHS
         enough = math.inf if last or sampling.excess or sampling.target else plan.sampling_target
         looks = _looks(lines, partial(_parts, groups), lighting, followed, enough)
         lights, near, worst, excess = dict[int, Light](), 1.0, 0, 0.0

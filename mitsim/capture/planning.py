@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,12 +13,12 @@ import drjit as dr
 from mitsim.capture import pilot
 from mitsim.capture.affordable import FIRST_LOOK, affordable, told
 from mitsim.capture.bench import Bench
-from mitsim.capture.choice import Candidates, cheapest, doubt, predicted
+from mitsim.capture.choice import Candidates, Choice, cheapest, doubt, predicted
 from mitsim.capture.cost import frame_seconds
 from mitsim.capture.decision import SceneFacts, decide
-from mitsim.capture.evidence import GROUPS, LOOKS, Evidence, Settings
+from mitsim.capture.evidence import GROUPS, LOOKS, MOST_PATHS, Evidence, whole
 from mitsim.capture.plan import Plan
-from mitsim.capture.prices import paces_of, tracing_seconds
+from mitsim.capture.prices import FIXED, tracing_seconds
 from mitsim.capture.request import check_accuracy
 from mitsim.capture.simulation import AT_ANCHORS, Simulation, Stage
 from mitsim.core.arrays import Labels
@@ -30,25 +31,20 @@ OPENING_S = 1.5
 _LONGER = 2.0
 """Seconds of a second, finer look over those of the first (photograph 1.0, corner 1.1, gift_card 1.3, cookie_bag 2.6 at
 a tenth of the accuracy)."""
-_REHEARSED, _MOST_REHEARSED = 2**16, 2**18
-"""Paths that tell a tracer's pace: a tenth of a second or less, and far more than launching a kernel takes; and how
-many tell it without more of them."""
+_REHEARSED = 2**16
+"""Paths that tell a tracer's pace at first: a tenth of a second or less."""
 _SELDOM = 3.0
 """What knowing for certain saves at most, over what a closer look may take for it: the look seldom turns out as hoped
 (corner and cookie_bag at 1e-3: four looks of 1 to 13 s, and no run was the faster for them)."""
-_LONG, _MORE = 5.0, 4
-"""Seconds of a stage from which its pace is told by what so many times as many paths take longer: the cost of launches
-does not count as if it grew with the paths."""
-
-_HEAVY_PATHS, _MOST_HEAVY_PATHS = 2**19, 2**21
-"""Paths from the camera that are looked at for rare heavy ones, 0.1 s, and while they show more of them than was known:
-ten glossy balls of alpha 0.02 need a million to tell their noise to a factor of two (25 thousand: 3000 too little)."""
+_MORE, _OF_ALL = 4, 0.1
+"""Times as many paths as before that tell a pace, or noise, next, and the part of all planned that they are at most."""
+_LEAST_SLOPE = 0.25
+"""Part of a path's seconds in a launch that are its own at least, whatever shorter launches seem to say."""
+_HEAVY_PATHS, _MOST_HEAVY_PATHS = 2**19, 2**23
+"""Paths from the camera that are looked at for rare heavy ones, 0.1 s, and at most, 1 s: ten glossy balls of alpha 0.02
+need millions to tell their noise to a factor of two (25 thousand: 3000 too little; two million: 4 once)."""
 _HEAVIER = 1.25
-"""Tracing that takes so many times as long as planned is told; less is what predictions are good to."""
-
-_STOPPED_LATE = 1.5
-"""Samples that heavy paths take over those that their noise asks for: sampling stops by a bound that lies further above
-it than that of light paths, and rounds overshoot (the glossy balls: 1.1, 1.7 and 2.1 by three seeds of looks)."""
+"""Tracing that takes so many times as long as planned is planned anew; less is what predictions are good to."""
 
 _FIELDS = MappingProxyType(
     {
@@ -153,43 +149,50 @@ def _decided(look: pilot.Look, accuracy: float, switches: Mapping[str, bool]) ->
     """The plan at an ``accuracy`` of what a ``look`` found, with the paces of its choice measured."""
     evidence, bench = look.evidence, look.bench
     chosen = cheapest(accuracy, evidence, switches)
+    if evidence.sharp is not None and Simulation(bench, chosen.settings).from_camera is not None:
+        evidence, chosen = _with_heavy_paths(look, accuracy, chosen, switches)
     simulation = Simulation(bench, chosen.settings)
     timed = _timed(evidence, simulation, look.lighting.labels, look.seed)
     plan = decide(accuracy, timed, SceneFacts.of(bench, switches), switches, chosen)
     if simulation.physics.mirrors:
         # The pilot formed the frames of other shots, or of fewer effects, from the same beams.
         plan = plan.taking(optics=plan.predicted["optics"] + bench.glint.seconds)
-    if simulation.from_camera is None or evidence.sharp is None:
-        return plan
-    more = _of_heavy_paths(look, accuracy, timed, chosen.settings, switches)
-    return plan.taking(transport=plan.predicted["transport"] + more) if more else plan
+    return plan
 
 
-def _of_heavy_paths(
-    look: pilot.Look, accuracy: float, evidence: Evidence, settings: Settings, switches: Mapping[str, bool]
-) -> float:
-    """Seconds that ``settings`` take more than with their samples, where rare paths over gloss make most of the noise.
+def _with_heavy_paths(
+    look: pilot.Look, accuracy: float, chosen: Choice, switches: Mapping[str, bool]
+) -> tuple[Evidence, Choice]:
+    """What a ``look`` found, and ``chosen`` with samples for rare paths over gloss where these make most of the noise.
 
-    Settings stay: that light is followed so far is known only while it is sampled. Of looks of ever more paths the
-    noisiest counts: what few paths see of such light is nearly always too little.
+    Whether the first samples of a run meet such paths is chance, and where they do not, nothing in it tells that their
+    light is missing. So sampling begins with what looks of ever more paths ask for, the last of a part of the run's.
     """
-    pace, known = paces_of(evidence), evidence
-    already = sum(tracing_seconds(evidence, settings, pace).values())
-    paths, needed = _HEAVY_PATHS, 0.0
-    while paths <= _MOST_HEAVY_PATHS:
-        found = look.heavy(max(1, paths // (LOOKS * evidence.from_camera.paths)))
-        noisier = {
-            name: replace(getattr(evidence, name), noise=effort.noise)
+    plain = tracing_seconds(look.evidence, chosen.settings, FIXED)
+    paths = _HEAVY_PATHS
+    while True:
+        found = look.heavy(max(1, paths // (LOOKS * look.evidence.from_camera.paths)))
+        heavier = {
+            name: replace(getattr(look.evidence, name), noise=effort.noise)
             for name, effort in found.items()
-            if effort.variance > getattr(known, name).variance
+            if effort.variance > getattr(look.evidence, name).variance
         }
-        known = replace(known, **noisier)
-        before = needed
-        needed = sum(tracing_seconds(known, predicted(accuracy, known, settings, switches).settings, pace).values())
-        if needed <= max(_HEAVIER * already, before):
-            break
+        evidence = replace(look.evidence, **heavier)
+        planned = predicted(accuracy, evidence, chosen.settings, switches)
+        seconds = tracing_seconds(evidence, planned.settings, FIXED)
+        if sum(seconds.values()) <= _HEAVIER * sum(plain.values()):
+            return look.evidence, chosen
         paths *= _MORE
-    return _STOPPED_LATE * needed - already if needed > _HEAVIER * already else 0.0
+        asked = {name: seconds[name] / getattr(FIXED, name) for name in heavier}
+        if paths > min(_MOST_HEAVY_PATHS, _OF_ALL * sum(asked.values())):
+            return evidence, _limited(planned, asked)
+
+
+def _limited(chosen: Choice, paths: Mapping[str, float]) -> Choice:
+    """The choice with no more samples of light whose ``paths`` in a run are known than sampling stops at."""
+    samples = {f"{name}_samples": MOST_PATHS / count for name, count in paths.items() if count > MOST_PATHS}
+    less = {name: part * getattr(chosen.settings, name) for name, part in samples.items()}
+    return replace(chosen, settings=replace(chosen.settings, **less))
 
 
 def _seconds(stage: Stage, seed: int, labels: Labels, samples: int) -> float:
@@ -206,17 +209,46 @@ def _timed(evidence: Evidence, simulation: Simulation, labels: Labels, seed: int
     """The ``evidence`` with the seconds that a path takes to be traced and filed in a ``simulation`` of the choice."""
     own, found = integer(seed, "pilot", "paces"), {}
     for name, stage in simulation.tracers().items():
-        samples = max(1, _REHEARSED // stage.tracer.lanes)
-        _seconds(stage, own, labels, 1)  # compiles the kernel
-        once = _seconds(stage, own, labels, samples)
-        seconds = once / samples
-        if GROUPS * stage.predicted * seconds > _LONG and samples * stage.tracer.lanes < _MOST_REHEARSED:
-            more = _seconds(stage, own, labels, _MORE * samples)
-            # What disturbs either of the two may not halve the pace, nor hide that more paths take less for each.
-            most = min(seconds, more / (_MORE * samples))
-            seconds = min(max((more - once) / ((_MORE - 1) * samples), most / 2), most)
+        seconds, longest = _pace(stage, simulation.paths_at_once, int(whole(name, stage.predicted)), labels, own)
         field = _FIELDS.get(name, name)
         effort = getattr(evidence, field)
         # A path of shared light counts for several.
         found[field] = replace(effort, seconds=seconds / (effort.paths if name == "indirect" else stage.tracer.lanes))
+        if name == "direct":
+            found["spread"] = replace(evidence.spread, seconds=longest / stage.tracer.lanes)
     return replace(evidence, **found)
+
+
+def _pace(stage: Stage, at_once: int, planned: int, labels: Labels, seed: int) -> tuple[float, float]:
+    """Seconds of a sample of a ``stage`` in a run, and in the longest launches that were timed.
+
+    Launches of more and more paths, up to those of the run itself, tell what each launch takes besides its paths.
+
+    Parameters
+    ----------
+    stage, labels, seed
+        what is traced, how it is filed, and the root of its random numbers.
+    at_once
+        paths of a launch of the run.
+    planned
+        samples of a group of the run.
+    """
+
+    lanes, every = stage.tracer.lanes, GROUPS * planned
+
+    def once(samples: int) -> float:
+        seconds = _seconds(stage, seed, labels, samples)
+        # What disturbs a moment would be multiplied.
+        return min(seconds, _seconds(stage, seed, labels, samples)) if samples <= _OF_ALL * every else seconds
+
+    _seconds(stage, seed, labels, 1)  # compiles the kernel
+    launch, samples = once(1), max(1, _REHEARSED // lanes)
+    longest = once(samples) if samples > 1 else launch
+    least = longest / samples
+    while _MORE * samples * lanes <= at_once and _MORE * samples <= _OF_ALL * every:
+        samples *= _MORE
+        longest = once(samples)
+        least = min(least, longest / samples)
+    slope = min(max((longest - launch) / (samples - 1), _LEAST_SLOPE * least), least) if samples > 1 else launch
+    launches = math.ceil(planned / max(1, at_once // lanes))
+    return slope + max(launch - slope, 0.0) * launches / planned, least

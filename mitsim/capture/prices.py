@@ -196,7 +196,7 @@ def paces_of(evidence: Evidence) -> Paces:
         product=float(product),
         entry=float(product / FIXED.product * FIXED.entry),
         filed=float(product / FIXED.product * FIXED.filed),
-        ray=evidence.direct.seconds * FIXED.ray / FIXED.direct or FIXED.ray,
+        ray=evidence.spread.seconds * FIXED.ray / FIXED.direct or FIXED.ray,
         pixel=float(product / FIXED.product * FIXED.pixel),
     )
 

@@ -242,7 +242,8 @@ def render(
         warnings += _of_sampler(bench.loaded)
     else:
         uniform = Lighting.uniform(bench.n)
-        plan = make_plan(bench, uniform, accuracy, seed, effects)
+        with job.planning(str(bench.loaded.path)):
+            plan = make_plan(bench, uniform, accuracy, seed, effects)
         frames_cost(bench, plan.settings, uniform, plan.predicted_seconds).check(str(bench.loaded.path), job.limits)
         light = trace_light(bench, plan, uniform, seed, Sampling(by_pixel=False), job.progress)
         warnings = light.warnings

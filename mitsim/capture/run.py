@@ -169,7 +169,7 @@ def capture(
     first_look.check(request.patterns, job.limits, place)
     head = RunHead.of(_configuration(bench, request))
     with _recorder(place, head, resume) as recorder:
-        with job.clock.stage("plan"):
+        with job.planning(request.patterns):
             plan = light.plan if light else plan
             plan = (plan or _planned(bench, lighting, request, 1)).taking(start=starting)
         seconds = exposing if light else plan.predicted_seconds

@@ -189,7 +189,7 @@ class Session:
         seconds = session_seconds(self.board, count, self.shots, first)
         exposures = len(self.recipe.exposure_ladder)
         session_cost(self.board, count, first, sum(seconds.values()), exposures).check("calibration", job.limits)
-        with job.clock.stage("plan"):
+        with job.planning("calibration"):
             plan = make_plan(self.board, _lines(n), accuracy, self.seed)
         seconds = session_seconds(self.board, count, self.shots, plan.settings)
         # There is no truth to be traced, and other frames are formed than those that the plan looks at.

@@ -175,7 +175,7 @@ def chosen_of(bench: Bench, request: dict[str, Any], job: Job) -> tuple[Bench, P
     MitsimError
         as :meth:`Bench.choose_colour`.
     """
-    with job.clock.stage("plan"):
+    with job.planning(request["patterns"]):
         chosen = bench.choose_colour(**request)
     return chosen.bench, chosen.plan, NO if chosen.mono else LINES
 

@@ -8,7 +8,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from mitsim.core.arguments import checked_fields
+from mitsim.core.deadline import within
+from mitsim.core.errors import MitsimError
 from mitsim.core.resources import Limits
+from mitsim.core.worker import OutOfTime
 
 Progress = Callable[[str, float], None]
 """Called with a stage's name and its finished part, 0 to 1."""
@@ -67,3 +70,26 @@ class Job:
     clock: Clock = field(default_factory=Clock)
     progress: Progress = silent
     limits: Limits = field(default_factory=Limits)
+
+    @contextmanager
+    def planning(self, what: str) -> Iterator[None]:
+        """The stage "plan" of the clock, refused once the whole work has taken all the seconds that its limits allow.
+
+        Parameters
+        ----------
+        what
+            the work, for the message.
+
+        Raises
+        ------
+        MitsimError
+            when they are over before the plan is made.
+        """
+        try:
+            with self.clock.stage("plan"), within(self.limits.seconds - self.clock.seconds()["total"]):
+                yield
+        except OutOfTime:
+            raise MitsimError(
+                f"{what}: was not planned within the {self.limits.seconds:.3g} s that are allowed; ask for less "
+                "accuracy or fewer frames, or raise max_seconds"
+            ) from None

@@ -39,6 +39,12 @@ _LONGEST_FAULT = 300
 _LONGEST_ADVICE = 256
 """Bytes; chosen so that any sentence fits."""
 
+
+class OutOfTime(BaseException):
+    """Raised in work whose time is over (:mod:`mitsim.core.deadline`); no Exception, so that nothing in it takes it for
+    a failure that it may go on from."""
+
+
 _stopped_by: int | None = None
 _advice: mmap.mmap | None = None
 _status: int | None = None
@@ -249,7 +255,10 @@ def _again(_: int, __: FrameType | None) -> None:
 
 def _unraisable(lost: sys.UnraisableHookArgs) -> None:
     """An interrupt that fell into a callback or a destructor, where Python drops it with a traceback, comes again; what
-    else goes wrong while the process is stopped is not told, as that a second signal came too late."""
+    else goes wrong while the process is stopped is not told, as that a second signal came too late. Alarms of
+    :mod:`mitsim.core.deadline` come again of themselves."""
+    if lost.exc_type is OutOfTime:
+        return
     if not stopped():
         sys.__unraisablehook__(lost)
     elif lost.exc_type is KeyboardInterrupt:

@@ -629,8 +629,21 @@ def bound_of(parts: FloatArray, energy: float) -> float:
     if not energy or not parts.sum():
         return 0.0
     count = len(parts)
-    spread = float(parts.std(ddof=1) / parts.mean()) * _deviations(count) if count > 1 else 0.0
-    return float(np.sqrt(parts.sum() / energy * (1 + spread)))
+    above = bound_over_error((float(parts.std(ddof=1) / parts.mean())) ** 2, count) if count > 1 else 1.0
+    return above * float(np.sqrt(parts.sum() / energy))
+
+
+def bound_over_error(variance: float, count: int) -> float:
+    """How far :func:`bound_of` lies above the error, as a ratio.
+
+    Parameters
+    ----------
+    variance
+        relative variance of the energy of the noise among groups.
+    count
+        of groups.
+    """
+    return math.sqrt(1 + math.sqrt(variance) * _deviations(count))
 
 
 def _deviations(count: int) -> float:

@@ -24,7 +24,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.optics.glint import Beams
 from mitsim.rig.camera import CameraGeometry
 from mitsim.transport.glint_rays import Chains, Crossings, GlintRays, IntArray, Mask, delta_bsdfs
-from mitsim.transport.glint_search import first_squares
+from mitsim.transport.glint_search import first_squares, grazing
 from mitsim.transport.projector import ProjectorOptics
 
 _UNIT = 2**24
@@ -109,8 +109,9 @@ def trace_glint(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, 
 def _of(tracer: GlintRays, n: int, geometry: CameraGeometry) -> tuple[list[Beams], FloatArray]:
     """Beams of the pixels of a window of ``n`` a side, and (2,) the flux that none has and their variance."""
     step = _UNIT // min(_UNIT, 2 ** max(0, int(np.ceil(np.log2(_COARSE / n)))))
-    parts, left = [], np.zeros(2)
-    for size, row, column in first_squares(tracer.mirrors, tracer.rays, n, _UNIT, step, _DIVISIONS):
+    arcs, close = grazing(tracer, geometry.half_width, _UNIT)
+    parts, left = [], np.array([close, 0.0])
+    for size, row, column in first_squares(tracer.mirrors, tracer.rays, n, _UNIT, step, _DIVISIONS, arcs):
         for first in range(0, len(row), _AT_ONCE):
             chosen = slice(first, first + _AT_ONCE)
             beams, lost = _search(tracer, row[chosen], column[chosen], size, n, geometry)

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.transport.coordinates import rows_columns, turn_and_origin
 from mitsim.transport.exact_hits import ExactHits, Hits
-from mitsim.transport.host import channels, per_lane, vectors
+from mitsim.transport.host import channels, lanes_of, per_lane, vectors
 from mitsim.transport.passage import CLEAR, Passage, transmits
 from mitsim.transport.projector import PinholeRays, ProjectorOptics, wavelength_sets
 
@@ -122,7 +122,7 @@ class GlintRays:
         polished = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
         self.mirrors = [s for s in scene.shapes() if s.bsdf() is not None and s.bsdf().flags() & polished]
         self._exact = ExactHits(self.mirrors)
-        self._camera_turn, self._camera_place = turn_and_origin(camera.world_transform())
+        self._camera_turn, self.camera_place = turn_and_origin(camera.world_transform())
 
     def follow(self, points: FloatArray) -> Crossings:
         """Send rays through window ``points`` (row, column) (k, 2), in projector pixels."""
@@ -150,14 +150,14 @@ class GlintRays:
         return Crossings.joined(crossings)
 
     def _intersect(self, rays: _Rays) -> mi.SurfaceInteraction3f:
-        ray = mi.Ray3f(mi.Point3f(rays.start.T.astype(np.float32)), mi.Vector3f(rays.direction.T.astype(np.float32)))
+        ray = mi.Ray3f(mi.Point3f(*lanes_of(rays.start)), mi.Vector3f(*lanes_of(rays.direction)))
         si = self._scene.ray_intersect(ray, mi.RayFlags.All, True)
         dr.eval(si)
         return si
 
     def _cross(self, rays: _Rays, distance: FloatArray) -> tuple[Crossings, Mask]:
         """Rays that cross the sensor plane from the front before they meet anything."""
-        origin = (rays.origin - self._camera_place) @ self._camera_turn
+        origin = (rays.origin - self.camera_place) @ self._camera_turn
         direction = rays.direction @ self._camera_turn
         ahead = (origin[:, 2] > 0) & (direction[:, 2] < 0)
         reach = np.full(len(ahead), np.inf)

@@ -1,16 +1,15 @@
-"""Dr.Jit values on the host: from arrays of the renderer, which may hold one number for all lanes, to NumPy's."""
+"""Between Dr.Jit and NumPy: arrays of the renderer, which may hold one number for all lanes, to NumPy's, and back."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
-
-if TYPE_CHECKING:
-    import mitsuba as mi
 
 
 def per_lane(values: mi.Float, count: int) -> npt.NDArray[Any]:
@@ -28,3 +27,15 @@ def vectors(values: mi.Vector3f, count: int) -> FloatArray:
 def channels(spectrum: mi.UnpolarizedSpectrum, count: int) -> FloatArray:
     """(``count``, channels) of a ``spectrum``."""
     return np.stack([per_lane(spectrum[i], count) for i in range(len(spectrum))], axis=1)
+
+
+def lanes_of(vectors: FloatArray) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """Components of ``vectors`` (k, 3) on the device, in single precision.
+
+    Gathered of one array: Dr.Jit takes arrays over as they lie in memory, and compiles kernels that read them anew for
+    each alignment, which is another for nearly every k (50 ms each).
+    """
+    flat = mi.Float(np.ascontiguousarray(vectors, dtype=np.float32).ravel())
+    first = 3 * dr.arange(mi.UInt32, len(vectors))
+    x, y, z = (dr.gather(mi.Float, flat, first + part) for part in range(3))
+    return x, y, z

@@ -24,7 +24,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.rig.projector import Lines
 from mitsim.transport.coordinates import Numbers, turn_and_origin
-from mitsim.transport.host import channels, per_lane
+from mitsim.transport.host import channels, lanes_of, per_lane
 
 _WAVELENGTH_SETS = 8
 """Sets of four wavelengths: 15 nm apart, finer than any measured spectrum that a scene would hold."""
@@ -305,7 +305,7 @@ def _asked(
     world = local @ turn.T
     world *= depth / (world @ forward)[:, None]
     interaction = dr.zeros(mi.SurfaceInteraction3f, len(local))
-    interaction.p = mi.Point3f((origin + world).T.astype(np.float32))
+    interaction.p = mi.Point3f(*lanes_of(origin + world))
     if wavelengths is not None:
         interaction.wavelengths = wavelengths
     sample, emitted = emitter.sample_direction(interaction, mi.Point2f(0.5), True)

@@ -28,8 +28,9 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.rig.patterns import Lighting
 from mitsim.scene.darkness import why_dark
+from mitsim.transport.highlights import highlights
 from mitsim.transport.left_out import LeftOut, left_out_light
-from mitsim.transport.lobes import SharpLight, sharp_light
+from mitsim.transport.lobes import SharpLight, sharp_light, with_neighbours
 
 STAGES = ("cells", "effects", "anchors", "followed", "occluded")
 """What is looked at apart: cells and layers of direct light, effects switched off, anchors, those of followed light,
@@ -77,6 +78,9 @@ _MOST_RAYS = 2**26
 """Rays that look for what a scene shows while few have met it, some 0.5 s: they meet 2e-4 of the window's width."""
 _MORE = 4
 """Times as many rays as before: a power of two keeps the places of each pixel's rays even."""
+_LOOSELY = 0.3
+"""Part of the light of highlights that the search for lobes may lack where it has found them: some 30 hits tell it to a
+fifth."""
 _FEWEST_IN_LOOK = 8.0
 """Hits that a look at a small target must count on: the looks then tell its light to a fifth."""
 _ALIGNED = 1e-6
@@ -114,7 +118,7 @@ class Look:
         depth, centre, hits = _first_light(first, seed, self._sharp)
         # A connection that meets a sharp lobe by chance may be all that the centre sees.
         self._light = self._sharp.rest if self._sharp.irradiance else centre
-        seen = Simulation(bench, Settings(depth=depth, effects=first_look))
+        self._seen = seen = Simulation(bench, Settings(depth=depth, effects=first_look))
         reach = light_reach(seen, integer(seed, "pilot", "reach"))
         own = integer(seed, "pilot", "sharp")
         apart = sharp_pixels(seen, self._sharp, self._light, accuracy, own)
@@ -240,6 +244,20 @@ class Look:
     def _left_out(self) -> LeftOut:
         return _left_out(self.switched.simulation, self.seed)
 
+    @property
+    def _unmet(self) -> float:
+        """Irradiance of glossy balls' highlights that neither the search for lobes nor the looks' rays meet."""
+        loaded, geometry = self.bench.loaded, self.bench.geometry
+        if not loaded.glossy:
+            return 0.0
+        every = highlights(loaded.scene, loaded.camera, self._seen.physics.projector, geometry)
+        unmet = every.unmet(self.samples["cells"].fine * LOOKS)
+        if not len(unmet.pixels):
+            return 0.0
+        near = with_neighbours(np.isin(np.arange(self.bench.n**2), unmet.pixels), self.bench.n)
+        missing = float(unmet.irradiance.sum() - self._sharp.by_pixel[near].sum())
+        return missing if missing > _LOOSELY * float(unmet.irradiance.sum()) else 0.0
+
     def _unsure_glint(self, other: float) -> float:
         """Part of all light that comes over mirrors alone and is in no frame, or may be in the wrong pixels.
 
@@ -264,6 +282,8 @@ class Look:
         left_out, mirror = self._left_out.unseen(_FEWEST_HITS / samples, _FEWEST_MET / samples)
         found = self._light + sharp.irradiance + switched.received
         few = not apart and sharp.hits * self.samples["cells"].fine * LOOKS < _FEWEST_HITS
+        unmet = self._unmet
+        unresolved = unmet + (sharp.irradiance if few else 0.0)
         return Evidence(
             depth=self._base.depth,
             layers=fine.layers,
@@ -277,7 +297,7 @@ class Look:
             from_camera=switched.effort("from_camera"),
             forming=replace(self.forming, lines=self._lines),
             apart=switched.apart,
-            unresolved=sharp.irradiance / (self._light + sharp.irradiance) if few else 0.0,
+            unresolved=unresolved / (self._light + sharp.irradiance + unmet) if unresolved else 0.0,
             left_out=left_out / (left_out + found) if left_out else 0.0,
             glint=self._unsure_glint(found),
             mirror=mirror,

@@ -12,7 +12,7 @@ import numpy as np
 from mitsim.capture.bench import Bench
 from mitsim.capture.evidence import LOOKS, Effort, Noise, Part, Settings
 from mitsim.capture.filing import Tray
-from mitsim.capture.pilot.looks import EVEN_CELLS, Sample, known, ladder, noise, norm
+from mitsim.capture.pilot.looks import EVEN_CELLS, Sample, heavy_paths, known, ladder, noise, norm
 from mitsim.capture.simulation import Simulation
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
@@ -104,9 +104,9 @@ class FollowedLight:
         tracer = simulation.at_anchors[1]
         if tracer is None or not self.changes or not light:
             return Effort.none()
-        seen = [tracer.trace(integer(seed, "heavy"), 0, samples) for seed in self._seeds]
-        error = noise(self._beyond(simulation, seen, samples=samples)) / light
-        return Effort(Noise(error, samples, 0.5), self._simulation().at_anchors[1].lanes)  # type: ignore[union-attr]
+        seen = [heavy_paths(tracer, integer(seed, "heavy"), samples) for seed in self._seeds]
+        frames = self._beyond(simulation, seen, samples=samples)
+        return Effort(Noise.among(frames, light, samples), self._simulation().at_anchors[1].lanes)  # type: ignore[union-attr]
 
     @property
     def _widths(self) -> dict[Part, FloatArray]:

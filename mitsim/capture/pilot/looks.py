@@ -22,7 +22,9 @@ from mitsim.core.parallel import in_threads
 from mitsim.optics.closed_form import Entries
 from mitsim.optics.shadow import Places
 from mitsim.rig.patterns import Lighting
-from mitsim.transport.histogram import Deposits
+from mitsim.transport.from_camera import FromCameraTracer
+from mitsim.transport.histogram import AMBIENT, Deposits
+from mitsim.transport.lamps import Together
 
 _Method = TypeVar("_Method", bound=Callable[..., Any])
 Known = dict[Hashable, tuple[Sequence[Deposits], FloatArray]]
@@ -43,6 +45,8 @@ _PIXELS = 64**2
 """Few pixels are sampled more often, until they take as many samples as so many pixels."""
 _MOST_PATHS = 2**20
 """Paths of one look that are held at a time: 60 MB."""
+_AT_ONCE = 2**19
+"""Paths of a longer look that are held at a time: 30 MB."""
 _CLOSER = 16
 """Times the samples of a look that a closer look takes at most: its standard errors are a quarter; of four, they were
 as large as before in half of the cases (cookie_bag, corner)."""
@@ -338,6 +342,19 @@ def product(one: FloatArray, other: FloatArray) -> float:
 def norm(seen: FloatArray) -> float:
     """Norm of frames ``seen`` in looks, without their noise."""
     return math.sqrt(max(product(seen, seen), 0.0))
+
+
+def heavy_paths(tracer: FromCameraTracer | Together, seed: int, samples: int) -> Deposits:
+    """The projector's light, a few samples at a time: few paths bring any, but lamps shine on all of them.
+
+    Parameters
+    ----------
+    tracer, seed, samples
+        from the camera's side, the root of its random numbers, and how many are traced.
+    """
+    each = max(1, _AT_ONCE // tracer.lanes)
+    parts = [tracer.trace(seed, first, min(each, samples - first)) for first in range(0, samples, each)]
+    return Deposits.joined([part.where(part.kind != AMBIENT) for part in parts])
 
 
 def noise(seen: FloatArray) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 from mitsim.capture.bench import Bench
 from mitsim.capture.effects import DIRECT, EFFECTS, FOLLOWED, Effect
 from mitsim.capture.evidence import LOOKS, Changes, Effort, Noise, Part, Settings
-from mitsim.capture.pilot.looks import Known, Sample, coarsened, noise, norm
+from mitsim.capture.pilot.looks import Known, Sample, coarsened, heavy_paths, noise, norm
 from mitsim.capture.pilot.sharp import SHARP_RATE
 from mitsim.capture.prices import SHARED_COST
 from mitsim.capture.simulation import Simulation, emitted
@@ -149,9 +149,9 @@ class SwitchedEffects:
         tracer = self.simulation.from_camera
         if tracer is None or not self.light:
             return Effort.none()
-        seen = [tracer.trace(integer(seed, "heavy"), 0, samples) for seed in self.seeds]
+        seen = [heavy_paths(tracer, integer(seed, "heavy"), samples) for seed in self.seeds]
         frames = self._form(self.simulation, followed=self._by_kind({"from_camera": seen}), samples=samples)
-        return Effort(Noise(noise(frames) / self.light, samples, 0.5), tracer.lanes)
+        return Effort(Noise.among(frames, self.light, samples), tracer.lanes)
 
     def indirect_effort(self) -> tuple[Effort, bool, tuple[int, ...]]:
         """What light over several surfaces takes, whether that is less where neighbouring pixels share it, and how

@@ -1,19 +1,25 @@
-"""Plans within a time: what is looked at, how finely, and what of the time is left for light, of invented prices."""
+"""Plans within a time: what is looked at, how finely, and what of the time is left for light, of invented prices; paces
+of invented launches, and samples for rare heavy paths."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from mitsim.capture import pilot, planning
 from mitsim.capture.affordable import FIRST_LOOK
+from mitsim.capture.choice import _BOUND_OVER_ERROR, Choice, _needed, cheapest
+from mitsim.capture.evidence import GROUPS, LOOKS, MOST_PATHS, Effort, Noise
 from mitsim.capture.plan import Plan
+from mitsim.optics.frames import bound_of
 from mitsim.rig.patterns import Lighting
-from tests.unit.capture.invented_evidence import plan
+from tests.unit.capture.invented_evidence import ONE_CLASS, plan
 
 LIGHTING, SEED, LOOKING, FRAMES = Lighting.uniform(4), 7, 0.5, {"sensor": 0.2, "write": 0.1}
 AROUND = planning.OPENING_S + sum(FRAMES.values()) + LOOKING
@@ -130,3 +136,102 @@ def test_a_finer_look_that_finds_no_accuracy_kept_takes_none_away(looks: Looks) 
     looks.kept = 1.0
     found = within(11.01)
     assert len(looks.asked) == 2 and found.accuracy == 1e-3 and found.warnings == (OWN,)
+
+
+LAUNCH_S, PATH_S = 0.02, 1e-7
+"""What an invented machine takes for each launch, and for each path of it."""
+
+
+@dataclass
+class Machine:
+    """Stands in for a stage's launches; one of them, by its number, takes ten times as long as it should."""
+
+    disturbed: int = -1
+    launches: list[int] = field(default_factory=list)
+
+    def seconds(self, stage: Any, seed: int, labels: object, samples: int) -> float:
+        self.launches.append(samples)
+        taken = LAUNCH_S + PATH_S * samples * stage.tracer.lanes
+        return 10 * taken if len(self.launches) - 1 == self.disturbed else taken
+
+
+@pytest.mark.parametrize("lanes", [4000, 25_280, 300_000])
+@pytest.mark.parametrize("planned", [3, 100, 5000])
+@pytest.mark.parametrize("disturbed", [-1, 0, 1, 2, 3, 4, 5, 6])
+def test_paces_are_those_of_launches_as_the_run_has_them(
+    monkeypatch: pytest.MonkeyPatch, lanes: int, planned: int, disturbed: int
+) -> None:
+    """Within 1.5 times of what all launches of the run take together, one slow moment or none, where that is more than
+    a second. (Planted: the pace of the first launch alone, 4 times too slow; the slower of two launches.)"""
+    at_once, machine = 2**21, Machine(disturbed)
+    monkeypatch.setattr(planning, "_seconds", machine.seconds)
+    stage: Any = SimpleNamespace(tracer=SimpleNamespace(lanes=lanes))
+    pace, longest = planning._pace(stage, at_once, planned, None, SEED)  # type: ignore[arg-type]
+    launches = math.ceil(planned / (at_once // lanes))
+    taken = GROUPS * (launches * LAUNCH_S + planned * lanes * PATH_S)
+    if disturbed < 0 or taken > 1.0:
+        assert GROUPS * planned * pace == pytest.approx(taken, rel=0.15 if disturbed < 0 and planned > 3 else 0.5)
+        assert longest == pytest.approx(PATH_S * lanes, rel=0.5) or planned * lanes < 1e6
+    assert sum(machine.launches[1:]) <= max(2 + 2**16 / lanes, 0.3 * GROUPS * planned)
+
+
+class Heavy:
+    """A look at evidence whose light from the camera turns out to have noise of such a variance in a sample."""
+
+    def __init__(self, variance: float, spread: float = 0.0) -> None:
+        self.evidence = replace(ONE_CLASS, followed_from_camera=replace(ONE_CLASS.followed, seconds=0.0))
+        self.variance, self.spread, self.looked = variance, spread, list[int]()
+
+    def heavy(self, samples: int) -> dict[str, Effort]:
+        self.looked.append(samples)
+        noise = Noise(math.sqrt(self.variance / samples), samples, 0.5, self.spread)
+        return {"from_camera": Effort(noise, self.evidence.from_camera.paths)}
+
+
+def planned_with(look: Any, accuracy: float = 3e-3) -> tuple[Choice, Choice]:
+    """The choice by the look's evidence, and that with heavy paths."""
+    chosen = cheapest(accuracy, look.evidence, {})
+    assert "interreflection" in chosen.settings.effects
+    return chosen, planning._with_heavy_paths(look, accuracy, chosen, {})[1]
+
+
+def test_rare_heavy_paths_are_sampled_from_the_first() -> None:
+    """The run begins with the samples that looks at more paths ask for. (Planted: the settings stay as they were, and
+    a run that meets none of these paths ends without them.)"""
+    plain = ONE_CLASS.from_camera.variance
+    same, unchanged = planned_with(Heavy(1.01 * plain))
+    assert unchanged is same
+    look = Heavy(400 * plain)
+    before, after = planned_with(look)
+    target = after.target
+    left = math.sqrt(look.variance / after.settings.from_camera_samples / GROUPS)
+    assert after.settings.from_camera_samples > 20 * before.settings.from_camera_samples and left < target
+    assert look.looked == sorted(look.looked) and look.looked[-1] * LOOKS * look.evidence.from_camera.paths <= 2**23
+    _, more = planned_with(Heavy(400 * plain, spread=4.0))
+    assert more.settings.from_camera_samples > 1.02 * after.settings.from_camera_samples
+    _, most = planned_with(Heavy(1e9 * plain))
+    assert most.settings.from_camera_samples * GROUPS * ONE_CLASS.from_camera.paths == pytest.approx(MOST_PATHS)
+
+
+def test_bounds_of_few_heavy_paths_take_more_samples() -> None:
+    """Sampling stops where a bound meets the target: of groups that some equal heavy paths meet by chance, half of the
+    bounds do with so many samples. (Planted: samples for the error alone, 9 % of the bounds.)"""
+    rate, per_look = 2.0, 50  # heavy paths in a look of so many samples
+    # Each brings an energy of 1 in its own pixels: variance of a sample, and of a look's energy over its square.
+    noise, target = Noise(math.sqrt(rate) / per_look, per_look, 0.5, 1 / rate), 1e-2
+    samples = float(_needed(Effort(noise, 1), target * math.sqrt(GROUPS) / _BOUND_OVER_ERROR))
+    rng = np.random.default_rng(5)
+    met = rng.poisson(rate * samples / per_look, (4000, GROUPS)).astype(np.float64)
+    bounds = np.array([bound_of(each / (samples * GROUPS) ** 2, 1.0) for each in met])
+    assert 0.35 < float((bounds < target).mean()) < 0.75
+
+
+def test_noise_tells_how_unlike_looks_are() -> None:
+    """Four looks of which one has all the noise: a relative variance of 16/9 about; of even noise next to none."""
+    rng = np.random.default_rng(6)
+    even, one = rng.normal(size=(LOOKS, 4000)), np.zeros((LOOKS, 4000))
+    one[2] = even[2]
+    assert Noise.among(even, 2.0, 8).spread < 0.01
+    assert Noise.among(even, 2.0, 8).error == pytest.approx(math.sqrt(4000) / 2, rel=0.05)
+    assert Noise.among(one, 2.0, 8).spread == pytest.approx(16 / 9, rel=0.01)
+    assert Noise.among(np.zeros((LOOKS, 3)), 2.0, 8) == Noise(0.0, 8, 0.5)
