@@ -21,7 +21,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import Channel, finite_channel, read_frame, write_frame
 from mitsim.core.output import whole_file
-from mitsim.core.plainfile import MOST_SIDE
+from mitsim.core.plainfile import FRAME_LIMITS, fits_a_frame
 from mitsim.core.resources import Cost, Limits
 from mitsim.core.seeds import stream
 from mitsim.core.versions import versions
@@ -184,8 +184,8 @@ def read_image(path: Path | str, channel: str | None = None) -> tuple[FloatArray
                 array = Npy.of(file, path.stat().st_size)
                 if array.dtype.kind not in "buif":
                     raise ValueError(f"{array.dtype} are no real numbers")
-                if max(array.shape, default=0) > MOST_SIDE:
-                    raise ValueError(f"its shape is {array.shape}; at most {MOST_SIDE} pixels a side are allowed")
+                if not fits_a_frame(array.shape):
+                    raise ValueError(f"its shape is {array.shape}; {FRAME_LIMITS} are allowed")
                 Cost(memory_bytes=_PIXEL_BYTES * math.prod(array.shape)).check(f"image {path}", Limits())
                 return np.asarray(array.part(file), dtype=np.float64), ()
         except (OSError, ValueError) as error:

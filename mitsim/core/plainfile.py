@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import os
 import stat
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -14,6 +15,16 @@ from mitsim.core.errors import MitsimError
 _silence = threading.RLock()
 MOST_SIDE = 16384
 """Pixels a side of the largest picture that is read: of the largest sensor and environment map that are simulated."""
+MOST_PIXELS = 1 << 26
+"""Of a frame or other picture, 8192 x 8192: sixteen times the largest sensors that coded masks are used with (2048 a
+side), read and checked in some 5 s and 1.6 GB; of a larger sensor a region or binned frames are read."""
+FRAME_LIMITS = f"at most {MOST_SIDE} pixels a side and {MOST_PIXELS} in all"
+"""For messages."""
+
+
+def fits_a_frame(shape: Sequence[int]) -> bool:
+    """Whether a picture of these sides is no larger than a frame may be."""
+    return max(shape, default=0) <= MOST_SIDE and math.prod(shape) <= MOST_PIXELS
 
 
 def check_plain(path: Path | str, what: str = "file") -> os.stat_result:
