@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.plainfile import read_text
+from mitsim.core.plainfile import read_text, resolved
 
 LOCK = ".mitsim.lock"
 """Held, in a folder, by the process that writes there; a killed process leaves the file behind, but not the lock. That
@@ -34,7 +34,9 @@ def whole_file(path: Path | str) -> Iterator[Path]:
     """
     path = Path(path)
     _check_plain(path)
-    target = path.resolve()
+    target = resolved(path)
+    if target.is_symlink():
+        raise MitsimError(f"file {path}: cannot be written (it is a link that leads to itself); remove it")
     part = _beside(target, f".{os.getpid()}-{threading.get_ident()}.part")
     try:
         yield part
@@ -142,7 +144,7 @@ def output_file(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     MitsimError as for :func:`prepare_output`, and when another process holds the file.
     """
     path = prepare_output(path, overwrite, "file")
-    with _locked(path, _beside(path.resolve(), LOCK)):
+    with _locked(path, _beside(resolved(path), LOCK)):
         yield prepare_output(path, overwrite, "file")  # nobody wrote it between the first look and the lock
 
 
@@ -161,10 +163,10 @@ def check_apart(path: Path | str, inputs: Iterable[Path | str]) -> None:
     MitsimError
         when the output is one of the files, by whatever name, or a file in one of the folders.
     """
-    place = Path(path).resolve()
+    place = resolved(path)
     for each in map(Path, inputs):
-        same = place == each.resolve() or (place.exists() and each.exists() and place.samefile(each))
-        if same or (each.is_dir() and place.exists() and place.is_relative_to(each.resolve())):
+        same = place == resolved(each) or (place.exists() and each.exists() and place.samefile(each))
+        if same or (each.is_dir() and place.exists() and place.is_relative_to(resolved(each))):
             raise MitsimError(f"output {path}: would replace {each}, which is read; choose another name")
 
 

@@ -42,6 +42,12 @@ def check_plain(path: Path | str, what: str = "file") -> os.stat_result:
     return status
 
 
+def resolved(path: Path | str) -> Path:
+    """Where ``path`` leads, links followed as far as they lead: ``Path.resolve`` raises RuntimeError for one that leads
+    to itself, before Python 3.13."""
+    return Path(os.path.realpath(path))
+
+
 @contextmanager
 def stderr_silenced() -> Iterator[None]:
     """What native code writes to stderr of a damaged file, past Python, goes nowhere: it raises too. One thread at a
