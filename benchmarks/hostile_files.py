@@ -402,7 +402,7 @@ def arrays(good: Good) -> Make:
             elif which == 6:
                 file.create_dataset(name, data=[b"{" * chance.choice((1, 99_999))] * chance.choice((1, 6)))
             elif which == 7:
-                file[name] = file[chance.choice(("/", "run", "calibration"))]
+                file[name] = file["run" if "run" in file and chance.random() < 0.5 else "/"]
             else:
                 shape = chance.choice(((0,), (0, 0), (6, 0, 52), (1,) * 30, (6, 40, 52, 1)))
                 file.create_dataset(name, data=np.zeros(shape, chance.choice(("u4", "f4", "u1"))))

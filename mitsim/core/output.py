@@ -33,6 +33,7 @@ def whole_file(path: Path | str) -> Iterator[Path]:
     MitsimError when the file cannot be written, or is no plain file; a link stays, and its file is replaced.
     """
     path = Path(path)
+    _check_name(path)
     _check_plain(path)
     target = resolved(path)
     if target.is_symlink():
@@ -81,10 +82,7 @@ def prepare_output(path: Path | str, overwrite: bool = False, kind: Literal["fol
         ``overwrite`` is off, or has a name that is not UTF-8, which OpenEXR cannot open.
     """
     path = Path(path)
-    try:
-        os.fspath(path.absolute()).encode()
-    except UnicodeEncodeError:
-        raise MitsimError(f"output {path}: is not UTF-8 text; choose a folder with another name") from None
+    _check_name(path)
     if not path.parent.is_dir():
         raise MitsimError(f"output {path}: the folder {path.parent} does not exist; create it or choose another")
     if kind == "file":
@@ -92,6 +90,14 @@ def prepare_output(path: Path | str, overwrite: bool = False, kind: Literal["fol
     else:
         _prepare_folder(path, overwrite)
     return path
+
+
+def _check_name(path: Path) -> None:
+    """MitsimError for a name that OpenEXR and HDF5 cannot open."""
+    try:
+        os.fspath(path.absolute()).encode()
+    except UnicodeEncodeError:
+        raise MitsimError(f"output {path}: is not UTF-8 text; choose a folder with another name") from None
 
 
 def check_output(path: Path | str, overwrite: bool = False, kind: Literal["folder", "file"] = "folder") -> None:

@@ -158,9 +158,7 @@ def _looked_into(path: Path, look: Callable[..., Any]) -> Any:
         with open(path, "rb") as file:
             return look(file)
     except NotImplementedError:
-        raise MitsimError(
-            f"{path}: is HDF5 (version 7.3); save it in MATLAB with -v7, or name an export .h5"
-        ) from None
+        raise MitsimError(f"{path}: is HDF5 (version 7.3); save it in MATLAB with -v7, or name an export .h5") from None
     except Exception as error:  # SciPy's reader raises of all kinds
         reason = " ".join(str(error).split()) or type(error).__name__
         raise MitsimError(f"{path}: damaged, or no MATLAB file ({reason}); write or copy it again") from error
