@@ -74,7 +74,11 @@ class Packed(Generic[Manifest]):
         another version, or channels that the exchange left out.
         """
         for name in dict.fromkeys(self.names):
-            write_frame(folder / name, *self.read(name))
+            channels, metadata = self.read(name)
+            try:
+                write_frame(folder / name, channels, metadata)
+            except (TypeError, ValueError) as error:
+                raise MitsimError(f"{self.place}: {name} is no frame ({error}); export it again") from error
         stated = self.manifest.checksums
         sums = {name: checksum(folder / name) for name in stated if name in self.names}
         if sums == stated and self.text:

@@ -173,6 +173,7 @@ def test_checksums_follow_the_bytes_that_were_written(bench: Made, tmp_path: Pat
         ("run/truth/reflectance", {"shape": (1 << 33, 4), "dtype": "f4", "chunks": (1, 4)}, "not all is stored"),
         ("run/truth/reflectance", {"data": np.zeros((9, 9), "f4"), "compression": "lzf"}, "filters other than gzip"),
         ("run/truth/reflectance", {"data": np.zeros((9, 9), "f4"), "scaleoffset": 3}, "filters other than gzip"),
+        ("run/truth/reflectance", {"data": np.zeros((9, 9), "f4")}, "truth.exr is no frame .*all must be one"),
         (
             "run/truth/reflectance",
             {"shape": (9, 9), "dtype": "f4", "chunks": (16000, 16000), "maxshape": (None, None)},
