@@ -145,6 +145,11 @@ def sense(
         whose file has no quantum efficiency.
     """
     check_wavelength(wavelength_nm)
+    if sensor.mosaic is not None:
+        raise MitsimError(
+            f"sensor {sensor.name!r}: has a mosaic {sensor.mosaic} of colour filters, which an image of one channel "
+            "does not tell apart; use a monochrome camera, or capture a scene with --colour mosaic"
+        )
     light = np.asarray(irradiance, dtype=np.float64)
     if light.ndim != 2 or not light.size or not (light.min() >= 0 and light.max() < np.inf):
         shown = f"the range is {light.min()} to {light.max()}" if light.size else "it is empty"
