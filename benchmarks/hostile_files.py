@@ -33,6 +33,9 @@ from tests.real_session import RealSession
 
 ROOT = Path(__file__).parents[1]
 FRAMES = ("--camera", "imx249", "--patterns", "uniform", "--exposure", "0.1", "--projector-pixels", "4")
+ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".webp", ".bmp", ".gif", ".PNG", ".Tif", ".npy", ".exr")
+MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr", "LAB", "I", "I;16", "I;16B", "F")
+PACKINGS = ("raw", "tiff_lzw", "tiff_adobe_deflate", "packbits", "group4", "jpeg", "zstd", "lzma", "webp")
 Make = Callable[[random.Random, Path], Sequence[str]]
 """Puts an input into a folder, and gives the command that reads it, writing to ``folder / "out"`` alone."""
 
@@ -261,55 +264,53 @@ def matlab(good: Good) -> Make:
     return make
 
 
+def interlaced(bits: int, colour: int) -> bytes:
+    """A PNG of 10 x 8 pixels whose lines come in seven passes (ISO/IEC 15948, 8.2)."""
+    samples = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}[colour]
+    passes = ((8, 8, 0, 0), (8, 8, 0, 4), (8, 4, 4, 0), (4, 4, 0, 2), (4, 2, 2, 0), (2, 2, 0, 1), (2, 1, 1, 0))
+    rows = b""
+    for down, right, top, left in passes:
+        lines, columns = -(-(8 - top) // down), -(-(10 - left) // right)
+        rows += bytes(1 + -(-columns * bits * samples // 8)) * lines
+    head = struct.pack(">IIBBBBB", 10, 8, bits, colour, 0, 0, 1)
+    palette = chunk(b"PLTE", bytes(3 * 2 ** min(bits, 8))) if colour == 3 else b""
+    body = palette + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + body
+
+
+def save_picture(folder: Path, chance: random.Random) -> Path:
+    """A picture as a program writes it: in colours, with a palette, transparency or a profile, packed, interlaced,
+    signed, of real numbers, or under the name of another kind."""
+    path = folder / f"a{chance.choice(ENDINGS)}"
+    if chance.random() < 0.15:
+        path.write_bytes(interlaced(chance.choice((1, 2, 4, 8, 16)), chance.choice((0, 2, 3, 4, 6))))
+        return path
+    picture = Image.new(chance.choice(MODES), chance.choice(((10, 8), (1, 1), (400, 3))), chance.choice((0, 1)))
+    kind = chance.choice(("PNG", "TIFF", "TIFF", "JPEG", "WEBP", "BMP", "GIF", "PPM", "ICO", "JPEG2000"))
+    if kind in ("PNG", "TIFF", "JPEG") and chance.random() < 0.8:
+        path = folder / {"PNG": "a.png", "TIFF": "a.tif", "JPEG": "a.jpg"}[kind]
+    more: dict[str, Any] = {}
+    if kind == "TIFF":
+        more = {"compression": chance.choice(PACKINGS), "big_tiff": chance.random() < 0.4}
+        if chance.random() < 0.4:
+            number = chance.choice((254, 262, 266, 284, 317, 322, 339, 270, 33432, 34675, 65000))
+            more["tiffinfo"] = {number: chance.choice((0, 1, 2, 65535, "x" * 9999))}
+    if chance.random() < 0.3:
+        profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+        more["icc_profile"] = chance.choice((profile, b"", bytes(70_000)))
+    if chance.random() < 0.2 and kind == "PNG":
+        more["transparency"] = 0
+    try:
+        with stderr_silenced():
+            picture.save(path, format=kind, **more)
+    except (OSError, ValueError, TypeError, KeyError, SystemError, RuntimeError, struct.error):
+        Image.new("L", (10, 8)).save(path, format="PNG")  # what the writer has not: a good one under some name
+    return path
+
+
 def saved(good: Good) -> Make:
-    """Pictures as programs write them, of which most are no frames: in colours, with palettes, transparency or
-    profiles, packed, interlaced, signed, of real numbers, and under names of other kinds."""
-    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-    packings = ("raw", "tiff_lzw", "tiff_adobe_deflate", "packbits", "group4", "jpeg", "zstd", "lzma", "webp")
-    endings = (".png", ".tif", ".tiff", ".jpg", ".webp", ".bmp", ".gif", ".PNG", ".Tif", ".npy", ".exr")
-
-    def interlaced(bits: int, colour: int) -> bytes:
-        samples = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}[colour]
-        passes = ((8, 8, 0, 0), (8, 8, 0, 4), (8, 4, 4, 0), (4, 4, 0, 2), (4, 2, 2, 0), (2, 2, 0, 1), (2, 1, 1, 0))
-        rows = b""
-        for down, right, top, left in passes:
-            lines, columns = -(-(8 - top) // down), -(-(10 - left) // right)
-            rows += bytes(1 + -(-columns * bits * samples // 8)) * lines
-        head = struct.pack(">IIBBBBB", 10, 8, bits, colour, 0, 0, 1)
-        palette = chunk(b"PLTE", bytes(3 * 2 ** min(bits, 8))) if colour == 3 else b""
-        body = palette + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
-        return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + body
-
-    def make(chance: random.Random, folder: Path) -> Sequence[str]:
-        path = folder / f"a{chance.choice(endings)}"
-        if chance.random() < 0.15:
-            path.write_bytes(interlaced(chance.choice((1, 2, 4, 8, 16)), chance.choice((0, 2, 3, 4, 6))))
-            return reading(path, chance)
-        mode = chance.choice(
-            ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr", "LAB", "I", "I;16", "I;16B", "F")
-        )
-        picture = Image.new(mode, chance.choice(((10, 8), (1, 1), (400, 3))), chance.choice((0, 1)))
-        kind = chance.choice(("PNG", "TIFF", "TIFF", "JPEG", "WEBP", "BMP", "GIF", "PPM", "ICO", "JPEG2000"))
-        if kind in ("PNG", "TIFF") and chance.random() < 0.8:
-            path = folder / ("a.png" if kind == "PNG" else "a.tif")
-        more: dict[str, Any] = {}
-        if kind == "TIFF":
-            more = {"compression": chance.choice(packings), "big_tiff": chance.random() < 0.4}
-            if chance.random() < 0.4:
-                number = chance.choice((254, 262, 266, 284, 317, 322, 339, 270, 33432, 34675, 65000))
-                more["tiffinfo"] = {number: chance.choice((0, 1, 2, 65535, "x" * 9999))}
-        if chance.random() < 0.3:
-            more["icc_profile"] = chance.choice((profile, b"", bytes(70_000)))
-        if chance.random() < 0.2 and kind == "PNG":
-            more["transparency"] = 0
-        try:
-            with stderr_silenced():
-                picture.save(path, format=kind, **more)
-        except (OSError, ValueError, TypeError, KeyError, SystemError, RuntimeError, struct.error):
-            Image.new("L", (10, 8)).save(path, format="PNG")  # what the writer has not: a good one under some name
-        return reading(path, chance)
-
-    return make
+    """Pictures as programs write them, of which most are no frames."""
+    return lambda chance, folder: reading(save_picture(folder, chance), chance)
 
 
 def openexr(good: Good) -> Make:

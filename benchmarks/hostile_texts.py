@@ -12,11 +12,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hostile_files import FRAMES, Good, Make
+from hostile_files import FRAMES, Good, Make, save_picture
 
-from tests.hard.fuzz import bytes_changed, json_changed
+from tests.hard.fuzz import PART, RICH, bytes_changed, json_changed, scene_changed
 from tests.hard.hostile import GOOD as SCENE
-from tests.hard.hostile import beside
+from tests.hard.hostile import MESH, OBJ, beside, mesh, picture, put
 from tests.hard.test_hostile_scenes import CASES as SCENES
 
 
@@ -220,6 +220,68 @@ def scenes(good: Good) -> Make:
     return make
 
 
+def changed_scenes(good: Good) -> Make:
+    """Scenes with values, objects and bytes changed; with bitmaps and meshes of other kinds, in other places and under
+    odd names; includes that come back; odd values of parameters."""
+    odd = (
+        "a\nb.png",
+        "\x1b[2J.png",
+        "-o.png",
+        "../a.png",
+        "/etc/passwd",
+        "a\\b.png",
+        "é.png",
+        "%s.png",
+        "$albedo",
+        " ",
+    )
+
+    def make(chance: random.Random, folder: Path) -> Sequence[str]:
+        place = folder / "scene"
+        place.mkdir()
+        beside(place)
+        (place / "part.xml").write_text(PART, encoding="utf-8")
+        which, text = chance.randrange(5), RICH
+        if which in (0, 1):
+            text = scene_changed(RICH, chance)
+        elif which == 2:
+            path = save_picture(place, chance)
+            if chance.random() < 0.3:
+                misplace(path, chance)
+            text = picture(chance.choice(odd) if chance.random() < 0.2 else path.name)
+        elif which == 3:
+            name, content = chance.choice((("m.ply", MESH), ("m.obj", OBJ)))
+            (place / name).write_bytes(bytes_changed(content.encode(), chance))
+            text = mesh(name, name[2:])
+        else:
+            last = chance.choice(("part.xml", "0.xml", "scene.xml", "./0.xml", "no.xml", "..", "/dev/zero"))
+            links = chance.choice((1, 2, 40))
+            for number in range(links):
+                following = f"{number + 1}.xml" if number + 1 < links else last
+                include = f'<include filename="{following}"/>'
+                (place / f"{number}.xml").write_text(f'<scene version="3.0.0">{include}</scene>')
+            text = put('<include filename="0.xml"/>')
+        data = text.encode()
+        (place / "scene.xml").write_bytes(bytes_changed(data, chance) if chance.random() < 0.2 else data)
+        scene, out = str(place / "scene.xml"), str(folder / "out")
+        words = ("albedo=", "albedo=nan", "albedo=2", "nope=1", "=1", "albedo=$x", "albedo=0.5\n", "albedo=<a/>")
+        define = ("-D", chance.choice(words)) if chance.random() < 0.2 else ()
+        return (
+            *chance.choice(
+                (
+                    ("plan", scene, "--patterns", "uniform"),
+                    ("capture", scene, "-o", out, "--patterns", "uniform"),
+                    ("calibrate", scene, "-o", out),
+                    ("render", scene, "-o", out + ".exr"),
+                    ("transport", scene, "-o", out + ".h5"),
+                )
+            ),
+            *define,
+        )
+
+    return make
+
+
 NUMBERS = (
     *(
         "0",
@@ -347,9 +409,8 @@ def devices(good: Good) -> Make:
         out, scene = str(folder / "out"), _scene(folder)
         if which == "recipe":
             return ("calibrate", str(folder / "no.xml"), "--recipe", str(path), "-o", out)
-        # Devices are read before the renderer is, which this variant ends.
         option = "--projector" if which == "projector" else "--camera"
-        plan = ("plan", scene, "--variant", "cuda_ad_mono", option, str(path))
+        plan = ("plan", scene, "--patterns", "uniform", option, str(path))
         if which != "camera":
             return plan
         light, camera = str(good.folder / "light.npy"), ("--camera", str(path))
