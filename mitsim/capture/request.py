@@ -127,6 +127,7 @@ class Request(BaseModel):
     ambient_shots: int | None = Field(None, description="shots of that frame; None: by the patterns")
 
     def __init__(self, **values: Any) -> None:
+        """Of the fields' ``values``, as they are; MitsimError as :meth:`of`."""
         try:
             super().__init__(**values)
         except ValidationError as error:

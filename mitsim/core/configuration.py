@@ -90,7 +90,8 @@ def validated(model: type[Model], data: dict[str, Any], where: str, context: obj
 
 
 def refusal(model: type[pydantic.BaseModel], error: pydantic.ValidationError, where: str) -> MitsimError:
-    """What pydantic found wrong with a ``model``, after ``where``, as :func:`validated` raises it."""
+    """The ``error`` that pydantic raised for a ``model`` in one line that begins with ``where``: what :func:`validated`
+    raises."""
     problems = error.errors(include_url=False)
     # A mistyped name is both an unknown field and a missing one; the first tells more.
     first = next((problem for problem in problems if problem["type"] == "extra_forbidden"), problems[0])

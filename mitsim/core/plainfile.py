@@ -23,7 +23,7 @@ FRAME_LIMITS = f"at most {MOST_SIDE} pixels a side and {MOST_PIXELS} in all"
 
 
 def fits_a_frame(shape: Sequence[int]) -> bool:
-    """Whether a picture of these sides is no larger than a frame may be."""
+    """Whether a picture of this ``shape`` (rows, columns) is no larger than a frame may be."""
     return max(shape, default=0) <= MOST_SIDE and math.prod(shape) <= MOST_PIXELS
 
 
