@@ -90,8 +90,17 @@ def validated(model: type[Model], data: dict[str, Any], where: str, context: obj
 
 
 def refusal(model: type[pydantic.BaseModel], error: pydantic.ValidationError, where: str) -> MitsimError:
-    """The ``error`` that pydantic raised for a ``model`` in one line that begins with ``where``: what :func:`validated`
-    raises."""
+    """What pydantic found wrong, as :func:`validated` raises it.
+
+    Parameters
+    ----------
+    model
+        that was to be made.
+    error
+        that pydantic raised.
+    where
+        what the message begins with.
+    """
     problems = error.errors(include_url=False)
     # A mistyped name is both an unknown field and a missing one; the first tells more.
     first = next((problem for problem in problems if problem["type"] == "extra_forbidden"), problems[0])
