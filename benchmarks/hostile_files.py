@@ -102,7 +102,8 @@ def pictures(good: Good) -> Make:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
     def png(width: int, height: int, more: bytes = b"", bits: int = 8, lines: int | None = None) -> bytes:
-        rows = zlib.compress(bytes((width * bits // 8 + 1) * (height if lines is None else lines)))
+        size = (width * bits // 8 + 1) * (height if lines is None else lines)
+        rows = zlib.compress(bytes(min(size, 1 << 20)))
         head = struct.pack(">IIBBBBB", width, height, bits, 0, 0, 0, 0)
         return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + more + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
 

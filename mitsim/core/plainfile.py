@@ -17,7 +17,8 @@ MOST_SIDE = 16384
 """Pixels a side of the largest picture that is read: of the largest sensor and environment map that are simulated."""
 MOST_PIXELS = 1 << 26
 """Of a frame or other picture, 8192 x 8192: sixteen times the largest sensors that coded masks are used with (2048 a
-side), read and checked in some 5 s and 1.6 GB; of a larger sensor a region or binned frames are read."""
+side); an import of one predicts 1.7 GB and takes 2.5 s of processor time. Of a larger sensor a region or binned frames
+are read."""
 FRAME_LIMITS = f"at most {MOST_SIDE} pixels a side and {MOST_PIXELS} in all"
 """For messages."""
 
