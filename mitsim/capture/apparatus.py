@@ -149,9 +149,11 @@ class Apparatus:
 
     @checked
     def parallax_from(self, depth: float) -> Parallax:
-        """The same of a calibration at ``depth`` [mm]."""
+        """The same of a calibration at ``depth`` [mm]; ArgumentError for one that is not beyond the mask."""
         from mitsim.core.manifests import Parallax
 
+        if depth <= self.geometry.mask_distance:
+            raise ArgumentError("depth", f"{depth:g}: the mask is at {self.geometry.mask_distance:g} mm; give more")
         window = self.windows_at(depth)
         farther = self.windows_at(2 * depth)  # in 1/z halfway to infinity: far enough that rounding of uv does not show
         shift = 1 / (2 * depth) - 1 / depth

@@ -124,8 +124,8 @@ def open_bench(
         try:
             sensor.efficiency(light.effective_wavelength_nm)
         except MitsimError as error:
-            pitch = f"{sensor.superpixel_pitch_um * 1e-3:g}"
-            raise MitsimError(f"camera {sensor_path}: {error}; its scene has a pixel_pitch of {pitch} mm") from None
+            fits = f"it goes with scenes whose pixel_pitch is {sensor.superpixel_pitch_um * 1e-3:g} mm"
+            raise MitsimError(f"camera {sensor_path}: {error}; {fits}") from None
     # Only now, with all else checked: the renderer takes a second to import.
     loaded = _loaded(variant, path, defines, needs_projector=not for_render, outside=allow_outside_files)
     row_um = (sensor.row_pitch_um or sensor.pixel_pitch_um) * sensor.binning

@@ -152,6 +152,7 @@ class Plan:
         systematic = self.systematic_error, self.systematic_bound
         return Estimate(*(math.hypot(*both) for both in zip(systematic, noise, strict=True)))
 
+    @checked
     def taking(self, **seconds: float) -> Plan:
         """The same plan, with the ``seconds`` of more stages in its prediction."""
         stages = {**self.predicted, **seconds}

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from mitsim.capture.effects import check_switches, parse_switches
-from mitsim.core.configuration import validated
+from mitsim.core.configuration import refusal, validated
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.seeds import check_root
 from mitsim.rig.families import NAMES, check_patterns
@@ -125,6 +125,13 @@ class Request(BaseModel):
     noise_fraction: float | None = Field(None, description="stop sampling at this part of the sensor's noise")
     ambient_frame: Literal["auto", "yes", "no"] = Field("auto", description="whether a frame of ambient light is taken")
     ambient_shots: int | None = Field(None, description="shots of that frame; None: by the patterns")
+
+    def __init__(self, **values: Any) -> None:
+        """Of the fields' ``values``, as they are; MitsimError as :meth:`of`."""
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            raise refusal(type(self), error, "request") from error
 
     @classmethod
     def of(cls, **values: object) -> Request:

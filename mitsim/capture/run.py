@@ -22,7 +22,7 @@ from mitsim.capture.plan import Plan
 from mitsim.capture.planning import make_plan, plan_within
 from mitsim.capture.request import Request
 from mitsim.capture.shooting import Shooting, Totals
-from mitsim.core.errors import ArgumentError
+from mitsim.core.errors import ArgumentError, cut
 from mitsim.core.framefile import Channel
 from mitsim.core.job import Job
 from mitsim.core.manifests import MANIFEST, Patterns, RunHead, RunManifest
@@ -111,6 +111,8 @@ def request_of(plan: Plan | str, changes: Mapping[str, Any]) -> Request:
     MitsimError for a value that a field cannot have, or a change that would need another plan.
     """
     if isinstance(plan, str):
+        if "patterns" in changes:
+            raise ArgumentError("patterns", f"{cut(repr(changes['patterns']))}: beside the plan {plan!r}; give one")
         return Request.of(patterns=plan, **changes)
     request = _request(plan).changed(**changes)
     for name in ("patterns", "accuracy", "seconds", "effects"):

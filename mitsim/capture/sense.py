@@ -21,7 +21,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.framefile import Channel, finite_channel, read_frame, write_frame
 from mitsim.core.output import whole_file
-from mitsim.core.plainfile import MOST_SIDE
+from mitsim.core.plainfile import FRAME_LIMITS, fits_a_frame
 from mitsim.core.resources import Cost, Limits
 from mitsim.core.seeds import stream
 from mitsim.core.versions import versions
@@ -145,6 +145,11 @@ def sense(
         whose file has no quantum efficiency.
     """
     check_wavelength(wavelength_nm)
+    if sensor.mosaic is not None:
+        raise MitsimError(
+            f"sensor {sensor.name!r}: has a mosaic {sensor.mosaic} of colour filters, which an image of one channel "
+            "does not tell apart; use a monochrome camera, or capture a scene with --colour mosaic"
+        )
     light = np.asarray(irradiance, dtype=np.float64)
     if light.ndim != 2 or not light.size or not (light.min() >= 0 and light.max() < np.inf):
         shown = f"the range is {light.min()} to {light.max()}" if light.size else "it is empty"
@@ -184,8 +189,8 @@ def read_image(path: Path | str, channel: str | None = None) -> tuple[FloatArray
                 array = Npy.of(file, path.stat().st_size)
                 if array.dtype.kind not in "buif":
                     raise ValueError(f"{array.dtype} are no real numbers")
-                if max(array.shape, default=0) > MOST_SIDE:
-                    raise ValueError(f"its shape is {array.shape}; at most {MOST_SIDE} pixels a side are allowed")
+                if not fits_a_frame(array.shape):
+                    raise ValueError(f"its shape is {array.shape}; {FRAME_LIMITS} are allowed")
                 Cost(memory_bytes=_PIXEL_BYTES * math.prod(array.shape)).check(f"image {path}", Limits())
                 return np.asarray(array.part(file), dtype=np.float64), ()
         except (OSError, ValueError) as error:

@@ -10,9 +10,9 @@ import ast
 import functools
 import inspect
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from numbers import Integral, Real
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from mitsim.core.errors import ArgumentError, cut
 
@@ -44,16 +44,30 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
     annotated = {name: each.annotation for name, each in signature.parameters.items()}
     kinds = {name: _kinds(text, function) if isinstance(text, str) else [] for name, text in annotated.items()}
 
+    rest = next((kinds[name] for name, each in signature.parameters.items() if each.kind == each.VAR_KEYWORD), [])
+
     @functools.wraps(function)
     def called(*arguments: P.args, **named: P.kwargs) -> R:
-        for name, value in signature.bind(*arguments, **named).arguments.items():
-            allowed = kinds[name]
+        for name, value in _each(signature, signature.bind(*arguments, **named).arguments):
+            allowed = kinds.get(name, rest)
             if allowed and not any(allows(value) for _, allows in allowed):
                 words = " or ".join(dict.fromkeys(words for words, _ in allowed))
                 raise ArgumentError(name, f"{cut(repr(value))}: give {words}")
         return function(*arguments, **named)
 
     return called
+
+
+def _each(signature: inspect.Signature, bound: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
+    """Name and value of every argument that is ``bound`` to a ``signature``, further ones one by one."""
+    for name, value in bound.items():
+        kind = signature.parameters[name].kind
+        if kind == inspect.Parameter.VAR_KEYWORD:
+            yield from value.items()
+        elif kind == inspect.Parameter.VAR_POSITIONAL:
+            yield from ((name, each) for each in value)
+        else:
+            yield name, value
 
 
 def checked_fields(made: C) -> C:

@@ -86,11 +86,26 @@ def validated(model: type[Model], data: dict[str, Any], where: str, context: obj
     try:
         return model.model_validate(data, context=context)
     except pydantic.ValidationError as error:
-        problems = error.errors(include_url=False)
-        # A mistyped name is both an unknown field and a missing one; the first tells more.
-        first = next((problem for problem in problems if problem["type"] == "extra_forbidden"), problems[0])
-        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        raise MitsimError(f"{where}: {_complaint(model, first)}{more}") from error
+        raise refusal(model, error, where) from error
+
+
+def refusal(model: type[pydantic.BaseModel], error: pydantic.ValidationError, where: str) -> MitsimError:
+    """What pydantic found wrong, as :func:`validated` raises it.
+
+    Parameters
+    ----------
+    model
+        that was to be made.
+    error
+        that pydantic raised.
+    where
+        what the message begins with.
+    """
+    problems = error.errors(include_url=False)
+    # A mistyped name is both an unknown field and a missing one; the first tells more.
+    first = next((problem for problem in problems if problem["type"] == "extra_forbidden"), problems[0])
+    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    return MitsimError(f"{where}: {_complaint(model, first)}{more}")
 
 
 def _complaint(model: type[pydantic.BaseModel], problem: Any) -> str:

@@ -22,7 +22,7 @@ from mitsim.core.errors import MitsimError, cut
 from mitsim.core.exr import read_header
 from mitsim.core.jsonfile import parse_json
 from mitsim.core.output import whole_file
-from mitsim.core.plainfile import check_plain, stderr_silenced
+from mitsim.core.plainfile import FRAME_LIMITS, check_plain, fits_a_frame, resolved, stderr_silenced
 
 Value = str | int | float
 Channel = npt.NDArray[np.float32] | npt.NDArray[np.uint32]
@@ -74,7 +74,9 @@ def read_frame(path: Path | str) -> tuple[dict[str, Channel], dict[str, Value]]:
     path = Path(path)
     check_plain(path, "frame")
     try:
-        read_header(path)
+        header = read_header(path)
+        if not fits_a_frame((header.height, header.width)):
+            raise ValueError(f"claims {header.width}x{header.height} pixels; {FRAME_LIMITS} are read")
         with _open(path) as file:
             header = file.header()
             # Both are emptied when the file closes, so they are copied here.
@@ -118,7 +120,7 @@ def verify(folder: Path, name: str, checksums: Mapping[str, str], remedy: str) -
     MitsimError
         when they differ, or the name leads out of the folder by a link.
     """
-    if not (folder / name).resolve().is_relative_to(folder.resolve()):
+    if not resolved(folder / name).is_relative_to(resolved(folder)):
         raise MitsimError(f"{folder / name}: leads out of its folder; copy the file there")
     expected = checksums.get(name)
     if expected is not None and checksum(folder / name) != expected:

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from mitsim.core.arrayfile import Npy
 from mitsim.core.errors import MitsimError
 from mitsim.core.imagelist import BARE, FORMATS, FRAME, Wanted
-from mitsim.core.plainfile import check_plain, stderr_silenced
+from mitsim.core.plainfile import FRAME_LIMITS, check_plain, fits_a_frame, stderr_silenced
 from mitsim.core.resources import Cost, Limits
 
 if TYPE_CHECKING:
@@ -174,6 +174,8 @@ def _look(path: Path, wanted: Wanted) -> _Found:
 def _check_size(path: Path, wanted: Wanted, rows: int, columns: int) -> None:
     if not (0 < rows <= wanted.most and 0 < columns <= wanted.most):
         raise wanted.refusal(path, f"{rows} x {columns} pixels; 1 to {wanted.most} a side are allowed")
+    if not fits_a_frame((rows, columns)):
+        raise wanted.refusal(path, f"{rows} x {columns} pixels; {FRAME_LIMITS} are read; bin it, or cut out a part")
 
 
 def _png(path: Path, wanted: Wanted) -> _Found:

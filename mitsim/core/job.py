@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from mitsim.core.arguments import checked_fields
+from mitsim.core.arguments import checked, checked_fields
 from mitsim.core.deadline import within
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError, cut
 from mitsim.core.resources import Limits
 from mitsim.core.worker import OutOfTime
 
@@ -41,8 +41,13 @@ class Clock:
         finally:
             self._stages[name] = self._stages.get(name, 0.0) + time.perf_counter() - started
 
+    @checked
     def add(self, stages: Mapping[str, float], prefix: str = "") -> None:
         """Take over the ``stages`` [s] of another clock, except its total, ``prefix`` before their names."""
+        try:
+            sum(stages.values())
+        except TypeError:
+            raise ArgumentError("stages", f"{cut(repr(stages))}: give seconds by name") from None
         for name, seconds in stages.items():
             if name != "total":
                 self._stages[prefix + name] = self._stages.get(prefix + name, 0.0) + seconds

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.plainfile import read_text
+from mitsim.core.plainfile import read_text, resolved
 
 LOCK = ".mitsim.lock"
 """Held, in a folder, by the process that writes there; a killed process leaves the file behind, but not the lock. That
@@ -33,8 +33,11 @@ def whole_file(path: Path | str) -> Iterator[Path]:
     MitsimError when the file cannot be written, or is no plain file; a link stays, and its file is replaced.
     """
     path = Path(path)
+    _check_name(path)
     _check_plain(path)
-    target = path.resolve()
+    target = resolved(path)
+    if target.is_symlink():
+        raise MitsimError(f"file {path}: cannot be written (it is a link that leads to itself); remove it")
     part = _beside(target, f".{os.getpid()}-{threading.get_ident()}.part")
     try:
         yield part
@@ -79,10 +82,7 @@ def prepare_output(path: Path | str, overwrite: bool = False, kind: Literal["fol
         ``overwrite`` is off, or has a name that is not UTF-8, which OpenEXR cannot open.
     """
     path = Path(path)
-    try:
-        os.fspath(path.absolute()).encode()
-    except UnicodeEncodeError:
-        raise MitsimError(f"output {path}: is not UTF-8 text; choose a folder with another name") from None
+    _check_name(path)
     if not path.parent.is_dir():
         raise MitsimError(f"output {path}: the folder {path.parent} does not exist; create it or choose another")
     if kind == "file":
@@ -90,6 +90,14 @@ def prepare_output(path: Path | str, overwrite: bool = False, kind: Literal["fol
     else:
         _prepare_folder(path, overwrite)
     return path
+
+
+def _check_name(path: Path) -> None:
+    """MitsimError for a name that OpenEXR and HDF5 cannot open."""
+    try:
+        os.fspath(path.absolute()).encode()
+    except UnicodeEncodeError:
+        raise MitsimError(f"output {path}: is not UTF-8 text; choose a folder with another name") from None
 
 
 def check_output(path: Path | str, overwrite: bool = False, kind: Literal["folder", "file"] = "folder") -> None:
@@ -142,7 +150,7 @@ def output_file(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     MitsimError as for :func:`prepare_output`, and when another process holds the file.
     """
     path = prepare_output(path, overwrite, "file")
-    with _locked(path, _beside(path.resolve(), LOCK)):
+    with _locked(path, _beside(resolved(path), LOCK)):
         yield prepare_output(path, overwrite, "file")  # nobody wrote it between the first look and the lock
 
 
@@ -161,10 +169,10 @@ def check_apart(path: Path | str, inputs: Iterable[Path | str]) -> None:
     MitsimError
         when the output is one of the files, by whatever name, or a file in one of the folders.
     """
-    place = Path(path).resolve()
+    place = resolved(path)
     for each in map(Path, inputs):
-        same = place == each.resolve() or (place.exists() and each.exists() and place.samefile(each))
-        if same or (each.is_dir() and place.exists() and place.is_relative_to(each.resolve())):
+        same = place == resolved(each) or (place.exists() and each.exists() and place.samefile(each))
+        if same or (each.is_dir() and place.exists() and place.is_relative_to(resolved(each))):
             raise MitsimError(f"output {path}: would replace {each}, which is read; choose another name")
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import os
 import stat
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -14,6 +15,17 @@ from mitsim.core.errors import MitsimError
 _silence = threading.RLock()
 MOST_SIDE = 16384
 """Pixels a side of the largest picture that is read: of the largest sensor and environment map that are simulated."""
+MOST_PIXELS = 1 << 26
+"""Of a frame or other picture, 8192 x 8192: sixteen times the largest sensors that coded masks are used with (2048 a
+side); an import of one predicts 1.7 GB and takes 2.5 s of processor time. Of a larger sensor a region or binned frames
+are read."""
+FRAME_LIMITS = f"at most {MOST_SIDE} pixels a side and {MOST_PIXELS} in all"
+"""For messages."""
+
+
+def fits_a_frame(shape: Sequence[int]) -> bool:
+    """Whether a picture of this ``shape`` (rows, columns) is no larger than a frame may be."""
+    return max(shape, default=0) <= MOST_SIDE and math.prod(shape) <= MOST_PIXELS
 
 
 def check_plain(path: Path | str, what: str = "file") -> os.stat_result:
@@ -29,6 +41,12 @@ def check_plain(path: Path | str, what: str = "file") -> os.stat_result:
     if not stat.S_ISREG(status.st_mode):
         raise MitsimError(f"{what} {path}: cannot be read (a pipe or device, no plain file); check the path")
     return status
+
+
+def resolved(path: Path | str) -> Path:
+    """Where ``path`` leads, links followed as far as they lead: ``Path.resolve`` raises RuntimeError for one that leads
+    to itself, before Python 3.13."""
+    return Path(os.path.realpath(path))
 
 
 @contextmanager

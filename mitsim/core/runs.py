@@ -14,7 +14,7 @@ import numpy as np
 
 from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError, cut
 from mitsim.core.framefile import Channel, Channels, Metadata, checksum, finite_channel, read_frame, verify
 from mitsim.core.manifests import MANIFEST, RunManifest, read_manifest
 from mitsim.core.measurement import Ambient, Measurement
@@ -176,10 +176,13 @@ class Capture:
         names = [shot.file for shot in self.manifest.patterns.captures] + ([] if ambient is None else [ambient.file])
         return (*names, TRUTH) if self._has_truth else tuple(names)
 
+    @checked
     def read(self, name: str) -> tuple[Channels, Metadata]:
         """Channels and metadata of one of the :attr:`files`, by its ``name``. MitsimError for one that is missing or
         damaged."""
         if self.folder is None:
+            if name not in self._memory:
+                raise ArgumentError("name", f"{cut(repr(name))}: is no file of this capture; see files")
             return self._memory[name]
         verify(self.folder, name, self.manifest.checksums, "capture it again with resume=True")
         return read_frame(self.folder / name)

@@ -22,7 +22,7 @@ from mitsim.core.framefile import Channels, Metadata, Value
 from mitsim.core.hdf5file import whole_hdf5
 from mitsim.core.jsonfile import MOST_BYTES, parse_json
 from mitsim.core.manifests import CalibrationManifest, RunManifest
-from mitsim.core.plainfile import MOST_SIDE, check_plain
+from mitsim.core.plainfile import FRAME_LIMITS, MOST_PIXELS, check_plain, fits_a_frame
 from mitsim.core.recorders import TRUTH
 from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import Capture
@@ -46,7 +46,7 @@ Run = Packed[RunManifest] | Coloured[RunManifest] | Filtered
 Calibration = Packed[CalibrationManifest] | Coloured[CalibrationManifest]
 _LINES = "lines"
 """Group that has a group of each line."""
-_MOST_CHUNK = 4 * MOST_SIDE**2
+_MOST_CHUNK = 4 * MOST_PIXELS
 """Bytes that are unpacked at once: of the largest frame."""
 LAYOUT = 1
 """Number of the layout that is written here, and the newest that is read: attribute `mitsim_exchange` of the file."""
@@ -175,7 +175,7 @@ def open_folders(path: Path | str) -> Iterator[tuple[Run, Calibration | None]]:
     with file:
         with _told(path):
             layout = file.attrs.get("mitsim_exchange")
-            if layout is None or not 1 <= int(layout) <= LAYOUT:
+            if not isinstance(layout, (int, np.integer)) or not 1 <= layout <= LAYOUT:
                 raise MitsimError(
                     f"{path}: is no HDF5 file of `mitsim export` (mitsim_exchange is {layout}, 1 to {LAYOUT} are read)"
                 )
@@ -371,7 +371,10 @@ def _metadata(texts: h5py.Dataset, number: int, path: Path) -> dict[str, Value]:
     # What is beyond the end of a file that was cut short after it was opened is read as zeros.
     if path.stat().st_size < texts.file.id.get_filesize():
         raise ValueError("it was cut short while it was read")
-    known = parse_json(texts[number].decode("utf-8"))
+    text = texts[number] if texts.ndim == 1 else None
+    if not isinstance(text, bytes):
+        raise MitsimError(f"{path}: {texts.name} is {texts.dtype} of shape {texts.shape}; a text a frame is needed")
+    known = parse_json(text.decode("utf-8"))
     if not isinstance(known, dict) or not all(isinstance(value, (str, int, float)) for value in known.values()):
         raise MitsimError(f"{path}: metadata of a frame is no object of texts and numbers; export it again")
     return known
@@ -389,8 +392,10 @@ def _dataset(parent: h5py.Group, name: str, path: Path) -> h5py.Dataset:
     dataset = _inside(parent, name, h5py.Dataset, path)
     if dataset.is_virtual or dataset.external:
         raise MitsimError(f"{path}: {dataset.name} lies in another file; export it again")
-    if dataset.shape is None or max(dataset.shape[1:], default=0) > MOST_SIDE:
-        raise MitsimError(f"{path}: {dataset.name} claims {dataset.shape}; at most {MOST_SIDE} a side are allowed")
+    if dataset.shape is None:
+        raise MitsimError(f"{path}: {dataset.name} is empty; export it again")
+    if not fits_a_frame(dataset.shape[1:]):
+        raise MitsimError(f"{path}: {dataset.name} claims {dataset.shape}; {FRAME_LIMITS} are allowed")
     filters = dataset.id.get_create_plist()
     used = {filters.get_filter(index)[0] for index in range(filters.get_nfilters())}
     if not used <= {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}:
@@ -402,7 +407,7 @@ def _dataset(parent: h5py.Group, name: str, path: Path) -> h5py.Dataset:
         wanted = math.prod(-(-side // chunk) for side, chunk in zip(dataset.shape, dataset.chunks, strict=True))
         stored = dataset.id.get_num_chunks() == wanted
         if math.prod(dataset.chunks) * dataset.dtype.itemsize > _MOST_CHUNK:
-            raise MitsimError(f"{path}: {dataset.name} is stored in pieces of over 1 GiB; export it again")
+            raise MitsimError(f"{path}: {dataset.name} is stored in pieces of over 256 MiB; export it again")
     if not stored:
         raise MitsimError(f"{path}: {dataset.name} claims {dataset.shape}, of which not all is stored; export it again")
     return dataset

@@ -24,7 +24,7 @@ LARGEST_VARIABLE = (1 << 31) - 1
 """Bytes of an array in a file of version 5."""
 _HEAD = 128
 """Bytes before the first variable: a text, the version and the order of bytes."""
-_HDF5 = 2
+_HDF5, _HDF5_MARK = 2, b"\x89HDF\r\n\x1a\n"
 """Version of a file that is an HDF5 file behind its head."""
 _MATRIX, _COMPRESSED = 14, 15
 """Kinds of elements: an array, and one that is packed."""
@@ -86,6 +86,8 @@ def _arrays_in(file: BinaryIO) -> dict[str, int]:
     """
     head = file.read(_HEAD)
     mark = head[_HEAD - 2 :]
+    if head.startswith(_HDF5_MARK):
+        raise NotImplementedError
     if len(head) < _HEAD or mark not in (b"IM", b"MI"):
         raise ValueError("it does not begin as one of version 5")
     order = "<" if mark == b"IM" else ">"
@@ -156,7 +158,7 @@ def _looked_into(path: Path, look: Callable[..., Any]) -> Any:
         with open(path, "rb") as file:
             return look(file)
     except NotImplementedError:
-        raise MitsimError(f"{path}: is of version 7.3; save it in MATLAB with -v7") from None
+        raise MitsimError(f"{path}: is HDF5 (version 7.3); save it in MATLAB with -v7, or name an export .h5") from None
     except Exception as error:  # SciPy's reader raises of all kinds
         reason = " ".join(str(error).split()) or type(error).__name__
         raise MitsimError(f"{path}: damaged, or no MATLAB file ({reason}); write or copy it again") from error

@@ -23,7 +23,7 @@ from mitsim.core.manifests import (
     write_manifest,
 )
 from mitsim.core.output import LOCK, whole_folder, write_text
-from mitsim.core.plainfile import MOST_SIDE, read_text
+from mitsim.core.plainfile import fits_a_frame, read_text
 from mitsim.core.recorders import TRUTH
 from mitsim.core.runs import load_run
 
@@ -74,7 +74,11 @@ class Packed(Generic[Manifest]):
         another version, or channels that the exchange left out.
         """
         for name in dict.fromkeys(self.names):
-            write_frame(folder / name, *self.read(name))
+            channels, metadata = self.read(name)
+            try:
+                write_frame(folder / name, channels, metadata)
+            except (TypeError, ValueError) as error:
+                raise MitsimError(f"{self.place}: {name} is no frame ({error}); export it again") from error
         stated = self.manifest.checksums
         sums = {name: checksum(folder / name) for name in stated if name in self.names}
         if sums == stated and self.text:
@@ -182,7 +186,7 @@ def checked_channel(values: object, name: str, place: Path) -> Channel:
         for another type or shape.
     """
     array = np.asarray(values)
-    if array.dtype not in (np.float32, np.uint32) or array.ndim != 2 or not 0 < max(array.shape) <= MOST_SIDE:
+    if array.dtype not in (np.float32, np.uint32) or array.ndim != 2 or not array.size or not fits_a_frame(array.shape):
         raise MitsimError(
             f"{place}: {name} is {array.dtype} of shape {array.shape}; float32 or uint32 of rows x columns is needed"
         )

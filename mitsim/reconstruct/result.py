@@ -11,9 +11,9 @@ import numpy as np
 
 from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.framefile import write_frame
-from mitsim.core.jsonfile import read_json, write_json
+from mitsim.core.jsonfile import plain, read_json, write_json
 from mitsim.core.output import output_folder, whole_file
 from mitsim.core.pictures import card, png, scaled, span
 from mitsim.reconstruct.asked import IMAGE_FILE
@@ -156,6 +156,10 @@ class Reconstruction:
         MitsimError
             when the folder holds another image or something else, or cannot be written.
         """
+        try:
+            plain(more)
+        except TypeError as error:
+            raise ArgumentError("more", f"cannot be stored ({error})") from None
         with output_folder(folder, overwrite=may_replace(Path(folder), self.inputs, overwrite)) as place:
             return self.write(place, more)
 

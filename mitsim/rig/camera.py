@@ -16,6 +16,7 @@ from pydantic.json_schema import SkipJsonSchema
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import validated
 from mitsim.core.errors import MitsimError
+from mitsim.core.plainfile import FRAME_LIMITS, fits_a_frame
 from mitsim.rig.drift import MaskMotion
 from mitsim.rig.mask import CameraMask, Mask, mls_mask
 from mitsim.rig.plate import FEW, Plate, within
@@ -48,7 +49,7 @@ class CameraGeometry(BaseModel):
     )
 
     pixels: int = Field(512, ge=1, le=16384, description="sensor pixels a side, of a square sensor")
-    """More than the largest square sensors, 10 560; a frame of it has 2 GiB."""
+    """More than the largest square sensors, 10 560, of which a region is read."""
     rows: int | None = Field(None, ge=1, le=16384, description="rows of sensor pixels; none: `pixels`")
     columns: int | None = Field(None, ge=1, le=16384, description="columns of sensor pixels; none: `pixels`")
     pixel_pitch: float = Field(
@@ -123,6 +124,13 @@ class CameraGeometry(BaseModel):
                     f"roi {list(self.roi)}: {self.roi[2]} rows from {self.roi[0]} and {self.roi[3]} columns from "
                     f"{self.roi[1]} are not on a sensor of {self.shape[0]} x {self.shape[1]} pixels"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _its_frames_can_be_read(self) -> CameraGeometry:
+        rows, columns = self.frame_shape
+        if not fits_a_frame(self.frame_shape):
+            raise ValueError(f"{rows} x {columns} pixels; {FRAME_LIMITS} are written and read, so read a part by roi")
         return self
 
     @model_validator(mode="after")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.imagefile import own_end, read_image
+from mitsim.core.imagefile import image_size, own_end, read_image
 from mitsim.core.imagelist import Wanted
 from mitsim.rig.plate import LARGEST
 
@@ -23,6 +23,13 @@ def read_drawing(path: Path) -> FloatArray:
     Row 0 is at the top and column 0 at the left of who looks from the sensor toward the scene. MitsimError for a file
     that is no PNG, TIFF, NPY or OpenEXR, has colours, transparency or several pages, or numbers outside 0 to 1.
     """
+    rows, columns = image_size(path, _DRAWING)
+    if (rows - columns) % 2 and 2 * max(rows, columns) > LARGEST:
+        raise _DRAWING.refusal(
+            path,
+            f"{rows} x {columns} pixels: about its centre the shorter side needs half a pixel, so features become half "
+            f"as large, of which {LARGEST} a side are allowed; make its sides differ by an even number",
+        )
     values = read_image(path, _DRAWING)
     white = own_end(values) if path.suffix.lower() in _PICTURES else None
     transmissions = np.asarray(values, dtype=np.float64) / (white or 1.0)

@@ -270,9 +270,14 @@ def within(plate: Plate, reach_mm: float) -> Plate:
     beyond = int((plate.extent_mm / 2 - seen) / plate.feature_mm)
     if beyond <= 0 or plate.crosses is not None:
         return plate
-    kept = slice(beyond, len(plate.values) - beyond)
-    part = plate.values[kept, kept]
-    return replace(plate, values=part) if part.any() else plate
+    more = 1
+    while beyond > 0:
+        part = plate.values[beyond:-beyond, beyond:-beyond]
+        if part.any():
+            return replace(plate, values=part)
+        # Closed all over, which no plate is: out to the next open feature.
+        beyond, more = beyond - more, 2 * more
+    return plate
 
 
 def _factors(

@@ -19,8 +19,6 @@ from mitsim.core.imagelist import Wanted
 from mitsim.core.resources import Cost, Limits
 
 _PICTURE = Wanted("point spread function", colour=True)
-_MOST_PIXELS = 2**26
-"""Of a picture: four times what cameras for such measurements have."""
 _PIXEL_BYTES = 64
 """Of memory for a pixel: four colours of double precision, and as many arrays of their mean."""
 _BORDER = 16
@@ -76,8 +74,6 @@ def load_psf(path: Path | str, reduce: int = 4, most: int | None = None) -> Floa
 
 def _grey(path: Path, size: tuple[int, int]) -> FloatArray:
     rows, columns = size
-    if rows * columns > _MOST_PIXELS:
-        raise _PICTURE.refusal(path, f"{rows} x {columns} pixels; at most {_MOST_PIXELS} in all are read")
     Cost(memory_bytes=rows * columns * _PIXEL_BYTES).check(f"point spread function {path}", Limits())
     values = np.asarray(read_image(path, _PICTURE), dtype=np.float64)
     return values if values.ndim == 2 else np.asarray(values[..., :3].mean(axis=2))

@@ -218,9 +218,9 @@ class SensorModel(BaseModel):
         """
         if (self.mosaic is None) != (plane is None):
             filters = f"a mosaic {self.mosaic}" if self.mosaic else "no mosaic"
-            asked = f"plane {plane}" if plane else "monochrome frames"
+            asked = f"plane {plane} was" if plane else "monochrome frames were"
             remedy = "use a monochrome camera, or --colour mosaic" if self.mosaic else "leave the plane out"
-            raise MitsimError(f"sensor {self.name!r}: has {filters}, and {asked} was asked for; {remedy}")
+            raise MitsimError(f"sensor {self.name!r}: has {filters}, and {asked} asked for; {remedy}")
         curve = getattr(self.mosaic_curves, plane) if plane else self.quantum_efficiency_curve
         try:
             found = self.quantum_efficiency if curve is None else curve.at(wavelength_nm)

@@ -25,7 +25,7 @@ _APART = 0.3
 """Predicted turn of its vectors [rad] up to which a singular value stands apart from others: beyond, noise mixes them,
 and bias and angle to first order do not hold."""
 _WHERE = {CAPTURE: "noise of the capture", SESSION: "noise of the session", SCENE: "light of the scene",
-          DRIFT: "drift", SOLVER: "the solver", UNEXPLAINED: "anywhere"}  # fmt: skip
+          DRIFT: "drift, not in this image", SOLVER: "the solver", UNEXPLAINED: "anywhere"}  # fmt: skip
 """Where a loss comes from, in words."""
 _HAS, _WOULD = "has lost by noise, light and solver", "would lose by a drift"
 """What becomes of the image, as the figure calls it."""

@@ -199,8 +199,10 @@ def characterise(
         return _characterised(sensor, procedure, capacity, job)
     with study_folder(output, "characterise") as folder:
         done = _characterised(sensor, procedure, capacity, job, str(folder))
-        write_json(folder / "characterise.json", {**done.payload(), "kind": "characterise", "versions": versions()})
+        results = folder / "characterise.json"  # last, so that a folder with it is whole
+        results.unlink(missing_ok=True)
         write_figures(folder, done.figures())
+        write_json(results, {**done.payload(), "kind": "characterise", "versions": versions()})
     return done
 
 

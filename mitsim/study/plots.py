@@ -139,7 +139,7 @@ def singular_values(curves: Mapping[str, npt.ArrayLike]) -> Figure:
         share = 100.0 * np.arange(1, ordered.size + 1) / ordered.size
         axes.semilogy(share, ordered / ordered[0], lw=2.0, label=name, **line_style(index))
     axes.set_xlim(0, 100)
-    label_axes(axes, "singular value's rank [% of all]", "relative to the largest [1]")
+    label_axes(axes, "singular value's rank [% of all]", "singular value, relative to the largest [1]")
     axes.legend(fontsize=FONT - 1, frameon=False, loc="lower left")
     return figure
 

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,15 +20,25 @@ PATTERNS = "hadamard:16"  # 512 frames: long enough to be hit in the middle
 RESUME = "; finished work is kept, go on with --resume\n"
 
 
-def running(least: int | str, *arguments: object) -> subprocess.Popen[str]:
+def started(command: Sequence[str], session: bool) -> subprocess.Popen[str]:
+    """The program that a ``command`` is, with the signals of a terminal: a shell's background jobs ignore SIGINT, those
+    of nohup SIGHUP, and so would what they start. ``session``: in a process group of its own."""
+    before = {each: signal.signal(each, signal.SIG_DFL) for each in (signal.SIGINT, signal.SIGHUP)}
+    try:
+        return subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=session
+        )
+    finally:
+        for each, handler in before.items():
+            signal.signal(each, handler)
+
+
+def running(least: int | str, *arguments: object, session: bool = False) -> subprocess.Popen[str]:
     """Start mitsim; back as soon as ``least`` frames, or the file of that name, are written; for 0 as soon as the
-    output folder is there."""
+    output folder is there. ``session``: in a process group of its own, which a terminal would have signalled."""
     folder = Path(str(arguments[arguments.index("-o") + 1]))
     command = [sys.executable, "-m", "mitsim", *map(str, arguments)]
-    # A shell's background jobs ignore SIGINT, and so would what they start.
-    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    signal.signal(signal.SIGINT, before)
+    process = started(command, session)
     limit = time.monotonic() + 120
     wanted, count = (least, 1) if isinstance(least, str) else ("frame_*.exr", least)
     while len(list(folder.glob(wanted))) < count or not folder.exists():

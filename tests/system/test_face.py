@@ -405,30 +405,34 @@ NO_KIND: list[Any] = [object(), b"x", np.array([]), 1j]
 """What no argument of the face may be."""
 
 
+def needed(bench: ms.Bench, shots: ms.Capture, factors: ms.Factors, called: Callable[..., object]) -> dict[str, Any]:
+    """Right arguments for those parameters of ``called`` that have no default."""
+    given = {"scene": bench.loaded.path, "shots": shots, "factors": factors, "bench": bench, "psnr": 30.0}
+    given |= dict.fromkeys(("image", "truth"), np.ones((2, 2)))
+    given |= dict.fromkeys(("folder", "run", "calibration", "output", "path", "frames"), "new")
+    given |= {"modelling": ms.Modelling("wave"), "model": "wave", "patterns": "dots:2", "variant": "llvm_ad_mono"}
+    given |= {"reflectance": 0.5, "count": 1, "depth": 400.0, "stages": {}, "name": "x"}
+    parameters = inspect.signature(called).parameters.values()
+    return {each.name: given[each.name] for each in parameters if each.default is each.empty and each.kind < 2}
+
+
 @pytest.mark.parametrize("of", ["ms", "bench", "shots", "factors"])
 def test_every_wrong_argument_is_refused_in_a_line(
     of: str, bench: ms.Bench, shots: ms.Capture, factors: ms.Factors
 ) -> None:
-    """By functions of the package and methods of what they make. (Planted: one method that checks nothing.)"""
+    """By functions of the package and methods of what they make; of more values, in test_wrong_arguments.py. (Planted:
+    one method that checks nothing.)"""
     owner: Any = {"ms": ms, "bench": bench, "shots": shots, "factors": factors}[of]
     names = [name for name in (ms.__all__ if of == "ms" else dir(owner)) if name in FACE[of]]
     assert sorted(names) == sorted(FACE[of])
-    given = {"scene": bench.loaded.path, "shots": shots, "factors": factors, "bench": bench, "psnr": 30.0}
-    given |= {
-        "image": np.ones((2, 2)),
-        "truth": np.ones((2, 2)),
-        "modelling": ms.Modelling("wave"),
-        "patterns": "dots:2",
-    }
-    given |= {name: "new" for name in ("folder", "run", "calibration", "output", "path", "frames")}
-    given |= {"reflectance": 0.5, "count": 1, "variant": "llvm_ad_mono", "depth": 400.0, "model": "wave"}
     for name in names:
-        parameters = inspect.signature(getattr(owner, name)).parameters.values()
-        needed = {each.name: given[each.name] for each in parameters if each.default is each.empty and each.kind < 2}
+        called = getattr(owner, name)
+        right = needed(bench, shots, factors, called)
+        parameters = inspect.signature(called).parameters.values()
         for parameter in (each for each in parameters if each.kind < 2 and each.annotation != "object"):
             for value in NO_KIND:
                 with pytest.raises(ms.MitsimError) as refusal:
-                    getattr(owner, name)(**{**needed, parameter.name: value})
+                    called(**{**right, parameter.name: value})
                 assert len(str(refusal.value).splitlines()) == 1
 
 

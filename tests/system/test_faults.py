@@ -102,7 +102,7 @@ def test_a_worker_that_dies_while_it_renders(
     """The kernel's out-of-memory killer, and an abort inside LLVM: the parent is left to say so."""
     run = tmp_path / "run"
     least = 30 if how == signal.SIGKILL else 0
-    process = running(least, "capture", *lab.rig, "-o", run, "--patterns", PATTERNS)
+    process = running(least or "manifest.json", "capture", *lab.rig, "-o", run, "--patterns", PATTERNS)
     (worker,) = psutil.Process(process.pid).children()
     worker.send_signal(how)
     done = ended(process)

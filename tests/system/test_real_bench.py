@@ -32,7 +32,7 @@ def test_the_page_leads_to_an_image(
     call: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variant: str
 ) -> None:
     """Every command of the page, in its order, with its devices; frames are taken when their pictures are drawn. The
-    image is as good as one of a run that mitsim captured and calibrated itself, with the same noise (50.4 dB)."""
+    image is as good as one of a run that mitsim captured and calibrated itself, with the same noise (49.8 dB)."""
     monkeypatch.chdir(tmp_path)
     for name, text in zip(("camera", "projector"), blocks(PAGE, "toml"), strict=True):
         Path(f"{name}.toml").write_text(text)

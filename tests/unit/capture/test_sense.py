@@ -120,7 +120,7 @@ def test_what_is_no_image_is_refused_in_a_line(tmp_path: Path) -> None:
         sense(IMAGE, sensor(quantum_efficiency=None))
     with pytest.raises(MitsimError, match="wavelength"):
         sense(IMAGE, CAMERA, wavelength_nm=0.0)
-    with pytest.raises(MitsimError, match="mosaic BGGR, and monochrome frames"):
+    with pytest.raises(MitsimError, match="mosaic BGGR of colour filters, which an image of one channel"):
         sense(IMAGE, load_sensor(shipped("calibration", "ov5647.toml")))
 
 
@@ -148,5 +148,7 @@ def test_an_array_that_claims_is_held_against_its_file(tmp_path: Path) -> None:
         with pytest.raises(MitsimError, match=words):
             read_image(tmp_path / "bad.npy")
     np.lib.format.open_memmap(tmp_path / "wide.npy", "w+", np.float64, (1, 20000)).flush()
-    with pytest.raises(MitsimError, match="at most 16384 pixels a side"):
-        read_image(tmp_path / "wide.npy")
+    np.lib.format.open_memmap(tmp_path / "large.npy", "w+", np.uint8, (8193, 8192)).flush()
+    for name in ("wide", "large"):
+        with pytest.raises(MitsimError, match="at most 16384 pixels a side and 67108864 in all"):
+            read_image(tmp_path / f"{name}.npy")

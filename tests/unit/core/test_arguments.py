@@ -35,7 +35,7 @@ def work(
     alias: Alias = 1,
     anything: Any = None,
     *rest: str,
-    **more: object,
+    **more: float,
 ) -> str:
     """A public function."""
     return f"{plan} {seed}"
@@ -58,6 +58,7 @@ ALLOWED = {
     "effects": [None, {}, {"gloss": True}],
     "alias": ["a", 3, object()],
     "anything": [object(), None, b""],
+    "seconds": [0, 1.5],
 }
 REFUSED = {
     "plan": [None, 3, b"dots:3", object(), np.zeros(2)],
@@ -66,6 +67,7 @@ REFUSED = {
     "lam": ["car", None, True, [1.0], np.zeros(2), 1j, b"auto"],
     "resume": [0, 1, "yes", None, np.zeros(0)],
     "effects": ["gloss", ["gloss"], 3],
+    "seconds": [None, "3", True, object()],
 }
 
 
@@ -77,7 +79,7 @@ def test_arguments_of_their_kind_are_let_pass(name: str) -> None:
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_others_are_refused_in_a_line(name: str) -> None:
-    """(Planted: numpy's numbers refused; True for a number; a text for any path.)"""
+    """(Planted: numpy's numbers refused; True for a number; a text for any path; further arguments let pass.)"""
     for value in REFUSED[name]:
         with pytest.raises(ArgumentError, match=f"^{name} .*: give ") as refusal:
             work(**{name: value})

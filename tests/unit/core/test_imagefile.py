@@ -155,9 +155,11 @@ def test_what_is_no_frame_is_refused(tmp_path: Path, name: str, write: Write, wo
 
 
 def test_a_picture_too_large_for_any_sensor_is_refused_by_its_header(tmp_path: Path) -> None:
-    np.lib.format.open_memmap(tmp_path / "a.npy", "w+", np.uint8, (2, 20000)).flush()
-    with pytest.raises(MitsimError, match="2 x 20000 pixels"):
-        image_size(tmp_path / "a.npy")
+    """(Planted: no bound of pixels in all.)"""
+    for name, sides in (("a.npy", (2, 20000)), ("b.npy", (8193, 8192))):
+        np.lib.format.open_memmap(tmp_path / name, "w+", np.uint8, sides).flush()
+        with pytest.raises(MitsimError, match=f"{sides[0]} x {sides[1]} pixels; "):
+            image_size(tmp_path / name)
     saved(NUMBERS)(tmp_path / "a.png")
     with pytest.raises(MitsimError, match=r"drawing .*5 x 7 pixels; 1 to 6 a side"):
         read_image(tmp_path / "a.png", Wanted("drawing", most=6))
@@ -338,7 +340,7 @@ def test_no_picture_is_mapped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 def test_a_picture_beyond_free_memory_is_refused_by_its_header(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Sparse files cost nothing on disk."""
-    np.lib.format.open_memmap(tmp_path / "a.npy", "w+", np.float64, (16000, 16000)).flush()
+    np.lib.format.open_memmap(tmp_path / "a.npy", "w+", np.float64, (8000, 8000)).flush()
     monkeypatch.setattr("mitsim.core.resources.free_memory", lambda: 2**30)
     with pytest.raises(MitsimError, match=r"a\.npy: would take about .* GiB of memory; allowed are 922 MiB"):
         read_image(tmp_path / "a.npy")

@@ -10,6 +10,7 @@ import pytest
 
 from mitsim.core import output
 from mitsim.core.errors import MitsimError
+from mitsim.core.framefile import verify
 from mitsim.core.output import LOCK, check_apart, output_file, output_folder, prepare_output, whole_file
 
 
@@ -172,6 +173,19 @@ def test_the_longest_names_are_written(tmp_path: Path, name: str) -> None:
     with output_file(tmp_path / name) as place, whole_file(place) as part:
         part.write_text("new")
     assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_link_to_itself_is_refused_in_a_line(tmp_path: Path) -> None:
+    """(Planted: `Path.resolve`, which raises RuntimeError before Python 3.13; no check, and the link was replaced.)"""
+    (tmp_path / "loop").symlink_to("loop")
+    (tmp_path / "other").write_text("x")
+    check_apart(tmp_path / "loop", [tmp_path / "other"])
+    check_apart(tmp_path / "other", [tmp_path / "loop"])
+    with pytest.raises(MitsimError, match="leads to itself"), whole_file(tmp_path / "loop") as part:
+        part.write_text("y")
+    with pytest.raises(MitsimError, match="loop: cannot be read"):
+        verify(tmp_path, "loop", {"loop": "0"}, "copy it again")
+    assert (tmp_path / "loop").is_symlink() and sorted(path.name for path in tmp_path.iterdir()) == ["loop", "other"]
 
 
 def test_one_of_two_writers_of_a_file_is_refused(tmp_path: Path) -> None:

@@ -228,9 +228,9 @@ def test_a_stack_of_many_pages_is_read_page_after_page(tmp_path: Path, monkeypat
 
 
 def test_frames_are_counted_by_their_headers(tmp_path: Path) -> None:
-    """A sparse array of 4096 frames of 256 megapixels is refused at once. (Planted: counted as they are read.)"""
+    """A sparse array of 4096 frames of 64 megapixels is refused at once. (Planted: counted as they are read.)"""
     bench = made(tmp_path)
-    np.lib.format.open_memmap(tmp_path / "a.npy", "w+", np.uint16, (4096, 16000, 16000)).flush()
+    np.lib.format.open_memmap(tmp_path / "a.npy", "w+", np.uint16, (4096, 8000, 8000)).flush()
     refused("holds 4096 frames", tmp_path, tmp_path / "a.npy", known(bench))
 
 

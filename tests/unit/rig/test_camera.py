@@ -76,6 +76,7 @@ def test_tall_pixels_behind_a_mask_on_a_raster_are_refused() -> None:
     [
         ("rows", 0),
         ("row_pitch", 0.0),
+        ("pixels", 8193),
         ("roi", (0, 0, 513, 3)),
         ("roi", (0, 1, 3, 512)),
         ("roi", (-1, 0, 3, 3)),

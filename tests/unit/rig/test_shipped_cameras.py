@@ -39,7 +39,7 @@ def test_a_camera_captures_as_its_file_says_or_is_told_what_it_lacks(camera: Pat
     with pytest.raises(MitsimError) as caught:
         open_bench("photograph", camera=camera)
     lacking = "--colour mosaic" if sensor.mosaic else "put one, with its source, into a copy of the file"
-    assert lacking in (line := str(caught.value)) and line.endswith(f"its scene has a pixel_pitch of {pitch} mm")
+    assert lacking in (line := str(caught.value)) and line.endswith(f"scenes whose pixel_pitch is {pitch} mm")
     own = f"`pixel_pitch` is {pitch}" if sensor.mosaic else "`quantum_efficiency`"
     assert "capture" in verbs or own in camera.read_text(encoding="utf-8")
 

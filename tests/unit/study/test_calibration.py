@@ -281,7 +281,10 @@ def test_the_page_has_every_loss_in_one_table() -> None:
     assert [row[3] for row in part.rows] == ["3.00 \N{PLUS-MINUS SIGN} 0.20", "2.00 \N{PLUS-MINUS SIGN} 0.10"]
     assert [row[4] for row in part.rows] == ["", "75.00 \N{PLUS-MINUS SIGN} 0.50 %"]
     assert "together say 43.98 dB" in part.lead and "Below 0.005 dB each: session: read noise." in part.notes
-    assert part.rows[0][:3] == ("drift", "mask down the rows", "0.4 um") and "vibration_um: no" in part.lead
+    assert (
+        part.rows[0][:3] == ("drift, not in this image", "mask down the rows", "0.4 um")
+        and "vibration_um: no" in part.lead
+    )
     assert set(found.figures()) >= {"losses.png"} and len(found.tables()["losses.csv"]) == 3
     text = " ".join(found.lines())
     assert "mask down the rows, 0.4 um: 3.00 +- 0.20 dB" in text and "read noise" not in text

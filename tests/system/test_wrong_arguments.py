@@ -1,0 +1,107 @@
+"""Wrong arguments of all that the Python face has: MitsimError of one line, and no other."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mitsim as ms
+from tests.system.test_face import FACE, NO_KIND, needed
+
+pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.slow]
+
+WRONG: list[Any] = [
+    *NO_KIND,
+    *(None, True, False, 0, -1, 3, 10**40, 2**63, 0.5, -1e-300, 1e300, float("nan"), float("inf"), -float("inf")),
+    *("", "x", "a\0b", "\udcff", "n" * 5000, (), [], {}, {"x": object()}, [1, "x"], (1.0, 2.0), np.ones((2, 3))),
+    *(np.float32("nan"), np.int8(-1), Path("no such"), type, lambda: None, ms),
+]
+"""These, and values that are wrong for most."""
+MORE = {
+    "ms": [*FACE["ms"], "Request"],
+    "bench": [*FACE["bench"], "speckle"],
+    "shots": [*FACE["shots"], "read", "measured", "measurements"],
+    "factors": FACE["factors"],
+    "light": ["expose", "save", "speckle"],
+    "image": ["save"],
+    "rendered": ["save"],
+    "plan": ["row", "taking"],
+    "Request": ["of"],
+    "request": ["changed"],
+    "clock": ["add"],
+}
+"""The same, and those of what they make in turn."""
+
+
+class Worked(Exception):
+    """Arguments were taken: work begins, which is another test's."""
+
+
+@pytest.fixture(scope="module")
+def face(shared_scene: Callable[..., Path]) -> dict[str, Any]:
+    """What has public functions, by name."""
+    bench = ms.open_bench(shared_scene("wrong", n=4))
+    shots, factors = bench.capture("dots:2", accuracy=0.1), bench.calibrate(accuracy=0.1)
+    return {
+        "ms": ms,
+        "bench": bench,
+        "shots": shots,
+        "factors": factors,
+        "light": bench.light("dots:2", accuracy=0.1),
+        "image": ms.reconstruct(shots, factors),
+        "rendered": bench.render(spp=4),
+        "plan": bench.plan("dots:2", accuracy=0.1),
+        "Request": ms.Request,
+        "request": ms.Request(),
+        "clock": ms.Clock(),
+    }
+
+
+@pytest.fixture
+def no_work(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Whatever traces light ends at once."""
+    import mitsuba as mi
+
+    from mitsim.capture import simulation
+    from mitsim.transport import flux
+
+    def works(*_: object, **__: object) -> None:
+        raise Worked
+
+    monkeypatch.setattr(simulation.Stage, "trace", works)
+    monkeypatch.setattr(flux.FluxTracer, "sums", works)
+    monkeypatch.setattr(mi, "render", works)
+    yield
+
+
+@pytest.mark.parametrize("of", MORE)
+def test_any_value_is_taken_or_refused_in_a_line(
+    of: str, face: dict[str, Any], no_work: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of many values for each parameter, also for those that a request has and of names that nothing has."""
+    monkeypatch.chdir(tmp_path)
+    owner, wrong = face[of], list[str]()
+    for name in MORE[of]:
+        called = getattr(owner, name)
+        right = needed(face["bench"], face["shots"], face["factors"], called)
+        parameters = inspect.signature(called).parameters
+        names = [each.name for each in parameters.values() if each.kind in (1, 3)]
+        if any(each.kind == each.VAR_KEYWORD for each in parameters.values()):
+            names += [*(ms.Request.model_fields if of != "plan" else ()), "no_such_name"]
+        for parameter in dict.fromkeys(names):
+            for value in WRONG:
+                try:
+                    called(**{**right, parameter: value})
+                except Worked:
+                    pass
+                except ms.MitsimError as refusal:
+                    if len(str(refusal).splitlines()) != 1 or not str(refusal).isprintable():
+                        wrong.append(f"{name}({parameter}={value!r:.60}): {refusal!r:.200}")
+                except Exception as error:
+                    wrong.append(f"{name}({parameter}={value!r:.60}): {error!r:.200}")
+    assert not wrong, "\n".join(wrong)
