@@ -54,7 +54,7 @@ def holding_thin_cylinders(outline: Outline, state: mi.parser.ParserState) -> It
         for a cylinder or sphere that is too thin for its distance, for a thin cylinder of smooth plastic, and where the
         meshes cannot be written.
     """
-    thin = list(_thin(outline, state.nodes))
+    thin = set(_thin(outline, state.nodes))
     with ExitStack() as stack:
         try:
             folder = stack.enter_context(tempfile.TemporaryDirectory()) if thin else ""
@@ -69,11 +69,11 @@ def holding_thin_cylinders(outline: Outline, state: mi.parser.ParserState) -> It
 def _thin(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Iterator[int]:
     """Numbers of the nodes of thin cylinders; MitsimError for what cannot be held."""
     eyes = [placed(node.props)[:3, 3] for node in nodes if node.props.plugin_name() == "projector"] + [np.zeros(3)]
-    for index in standing(nodes):
+    for index, to_world in _seen(nodes):
         props, kind = nodes[index].props, nodes[index].props.plugin_name()
         if kind not in _FINEST:
             continue
-        ends, radius = _extent(props)
+        ends, radius = _extent(props, to_world)
         distance = max(float(np.linalg.norm(end - eye)) for end in ends for eye in eyes)
         tag = outline.tag(mi.parser.SceneNode(nodes[index]), "radius")
         got, held = f"{radius:g} mm at a distance of {distance:.4g} mm", "single precision holds {:.2g} mm there; {}"
@@ -88,6 +88,20 @@ def _thin(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Iterator[in
         yield index
 
 
+def _seen(nodes: Sequence[mi.parser.SceneNode]) -> Iterator[tuple[int, FloatArray]]:
+    """Numbers of all nodes of shapes, and (4, 4) from where they stand to the world: of a group's once an instance."""
+    for index in standing(nodes):
+        yield index, np.eye(4)
+        if nodes[index].props.plugin_name() == "instance":
+            for group in _below(nodes[index].props):
+                yield from ((own, placed(nodes[index].props)) for own in standing(nodes, group))
+
+
+def _below(props: mi.Properties) -> list[int]:
+    """Numbers of the nodes that ``props`` refer to."""
+    return [props[name].index() for name in props.keys() if props.type(name) == _Type.ResolvedReference]  # noqa: SIM118
+
+
 def _replace(nodes: Sequence[mi.parser.SceneNode], index: int, path: Path) -> None:
     """Have a node be the mesh of its cylinder, written to ``path``."""
     props = nodes[index].props
@@ -98,14 +112,13 @@ def _replace(nodes: Sequence[mi.parser.SceneNode], index: int, path: Path) -> No
             del props[name]
     props["filename"] = str(path)
     # A lamp with vertex normals would shine by them, and lose light.
-    own = [props[name].index() for name in props.keys() if props.type(name) == _Type.ResolvedReference]  # noqa: SIM118
-    props["face_normals"] = any(nodes[below].props.plugin_name() == "area" for below in own)
+    props["face_normals"] = any(nodes[below].props.plugin_name() == "area" for below in _below(props))
 
 
-def _extent(props: mi.Properties) -> tuple[list[FloatArray], float]:
+def _extent(props: mi.Properties, to_world: FloatArray) -> tuple[list[FloatArray], float]:
     """Ends or centre in the world, and the largest radius there."""
-    local = placed(props, centred=False)
-    ends = [placed(props)[:3, 3]]
+    local = to_world @ placed(props, centred=False)
+    ends = [(to_world @ placed(props))[:3, 3]]
     if props.plugin_name() == "cylinder":
         ends.append(local[:3, :3] @ _point(props, "p1", (0, 0, 1)) + local[:3, 3])
     stretch = float(np.linalg.svd(local[:3, :3], compute_uv=False)[0])
@@ -114,11 +127,9 @@ def _extent(props: mi.Properties) -> tuple[list[FloatArray], float]:
 
 def _materials(nodes: Sequence[mi.parser.SceneNode], index: int) -> set[str]:
     """Names of all plugins below a node."""
-    props, found = nodes[index].props, set[str]()
-    for name in props.keys():  # noqa: SIM118 - Properties is no dict
-        if props.type(name) == _Type.ResolvedReference:
-            below = props[name].index()
-            found |= {str(nodes[below].props.plugin_name())} | _materials(nodes, below)
+    found = set[str]()
+    for below in _below(nodes[index].props):
+        found |= {str(nodes[below].props.plugin_name())} | _materials(nodes, below)
     return found
 
 
