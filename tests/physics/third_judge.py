@@ -633,7 +633,7 @@ class Answer:
 
 def answer(
     scene: Scene,
-    points: Sequence[tuple[int, int]],
+    points: Sequence[tuple[float, float]],
     labels: npt.NDArray[np.int64] | None = None,
     k: int = 4,
     fine: int = 0,
@@ -646,7 +646,7 @@ def answer(
     scene
         what is lit.
     points
-        (row, column) of sensor pixels.
+        (row, column) of sensor pixels, or of places between their middles.
     labels
         (n^2,) class of each projector pixel; None: one for all.
     k
@@ -681,7 +681,7 @@ def _pixels(scene: Scene, k: int, fine: int) -> Iterator[tuple[npt.NDArray[np.in
 
 
 def _quadrature(
-    scene: Scene, points: Sequence[tuple[int, int]], labels: npt.NDArray[np.int64], k: int, fine: int, parts: int
+    scene: Scene, points: Sequence[tuple[float, float]], labels: npt.NDArray[np.int64], k: int, fine: int, parts: int
 ) -> Array:
     projector, classes = scene.projector, int(labels.max()) + 1
     total = np.zeros((classes, len(points)))
