@@ -50,11 +50,11 @@ def of_reference(name: str, spp: int) -> dict[str, Any]:
     middles = [((i + 0.5) * side - 0.5, (j + 0.5) * side - 0.5) for i, j in np.ndindex(4, 4)]
     right = judge.answer(scene, middles, None, judged.k, judged.fine)
     parts, variance = (each.reshape(4, side, 4, side) for each in (frame.mean, np.square(frame.error)))
-    mean, error = parts.mean(axis=(1, 3)).ravel(), np.sqrt(variance.sum(axis=(1, 3))).ravel() / side**2
+    mean, noise = parts.mean(axis=(1, 3)).ravel(), np.sqrt(variance.sum(axis=(1, 3))).ravel() / side**2
     own = right.error * right.light[0]
     whole = float(mean.sum() / right.light.sum() - 1)
-    of_whole = float(np.sqrt(np.square(error).sum()) / right.light.sum())
-    worst = float(np.abs((mean - right.light[0]) / np.hypot(error, own)).max())
+    of_whole = float(np.sqrt(np.square(noise).sum()) / right.light.sum())
+    worst = float(np.abs((mean - right.light[0]) / np.hypot(noise, own)).max())
     return {
         "scene": name,
         "total": whole,
