@@ -40,6 +40,8 @@ MOST_MIRRORS, MOST_ORDER = 4, 3
 """Turns in mirrors one after the other, and pairs of reflections inside of a pane: at 60 degrees R^8 is 4e-9."""
 LEAST = 1e-5
 """Part of the light below which more reflections inside of a pane are left out."""
+FEWER = 3
+"""Part of the rays a side that reflections inside of a pane take: they are a hundredth of the light."""
 SHOWN = 100
 """Parts a side of a mirror, for what it shows."""
 STEP = 1e-7
@@ -690,7 +692,7 @@ def _quadrature(
         for order in range(MOST_ORDER + 1 if scene.pane else 1):
             found.append(0.0)
             for before in range(order + 1):
-                lights, _ = lit(scene, some, count, before)
+                lights, _ = lit(scene, some, max(2, count // FEWER) if order else count, before)
                 for j, (row, column) in enumerate(points):
                     light = received(scene, lights, scene.camera.point(row, column), order=order - before)
                     total[:, j] += np.bincount(labels[lights.pixel], light, minlength=classes)
