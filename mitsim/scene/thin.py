@@ -88,19 +88,30 @@ def _thin(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Iterator[in
         below = _plugins_below(nodes, index)
         lamp = kind == "sphere" and "area" in below
         ends, radius = _extent(props, to_world)
-        distance = max(float(np.linalg.norm(end - eye)) for end in ends for eye in eyes + (places if lamp else []))
+        distance = _farthest(ends, eyes)
         tag = outline.tag(mi.parser.SceneNode(nodes[index]), "radius")
         got, held = f"{radius:g} mm at a distance of {distance:.4g} mm", "single precision holds {:.2g} mm there; {}"
         finest = _FINEST["lamp" if lamp else kind]
         if distance > finest * radius:
             raise tag.refusal("radius", got, held.format(distance / finest, "take a larger radius"))
-        slender = _SMALL if lamp else _SLENDER
-        if distance < slender * radius or (not lamp and (kind == "sphere" or below & set(_POLISHED))):
+        if lamp:
+            kept, slender, rule = set[str](), _SMALL, "take a matt material"
+            mixed = set(_MIXED + _POLISHED)
+        else:
+            kept, slender, rule = set(_POLISHED), _SLENDER, "take roughplastic in place of the smooth one"
+            mixed = set(_MIXED)
+        if (kind == "sphere" and not lamp) or below & kept:
             continue
-        if below & set(_MIXED if not lamp else _MIXED + _POLISHED):
-            rule = "take a matt material" if lamp else "take roughplastic in place of the smooth one"
+        if distance > slender * radius and below & mixed:
             raise tag.refusal("radius", got, held.format(distance / slender, rule))
-        yield index
+        # What a lamp lights may be further away than camera and projector.
+        if not below & mixed and (_farthest(ends, eyes + places) if lamp else distance) > slender * radius:
+            yield index
+
+
+def _farthest(ends: Sequence[FloatArray], places: Sequence[FloatArray]) -> float:
+    """Largest distance of the ``ends`` from any of the ``places``."""
+    return max(float(np.linalg.norm(end - place)) for end in ends for place in places)
 
 
 def _seen(nodes: Sequence[mi.parser.SceneNode]) -> Iterator[tuple[int, FloatArray]]:
