@@ -176,7 +176,7 @@ def prism(props: mi.Properties) -> Mesh:
 
 
 def ball(props: mi.Properties) -> Mesh:
-    """The same of a sphere, with its area."""
+    """The mesh of a sphere's ``props`` in the world, of the same area."""
     v, u = np.meshgrid(np.linspace(0, 1, _RINGS + 1), np.linspace(0, 1, 2 * _RINGS + 1), indexing="ij")
     sine = np.sin(np.pi * v)
     normal = np.stack([sine * np.cos(2 * np.pi * u), sine * np.sin(2 * np.pi * u), np.cos(np.pi * v)], axis=-1)
