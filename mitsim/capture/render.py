@@ -15,6 +15,7 @@ import numpy as np
 from mitsim.capture.bench import Bench
 from mitsim.capture.cost import frames_cost
 from mitsim.capture.light import Sampling, trace_light
+from mitsim.capture.losses import unseen_lamps
 from mitsim.capture.planning import make_plan
 from mitsim.capture.request import FEWEST_PASSES, REFERENCE, check_accuracy, check_samples
 from mitsim.core.arguments import checked
@@ -240,6 +241,7 @@ def render(
         mean, error = reference(bench.loaded, spp, seed, job)
         warnings = (bench.loaded.unfit.caustics,) if bench.loaded.unfit.caustics else ()
         warnings += _of_sampler(bench.loaded)
+        warnings += tuple(unseen_lamps(bench.loaded, spp * mean.shape[0] * mean.shape[1], "the reference"))
     else:
         uniform = Lighting.uniform(bench.n)
         with job.planning(str(bench.loaded.path)):

@@ -19,6 +19,8 @@ _FAR = 3.0
 """Beyond so many times the aligned plane's distance, a scene is called too far: the window is three times as wide."""
 _SMALL = 1e-2
 """Part of the aligned plane's distance below which a whole scene is taken for one in metres; theirs is 1e-3."""
+_MOST_SHAPES = 64
+"""Shapes that are aimed at one by one, where no ray at all of them together meets one: each takes milliseconds."""
 _MOST_PASSED = 16
 """Surfaces that a ray passes: eight panes of two faces."""
 
@@ -36,9 +38,9 @@ def why_dark(loaded: LoadedScene) -> str:
     projector_to_world = mi.traverse(loaded.projector)["to_world"]
     start = projector_to_world @ mi.Point3f(0)
     window = grid.row_tan, grid.column_tan
-    for part in (window, _part_with_scene(loaded, to_world.inverse() @ start)):
-        if part is None:
-            return _missed(loaded, to_world)
+    boxes = [loaded.scene.bbox(), *(shape.bbox() for shape in loaded.scene.shapes()[:_MOST_SHAPES])]
+    parts = [_part_with(box, loaded, to_world.inverse() @ start) for box in boxes]
+    for part in (window, *filter(None, parts)):
         rows, columns = (low + (high - low) * (np.arange(_RAYS) + 0.5) / _RAYS for low, high in part)
         y, x = (-geometry.scene_distance * edges.ravel() for edges in np.meshgrid(rows, columns, indexing="ij"))
         plane = to_world @ mi.Point3f(x, y, geometry.scene_distance)
@@ -52,7 +54,7 @@ def why_dark(loaded: LoadedScene) -> str:
         if _any(loaded.scene.ray_test(mi.Ray3f(start, towards))):
             return "all that the projector's rays meet lets light pass; put something opaque behind it"
     else:
-        return _missed(loaded, to_world)
+        return _missed(loaded, to_world, any(parts[1:]))
     back = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.BackSide)
     centre = to_world @ mi.Point3f(0)
     lit = si.is_valid() & (back | (si.wi.z > 0))
@@ -87,10 +89,10 @@ _Edges = tuple[tuple[float, float], tuple[float, float]]
 """First and last tan-angle of rows and of columns on the aligned plane."""
 
 
-def _part_with_scene(loaded: LoadedScene, start: mi.Point3f) -> _Edges | None:
-    """The part of the window through which rays from ``start``, in the camera's frame, may meet the scene's box; None
-    where there is none."""
-    box, distance = loaded.scene.bbox(), loaded.camera.geometry.scene_distance
+def _part_with(box: mi.BoundingBox3f, loaded: LoadedScene, start: mi.Point3f) -> _Edges | None:
+    """The part of the window through which rays from ``start``, in the camera's frame, may meet a ``box``; None where
+    there is none."""
+    distance = loaded.camera.geometry.scene_distance
     if not box.valid():
         return None
     corners = _corners(box, loaded.camera.world_transform())
@@ -127,8 +129,9 @@ def _opaque(scene: mi.Scene, ray: mi.Ray3f, target: mi.Point3f | None) -> mi.Sur
     return si
 
 
-def _missed(loaded: LoadedScene, to_world: mi.Transform4f) -> str:
-    """Where the scene lies, when no ray of the projector meets it."""
+def _missed(loaded: LoadedScene, to_world: mi.Transform4f, within: bool) -> str:
+    """Where the scene lies, when no ray of the projector meets it; ``within`` tells whether the box of a shape lies in
+    the window."""
     distance, box = loaded.camera.geometry.scene_distance, loaded.scene.bbox()
     if not box.valid():
         return "the scene has no surfaces; add a shape"
@@ -141,6 +144,11 @@ def _missed(loaded: LoadedScene, to_world: mi.Transform4f) -> str:
         return f"{where}: too far, for the rig is aligned to {distance:g} mm; move it nearer or set scene_distance"
     if high[2] <= 0:
         return f"{where}: behind the camera, which looks along +z; move the scene or turn the camera"
+    if within:
+        return (
+            f"{where}: within the window, but {_RAYS} x {_RAYS} rays at each of its shapes miss them; give the "
+            "projector a narrower fov, or a larger target"
+        )
     rows, columns = loaded.pixels.row_tan, loaded.pixels.column_tan
     window = ", ".join(
         f"{axis} = {-distance * edges[1]:.4g} to {-distance * edges[0]:.4g}"

@@ -154,13 +154,14 @@ def write(judged: Judged, folder: Path) -> Path:
     x, y, z = judged.moved
     move = f'<translate x="{x}" y="{y}" z="{z}"/>' if any(judged.moved) else ""
     mask = "open" if camera.code is None else "separable"
+    integrator = "volpath" if any(isinstance(one, Rectangle) and one.open for one in scene.shapes) else "path"
     px, py, pz = projector.place
     shapes = "\n".join(
         _shape(one, folder, f"shape{i}", move) for i, one in enumerate([*scene.shapes, *filter(None, [scene.pane])])
     )
     (folder / "scene.xml").write_text(
         f"""<scene version="3.0.0">
-<integrator type="path"><integer name="max_depth" value="2"/></integrator>
+<integrator type="{integrator}"><integer name="max_depth" value="2"/></integrator>
 <sensor type="mitsim_lensless"><transform name="to_world">{move}</transform>
 <float name="pixel_pitch" value="{camera.pitch}"/><string name="mask" value="{mask}"/>
 <integer name="mask_order" value="8"/><float name="mask_feature" value="{camera.feature}"/>

@@ -75,6 +75,34 @@ def test_a_card_of_opacity_0_is_no_card(scene: Callable[..., Bench]) -> None:
     assert direct_light(behind, 1) == pytest.approx(direct_light(alone, 1), rel=1e-6)
 
 
+@pytest.mark.parametrize("radius", [6.0, 1.5])
+def test_a_cylinder_does_not_hide_itself(scene: Callable[..., Bench], radius: float) -> None:
+    """Its points lie off its surface by single precision. (Seen failing with the short offset of flat surfaces: 28
+    and 62 % of the light were lost.)"""
+    rod = f"""<shape type="cylinder"><point name="p0" x="-40" y="-30" z="330"/><point name="p1" x="40" y="25" z="310"/>
+        <float name="radius" value="{radius}"/>{MATT}</shape>"""
+    alone, beside = scene(rod, sheet_z=-400), scene(rod + plate(350, card(0)), sheet_z=-400)
+    assert direct_light(beside, 1) == pytest.approx(direct_light(alone, 1), rel=1e-3)
+
+
+def test_an_instance_does_not_hide_itself(scene: Callable[..., Bench]) -> None:
+    """Rods, alone and of a group in which they are half as large. (Seen failing with the short offset of what is no
+    instance: 16 % was lost.)"""
+
+    def rods(scale: float, z: float) -> str:
+        ends = ("p0", -40, -30, 330), ("p1", 40, 25, 310)
+        points = "".join(
+            f'<point name="{name}" x="{x * scale}" y="{y * scale}" z="{(depth - z) * scale}"/>'
+            for name, x, y, depth in ends
+        )
+        return f'<shape type="cylinder">{points}<float name="radius" value="{0.5 * scale}"/>{MATT}</shape>'
+
+    group = f"""<shape type="shapegroup" id="group">{rods(0.5, 300)}</shape><shape type="instance"><ref id="group"/>
+        <transform name="to_world"><scale value="2"/><translate z="300"/></transform></shape>"""
+    alone = scene(rods(1, 0), sheet_z=-400)
+    assert direct_light(scene(group, sheet_z=-400), 1) == pytest.approx(direct_light(alone, 1), rel=1e-3)
+
+
 def test_what_stands_behind_the_sensor_hides_nothing(scene: Callable[..., Bench]) -> None:
     """A wall of the room behind camera and projector (seen failing: what lay beyond the sensor hid all light)."""
     room = plate(-300, MATT, 1000)

@@ -40,6 +40,8 @@ MOST_MIRRORS, MOST_ORDER = 4, 3
 """Turns in mirrors one after the other, and pairs of reflections inside of a pane: at 60 degrees R^8 is 4e-9."""
 LEAST = 1e-5
 """Part of the light below which more reflections inside of a pane are left out."""
+FEWER = 3
+"""Part of the rays a side that reflections inside of a pane take: they are a hundredth of the light."""
 SHOWN = 100
 """Parts a side of a mirror, for what it shows."""
 STEP = 1e-7
@@ -633,7 +635,7 @@ class Answer:
 
 def answer(
     scene: Scene,
-    points: Sequence[tuple[int, int]],
+    points: Sequence[tuple[float, float]],
     labels: npt.NDArray[np.int64] | None = None,
     k: int = 4,
     fine: int = 0,
@@ -646,7 +648,7 @@ def answer(
     scene
         what is lit.
     points
-        (row, column) of sensor pixels.
+        (row, column) of sensor pixels, or of places between their middles.
     labels
         (n^2,) class of each projector pixel; None: one for all.
     k
@@ -681,7 +683,7 @@ def _pixels(scene: Scene, k: int, fine: int) -> Iterator[tuple[npt.NDArray[np.in
 
 
 def _quadrature(
-    scene: Scene, points: Sequence[tuple[int, int]], labels: npt.NDArray[np.int64], k: int, fine: int, parts: int
+    scene: Scene, points: Sequence[tuple[float, float]], labels: npt.NDArray[np.int64], k: int, fine: int, parts: int
 ) -> Array:
     projector, classes = scene.projector, int(labels.max()) + 1
     total = np.zeros((classes, len(points)))
@@ -690,7 +692,7 @@ def _quadrature(
         for order in range(MOST_ORDER + 1 if scene.pane else 1):
             found.append(0.0)
             for before in range(order + 1):
-                lights, _ = lit(scene, some, count, before)
+                lights, _ = lit(scene, some, max(2, count // FEWER) if order else count, before)
                 for j, (row, column) in enumerate(points):
                     light = received(scene, lights, scene.camera.point(row, column), order=order - before)
                     total[:, j] += np.bincount(labels[lights.pixel], light, minlength=classes)

@@ -151,6 +151,43 @@ def test_a_small_lamp_in_view_flags_the_plan(
         )
 
 
+def glowing(x: float, z: float, radius: float) -> str:
+    return f"""<shape type="sphere"><point name="center" x="{x}" y="0" z="{z}"/><float name="radius" value="{radius}"/>
+        <emitter type="area"><spectrum name="radiance" value="100"/></emitter></shape>"""
+
+
+@pytest.mark.parametrize(
+    ("extra", "seen"),
+    [
+        (glowing(20, 300, 0.3), True),
+        (glowing(20, 300, 2), False),  # found by paths
+        (glowing(0.19 * 300, 300, 0.3), False),
+        (glowing(0, 500, 0.3), False),  # behind the sheet
+        (
+            glowing(20, 300, 0.3) + BEHIND.format(HOLE.format(1)).replace("<translate", '<scale value="9"/><translate'),
+            False,
+        ),
+    ],
+)
+def test_a_speck_that_shines_into_the_camera_flags_the_run(
+    small_scene: Callable[..., Path], variant: str, extra: str, seen: bool
+) -> None:
+    """Paths from the sensor meet it by chance alone: it was missing in silence, by both estimators. (Planted: the stop
+    ignored, nothing in the way, every lamp.)"""
+    path = small_scene(n=N, extra=extra, integrator="volpath")
+    bench = open_bench(path, variant)
+    said = list(known_losses(bench.loaded, {}))
+    assert bool(said) is seen and not list(known_losses(bench.loaded, {"ambient": False}))
+    by_reference = bench.render("reference", spp=4).warnings
+    assert bool(by_reference) is seen
+    if seen:
+        line = 1 + path.read_text(encoding="utf-8").split('<shape type="sphere"')[0].count("\n")
+        for sentence in (*said, *by_reference):
+            assert sentence.startswith(
+                f"{path}:{line}: lamp: got 2.6e-05 of the field of view in <shape type='sphere'>"
+            )
+
+
 def test_a_lamp_that_cannot_be_connected_is_refused(small_scene: Callable[..., Path], variant: str) -> None:
     """No tracer finds a surface's light in a single direction: its ambient frame was black, without a word."""
     path = small_scene(n=N, extra='<shape type="disk"><emitter type="directionalarea"/></shape>')

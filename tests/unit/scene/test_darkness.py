@@ -107,3 +107,17 @@ def test_causes_are_looked_for_behind_what_lets_light_pass(small_scene: Write, b
 def test_a_scene_of_glass_alone(small_scene: Write) -> None:
     path = small_scene(extra=PANE.format(z=200, bsdf="null"), sheet_z=-400)
     assert "lets light pass" in sentence(path)
+
+
+BALL = '<shape type="sphere"><point name="center" x="{x}" y="{y}" z="400"/><float name="radius" value="{r}"/></shape>'
+
+
+def test_a_speck_beside_a_ball_outside_the_window(small_scene: Write) -> None:
+    """The scene's box spans the window, which shows a speck alone. (Seen failing: "outside the window".)"""
+    speck, ball = BALL.format(x=10, y=5, r=0.001), BALL.format(x=150, y=5, r=5)
+    path = small_scene(extra=speck + ball, sheet_z=-400)
+    sheet = path.read_text()
+    sheet = sheet[sheet.index('<shape type="rectangle"') : sheet.index("</shape>") + 8]
+    assert "projector pixels: too few rays meet it" in sentence(path, sheet)
+    path = small_scene("outside", extra=ball + BALL.format(x=-150, y=5, r=5), sheet_z=-400)
+    assert "outside the window" in sentence(path, sheet.replace("small_", "outside_"))

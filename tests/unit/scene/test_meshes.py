@@ -108,3 +108,16 @@ def test_a_valid_mesh_is_loaded_as_it_is(tmp_path: Path, dialect: str) -> None:
         mesh = mi.load_dict({"type": "ply", "filename": str(path)})
         assert mesh.face_count() == 2
         assert float(np.array(mesh.surface_area()).ravel()[0]) == pytest.approx(AREA, rel=1e-6)
+
+
+@pytest.mark.usefixtures("variant")
+def test_a_header_that_mitsuba_does_not_know_is_refused(tmp_path: Path) -> None:
+    """The line that scanners write, valid as it is, by its words; once Mitsuba reads it, let it pass."""
+    import mitsuba as mi
+
+    path = tmp_path / "scan.ply"
+    path.write_bytes(Dialect(comments=["obj_info num_cols 512"]).written("ascii"))
+    with pytest.raises(ValueError, match=r"header line that is not understood \('obj_info num_cols 512'\); remove it"):
+        check_ply(path)
+    with pytest.raises(RuntimeError, match="invalid PLY header"):
+        mi.load_dict({"type": "ply", "filename": str(path)})
