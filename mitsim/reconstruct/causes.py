@@ -9,9 +9,9 @@ nothing.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 
 import numpy as np
 
@@ -167,6 +167,10 @@ class Evidence:
             self._common += residual
             self._common_noise += variance * residual.size
             self._shots += 1
+        self.collect(measurement, frame, variance)
+
+    def collect(self, measurement: Measurement, frame: FloatArray, variance: float) -> None:
+        """Count in one measurement for :meth:`print_part` alone; parameters as of :meth:`add`."""
         for k, (rows, columns) in enumerate(self._groups):
             weight = rows.weights[measurement.row] * columns.weights[measurement.column]
             if weight:
@@ -180,29 +184,32 @@ class Evidence:
         if self._shots > 1 and unexplained > 0:
             common = (float(np.square(self._common).sum()) - self._common_noise) / self._shots / unexplained
         everything = [orthonormal(side) for side in self._factors]
-        left, frames = np.zeros(5), list(self._lit_frames())
-        for each in frames:
+        left = np.zeros(5)
+        for each in self._lit_frames:
             own = each.ranges
             glossy = [orthonormal(_modulated(side)) for side in each.factors]
             ranges = own, (everything[0], own[1]), (own[0], everything[1]), everything, glossy
             left += [each.beyond(*pair) for pair in ranges]
         rows, columns, everywhere, gloss = 1 - left[1:] / left[0] if left[0] > 0 else np.full(4, np.nan)
         mask = self.foretold / unexplained if self.foretold is not None and unexplained > 0 else np.nan
-        detail = print_part(frames) if self._told_apart else np.nan
-        told = rows, columns, everywhere, gloss, common, saturated, mask, detail
+        told = rows, columns, everywhere, gloss, common, saturated, mask, self.print_part()
         return Signatures(*(float(value) for value in told))
 
-    def _lit_frames(self) -> Iterator[LitFrame]:
-        slopes = [slope_of(side) for side in self._factors]
+    def print_part(self) -> float:
+        """Part of what the lit pixels leave of their frames that is print finer than a pixel; NaN where pixels of
+        patterns overlap."""
+        return print_part(self._lit_frames) if self._told_apart else np.nan
+
+    @cached_property
+    def _lit_frames(self) -> list[LitFrame]:
+        slopes = [slope_of(side, spline=True) for side in self._factors]
+        frames = []
         for groups, frame, variance in zip(self._groups, self._frames, self._variances, strict=True):
             rows, columns = (group.pixels for group in groups)
-            yield LitFrame(
-                frame,
-                variance,
-                (self._factors[0][:, rows], self._factors[1][:, columns]),
-                (slopes[0][:, rows], slopes[1][:, columns]),
-                (blocks_of(rows, self._factors[0].shape[1]), blocks_of(columns, self._factors[1].shape[1])),
-            )
+            lit = self._factors[0][:, rows], self._factors[1][:, columns]
+            blocks = blocks_of(rows, self._factors[0].shape[1]), blocks_of(columns, self._factors[1].shape[1])
+            frames.append(LitFrame(frame, variance, lit, (slopes[0][:, rows], slopes[1][:, columns]), blocks))
+        return frames
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,11 +18,12 @@ from scipy.optimize import minimize_scalar
 
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
-from mitsim.reconstruct.accumulator import Accumulator
+from mitsim.reconstruct.accumulator import Accumulator, centred
 from mitsim.reconstruct.alldepths import AllDepths, searched
 from mitsim.reconstruct.arrivals import parallax_period
+from mitsim.reconstruct.causes import Evidence
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import stated_parallax
+from mitsim.reconstruct.focus import focused, stated_parallax
 from mitsim.reconstruct.misfit import CHANCE
 from mitsim.reconstruct.noise import factor_energy
 from mitsim.reconstruct.solver import Prepared, prepare
@@ -149,6 +150,7 @@ class _Search:
             self._period = parallax_period(shots.patterns, stated_parallax(factors))
             beyond = min(self._period, self._ends[1])
         self._tried = self._ends[0] - beyond, self._ends[1] + beyond
+        self._shots, self._factors = shots, factors
         self._all = AllDepths(shots, factors, self._tried)
         self._inverse, self._factor_noise = 1 / stated_parallax(factors).depth_mm, factors.manifest.noise
         self.pixel = 1 / max(self._all.reach(axis) for axis in (0, 1))
@@ -165,18 +167,18 @@ class _Search:
         mm, at_end = self._mm(shift), not self._ends[0] + margin < shift < self._ends[1] - margin
         local = float(np.hypot(error, _RESOLUTION * self.pixel)) * mm**2
         misfit = self._misfit(shift, least)
-        ties = [
-            valley for valley in valleys[1:] if valley[0] - least < self._indifferent(valley[0] - least, least, misfit)
-        ]
+        if misfit and (self._ties(valleys, misfit) or rise < self._indifferent(rise, least, misfit)):
+            misfit *= 1 - self._print_part(shift)
+        ties = self._ties(valleys, misfit)
         others = tuple(
             Alternative(self._mm(other), float(np.sqrt((left - least) / self._all.energy))) for left, other in ties
         )
         doubt = ""
         if at_end:
             doubt = (
-                f"End of range: {mm:.1f} mm, which explains most, is not within the depths that were tried, "
-                f"{range_mm[0]:.0f} to {range_mm[1]:.0f} mm; give another range of depths, or calibrate nearer to the "
-                "scene."
+                f"End of range: {mm:.1f} mm explains most, and depths from {range_mm[0]:.0f} to {range_mm[1]:.0f} mm "
+                "were tried, so the scene may lie beyond; give a range of depths that holds it, with --depth-range "
+                "NEAR:FAR or depth_range, or calibrate nearer to it."
             )
         elif not (
             error < self.pixel and rise > max(self._indifferent(rise, least, misfit), _LEAST_RISE * self._all.energy)
@@ -256,6 +258,22 @@ class _Search:
     def _indifferent(self, difference: float, least: float, misfit: float) -> float:
         """Energy by which two depths may differ of which either is the right one."""
         return max(by_chance(difference, self._variance(least), self._unknowns), _OPPOSED * misfit)
+
+    def _ties(self, valleys: list[tuple[float, float]], misfit: float) -> list[tuple[float, float]]:
+        """Those of the sorted ``valleys`` that may be the right one, beside the lowest, by what its depth leaves beyond
+        noise."""
+        least = valleys[0][0]
+        return [each for each in valleys[1:] if each[0] - least < self._indifferent(each[0] - least, least, misfit)]
+
+    def _print_part(self, shift: float) -> float:
+        """Part of the misfit at the depth of ``shift`` that is print finer than a scene pixel: its light lies on either
+        side of the pixels' centres, so no other depth explains it."""
+        there = focused(self._factors, self._mm(shift))
+        evidence = Evidence(there.factors, self._all.patterns)
+        for each in there.of(self._shots).measured():
+            frame = centred(each.frame) if there.factors.manifest.centre else each.frame
+            evidence.collect(each, frame, float(self._all.noise.variance[each.row, each.column]))
+        return float(np.nan_to_num(evidence.print_part()))
 
     def _misfit(self, shift: float, least: float) -> float:
         """Energy that the depth of ``shift`` leaves beyond what noise of frames and factors and rendering leave; 0

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter
 
 from mitsim.core.arrays import FloatArray
@@ -220,17 +221,28 @@ def moved_responses(side: Side, slope: FloatArray, patterns: FloatArray) -> Floa
     return total
 
 
-def slope_of(factor: FloatArray) -> FloatArray:
+def slope_of(factor: FloatArray, spline: bool = False) -> FloatArray:
     """(m, n) Phi', change of a ``factor`` (m, n) by scene pixel.
 
     Where a shadow moves by more than a sensor pixel from one scene pixel to the next, its slope is that along the
     sensor, since neighbours in the scene may be a whole feature of the mask apart; otherwise that of neighbours.
+
+    Parameters
+    ----------
+    factor
+        of one side.
+    spline
+        whether by a cubic spline through neighbours instead of their differences: half as much is missed at the edges
+        of features, 6 instead of 11 % of the energy of points in pixels of 1.9 mm, and noise counts twice.
     """
     rows, columns = factor.shape
     if columns == 1:
         return np.zeros_like(factor)
     shift = _shift(factor) if rows > 2 else 0.0
-    return np.asarray(np.gradient(factor, axis=1) if abs(shift) < 1 else -shift * np.gradient(factor, axis=0))
+    if abs(shift) >= 1:
+        return np.asarray(-shift * np.gradient(factor, axis=0))
+    places = np.arange(columns)
+    return np.asarray(CubicSpline(places, factor, axis=1)(places, 1) if spline else np.gradient(factor, axis=1))
 
 
 def disagreement(model: Model, gain: FloatArray, halves: Halves, known: tuple[FloatArray, FloatArray]) -> FloatArray:

