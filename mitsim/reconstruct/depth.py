@@ -74,7 +74,7 @@ class Depth:
     alternatives
         depths that explain the measurements as well.
     at_end
-        whether it is an end of the range, or beyond it by a period of the dots.
+        whether it is an end of what was tried, where nothing fits.
     """
 
     mm: float
@@ -158,13 +158,13 @@ class _Search:
 
     def found(self) -> Depth:
         """The lowest valley, and all that may be as low."""
-        valleys = sorted(self._valleys())
-        valleys = sorted([*valleys, *self._beyond(valleys[0][1])])
+        margin = 2 * _RESOLUTION * self.pixel
+        valleys = sorted(self._valleys(*self._ends))
+        valleys = sorted([*valleys, *self._beyond(valleys[0][1], margin)])
         least, shift = valleys[0]
         error, rise = self._certainty(shift, least)
-        range_mm = self._mm(self._ends[1]), self._mm(self._ends[0])
-        margin = 2 * _RESOLUTION * self.pixel
-        mm, at_end = self._mm(shift), not self._ends[0] + margin < shift < self._ends[1] - margin
+        mm, range_mm = self._mm(shift), (self._mm(self._ends[1]), self._mm(self._ends[0]))
+        at_end = min(abs(end - shift) for end in (*self._ends, *self._tried)) < margin
         local = float(np.hypot(error, _RESOLUTION * self.pixel)) * mm**2
         misfit = self._misfit(shift, least)
         if misfit and (self._ties(valleys, misfit) or rise < self._indifferent(rise, least, misfit)):
@@ -174,7 +174,7 @@ class _Search:
             Alternative(self._mm(other), float(np.sqrt((left - least) / self._all.energy))) for left, other in ties
         )
         doubt = ""
-        if at_end:
+        if at_end or not self._ends[0] < shift < self._ends[1]:
             doubt = (
                 f"End of range: {mm:.1f} mm explains most, and depths from {range_mm[0]:.0f} to {range_mm[1]:.0f} mm "
                 "were tried, so the scene may lie beyond; give a range of depths that holds it, with --depth-range "
@@ -206,10 +206,11 @@ class _Search:
         problem = prepared.problem(sums)
         return self._all.energy - float(np.square(problem.projected[problem.sigma > 0]).sum())
 
-    def _valleys(self) -> Iterator[tuple[float, float]]:
-        """Energy left over at the bottom of the lowest valley and of those that may be as low, and changes of 1/z."""
-        steps = max(int(np.ceil((self._ends[1] - self._ends[0]) / (_STEP * self.pixel))), _FEWEST)
-        shifts = np.linspace(*self._ends, steps + 1)
+    def _valleys(self, first: float, last: float) -> Iterator[tuple[float, float]]:
+        """Energy left over at the bottom of the lowest valley between two changes of 1/z and of those that may be as
+        low, and changes of 1/z."""
+        steps = max(int(np.ceil((last - first) / (_STEP * self.pixel))), _FEWEST)
+        shifts = np.linspace(first, last, steps + 1)
         scores = np.array([self.left_over(shift) for shift in shifts])
         beside = np.minimum(np.append(scores[1:], np.inf), np.append(np.inf, scores[:-1]))
         lows = sorted(map(int, np.flatnonzero(scores <= beside)), key=lambda index: float(scores[index]))
@@ -220,19 +221,23 @@ class _Search:
             left, shift = self._bottom(shifts[max(index - 1, 0)], shifts[min(index + 1, steps)])
             if left < least:
                 half = shifts[1] - shifts[0]
-                around = [self.left_over(float(np.clip(shift + part * half, *self._ends))) for part in (-0.5, 0.5)]
+                around = [self.left_over(float(np.clip(shift + part * half, first, last))) for part in (-0.5, 0.5)]
                 least, below = left, max(around) - left
             yield left, shift
 
-    def _beyond(self, shift: float) -> Iterator[tuple[float, float]]:
+    def _beyond(self, shift: float, margin: float) -> Iterator[tuple[float, float]]:
         """The same of depths beyond the range that are a period of the dots from the best ``shift`` within it, or
-        several."""
-        if np.isfinite(self._period):
-            for end, step in zip(self._tried, (-self._period, self._period), strict=True):
+        several; and of all beyond an end that it is, within the ``margin``."""
+        for end, tried, step in zip(self._ends, self._tried, (-self._period, self._period), strict=True):
+            if tried == end:
+                continue
+            if abs(shift - end) < margin:
+                yield from self._valleys(*sorted((end, tried)))
+            elif np.isfinite(self._period):
                 away = shift + step
                 while self._ends[0] <= away <= self._ends[1]:
                     away += step
-                if abs(away) < abs(end):
+                if abs(away) < abs(tried):
                     yield self._bottom(away - _STEP * self.pixel, away + _STEP * self.pixel)
 
     def _bottom(self, first: float, last: float) -> tuple[float, float]:

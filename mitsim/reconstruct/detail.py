@@ -43,6 +43,8 @@ cover alike (within 1 %, 48 arrangements of prints, mask and patterns)."""
 _BLOCKS = 4
 """Blocks a side of the scene in which a depth of their own is looked for: tilted and stepped surfaces leave a sixteenth
 of their dipoles' energy unexplained by blocks, and each has pixels enough to tell a depth from print."""
+_EDGE = 0.5
+"""Scene pixels from the centre of one to its edge."""
 _RANK = 1e-6
 """Relative eigenvalue below which a block's depth is not told: chosen, blocks without light have none."""
 
@@ -138,6 +140,15 @@ class LitFrame:
         beyond = np.square(self.frame).sum() - np.square(seen).sum() - (self.frame.size - seen.size) * self.variance
         return float(beyond)
 
+    @cached_property
+    def moments(self) -> FloatArray:
+        """(3,) sums of squares of the lit pixels' light, and of its dipoles along rows and along columns."""
+        inverse = [np.linalg.pinv(np.hstack(both)) for both in zip(self.factors, self.slopes, strict=True)]
+        found = inverse[0] @ self.frame @ inverse[1].T
+        rows, columns = (side.shape[1] for side in self.factors)
+        parts = found[:rows, :columns], found[rows:, :columns], found[:rows, columns:]
+        return np.array([np.square(part).sum() for part in parts])
+
     def of_depths(self) -> tuple[FloatArray, FloatArray]:
         """Normal matrix and right side of the dipoles, along rows and columns of each block, that are the same multiple
         of all its pixels' light, fitted to what the factors alone leave."""
@@ -163,8 +174,12 @@ def print_part(frames: Sequence[LitFrame]) -> float:
     Print has its light on either side of the centres; a surface beside the calibrated distance has all of it on one, by
     the same part of a pixel nearby. So what depths explain, the same for all frames, is no print: of the whole scene or
     block by block, told from all frames but that which they explain, as dipoles of print may add up to any depth in
-    one. Wider ranges explain a part of anything, too, in proportion to their size.
+    one. No light is further from its pixel's centre than the edge: more has been moved by something else. Wider ranges
+    explain a part of anything, too, in proportion to their size.
     """
+    light, *dipoles = np.sum([each.moments for each in frames], axis=0)
+    if max(dipoles) > _EDGE**2 * light:
+        return 0.0
     own = sum(each.beyond(*each.ranges) for each in frames)
     left_over = 0.0
     for each in frames:
