@@ -14,6 +14,8 @@ import pytest
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.alldepths import AllDepths
+from mitsim.reconstruct.causes import Cause
+from mitsim.reconstruct.depth import Depth
 from mitsim.reconstruct.depthmap import depth_map
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.pixeldepths import PixelDepths
@@ -89,6 +91,25 @@ def test_a_card_before_a_board(patterns: str, baseline: tuple[float, float], lea
     assert not found.doubt and np.median(error) < 2 and (error < 5).mean() > 0.95
     assert psnr(found.image) > least and psnr(found.image) > psnr(one.image) + 20
     assert found.told.mean() > 0.9
+
+
+def tilted() -> np.ndarray:
+    """Eight strips from 425 to 435 mm, as of a sheet that is turned by 5 degrees."""
+    return np.tile(np.repeat(np.linspace(425, 435, 8), N // 8), (N, 1))
+
+
+@pytest.mark.parametrize("depths", [tilted(), cards()], ids=["tilted", "cards"])
+def test_one_depth_of_several_is_flagged(depths: np.ndarray) -> None:
+    """One depth between those of the scene is found, and what it leaves is called depth; one for each pixel leaves a
+    third of it."""
+    run, factors = shots(depths, "dots:4x8"), calibrated()
+    one, each = (reconstruct(run, factors, focus=focus) for focus in ("auto", "map"))
+    print(one.focus, one.status, psnr(one.image), psnr(each.image))
+    assert isinstance(one.focus, Depth) and depths.min() - 1 < one.focus.mm < depths.max() + 1
+    assert not one.ok and one.misfit and one.misfit.cause is Cause.DEPTH
+    assert (
+        each.misfit and each.misfit.unexplained < one.misfit.unexplained / 3 and psnr(each.image) > psnr(one.image) + 3
+    )
 
 
 @pytest.mark.parametrize(
