@@ -170,7 +170,13 @@ class Evidence:
         self.collect(measurement, frame, variance)
 
     def collect(self, measurement: Measurement, frame: FloatArray, variance: float) -> None:
-        """Count in one measurement for :meth:`print_part` alone; parameters as of :meth:`add`."""
+        """Count in one measurement for :meth:`print_part` alone.
+
+        Parameters
+        ----------
+        measurement, frame, variance
+            as of :meth:`add`.
+        """
         for k, (rows, columns) in enumerate(self._groups):
             weight = rows.weights[measurement.row] * columns.weights[measurement.column]
             if weight:

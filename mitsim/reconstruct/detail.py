@@ -135,7 +135,7 @@ class LitFrame:
         return left, right
 
     def beyond(self, left: FloatArray, right: FloatArray) -> float:
-        """Energy beyond the noise that two orthonormal ranges leave."""
+        """Energy beyond the noise that two orthonormal ranges leave, ``left`` (m, r) and ``right`` (m', r')."""
         seen = left.T @ self.frame @ right
         beyond = np.square(self.frame).sum() - np.square(seen).sum() - (self.frame.size - seen.size) * self.variance
         return float(beyond)
