@@ -78,11 +78,8 @@ class Arrivals:
         periods = [own.shape[1] for own in shots.patterns]
         self.width = min(self._span, _unambiguous(np.where(self._open, moves, 0.0) * self.pixel, periods) * self.pixel)
         self.reach = beside + self.width / 2 + (max(OFFSETS) + _MARGIN) * self.pixel
-        # All depths moved by a whole period are tried as well.
-        self.reach += self.width if self.limited else 0.0
         self.depths = AllDepths(shots, factors, (-self.reach, self.reach))
-        reached = self.reach - (self.width if self.limited else 0.0)
-        self._margin = int(np.ceil(reached / self.pixel)) + 1
+        self._margin = int(np.ceil(self.reach / self.pixel)) + 1
 
     @property
     def limited(self) -> bool:

@@ -11,12 +11,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.measurement import Measurement
 from mitsim.reconstruct.calibration import SEPARABLE_RESIDUAL
+from mitsim.reconstruct.detail import LitFrame, blocks_of, orthonormal, print_part, slope_of
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.sides import IndexArray, group_pixels
 
@@ -88,8 +90,12 @@ class Cause(Enum):
         "a camera that is not separable, which its calibration shows as well",
         "straighten the mask, or take a separable one",
     )
+    DETAIL = (
+        "print finer than a scene pixel, light beside the centres of the pixels",
+        "use a projector of more pixels, or bring projector and scene closer together",
+    )
     UNKNOWN = (
-        "unknown: depth, gloss, indirect light or print much finer than a projector pixel",
+        "unknown: depth, gloss or indirect light",
         "compare the map of the misfit with the scene",
     )
 
@@ -101,6 +107,8 @@ class Signatures:
     ``rows``, ``columns``, ``everywhere``: explained by light of any scene row, of any column, of any pixel.
     ``gloss``: explained by factors that change over the sensor. ``common``: the same in every shot. ``saturated``: part
     of the readings at the end of their range. ``mask``: foretold by what the calibration knows that its factors lack.
+    ``detail``: light beside the centres of the lit pixels, but not because of depth; NaN where pixels of patterns
+    overlap.
     """
 
     rows: float
@@ -110,6 +118,7 @@ class Signatures:
     common: float
     saturated: float
     mask: float = np.nan
+    detail: float = np.nan
 
 
 class Evidence:
@@ -132,7 +141,8 @@ class Evidence:
         self._factors = factors.sides
         noise = factors.manifest.noise
         self.of_factors = noise.unexplained if noise else 0.0
-        sides = [_lit_groups(side) for side in patterns]
+        sides, apart = zip(*(_lit_groups(side) for side in patterns), strict=True)
+        self._told_apart = all(apart)
         places = {(int(row * len(sides[0])), int(column * len(sides[1]))) for row, column in _PLACES}
         self._groups = [(sides[0][row], sides[1][column]) for row, column in sorted(places)]
         shape = len(factors.left), len(factors.right)
@@ -157,6 +167,16 @@ class Evidence:
             self._common += residual
             self._common_noise += variance * residual.size
             self._shots += 1
+        self.collect(measurement, frame, variance)
+
+    def collect(self, measurement: Measurement, frame: FloatArray, variance: float) -> None:
+        """Count in one measurement for :meth:`print_part` alone.
+
+        Parameters
+        ----------
+        measurement, frame, variance
+            as of :meth:`add`.
+        """
         for k, (rows, columns) in enumerate(self._groups):
             weight = rows.weights[measurement.row] * columns.weights[measurement.column]
             if weight:
@@ -169,16 +189,33 @@ class Evidence:
         common = np.nan
         if self._shots > 1 and unexplained > 0:
             common = (float(np.square(self._common).sum()) - self._common_noise) / self._shots / unexplained
-        everything = [_orthonormal(side) for side in self._factors]
+        everything = [orthonormal(side) for side in self._factors]
         left = np.zeros(5)
-        for groups, frame, variance in zip(self._groups, self._frames, self._variances, strict=True):
-            lit = [side[:, group.pixels] for side, group in zip(self._factors, groups, strict=True)]
-            own, glossy = [_orthonormal(side) for side in lit], [_orthonormal(_modulated(side)) for side in lit]
-            ranges = (own[0], own[1]), (everything[0], own[1]), (own[0], everything[1]), everything, glossy
-            left += [_beyond(frame, variance, *pair) for pair in ranges]
+        for each in self._lit_frames:
+            own = each.ranges
+            glossy = [orthonormal(_modulated(side)) for side in each.factors]
+            ranges = own, (everything[0], own[1]), (own[0], everything[1]), everything, glossy
+            left += [each.beyond(*pair) for pair in ranges]
         rows, columns, everywhere, gloss = 1 - left[1:] / left[0] if left[0] > 0 else np.full(4, np.nan)
         mask = self.foretold / unexplained if self.foretold is not None and unexplained > 0 else np.nan
-        return Signatures(*(float(value) for value in (rows, columns, everywhere, gloss, common, saturated, mask)))
+        told = rows, columns, everywhere, gloss, common, saturated, mask, self.print_part()
+        return Signatures(*(float(value) for value in told))
+
+    def print_part(self) -> float:
+        """Part of what the lit pixels leave of their frames that is print finer than a pixel; NaN where pixels of
+        patterns overlap."""
+        return print_part(self._lit_frames) if self._told_apart else np.nan
+
+    @cached_property
+    def _lit_frames(self) -> list[LitFrame]:
+        slopes = [slope_of(side, spline=True) for side in self._factors]
+        frames = []
+        for groups, frame, variance in zip(self._groups, self._frames, self._variances, strict=True):
+            rows, columns = (group.pixels for group in groups)
+            lit = self._factors[0][:, rows], self._factors[1][:, columns]
+            blocks = blocks_of(rows, self._factors[0].shape[1]), blocks_of(columns, self._factors[1].shape[1])
+            frames.append(LitFrame(frame, variance, lit, (slopes[0][:, rows], slopes[1][:, columns]), blocks))
+        return frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,14 +226,16 @@ class _Lit:
     weights: FloatArray
 
 
-def _lit_groups(patterns: FloatArray) -> list[_Lit]:
-    """Groups of one side that measurements can be added up for; each pattern's own lit pixels where there are none."""
+def _lit_groups(patterns: FloatArray) -> tuple[list[_Lit], bool]:
+    """Groups of one side that measurements can be added up for, and whether there are such; otherwise each pattern's
+    own lit pixels."""
     groups = group_pixels(patterns, "block")
     if all(group.shared is not None for group in groups):
         lit = [(group.pixels, group.shared[1]) for group in groups if group.shared and group.shared[1].any()]
-        return [_Lit(pixels, psi / np.dot(psi, psi)) for pixels, psi in lit]
+        return [_Lit(pixels, psi / np.dot(psi, psi)) for pixels, psi in lit], True
     alone = np.eye(patterns.shape[1])
-    return [_Lit(np.flatnonzero(column), one) for column, one in zip(patterns.T, alone, strict=True) if column.any()]
+    own = [_Lit(np.flatnonzero(column), one) for column, one in zip(patterns.T, alone, strict=True) if column.any()]
+    return own, False
 
 
 def likely_cause(signatures: Signatures, unexplained: float, of_factors: float = 0.0) -> Cause:
@@ -215,8 +254,10 @@ def likely_cause(signatures: Signatures, unexplained: float, of_factors: float =
     if signatures.mask > _MOST or of_factors > max(SEPARABLE_RESIDUAL, unexplained):
         return Cause.MASK
     # One axis explains what the other does not: a baseline. NaN compares as False throughout.
-    if along > _MOST and along > 2 * across:
+    if along > _MOST and along > 2 * across and not along < signatures.detail:
         return Cause.DEPTH
+    if signatures.detail > _MOST:
+        return Cause.DETAIL
     if signatures.common > _COMMON and signatures.everywhere > _EVERYWHERE:
         return Cause.AMBIENT
     if unexplained > _ALL:
@@ -226,20 +267,7 @@ def likely_cause(signatures: Signatures, unexplained: float, of_factors: float =
     return Cause.GLOSS if signatures.gloss > _MOST else Cause.UNKNOWN
 
 
-def _beyond(frame: FloatArray, variance: float, left: FloatArray, right: FloatArray) -> float:
-    """Energy of a ``frame`` beyond its noise that two orthonormal ranges leave."""
-    seen = left.T @ frame @ right
-    beyond = np.square(frame).sum() - np.square(seen).sum() - (frame.size - seen.size) * variance
-    return float(beyond)
-
-
 def _modulated(factor: FloatArray) -> FloatArray:
     """A factor's columns (m, c), and these times powers of the place along the sensor: (m, c (degree + 1))."""
     place = np.linspace(-1, 1, len(factor))[:, None]
     return np.concatenate([factor * place**power for power in range(_DEGREE + 1)], axis=1)
-
-
-def _orthonormal(matrix: FloatArray) -> FloatArray:
-    """Orthonormal columns that span those of ``matrix``, but for directions that are rounding."""
-    left, singular, _ = np.linalg.svd(matrix, full_matrices=False)
-    return np.asarray(left[:, singular > singular[0] * max(matrix.shape) * np.finfo(np.float64).eps])

@@ -18,11 +18,12 @@ from scipy.optimize import minimize_scalar
 
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
-from mitsim.reconstruct.accumulator import Accumulator
+from mitsim.reconstruct.accumulator import Accumulator, centred
 from mitsim.reconstruct.alldepths import AllDepths, searched
 from mitsim.reconstruct.arrivals import parallax_period
+from mitsim.reconstruct.causes import Evidence
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import stated_parallax
+from mitsim.reconstruct.focus import focused, stated_parallax
 from mitsim.reconstruct.misfit import CHANCE
 from mitsim.reconstruct.noise import factor_energy
 from mitsim.reconstruct.solver import Prepared, prepare
@@ -73,7 +74,7 @@ class Depth:
     alternatives
         depths that explain the measurements as well.
     at_end
-        whether it is an end of the range, or beyond it by a period of the dots.
+        whether it is an end of what was tried, where nothing fits.
     """
 
     mm: float
@@ -149,6 +150,7 @@ class _Search:
             self._period = parallax_period(shots.patterns, stated_parallax(factors))
             beyond = min(self._period, self._ends[1])
         self._tried = self._ends[0] - beyond, self._ends[1] + beyond
+        self._shots, self._factors = shots, factors
         self._all = AllDepths(shots, factors, self._tried)
         self._inverse, self._factor_noise = 1 / stated_parallax(factors).depth_mm, factors.manifest.noise
         self.pixel = 1 / max(self._all.reach(axis) for axis in (0, 1))
@@ -156,27 +158,27 @@ class _Search:
 
     def found(self) -> Depth:
         """The lowest valley, and all that may be as low."""
-        valleys = sorted(self._valleys())
-        valleys = sorted([*valleys, *self._beyond(valleys[0][1])])
+        margin = 2 * _RESOLUTION * self.pixel
+        valleys = sorted(self._valleys(*self._ends))
+        valleys = sorted([*valleys, *self._beyond(valleys[0][1], margin)])
         least, shift = valleys[0]
         error, rise = self._certainty(shift, least)
-        range_mm = self._mm(self._ends[1]), self._mm(self._ends[0])
-        margin = 2 * _RESOLUTION * self.pixel
-        mm, at_end = self._mm(shift), not self._ends[0] + margin < shift < self._ends[1] - margin
+        mm, range_mm = self._mm(shift), (self._mm(self._ends[1]), self._mm(self._ends[0]))
+        at_end = min(abs(end - shift) for end in (*self._ends, *self._tried)) < margin
         local = float(np.hypot(error, _RESOLUTION * self.pixel)) * mm**2
         misfit = self._misfit(shift, least)
-        ties = [
-            valley for valley in valleys[1:] if valley[0] - least < self._indifferent(valley[0] - least, least, misfit)
-        ]
+        if misfit and (self._ties(valleys, misfit) or rise < self._indifferent(rise, least, misfit)):
+            misfit *= 1 - self._print_part(shift)
+        ties = self._ties(valleys, misfit)
         others = tuple(
             Alternative(self._mm(other), float(np.sqrt((left - least) / self._all.energy))) for left, other in ties
         )
         doubt = ""
-        if at_end:
+        if at_end or not self._ends[0] < shift < self._ends[1]:
             doubt = (
-                f"End of range: {mm:.1f} mm, which explains most, is not within the depths that were tried, "
-                f"{range_mm[0]:.0f} to {range_mm[1]:.0f} mm; give another range of depths, or calibrate nearer to the "
-                "scene."
+                f"End of range: {mm:.1f} mm explains most, and depths from {range_mm[0]:.0f} to {range_mm[1]:.0f} mm "
+                "were tried, so the scene may lie beyond; give a range of depths that holds it, with --depth-range "
+                "NEAR:FAR or depth_range, or calibrate nearer to it."
             )
         elif not (
             error < self.pixel and rise > max(self._indifferent(rise, least, misfit), _LEAST_RISE * self._all.energy)
@@ -204,10 +206,11 @@ class _Search:
         problem = prepared.problem(sums)
         return self._all.energy - float(np.square(problem.projected[problem.sigma > 0]).sum())
 
-    def _valleys(self) -> Iterator[tuple[float, float]]:
-        """Energy left over at the bottom of the lowest valley and of those that may be as low, and changes of 1/z."""
-        steps = max(int(np.ceil((self._ends[1] - self._ends[0]) / (_STEP * self.pixel))), _FEWEST)
-        shifts = np.linspace(*self._ends, steps + 1)
+    def _valleys(self, first: float, last: float) -> Iterator[tuple[float, float]]:
+        """Energy left over at the bottom of the lowest valley between two changes of 1/z and of those that may be as
+        low, and changes of 1/z."""
+        steps = max(int(np.ceil((last - first) / (_STEP * self.pixel))), _FEWEST)
+        shifts = np.linspace(first, last, steps + 1)
         scores = np.array([self.left_over(shift) for shift in shifts])
         beside = np.minimum(np.append(scores[1:], np.inf), np.append(np.inf, scores[:-1]))
         lows = sorted(map(int, np.flatnonzero(scores <= beside)), key=lambda index: float(scores[index]))
@@ -218,19 +221,23 @@ class _Search:
             left, shift = self._bottom(shifts[max(index - 1, 0)], shifts[min(index + 1, steps)])
             if left < least:
                 half = shifts[1] - shifts[0]
-                around = [self.left_over(float(np.clip(shift + part * half, *self._ends))) for part in (-0.5, 0.5)]
+                around = [self.left_over(float(np.clip(shift + part * half, first, last))) for part in (-0.5, 0.5)]
                 least, below = left, max(around) - left
             yield left, shift
 
-    def _beyond(self, shift: float) -> Iterator[tuple[float, float]]:
+    def _beyond(self, shift: float, margin: float) -> Iterator[tuple[float, float]]:
         """The same of depths beyond the range that are a period of the dots from the best ``shift`` within it, or
-        several."""
-        if np.isfinite(self._period):
-            for end, step in zip(self._tried, (-self._period, self._period), strict=True):
+        several; and of all beyond an end that it is, within the ``margin``."""
+        for end, tried, step in zip(self._ends, self._tried, (-self._period, self._period), strict=True):
+            if tried == end:
+                continue
+            if abs(shift - end) < margin:
+                yield from self._valleys(*sorted((end, tried)))
+            elif np.isfinite(self._period):
                 away = shift + step
                 while self._ends[0] <= away <= self._ends[1]:
                     away += step
-                if abs(away) < abs(end):
+                if abs(away) < abs(tried):
                     yield self._bottom(away - _STEP * self.pixel, away + _STEP * self.pixel)
 
     def _bottom(self, first: float, last: float) -> tuple[float, float]:
@@ -256,6 +263,22 @@ class _Search:
     def _indifferent(self, difference: float, least: float, misfit: float) -> float:
         """Energy by which two depths may differ of which either is the right one."""
         return max(by_chance(difference, self._variance(least), self._unknowns), _OPPOSED * misfit)
+
+    def _ties(self, valleys: list[tuple[float, float]], misfit: float) -> list[tuple[float, float]]:
+        """Those of the sorted ``valleys`` that may be the right one, beside the lowest, by what its depth leaves beyond
+        noise."""
+        least = valleys[0][0]
+        return [each for each in valleys[1:] if each[0] - least < self._indifferent(each[0] - least, least, misfit)]
+
+    def _print_part(self, shift: float) -> float:
+        """Part of the misfit at the depth of ``shift`` that is print finer than a scene pixel: its light lies on either
+        side of the pixels' centres, so no other depth explains it."""
+        there = focused(self._factors, self._mm(shift))
+        evidence = Evidence(there.factors, self._all.patterns)
+        for each in there.of(self._shots).measured():
+            frame = centred(each.frame) if there.factors.manifest.centre else each.frame
+            evidence.collect(each, frame, float(self._all.noise.variance[each.row, each.column]))
+        return float(np.nan_to_num(evidence.print_part()))
 
     def _misfit(self, shift: float, least: float) -> float:
         """Energy that the depth of ``shift`` leaves beyond what noise of frames and factors and rendering leave; 0

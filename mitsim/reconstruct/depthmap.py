@@ -180,13 +180,13 @@ class _Search:
 
     def __init__(self, shots: Capture, factors: Factors, depth_range: tuple[float, float] | None) -> None:
         # Of a flat scene far from the calibrated depth dots of any period tell the rest.
-        self._ends, self._given = searched(factors, depth_range), depth_range is not None
+        self._ends = searched(factors, depth_range)
         inverse = 1 / stated_parallax(factors).depth_mm
-        plane = best_depth(shots, factors, (1 / (inverse + self._ends[1]), 1 / (inverse + self._ends[0])))
+        self._plane = best_depth(shots, factors, (1 / (inverse + self._ends[1]), 1 / (inverse + self._ends[0])))
         self._middle = (self._ends[0] + self._ends[1]) / 2
         # A start, so in doubt any of several depths will do; but an end of the range is the depth of nothing.
-        self._plane = self._middle if plane.at_end else 1 / plane.mm - inverse
-        self._arrivals = Arrivals(shots, factors, self._ends, max(abs(self._plane), abs(self._middle)))
+        self._start = self._middle if self._plane.at_end else 1 / self._plane.mm - inverse
+        self._arrivals = Arrivals(shots, factors, self._ends, max(abs(self._start), abs(self._middle)))
         self._all, self.width, self.pixel = self._arrivals.depths, self._arrivals.width, self._arrivals.pixel
         self._pixels = PixelDepths(self._all, self._arrivals.reach, STEP * self.pixel)
 
@@ -196,7 +196,7 @@ class _Search:
         tried = {(look, middle): self._left_over(self._arrivals.most(look, middle)[0]) for look in LAMBDAS}
         if self._arrivals.limited:
             look = min(tried, key=lambda start: tried[start])[0]
-            plane = self._plane / self.pixel
+            plane = self._start / self.pixel
             offsets = {start + offset for start in (middle, plane) for offset in (0.0, *OFFSETS)} - {middle}
             tried |= {(look, offset): self._left_over(self._arrivals.most(look, offset)[0]) for offset in offsets}
         start = min(tried, key=lambda start: tried[start])
@@ -226,7 +226,11 @@ class _Search:
             starts (look, offset) that explain nearly as much as that of these.
         """
         told = confidence >= _TOLD
-        if not told.any() or self._left_over(shift) > self._left_over(np.zeros(shift.shape)):
+        found = self._pixels.solve(shift)
+        variance, unknowns = self._pixels.variance(found), 2 * shift.size
+        less = found.left_over - self._left_over(np.zeros(shift.shape))
+        # Of a sheet at the calibrated depth either may leave more.
+        if not told.any() or less > by_chance(less, variance, unknowns):
             return "Depths by pixel explain no more of the measurements than the calibrated one, which the image is of."
         span = float(np.ptp(np.percentile(shift[told], (1, 99))))
         astray = max(
@@ -239,23 +243,14 @@ class _Search:
                 f"{self.width / self.pixel:.0f} apart: depths may be off by a whole period, so the image is that of "
                 "the calibrated one. Use dots of a longer period along the baseline, such as dots:7x16."
             )
-        return self._periods_away(shift, told) if self._arrivals.limited else ""
-
-    def _periods_away(self, shift: FloatArray, told: np.ndarray) -> str:
-        """Doubt where all depths, moved by a whole period of the dots, explain as much, or nothing."""
-        found = self._pixels.solve(shift)
-        median = float(np.median(shift[told]))
-        for move in (-self.width, self.width):
-            if not self._given or self._ends[0] <= median + move <= self._ends[1]:
-                more = self._left_over(shift + move) - found.left_over
-                if more < by_chance(more, self._pixels.variance(found), 2 * shift.size):
-                    inverse = 1 / self._all.parallax.depth_mm
-                    return (
-                        "Depths may be off by a whole period of the dots: with a median of "
-                        f"{1 / (inverse + median):.4g} or {1 / (inverse + median + move):.4g} mm they explain as much, "
-                        "so the image is that of the calibrated one. Use dots of a longer period along the baseline, "
-                        "or give the range of depths."
-                    )
+        ties = [(other.mm, other.difference**2 * self._all.energy) for other in self._plane.alternatives]
+        others = [f"{mm:.1f}" for mm, more in ties if more < by_chance(more, variance, unknowns)]
+        if others:
+            return (
+                f"Depths may be off by a whole period of the dots: {self._plane.mm:.1f} or {' or '.join(others)} mm "
+                "explain a flat scene as well, so the image is that of the calibrated one. Use dots of a longer period "
+                "along the baseline, or give the range of depths."
+            )
         return ""
 
     def _left_over(self, shift: FloatArray) -> float:

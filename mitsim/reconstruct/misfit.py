@@ -79,6 +79,9 @@ class Misfit:
         of a flagged image: how else its frames fit; None where they do not.
     defects
         pixels of the sensor whose readings were left out, or are to be; None: there are none.
+    detail
+        part of the measurements, rms, that the frames themselves show to be print finer than a scene pixel, where the
+        image would be flagged without; no part of ``unexplained``.
     """
 
     chi_square: float
@@ -93,14 +96,16 @@ class Misfit:
     faults: tuple[FrameFault, ...] = ()
     reading: Reading | None = None
     defects: Defects | None = None
+    detail: float = 0.0
 
     def __str__(self) -> str:
         noise = "" if self.stated else " of shot noise alone, as no other was stated"
         cause = f"; likely cause: {self.reason}" if self.cause else ""
         defects = f"; {self.defects}" if self.defects else ""
+        detail = f" beside {self.detail:.1e} of print finer than a scene pixel" if self.detail else ""
         return (
-            f"misfit: chi-square {shown(self.chi_square)} a datum{noise}, {self.unexplained:.1e} unexplained{cause}"
-            f"{defects}"
+            f"misfit: chi-square {shown(self.chi_square)} a datum{noise}, {self.unexplained:.1e} unexplained{detail}"
+            f"{cause}{defects}"
         )
 
     @property
@@ -121,6 +126,7 @@ class Misfit:
             "cause": self.cause.name.lower() if self.cause else None,
             "signatures": asdict(self.signatures) if self.signatures else None,
             "foretold": self.foretold,
+            "detail": self.detail,
             "defective_pixels": self.defects.summary() if self.defects else None,
             "reading": self.reading.words if self.reading else None,
             "faults": [fault.summary() for fault in self.faults],
@@ -311,6 +317,11 @@ def judge(
     if not found.flagged:
         return found
     signatures = evidence.signatures(excess, noise.saturated / max(noise.readings, 1))
+    # Of what is left beyond the sensor's noise, as signatures are.
+    of_print = float(np.nan_to_num(signatures.detail)) * (excess + beside_noise)
+    fine, _ = balance.misfit(noise, max(print_energy, of_print))
+    if not fine.flagged:
+        return replace(fine, foretold=found.foretold, detail=float(np.sqrt(of_print / sums.energy.sum())))
     return replace(found, cause=likely_cause(signatures, found.unexplained, evidence.of_factors), signatures=signatures)
 
 

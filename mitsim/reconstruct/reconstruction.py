@@ -47,7 +47,7 @@ _BETTER = 0.5
 not fit either."""
 
 
-_OF_THE_SCENE = Cause.GLOSS, Cause.INDIRECT, Cause.UNKNOWN, Cause.RIG
+_OF_THE_SCENE = Cause.GLOSS, Cause.INDIRECT, Cause.DETAIL, Cause.UNKNOWN, Cause.RIG
 """Causes that light of a depth beyond the searched range is taken for."""
 
 

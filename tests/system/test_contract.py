@@ -113,6 +113,7 @@ def test_reconstruct(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None
             "faults",
             "reading",
             "defective_pixels",
+            "detail",
         ),
     }
     assert number(found["misfit"]["chi_square"], 0.5, 1.2) and found["misfit"]["noise_stated"]

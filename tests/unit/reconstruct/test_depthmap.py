@@ -14,7 +14,9 @@ import pytest
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.alldepths import AllDepths
-from mitsim.reconstruct.depthmap import _Search, depth_map
+from mitsim.reconstruct.causes import Cause
+from mitsim.reconstruct.depth import Depth
+from mitsim.reconstruct.depthmap import depth_map
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.pixeldepths import PixelDepths
 from mitsim.reconstruct.reconstruction import accumulated, reconstruct
@@ -64,16 +66,21 @@ def psnr(image: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize(
-    ("patterns", "baseline"),
+    ("patterns", "baseline", "least"),
     [
-        ("dots:4x8", BESIDE),
-        ("dots:8", BASELINE),
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("dots:4x10", BESIDE), ("dots:5x8", BASELINE))),
+        ("dots:4x8", BESIDE, 47.0),
+        ("dots:8", BASELINE, 48.0),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (("dots:4x10", BESIDE, 50.0), ("dots:5x8", BASELINE, 43.0))
+        ),
     ],
 )
-def test_a_card_before_a_board(patterns: str, baseline: tuple[float, float]) -> None:
-    """Both depths are found, and the image is within 8 dB of that at the true depths, 25 above that at one depth.
-    (Planted: light looked for on the other side; the derivative's sign; edges left as pooled, 12 dB.)"""
+def test_a_card_before_a_board(patterns: str, baseline: tuple[float, float], least: float) -> None:
+    """Both depths are found, and the image has ``least`` dB: 1.5 less than were found, and more than a cubic between
+    columns gave at the true depths (40.4, 41.1, 44.1, 39.7 dB). The true depths give 51.5, 57.0, 53.2, 53.7 now: what
+    is left to them are pixels beside the card's edges. (Planted: light looked for on the other side; the derivative's
+    sign; edges left as pooled, 12 dB.)"""
     run, factors, true = shots(cards(), patterns, baseline), calibrated(baseline), 1 / cards() - 1 / 400
     found, one = depth_map(run, factors), reconstruct(run, factors)
     depths = AllDepths(run, factors, (-4e-4, 4e-4))
@@ -82,8 +89,27 @@ def test_a_card_before_a_board(patterns: str, baseline: tuple[float, float]) -> 
     error = np.abs(found.mm - cards())
     print(psnr(one.image), psnr(found.image), psnr(ideal), np.median(error), found.told.mean())
     assert not found.doubt and np.median(error) < 2 and (error < 5).mean() > 0.95
-    assert psnr(found.image) > psnr(ideal) - 8 and psnr(found.image) > psnr(one.image) + 25
+    assert psnr(found.image) > least and psnr(found.image) > psnr(one.image) + 20
     assert found.told.mean() > 0.9
+
+
+def tilted() -> np.ndarray:
+    """Eight strips from 425 to 435 mm, as of a sheet that is turned by 5 degrees."""
+    return np.tile(np.repeat(np.linspace(425, 435, 8), N // 8), (N, 1))
+
+
+@pytest.mark.parametrize("depths", [tilted(), cards()], ids=["tilted", "cards"])
+def test_one_depth_of_several_is_flagged(depths: np.ndarray) -> None:
+    """One depth between those of the scene is found, and what it leaves is called depth; one for each pixel leaves a
+    third of it."""
+    run, factors = shots(depths, "dots:4x8"), calibrated()
+    one, each = (reconstruct(run, factors, focus=focus) for focus in ("auto", "map"))
+    print(one.focus, one.status, psnr(one.image), psnr(each.image))
+    assert isinstance(one.focus, Depth) and depths.min() - 1 < one.focus.mm < depths.max() + 1
+    assert not one.ok and one.misfit and one.misfit.cause is Cause.DEPTH
+    assert (
+        each.misfit and each.misfit.unexplained < one.misfit.unexplained / 3 and psnr(each.image) > psnr(one.image) + 3
+    )
 
 
 @pytest.mark.parametrize(
@@ -91,13 +117,14 @@ def test_a_card_before_a_board(patterns: str, baseline: tuple[float, float]) -> 
     [pytest.param(400.0, "dots:4x8", marks=pytest.mark.slow), (380.0, "dots:4x8"), (360.0, "dots:4")],
 )
 def test_a_flat_sheet_has_one_depth(depth: float, patterns: str) -> None:
-    """And the image that its own depth gives, less 3 dB: twice as many unknowns. At 360 mm light lies half a period
-    of 4 beside. (Planted: depths looked for about the calibrated one alone.)"""
+    """And the image that its own depth gives, less 1.5 dB: twice as many unknowns. At 360 mm light lies half a period
+    of 4 beside. (Planted: depths looked for about the calibrated one alone; a part of the sensor left out that knows
+    the depths, 2.3 dB.)"""
     run, factors = shots(np.full((N, N), depth), patterns), calibrated()
     image, given = reconstruct(run, factors, focus="map"), reconstruct(run, factors, focus=depth)
     assert image.depths is not None and np.abs(image.depths.mm - depth).max() < 6
     assert np.median(np.abs(image.depths.mm - depth)) < 1
-    assert psnr(image.image) > psnr(given.image) - 3
+    assert psnr(image.image) > psnr(given.image) - 1.5
     assert image.misfit is not None and given.misfit is not None
     assert image.misfit.chi_square == pytest.approx(given.misfit.chi_square, rel=0.1)
     assert image.uncertainties is None
@@ -136,13 +163,13 @@ def flat(depth: float, patterns: str, peak: float = PEAK, dark: int = 0) -> Capt
 def test_depths_that_may_all_be_a_period_away(
     peak: float, depth_range: tuple[float, float] | None, named: bool
 ) -> None:
-    """The true ones and those a period away differ by less than chance where eight dim columns are seen, unless the
-    range has no others. (Planted: chance left out; the range ignored.)"""
-    search = _Search(flat(400.0, "dots:8x5", peak, 16), calibrated(), depth_range)
-    told = np.zeros((N, N), bool)
-    told[:, 16 : N - 16] = True
-    doubt = search._periods_away(np.zeros((N, N)), told)
-    assert ("with a median of 400 or" in doubt) == named
+    """The true depth and those a period away differ by less than chance where the light is dim and no edge in view,
+    unless the range has no others; a bright sheet at the calibrated depth is not doubted, though depths by pixel leave
+    no less. (Planted: the plane's alternatives left out; no chance left to the calibrated depth.)"""
+    image = reconstruct(flat(400.0, "dots:8x5", peak, 8), calibrated(), focus="map", depth_range=depth_range)
+    print(image.status)
+    assert image.ok == (not named) and ("400.0 or 533." in str(image.status)) == named
+    assert (image.depths is None) == named
 
 
 @pytest.mark.parametrize("patterns", ["dots:4", "dots:8"])

@@ -27,6 +27,7 @@ from mitsim.reconstruct.result import Reconstruction
 from mitsim.rig.camera import centred_edges
 from mitsim.rig.mask import mls_mask
 from tests.ideal_sessions import PEAK, PITCH, PIXELS, Bench, picture
+from tests.unit.reconstruct.test_faults import dark, with_frames
 
 N = 40
 """Projector pixels a side of images: each 15 um in the mask's plane, a quarter of a feature."""
@@ -246,10 +247,42 @@ def test_two_depths_that_explain_as_much_are_named(fine: Factors) -> None:
 
 @pytest.mark.parametrize("depth", [308.0, 556.0])
 def test_a_depth_beyond_the_range_is_not_taken_for_one_within(fine: Factors, depth: float) -> None:
-    """A period of the dots away is a depth within."""
+    """A period of the dots from 308 mm is a depth within the range, and from 556 an end of it. (Planted: nothing beyond
+    an end is tried.)"""
     found = best_depth(beside(depth, "dots:4"), fine)
     print(found)
-    assert found.at_end and "End of range" in found.doubt and abs(found.mm - depth) < 2 * found.error_mm
+    assert "may lie beyond" in found.doubt and "--depth-range" in found.doubt and not found.at_end
+    assert abs(found.mm - depth) < 2 * found.error_mm < 0.6
+
+
+@pytest.mark.parametrize("depth_range", [None, (400.0, 550.0)])
+def test_faulty_frames_are_named_at_the_end_of_a_range(fine: Factors, depth_range: tuple[float, float] | None) -> None:
+    """Beside it, not taken for depth."""
+    run = with_frames(beside(556.0, "dots:4"), lambda frames: [*frames[:5], dark(frames[5]), *frames[6:]])
+    image = reconstruct(run, fine, focus="auto", depth_range=depth_range)
+    print(image.status)
+    assert image.misfit and image.misfit.cause is Cause.FRAMES
+    assert "frame 5" in str(image.status) and "may lie beyond" in str(image.status)
+
+
+@pytest.mark.parametrize("patterns", ["hadamard:4", "random:6"])
+def test_other_patterns_tell_depth(fine: Factors, patterns: str) -> None:
+    """Without a period, so that none is named."""
+    found = best_depth(beside(440.0, patterns), fine)
+    print(found)
+    assert not found.doubt and not found.alternatives and abs(found.mm - 440) < 2 * found.error_mm < 1
+
+
+def test_light_of_a_lamp_does_not_move_depth(fine: Factors) -> None:
+    """A tenth of the light comes from all pixels in all shots, and is not called depth."""
+    left, right = (shadow(440.0, axis, COARSE, (0.0, BASELINE[1])) for axis in (0, 1))
+    lamp = left @ np.ones((COARSE, COARSE)) @ right.T
+    lit = Bench(left, right, optics=lambda light: light + 0.1 * PEAK * lamp / lamp.max())
+    image = reconstruct(lit.run("dots:5", picture(n=COARSE), 0), fine, focus="auto")
+    print(image.focus, image.status)
+    assert isinstance(image.focus, Depth) and image.focus.error_mm is not None
+    assert abs(image.focus.mm - 440) < 2 * image.focus.error_mm
+    assert not image.ok and image.misfit and image.misfit.cause in (Cause.AMBIENT, Cause.INDIRECT)
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ import pytest
 
 from mitsim.core.manifests import Digital, FactorNoise, Patterns
 from mitsim.reconstruct import misfit
-from mitsim.reconstruct.causes import Evidence, _beyond, _orthonormal
-from mitsim.reconstruct.detail import Model
+from mitsim.reconstruct.causes import Evidence
+from mitsim.reconstruct.detail import LitFrame, Model, orthonormal
 from mitsim.reconstruct.misfit import Residuals
 from mitsim.reconstruct.noise import FrameNoise, factor_energy
 from mitsim.reconstruct.solver import prepare
@@ -24,16 +24,20 @@ def test_noise_outside_two_ranges_is_taken_off_and_light_inside_is_no_misfit() -
     rng = np.random.default_rng(1)
     left, right = (np.linalg.qr(rng.normal(size=shape))[0] for shape in ((6, 2), (5, 3)))
     inside = left @ rng.normal(size=(2, 3)) @ right.T
-    assert _beyond(np.zeros((6, 5)), 0.5, left, right) == pytest.approx(-12.0)
-    assert _beyond(inside, 0.0, left, right) == pytest.approx(0, abs=1e-12)
-    assert _beyond(inside + 1, 0.0, left, right) == pytest.approx(
+
+    def beyond(frame: np.ndarray, variance: float) -> float:
+        return LitFrame(frame, variance, (left, right), (left, right), (np.arange(2), np.arange(3))).beyond(left, right)
+
+    assert beyond(np.zeros((6, 5)), 0.5) == pytest.approx(-12.0)
+    assert beyond(inside, 0.0) == pytest.approx(0, abs=1e-12)
+    assert beyond(inside + 1, 0.0) == pytest.approx(
         30 - np.square(left.sum(axis=0)).sum() * np.square(right.sum(axis=0)).sum()
     )
 
 
 def test_directions_that_are_rounding_of_the_largest_are_none() -> None:
     matrix = np.eye(5, 3) * [1.0, 1e-8, 1e-18]
-    assert _orthonormal(matrix).shape == (5, 2)
+    assert orthonormal(matrix).shape == (5, 2)
 
 
 def test_the_groups_that_are_looked_at_are_spread_over_both_sides() -> None:
