@@ -219,7 +219,7 @@ class FrameCheck:
         lit = [(side != 0).sum(axis=1) for side in patterns]
         self._exclusive = bool(max(lit[0]) == 1 and max(lit[1]) == 1) and noise.variance.size > 1
         self._size = prepared.left.sensor_size * prepared.right.sensor_size
-        self._spare = 1 - prepared.rank / (prepared.left.data_rows * prepared.right.data_rows)
+        self._spare = prepared.spare
 
     # ---- suspicion
 

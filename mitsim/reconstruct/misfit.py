@@ -41,6 +41,9 @@ _GROSS_CHI_SQUARE = 4.0
 """The same as a chi-square, of shot noise alone: read noise of as many electrons makes 2."""
 _SHOWN = 4
 """Faults that a sentence holds; result.json has them all."""
+_QUIET = 0.03
+"""Of the sensor's noise, beside half of :data:`CHANCE`, that may be missing before tone curves are tried: chosen, gains
+are stated to a few per cent."""
 _TINY = 1e-300
 """Stands for 0 in a denominator."""
 _TILES = 8
@@ -234,12 +237,19 @@ class Residuals:
         variance = count * self._noise.of(self._noise.light / count, self._noise.shots)
         return defects_of(self.squares, variance, count)
 
+    @property
+    def quiet(self) -> bool:
+        """Whether less is left than the sensor's noise alone makes."""
+        noise = float(self.variance.sum()) * self._prepared.spare
+        return float(self.squares.sum()) < noise * (1 - _QUIET - _chance(self._noise, float(self.pixels.sum())) / 2)
+
     def expected(self, factor_energy: float) -> FloatArray:
         """(tiles, tiles) energy that is expected of the residual: the sensor's noise less what the fit takes up, the
         error of simulated frames where the light is, and ``factor_energy`` evenly."""
-        spare = 1 - self._prepared.rank / (self._prepared.left.data_rows * self._prepared.right.data_rows)
         rendering = self._noise.rendering * self.power / max(float(self.power.sum()), _TINY)
-        return np.asarray(self.variance * spare + rendering + factor_energy * self.pixels / self.pixels.sum())
+        return np.asarray(
+            self.variance * self._prepared.spare + rendering + factor_energy * self.pixels / self.pixels.sum()
+        )
 
     def _sums(self, values: FloatArray) -> FloatArray:
         # Not reduceat along the rows: it takes five times as long.
@@ -274,7 +284,7 @@ def judge(
         whether defective pixels are looked for, and no cause where there are some.
     """
     prepared, noise = check.prepared, check.noise
-    if prepared.rank >= prepared.left.data_rows * prepared.right.data_rows:
+    if prepared.spare <= 0:
         return None
     sums = Residuals(prepared, check.weights, noise, evidence)
     for measurement in check.measured():
@@ -293,12 +303,14 @@ def judge(
         return replace(
             found, flagged=True, cause=Cause.ORDER, reading=Reading(Cause.ORDER, f"the frames are {step}", 0.0)
         )
+    readings, reading = Readings(prepared, check.manifest, noise, check.measured), None
     if found.flagged:
         beside = beside_noise / max(float(sums.energy.sum()), _TINY)
-        readings = Readings(prepared, check.manifest, noise, check.measured)
         reading = readings.fitting(found.unexplained, beside, check.all_off(sums.by_pattern, beside_noise))
-        if reading:
-            return replace(found, cause=reading.cause, reading=reading)
+    elif noise.stated and sums.quiet:
+        reading = readings.curved()
+    if reading:
+        return replace(found, flagged=True, cause=reading.cause, reading=reading)
     faults = check.faults(sums.by_pattern, beside_noise)
     if faults:
         return replace(found, flagged=True, cause=Cause.FRAMES, faults=faults)
