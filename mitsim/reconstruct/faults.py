@@ -76,11 +76,6 @@ STEPS = (
     "one step early: each shot shows the pattern of the next",
 )
 """Ways in which shots are a step beside their patterns."""
-_FLAT = 1e-4, 10, 4.0
-"""Readings at a frame's largest number from which it is clipped: a part of all, at least so many, and so many times the
-readings of the upper half of what remains below it, a hundredth of its range wide."""
-_NEAR_TOP = 0.8
-"""Of the largest number, the light that clipped readings are foretold at least; hot pixels have less."""
 _REACH = 24
 """Sensor pixels that frames are moved by in search of a shift."""
 _ROUNDING = 1e-20
@@ -135,6 +130,7 @@ class FrameSums:
     of the measurement as the solver takes it. ``light``: sum of its light. ``sums``: of signed
     patterns, energy by which the halves' sum differs from that of all others. ``halves``: light of a signed pattern's
     shots. ``digests``: patterns, and which of their shots, by a number that frames which are one and the same share.
+    ``clipped``: of the shots that are, readings at their largest number.
     """
 
     counts: tuple[int, int]
@@ -148,6 +144,7 @@ class FrameSums:
         self.residual, self.power, self.energy = (np.zeros(self.counts) for _ in range(3))
         self.light, self.sums = (np.zeros(self.counts) for _ in range(2))
         self.digests: dict[int, list[tuple[Pattern, int]]] = {}
+        self.clipped: dict[tuple[Pattern, int], int] = {}
         self.halves: dict[Pattern, tuple[float, float]] = {}
 
     def add(self, measurement: Measurement, residual: float, power: float, energy: float, total: FloatArray) -> None:
@@ -164,8 +161,10 @@ class FrameSums:
         """
         pattern = measurement.row, measurement.column
         self.residual[pattern], self.power[pattern], self.energy[pattern] = residual, power, energy
-        for half, digest in enumerate(measurement.digests):
+        for half, (digest, clipped) in enumerate(zip(measurement.digests, measurement.clipped, strict=True)):
             self.digests.setdefault(digest, []).append((pattern, half))
+            if clipped:
+                self.clipped[pattern, half] = clipped
         self.light[pattern] = light = float(measurement.light.sum())
         if measurement.shots == 2:
             difference = float(measurement.frame.sum())
@@ -241,7 +240,7 @@ class FrameCheck:
         beside_noise
             energy that rendering, the factors' noise and print put into all of them.
         """
-        found = [*self._same(sums), *self._noiseless(sums)]
+        found = [*self._same(sums), *self._clipped(sums), *self._noiseless(sums)]
         bad: dict[Pattern, bool] = {}  # and whether its brightness alone is off
         others = self.weights
         count = self.noise.variance.size
@@ -257,9 +256,11 @@ class FrameCheck:
             others = self._without(tuple(bad))
             sums = self._gathered(others, bad)
         named = _Namer(self, bad, others).faults() if bad else []
-        # What is known without the model is said where that does not say more.
-        known = {number for fault in named for number in fault.numbers}
-        return (*(fault for fault in found if not known & set(fault.numbers)), *named)
+        # What is known without the model is said where that does not say more; of clipped frames it explains the rest.
+        clipped = {number for fault in found if fault.fault is Fault.CLIPPED for number in fault.numbers}
+        named = [fault for fault in named if not clipped & set(fault.numbers)]
+        known = clipped | {number for fault in named for number in fault.numbers}
+        return (*(each for each in found if each.fault is Fault.CLIPPED or not known & set(each.numbers)), *named)
 
     def out_of_step(self, sums: FrameSums) -> str:
         """How signed shots are a step beside their patterns, as ``sums`` of their light tell, or nothing.
@@ -408,6 +409,13 @@ class FrameCheck:
             if digest and len(shots) > 1:
                 numbers = [self._number[(*pattern, (1 - 2 * half) if self._signed else 0)] for pattern, half in shots]
                 yield self._fault(Fault.REPEATED, numbers, "are one and the same")
+
+    def _clipped(self, sums: FrameSums) -> Iterable[FrameFault]:
+        """Shots with many readings at their largest number; where most have, it is the end of the sensor's range."""
+        if len(sums.clipped) <= max(1, _MOST_BAD * len(self._shots)):
+            for (pattern, half), count in sums.clipped.items():
+                numbers = [self._number[(*pattern, (1 - 2 * half) if self._signed else 0)]]
+                yield self._fault(Fault.CLIPPED, numbers, f"has {count} readings at its largest number")
 
     def _noiseless(self, sums: FrameSums) -> Iterable[FrameFault]:
         """Frames with less noise than their sensor has: only where readings can show it."""
@@ -647,16 +655,16 @@ class _Namer:
         left = self._left(frames, self._together(frames)) - self._least
         return left - sum(frame.size for frame in frames.values()) * variance * self._check._spare
 
-    def _filled(self, one: _Seen, raw: FloatArray, known: BoolArray, least: float = -np.inf) -> float:
+    def _filled(self, one: _Seen, raw: FloatArray, known: BoolArray) -> float:
         """Energy beyond noise that ``raw`` light in the place of ``one`` leaves where it is ``known``; elsewhere it may
-        be anything, or anything from ``least`` on."""
+        be anything."""
         known = np.broadcast_to(known, raw.shape)
         fit, means = self._foretold[one.pattern], np.zeros(())
         if self._check.prepared.centre:
             means = np.where(known, raw, np.median(raw[known]))
             means = means - self._level(means)
         for _ in range(_STEPS):
-            filled = np.where(known, raw, np.maximum(fit + means, least))
+            filled = np.where(known, raw, fit + means)
             frame = self._level(filled)
             means = filled - frame
             weights = self._together({one.pattern: frame})
@@ -731,7 +739,6 @@ class _Namer:
             yield from self._by_neighbours(one)
             return
         yield from self._part_lost(one)
-        yield from self._clipped(one)
         yield from self._scaled(one)
         yield from self._elsewhere(one)
         yield from self._moved(one)
@@ -795,32 +802,6 @@ class _Namer:
             else:
                 left = self._filled(one, one.raw, kept[:, None] if axis == 0 else kept[None, :])
             yield left, Fault.HALF_LOST, one.numbers, f"has no light in sensor {name} {first} to {last - 1}"
-
-    def _clipped(self, one: _Seen) -> Iterable[Named]:
-        """Many readings at the largest number, as no noise leaves them."""
-        digital = self._check._digital
-        step = max((digital.step_dn or 0.0) / digital.gain_dn_per_e / digital.exposure_s, 0.0)
-        top = float(one.raw.max())
-        flat = one.raw >= top - max(step / 2, 1e-6 * abs(top))
-        count, (part, least, times) = int(flat.sum()), _FLAT
-        below = one.raw[(~flat) & (one.raw >= top - max(0.01 * abs(top), 1.5 * step))].size
-        if count < max(part * flat.size, least) or count * times < below or count > 0.9 * flat.size:
-            return
-        if one.foretold is not None:
-            if not self._check.prepared.centre and float(np.median(one.foretold[flat])) < _NEAR_TOP * top:
-                return
-            left = _energy(one.frame - np.minimum(one.foretold, top)) - flat.size * one.variance
-            if not self._check._signed:
-                left = self._filled(one, one.raw, ~flat, top)
-        else:
-            filled = one.frame
-            for _ in range(_STEPS):
-                fit = self._fit(filled, one.pattern)
-                filled = np.where(flat, np.maximum(fit, one.frame), one.frame)
-            if float(np.median(fit[flat])) < _NEAR_TOP * top:  # hot pixels, not light
-                return
-            left = _energy((one.frame - fit)[~flat]) - float((~flat).sum()) * one.variance * self._check._spare
-        yield left, Fault.CLIPPED, one.numbers, f"has {count} readings at its largest number"
 
     def _elsewhere(self, one: _Seen) -> Iterable[Named]:
         """Another pattern than that of its place: of all patterns under dots, else of those that are suspected."""
