@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from enum import Enum
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,8 @@ _BRIGHT_ENOUGH = 0.2
 """Of the mean foretold reflectance, from which a pixel counts when it is compared with its neighbours."""
 _BLACK = 0.03
 """Of the light that is foretold, below which a frame is black whatever the others are: half of the darkest ink."""
+_MOST_PAIRS = 6
+"""Pairs of which it is tried which half is wrong: 64 images."""
 _FEWEST_PIXELS = 8
 """Pixels of a frame that its neighbours foretell, below which their median is chance."""
 _DARK = 0.1
@@ -692,35 +695,57 @@ class _Namer:
         return _Seen((number,), pattern, measurement.frame, frame, foretold, variance, off)
 
     def _signed(self) -> list[_Seen]:
-        """Of patterns whose sum is off the half that its other half, and the model, tell to be wrong; of others the
-        difference."""
+        """Of patterns whose sum is off the half that is wrong; of others the difference."""
         check = self._check
-        good = check.noise.variance.size - len(self._bad)
+        good = max(check.noise.variance.size - len(self._bad), 1)
         total = self._total - sum(each.light for each in self._measured.values())
-        mean = total / max(good, 1)
-        found = []
+        mean = total / good
+        found, off = [], dict[Pattern, float]()
         for pattern, each in self._measured.items():
-            variance = float(check.noise.variance[pattern]) * (1 + 1 / max(good, 1))
-            off = _energy(each.light - mean) - each.light.size * variance
+            variance = float(check.noise.variance[pattern]) * (1 + 1 / good)
+            beyond = _energy(each.light - mean) - each.light.size * variance
+            if beyond > CHANCE * variance * np.sqrt(2 * each.light.size) and beyond > _OFF**2 * _energy(mean):
+                off[pattern] = beyond
+                continue
             numbers = tuple(check._number[(*pattern, sign)] for sign in (1, -1))
-            if off > CHANCE * variance * np.sqrt(2 * each.light.size) and off > _OFF**2 * _energy(mean):
-                halves = (each.light + each.frame) / 2, (each.light - each.frame) / 2
-                modelled = check._frame(self._weights, *pattern)
-                # Which half is wrong: the other one, as it is, makes a difference nearer to what the model tells.
-                by_model = [
-                    _energy(self._level(sign * (mean - 2 * other)) - modelled)
-                    for sign, other in ((1, halves[1]), (-1, halves[0]))
-                ]
-                wrong = int(np.argmin(by_model))
-                if not self._is_lit(pattern, 1 - 2 * wrong):
-                    continue
-                half, other = halves[wrong], halves[1 - wrong]
-                found.append(_Seen((numbers[wrong],), pattern, half, half, mean - other, variance, off))
-            else:
-                foretold, frame = check._frame(self._weights, *pattern), check._centred(each.frame)
-                off = self._beyond({pattern: frame}, variance)
-                found.append(_Seen(numbers, pattern, each.frame, frame, foretold, variance, off))
+            foretold, frame = check._frame(self._weights, *pattern), check._centred(each.frame)
+            beyond = self._beyond({pattern: frame}, variance)
+            found.append(_Seen(numbers, pattern, each.frame, frame, foretold, variance, beyond))
+        for pattern, sign in self._wrong_halves(off, mean).items():
+            each, variance = self._measured[pattern], float(check.noise.variance[pattern]) * (1 + 1 / good)
+            half, other = (each.light + sign * each.frame) / 2, (each.light - sign * each.frame) / 2
+            number = check._number[(*pattern, sign)]
+            if self._is_lit(pattern, sign):
+                found.append(_Seen((number,), pattern, half, half, mean - other, variance, off[pattern]))
         return found
+
+    def _wrong_halves(self, off: dict[Pattern, float], mean: FloatArray) -> dict[Pattern, int]:
+        """Sign of the half that is wrong of each pattern that is ``off``, by that energy, the ``mean`` of halves' sums.
+
+        The other half foretells it either way, and no pattern of +-1 tells another's coefficients. First come those
+        that explain each other, as frames that are exchanged; then those that make the image vary least from pixel to
+        pixel, as coefficients that are wrong are a comb over all of it.
+        """
+        check, patterns = self._check, list(off)[:_MOST_PAIRS]
+
+        def exchanged(one: tuple[Pattern, int], other: tuple[Pattern, int]) -> bool:
+            noise = mean.size * float(check.noise.variance[one[0]] + check.noise.variance[other[0]])
+            apart = (halves[one] + halves[other[0], -other[1]] - mean, halves[other] + halves[one[0], -one[1]] - mean)
+            return max(_energy(each) for each in apart) - noise < _EXPLAINS * min(off[one[0]], off[other[0]])
+
+        halves = {
+            (pattern, sign): (each.light + sign * each.frame) / 2
+            for pattern, each in self._measured.items()
+            for sign in (1, -1)
+        }
+        ranks: dict[tuple[int, ...], tuple[int, float]] = {}
+        for signs in map(tuple, product((1, -1), repeat=len(patterns))):
+            wrong = list(zip(patterns, signs, strict=True))
+            frames = {pattern: check._centred(sign * (mean - 2 * halves[pattern, -sign])) for pattern, sign in wrong}
+            image = check._image(self._together(frames))
+            variation = float(sum(np.abs(np.diff(image, axis=axis)).sum() for axis in (0, 1)))
+            ranks[signs] = -sum(exchanged(*pair) for pair in combinations(wrong, 2)), variation
+        return dict(zip(patterns, min(ranks, key=lambda signs: ranks[signs]), strict=True))
 
     def _is_lit(self, pattern: Pattern, sign: int) -> bool:
         """Whether the half of that ``sign`` of a signed pattern lights any pixel."""
