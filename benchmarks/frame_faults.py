@@ -262,7 +262,7 @@ def is_named(fault: str, numbers: set[int], said: dict[str, Any]) -> bool:
     if fault == "repeated":  # of two frames that are one, it need not be clear which is the other
         return len(said["faults"]) == 1 and said["faults"][0][0] == fault and numbers <= set(said["faults"][0][1])
     if fault == "dead":
-        return said["ok"] and len(said["defects"]) == 1 and set(said["defects"][0]) == numbers
+        return len(said["defects"]) == 1 and set(said["defects"][0]) == numbers
     return bool(said["faults"] == [[fault, sorted(numbers)]])
 
 
@@ -281,7 +281,10 @@ def faulty(
     if fault == "rig":
         factors = replace(camera(mask, n, other=True)).calibrated(seed)
     said = verdict(changed(shots, laid, CODES * 16 if fault == "scale" else CODES), factors)
-    return is_named(fault, numbers, said), {**said, "laid": sorted(numbers)}
+    right = is_named(fault, numbers, said)
+    if fault == "dead" and right and not said["ok"]:  # left out, it is no reason for a flag
+        right = not verdict(shots, factors)["ok"]
+    return right, {**said, "laid": sorted(numbers)}
 
 
 def _alike(one: np.ndarray, other: np.ndarray) -> bool:

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from enum import Enum
 from itertools import combinations, product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -214,6 +214,8 @@ class FrameCheck:
         self._shots = manifest.patterns.captures
         self._number = {(shot.row, shot.column, shot.sign): index for index, shot in enumerate(self._shots)}
         self._signed = any(shot.sign for shot in self._shots)
+        all_lit = [np.flatnonzero((side > 0).all(axis=0)) for side in patterns]
+        self._whole = (int(all_lit[0][0]), int(all_lit[1][0])) if self._signed and all(map(len, all_lit)) else None
         sigma = np.outer(prepared.left.singular, prepared.right.singular)
         self._sigma = sigma
         self._kept = np.divide(np.square(sigma), np.square(sigma) + lam, out=np.zeros_like(sigma), where=sigma > 0)
@@ -270,11 +272,9 @@ class FrameCheck:
 
         That of two halves is the same for all patterns; most is that of the half that lights all pixels.
         """
-        left, right = self._patterns
-        whole = [n for n, shot in enumerate(self._shots) if (left[:, shot.row] > 0).all() and shot.sign == 1]
-        whole = [n for n in whole if (right[:, self._shots[n].column] > 0).all()]
-        if not self._signed or self.noise.variance.size < 4 or len(whole) != 1:
+        if self._whole is None or self.noise.variance.size < 4:
             return ""
+        whole = self._number[(*self._whole, 1)]
         light = np.zeros(len(self._shots))
         for pattern, halves in sums.halves.items():
             for sign, half in zip((1, -1), halves, strict=True):
@@ -290,9 +290,14 @@ class FrameCheck:
 
         if odd(0) > 1:
             for step, words in ((1, STEPS[0]), (-1, STEPS[1])):
-                if odd(step) == 0 and int(np.argmax(np.roll(light, -step))) == whole[0]:
+                if odd(step) == 0 and int(np.argmax(np.roll(light, -step))) == whole:
                     return words
         return ""
+
+    def whole(self) -> FloatArray | None:
+        """(m, m') the sum of a signed pattern's halves, as the model has it of the pattern of +1 alone; None without
+        that."""
+        return None if self._whole is None else self._frame(self.weights, *self._whole)
 
     def negative(self) -> str:
         """Why signed patterns were taken the wrong way round, or nothing: pixels that are always lit alike then have a
@@ -610,8 +615,15 @@ class _Seen:
     off: float
 
 
-Named = tuple[float, Fault, tuple[int, ...], str]
-"""Energy that a fault leaves of what a frame is off by, the fault, numbers of its frames, and words."""
+class _Named(NamedTuple):
+    """A ``fault`` of the frames of some ``numbers``, in ``words``; what it leaves of what they are off by, and
+    the ``place`` whose light they hold."""
+
+    left: float
+    fault: Fault
+    numbers: tuple[int, ...]
+    words: str
+    place: tuple[int, ...] = ()
 
 
 class _Namer:
@@ -632,12 +644,12 @@ class _Namer:
         check = self._check
         seen = self._signed() if check._signed else [self._plain(pattern) for pattern in self._bad]
         repeats = self._repeats(seen)
-        named: list[Named] = []
+        named: list[list[_Named]] = []
         for one in seen:
-            same = [each for each in repeats.get(one.numbers, []) if each[0] == -np.inf]
-            fits = [each for each in (*same, *self._tried(one)) if each[0] <= _EXPLAINS * one.off]
-            named += [min(fits, key=lambda each: each[0])] if fits else repeats.get(one.numbers, [])[:1]
-        return [check._fault(fault, numbers, words) for _, fault, numbers, words in self._pairs(named)]
+            same = [each for each in repeats.get(one.numbers, []) if each.left == -np.inf]
+            fits = [each for each in (*same, *self._tried(one)) if each.left <= _EXPLAINS * one.off]
+            named.append(sorted(fits, key=lambda each: each.left) or repeats.get(one.numbers, [])[:1])
+        return list(self._pairs(named))
 
     # ---- what frames leave
 
@@ -738,14 +750,14 @@ class _Namer:
             for pattern, each in self._measured.items()
             for sign in (1, -1)
         }
-        ranks: dict[tuple[int, ...], tuple[int, float]] = {}
-        for signs in map(tuple, product((1, -1), repeat=len(patterns))):
+        ranked = []
+        for signs in product((1, -1), repeat=len(patterns)):
             wrong = list(zip(patterns, signs, strict=True))
             frames = {pattern: check._centred(sign * (mean - 2 * halves[pattern, -sign])) for pattern, sign in wrong}
             image = check._image(self._together(frames))
             variation = float(sum(np.abs(np.diff(image, axis=axis)).sum() for axis in (0, 1)))
-            ranks[signs] = -sum(exchanged(*pair) for pair in combinations(wrong, 2)), variation
-        return dict(zip(patterns, min(ranks, key=lambda signs: ranks[signs]), strict=True))
+            ranked.append((-sum(exchanged(*pair) for pair in combinations(wrong, 2)), variation, wrong))
+        return dict(min(ranked)[2])
 
     def _is_lit(self, pattern: Pattern, sign: int) -> bool:
         """Whether the half of that ``sign`` of a signed pattern lights any pixel."""
@@ -754,12 +766,12 @@ class _Namer:
 
     # ---- what explains it
 
-    def _tried(self, one: _Seen) -> Iterable[Named]:
+    def _tried(self, one: _Seen) -> Iterable[_Named]:
         if len(one.numbers) == 2:
             yield from self._exchanged(one)
             return
         if self._is_black(one):
-            yield -np.inf, Fault.BLACK, one.numbers, "holds no light"
+            yield _Named(-np.inf, Fault.BLACK, one.numbers, "holds no light")
         if one.foretold is None and self._bad[one.pattern]:
             yield from self._by_neighbours(one)
             return
@@ -778,7 +790,7 @@ class _Namer:
         spread, expected = float(one.raw.var()) - dark, float(light.var())
         return bool(spread < _DARK**2 * expected + dark and one.raw.mean() < _DARK * abs(light.mean()) + np.sqrt(dark))
 
-    def _by_neighbours(self, one: _Seen) -> Iterable[Named]:
+    def _by_neighbours(self, one: _Seen) -> Iterable[_Named]:
         check = self._check
         if not check._exclusive:
             return
@@ -786,9 +798,9 @@ class _Namer:
         ratio = float(np.vdot(check._own(one.frame, *one.pattern), told)) / max(_energy(told), 1e-300)
         fault = Fault.DIM if ratio < 1 else Fault.BRIGHT
         words = f"holds {ratio:.2f} of the light that its neighbours' pixels tell"
-        yield -np.inf, fault, one.numbers, words
+        yield _Named(-np.inf, fault, one.numbers, words)
 
-    def _scaled(self, one: _Seen) -> Iterable[Named]:
+    def _scaled(self, one: _Seen) -> Iterable[_Named]:
         if one.foretold is None:
             return
         ratio = float(np.vdot(one.frame, one.foretold)) / max(_energy(one.foretold), 1e-300)
@@ -797,7 +809,7 @@ class _Namer:
             ratio, left = self._least_scale(one, ratio)
         if ratio > 0:
             fault = Fault.DIM if ratio < 1 else Fault.BRIGHT
-            yield left, fault, one.numbers, f"holds {ratio:.2f} of the light that the other frames tell"
+            yield _Named(left, fault, one.numbers, f"holds {ratio:.2f} of the light that the other frames tell")
 
     def _least_scale(self, one: _Seen, start: float) -> tuple[float, float]:
         """The part of its light that a frame has, and what it leaves divided by that."""
@@ -808,7 +820,7 @@ class _Namer:
         found = minimize_scalar(left, bounds=(0.3 * start, min(3 * start, 10.0)), method="bounded")
         return float(found.x), float(found.fun)
 
-    def _part_lost(self, one: _Seen) -> Iterable[Named]:
+    def _part_lost(self, one: _Seen) -> Iterable[_Named]:
         """Rows, or columns, without light side by side."""
         for axis, name in ((0, "rows"), (1, "columns")):
             lines, usual = one.raw.mean(axis=1 - axis), self._total.mean(axis=1 - axis)
@@ -826,9 +838,9 @@ class _Namer:
                 left = self._outside_of_part(one, kept, axis)
             else:
                 left = self._filled(one, one.raw, kept[:, None] if axis == 0 else kept[None, :])
-            yield left, Fault.HALF_LOST, one.numbers, f"has no light in sensor {name} {first} to {last - 1}"
+            yield _Named(left, Fault.HALF_LOST, one.numbers, f"has no light in sensor {name} {first} to {last - 1}")
 
-    def _elsewhere(self, one: _Seen) -> Iterable[Named]:
+    def _elsewhere(self, one: _Seen) -> Iterable[_Named]:
         """Another pattern than that of its place: of all patterns under dots, else of those that are suspected."""
         check = self._check
         if one.foretold is None:
@@ -864,22 +876,22 @@ class _Namer:
         """The other half of a signed pattern's shot."""
         return np.asarray(self._measured[one.pattern].light - one.raw)
 
-    def _of_pattern(self, left: float, one: _Seen, number: int) -> Named:
-        return left, Fault.MISPLACED, (*one.numbers, number), ""
+    def _of_pattern(self, left: float, one: _Seen, *place: int) -> _Named:
+        words = f"{'hold' if len(place) > 1 else 'holds'} the light of the pattern of frame {place[0]}"
+        return _Named(left, Fault.MISPLACED, one.numbers, words, place)
 
-    def _exchanged(self, one: _Seen) -> Iterable[Named]:
+    def _exchanged(self, one: _Seen) -> Iterable[_Named]:
         """Both halves of signed patterns: the two exchanged, or those of another pattern."""
         if one.foretold is None:
             return
-        yield self._beyond({one.pattern: -one.frame}, one.variance), Fault.SWAPPED, one.numbers, "are exchanged"
+        yield _Named(self._beyond({one.pattern: -one.frame}, one.variance), Fault.SWAPPED, one.numbers, "are exchanged")
         for other in self._bad:
             if other != one.pattern:
                 there = self._check._centred(self._measured[other].frame)
                 left = self._crossed(one, other, there)
-                both = tuple(self._check._number[(*other, sign)] for sign in (1, -1))
-                yield left, Fault.MISPLACED, (*one.numbers, *both), ""
+                yield self._of_pattern(left, one, *(self._check._number[(*other, sign)] for sign in (1, -1)))
 
-    def _moved(self, one: _Seen) -> Iterable[Named]:
+    def _moved(self, one: _Seen) -> Iterable[_Named]:
         """Moved over the sensor by whole pixels."""
         reach = min(_REACH, *(side // 8 for side in one.frame.shape))
         if reach < 1:
@@ -900,7 +912,7 @@ class _Namer:
             if (rows, columns) == (0, 0):
                 return
             words = f"is shifted by {rows} rows and {columns} columns of the sensor"
-            yield left, Fault.SHIFTED, one.numbers, words
+            yield _Named(left, Fault.SHIFTED, one.numbers, words)
             return
         ends = [slice(reach + step, size - reach + step) for step, size in zip(shift, one.raw.shape, strict=True)]
         still = [slice(reach, size - reach) for size in one.raw.shape]
@@ -908,7 +920,7 @@ class _Namer:
         if unmoved > 0:
             rows, columns = shift
             words = f"is shifted by {rows} rows and {columns} columns of the sensor"
-            yield moved / unmoved * one.off, Fault.SHIFTED, one.numbers, words
+            yield _Named(moved / unmoved * one.off, Fault.SHIFTED, one.numbers, words)
 
     def _put_back(self, one: _Seen, shift: tuple[int, int]) -> float:
         """Energy beyond noise that a frame leaves that is moved back by a ``shift``, rows and columns."""
@@ -946,10 +958,12 @@ class _Namer:
         """Energy beyond noise that is off in the ``kept`` rows (``axis`` 0) or columns of the sensor."""
         window = (kept, slice(None)) if axis == 0 else (slice(None), kept)
         part = one.raw[window]
+        # The noise of a frame is that of its mean light, which what is lost makes too little.
+        variance = max(one.variance, float(self._check.noise.of(float(part.mean()), 1)))
         if one.foretold is not None:
-            return _energy(self._level(part - one.foretold[window])) - part.size * one.variance
+            return _energy(self._level(part - one.foretold[window])) - part.size * variance
         left, right = self._ranges(one.pattern, *window)
-        return _energy(part) - _energy(left.T @ part @ right) - self._check._spare * part.size * one.variance
+        return _energy(part) - _energy(left.T @ part @ right) - self._check._spare * part.size * variance
 
     def _level(self, part: FloatArray) -> FloatArray:
         return centred(part) if self._check.prepared.centre else part
@@ -978,10 +992,10 @@ class _Namer:
 
     # ---- frames that go together
 
-    def _repeats(self, seen: list[_Seen]) -> dict[tuple[int, ...], list[Named]]:
+    def _repeats(self, seen: list[_Seen]) -> dict[tuple[int, ...], list[_Named]]:
         """Shots that are equal to another, but for noise."""
         check = self._check
-        found: dict[tuple[int, ...], list[Named]] = {}
+        found: dict[tuple[int, ...], list[_Named]] = {}
         for each in check.measured():
             pattern = each.row, each.column
             signs = (1, -1) if each.shots == 2 else (0,)
@@ -998,26 +1012,22 @@ class _Namer:
                         beyond = -np.inf
                     if beyond < 0.5 * _EXPLAINS * one.off and beyond < CHANCE * one.variance * np.sqrt(8 * shot.size):
                         words = f"repeats frame {number} ({check._shots[number].file})"
-                        found.setdefault(one.numbers, []).append((beyond, Fault.REPEATED, one.numbers, words))
+                        found.setdefault(one.numbers, []).append(_Named(beyond, Fault.REPEATED, one.numbers, words))
         return found
 
-    def _pairs(self, named: list[Named]) -> Iterable[Named]:
-        """Frames that are of each other's pattern, as one fault."""
-        misplaced = {each[2][: len(each[2]) // 2]: each for each in named if each[1] is Fault.MISPLACED}
-        done = set()
-        for left, fault, numbers, words in named:
-            if fault is not Fault.MISPLACED:
-                yield left, fault, numbers, words
+    def _pairs(self, named: list[list[_Named]]) -> Iterable[FrameFault]:
+        """The first of each that is ``named``; but frames that hold each other's light as one fault."""
+        places, done = {(each.numbers, each.place) for fits in named for each in fits}, set[tuple[int, ...]]()
+        for fits in named:
+            if not fits or fits[0].numbers in done:
                 continue
-            own, other = numbers[: len(numbers) // 2], numbers[len(numbers) // 2 :]
-            back = misplaced.get(other)
-            if own in done:
-                continue
-            if back is not None and back[2][len(other) :] == own:
-                done |= {own, other}
-                yield left, Fault.SWAPPED, (*own, *other), "are exchanged"
+            best = fits[0]
+            pair = next((each for each in fits if best.left > -np.inf and (each.place, each.numbers) in places), None)
+            if pair:
+                done |= {pair.numbers, pair.place}
+                yield self._check._fault(Fault.SWAPPED, (*pair.numbers, *pair.place), "are exchanged")
             else:
-                yield left, Fault.MISPLACED, own, f"holds the light of the pattern of frame {other[0]}"
+                yield self._check._fault(best.fault, best.numbers, best.words)
 
 
 def _correlated(frame: FloatArray, foretold: FloatArray, reach: int) -> tuple[int, int]:

@@ -41,6 +41,8 @@ _GROSS_CHI_SQUARE = 4.0
 """The same as a chi-square, of shot noise alone: read noise of as many electrons makes 2."""
 _SHOWN = 4
 """Faults that a sentence holds; result.json has them all."""
+_MOSTLY = 0.5
+"""Part of the unexplained energy at defective pixels from which frames are not blamed: most of it."""
 _QUIET = 0.03
 """Of the sensor's noise, beside half of :data:`CHANCE`, that may be missing before tone curves are tried: chosen, gains
 are stated to a few per cent."""
@@ -229,13 +231,30 @@ class Residuals:
         """(tiles, tiles) sum of the squares of residuals."""
         return self._sums(self.squares)
 
-    def defects(self) -> Defects | None:
-        """Pixels that are off in all measurements, where the sensor's noise is stated."""
+    def defects(self, whole: FloatArray | None) -> Defects | None:
+        """Pixels that are off in all measurements, where the sensor's noise is stated.
+
+        Parameters
+        ----------
+        whole
+            (rows, columns) the halves' sum of signed patterns, as the model has it; None: it has none.
+        """
         if not self._noise.stated:
             return None
         count = self._noise.variance.size
-        variance = count * self._noise.of(self._noise.light / count, self._noise.shots)
-        return defects_of(self.squares, variance, count)
+        mean = self._noise.light / count
+        variance = self._noise.of(mean, self._noise.shots)
+        found = defects_of(self.squares, count * variance, count)
+        if whole is None:
+            return found
+        # Differences of halves tell little of pixels that stand still, their sums all.
+        mean = centred(mean) if self._prepared.centre else mean
+        still = defects_of(np.square(mean - whole), variance / count, 1)
+        return still.with_others(found) if still else found
+
+    def at(self, defects: Defects) -> float:
+        """Energy that is left at pixels that are defective."""
+        return float(self.squares[defects.rows, defects.columns].sum())
 
     @property
     def quiet(self) -> bool:
@@ -303,6 +322,9 @@ def judge(
         return replace(
             found, flagged=True, cause=Cause.ORDER, reading=Reading(Cause.ORDER, f"the frames are {step}", 0.0)
         )
+    defects = sums.defects(check.whole()) if with_defects else None
+    if defects and sums.at(defects) > _MOSTLY * excess:
+        return replace(found, defects=defects)
     readings, reading = Readings(prepared, check.manifest, noise, check.measured), None
     if found.flagged:
         beside = beside_noise / max(float(sums.energy.sum()), _TINY)
@@ -314,7 +336,6 @@ def judge(
     faults = check.faults(sums.by_pattern, beside_noise)
     if faults:
         return replace(found, flagged=True, cause=Cause.FRAMES, faults=faults)
-    defects = sums.defects() if with_defects else None
     if defects:
         return replace(found, defects=defects)
     negative = check.negative()

@@ -79,7 +79,7 @@ class Readings:
     noise: FrameNoise
     measured: Callable[[], Iterable[Measurement]]
 
-    def fitting(self, unexplained: float, beside_noise: float, cut: bool) -> Reading | None:
+    def fitting(self, unexplained: float, beside_noise: float, all_off: bool) -> Reading | None:
         """The reading that fits best, where one does.
 
         Parameters
@@ -88,16 +88,17 @@ class Readings:
             part of the measurements, rms, that is left of them as they are.
         beside_noise
             part of their energy that rendering, the factors' noise and print put there.
-        cut
-            whether an order counts that leaves one frame of a cycle.
+        all_off
+            whether most frames are off: then numbers may have gone through a curve, and an order counts that leaves
+            one frame of a cycle.
         """
         fits: list[Reading] = []
-        for cause, words, frames, most in self._tried(cut):
+        for cause, words, frames, most in self._tried(all_off):
             left_over, expected = self._left_over(frames)
             left = np.sqrt(max(left_over - expected - beside_noise, 0.0))
             if left < np.sqrt(most) * unexplained and (left < _AT_MOST or most > _FITS):
                 fits.append(Reading(cause, words, float(left)))
-        return min(fits, key=lambda reading: reading.left, default=None) or self.curved()
+        return min(fits, key=lambda reading: reading.left, default=None) or (self.curved() if all_off else None)
 
     def curved(self) -> Reading | None:
         """The tone curve that the numbers went through, where one is likelier than none."""
@@ -117,7 +118,7 @@ class Readings:
 
     def _tried(self, with_cut: bool) -> Iterator[tuple[Cause, str, Frames, float]]:
         """Cause, words and frames of each reading, and the part of the unexplained energy that it may leave;
-        ``with_cut`` as :meth:`fitting` takes it."""
+        ``with_cut`` as ``all_off`` of :meth:`fitting` takes it."""
         shape = self.prepared.left.sensor_size, self.prepared.right.sensor_size
         for words, turn in _TURNS.items():
             if turn(np.zeros(shape)).shape == shape:
