@@ -52,15 +52,14 @@ which patterns that know nothing of each other do not need: chosen."""
 _STEPS = 12
 """Rounds in which patterns left out are foretold from the rest: each brings what overlapping patterns know to a half or
 less of its distance."""
-_SCALE_SPREADS, _SCALE_LEAST = 6.0, 0.08
+_SCALE_SPREADS, _SCALE_LEAST, _SCALE_OTHERS = 4.0, 0.08, 2.0
 """Standard deviations, as half of the frames tell them, by which a frame's brightness may differ from what its
-neighbours foretell; and the least such part that is named."""
+neighbours foretell, the least such part that is named, and times what any other frame differs by: chosen, of 49 normal
+numbers one is as far away once in 20 000 runs."""
 _FEW = 2.5
 """The least part times the number of frames: half of so few frames do not tell a spread."""
 _BRIGHT_ENOUGH = 0.2
 """Of the mean foretold reflectance, from which a pixel counts when it is compared with its neighbours."""
-_BLACK = 0.03
-"""Of the light that is foretold, below which a frame is black whatever the others are: half of the darkest ink."""
 _MOST_PAIRS = 6
 """Pairs of which it is tried which half is wrong: 64 images."""
 _FEWEST_PIXELS = 8
@@ -369,45 +368,50 @@ class FrameCheck:
     def _brightness(self, weights: FloatArray, good: BoolArray) -> Pattern | None:
         """The ``good`` pattern whose brightness differs most from what its pixels' neighbours foretell, if it does.
 
-        Both its light as a whole and the median of its pixels must differ: a highlight moves the first alone, stripes
-        as fine as the dots the other frames as well.
+        The median of its pixels must differ, which highlights and edges do not move, its light as a whole to the same
+        side, and by more than the others': stripes as fine as the dots make others differ as well.
         """
-        image = self._image(weights)
-        near = self._neighbours(image, good)
-        amid = self._between(image, good)
-        expected, kept = self._seen(near), self._sigma > 0
-        bright = near > _BRIGHT_ENOUGH * max(float(near.mean()), 0.0)
-        whole, middle = np.full(good.shape, np.nan), np.full(good.shape, np.nan)
-        for pattern in np.argwhere(good):
-            row, column = int(pattern[0]), int(pattern[1])
-            places = self._columns(row, column)
-            seen, told = (np.where(kept, values, 0.0)[places] for values in (weights, expected))
-            lit = np.ix_(self._patterns[0][:, row] != 0, self._patterns[1][:, column] != 0)
-            chosen = bright[lit]
-            if chosen.sum() >= _FEWEST_PIXELS and (size := _energy(told)) > 0:
-                whole[row, column] = float(np.vdot(seen, told)) / size
-                middle[row, column] = float(np.median(image[lit][chosen] / near[lit][chosen]))
-                between = amid[lit] > _BRIGHT_ENOUGH * max(float(near.mean()), 0.0)
-                dark = whole[row, column] < _BLACK and between.sum() >= _FEWEST_PIXELS
-                if dark and float(np.median(image[lit][between] / amid[lit][between])) < _BLACK:
-                    return row, column
-        if np.isfinite(whole).sum() < 3:
+        image, lit = self._image(weights), self._lit(good)
+        ratios = self._ratios(image, lit, good)
+        if ratios is None or len(ratios[0]) < 3:
             return None
-        least = max(_SCALE_LEAST, _FEW / good.size)
-        off = np.full(good.shape, np.inf)
-        signs = []
-        for ratio in (whole, middle):
-            centre = float(np.nanmedian(ratio))
-            if not centre > 0:
-                return None
-            away = ratio / centre
-            away = np.where(away > 1, 1 - 1 / away, away - 1)
-            spread = 1.4826 * float(np.nanmedian(np.abs(away)))
-            off = np.fmin(off, np.abs(away) / max(least, _SCALE_SPREADS * spread))
-            signs.append(np.sign(away))
-        off = np.where((signs[0] == signs[1]) & np.isfinite(whole), off, 0.0)
-        row, column = divmod(int(np.argmax(off)), good.shape[1])
-        return (row, column) if off[row, column] > 1 else None
+        first = max(ratios[0], key=lambda pattern: abs(_away(ratios[0][pattern], list(ratios[0].values()))))
+        # Its neighbours are off by what it is off.
+        place = np.ix_(*(side[:, index] != 0 for side, index in zip(self._patterns, first, strict=True)))
+        lit = lit.copy()
+        lit[place] = False
+        beside = self._ratios(image, lit, good)
+        if beside is None or len(beside[0]) < 3:
+            return None
+        middles, wholes, _ = beside
+        others = [ratio for pattern, ratio in middles.items() if pattern != first]
+        most = max(abs(_away(ratio, others)) for ratio in others)
+        spread = 1.4826 * float(np.median([abs(_away(ratio, others)) for ratio in others]))
+        away = _away(ratios[0][first], others)
+        whole = _away(ratios[1][first], [ratio for pattern, ratio in wholes.items() if pattern != first])
+        error = float(np.hypot(spread, ratios[2][first] / max(float(np.median(others)), 1e-300)))
+        least = max(_SCALE_LEAST, _FEW / good.size, _SCALE_SPREADS * error, _SCALE_OTHERS * most)
+        return first if abs(away) > least and away * whole > 0 else None
+
+    def _ratios(
+        self, image: FloatArray, lit: BoolArray, good: BoolArray
+    ) -> tuple[dict[Pattern, float], dict[Pattern, float], dict[Pattern, float]] | None:
+        """By ``good`` pattern, its pixels over their neighbours that are ``lit``: the median, their light as a whole,
+        and the standard error of the median."""
+        near = self._neighbours(image, lit)
+        bright = near > _BRIGHT_ENOUGH * max(float(near.mean()), 0.0)
+        middles, wholes, errors = dict[Pattern, float](), dict[Pattern, float](), dict[Pattern, float]()
+        for row, column in np.ndindex(good.shape):
+            place = np.ix_(self._patterns[0][:, row] != 0, self._patterns[1][:, column] != 0)
+            chosen = bright[place]
+            if good[row, column] and chosen.sum() >= _FEWEST_PIXELS:
+                seen, told = image[place][chosen], near[place][chosen]
+                middle = float(np.median(seen / told))
+                spread = 1.4826 * float(np.median(np.abs(seen / told - middle)))
+                middles[row, column] = middle
+                wholes[row, column] = float(np.vdot(seen, told)) / _energy(told)
+                errors[row, column] = 1.2533 * spread / np.sqrt(len(seen))  # of a median
+        return middles, wholes, errors
 
     def _same(self, sums: FrameSums) -> Iterable[FrameFault]:
         """Shots that are one and the same frame, noise and all."""
@@ -482,24 +486,14 @@ class FrameCheck:
         left, right = ((side != 0).astype(np.float64) for side in self._patterns)
         return np.asarray(left @ good @ right.T > 0)
 
-    def _neighbours(self, image: FloatArray, good: BoolArray) -> FloatArray:
-        """(n, n') mean of each pixel's neighbours, along sides with several groups, that a ``good`` pattern lights."""
+    def _neighbours(self, image: FloatArray, lit: BoolArray) -> FloatArray:
+        """(n, n') mean of each pixel's neighbours, along sides with several groups, that are ``lit``."""
         size = [3 if period > 1 else 1 for period in self._periods]
-        lit = self._lit(good).astype(np.float64)
         light, count = (
-            uniform_filter(values, size, mode="constant") * np.prod(size) - values for values in (image * lit, lit)
+            uniform_filter(values, size, mode="constant") * np.prod(size) - values
+            for values in (image * lit, lit.astype(np.float64))
         )
         return np.asarray(np.divide(light, count, out=np.zeros_like(light), where=count > 0.5))
-
-    def _between(self, image: FloatArray, good: BoolArray) -> FloatArray:
-        """(n, n') the lesser of each pixel's neighbours on either side, along the side where that is more: what lies
-        inside of a bright surface is no darker, whatever lies beside it."""
-        seen = np.pad(np.where(self._lit(good), image, 0.0), 1)
-        sides = [
-            np.minimum(seen[:-2, 1:-1], seen[2:, 1:-1]) * (self._periods[0] > 2),
-            np.minimum(seen[1:-1, :-2], seen[1:-1, 2:]) * (self._periods[1] > 2),
-        ]
-        return np.asarray(np.maximum(*sides))
 
     def _measurements(self, patterns: Iterable[Pattern]) -> dict[Pattern, Measurement]:
         wanted = set(patterns)
@@ -520,7 +514,8 @@ class FrameCheck:
         if not self._exclusive and max(self._periods) > 1:
             # One pattern of +-1 that is wrong is a comb of the dots' period, without a mean.
             image = uniform_filter(image, self._periods, mode="nearest")
-        image = np.where(self._lit(good), image, self._neighbours(image, good))
+        lit = self._lit(good)
+        image = np.where(lit, image, self._neighbours(image, lit))
         weights = self._seen(image)
         grams = {
             pattern: (
@@ -1028,6 +1023,12 @@ class _Namer:
                 yield self._check._fault(Fault.SWAPPED, (*pair.numbers, *pair.place), "are exchanged")
             else:
                 yield self._check._fault(best.fault, best.numbers, best.words)
+
+
+def _away(ratio: float, others: list[float]) -> float:
+    """Part by which a ``ratio`` is below the median of ``others``, negative, or that above it."""
+    part = ratio / max(float(np.median(others)), 1e-300)
+    return 1 - 1 / part if part > 1 else part - 1
 
 
 def _correlated(frame: FloatArray, foretold: FloatArray, reach: int) -> tuple[int, int]:
