@@ -46,6 +46,12 @@ _EXPLAINS = 0.2
 """Part of what a frame is off by that a fault may leave: chosen, with room for what the others foretell badly."""
 _MOST_BAD = 0.25
 """Of all patterns: above it the run is another than it says, and no single frames are at fault."""
+_HINT, _FURTHER, _TRIED = 2.5, 4.0, 3
+"""In place of :data:`CHANCE` where all frames together are off by half of that, and once one frame is suspected: only
+what a fault then explains is named; and the most frames of which it is tried which one puts the others off."""
+_LIKELY, _LEFT = 60.0, 3.0
+"""Variances of a datum that a fault must explain, twice the logarithm of a likelihood ratio of 1e13: some of them are
+searched for among 10^4; and the standard deviations of noise that it may leave."""
 _SETTLED, _MOST_STEPS = 0.1, 100
 """Of :data:`CHANCE`, the energy below which a step of foretelling changes nothing that counts; and the most steps,
 which patterns that know nothing of each other do not need: chosen."""
@@ -234,7 +240,7 @@ class FrameCheck:
         part = np.maximum(sums.residual - noise - share, 0.0) / np.maximum(sums.power, np.finfo(float).tiny)
         return bool(np.median(part) > _OFF**2)
 
-    def faults(self, sums: FrameSums, beside_noise: float) -> tuple[FrameFault, ...]:
+    def faults(self, sums: FrameSums, beside_noise: float, hinted: bool = False) -> tuple[FrameFault, ...]:
         """The frames at fault.
 
         Parameters
@@ -243,28 +249,53 @@ class FrameCheck:
             of all measurements.
         beside_noise
             energy that rendering, the factors' noise and print put into all of them.
+        hinted
+            whether frames are suspected from less on, as together they are off by a little.
         """
         found = [*self._same(sums), *self._clipped(sums), *self._noiseless(sums)]
-        bad: dict[Pattern, bool] = {}  # and whether its brightness alone is off
-        others = self.weights
-        count = self.noise.variance.size
-        while True:
-            suspect = self._suspect(sums, others, beside_noise, bad)
-            if suspect is None:
-                break
-            bad[suspect[0]] = suspect[1]
-            if len(bad) > max(1, _MOST_BAD * count):
-                return tuple(found)
-            if count == 1:
-                break
-            others = self._without(tuple(bad))
-            sums = self._gathered(others, bad)
-        named = _Namer(self, bad, others).faults() if bad else []
+        suspects = self._suspects(sums, beside_noise, CHANCE)
+        if suspects and not suspects[0] and hinted:
+            suspects = self._suspects(sums, beside_noise, _HINT)
+        if suspects is None:  # too many
+            return tuple(found)
+        named = _Namer(self, *suspects).faults() if suspects[0] else []
         # What is known without the model is said where that does not say more; of clipped frames it explains the rest.
         clipped = {number for fault in found if fault.fault is Fault.CLIPPED for number in fault.numbers}
         named = [fault for fault in named if not clipped & set(fault.numbers)]
         known = clipped | {number for fault in named for number in fault.numbers}
         return (*(each for each in found if each.fault is Fault.CLIPPED or not known & set(each.numbers)), *named)
+
+    def _suspects(
+        self, sums: FrameSums, beside_noise: float, level: float
+    ) -> tuple[dict[Pattern, bool], FloatArray] | None:
+        """Patterns that are off, each with whether its brightness alone is, and W with these as the others foretell
+        them; None where too many are.
+
+        Parameters
+        ----------
+        sums, beside_noise
+            as :meth:`faults` takes them.
+        level
+            standard deviations of noise from which the first is suspected.
+        """
+        bad: dict[Pattern, bool] = {}
+        weights, count = self.weights, self.noise.variance.size
+        while candidates := self._off(sums, weights, beside_noise, bad, min(level, _FURTHER) if bad else level):
+            if len(bad) + 1 > max(1, _MOST_BAD * count):
+                return None
+            if count == 1:
+                return dict(candidates), weights
+            # Where patterns overlap a frame puts others off: it is the one without which the rest fits best.
+            several = not (self._exclusive or self._signed)
+            least = np.inf
+            for pattern, by_brightness in candidates[: _TRIED if several else 1]:
+                rest, explained = self._without((*bad, pattern))
+                noise = float(self.noise.variance[pattern]) * self._size * self._spare
+                if (left := noise - float(sums.energy[pattern]) - explained) < least:
+                    least, found = left, (pattern, by_brightness, rest)
+            bad[found[0]], weights = found[1:]
+            sums = self._gathered(weights, bad)
+        return bad, weights
 
     def out_of_step(self, sums: FrameSums) -> str:
         """How signed shots are a step beside their patterns, as ``sums`` of their light tell, or nothing.
@@ -310,17 +341,17 @@ class FrameCheck:
             return ""
         return "the image is negative: the halves of signed pairs are exchanged, or their frames in another order"
 
-    def _suspect(
-        self, sums: FrameSums, weights: FloatArray, beside_noise: float, bad: dict[Pattern, bool]
-    ) -> tuple[Pattern, bool] | None:
-        """The pattern that is off most, and whether its brightness alone is; None where none is.
+    def _off(
+        self, sums: FrameSums, weights: FloatArray, beside_noise: float, bad: dict[Pattern, bool], level: float
+    ) -> list[tuple[Pattern, bool]]:
+        """Patterns that are off, the most first, and whether their brightness alone is.
 
         Parameters
         ----------
         sums, weights
             of all, and W of those that are not ``bad``.
-        beside_noise
-            as :meth:`faults` takes it.
+        beside_noise, level
+            as :meth:`_suspects` takes them.
         bad
             patterns that are suspected already.
         """
@@ -328,9 +359,9 @@ class FrameCheck:
         for pattern in bad:
             good[pattern] = False
         if not good.any():
-            return None
+            return []
         noise = self.noise.variance * self._size
-        chance = CHANCE * self.noise.variance * np.sqrt(2 * self._size)
+        chance = level * self.noise.variance * np.sqrt(2 * self._size)
         share = beside_noise * sums.power / max(float(sums.power.sum()), np.finfo(float).tiny)
         others = max(good.sum() - 1, 1)
         # Behind a mask with a constant term most of a frame's light says nothing, and is no part of what it is off by.
@@ -339,27 +370,22 @@ class FrameCheck:
         if self._signed:
             mean = float(noise[good].mean())
             tests.append((sums.sums, sums.power, noise + mean / others + share, 2 * chance))
-        worst: tuple[float, Pattern, bool] | None = None
+        parts = np.zeros(good.shape)
         for energy, whole, expected, allowed in tests:
             power = np.maximum(whole, np.median(whole[good]))
             beyond = np.where(good, np.maximum(energy - expected, 0.0), 0.0)
             part = beyond / np.maximum(power, np.finfo(float).tiny)
             usual = float(np.median(part[good])) if good.sum() > 2 else 0.0
             off = good & (beyond > allowed) & (part > max(_OFF**2, _MORE * usual))
-            if off.any():
-                row, column = divmod(int(np.argmax(np.where(off, part, 0.0))), part.shape[1])
-                place = row, column
-                if worst is None or part[place] > worst[0]:
-                    worst = float(part[place]), place, False
-        if worst is not None:
-            return worst[1:]
+            parts = np.maximum(parts, np.where(off, part, 0.0))
+        if parts.any():
+            order = np.argsort(-parts, axis=None, kind="stable")[: np.count_nonzero(parts)]
+            rows, columns = np.unravel_index(order, parts.shape)
+            return [((int(row), int(column)), False) for row, column in zip(rows, columns, strict=True)]
         if self._exclusive:
             ratio = self._brightness(weights, good)
-            if ratio is not None:
-                return ratio, True
-        elif good.size == 1 and self._is_dark(sums):
-            return (0, 0), True
-        return None
+            return [] if ratio is None else [(ratio, True)]
+        return [((0, 0), True)] if good.size == 1 and self._is_dark(sums) else []
 
     def _is_dark(self, sums: FrameSums) -> bool:
         """Whether the only frame has no more light than noise makes."""
@@ -502,8 +528,9 @@ class FrameCheck:
     def _centred(self, frame: FloatArray) -> FloatArray:
         return centred(frame) if self.prepared.centre else frame
 
-    def _without(self, bad: tuple[Pattern, ...]) -> FloatArray:
-        """W of all patterns, the ``bad`` ones as the others foretell them."""
+    def _without(self, bad: tuple[Pattern, ...]) -> tuple[FloatArray, float]:
+        """W of all patterns, the ``bad`` ones as the others foretell them, and what it explains of these others'
+        energy."""
         rest = self.weights.copy()
         for pattern, measurement in self._measurements(bad).items():
             rest[self._columns(*pattern)] -= self._own(self._centred(measurement.frame), *pattern)
@@ -533,7 +560,8 @@ class FrameCheck:
             return own
 
         if self._exclusive:
-            return np.asarray(rest + of_bad(weights))
+            weights = np.asarray(rest + of_bad(weights))
+            return weights, float(np.vdot(weights, rest))
         # W - of_bad(W) = rest are the normal equations of the good ones: conjugate gradients after Hestenes and Stiefel
         # (1952), until a step brings these frames less than chance does.
         enough = _SETTLED * CHANCE * float(self.noise.variance.mean()) * np.sqrt(2 * self._size)
@@ -551,7 +579,7 @@ class FrameCheck:
             left_over -= length * moved
             before, squared = squared, _energy(left_over)
             step = left_over + squared / before * step
-        return weights
+        return weights, float(np.vdot(weights, rest))
 
     def _gathered(self, weights: FloatArray, bad: Iterable[Pattern]) -> FrameSums:
         """Sums of all measurements against other ``weights``; the light of all is that of those not ``bad``."""
@@ -642,7 +670,12 @@ class _Namer:
         named: list[list[_Named]] = []
         for one in seen:
             same = [each for each in repeats.get(one.numbers, []) if each.left == -np.inf]
-            fits = [each for each in (*same, *self._tried(one)) if each.left <= _EXPLAINS * one.off]
+            chance = _LEFT * one.variance * np.sqrt(2 * one.frame.size)
+            fits = [
+                each
+                for each in (*same, *self._tried(one))
+                if each.left <= max(_EXPLAINS * one.off, chance) and one.off - each.left > _LIKELY * one.variance
+            ]
             named.append(sorted(fits, key=lambda each: each.left) or repeats.get(one.numbers, [])[:1])
         return list(self._pairs(named))
 

@@ -323,17 +323,19 @@ def judge(
             found, flagged=True, cause=Cause.ORDER, reading=Reading(Cause.ORDER, f"the frames are {step}", 0.0)
         )
     defects = sums.defects(check.whole()) if with_defects else None
-    if defects and sums.at(defects) > _MOSTLY * excess:
+    if defects and excess > 0 and sums.at(defects) > _MOSTLY * excess:
         return replace(found, defects=defects)
     readings, reading = Readings(prepared, check.manifest, noise, check.measured), None
-    if found.flagged:
+    chance = _chance(noise, float(sums.pixels.sum()))
+    hinted = found.flagged or (found.stated and found.unexplained > UNEXPLAINED and found.chi_square > 1 + chance / 2)
+    if hinted:
         beside = beside_noise / max(float(sums.energy.sum()), _TINY)
         reading = readings.fitting(found.unexplained, beside, check.all_off(sums.by_pattern, beside_noise))
     elif noise.stated and sums.quiet:
         reading = readings.curved()
     if reading:
         return replace(found, flagged=True, cause=reading.cause, reading=reading)
-    faults = check.faults(sums.by_pattern, beside_noise)
+    faults = check.faults(sums.by_pattern, beside_noise, hinted)
     if faults:
         return replace(found, flagged=True, cause=Cause.FRAMES, faults=faults)
     if defects:

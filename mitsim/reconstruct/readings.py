@@ -26,6 +26,9 @@ _FITS = 0.05
 _AT_MOST = 2e-2
 """Part of the measurements, rms, that it may leave: one that is right leaves 1e-2 of a sheet 2 mm beside the calibrated
 distance."""
+_CHANCE = 3.0
+"""Standard deviations of noise that a reading may leave in any case, where that is less than half of what is
+unexplained."""
 _CUT = 1.5
 """Part of the unexplained energy that another order may leave, times the number of patterns: of a cycle that was
 entered late one frame was taken before it."""
@@ -89,16 +92,18 @@ class Readings:
         beside_noise
             part of their energy that rendering, the factors' noise and print put there.
         all_off
-            whether most frames are off: then numbers may have gone through a curve, and an order counts that leaves
-            one frame of a cycle.
+            whether most frames are off: then an order counts that leaves one frame of a cycle.
         """
         fits: list[Reading] = []
         for cause, words, frames, most in self._tried(all_off):
             left_over, expected = self._left_over(frames)
-            left = np.sqrt(max(left_over - expected - beside_noise, 0.0))
-            if left < np.sqrt(most) * unexplained and (left < _AT_MOST or most > _FITS):
-                fits.append(Reading(cause, words, float(left)))
-        return min(fits, key=lambda reading: reading.left, default=None) or (self.curved() if all_off else None)
+            left = max(left_over - expected - beside_noise, 0.0)
+            numbers = self.noise.readings / self.noise.shots * self.prepared.spare
+            chance = min(_CHANCE * expected * np.sqrt(2 / numbers), 0.5 * unexplained**2) if self.noise.stated else 0.0
+            fit = left < most * unexplained**2 and (left < _AT_MOST**2 or most > _FITS)
+            if fit or left < chance:
+                fits.append(Reading(cause, words, float(np.sqrt(left))))
+        return min(fits, key=lambda reading: reading.left, default=None) or self.curved()
 
     def curved(self) -> Reading | None:
         """The tone curve that the numbers went through, where one is likelier than none."""
