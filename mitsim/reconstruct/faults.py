@@ -744,7 +744,7 @@ class _Namer:
         for pattern, each in self._measured.items():
             variance = float(check.noise.variance[pattern]) * (1 + 1 / good)
             beyond = _energy(each.light - mean) - each.light.size * variance
-            if beyond > CHANCE * variance * np.sqrt(2 * each.light.size) and beyond > _OFF**2 * _energy(mean):
+            if beyond > CHANCE * variance * np.sqrt(2 * each.light.size) and beyond > _OFF**2 * each.power:
                 off[pattern] = beyond
                 continue
             numbers = tuple(check._number[(*pattern, sign)] for sign in (1, -1))
@@ -771,7 +771,8 @@ class _Namer:
         def exchanged(one: tuple[Pattern, int], other: tuple[Pattern, int]) -> bool:
             noise = mean.size * float(check.noise.variance[one[0]] + check.noise.variance[other[0]])
             apart = (halves[one] + halves[other[0], -other[1]] - mean, halves[other] + halves[one[0], -one[1]] - mean)
-            return max(_energy(each) for each in apart) - noise < _EXPLAINS * min(off[one[0]], off[other[0]])
+            most = max(_EXPLAINS * min(off[one[0]], off[other[0]]), _LEFT * noise * float(np.sqrt(2 / mean.size)))
+            return max(_energy(each) for each in apart) - noise < most
 
         halves = {
             (pattern, sign): (each.light + sign * each.frame) / 2

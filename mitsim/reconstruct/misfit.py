@@ -349,6 +349,15 @@ def judge(
     return replace(found, cause=likely_cause(signatures, found.unexplained, evidence.of_factors), signatures=signatures)
 
 
+def faulty_frames(check: FrameCheck, beside_noise: float, evidence: Evidence) -> tuple[FrameFault, ...]:
+    """Frames at fault of a scene of several depths, of which the model of a ``check`` fits a part; ``evidence`` is as
+    :func:`judge` takes it, ``beside_noise`` as :meth:`FrameCheck.faults` does."""
+    sums = Residuals(check.prepared, check.weights, check.noise, evidence)
+    for measurement in check.measured():
+        sums.add(measurement)
+    return check.faults(sums.by_pattern, beside_noise)
+
+
 @dataclass(frozen=True, eq=False)
 class Balance:
     """Energies by tile of the sensor, or of all of it.
