@@ -173,10 +173,12 @@ def defects_of(squares: FloatArray, variance: FloatArray, count: int) -> Defects
     mean = float(variance.mean())
     ratio = squares / np.clip(variance, _LEAST_VARIANCE * mean or 1.0, _MOST_VARIANCE * mean or 1.0)
     limit = _limit(count)
-    typical = (1 - 2 / (9 * count)) ** 3
+    typical, most = (1 - 2 / (9 * count)) ** 3, float(ratio.max())
+    if not most > limit:
+        return None
     off = ratio > limit * max(1.0, float(np.median(ratio)) / typical)
     # What bright ones are off by leaks into others: these first.
-    off &= ratio > _LEAKS * float(ratio.max())
+    off &= ratio > _LEAKS * most
     places = np.argwhere(off)
     if not 0 < len(places) <= _MOST * ratio.size:
         return None

@@ -9,6 +9,7 @@ distance sends.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -179,8 +180,8 @@ class Residuals:
 
     Attributes
     ----------
-    energy, power, variance
-        (tiles, tiles) sums of the squares of measurements and of shots, and of the noise's variance.
+    energy, power
+        (tiles, tiles) sums of the squares of measurements and of shots.
     pixels
         (tiles, tiles) pixels of each tile.
     by_pattern
@@ -196,7 +197,7 @@ class Residuals:
         self._strips = [slice(*ends) for ends in pairwise(edges[0])]
         self._starts = edges[1][:-1]
         self.pixels: FloatArray = np.outer(*(np.diff(edge) for edge in edges)).astype(np.float64)
-        self.energy, self.power, self.variance = (np.zeros(self.pixels.shape) for _ in range(3))
+        self.energy, self.power = (np.zeros(self.pixels.shape) for _ in range(2))
         self.squares: FloatArray = np.zeros(sizes)
         # Of one frame: to make them anew takes longer than to fill them.
         self._residual, self._squared = np.zeros(sizes), np.zeros(sizes)
@@ -220,11 +221,16 @@ class Residuals:
         self.power += power
         left_over, given = float(np.dot(flat, flat)), float(energy.sum())
         self.by_pattern.add(measurement, left_over, float(power.sum()), given, self._noise.light)
-        # The variance is linear in the light: that of a tile's mean light is the tile's mean variance.
-        light = self._sums(measurement.light) / self.pixels
-        variance = self._noise.of(light, measurement.shots) * self.pixels
-        self.variance += variance
-        self.evidence.add(measurement, frame, residual, float(variance.sum()) / frame.size)
+        mean = float(self._noise.means[measurement.row, measurement.column])
+        self.evidence.add(measurement, frame, residual, float(self._noise.of(mean, measurement.shots)))
+
+    @cached_property
+    def variance(self) -> FloatArray:
+        """(tiles, tiles) sum of the noise's variance."""
+        # It is linear in the light: that of a tile's mean light is the tile's mean variance.
+        count = self._noise.variance.size
+        light = self._sums(self._noise.light) / self.pixels / count
+        return self._noise.of(light, self._noise.shots) * self.pixels * count
 
     @property
     def residual(self) -> FloatArray:
