@@ -21,7 +21,9 @@ from mitsim.reconstruct.accumulator import centred
 from mitsim.reconstruct.calibration import decibels
 from mitsim.reconstruct.causes import Cause, Evidence, Signatures, likely_cause
 from mitsim.reconstruct.defects import Defects, defects_of
-from mitsim.reconstruct.faults import FrameCheck, FrameFault, FrameSums
+from mitsim.reconstruct.faults import FrameCheck
+from mitsim.reconstruct.framefault import FrameFault
+from mitsim.reconstruct.leaveoneout import FrameSums
 from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.readings import Reading, Readings, multiple
 from mitsim.reconstruct.solver import Prepared
@@ -259,7 +261,7 @@ class Residuals:
         return still.with_others(found) if still else found
 
     def at(self, defects: Defects) -> float:
-        """Energy that is left at pixels that are defective."""
+        """Energy that is left at pixels that are ``defects``."""
         return float(self.squares[defects.rows, defects.columns].sum())
 
     @property
@@ -356,8 +358,15 @@ def judge(
 
 
 def faulty_frames(check: FrameCheck, beside_noise: float, evidence: Evidence) -> tuple[FrameFault, ...]:
-    """Frames at fault of a scene of several depths, of which the model of a ``check`` fits a part; ``evidence`` is as
-    :func:`judge` takes it, ``beside_noise`` as :meth:`FrameCheck.faults` does."""
+    """Frames at fault of a scene of several depths, of which the model fits a part.
+
+    Parameters
+    ----------
+    check, evidence
+        as :func:`judge` takes them.
+    beside_noise
+        as :meth:`FrameCheck.faults` takes it.
+    """
     sums = Residuals(check.prepared, check.weights, check.noise, evidence)
     for measurement in check.measured():
         sums.add(measurement)

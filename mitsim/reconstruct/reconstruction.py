@@ -23,8 +23,9 @@ from mitsim.reconstruct.depth import Depth, best_depth
 from mitsim.reconstruct.depthmap import DepthMap, depth_map
 from mitsim.reconstruct.detail import Model, print_energy
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.faults import FrameCheck, FrameFault
+from mitsim.reconstruct.faults import FrameCheck
 from mitsim.reconstruct.focus import focused
+from mitsim.reconstruct.framefault import FrameFault
 from mitsim.reconstruct.lacking import Lack
 from mitsim.reconstruct.margin import Margin
 from mitsim.reconstruct.misfit import Misfit, faulty_frames, judge
@@ -242,7 +243,15 @@ class Accumulated:
         return judge(self._check(shots, lam), added, print_energy(self.model, image), evidence, with_defects)
 
     def faulty_frames(self, shots: Capture, factors: Factors, depths: DepthMap) -> tuple[FrameFault, ...]:
-        """Frames at fault of ``shots``, held against ``factors`` of one of the ``depths``."""
+        """Frames at fault of a scene of several depths.
+
+        Parameters
+        ----------
+        shots, factors
+            that these sums are of, at the depth of most of the scene.
+        depths
+            of its pixels, and their image.
+        """
         stated = factors.manifest.noise
         added = factor_energy(self.prepared, shots.patterns, stated, depths.image) if stated else 0.0
         beside = self.noise.rendering + added + print_energy(self.model, depths.image)
