@@ -14,11 +14,13 @@ import pytest
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.alldepths import AllDepths
+from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.depthmap import _Search, depth_map
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.pixeldepths import PixelDepths
 from mitsim.reconstruct.reconstruction import accumulated, reconstruct
 from tests.ideal_sessions import PEAK, Bench, picture
+from tests.unit.reconstruct.test_faults import dark, with_frames
 from tests.unit.reconstruct.test_focus import BASELINE, PARALLAX, N, shadow
 
 BESIDE = (0.0, BASELINE[1])
@@ -84,6 +86,22 @@ def test_a_card_before_a_board(patterns: str, baseline: tuple[float, float]) -> 
     assert not found.doubt and np.median(error) < 2 and (error < 5).mean() > 0.95
     assert psnr(found.image) > psnr(ideal) - 8 and psnr(found.image) > psnr(one.image) + 25
     assert found.told.mean() > 0.9
+
+
+@pytest.mark.parametrize("fault", ["black", "exchanged"])
+def test_frames_at_fault_are_named(fault: str) -> None:
+    """Of two depths, against the factors of one."""
+    run = shots(cards(), "dots:4x8")
+
+    def change(frames: list[np.ndarray]) -> list[np.ndarray]:
+        places = {3: dark(frames[3])} if fault == "black" else {2: frames[6], 6: frames[2]}
+        return [places.get(number, frame) for number, frame in enumerate(frames)]
+
+    found = reconstruct(with_frames(run, change), calibrated(), focus="map")
+    assert not found.ok and found.misfit is not None and found.misfit.cause is Cause.FRAMES
+    (said,) = found.misfit.faults
+    assert said.numbers == ((3,) if fault == "black" else (2, 6))
+    assert ("no light" if fault == "black" else "exchanged") in said.words
 
 
 @pytest.mark.parametrize(
