@@ -365,7 +365,7 @@ def main() -> None:
         said = verdict(*run_of(mask, name, family, n, peak, seed), scene(name, n, seed))
         blamed = {Cause.FRAMES, *CAUSES.values(), Cause.RIG}
         alarm = bool(said["faults"] or said["defects"] or said["cause"] in {cause.name for cause in blamed})
-        alarm |= not said["ok"] and name not in GLOSSY
+        alarm |= bool(said["cause"]) and name not in GLOSSY
         alarms += alarm
         if alarm:
             wrong.append({"fault": None, "case": [mask, name, family, n, peak, seed], **said})

@@ -23,9 +23,9 @@ _MORE = 4.0
 of its energy into the others where patterns overlap."""
 _MOST_BAD = 0.25
 """Of all patterns: above it the run is another than it says, and no single frames are at fault."""
-_HINT, _FURTHER, _TRIED = 2.5, 4.0, 3
-"""In place of :data:`CHANCE` where all frames together are off by half of that, and once one frame is suspected: only
-what a fault then explains is named; and the most frames of which it is tried which one puts the others off."""
+_FURTHER, _TRIED = 4.0, 3
+"""In place of :data:`CHANCE`, once one frame is suspected; and the most frames of which it is tried which one puts the
+others off: chosen, only what a fault explains is named."""
 _NEGATIVE = 0.5
 """Mean reflectance of pixels that are lit alike, over the largest such mean, below which less the image is negative:
 chosen, no noise of a picture that shows anything is as large."""
@@ -52,7 +52,7 @@ class FrameCheck(LeaveOneOut):
         part = np.maximum(sums.residual - noise - share, 0.0) / np.maximum(sums.power, np.finfo(float).tiny)
         return bool(np.median(part) > OFF**2)
 
-    def faults(self, sums: FrameSums, beside_noise: float, hinted: bool = False) -> tuple[FrameFault, ...]:
+    def faults(self, sums: FrameSums, beside_noise: float) -> tuple[FrameFault, ...]:
         """The frames at fault.
 
         Parameters
@@ -61,13 +61,9 @@ class FrameCheck(LeaveOneOut):
             of all measurements.
         beside_noise
             energy that rendering, the factors' noise and print put into all of them.
-        hinted
-            whether frames are suspected from less on, as together they are off by a little.
         """
         found = [*self._same(sums), *self._clipped(sums), *self._noiseless(sums)]
-        suspects = self._suspects(sums, beside_noise, CHANCE)
-        if suspects and not suspects[0] and hinted:
-            suspects = self._suspects(sums, beside_noise, _HINT)
+        suspects = self._suspects(sums, beside_noise)
         if suspects is None:  # too many
             return tuple(found)
         named = Explanations(self, *suspects).faults() if suspects[0] else []
@@ -77,22 +73,12 @@ class FrameCheck(LeaveOneOut):
         known = clipped | {number for fault in named for number in fault.numbers}
         return (*(each for each in found if each.fault is Fault.CLIPPED or not known & set(each.numbers)), *named)
 
-    def _suspects(
-        self, sums: FrameSums, beside_noise: float, level: float
-    ) -> tuple[dict[Pattern, bool], FloatArray] | None:
+    def _suspects(self, sums: FrameSums, beside_noise: float) -> tuple[dict[Pattern, bool], FloatArray] | None:
         """Patterns that are off, each with whether its brightness alone is, and W with these as the others foretell
-        them; None where too many are.
-
-        Parameters
-        ----------
-        sums, beside_noise
-            as :meth:`faults` takes them.
-        level
-            standard deviations of noise from which the first is suspected.
-        """
+        them; None where too many are. The parameters are those of :meth:`faults`."""
         bad: dict[Pattern, bool] = {}
         weights, count = self.weights, self.noise.variance.size
-        while candidates := self._off(sums, weights, beside_noise, bad, min(level, _FURTHER) if bad else level):
+        while candidates := self._off(sums, weights, beside_noise, bad, _FURTHER if bad else CHANCE):
             if len(bad) + 1 > max(1, _MOST_BAD * count):
                 return None
             if count == 1:
@@ -162,10 +148,12 @@ class FrameCheck(LeaveOneOut):
         ----------
         sums, weights
             of all, and W of those that are not ``bad``.
-        beside_noise, level
-            as :meth:`_suspects` takes them.
+        beside_noise
+            as :meth:`faults` takes it.
         bad
             patterns that are suspected already.
+        level
+            standard deviations of noise by which others must be off.
         """
         good = np.ones(self.noise.variance.shape, dtype=np.bool_)
         for pattern in bad:

@@ -343,7 +343,7 @@ def judge(
         reading = readings.curved()
     if reading:
         return replace(found, flagged=True, cause=reading.cause, reading=reading)
-    faults = check.faults(sums.by_pattern, beside_noise, hinted)
+    faults = check.faults(sums.by_pattern, beside_noise)
     if faults:
         return replace(found, flagged=True, cause=Cause.FRAMES, faults=faults)
     if defects:
