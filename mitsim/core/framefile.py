@@ -147,8 +147,9 @@ def finite_channel(channels: Channels, name: str, path: Path) -> FloatArray:
     if name not in channels:
         raise MitsimError(f"{path}: channels are {', '.join(channels)}; {name} is needed")
     values = channels[name].astype(np.float64)
-    bad = int(np.count_nonzero(~np.isfinite(values)))
-    if bad:
+    with np.errstate(invalid="ignore", over="ignore"):
+        total = values.sum()
+    if not np.isfinite(total) and (bad := int(np.count_nonzero(~np.isfinite(values)))):
         raise MitsimError(f"{path}: {bad} values are not finite; capture or calibrate again")
     return values
 

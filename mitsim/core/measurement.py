@@ -51,6 +51,9 @@ class Measurement:
         largest whole number that divides all of their digital numbers; 1 where they are not whole.
     digests
         of each shot, which no two that were read apart share; 0 where all of its numbers are equal.
+    clipped
+        of each shot, readings at its largest number, below the end of their range, where noise leaves fewer; 0 where
+        it leaves as many.
     """
 
     frame: FloatArray
@@ -61,13 +64,15 @@ class Measurement:
     saturated: int
     factor: int = 1
     digests: tuple[int, ...] = ()
+    clipped: tuple[int, ...] = ()
 
     def __add__(self, other: Measurement) -> Measurement:
         """Both halves of a signed pattern as one measurement."""
         shots, saturated = self.shots + other.shots, self.saturated + other.saturated
         light, factor = self.light + other.light, math.gcd(self.factor, other.factor)
         frame, digests = self.frame + other.frame, self.digests + other.digests
-        return Measurement(frame, self.row, self.column, light, shots, saturated, factor, digests)
+        clipped = self.clipped + other.clipped
+        return Measurement(frame, self.row, self.column, light, shots, saturated, factor, digests, clipped)
 
     @property
     def power(self) -> float:

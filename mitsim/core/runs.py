@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import shutil
 import zlib
 from collections.abc import Iterator, Mapping
@@ -16,7 +17,7 @@ from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError, cut
 from mitsim.core.framefile import Channel, Channels, Metadata, checksum, finite_channel, read_frame, verify
-from mitsim.core.manifests import MANIFEST, RunManifest, read_manifest
+from mitsim.core.manifests import MANIFEST, Digital, RunManifest, read_manifest
 from mitsim.core.measurement import Ambient, Measurement
 from mitsim.core.pictures import card, scaled, span
 from mitsim.core.recorders import TRUTH, Recorder, claimed, frame_name
@@ -24,8 +25,11 @@ from mitsim.core.recorders import TRUTH, Recorder, claimed, frame_name
 _SHOWN = 3
 """Frames that a notebook shows: with the truth they fill a line."""
 
-_EVERY = 5, 3
-"""Rows and columns that tell frames apart: 17 000 numbers with noise of 512 x 512."""
+_EVERY = 8
+"""Rows and columns that tell frames apart: 4096 numbers with noise of 512 x 512, 64 of the smallest sensors."""
+_CLIPPED, _UNLIKELY, _LEVELS = 10, 20.0, 16
+"""Readings at a frame's largest number from which it may be clipped; -log of the probability, 2e-9, of as many by
+chance; and the most numbers below it that are compared: chosen, as many as are needed for 10 to be no chance."""
 _SAMPLE = 1024
 """Numbers of a frame that are looked at first for a factor of all of them: by chance that many are even once in
 2^1024."""
@@ -149,9 +153,14 @@ class Capture:
                     f"{_size(shape or ())}; calibrate this camera"
                 )
             light = digital.rate(dn)
-            full = 0 if digital.saturation_dn is None else int(np.count_nonzero(dn >= digital.saturation_dn))
             own = light * shot.sign if shot.sign else self._lit(light)
-            half = Measurement(own, *index, light, 1, full, _common_factor(dn), (_digest(dn),))
+            factor, top = _common_factor(dn), float(dn.max())
+            full, cut = 0, 0
+            if digital.saturation_dn is not None and top >= digital.saturation_dn:
+                full = int(np.count_nonzero(dn >= digital.saturation_dn))
+            else:
+                cut = _clipped(dn, top, digital, factor)
+            half = Measurement(own, *index, light, 1, full, factor, (_digest(dn),), (cut,))
             if shot.sign and index not in waiting:
                 waiting[index] = half
                 continue
@@ -323,8 +332,36 @@ def _common_factor(dn: FloatArray) -> int:
 def _digest(dn: FloatArray) -> int:
     """A number by which frames that are one and the same are known, from some of their numbers ``dn``; 0 where these
     are all equal."""
-    some = np.ascontiguousarray(dn[:: _EVERY[0], :: _EVERY[1]])
+    some = np.ascontiguousarray(dn[::_EVERY, ::_EVERY])
     return 0 if (some == some.flat[0]).all() else 1 + zlib.crc32(some.tobytes())
+
+
+def _clipped(dn: FloatArray, top: float, digital: Digital, factor: int) -> int:
+    """Readings at the largest of all numbers, ``top``, where noise does not leave so many; else 0.
+
+    Of light that ends in noise alone, no number at its end is more frequent than those just below it.
+
+    Parameters
+    ----------
+    dn, factor
+        numbers of a frame, and the largest whole number that divides them.
+    digital
+        of their sensor.
+    """
+    count = int(np.count_nonzero(dn == top))
+    if not _CLIPPED <= count < dn.size:
+        return 0
+    variance = float(digital.variance(digital.rate(np.array(top))))
+    deviation = math.sqrt(max(variance, 0.0)) * digital.exposure_s * digital.gain_dn_per_e
+    step = max(digital.step_dn, float(factor)) if digital.step_dn else 0.0
+    levels = _LEVELS if not step else min(int(deviation / step), _LEVELS)
+    below = int(np.count_nonzero(dn > top - (levels + 0.5) * (step or deviation / _LEVELS))) - count
+    share, least = count / (count + below), 1 / (1 + levels)
+    if share <= least:
+        return 0
+    # The binomial tail after Chernoff (1952).
+    unlikely = count * math.log(share / least) + (below * math.log((1 - share) / (1 - least)) if below else 0.0)
+    return count if unlikely > _UNLIKELY else 0
 
 
 def _size(shape: tuple[int, ...]) -> str:

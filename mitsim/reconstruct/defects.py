@@ -32,8 +32,9 @@ _CROWD = 0.35
 """Part of these 7 x 7 that are off at most: two dead lines side by side, or two that cross, are less than a third."""
 _MOST = 0.02
 """Part of the sensor that may be defective: where more is off, the scene does not fit."""
-_LEAST_VARIANCE = 1e-3
-"""Part of the mean variance that a pixel's counts as at least: one that reads nothing has none of light."""
+_LEAST_VARIANCE, _MOST_VARIANCE = 1e-3, 4.0
+"""Part of the mean variance that a pixel's counts as at least, as one that reads nothing has none of light; and times
+the mean at most, as that of a hot one is not light's: frames are four times as bright at their brightest."""
 _LEAKS = 0.1
 """Part of the largest energy of a pixel that others may have by it: the square of what the fit takes from one reading
 for the next, 0.03 where the scene has 0.4 of the sensor's pixels a side."""
@@ -169,12 +170,15 @@ def defects_of(squares: FloatArray, variance: FloatArray, count: int) -> Defects
     count
         of the measurements.
     """
-    ratio = squares / np.maximum(variance, _LEAST_VARIANCE * float(variance.mean()) or 1.0)
+    mean = float(variance.mean())
+    ratio = squares / np.clip(variance, _LEAST_VARIANCE * mean or 1.0, _MOST_VARIANCE * mean or 1.0)
     limit = _limit(count)
-    typical = (1 - 2 / (9 * count)) ** 3
+    typical, most = (1 - 2 / (9 * count)) ** 3, float(ratio.max())
+    if not most > limit:
+        return None
     off = ratio > limit * max(1.0, float(np.median(ratio)) / typical)
     # What bright ones are off by leaks into others: these first.
-    off &= ratio > _LEAKS * float(ratio.max())
+    off &= ratio > _LEAKS * most
     places = np.argwhere(off)
     if not 0 < len(places) <= _MOST * ratio.size:
         return None

@@ -1,71 +1,31 @@
 """Measurements, the factorised model and its fit in; out come frames that are not what they say, by number and fault.
 
-Each frame is foretold from the others. Where patterns overlap the model does it: a pattern is left out of the sums W,
-and its own part is put in again as the rest tells it, until that stands still. Under shifting dots no pixel is in two
-frames, so that any frame fits itself; but dots:k are k^2 samples of one light, and a frame's brightness follows from
-its pixels' neighbours. The halves of signed patterns add up to the same frame for all of them, which foretells each
-half by the other without any model.
-
 A frame is suspected where it is off by more than noise, and by more than the other frames are: a scene that does not
-fit has all its frames off. It is named where one fault explains what it is off by.
+fit has all its frames off. It is named where one fault explains what it is off by. The halves of signed patterns add up
+to the same frame for all of them, which foretells each half by the other without any model.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
-from enum import Enum
-from typing import Any
+from collections.abc import Iterable
 
 import numpy as np
-import numpy.typing as npt
-from scipy import fft
-from scipy.ndimage import uniform_filter
-from scipy.optimize import minimize_scalar
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.manifests import RunManifest
-from mitsim.core.measurement import Measurement
-from mitsim.reconstruct.accumulator import centred
-from mitsim.reconstruct.noise import FrameNoise
+from mitsim.reconstruct.brightness import odd_brightness
+from mitsim.reconstruct.explanations import Explanations
+from mitsim.reconstruct.framefault import Fault, FrameFault
+from mitsim.reconstruct.leaveoneout import CHANCE, OFF, FrameSums, LeaveOneOut, Pattern
 from mitsim.reconstruct.sides import group_pixels
-from mitsim.reconstruct.solver import Prepared
 
-Pattern = tuple[int, int]
-BoolArray = npt.NDArray[np.bool_]
-
-CHANCE = 6.0
-"""Standard deviations of a frame's noise energy that are left to chance: 1e-9 for each of up to 65536 shots."""
-_OFF = 7e-3
-"""Part of a frame, rms, by which it may be off: twice what all measurements together may, as print is not averaged."""
 _MORE = 4.0
 """Times the median frame's unexplained energy from which a frame is suspected: chosen, as one that is wrong puts part
 of its energy into the others where patterns overlap."""
-_EXPLAINS = 0.2
-"""Part of what a frame is off by that a fault may leave: chosen, with room for what the others foretell badly."""
 _MOST_BAD = 0.25
 """Of all patterns: above it the run is another than it says, and no single frames are at fault."""
-_SETTLED, _MOST_STEPS = 0.1, 100
-"""Of :data:`CHANCE`, the energy below which a step of foretelling changes nothing that counts; and the most steps,
-which patterns that know nothing of each other do not need: chosen."""
-_STEPS = 12
-"""Rounds in which patterns left out are foretold from the rest: each brings what overlapping patterns know to a half or
-less of its distance."""
-_SCALE_SPREADS, _SCALE_LEAST = 6.0, 0.08
-"""Standard deviations, as half of the frames tell them, by which a frame's brightness may differ from what its
-neighbours foretell; and the least such part that is named."""
-_FEW = 2.5
-"""The least part times the number of frames: half of so few frames do not tell a spread."""
-_BRIGHT_ENOUGH = 0.2
-"""Of the mean foretold reflectance, from which a pixel counts when it is compared with its neighbours."""
-_BLACK = 0.03
-"""Of the light that is foretold, below which a frame is black whatever the others are: half of the darkest ink."""
-_FEWEST_PIXELS = 8
-"""Pixels of a frame that its neighbours foretell, below which their median is chance."""
-_DARK = 0.1
-"""Of the light that is foretold, below which a frame or a row of it is black."""
-_LEAST_LOST = 0.02
-"""Part of a frame's rows, or columns, that are lost before it is said; a dead line is less."""
+_FURTHER, _TRIED = 4.0, 3
+"""In place of :data:`CHANCE`, once one frame is suspected; and the most frames of which it is tried which one puts the
+others off: chosen, only what a fault explains is named."""
 _NEGATIVE = 0.5
 """Mean reflectance of pixels that are lit alike, over the largest such mean, below which less the image is negative:
 chosen, no noise of a picture that shows anything is as large."""
@@ -76,160 +36,21 @@ STEPS = (
     "one step early: each shot shows the pattern of the next",
 )
 """Ways in which shots are a step beside their patterns."""
-_FLAT = 1e-4, 10, 4.0
-"""Readings at a frame's largest number from which it is clipped: a part of all, at least so many, and so many times the
-readings of the upper half of what remains below it, a hundredth of its range wide."""
-_NEAR_TOP = 0.8
-"""Of the largest number, the light that clipped readings are foretold at least; hot pixels have less."""
-_REACH = 24
-"""Sensor pixels that frames are moved by in search of a shift."""
-_ROUNDING = 1e-20
-"""Of a frame's energy, by which the halves of two pairs differ that were the same numbers."""
 _QUIET, _AVERAGED = 0.5, 0.01
 """Part of the sensor's noise, without rounding, that frames may have at least: half where numbers are digital, stated
 gains are that wrong; where they are not, means of up to 100 shots may have been given."""
 
 
-class Fault(Enum):
-    """What may be wrong with frames; the value is what is said of them."""
-
-    BLACK = "black"
-    DIM = "dim"
-    BRIGHT = "too bright"
-    REPEATED = "a repeat of another"
-    SWAPPED = "exchanged"
-    MISPLACED = "of another pattern"
-    HALF_LOST = "partly lost"
-    SHIFTED = "shifted"
-    CLIPPED = "clipped"
-    NOISELESS = "free of noise"
-
-
-@dataclass(frozen=True)
-class FrameFault:
-    """A ``fault`` of the shots of some ``numbers``, in ``files``, from 0 in the manifest's order; ``words`` say it."""
-
-    fault: Fault
-    numbers: tuple[int, ...]
-    files: tuple[str, ...]
-    words: str
-
-    def __str__(self) -> str:
-        return self.words
-
-    def summary(self) -> dict[str, Any]:
-        """For result.json."""
-        return {
-            "fault": self.fault.name.lower(),
-            "frames": list(self.numbers),
-            "files": list(self.files),
-            "words": self.words,
-        }
-
-
-@dataclass(eq=False)
-class FrameSums:
-    """Energies by pattern, (K, K') each, gathered as measurements are held against a model.
-
-    ``residual``, ``power``, ``energy``: what is left of a pattern's measurement, sum of the squares of its shots, and
-    of the measurement as the solver takes it. ``light``: sum of its light. ``sums``: of signed
-    patterns, energy by which the halves' sum differs from that of all others. ``halves``: light of a signed pattern's
-    shots. ``digests``: patterns, and which of their shots, by a number that frames which are one and the same share.
-    """
-
-    counts: tuple[int, int]
-    residual: FloatArray = field(init=False)
-    power: FloatArray = field(init=False)
-    energy: FloatArray = field(init=False)
-    light: FloatArray = field(init=False)
-    sums: FloatArray = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.residual, self.power, self.energy = (np.zeros(self.counts) for _ in range(3))
-        self.light, self.sums = (np.zeros(self.counts) for _ in range(2))
-        self.digests: dict[int, list[tuple[Pattern, int]]] = {}
-        self.halves: dict[Pattern, tuple[float, float]] = {}
-
-    def add(self, measurement: Measurement, residual: float, power: float, energy: float, total: FloatArray) -> None:
-        """Count in one measurement.
-
-        Parameters
-        ----------
-        measurement
-            which pattern it is of.
-        residual, power, energy
-            of what is left of it, of its shots, and of itself as the solver takes it.
-        total
-            (rows, columns) light of all patterns' shots.
-        """
-        pattern = measurement.row, measurement.column
-        self.residual[pattern], self.power[pattern], self.energy[pattern] = residual, power, energy
-        for half, digest in enumerate(measurement.digests):
-            self.digests.setdefault(digest, []).append((pattern, half))
-        self.light[pattern] = light = float(measurement.light.sum())
-        if measurement.shots == 2:
-            difference = float(measurement.frame.sum())
-            self.halves[pattern] = (light + difference) / 2, (light - difference) / 2
-        others = self.residual.size - 1
-        if measurement.shots == 2 and others:
-            # light - (total - light) / others
-            beyond = (measurement.light * (1 + others) - total) / others
-            self.sums[pattern] = _energy(beyond)
-
-
-class FrameCheck:
-    """Foretells each frame of a run from its others.
-
-    Parameters
-    ----------
-    prepared, weights
-        the factorised model, and W of all measurements.
-    lam
-        lambda of its image.
-    patterns
-        P_L (n, K) and P_R (n', K').
-    manifest
-        of the run.
-    noise
-        of its measurements.
-    measured
-        reads all measurements once more.
-    """
-
-    def __init__(
-        self,
-        prepared: Prepared,
-        weights: FloatArray,
-        lam: float,
-        patterns: tuple[FloatArray, FloatArray],
-        manifest: RunManifest,
-        noise: FrameNoise,
-        measured: Callable[[], Iterable[Measurement]],
-    ) -> None:
-        self.prepared, self.weights, self.noise = prepared, weights, noise
-        self.manifest, self.measured = manifest, measured
-        self._patterns, self._digital = patterns, manifest.digital
-        self._shots = manifest.patterns.captures
-        self._number = {(shot.row, shot.column, shot.sign): index for index, shot in enumerate(self._shots)}
-        self._signed = any(shot.sign for shot in self._shots)
-        sigma = np.outer(prepared.left.singular, prepared.right.singular)
-        self._sigma = sigma
-        self._kept = np.divide(np.square(sigma), np.square(sigma) + lam, out=np.zeros_like(sigma), where=sigma > 0)
-        self._periods = tuple(len(group_pixels(side, "block")) for side in patterns)
-        lit = [(side != 0).sum(axis=1) for side in patterns]
-        self._exclusive = bool(max(lit[0]) == 1 and max(lit[1]) == 1) and noise.variance.size > 1
-        self._size = prepared.left.sensor_size * prepared.right.sensor_size
-        self._spare = 1 - prepared.rank / (prepared.left.data_rows * prepared.right.data_rows)
-
-    # ---- suspicion
+class FrameCheck(LeaveOneOut):
+    """Finds the frames of a run that are not what they say."""
 
     def all_off(self, sums: FrameSums, beside_noise: float) -> bool:
         """Whether the typical frame is off, and not single ones; ``sums`` and ``beside_noise`` as :meth:`faults` takes
         them."""
-        noise = self.noise.variance * self._size * self._spare
+        noise = self.noise.variance * self.size * self.prepared.spare
         share = beside_noise * sums.power / max(float(sums.power.sum()), np.finfo(float).tiny)
         part = np.maximum(sums.residual - noise - share, 0.0) / np.maximum(sums.power, np.finfo(float).tiny)
-        return bool(np.median(part) > _OFF**2)
+        return bool(np.median(part) > OFF**2)
 
     def faults(self, sums: FrameSums, beside_noise: float) -> tuple[FrameFault, ...]:
         """The frames at fault.
@@ -241,44 +62,55 @@ class FrameCheck:
         beside_noise
             energy that rendering, the factors' noise and print put into all of them.
         """
-        found = [*self._same(sums), *self._noiseless(sums)]
-        bad: dict[Pattern, bool] = {}  # and whether its brightness alone is off
-        others = self.weights
-        count = self.noise.variance.size
-        while True:
-            suspect = self._suspect(sums, others, beside_noise, bad)
-            if suspect is None:
-                break
-            bad[suspect[0]] = suspect[1]
-            if len(bad) > max(1, _MOST_BAD * count):
-                return tuple(found)
+        found = [*self._same(sums), *self._clipped(sums), *self._noiseless(sums)]
+        suspects = self._suspects(sums, beside_noise)
+        if suspects is None:  # too many
+            return tuple(found)
+        named = Explanations(self, *suspects).faults() if suspects[0] else []
+        # What is known without the model is said where that does not say more; of clipped frames it explains the rest.
+        clipped = {number for fault in found if fault.fault is Fault.CLIPPED for number in fault.numbers}
+        named = [fault for fault in named if not clipped & set(fault.numbers)]
+        known = clipped | {number for fault in named for number in fault.numbers}
+        return (*(each for each in found if each.fault is Fault.CLIPPED or not known & set(each.numbers)), *named)
+
+    def _suspects(self, sums: FrameSums, beside_noise: float) -> tuple[dict[Pattern, bool], FloatArray] | None:
+        """Patterns that are off, each with whether its brightness alone is, and W with these as the others foretell
+        them; None where too many are. The parameters are those of :meth:`faults`."""
+        bad: dict[Pattern, bool] = {}
+        weights, count = self.weights, self.noise.variance.size
+        while candidates := self._off(sums, weights, beside_noise, bad, _FURTHER if bad else CHANCE):
+            if len(bad) + 1 > max(1, _MOST_BAD * count):
+                return None
             if count == 1:
-                break
-            others = self._without(tuple(bad))
-            sums = self._gathered(others, bad)
-        named = _Namer(self, bad, others).faults() if bad else []
-        # What is known without the model is said where that does not say more.
-        known = {number for fault in named for number in fault.numbers}
-        return (*(fault for fault in found if not known & set(fault.numbers)), *named)
+                return dict(candidates), weights
+            # Where patterns overlap a frame puts others off: it is the one without which the rest fits best.
+            several = not (self.exclusive or self.signed)
+            least = np.inf
+            for pattern, by_brightness in candidates[: _TRIED if several else 1]:
+                rest, explained = self.without((*bad, pattern))
+                noise = float(self.noise.variance[pattern]) * self.size * self.prepared.spare
+                if (left := noise - float(sums.energy[pattern]) - explained) < least:
+                    least, found = left, (pattern, by_brightness, rest)
+            bad[found[0]], weights = found[1:]
+            sums = self.gathered(weights, bad)
+        return bad, weights
 
     def out_of_step(self, sums: FrameSums) -> str:
         """How signed shots are a step beside their patterns, as ``sums`` of their light tell, or nothing.
 
         That of two halves is the same for all patterns; most is that of the half that lights all pixels.
         """
-        left, right = self._patterns
-        whole = [n for n, shot in enumerate(self._shots) if (left[:, shot.row] > 0).all() and shot.sign == 1]
-        whole = [n for n in whole if (right[:, self._shots[n].column] > 0).all()]
-        if not self._signed or self.noise.variance.size < 4 or len(whole) != 1:
+        if self._whole is None or self.noise.variance.size < 4:
             return ""
-        light = np.zeros(len(self._shots))
+        whole = self.number[(*self._whole, 1)]
+        light = np.zeros(len(self.shots))
         for pattern, halves in sums.halves.items():
             for sign, half in zip((1, -1), halves, strict=True):
-                light[self._number[(*pattern, sign)]] = half
+                light[self.number[(*pattern, sign)]] = half
 
         def odd(step: int) -> int:
             pairs: dict[Pattern, float] = {}
-            for number, shot in enumerate(self._shots):
+            for number, shot in enumerate(self.shots):
                 pattern = shot.row, shot.column
                 pairs[pattern] = pairs.get(pattern, 0.0) + light[(number + step) % len(light)]
             totals = np.array(list(pairs.values()))
@@ -286,26 +118,31 @@ class FrameCheck:
 
         if odd(0) > 1:
             for step, words in ((1, STEPS[0]), (-1, STEPS[1])):
-                if odd(step) == 0 and int(np.argmax(np.roll(light, -step))) == whole[0]:
+                if odd(step) == 0 and int(np.argmax(np.roll(light, -step))) == whole:
                     return words
         return ""
+
+    def whole(self) -> FloatArray | None:
+        """(m, m') the sum of a signed pattern's halves, as the model has it of the pattern of +1 alone; None without
+        that."""
+        return None if self._whole is None else self.modelled(self.weights, *self._whole)
 
     def negative(self) -> str:
         """Why signed patterns were taken the wrong way round, or nothing: pixels that are always lit alike then have a
         negative reflectance in the mean, where noise is averaged."""
-        if not self._signed or max(self._periods) < 2:
+        if not self.signed or max(self._periods) < 2:
             return ""
-        image = self._image(self.weights)
-        rows, columns = (group_pixels(side, "block") for side in self._patterns)
+        image = self.image(self.weights)
+        rows, columns = (group_pixels(side, "block") for side in self.patterns)
         means = np.array([[image[np.ix_(row.pixels, column.pixels)].mean() for column in columns] for row in rows])
         if means.min() > -_NEGATIVE * np.abs(means).max():
             return ""
         return "the image is negative: the halves of signed pairs are exchanged, or their frames in another order"
 
-    def _suspect(
-        self, sums: FrameSums, weights: FloatArray, beside_noise: float, bad: dict[Pattern, bool]
-    ) -> tuple[Pattern, bool] | None:
-        """The pattern that is off most, and whether its brightness alone is; None where none is.
+    def _off(
+        self, sums: FrameSums, weights: FloatArray, beside_noise: float, bad: dict[Pattern, bool], level: float
+    ) -> list[tuple[Pattern, bool]]:
+        """Patterns that are off, the most first, and whether their brightness alone is.
 
         Parameters
         ----------
@@ -315,90 +152,44 @@ class FrameCheck:
             as :meth:`faults` takes it.
         bad
             patterns that are suspected already.
+        level
+            standard deviations of noise by which others must be off.
         """
         good = np.ones(self.noise.variance.shape, dtype=np.bool_)
         for pattern in bad:
             good[pattern] = False
         if not good.any():
-            return None
-        noise = self.noise.variance * self._size
-        chance = CHANCE * self.noise.variance * np.sqrt(2 * self._size)
+            return []
+        noise = self.noise.variance * self.size
+        chance = level * self.noise.variance * np.sqrt(2 * self.size)
         share = beside_noise * sums.power / max(float(sums.power.sum()), np.finfo(float).tiny)
         others = max(good.sum() - 1, 1)
         # Behind a mask with a constant term most of a frame's light says nothing, and is no part of what it is off by.
         whole = sums.energy if self.prepared.centre else sums.power
-        tests = [(sums.residual, whole, noise * self._spare + share, chance)]
-        if self._signed:
+        tests = [(sums.residual, whole, noise * self.prepared.spare + share, chance)]
+        if self.signed:
             mean = float(noise[good].mean())
             tests.append((sums.sums, sums.power, noise + mean / others + share, 2 * chance))
-        worst: tuple[float, Pattern, bool] | None = None
+        parts = np.zeros(good.shape)
         for energy, whole, expected, allowed in tests:
             power = np.maximum(whole, np.median(whole[good]))
             beyond = np.where(good, np.maximum(energy - expected, 0.0), 0.0)
             part = beyond / np.maximum(power, np.finfo(float).tiny)
             usual = float(np.median(part[good])) if good.sum() > 2 else 0.0
-            off = good & (beyond > allowed) & (part > max(_OFF**2, _MORE * usual))
-            if off.any():
-                row, column = divmod(int(np.argmax(np.where(off, part, 0.0))), part.shape[1])
-                place = row, column
-                if worst is None or part[place] > worst[0]:
-                    worst = float(part[place]), place, False
-        if worst is not None:
-            return worst[1:]
-        if self._exclusive:
-            ratio = self._brightness(weights, good)
-            if ratio is not None:
-                return ratio, True
-        elif good.size == 1 and self._is_dark(sums):
-            return (0, 0), True
-        return None
+            off = good & (beyond > allowed) & (part > max(OFF**2, _MORE * usual))
+            parts = np.maximum(parts, np.where(off, part, 0.0))
+        if parts.any():
+            order = np.argsort(-parts, axis=None, kind="stable")[: np.count_nonzero(parts)]
+            rows, columns = np.unravel_index(order, parts.shape)
+            return [((int(row), int(column)), False) for row, column in zip(rows, columns, strict=True)]
+        if self.exclusive:
+            ratio = odd_brightness(self, weights, good)
+            return [] if ratio is None else [(ratio, True)]
+        return [((0, 0), True)] if good.size == 1 and self._is_dark() else []
 
-    def _is_dark(self, sums: FrameSums) -> bool:
+    def _is_dark(self) -> bool:
         """Whether the only frame has no more light than noise makes."""
-        return bool(abs(sums.light[0, 0]) < CHANCE * float(np.sqrt(self.noise.variance[0, 0] * self._size)))
-
-    def _brightness(self, weights: FloatArray, good: BoolArray) -> Pattern | None:
-        """The ``good`` pattern whose brightness differs most from what its pixels' neighbours foretell, if it does.
-
-        Both its light as a whole and the median of its pixels must differ: a highlight moves the first alone, stripes
-        as fine as the dots the other frames as well.
-        """
-        image = self._image(weights)
-        near = self._neighbours(image, good)
-        amid = self._between(image, good)
-        expected, kept = self._seen(near), self._sigma > 0
-        bright = near > _BRIGHT_ENOUGH * max(float(near.mean()), 0.0)
-        whole, middle = np.full(good.shape, np.nan), np.full(good.shape, np.nan)
-        for pattern in np.argwhere(good):
-            row, column = int(pattern[0]), int(pattern[1])
-            places = self._columns(row, column)
-            seen, told = (np.where(kept, values, 0.0)[places] for values in (weights, expected))
-            lit = np.ix_(self._patterns[0][:, row] != 0, self._patterns[1][:, column] != 0)
-            chosen = bright[lit]
-            if chosen.sum() >= _FEWEST_PIXELS and (size := _energy(told)) > 0:
-                whole[row, column] = float(np.vdot(seen, told)) / size
-                middle[row, column] = float(np.median(image[lit][chosen] / near[lit][chosen]))
-                between = amid[lit] > _BRIGHT_ENOUGH * max(float(near.mean()), 0.0)
-                dark = whole[row, column] < _BLACK and between.sum() >= _FEWEST_PIXELS
-                if dark and float(np.median(image[lit][between] / amid[lit][between])) < _BLACK:
-                    return row, column
-        if np.isfinite(whole).sum() < 3:
-            return None
-        least = max(_SCALE_LEAST, _FEW / good.size)
-        off = np.full(good.shape, np.inf)
-        signs = []
-        for ratio in (whole, middle):
-            centre = float(np.nanmedian(ratio))
-            if not centre > 0:
-                return None
-            away = ratio / centre
-            away = np.where(away > 1, 1 - 1 / away, away - 1)
-            spread = 1.4826 * float(np.nanmedian(np.abs(away)))
-            off = np.fmin(off, np.abs(away) / max(least, _SCALE_SPREADS * spread))
-            signs.append(np.sign(away))
-        off = np.where((signs[0] == signs[1]) & np.isfinite(whole), off, 0.0)
-        row, column = divmod(int(np.argmax(off)), good.shape[1])
-        return (row, column) if off[row, column] > 1 else None
+        return bool(abs(self.noise.means[0, 0]) < CHANCE * float(np.sqrt(self.noise.variance[0, 0] / self.size)))
 
     def _same(self, sums: FrameSums) -> Iterable[FrameFault]:
         """Shots that are one and the same frame, noise and all."""
@@ -406,15 +197,22 @@ class FrameCheck:
             return
         for digest, shots in sums.digests.items():
             if digest and len(shots) > 1:
-                numbers = [self._number[(*pattern, (1 - 2 * half) if self._signed else 0)] for pattern, half in shots]
-                yield self._fault(Fault.REPEATED, numbers, "are one and the same")
+                numbers = [self.number[(*pattern, (1 - 2 * half) if self.signed else 0)] for pattern, half in shots]
+                yield self.fault(Fault.REPEATED, numbers, "are one and the same")
+
+    def _clipped(self, sums: FrameSums) -> Iterable[FrameFault]:
+        """Shots with many readings at their largest number; where most have, it is the end of the sensor's range."""
+        if len(sums.clipped) <= max(1, _MOST_BAD * len(self.shots)):
+            for (pattern, half), count in sums.clipped.items():
+                numbers = [self.number[(*pattern, (1 - 2 * half) if self.signed else 0)]]
+                yield self.fault(Fault.CLIPPED, numbers, f"has {count} readings at its largest number")
 
     def _noiseless(self, sums: FrameSums) -> Iterable[FrameFault]:
         """Frames with less noise than their sensor has: only where readings can show it."""
-        digital = self._digital
+        digital = self.manifest.digital
         if not digital.noise_is_stated:
             return
-        light = sums.light / self._size
+        light = self.noise.means
         rounding = ((digital.step_dn or 0.0) / digital.gain_dn_per_e / digital.exposure_s) ** 2 / 12 * self.noise.shots
         own = self.noise.variance - rounding
         # Digital numbers of one reading: its noise, and how far it is above the end of its range.
@@ -422,625 +220,13 @@ class FrameCheck:
         above = (light / self.noise.shots) * digital.exposure_s * digital.gain_dn_per_e + digital.black_level_dn
         shows = (deviation > 0.5 * (digital.step_dn or 0.0)) & (above > 3 * deviation) & (own > 0)
         shows &= self.noise.saturated < 1e-3 * max(self.noise.readings, 1)
-        expected = np.where(shows, own * self._size * self._spare, 1.0)
+        expected = np.where(shows, own * self.size * self.prepared.spare, 1.0)
         least = _QUIET if digital.step_dn else _AVERAGED
-        quiet = shows & (sums.residual / expected < least * (1 - CHANCE * np.sqrt(2 / (self._size * self._spare))))
-        numbers = [n for n, shot in enumerate(self._shots) if quiet[shot.row, shot.column]]
+        quiet = shows & (
+            sums.residual / expected < least * (1 - CHANCE * np.sqrt(2 / (self.size * self.prepared.spare)))
+        )
+        numbers = [n for n, shot in enumerate(self.shots) if quiet[shot.row, shot.column]]
         if numbers:
             part = float(sums.residual[quiet].sum() / expected[quiet].sum())
             has = f"{'have' if len(numbers) > 1 else 'has'} {part:.2g} of the noise that the sensor makes"
-            yield self._fault(Fault.NOISELESS, numbers, has)
-
-    # ---- foretelling
-
-    def _columns(self, row: int, column: int) -> Any:
-        """Where the coefficients of a pattern are in W."""
-        places = [
-            np.arange(side.accumulated_size)[side.slabs[index].columns]
-            for side, index in ((self.prepared.left, row), (self.prepared.right, column))
-        ]
-        return np.ix_(*places)
-
-    def _frame(self, weights: FloatArray, row: int, column: int) -> FloatArray:
-        """(m, m') the frame of a pattern by ``weights``."""
-        left, right = self.prepared.left.slabs[row], self.prepared.right.slabs[column]
-        return np.asarray(left.matrix @ weights[left.columns][:, right.columns] @ right.matrix.T)
-
-    def _own(self, frame: FloatArray, row: int, column: int) -> FloatArray:
-        """What a ``frame`` of a pattern adds to W at its columns."""
-        left, right = self.prepared.left.slabs[row], self.prepared.right.slabs[column]
-        return np.asarray(left.matrix.T @ frame @ right.matrix)
-
-    def _image(self, weights: FloatArray) -> FloatArray:
-        """(n, n') image of W at the image's lambda."""
-        filtered = np.divide(self._kept * weights, self._sigma, out=np.zeros_like(weights), where=self._sigma > 0)
-        return self.prepared.image(filtered)
-
-    def _seen(self, image: FloatArray) -> FloatArray:
-        """W of an ``image`` without noise."""
-        duals = [side.basis if side.dual is None else side.dual for side in (self.prepared.left, self.prepared.right)]
-        return np.asarray(self._sigma * (duals[0].T @ image @ duals[1]))
-
-    def _lit(self, good: BoolArray) -> BoolArray:
-        """(n, n') pixels that a ``good`` pattern lights."""
-        left, right = ((side != 0).astype(np.float64) for side in self._patterns)
-        return np.asarray(left @ good @ right.T > 0)
-
-    def _neighbours(self, image: FloatArray, good: BoolArray) -> FloatArray:
-        """(n, n') mean of each pixel's neighbours, along sides with several groups, that a ``good`` pattern lights."""
-        size = [3 if period > 1 else 1 for period in self._periods]
-        lit = self._lit(good).astype(np.float64)
-        light, count = (
-            uniform_filter(values, size, mode="constant") * np.prod(size) - values for values in (image * lit, lit)
-        )
-        return np.asarray(np.divide(light, count, out=np.zeros_like(light), where=count > 0.5))
-
-    def _between(self, image: FloatArray, good: BoolArray) -> FloatArray:
-        """(n, n') the lesser of each pixel's neighbours on either side, along the side where that is more: what lies
-        inside of a bright surface is no darker, whatever lies beside it."""
-        seen = np.pad(np.where(self._lit(good), image, 0.0), 1)
-        sides = [
-            np.minimum(seen[:-2, 1:-1], seen[2:, 1:-1]) * (self._periods[0] > 2),
-            np.minimum(seen[1:-1, :-2], seen[1:-1, 2:]) * (self._periods[1] > 2),
-        ]
-        return np.asarray(np.maximum(*sides))
-
-    def _measurements(self, patterns: Iterable[Pattern]) -> dict[Pattern, Measurement]:
-        wanted = set(patterns)
-        return {key: each for each in self.measured() if (key := (each.row, each.column)) in wanted}
-
-    def _centred(self, frame: FloatArray) -> FloatArray:
-        return centred(frame) if self.prepared.centre else frame
-
-    def _without(self, bad: tuple[Pattern, ...]) -> FloatArray:
-        """W of all patterns, the ``bad`` ones as the others foretell them."""
-        rest = self.weights.copy()
-        for pattern, measurement in self._measurements(bad).items():
-            rest[self._columns(*pattern)] -= self._own(self._centred(measurement.frame), *pattern)
-        good = np.ones(self.noise.variance.shape, dtype=np.bool_)
-        for pattern in bad:
-            good[pattern] = False
-        image = self._image(self.weights)
-        if not self._exclusive and max(self._periods) > 1:
-            # One pattern of +-1 that is wrong is a comb of the dots' period, without a mean.
-            image = uniform_filter(image, self._periods, mode="nearest")
-        image = np.where(self._lit(good), image, self._neighbours(image, good))
-        weights = self._seen(image)
-        grams = {
-            pattern: (
-                self.prepared.left.slabs[pattern[0]].matrix.T @ self.prepared.left.slabs[pattern[0]].matrix,
-                self.prepared.right.slabs[pattern[1]].matrix.T @ self.prepared.right.slabs[pattern[1]].matrix,
-            )
-            for pattern in bad
-        }
-
-        def of_bad(values: FloatArray) -> FloatArray:
-            own = np.zeros_like(values)
-            for pattern, (left, right) in grams.items():
-                places = self._columns(*pattern)
-                own[places] += left @ values[places] @ right
-            return own
-
-        if self._exclusive:
-            return np.asarray(rest + of_bad(weights))
-        # W - of_bad(W) = rest are the normal equations of the good ones: conjugate gradients after Hestenes and Stiefel
-        # (1952), until a step brings these frames less than chance does.
-        enough = _SETTLED * CHANCE * float(self.noise.variance.mean()) * np.sqrt(2 * self._size)
-        left_over = rest + of_bad(weights) - weights
-        step, squared = left_over.copy(), _energy(left_over)
-        for _ in range(_MOST_STEPS):
-            moved = step - of_bad(step)
-            curvature = float(np.vdot(step, moved))
-            if not curvature > 0:
-                break
-            length = squared / curvature
-            weights = weights + length * step
-            if length * squared < enough:
-                break
-            left_over -= length * moved
-            before, squared = squared, _energy(left_over)
-            step = left_over + squared / before * step
-        return weights
-
-    def _gathered(self, weights: FloatArray, bad: Iterable[Pattern]) -> FrameSums:
-        """Sums of all measurements against other ``weights``; the light of all is that of those not ``bad``."""
-        sums = FrameSums((self.noise.variance.shape[0], self.noise.variance.shape[1]))
-        total = np.zeros(0)
-        if self._signed:
-            total = sum((each.light for each in self._measurements(self._good(bad)).values()), start=np.zeros(()))
-        others = max(self.noise.variance.size - len(set(bad)), 2)
-        for each in self.measured():
-            pattern, frame = (each.row, each.column), self._centred(each.frame)
-            residual = frame - self._frame(weights, each.row, each.column)
-            sums.residual[pattern], sums.power[pattern] = _energy(residual), each.power
-            sums.energy[pattern] = _energy(frame)
-            sums.light[pattern] = float(each.light.sum())
-            if self._signed:
-                sums.sums[pattern] = _energy((each.light * others - total) / (others - 1))
-        return sums
-
-    def _good(self, bad: Iterable[Pattern]) -> set[Pattern]:
-        return set(np.ndindex(self.noise.variance.shape)) - set(bad)
-
-    # ---- names
-
-    def _fault(self, fault: Fault, numbers: Iterable[int], words: str) -> FrameFault:
-        numbers = tuple(sorted(numbers))
-        files = tuple(self._shots[number].file for number in numbers)
-        return FrameFault(fault, numbers, files, f"{listed(numbers, files)} {words}")
-
-
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """What was read at a pattern that is suspected: a shot, or of a signed pattern whose halves' sum is right both.
-
-    Attributes
-    ----------
-    numbers
-        of its shots.
-    pattern
-        that it is of.
-    raw, frame
-        (m, m') its light, and that as the solver takes it.
-    foretold
-        (m, m') the same as the other frames tell it; None: they do not.
-    variance
-        of a datum of ``frame``, and of what it is held against.
-    off
-        energy beyond noise that it is off by.
-    """
-
-    numbers: tuple[int, ...]
-    pattern: Pattern
-    raw: FloatArray
-    frame: FloatArray
-    foretold: FloatArray | None
-    variance: float
-    off: float
-
-
-Named = tuple[float, Fault, tuple[int, ...], str]
-"""Energy that a fault leaves of what a frame is off by, the fault, numbers of its frames, and words."""
-
-
-class _Namer:
-    """Faults of the patterns that a ``check`` suspects; ``bad`` and ``weights`` are as there."""
-
-    def __init__(self, check: FrameCheck, bad: dict[Pattern, bool], weights: FloatArray) -> None:
-        self._check, self._bad, self._weights = check, bad, weights
-        self._measured = check._measurements(bad)
-        self._total = check.noise.light
-        self._foretold = {pattern: check._frame(weights, *pattern) for pattern in bad}
-        self._rest = check.weights.copy()
-        for pattern, each in self._measured.items():
-            self._rest[check._columns(*pattern)] -= check._own(check._centred(each.frame), *pattern)
-        self._least = self._left({}, weights)
-
-    def faults(self) -> list[FrameFault]:
-        """One for each that is found."""
-        check = self._check
-        seen = self._signed() if check._signed else [self._plain(pattern) for pattern in self._bad]
-        repeats = self._repeats(seen)
-        named: list[Named] = []
-        for one in seen:
-            same = [each for each in repeats.get(one.numbers, []) if each[0] == -np.inf]
-            fits = [each for each in (*same, *self._tried(one)) if each[0] <= _EXPLAINS * one.off]
-            named += [min(fits, key=lambda each: each[0])] if fits else repeats.get(one.numbers, [])[:1]
-        return [check._fault(fault, numbers, words) for _, fault, numbers, words in self._pairs(named)]
-
-    # ---- what frames leave
-
-    def _together(self, frames: dict[Pattern, FloatArray]) -> FloatArray:
-        """W of the patterns that are not suspected, and of these ``frames`` of others; of the rest as foretold."""
-        weights = self._rest.copy()
-        for pattern, foretold in self._foretold.items():
-            weights[self._check._columns(*pattern)] += self._check._own(frames.get(pattern, foretold), *pattern)
-        return np.where(self._check._sigma > 0, weights, 0.0)
-
-    def _left(self, frames: dict[Pattern, FloatArray], weights: FloatArray) -> float:
-        """Energy that ``frames`` of suspected patterns leave of all, but for a constant, their W being ``weights``."""
-        light = sum(_energy(frames.get(pattern, foretold)) for pattern, foretold in self._foretold.items())
-        return light - _energy(weights)
-
-    def _beyond(self, frames: dict[Pattern, FloatArray], variance: float) -> float:
-        """Energy beyond noise that all frames are off by with these, at a ``variance`` of a datum."""
-        left = self._left(frames, self._together(frames)) - self._least
-        return left - sum(frame.size for frame in frames.values()) * variance * self._check._spare
-
-    def _filled(self, one: _Seen, raw: FloatArray, known: BoolArray, least: float = -np.inf) -> float:
-        """Energy beyond noise that ``raw`` light in the place of ``one`` leaves where it is ``known``; elsewhere it may
-        be anything, or anything from ``least`` on."""
-        known = np.broadcast_to(known, raw.shape)
-        fit, means = self._foretold[one.pattern], np.zeros(())
-        if self._check.prepared.centre:
-            means = np.where(known, raw, np.median(raw[known]))
-            means = means - self._level(means)
-        for _ in range(_STEPS):
-            filled = np.where(known, raw, np.maximum(fit + means, least))
-            frame = self._level(filled)
-            means = filled - frame
-            weights = self._together({one.pattern: frame})
-            fit = self._check._frame(weights, *one.pattern)
-        left = self._left({one.pattern: frame}, weights) - self._least
-        # The noise of a frame is that of its mean light, which what is lost makes too little.
-        variance = max(one.variance, float(self._check.noise.of(float(raw[known].mean()), 1)))
-        return left - float(known.sum()) * variance * self._check._spare
-
-    # ---- what was read
-
-    def _plain(self, pattern: Pattern) -> _Seen:
-        check, measurement = self._check, self._measured[pattern]
-        number, frame = check._number[(*pattern, 0)], check._centred(measurement.frame)
-        variance = float(check.noise.variance[pattern])
-        foretold = (
-            None
-            if check._exclusive or len(self._bad) == check.noise.variance.size
-            else check._frame(self._weights, *pattern)
-        )
-        if foretold is None:
-            off = self._outside(frame, pattern, variance)
-            return _Seen((number,), pattern, measurement.frame, frame, None, variance, off)
-        off = self._beyond({pattern: frame}, variance)
-        return _Seen((number,), pattern, measurement.frame, frame, foretold, variance, off)
-
-    def _signed(self) -> list[_Seen]:
-        """Of patterns whose sum is off the half that its other half, and the model, tell to be wrong; of others the
-        difference."""
-        check = self._check
-        good = check.noise.variance.size - len(self._bad)
-        total = self._total - sum(each.light for each in self._measured.values())
-        mean = total / max(good, 1)
-        found = []
-        for pattern, each in self._measured.items():
-            variance = float(check.noise.variance[pattern]) * (1 + 1 / max(good, 1))
-            off = _energy(each.light - mean) - each.light.size * variance
-            numbers = tuple(check._number[(*pattern, sign)] for sign in (1, -1))
-            if off > CHANCE * variance * np.sqrt(2 * each.light.size) and off > _OFF**2 * _energy(mean):
-                halves = (each.light + each.frame) / 2, (each.light - each.frame) / 2
-                modelled = check._frame(self._weights, *pattern)
-                # Which half is wrong: the other one, as it is, makes a difference nearer to what the model tells.
-                by_model = [
-                    _energy(self._level(sign * (mean - 2 * other)) - modelled)
-                    for sign, other in ((1, halves[1]), (-1, halves[0]))
-                ]
-                wrong = int(np.argmin(by_model))
-                if not self._is_lit(pattern, 1 - 2 * wrong):
-                    continue
-                half, other = halves[wrong], halves[1 - wrong]
-                found.append(_Seen((numbers[wrong],), pattern, half, half, mean - other, variance, off))
-            else:
-                foretold, frame = check._frame(self._weights, *pattern), check._centred(each.frame)
-                off = self._beyond({pattern: frame}, variance)
-                found.append(_Seen(numbers, pattern, each.frame, frame, foretold, variance, off))
-        return found
-
-    def _is_lit(self, pattern: Pattern, sign: int) -> bool:
-        """Whether the half of that ``sign`` of a signed pattern lights any pixel."""
-        left, right = (side[:, index] for side, index in zip(self._check._patterns, pattern, strict=True))
-        return bool((1 + sign * np.outer(left, right)).any())
-
-    # ---- what explains it
-
-    def _tried(self, one: _Seen) -> Iterable[Named]:
-        if len(one.numbers) == 2:
-            yield from self._exchanged(one)
-            return
-        if self._is_black(one):
-            yield -np.inf, Fault.BLACK, one.numbers, "holds no light"
-        if one.foretold is None and self._bad[one.pattern]:
-            yield from self._by_neighbours(one)
-            return
-        yield from self._part_lost(one)
-        yield from self._clipped(one)
-        yield from self._scaled(one)
-        yield from self._elsewhere(one)
-        yield from self._moved(one)
-
-    def _is_black(self, one: _Seen) -> bool:
-        """Whether a shot is as even, and as dark, as a sensor without light."""
-        count = self._check.noise.variance.size
-        light = one.foretold if one.foretold is not None else self._total / count
-        if count == 1 and self._bad[one.pattern]:
-            return True
-        dark = float(self._check._digital.variance(0.0))
-        spread, expected = float(one.raw.var()) - dark, float(light.var())
-        return bool(spread < _DARK**2 * expected + dark and one.raw.mean() < _DARK * abs(light.mean()) + np.sqrt(dark))
-
-    def _by_neighbours(self, one: _Seen) -> Iterable[Named]:
-        check = self._check
-        if not check._exclusive:
-            return
-        told = self._weights[check._columns(*one.pattern)]
-        ratio = float(np.vdot(check._own(one.frame, *one.pattern), told)) / max(_energy(told), 1e-300)
-        fault = Fault.DIM if ratio < 1 else Fault.BRIGHT
-        words = f"holds {ratio:.2f} of the light that its neighbours' pixels tell"
-        yield -np.inf, fault, one.numbers, words
-
-    def _scaled(self, one: _Seen) -> Iterable[Named]:
-        if one.foretold is None:
-            return
-        ratio = float(np.vdot(one.frame, one.foretold)) / max(_energy(one.foretold), 1e-300)
-        left = _energy(one.frame - ratio * one.foretold) - one.frame.size * one.variance
-        if ratio > 0 and not self._check._signed:
-            ratio, left = self._least_scale(one, ratio)
-        if ratio > 0:
-            fault = Fault.DIM if ratio < 1 else Fault.BRIGHT
-            yield left, fault, one.numbers, f"holds {ratio:.2f} of the light that the other frames tell"
-
-    def _least_scale(self, one: _Seen, start: float) -> tuple[float, float]:
-        """The part of its light that a frame has, and what it leaves divided by that."""
-
-        def left(ratio: float) -> float:
-            return self._beyond({one.pattern: one.frame / ratio}, one.variance / ratio**2) * ratio**2
-
-        found = minimize_scalar(left, bounds=(0.3 * start, min(3 * start, 10.0)), method="bounded")
-        return float(found.x), float(found.fun)
-
-    def _part_lost(self, one: _Seen) -> Iterable[Named]:
-        """Rows, or columns, without light side by side."""
-        for axis, name in ((0, "rows"), (1, "columns")):
-            lines, usual = one.raw.mean(axis=1 - axis), self._total.mean(axis=1 - axis)
-            if self._check.noise.variance.size == 1:
-                usual = np.full_like(usual, np.percentile(lines, 90))
-            ratio = lines / np.where(usual > 0, usual, np.inf)
-            lost = np.abs(ratio) < _DARK * max(float(np.percentile(ratio, 75)), 0.0)
-            lost |= (lines < 0) & (usual > 0) & (ratio < 0)
-            first, last = _longest(lost)
-            if not max(_LEAST_LOST * len(lines), 2) <= last - first < 0.9 * len(lines):
-                continue
-            kept = np.ones(len(lines), dtype=np.bool_)
-            kept[first:last] = False
-            if one.foretold is None or self._check._signed:
-                left = self._outside_of_part(one, kept, axis)
-            else:
-                left = self._filled(one, one.raw, kept[:, None] if axis == 0 else kept[None, :])
-            yield left, Fault.HALF_LOST, one.numbers, f"has no light in sensor {name} {first} to {last - 1}"
-
-    def _clipped(self, one: _Seen) -> Iterable[Named]:
-        """Many readings at the largest number, as no noise leaves them."""
-        digital = self._check._digital
-        step = max((digital.step_dn or 0.0) / digital.gain_dn_per_e / digital.exposure_s, 0.0)
-        top = float(one.raw.max())
-        flat = one.raw >= top - max(step / 2, 1e-6 * abs(top))
-        count, (part, least, times) = int(flat.sum()), _FLAT
-        below = one.raw[(~flat) & (one.raw >= top - max(0.01 * abs(top), 1.5 * step))].size
-        if count < max(part * flat.size, least) or count * times < below or count > 0.9 * flat.size:
-            return
-        if one.foretold is not None:
-            if not self._check.prepared.centre and float(np.median(one.foretold[flat])) < _NEAR_TOP * top:
-                return
-            left = _energy(one.frame - np.minimum(one.foretold, top)) - flat.size * one.variance
-            if not self._check._signed:
-                left = self._filled(one, one.raw, ~flat, top)
-        else:
-            filled = one.frame
-            for _ in range(_STEPS):
-                fit = self._fit(filled, one.pattern)
-                filled = np.where(flat, np.maximum(fit, one.frame), one.frame)
-            if float(np.median(fit[flat])) < _NEAR_TOP * top:  # hot pixels, not light
-                return
-            left = _energy((one.frame - fit)[~flat]) - float((~flat).sum()) * one.variance * self._check._spare
-        yield left, Fault.CLIPPED, one.numbers, f"has {count} readings at its largest number"
-
-    def _elsewhere(self, one: _Seen) -> Iterable[Named]:
-        """Another pattern than that of its place: of all patterns under dots, else of those that are suspected."""
-        check = self._check
-        if one.foretold is None:
-            others = [other for other in np.ndindex(check.noise.variance.shape) if other != one.pattern]
-            if not others:
-                return
-            left, best = min((self._outside(one.frame, other, one.variance), other) for other in others)
-            yield self._of_pattern(left, one, check._number[(*best, 0)])
-            return
-        for other in self._bad:
-            if other == one.pattern:
-                continue
-            if not check._signed:  # of two that are suspected each may be the other's
-                there = check._centred(self._measured[other].frame)
-                yield self._of_pattern(self._crossed(one, other, there), one, check._number[(*other, 0)])
-                continue
-            each = self._measured[other]
-            for sign in (1, -1):  # the other half of that pattern tells this one
-                partner = (each.light - sign * each.frame) / 2
-                mean = one.foretold + self._partner(one)
-                left = _energy(one.frame - (mean - partner)) - one.frame.size * one.variance
-                yield self._of_pattern(left, one, check._number[(*other, sign)])
-
-    def _crossed(self, one: _Seen, other: Pattern, there: FloatArray) -> float:
-        """Energy of :attr:`_Seen.off` that is left when a frame and that of an ``other`` pattern, ``there``, are
-        exchanged."""
-        variance = (one.variance + float(self._check.noise.variance[other])) / 2
-        own = self._beyond({one.pattern: one.frame, other: there}, variance)
-        left = self._beyond({one.pattern: there, other: one.frame}, variance)
-        return left / own * one.off if own > 0 else np.inf
-
-    def _partner(self, one: _Seen) -> FloatArray:
-        """The other half of a signed pattern's shot."""
-        return np.asarray(self._measured[one.pattern].light - one.raw)
-
-    def _of_pattern(self, left: float, one: _Seen, number: int) -> Named:
-        return left, Fault.MISPLACED, (*one.numbers, number), ""
-
-    def _exchanged(self, one: _Seen) -> Iterable[Named]:
-        """Both halves of signed patterns: the two exchanged, or those of another pattern."""
-        if one.foretold is None:
-            return
-        yield self._beyond({one.pattern: -one.frame}, one.variance), Fault.SWAPPED, one.numbers, "are exchanged"
-        for other in self._bad:
-            if other != one.pattern:
-                there = self._check._centred(self._measured[other].frame)
-                left = self._crossed(one, other, there)
-                both = tuple(self._check._number[(*other, sign)] for sign in (1, -1))
-                yield left, Fault.MISPLACED, (*one.numbers, *both), ""
-
-    def _moved(self, one: _Seen) -> Iterable[Named]:
-        """Moved over the sensor by whole pixels."""
-        reach = min(_REACH, *(side // 8 for side in one.frame.shape))
-        if reach < 1:
-            return
-        shift = self._by_range(one, reach) if one.foretold is None else _correlated(one.frame, one.foretold, reach)
-        if shift == (0, 0):
-            return
-        if one.foretold is not None and not self._check._signed:
-            # Frames of a smooth mask correlate beside their shift: from there on it is what leaves least.
-            left, (rows, columns) = self._put_back(one, shift), shift
-            for _ in range(reach):
-                beside = [(rows + down, columns + across) for down in (-1, 0, 1) for across in (-1, 0, 1)]
-                within = [each for each in beside if each != (rows, columns) and max(map(abs, each)) <= reach]
-                best, place = min((self._put_back(one, each), each) for each in within)
-                if best >= left:
-                    break
-                left, (rows, columns) = best, place
-            if (rows, columns) == (0, 0):
-                return
-            words = f"is shifted by {rows} rows and {columns} columns of the sensor"
-            yield left, Fault.SHIFTED, one.numbers, words
-            return
-        ends = [slice(reach + step, size - reach + step) for step, size in zip(shift, one.raw.shape, strict=True)]
-        still = [slice(reach, size - reach) for size in one.raw.shape]
-        moved, unmoved = (self._inside(one, window, still) for window in (ends, still))
-        if unmoved > 0:
-            rows, columns = shift
-            words = f"is shifted by {rows} rows and {columns} columns of the sensor"
-            yield moved / unmoved * one.off, Fault.SHIFTED, one.numbers, words
-
-    def _put_back(self, one: _Seen, shift: tuple[int, int]) -> float:
-        """Energy beyond noise that a frame leaves that is moved back by a ``shift``, rows and columns."""
-        known = [np.zeros(size, dtype=np.bool_) for size in one.raw.shape]
-        for line, step in zip(known, shift, strict=True):
-            line[max(-step, 0) : len(line) - max(step, 0)] = True
-        return self._filled(one, np.roll(one.raw, (-shift[0], -shift[1]), (0, 1)), np.outer(*known))
-
-    # ---- fits
-
-    def _fit(self, frame: FloatArray, pattern: Pattern) -> FloatArray:
-        """(m, m') the part of a ``frame`` in the range of a ``pattern``."""
-        left, right = (slab.matrix for slab in self._slabs(pattern))
-        return np.asarray(left @ (left.T @ frame @ right) @ right.T)
-
-    def _slabs(self, pattern: Pattern) -> tuple[Any, Any]:
-        prepared = self._check.prepared
-        return prepared.left.slabs[pattern[0]], prepared.right.slabs[pattern[1]]
-
-    def _outside(self, frame: FloatArray, pattern: Pattern, variance: float) -> float:
-        """Energy of a ``frame`` beyond noise that no light of the pixels of a ``pattern`` explains."""
-        return _energy(frame) - _energy(self._check._own(frame, *pattern)) - self._check._spare * frame.size * variance
-
-    def _ranges(self, pattern: Pattern, rows: Any, columns: Any) -> tuple[FloatArray, FloatArray]:
-        """Orthonormal ranges of a ``pattern`` on part of the sensor's ``rows`` and ``columns``."""
-        bases = []
-        for slab, kept in zip(self._slabs(pattern), (rows, columns), strict=True):
-            part = slab.matrix[kept]
-            if self._check.prepared.centre:
-                part = np.concatenate([part, np.ones((len(part), 1))], axis=1)
-            bases.append(np.linalg.qr(part)[0])
-        return bases[0], bases[1]
-
-    def _outside_of_part(self, one: _Seen, kept: BoolArray, axis: int) -> float:
-        """Energy beyond noise that is off in the ``kept`` rows (``axis`` 0) or columns of the sensor."""
-        window = (kept, slice(None)) if axis == 0 else (slice(None), kept)
-        part = one.raw[window]
-        if one.foretold is not None:
-            return _energy(self._level(part - one.foretold[window])) - part.size * one.variance
-        left, right = self._ranges(one.pattern, *window)
-        return _energy(part) - _energy(left.T @ part @ right) - self._check._spare * part.size * one.variance
-
-    def _level(self, part: FloatArray) -> FloatArray:
-        return centred(part) if self._check.prepared.centre else part
-
-    def _inside(self, one: _Seen, window: list[slice], still: list[slice]) -> float:
-        """Energy beyond noise of a ``window`` of the sensor, held against the ``still`` middle of it."""
-        part = one.raw[window[0], window[1]]
-        if one.foretold is not None:
-            return _energy(self._level(part - one.foretold[still[0], still[1]])) - part.size * one.variance
-        left, right = self._ranges(one.pattern, *still)
-        return _energy(part) - _energy(left.T @ part @ right) - self._check._spare * part.size * one.variance
-
-    def _by_range(self, one: _Seen, reach: int) -> tuple[int, int]:
-        """The shift that puts most of a frame into the range of its pattern: of rows, then of columns, as a shift along
-        one side of the sensor does not move the other's range."""
-        still = [slice(reach, size - reach) for size in one.raw.shape]
-        found = []
-        for axis, basis in enumerate(self._ranges(one.pattern, *still)):
-            frame = one.raw if axis == 0 else one.raw.T
-            parts = {}
-            for step in range(-reach, reach + 1):
-                lines = frame[reach + step : len(frame) - reach + step]
-                parts[step] = _energy(basis.T @ lines) / max(_energy(lines), 1e-300)
-            found.append(max(parts, key=lambda step: (parts[step], -abs(step))))
-        return found[0], found[1]
-
-    # ---- frames that go together
-
-    def _repeats(self, seen: list[_Seen]) -> dict[tuple[int, ...], list[Named]]:
-        """Shots that are equal to another, but for noise."""
-        check = self._check
-        found: dict[tuple[int, ...], list[Named]] = {}
-        for each in check.measured():
-            pattern = each.row, each.column
-            signs = (1, -1) if each.shots == 2 else (0,)
-            variance = float(check.noise.variance[pattern])
-            for sign in signs:
-                shot = (each.light + sign * each.frame) / 2 if sign else each.frame
-                number = check._number[(*pattern, sign)]
-                for one in seen:
-                    if len(one.numbers) > 1 or number in one.numbers:
-                        continue
-                    apart = _energy(one.raw - shot)
-                    beyond = apart - shot.size * (one.variance + variance / len(signs))
-                    if apart < _ROUNDING * _energy(shot):
-                        beyond = -np.inf
-                    if beyond < 0.5 * _EXPLAINS * one.off and beyond < CHANCE * one.variance * np.sqrt(8 * shot.size):
-                        words = f"repeats frame {number} ({check._shots[number].file})"
-                        found.setdefault(one.numbers, []).append((beyond, Fault.REPEATED, one.numbers, words))
-        return found
-
-    def _pairs(self, named: list[Named]) -> Iterable[Named]:
-        """Frames that are of each other's pattern, as one fault."""
-        misplaced = {each[2][: len(each[2]) // 2]: each for each in named if each[1] is Fault.MISPLACED}
-        done = set()
-        for left, fault, numbers, words in named:
-            if fault is not Fault.MISPLACED:
-                yield left, fault, numbers, words
-                continue
-            own, other = numbers[: len(numbers) // 2], numbers[len(numbers) // 2 :]
-            back = misplaced.get(other)
-            if own in done:
-                continue
-            if back is not None and back[2][len(other) :] == own:
-                done |= {own, other}
-                yield left, Fault.SWAPPED, (*own, *other), "are exchanged"
-            else:
-                yield left, Fault.MISPLACED, own, f"holds the light of the pattern of frame {other[0]}"
-
-
-def _correlated(frame: FloatArray, foretold: FloatArray, reach: int) -> tuple[int, int]:
-    """The shift (rows, columns) by which ``frame`` is most like what was ``foretold``, up to ``reach``."""
-    shape = [fft.next_fast_len(size + reach) for size in frame.shape]
-    spectra = [fft.rfft2(values - values.mean(), shape) for values in (frame, foretold)]
-    alike = fft.irfft2(spectra[0] * spectra[1].conj(), shape)
-    steps = np.arange(-reach, reach + 1)
-    place = np.unravel_index(int(np.argmax(alike[np.ix_(steps, steps)])), (len(steps),) * 2)
-    return int(steps[place[0]]), int(steps[place[1]])
-
-
-def _longest(lost: BoolArray) -> tuple[int, int]:
-    """First of the longest run of ``lost`` lines, and the first after it."""
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], lost, [False]]).astype(np.int8)))
-    if not len(ends):
-        return 0, 0
-    runs = ends.reshape(-1, 2)
-    first, last = runs[np.argmax(runs[:, 1] - runs[:, 0])]
-    return int(first), int(last)
-
-
-def listed(numbers: tuple[int, ...], files: tuple[str, ...]) -> str:
-    """Frames by their ``numbers`` and ``files``, the first few."""
-    shown = ", ".join(f"{number} ({file})" for number, file in zip(numbers[:4], files[:4], strict=True))
-    more = f" and {len(numbers) - 4} more" if len(numbers) > 4 else ""
-    return f"frame{'s' if len(numbers) > 1 else ''} {shown}{more}"
-
-
-def _energy(values: FloatArray) -> float:
-    flat = np.ascontiguousarray(values).ravel()
-    return float(np.dot(flat, flat))
+            yield self.fault(Fault.NOISELESS, numbers, has)

@@ -9,6 +9,7 @@ distance sends.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -20,7 +21,9 @@ from mitsim.reconstruct.accumulator import centred
 from mitsim.reconstruct.calibration import decibels
 from mitsim.reconstruct.causes import Cause, Evidence, Signatures, likely_cause
 from mitsim.reconstruct.defects import Defects, defects_of
-from mitsim.reconstruct.faults import FrameCheck, FrameFault, FrameSums
+from mitsim.reconstruct.faults import FrameCheck
+from mitsim.reconstruct.framefault import FrameFault
+from mitsim.reconstruct.leaveoneout import FrameSums
 from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.readings import Reading, Readings, multiple
 from mitsim.reconstruct.solver import Prepared
@@ -41,6 +44,11 @@ _GROSS_CHI_SQUARE = 4.0
 """The same as a chi-square, of shot noise alone: read noise of as many electrons makes 2."""
 _SHOWN = 4
 """Faults that a sentence holds; result.json has them all."""
+_MOSTLY = 0.5
+"""Part of the unexplained energy at defective pixels from which frames are not blamed: most of it."""
+_QUIET = 0.03
+"""Of the sensor's noise, beside half of :data:`CHANCE`, that may be missing before tone curves are tried: chosen, gains
+are stated to a few per cent."""
 _TINY = 1e-300
 """Stands for 0 in a denominator."""
 _TILES = 8
@@ -180,8 +188,8 @@ class Residuals:
 
     Attributes
     ----------
-    energy, power, variance
-        (tiles, tiles) sums of the squares of measurements and of shots, and of the noise's variance.
+    energy, power
+        (tiles, tiles) sums of the squares of measurements and of shots.
     pixels
         (tiles, tiles) pixels of each tile.
     by_pattern
@@ -197,7 +205,7 @@ class Residuals:
         self._strips = [slice(*ends) for ends in pairwise(edges[0])]
         self._starts = edges[1][:-1]
         self.pixels: FloatArray = np.outer(*(np.diff(edge) for edge in edges)).astype(np.float64)
-        self.energy, self.power, self.variance = (np.zeros(self.pixels.shape) for _ in range(3))
+        self.energy, self.power = (np.zeros(self.pixels.shape) for _ in range(2))
         self.squares: FloatArray = np.zeros(sizes)
         # Of one frame: to make them anew takes longer than to fill them.
         self._residual, self._squared = np.zeros(sizes), np.zeros(sizes)
@@ -221,31 +229,60 @@ class Residuals:
         self.power += power
         left_over, given = float(np.dot(flat, flat)), float(energy.sum())
         self.by_pattern.add(measurement, left_over, float(power.sum()), given, self._noise.light)
-        # The variance is linear in the light: that of a tile's mean light is the tile's mean variance.
-        light = self._sums(measurement.light) / self.pixels
-        variance = self._noise.of(light, measurement.shots) * self.pixels
-        self.variance += variance
-        self.evidence.add(measurement, frame, residual, float(variance.sum()) / frame.size)
+        mean = float(self._noise.means[measurement.row, measurement.column])
+        self.evidence.add(measurement, frame, residual, float(self._noise.of(mean, measurement.shots)))
+
+    @cached_property
+    def variance(self) -> FloatArray:
+        """(tiles, tiles) sum of the noise's variance."""
+        # It is linear in the light: that of a tile's mean light is the tile's mean variance.
+        count = self._noise.variance.size
+        light = self._sums(self._noise.light) / self.pixels / count
+        return self._noise.of(light, self._noise.shots) * self.pixels * count
 
     @property
     def residual(self) -> FloatArray:
         """(tiles, tiles) sum of the squares of residuals."""
         return self._sums(self.squares)
 
-    def defects(self) -> Defects | None:
-        """Pixels that are off in all measurements, where the sensor's noise is stated."""
+    def defects(self, whole: FloatArray | None) -> Defects | None:
+        """Pixels that are off in all measurements, where the sensor's noise is stated.
+
+        Parameters
+        ----------
+        whole
+            (rows, columns) the halves' sum of signed patterns, as the model has it; None: it has none.
+        """
         if not self._noise.stated:
             return None
         count = self._noise.variance.size
-        variance = count * self._noise.of(self._noise.light / count, self._noise.shots)
-        return defects_of(self.squares, variance, count)
+        mean = self._noise.light / count
+        variance = self._noise.of(mean, self._noise.shots)
+        found = defects_of(self.squares, count * variance, count)
+        if whole is None:
+            return found
+        # Differences of halves tell little of pixels that stand still, their sums all.
+        mean = centred(mean) if self._prepared.centre else mean
+        still = defects_of(np.square(mean - whole), variance / count, 1)
+        return still.with_others(found) if still else found
+
+    def at(self, defects: Defects) -> float:
+        """Energy that is left at pixels that are ``defects``."""
+        return float(self.squares[defects.rows, defects.columns].sum())
+
+    @property
+    def quiet(self) -> bool:
+        """Whether less is left than the sensor's noise alone makes."""
+        noise = float(self.variance.sum()) * self._prepared.spare
+        return float(self.squares.sum()) < noise * (1 - _QUIET - _chance(self._noise, float(self.pixels.sum())) / 2)
 
     def expected(self, factor_energy: float) -> FloatArray:
         """(tiles, tiles) energy that is expected of the residual: the sensor's noise less what the fit takes up, the
         error of simulated frames where the light is, and ``factor_energy`` evenly."""
-        spare = 1 - self._prepared.rank / (self._prepared.left.data_rows * self._prepared.right.data_rows)
         rendering = self._noise.rendering * self.power / max(float(self.power.sum()), _TINY)
-        return np.asarray(self.variance * spare + rendering + factor_energy * self.pixels / self.pixels.sum())
+        return np.asarray(
+            self.variance * self._prepared.spare + rendering + factor_energy * self.pixels / self.pixels.sum()
+        )
 
     def _sums(self, values: FloatArray) -> FloatArray:
         # Not reduceat along the rows: it takes five times as long.
@@ -280,7 +317,7 @@ def judge(
         whether defective pixels are looked for, and no cause where there are some.
     """
     prepared, noise = check.prepared, check.noise
-    if prepared.rank >= prepared.left.data_rows * prepared.right.data_rows:
+    if prepared.spare <= 0:
         return None
     sums = Residuals(prepared, check.weights, noise, evidence)
     for measurement in check.measured():
@@ -299,16 +336,22 @@ def judge(
         return replace(
             found, flagged=True, cause=Cause.ORDER, reading=Reading(Cause.ORDER, f"the frames are {step}", 0.0)
         )
-    if found.flagged:
+    defects = sums.defects(check.whole()) if with_defects else None
+    if defects and excess > 0 and sums.at(defects) > _MOSTLY * excess:
+        return replace(found, defects=defects)
+    readings, reading = Readings(prepared, check.manifest, noise, check.measured), None
+    chance = _chance(noise, float(sums.pixels.sum()))
+    hinted = found.flagged or (found.stated and found.unexplained > UNEXPLAINED and found.chi_square > 1 + chance / 2)
+    if hinted:
         beside = beside_noise / max(float(sums.energy.sum()), _TINY)
-        readings = Readings(prepared, check.manifest, noise, check.measured)
         reading = readings.fitting(found.unexplained, beside, check.all_off(sums.by_pattern, beside_noise))
-        if reading:
-            return replace(found, cause=reading.cause, reading=reading)
+    elif noise.stated and sums.quiet:
+        reading = readings.curved()
+    if reading:
+        return replace(found, flagged=True, cause=reading.cause, reading=reading)
     faults = check.faults(sums.by_pattern, beside_noise)
     if faults:
         return replace(found, flagged=True, cause=Cause.FRAMES, faults=faults)
-    defects = sums.defects() if with_defects else None
     if defects:
         return replace(found, defects=defects)
     negative = check.negative()
@@ -323,6 +366,22 @@ def judge(
     if not fine.flagged:
         return replace(fine, foretold=found.foretold, detail=float(np.sqrt(of_print / sums.energy.sum())))
     return replace(found, cause=likely_cause(signatures, found.unexplained, evidence.of_factors), signatures=signatures)
+
+
+def faulty_frames(check: FrameCheck, beside_noise: float, evidence: Evidence) -> tuple[FrameFault, ...]:
+    """Frames at fault of a scene of several depths, of which the model fits a part.
+
+    Parameters
+    ----------
+    check, evidence
+        as :func:`judge` takes them.
+    beside_noise
+        as :meth:`FrameCheck.faults` takes it.
+    """
+    sums = Residuals(check.prepared, check.weights, check.noise, evidence)
+    for measurement in check.measured():
+        sums.add(measurement)
+    return check.faults(sums.by_pattern, beside_noise)
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,6 +34,8 @@ class FrameNoise:
         standard error of single projector pixels' light in simulated frames, 1 is the board's; 0: not stated.
     power, light
         sum of the squares of all shots [(electrons/s)^2], and (m, m') of all shots [electrons/s].
+    means
+        (K, K') mean light of each pattern's shots [electrons/s].
     shots, saturated, readings
         shots of a pattern; readings at the full well or the ADC's end, and all of them.
     factor
@@ -47,6 +49,7 @@ class FrameNoise:
         self._sampling, self._systematic = manifest.mc_error or 0.0, _number(manifest.plan, "systematic_error")
         counts = len(manifest.patterns.P_L[0]), len(manifest.patterns.P_R[0])
         self.variance: FloatArray = np.zeros(counts)
+        self.means: FloatArray = np.zeros(counts)
         self.rows: FloatArray
         self.columns: FloatArray
         self.rows, self.columns = (np.zeros((*counts, 0)) for _ in range(2))
@@ -89,7 +92,8 @@ class FrameNoise:
             self.light = np.zeros(light.shape)
         self.light += light
         by_row, by_column = light.mean(axis=1), light.mean(axis=0)
-        self.variance[pattern] = self._own(float(by_row.mean()), shots)
+        self.means[pattern] = mean = float(by_row.mean())
+        self.variance[pattern] = self._own(mean, shots)
         self.rows[pattern], self.columns[pattern] = self._own(by_row, shots), self._own(by_column, shots)
         self.power += measurement.power
         self.shots = shots

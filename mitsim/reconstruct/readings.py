@@ -1,14 +1,14 @@
 """Measurements that fit no image in; out comes how else their frames may be read, where they fit that way.
 
 Each other reading is added up anew by the same factorised model: frames turned or mirrored, shots in another order,
-numbers that are a power of the light. U of the model is orthonormal, so that |Y|^2 - |W|^2 is what a reading leaves.
+numbers without a tone curve (:mod:`mitsim.reconstruct.tonecurve`). U of the model is orthonormal, so that
+|Y|^2 - |W|^2 is what a reading leaves.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -19,23 +19,21 @@ from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.faults import STEPS
 from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.solver import Prepared
+from mitsim.reconstruct.tonecurve import ToneCurves
 
 _FITS = 0.05
 """Part of the unexplained energy that a reading may leave: chosen, so that it explains nearly all of it."""
 _AT_MOST = 2e-2
 """Part of the measurements, rms, that it may leave: one that is right leaves 1e-2 of a sheet 2 mm beside the calibrated
 distance."""
-_QUIETEST, _TOLD, _CURVED = 0.3, 0.25, 0.05
-"""Of curves: least of the expected noise that is left, most of that noise over the unexplained energy, and least of
-that, rms. Dim numbers of sRGB are a thirteenth of their light, and so mostly noise, in which any light fits."""
+_CHANCE = 3.0
+"""Standard deviations of noise that a reading may leave in any case, where that is less than half of what is
+unexplained."""
 _CUT = 1.5
 """Part of the unexplained energy that another order may leave, times the number of patterns: of a cycle that was
 entered late one frame was taken before it."""
 _CUT_AT_MOST = 0.3
 """The most of that: runs of a few frames do not tell an order."""
-_POWERS = 1.8, 2.2, 2.4
-"""Exponents that displays and files encode light by, beside the curve of sRGB (IEC 61966-2-1)."""
-
 _MULTIPLIED, _LEAST_MULTIPLIED = 0.15, 1.5
 """Chi-square of multiplied numbers, over their factor, and at least: shot noise alone makes that the factor, and
 a black level that was multiplied too, which then counts as light, 0.3 of it; what is rounded to a factor has 1.1."""
@@ -84,7 +82,7 @@ class Readings:
     noise: FrameNoise
     measured: Callable[[], Iterable[Measurement]]
 
-    def fitting(self, unexplained: float, beside_noise: float, cut: bool) -> Reading | None:
+    def fitting(self, unexplained: float, beside_noise: float, all_off: bool) -> Reading | None:
         """The reading that fits best, where one does.
 
         Parameters
@@ -93,21 +91,24 @@ class Readings:
             part of the measurements, rms, that is left of them as they are.
         beside_noise
             part of their energy that rendering, the factors' noise and print put there.
-        cut
-            whether an order counts that leaves one frame of a cycle.
+        all_off
+            whether most frames are off: then an order counts that leaves one frame of a cycle.
         """
         fits: list[Reading] = []
-        for cause, words, frames, most in self._tried(cut):
+        for cause, words, frames, most in self._tried(all_off):
             left_over, expected = self._left_over(frames)
-            if cause is Cause.GAMMA and not (
-                _QUIETEST * expected < left_over and expected < _TOLD * unexplained**2 and unexplained > _CURVED
-            ):
-                continue
-            left = np.sqrt(max(left_over - expected - beside_noise, 0.0))
-            if left < np.sqrt(most) * unexplained and (left < _AT_MOST or most > _FITS):
-                fits.append(Reading(cause, words, float(left)))
-        exact = [reading for reading in fits if reading.cause is not Cause.GAMMA]
-        return min(exact or fits, key=lambda reading: reading.left, default=None)
+            left = max(left_over - expected - beside_noise, 0.0)
+            numbers = self.noise.readings / self.noise.shots * self.prepared.spare
+            chance = min(_CHANCE * expected * np.sqrt(2 / numbers), 0.5 * unexplained**2) if self.noise.stated else 0.0
+            fit = left < most * unexplained**2 and (left < _AT_MOST**2 or most > _FITS)
+            if fit or left < chance:
+                fits.append(Reading(cause, words, float(np.sqrt(left))))
+        return min(fits, key=lambda reading: reading.left, default=None) or self.curved()
+
+    def curved(self) -> Reading | None:
+        """The tone curve that the numbers went through, where one is likelier than none."""
+        words = ToneCurves(self.prepared, self.manifest, self.measured).likeliest()
+        return Reading(Cause.GAMMA, words, 0.0) if words else None
 
     def _left_over(self, frames: Frames) -> tuple[float, float]:
         """Part of the energy of ``frames`` that the model leaves, and that noise is expected to leave."""
@@ -117,13 +118,12 @@ class Readings:
             noise += own
         problem = self.prepared.problem(sums)
         explained = float(np.square(problem.projected[problem.sigma > 0]).sum())
-        spare = 1 - self.prepared.rank / (self.prepared.left.data_rows * self.prepared.right.data_rows)
         energy = max(problem.energy, np.finfo(float).tiny)
-        return 1 - explained / energy, noise * spare / energy
+        return 1 - explained / energy, noise * self.prepared.spare / energy
 
     def _tried(self, with_cut: bool) -> Iterator[tuple[Cause, str, Frames, float]]:
         """Cause, words and frames of each reading, and the part of the unexplained energy that it may leave;
-        ``with_cut`` as :meth:`fitting` takes it."""
+        ``with_cut`` as ``all_off`` of :meth:`fitting` takes it."""
         shape = self.prepared.left.sensor_size, self.prepared.right.sensor_size
         for words, turn in _TURNS.items():
             if turn(np.zeros(shape)).shape == shape:
@@ -139,10 +139,6 @@ class Readings:
                 orders |= {STEPS[0]: lambda number: number - 1, STEPS[1]: lambda number: number + 1}
             for words, order in orders.items():
                 yield Cause.ORDER, f"the frames are {words}", self._ordered(order), cut
-        yield Cause.GAMMA, "the numbers follow the curve of sRGB", self._linear(_of_srgb), _FITS
-        for power in _POWERS:
-            words = f"the numbers are the light to the power of 1/{power:g}"
-            yield Cause.GAMMA, words, self._linear(partial(_to_the, power)), _FITS
 
     def _each(self, turn: Callable[[FloatArray], FloatArray]) -> Frames:
         for each in self.measured():
@@ -162,16 +158,6 @@ class Readings:
     def _ordered(self, order: Callable[[int], int]) -> Frames:
         """Measurements of the shots, each taken for that which ``order`` gives for its number."""
         return self._paired((order(number), light) for number, light in self._shots())
-
-    def _linear(self, curve: Callable[[FloatArray], FloatArray]) -> Frames:
-        """Measurements of shots whose light, in units of the largest, a ``curve`` makes linear."""
-        digital = self.manifest.digital
-        top = digital.saturation_dn
-        peak = float(digital.rate(np.array(top))) if top else max(float(light.max()) for _, light in self._shots())
-        peak = max(peak, np.finfo(float).tiny)
-        return self._paired(
-            (number, peak * np.sign(light) * curve(np.abs(light) / peak)) for number, light in self._shots()
-        )
 
     def _paired(self, shots: Iterable[tuple[int, FloatArray]]) -> Frames:
         """Measurements of ``shots``, by their number: halves of signed patterns as their difference."""
@@ -208,12 +194,3 @@ def multiple(noise: FrameNoise, chi_square: float) -> Reading | None:
     if factor & (factor - 1) == 0:
         words += f", as of fewer bits that were moved up by {factor.bit_length() - 1}"
     return Reading(Cause.SCALE, words, 0.0)
-
-
-def _to_the(power: float, light: FloatArray) -> FloatArray:
-    return np.asarray(light**power)
-
-
-def _of_srgb(light: FloatArray) -> FloatArray:
-    """Linear light of numbers of sRGB, 0 to 1."""
-    return np.where(light <= 0.04045, light / 12.92, ((light + 0.055) / 1.055) ** 2.4)

@@ -25,9 +25,10 @@ from mitsim.reconstruct.detail import Model, print_energy
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.faults import FrameCheck
 from mitsim.reconstruct.focus import focused
+from mitsim.reconstruct.framefault import FrameFault
 from mitsim.reconstruct.lacking import Lack
 from mitsim.reconstruct.margin import Margin
-from mitsim.reconstruct.misfit import Misfit, judge
+from mitsim.reconstruct.misfit import Misfit, faulty_frames, judge
 from mitsim.reconstruct.noise import FrameNoise, factor_energy
 from mitsim.reconstruct.result import Reconstruction
 from mitsim.reconstruct.solver import Prepared, Solution, prepare
@@ -121,6 +122,13 @@ def reconstruct(
     solution = depth if isinstance(depth, DepthMap) and not depth.doubt else data.solution(lam, method)
     solved = time.perf_counter()
     misfit = data.misfit(shots, factors, solution)
+    if misfit and isinstance(solution, DepthMap):
+        # At the depth of most of the scene a frame that is not what it says is off by more than depth puts it.
+        of_depth = focused(factors, float(np.median(solution.mm)))
+        faults = accumulated(of_depth.of(shots), of_depth.factors).faulty_frames(
+            of_depth.of(shots), of_depth.factors, solution
+        )
+        misfit = replace(misfit, flagged=True, cause=Cause.FRAMES, faults=faults) if faults else misfit
     if misfit and misfit.defects:
         shots, data, solution, misfit = _without_defects(shots, factors, lam, method, data, misfit)
         prepared, frames = data.prepared, data.frames
@@ -233,21 +241,27 @@ class Accumulated:
         if isinstance(solution, DepthMap):
             return solution.misfit(self.noise, added, print_energy(self.model, image))
         lam = _LAMBDA_OF_TV * problem.scale if isinstance(solution, TVSolution) else solution.lam
-        return judge(
-            FrameCheck(
-                self.prepared,
-                self.weights,
-                lam,
-                shots.patterns,
-                shots.manifest,
-                self.noise,
-                lambda: self.kept or shots.measured(),
-            ),
-            added,
-            print_energy(self.model, image),
-            Evidence(factors, shots.patterns, lack.energy if lack else None),
-            with_defects,
-        )
+        evidence = Evidence(factors, shots.patterns, lack.energy if lack else None)
+        return judge(self._check(shots, lam), added, print_energy(self.model, image), evidence, with_defects)
+
+    def faulty_frames(self, shots: Capture, factors: Factors, depths: DepthMap) -> tuple[FrameFault, ...]:
+        """Frames at fault of a scene of several depths.
+
+        Parameters
+        ----------
+        shots, factors
+            that these sums are of, at the depth of most of the scene.
+        depths
+            of its pixels, and their image.
+        """
+        stated = factors.manifest.noise
+        added = factor_energy(self.prepared, shots.patterns, stated, depths.image) if stated else 0.0
+        beside = self.noise.rendering + added + print_energy(self.model, depths.image)
+        return faulty_frames(self._check(shots, depths.lam), beside, Evidence(factors, shots.patterns))
+
+    def _check(self, shots: Capture, lam: float) -> FrameCheck:
+        measured = lambda: self.kept or shots.measured()  # noqa: E731
+        return FrameCheck(self.prepared, self.weights, lam, shots.patterns, shots.manifest, self.noise, measured)
 
     def uncertainty(self, shots: Capture, factors: Factors, solution: Solution) -> Uncertainty:
         """Standard uncertainty of a solution.

@@ -117,6 +117,13 @@ class Prepared:
         return self.left.rank * self.right.rank
 
     @property
+    def spare(self) -> float:
+        """Part of the energy of white noise in all frames that neither centring nor an image takes up."""
+        left, right = self.left, self.right
+        numbers = left.sensor_size * left.pattern_count * right.sensor_size * right.pattern_count
+        return (left.data_rows * right.data_rows - self.rank) / numbers
+
+    @property
     def unknowns(self) -> int:
         """Number of scene pixels."""
         return self.left.scene_size * self.right.scene_size

@@ -36,6 +36,23 @@ def test_single_pixels(patterns: str) -> None:
     )
 
 
+@pytest.mark.parametrize("place", [(40, 51), (10, 11), (70, 30)])
+@pytest.mark.parametrize("number", [BLACK, CODES - 1])
+def test_a_pixel_that_stands_still(place: tuple[int, int], number: float) -> None:
+    """Halves of signed patterns differ by less than noise there; their sum is none of the light."""
+
+    def still(frames: Frames) -> Frames:
+        changed = [frame.copy() for frame in frames]
+        for frame in changed:
+            frame[place] = number
+        return changed
+
+    shots = with_frames(bench(peak=300.0).run("hadamard:4", picture(1), 1), still)
+    mended = reconstruct(shots, bench().calibrated(1))
+    assert mended.ok and mended.misfit is not None and mended.misfit.defects is not None
+    assert mended.misfit.defects.places == [place]
+
+
 def test_a_dead_line() -> None:
     def dead(frames: Frames) -> Frames:
         return [np.where(np.arange(96)[None, :] == 51, BLACK, frame) for frame in frames]

@@ -21,6 +21,7 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.pixeldepths import PixelDepths
 from mitsim.reconstruct.reconstruction import accumulated, reconstruct
 from tests.ideal_sessions import PEAK, Bench, picture
+from tests.unit.reconstruct.test_faults import dark, with_frames
 from tests.unit.reconstruct.test_focus import BASELINE, PARALLAX, N, shadow
 
 BESIDE = (0.0, BASELINE[1])
@@ -110,6 +111,22 @@ def test_one_depth_of_several_is_flagged(depths: np.ndarray) -> None:
     assert (
         each.misfit and each.misfit.unexplained < one.misfit.unexplained / 3 and psnr(each.image) > psnr(one.image) + 3
     )
+
+
+@pytest.mark.parametrize("fault", ["black", "exchanged"])
+def test_frames_at_fault_are_named(fault: str) -> None:
+    """Of two depths, against the factors of one."""
+    run = shots(cards(), "dots:4x8")
+
+    def change(frames: list[np.ndarray]) -> list[np.ndarray]:
+        places = {3: dark(frames[3])} if fault == "black" else {2: frames[6], 6: frames[2]}
+        return [places.get(number, frame) for number, frame in enumerate(frames)]
+
+    found = reconstruct(with_frames(run, change), calibrated(), focus="map")
+    assert not found.ok and found.misfit is not None and found.misfit.cause is Cause.FRAMES
+    (said,) = found.misfit.faults
+    assert said.numbers == ((3,) if fault == "black" else (2, 6))
+    assert ("no light" if fault == "black" else "exchanged") in said.words
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.reconstruction import reconstruct
 from mitsim.reconstruct.result import Reconstruction
 from mitsim.reconstruct.status import Verdict
-from tests.ideal_sessions import BLACK, DARK, GAIN, PIXELS, READ, bench, picture
+from tests.ideal_sessions import BLACK, DARK, GAIN, PIXELS, READ, Bench, bench, picture, shadow
 
 FAMILIES = "dots:4", "hadamard:4", "random:4", "dots:1x8"
 Frames = list[np.ndarray]
@@ -83,12 +83,59 @@ def test_a_frame_at_fault_is_named(patterns: str, fault: str) -> None:
 
 
 @pytest.mark.parametrize("patterns", FAMILIES)
+def test_a_frame_that_is_clipped_where_noise_hides_it(patterns: str) -> None:
+    """A few readings cut by a tenth of them, which no residual shows; noise alone ends in no number so often."""
+    shots = bench(peak=800.0).run(patterns, picture(1), 1)
+
+    def cut(frames: Frames) -> Frames:
+        return [*frames[:3], np.minimum(frames[3], np.sort(frames[3], axis=None)[-60]), *frames[4:]]
+
+    misfit = reconstruct(with_frames(shots, cut), bench().calibrated(1)).misfit
+    assert misfit is not None
+    (said,) = misfit.faults
+    assert said.fault.name == "CLIPPED" and said.numbers == (3,)
+
+
+def test_text_tells_the_brightness_of_dots() -> None:
+    """Half of all pixels lie beside an edge, and the frames on either side of a dim one seem bright."""
+    page = np.where(np.random.default_rng(3).random((32, 32)) < 0.35, 0.1, 0.85)
+    camera = Bench(shadow(n=32), shadow(n=32))
+    shots, factors = camera.run("dots:1x8", page, 1), camera.calibrated(1)
+    assert reconstruct(shots, factors).ok
+    found = reconstruct(with_frames(shots, lambda frames: [*frames[:3], dim(frames[3]), *frames[4:]]), factors)
+    assert found.misfit is not None
+    (said,) = found.misfit.faults
+    assert said.fault.name == "DIM" and said.numbers == (3,)
+
+
+def test_a_dim_frame_of_dim_light() -> None:
+    """Where patterns overlap it puts others off, by nearly as much as itself."""
+    shots = bench(peak=150.0).run("random:4", picture(1), 1)
+    found = reconstruct(
+        with_frames(shots, lambda frames: [*frames[:3], dim(frames[3]), *frames[4:]]), bench().calibrated(1)
+    )
+    assert found.misfit is not None
+    (said,) = found.misfit.faults
+    assert said.fault.name == "DIM" and said.numbers == (3,)
+
+
+@pytest.mark.parametrize("patterns", FAMILIES)
 def test_frames_that_are_exchanged_are_named(patterns: str) -> None:
     """Of a signed family half of two pairs: which halves is told by the difference that they make."""
     found = image(patterns, lambda frames: [*frames[:2], frames[5], *frames[3:5], frames[2], *frames[6:]])
     assert found.misfit is not None
     (said,) = found.misfit.faults
     assert said.fault.name == "SWAPPED" and said.numbers == (2, 5)
+
+
+@pytest.mark.parametrize("pair", [(6, 17), (3, 23), (4, 30)])
+def test_halves_of_two_pairs_exchanged(pair: tuple[int, int]) -> None:
+    """Their other halves exchanged would do as well, but for a comb over the image."""
+    one, other = pair
+    found = image("hadamard:4", lambda frames: [frames[{one: other, other: one}.get(n, n)] for n in range(len(frames))])
+    assert found.misfit is not None
+    (said,) = found.misfit.faults
+    assert said.fault.name == "SWAPPED" and said.numbers == pair
 
 
 def test_halves_of_one_pair_exchanged() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -62,6 +63,39 @@ def test_a_tone_curve(patterns: str) -> None:
         patterns, lambda frames: [BLACK + span * (np.maximum(f - BLACK, 0) / span) ** (1 / 2.2) for f in frames]
     )
     assert cause is Cause.GAMMA
+
+
+@pytest.mark.parametrize("patterns", ["dots:4", "hadamard:4", "random:4"])
+def test_a_tone_curve_of_dim_light(patterns: str) -> None:
+    """Where dark current is a part of it that the curve makes larger."""
+    span = CODES - 1 - BLACK
+    shots = with_frames(
+        replace(CAMERA, peak=400.0).run(patterns, picture(1), 1),
+        lambda frames: [BLACK + span * (np.maximum(f - BLACK, 0) / span) ** (1 / 2.2) for f in frames],
+    )
+    misfit = reconstruct(shots, CAMERA.calibrated(1)).misfit
+    assert misfit is not None and misfit.cause is Cause.GAMMA
+
+
+def test_a_tone_curve_that_fits_with_too_little_noise() -> None:
+    """Nearly even light before a centred model: only the noise, three quarters of what it should be, is wrong."""
+    even = replace(CAMERA, optics=lambda light: light / 50 + 0.98 * light.mean())
+    factors = CAMERA.calibrated(1)
+    factors = replace(factors, manifest=factors.manifest.model_copy(update={"centre": True}))
+    shots, span = even.run("dots:4", picture(1), 1), CODES - 1 - BLACK
+    assert reconstruct(shots, factors).ok
+    curved = with_frames(shots, lambda frames: [BLACK + span * ((f - BLACK) / span) ** (1 / 2.2) for f in frames])
+    misfit = reconstruct(curved, factors).misfit
+    assert misfit is not None and misfit.flagged and misfit.cause is Cause.GAMMA
+
+
+def test_another_order_of_dim_light() -> None:
+    """Light that is off by less than chance leaves to all of it fits the right order alone."""
+    shots = replace(CAMERA, peak=10.0).run("dots:4", picture(1), 1)
+    late = with_frames(shots, lambda frames: [frames[-1], *frames[:-1]])
+    misfit = reconstruct(late, CAMERA.calibrated(1)).misfit
+    assert misfit is not None and misfit.flagged and misfit.reason.startswith("the frames are one step late")
+    assert misfit.chi_square < 1 + 6 * np.sqrt(2 / (16 * 96 * 96))
 
 
 def left_aligned(gain: float) -> Capture:

@@ -1,0 +1,288 @@
+"""Measurements and the factorised model in; each frame as the others tell it out.
+
+Where patterns overlap the model does it: patterns are left out of the sums W, and normal equations of the others are
+solved. Under shifting dots no pixel is in two frames, and those left out have light as their pixels' neighbours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import uniform_filter
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.manifests import RunManifest
+from mitsim.core.measurement import Measurement
+from mitsim.reconstruct.accumulator import centred
+from mitsim.reconstruct.framefault import Fault, FrameFault, listed
+from mitsim.reconstruct.noise import FrameNoise
+from mitsim.reconstruct.sides import group_pixels
+from mitsim.reconstruct.solver import Prepared
+
+Pattern = tuple[int, int]
+BoolArray = npt.NDArray[np.bool_]
+
+CHANCE = 6.0
+"""Standard deviations of a frame's noise energy that are left to chance: 1e-9 for each of up to 65536 shots."""
+OFF = 7e-3
+"""Part of a frame, rms, by which it may be off: twice what all measurements together may, as print is not averaged."""
+_SETTLED, _MOST_STEPS = 0.1, 100
+"""Of :data:`CHANCE`, the energy below which a step of foretelling changes nothing that counts; and the most steps,
+which patterns that know nothing of each other do not need: chosen."""
+
+
+@dataclass(eq=False)
+class FrameSums:
+    """Energies by pattern, (K, K') each, gathered as measurements are held against a model.
+
+    ``residual``, ``power``, ``energy``: what is left of a pattern's measurement, sum of the squares of its shots, and
+    of the measurement as the solver takes it. ``sums``: of signed patterns, energy by which the halves' sum differs
+    from that of all others. ``halves``: light of a signed pattern's shots. ``digests``: patterns, and which of their
+    shots, by a number that frames which are one and the same share. ``clipped``: of the shots that are, readings at
+    their largest number.
+    """
+
+    counts: tuple[int, int]
+    residual: FloatArray = field(init=False)
+    power: FloatArray = field(init=False)
+    energy: FloatArray = field(init=False)
+    sums: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.residual, self.power, self.energy = (np.zeros(self.counts) for _ in range(3))
+        self.sums = np.zeros(self.counts)
+        self.digests: dict[int, list[tuple[Pattern, int]]] = {}
+        self.clipped: dict[tuple[Pattern, int], int] = {}
+        self.halves: dict[Pattern, tuple[float, float]] = {}
+
+    def add(self, measurement: Measurement, residual: float, power: float, energy: float, total: FloatArray) -> None:
+        """Count in one measurement.
+
+        Parameters
+        ----------
+        measurement
+            which pattern it is of.
+        residual, power, energy
+            of what is left of it, of its shots, and of itself as the solver takes it.
+        total
+            (rows, columns) light of all patterns' shots.
+        """
+        pattern = measurement.row, measurement.column
+        self.residual[pattern], self.power[pattern], self.energy[pattern] = residual, power, energy
+        for half, (digest, clipped) in enumerate(zip(measurement.digests, measurement.clipped, strict=True)):
+            self.digests.setdefault(digest, []).append((pattern, half))
+            if clipped:
+                self.clipped[pattern, half] = clipped
+        if measurement.shots == 2:
+            light, difference = float(measurement.light.sum()), float(measurement.frame.sum())
+            self.halves[pattern] = (light + difference) / 2, (light - difference) / 2
+        others = self.residual.size - 1
+        if measurement.shots == 2 and others:
+            # light - (total - light) / others
+            beyond = (measurement.light * (1 + others) - total) / others
+            self.sums[pattern] = energy_of(beyond)
+
+
+class LeaveOneOut:
+    """Foretells each frame of a run from its others.
+
+    Parameters
+    ----------
+    prepared, weights
+        the factorised model, and W of all measurements.
+    lam
+        lambda of its image.
+    patterns
+        P_L (n, K) and P_R (n', K').
+    manifest
+        of the run.
+    noise
+        of its measurements.
+    measured
+        reads all measurements once more.
+    """
+
+    def __init__(
+        self,
+        prepared: Prepared,
+        weights: FloatArray,
+        lam: float,
+        patterns: tuple[FloatArray, FloatArray],
+        manifest: RunManifest,
+        noise: FrameNoise,
+        measured: Callable[[], Iterable[Measurement]],
+    ) -> None:
+        self.prepared, self.weights, self.noise = prepared, weights, noise
+        self.manifest, self.measured = manifest, measured
+        self.patterns, self.shots = patterns, manifest.patterns.captures
+        self.number = {(shot.row, shot.column, shot.sign): index for index, shot in enumerate(self.shots)}
+        self.signed = any(shot.sign for shot in self.shots)
+        all_lit = [np.flatnonzero((side > 0).all(axis=0)) for side in patterns]
+        self._whole = (int(all_lit[0][0]), int(all_lit[1][0])) if self.signed and all(map(len, all_lit)) else None
+        self.sigma = sigma = np.outer(prepared.left.singular, prepared.right.singular)
+        self._kept = np.divide(np.square(sigma), np.square(sigma) + lam, out=np.zeros_like(sigma), where=sigma > 0)
+        self._periods = tuple(len(group_pixels(side, "block")) for side in patterns)
+        lit = [(side != 0).sum(axis=1) for side in patterns]
+        self.exclusive = bool(max(lit[0]) == 1 and max(lit[1]) == 1) and noise.variance.size > 1
+        self.size = prepared.left.sensor_size * prepared.right.sensor_size
+
+    def columns(self, row: int, column: int) -> Any:
+        """Where the coefficients of the pattern of a ``row`` and a ``column`` are in W."""
+        places = [
+            np.arange(side.accumulated_size)[side.slabs[index].columns]
+            for side, index in ((self.prepared.left, row), (self.prepared.right, column))
+        ]
+        return np.ix_(*places)
+
+    def modelled(self, weights: FloatArray, row: int, column: int) -> FloatArray:
+        """(m, m') the frame of a pattern.
+
+        Parameters
+        ----------
+        weights
+            W.
+        row, column
+            of the pattern.
+        """
+        left, right = self.prepared.left.slabs[row], self.prepared.right.slabs[column]
+        return np.asarray(left.matrix @ weights[left.columns][:, right.columns] @ right.matrix.T)
+
+    def projected(self, frame: FloatArray, row: int, column: int) -> FloatArray:
+        """What a frame adds to W at its columns.
+
+        Parameters
+        ----------
+        frame
+            (m, m') as the solver takes it.
+        row, column
+            of its pattern.
+        """
+        left, right = self.prepared.left.slabs[row], self.prepared.right.slabs[column]
+        return np.asarray(left.matrix.T @ frame @ right.matrix)
+
+    def image(self, weights: FloatArray) -> FloatArray:
+        """(n, n') image of the ``weights`` W at the image's lambda."""
+        filtered = np.divide(self._kept * weights, self.sigma, out=np.zeros_like(weights), where=self.sigma > 0)
+        return self.prepared.image(filtered)
+
+    def _seen(self, image: FloatArray) -> FloatArray:
+        """W of an ``image`` without noise."""
+        duals = [side.basis if side.dual is None else side.dual for side in (self.prepared.left, self.prepared.right)]
+        return np.asarray(self.sigma * (duals[0].T @ image @ duals[1]))
+
+    def lit(self, good: BoolArray) -> BoolArray:
+        """(n, n') pixels that a ``good`` pattern lights."""
+        left, right = ((side != 0).astype(np.float64) for side in self.patterns)
+        return np.asarray(left @ good @ right.T > 0)
+
+    def neighbours(self, image: FloatArray, lit: BoolArray) -> FloatArray:
+        """(n, n') mean of each pixel's neighbours in an ``image``, along sides of several groups, that are ``lit``."""
+        size = [3 if period > 1 else 1 for period in self._periods]
+        light, count = (
+            uniform_filter(values, size, mode="constant") * np.prod(size) - values
+            for values in (image * lit, lit.astype(np.float64))
+        )
+        return np.asarray(np.divide(light, count, out=np.zeros_like(light), where=count > 0.5))
+
+    def measurements(self, patterns: Iterable[Pattern]) -> dict[Pattern, Measurement]:
+        """Those of ``patterns``."""
+        wanted = set(patterns)
+        return {key: each for each in self.measured() if (key := (each.row, each.column)) in wanted}
+
+    def as_solved(self, frame: FloatArray) -> FloatArray:
+        """A ``frame`` as the solver takes it."""
+        return centred(frame) if self.prepared.centre else frame
+
+    def without(self, bad: tuple[Pattern, ...]) -> tuple[FloatArray, float]:
+        """W of all patterns, the ``bad`` ones as the others foretell them, and what it explains of these others'
+        energy."""
+        rest = self.weights.copy()
+        for pattern, measurement in self.measurements(bad).items():
+            rest[self.columns(*pattern)] -= self.projected(self.as_solved(measurement.frame), *pattern)
+        good = np.ones(self.noise.variance.shape, dtype=np.bool_)
+        for pattern in bad:
+            good[pattern] = False
+        image = self.image(self.weights)
+        if not self.exclusive and max(self._periods) > 1:
+            # One pattern of +-1 that is wrong is a comb of the dots' period, without a mean.
+            image = uniform_filter(image, self._periods, mode="nearest")
+        lit = self.lit(good)
+        image = np.where(lit, image, self.neighbours(image, lit))
+        weights = self._seen(image)
+        grams = {
+            pattern: (
+                self.prepared.left.slabs[pattern[0]].matrix.T @ self.prepared.left.slabs[pattern[0]].matrix,
+                self.prepared.right.slabs[pattern[1]].matrix.T @ self.prepared.right.slabs[pattern[1]].matrix,
+            )
+            for pattern in bad
+        }
+
+        def of_bad(values: FloatArray) -> FloatArray:
+            own = np.zeros_like(values)
+            for pattern, (left, right) in grams.items():
+                places = self.columns(*pattern)
+                own[places] += left @ values[places] @ right
+            return own
+
+        if self.exclusive:
+            weights = np.asarray(rest + of_bad(weights))
+            return weights, float(np.vdot(weights, rest))
+        # W - of_bad(W) = rest are the normal equations of the good ones: conjugate gradients after Hestenes and Stiefel
+        # (1952), until a step brings these frames less than chance does.
+        enough = _SETTLED * CHANCE * float(self.noise.variance.mean()) * np.sqrt(2 * self.size)
+        left_over = rest + of_bad(weights) - weights
+        step, squared = left_over.copy(), energy_of(left_over)
+        for _ in range(_MOST_STEPS):
+            moved = step - of_bad(step)
+            curvature = float(np.vdot(step, moved))
+            if not curvature > 0:
+                break
+            length = squared / curvature
+            weights = weights + length * step
+            if length * squared < enough:
+                break
+            left_over -= length * moved
+            before, squared = squared, energy_of(left_over)
+            step = left_over + squared / before * step
+        return weights, float(np.vdot(weights, rest))
+
+    def gathered(self, weights: FloatArray, bad: Iterable[Pattern]) -> FrameSums:
+        """Sums of all measurements against other ``weights``; the light of all is that of those not ``bad``."""
+        sums = FrameSums((self.noise.variance.shape[0], self.noise.variance.shape[1]))
+        total = np.zeros(0)
+        if self.signed:
+            total = sum((each.light for each in self.measurements(self._good(bad)).values()), start=np.zeros(()))
+        others = max(self.noise.variance.size - len(set(bad)), 2)
+        for each in self.measured():
+            pattern, frame = (each.row, each.column), self.as_solved(each.frame)
+            residual = frame - self.modelled(weights, each.row, each.column)
+            sums.residual[pattern], sums.power[pattern] = energy_of(residual), each.power
+            sums.energy[pattern] = energy_of(frame)
+            if self.signed:
+                sums.sums[pattern] = energy_of((each.light * others - total) / (others - 1))
+        return sums
+
+    def _good(self, bad: Iterable[Pattern]) -> set[Pattern]:
+        return set(np.ndindex(self.noise.variance.shape)) - set(bad)
+
+    def fault(self, fault: Fault, numbers: Iterable[int], words: str) -> FrameFault:
+        """That.
+
+        Parameters
+        ----------
+        fault, numbers, words
+            as :class:`FrameFault` takes them, the files apart.
+        """
+        numbers = tuple(sorted(numbers))
+        files = tuple(self.shots[number].file for number in numbers)
+        return FrameFault(fault, numbers, files, f"{listed(numbers, files)} {words}")
+
+
+def energy_of(values: FloatArray) -> float:
+    """Sum of the squares of ``values``, any shape."""
+    flat = np.ascontiguousarray(values).ravel()
+    return float(np.dot(flat, flat))
