@@ -45,7 +45,8 @@ from mitsim.reconstruct.calibration import (
     stripe_sums,
 )
 from mitsim.reconstruct.factors import Factors, load_calibration
-from mitsim.reconstruct.session_faults import Checked, check_session, frame_words
+from mitsim.reconstruct.session_faults import Checked, check_session
+from mitsim.reconstruct.session_findings import frame_words
 from mitsim.rig.order import SIDES
 from mitsim.rig.recipe import SessionRecipe, load_recipe
 

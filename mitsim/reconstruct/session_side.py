@@ -1,0 +1,296 @@
+"""Vectors of one side's stripe patterns in; those that are out of their place put back, those that are wrong left out.
+
+What a pattern's vector should be, the others foretell, as all are of one moving shadow
+(:mod:`mitsim.reconstruct.moving_shadow`). Where that is a shadow of nothing, and columns are independent, nothing is
+foretold and nothing is found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.reconstruct.calibration import StripeSums
+from mitsim.reconstruct.moving_shadow import MovingShadow
+from mitsim.reconstruct.session_findings import DARK, Fault, dimmed, frame_words
+from mitsim.rig import order
+from mitsim.rig.order import SIDES, UNIFORM, Half
+
+MOST_FAULTS = 0.1
+"""Part of the patterns that may be wrong before the session is refused: with more, what most share is in doubt."""
+_ENOUGH = 16, 64
+"""Patterns, and sensor rows, from which columns' covariance is known well enough."""
+_DEVIATIONS = 8.0
+"""Deviations of a misfit from the others, by their robust scatter, that make a fault."""
+_UNEXPLAINED = 0.05
+"""Part of a response's energy, beyond the others' noise, that no separable camera explains where it is a fault: 22 %
+of its amplitude."""
+_FAR, _UNLIKE = 25.0, 0.1
+"""Squared deviation of a vector from the foretold one, in that of the median pattern, and as a part of its own square,
+from which it is wrong."""
+_GAIN = 3.0
+"""What putting patterns in their place must take off the squared deviations, in that of the median one, at least."""
+_EXPLAINED, _BOTH = 0.7, 1.1
+"""What that is at least of the squared deviation of the pattern that is wrong, and of the larger of two: one that is
+black, dim or a repeat fits better in another's place too, but the other one not in its."""
+_TRIED = 64
+"""Patterns among which swaps are tried, those that deviate most."""
+_SAME = 4.0
+"""Squared distance of two vectors, in the noise of one, up to which they show the same: noise makes 2."""
+_SEEN = 64.0
+"""Squared length of a vector, over its noise, from which another that equals it is no chance: both are seen."""
+_FLOOR = 0.02
+"""Relative error of a factor that its columns' covariance is taken to have at least, as it is no exact law; chosen."""
+_TURNS = 8
+"""Steps that foretell left-out patterns with a covariance free of them, which has their foretold variance in their
+place; where another pattern of the same period is known, each step takes off half of the error."""
+
+
+class Side:
+    """One side of a session while it is checked: ``vectors`` (m, N) as they are repaired so far.
+
+    Attributes
+    ----------
+    sums, signs
+        as they came in; H (n, N).
+    side
+        ``horizontal`` or ``vertical``.
+    vectors
+        (m, N) as repaired so far.
+    faults
+        that were found.
+    uncounted
+        responses whose misfit does not count.
+    unknown
+        patterns whose vector the others must foretell.
+    extras
+        (N,) squared error of each vector beyond its noise.
+    """
+
+    def __init__(self, sums: StripeSums, signs: FloatArray) -> None:
+        self.sums, self.signs = sums, signs
+        self.side: order.Side = "horizontal" if sums.side == SIDES[0] else "vertical"
+        self.vectors = sums.vectors
+        self.faults: list[Fault] = []
+        self.uncounted: set[int] = set()
+        self.unknown: set[int] = set()
+        self._settled: set[int] = set()
+        self.extras = np.zeros(sums.vectors.shape[1])
+
+    @property
+    def length(self) -> int:
+        """Sensor rows, or columns."""
+        return len(self.vectors)
+
+    @property
+    def pairs(self) -> bool:
+        """Whether a pattern has two frames."""
+        return self.sums.pairs is not None
+
+    @property
+    def noise(self) -> float:
+        """Squared noise of one pattern's vector, all numbers together, from the responses' median misfit."""
+        spare = self.length * (len(self.sums.common) - 1)
+        squared = float(np.median(self.sums.misfits)) / max(spare, 1)
+        return squared * self.length / float(np.dot(self.sums.common, self.sums.common))
+
+    def change(self, index: int, vector: FloatArray) -> None:
+        """Put a ``vector`` in place of a pattern's own."""
+        if self.vectors is self.sums.vectors:
+            self.vectors = self.vectors.copy()
+        self.vectors[:, index] = vector
+
+    def rescale(self, factor: float) -> None:
+        """Make the uniform response's share in all vectors smaller by ``factor``, and them larger."""
+        self.vectors = self.vectors * factor
+
+    def result(self) -> StripeSums:
+        """The sums with what was changed."""
+        if self.vectors is self.sums.vectors and not self.uncounted:
+            return self.sums
+        kept = np.setdiff1d(np.arange(self.sums.done), sorted(self.uncounted))
+        return replace(
+            self.sums,
+            vectors=self.vectors,
+            misfit=float(self.sums.misfits[kept].sum()),
+            energy=float(self.sums.energies[kept].sum()),
+        )
+
+    def check(self) -> None:
+        """Find patterns that show no stripes, are out of their place or are not what others foretell."""
+        self._check_misfits()
+        count = self.signs.shape[1]
+        if count < _ENOUGH[0] or self.length < _ENOUGH[1]:
+            for index in self.unknown:
+                self._forget(index)
+            return
+        for index in sorted(self.unknown):
+            self._foretell(index)
+        for _ in range(int(MOST_FAULTS * count) + 2):
+            if not self._mend():
+                break
+
+    def _check_misfits(self) -> None:
+        """Responses that hold much that no separable camera explains, where the others do not."""
+        misfits, energies = self.sums.misfits, self.sums.energies
+        middle = float(np.median(misfits))
+        scatter = 1.4826 * float(np.median(np.abs(misfits - middle)))
+        excess = misfits - middle - max(_UNEXPLAINED * float(np.median(energies)), _DEVIATIONS * scatter)
+        for index in np.flatnonzero(excess > _UNEXPLAINED * energies):
+            if index in self.uncounted or index in self.unknown:
+                continue
+            if np.median(misfits / np.maximum(energies, 1e-300)) > _UNEXPLAINED and misfits[index] < 4 * middle:
+                continue
+            part = misfits[index] / energies[index]
+            detail = f"shows no {self.side} stripes: {part:.0%} of its response is of other shape"
+            self._add(int(index), "wrong", detail, "it is left out")
+            self.unknown.add(int(index))
+            self.uncounted.add(int(index))
+
+    def _add(self, index: int, kind: str, detail: str, repair: str, other: Half | None = None) -> None:
+        self.faults.append(Fault(self.side, index, None if self.pairs else 1, kind, detail, repair, other))
+
+    # ---- patterns that do not fit the others -------------------------------------------------------------------------
+
+    def _mend(self) -> bool:
+        """Whether a pattern was wrong, the one whose exchange or swap makes most fit, or that fits least."""
+        shadow = MovingShadow(self.vectors, self.signs, self.unknown)
+        fixed = np.zeros(self.sums.done, dtype=bool)
+        fixed[[0, *self.unknown]] = True
+        deviations = np.where(fixed, 0.0, shadow.deviations)
+        fixed[list(self._settled)] = True
+        exchanges = np.where(fixed | (shadow.by_exchange < _EXPLAINED * deviations), -np.inf, shadow.by_exchange)
+        flip = int(np.argmax(exchanges))
+        gain, places = float(exchanges[flip]), [flip]
+        if deviations.max() > _FAR:
+            swaps, pairs = self._swaps(shadow, np.where(fixed, -np.inf, shadow.deviations))
+            best = int(np.argmax(swaps))
+            if swaps[best] > gain:
+                gain, places = float(swaps[best]), [*pairs[best]]
+        deviations[shadow.unlike < _UNLIKE] = 0.0
+        worst = int(np.argmax(deviations))
+        far = bool(deviations[worst] > _FAR)
+        if gain > _GAIN and not (far and gain < _EXPLAINED * deviations[worst]):
+            self._put_in_place(places)
+        elif far:
+            self._replace(worst, shadow)
+        else:
+            return False
+        return True
+
+    @staticmethod
+    def _swaps(shadow: MovingShadow, deviations: FloatArray) -> tuple[FloatArray, list[tuple[int, int]]]:
+        """What swaps of those that deviate most take off, and what is swapped."""
+        tried = np.sort([index for index in np.argsort(-deviations)[:_TRIED] if np.isfinite(deviations[index])])
+        pairs = [(int(one), int(other)) for place, one in enumerate(tried) for other in tried[place + 1 :]]
+        gains = shadow.by_swap(pairs)
+        least = [_BOTH * max(deviations[one], deviations[other]) for one, other in pairs]
+        return np.where(gains < least, -np.inf, gains), pairs
+
+    def _put_in_place(self, places: list[int]) -> None:
+        """Exchange the frames of one pattern, or swap two."""
+        first, *rest = places
+        moved = self.vectors.copy()
+        moved[:, places] = self.vectors[:, places[::-1]] if rest else -self.vectors[:, places]
+        self.vectors = moved
+        self._settled.update(places)
+        if rest:
+            detail = f"is swapped with {self.side} stripes {rest[0]}"
+            self._add(first, "swapped", detail, "both count in their right order", (self.side, rest[0], UNIFORM))
+        elif not self.pairs:
+            self._add(first, "exchanged", "shows black where white should be", "it counts with its sign")
+        elif not self._turned(first):
+            self._add(first, "exchanged", "has its two frames exchanged", "they count in their right order")
+
+    def _turned(self, index: int) -> bool:
+        """Whether a pattern's faulty frame is the other one of its pair: a frame may repeat the other, or that it."""
+        for place, fault in enumerate(self.faults):
+            if fault.index == index and fault.sign is not None:
+                other, detail = fault.other, fault.detail
+                if other is not None and other[:2] == (self.side, index):
+                    other = self.side, index, fault.sign
+                    detail = f"repeats {frame_words(other)}"
+                self.faults[place] = replace(fault, sign=-fault.sign, detail=detail, other=other)
+                return True
+        return False
+
+    def _replace(self, index: int, shadow: MovingShadow) -> None:
+        """Put what the others foretell in place of a pattern that does not fit them; a dim frame is made brighter."""
+        kind, detail, other = self._named(index)
+        self.faults = [fault for fault in self.faults if fault.index != index]
+        self.uncounted.add(index)
+        if kind == "wrong" and not self.pairs and shadow.by_scale(index)[0] > _EXPLAINED * shadow.deviations[index]:
+            part = self._brightened(index)
+            self._add(index, *dimmed(part), "its numbers are divided by that")
+            return
+        self.unknown.add(index)
+        self._foretell(index)
+        self._add(index, kind, detail, "it is left out", other)
+
+    def _named(self, index: int) -> tuple[str, str, Half | None]:
+        """What a pattern shows instead of its own stripes."""
+        own, light = self.vectors[:, index], self.vectors[:, 0]
+        away = np.square(own[:, None] - self.vectors).sum(axis=0)
+        away[index] = np.inf
+        nearest = int(np.argmin(away))
+        if not self.pairs and np.linalg.norm(own + light) / 2 < DARK * np.linalg.norm(light):
+            return "black", "is black", None
+        if away[nearest] < _SAME * self.noise and np.square(own).sum() > _SEEN * self.noise:
+            return "repeated", f"repeats {self.side} stripes {nearest}", (self.side, nearest, 1)
+        return "wrong", "does not fit the other patterns", None
+
+    def _brightened(self, index: int) -> float:
+        """Divide a frame against one uniform one by the part of its light that it has, which is returned."""
+        light, shown, scale = self.vectors[:, 0], self.vectors[:, index] + self.vectors[:, 0], 1.0
+        self._settled.add(index)
+        error = 0.0
+        for _ in range(_TURNS):  # with the covariance that results
+            _, more, deviation = MovingShadow(self.vectors, self.signs, self.unknown).by_scale(index)
+            scale *= more
+            self.change(index, scale * shown - light)
+            error = deviation * float(np.linalg.norm(scale * shown))
+        self.extras[index] = error**2 + max(scale**2 - 1, 0.0) * self.noise
+        return 1 / scale
+
+    # ---- what others foretell of a pattern ---------------------------------------------------------------------------
+
+    def _forget(self, index: int) -> None:
+        """Leave a pattern out where nothing foretells it; its error is then its own size, which the others' tells."""
+        others = np.delete(self.vectors[:, 1:], index - 1, axis=1) if index else self.vectors[:, 1:]
+        self.extras[index] = float(np.square(others).sum(axis=0).mean()) if others.size else 0.0
+        self.change(index, np.zeros(self.length))
+
+    def _foretell(self, index: int) -> None:
+        """Leave a pattern out: in its place comes what the others foretell, and the error of that counts.
+
+        Of columns as they are, and not moved back: those that are would foretell more, but for the sensor's ends.
+        """
+        self.change(index, np.zeros(self.length))
+        variance = 0.0
+        for _ in range(_TURNS):
+            precision = self._precision(index, variance)
+            row = precision[index].copy()
+            variance, row[index] = float(1 / row[index]), 0.0
+            self.change(index, -self.vectors @ row * variance)
+        self.extras[index] = variance * self.length
+
+    def _precision(self, index: int, variance: float) -> FloatArray:
+        """(N, N) inverse covariance of the patterns' vectors, that of columns being a function of their distance; the
+        vector of a pattern has a ``variance`` round what it is."""
+        n, count = self.signs.shape
+        columns = self.vectors @ self.signs.T / count
+        covariance = columns.T @ columns / self.length
+        covariance += variance / count**2 * np.outer(self.signs[:, index], self.signs[:, index])
+        by_distance = np.array([np.trace(covariance, lag) / (n - lag) for lag in range(n)])
+        values, modes = np.linalg.eigh(by_distance[np.abs(np.subtract.outer(np.arange(n), np.arange(n)))])
+        values = np.maximum(values, 0.0) + _FLOOR**2 * by_distance[0] * n / count
+        shown = self.signs.T @ modes
+        whole = (shown * values) @ shown.T
+        if not whole.any():
+            return np.eye(count)
+        # Where H has more columns than rows and nothing is noise, patterns depend on each other to the last digit.
+        whole[np.diag_indices(count)] += (self.noise + self.extras) / self.length
+        whole[np.diag_indices(count)] += 1e-9 * np.trace(whole) / count
+        return np.asarray(np.linalg.inv(whole))
