@@ -309,11 +309,17 @@ def checked_estimates(
                 checkpoint.save(_STRIPES, stripes.arrays())
     drift = session.recipe.drift
     # Who states that the lamp drifts asks what that costs, which is gone once it is divided out.
-    steady = not (drift.session_ramp or drift.session_flicker)
+    unsteady = bool(drift.session_ramp or drift.session_flicker)
     with job.clock.stage("estimate"):
         judged = [
-            check_session(stripes.sums[kind], session.signs, session.order, saturated=bool(stripes.saturated))
-            if kind == NOISY and steady
+            check_session(
+                stripes.sums[kind],
+                session.signs,
+                session.order,
+                saturated=bool(stripes.saturated),
+                unsteady=unsteady,
+            )
+            if kind == NOISY
             else Checked(stripes.sums[kind])
             for kind in kinds
         ]

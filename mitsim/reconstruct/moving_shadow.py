@@ -61,6 +61,8 @@ class MovingShadow:
         (N,) mean squared deviation of a vector from what the others foretell, in that of the median pattern.
     unlike
         (N,) the same squared deviation as a part of the vector's own square.
+    first_line
+        the same deviation of the first column, which errors that all patterns share make, in that of the median column.
     by_exchange
         (N,) what -u_i in place of u_i takes off the squared deviations of all vectors, in the same unit.
     """
@@ -82,6 +84,7 @@ class MovingShadow:
         self._signs = signs
         self._own = own = self._joint(n / count**2, self._shown)
         self._left = self._beyond(modes, turned, columns)
+        self.first_line = _first_line(modes, self._left @ signs.T)
         for index in [*unknown] * _TURNS:
             spectra[:, index] -= self._left[:, index] / own[:, index]
             self._left = self._beyond(modes, turned, spectra @ signs.T / count)
@@ -100,8 +103,8 @@ class MovingShadow:
 
     @staticmethod
     def _joint(size: FloatArray | float, shown: ComplexArray) -> FloatArray:
-        """(frequencies, patterns) squared length of patterns beyond the modes, of their ``size`` (patterns,) and of what
-        they have ``shown`` of the modes (frequencies, modes, patterns)."""
+        """(frequencies, patterns) squared length of patterns beyond the modes, of their whole ``size`` (patterns,) and
+        of what they have ``shown`` of the modes (frequencies, modes, patterns)."""
         rest = size - np.square(shown.real).sum(axis=1) - np.square(shown.imag).sum(axis=1)
         return np.asarray(np.maximum(rest, 1e-9 * size))
 
@@ -142,6 +145,14 @@ def _modes(angles: FloatArray, step: float, n: int) -> ComplexArray:
     slow = np.polynomial.legendre.legvander(np.linspace(-1, 1, n), degree)
     phases = [np.exp(1j * step * np.outer(2 * np.pi * turns + sign * angles, np.arange(n))) for turns, sign in _MOVES]
     return np.asarray(np.linalg.qr(np.concatenate([phase[..., None] * slow for phase in phases], axis=2))[0])
+
+
+def _first_line(modes: ComplexArray, rest: ComplexArray) -> float:
+    """Squared deviation of the first of columns, in the median column's, of the ``rest`` (frequencies, n) that modes
+    leave of them."""
+    kept = np.maximum(1 - np.square(np.abs(modes)).sum(axis=2), 1e-3)
+    lines = (np.square(np.abs(rest)) / kept).sum(axis=0)
+    return float(lines[0] / (np.median(lines) or 1.0))
 
 
 def _taper(pixels: int) -> FloatArray:

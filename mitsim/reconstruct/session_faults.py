@@ -88,6 +88,7 @@ def check_session(
     clipped: Callable[[Half], bool] = lambda half: False,
     uniform_given: bool = False,
     saturated: bool = False,
+    unsteady: bool = False,
 ) -> Checked:
     """What of a session can be believed.
 
@@ -107,6 +108,8 @@ def check_session(
     saturated
         whether frames have saturated pixels, which make many pairs add up to less; those sessions are flagged for it,
         and not refused.
+    unsteady
+        whether it is stated that the lamp is, so that its power is neither divided out nor said.
 
     Raises
     ------
@@ -119,7 +122,7 @@ def check_session(
         pairs = Pairs(work, order, clipped)
         if saturated and pairs.many:
             return Checked(sums)
-        lamp = pairs.check()
+        lamp = pairs.check(not unsteady)
     at_first = [fault for own in work for fault in own.faults if fault.index == 0]
     if at_first and not uniform_given:
         return Checked(sums, at_first)

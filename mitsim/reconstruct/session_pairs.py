@@ -150,12 +150,13 @@ class Pairs:
         """Those of the ``values`` (2 N,) that belong to a side."""
         return np.asarray(values[number * self.count : (number + 1) * self.count])
 
-    def check(self) -> Lamp:
-        """Find faulty frames, put what their pairs foretell in their place, and find how steady the lamp is."""
+    def check(self, steady: bool = True) -> Lamp:
+        """Find faulty frames, put what their pairs foretell in their place, and find how steady the lamp is, where it
+        should be ``steady``."""
         bad = ~self.good
         if self.many:
             self._refuse(int(bad.sum()))
-        lamp = self._correct()
+        lamp = self._correct() if steady else Lamp()
         for place in np.flatnonzero(bad):
             self._repair(self.sides[place // self.count], int(place // self.count), int(place % self.count), lamp)
         for own, pairs in zip(self.sides, self.pairs, strict=True):

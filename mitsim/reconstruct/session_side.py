@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.calibration import StripeSums
 from mitsim.reconstruct.moving_shadow import MovingShadow
 from mitsim.reconstruct.session_findings import DARK, Fault, dimmed, frame_words
@@ -27,14 +28,18 @@ _DEVIATIONS = 8.0
 _UNEXPLAINED = 0.05
 """Part of a response's energy, beyond the others' noise, that no separable camera explains where it is a fault: 22 %
 of its amplitude."""
-_FAR, _UNLIKE = 25.0, 0.1
+_FAR, _UNLIKE = 10.0, 0.05
 """Squared deviation of a vector from the foretold one, in that of the median pattern, and as a part of its own square,
 from which it is wrong."""
+_FAR_LINE = 15.0
+"""Squared deviation of the first scene line's column, in that of the median one, from which the frame that all patterns
+are held against is wrong, as its error is in that column alone: of 56 good sides none has 8, a uniform frame of 0.95 or
+1.05 of its light made 20 at least."""
 _GAIN = 3.0
 """What putting patterns in their place must take off the squared deviations, in that of the median one, at least."""
-_EXPLAINED, _BOTH = 0.7, 1.1
-"""What that is at least of the squared deviation of the pattern that is wrong, and of the larger of two: one that is
-black, dim or a repeat fits better in another's place too, but the other one not in its."""
+_EXPLAINED = 0.7
+"""What that is at least of the squared deviation of the pattern that is wrong. Of two, it is more than either's: one
+that is black, dim or a repeat fits better in another's place, but the other one not in its."""
 _TRIED = 64
 """Patterns among which swaps are tried, those that deviate most."""
 _SAME = 4.0
@@ -157,6 +162,11 @@ class Side:
     def _mend(self) -> bool:
         """Whether a pattern was wrong, the one whose exchange or swap makes most fit, or that fits least."""
         shadow = MovingShadow(self.vectors, self.signs, self.unknown)
+        if not self.pairs and shadow.first_line > _FAR_LINE:
+            raise MitsimError(
+                f"{self.side} stripes: their uniform frame, or a dark frame, is not of the light that their patterns "
+                "are of; look at these, and take the session again"
+            )
         fixed = np.zeros(self.sums.done, dtype=bool)
         fixed[[0, *self.unknown]] = True
         deviations = np.where(fixed, 0.0, shadow.deviations)
@@ -186,7 +196,7 @@ class Side:
         tried = np.sort([index for index in np.argsort(-deviations)[:_TRIED] if np.isfinite(deviations[index])])
         pairs = [(int(one), int(other)) for place, one in enumerate(tried) for other in tried[place + 1 :]]
         gains = shadow.by_swap(pairs)
-        least = [_BOTH * max(deviations[one], deviations[other]) for one, other in pairs]
+        least = [max(deviations[one], deviations[other]) for one, other in pairs]
         return np.where(gains < least, -np.inf, gains), pairs
 
     def _put_in_place(self, places: list[int]) -> None:
