@@ -119,23 +119,15 @@ class MovingShadow:
         change = 2 * np.real(moved.conj() * left) + np.square(np.abs(moved)) * size
         return np.asarray(-change.sum(axis=0) / self._unit)
 
-    def by_scale(self, index: int) -> tuple[float, float, float]:
-        """What it takes off to scale a frame that is shown against the uniform one, whose vector is u_i + u_0; the
-        scale; and its standard deviation.
-
-        Parameters
-        ----------
-        index
-            of the pattern.
-        """
-        shown = self._spectra[:, index] + self._spectra[:, 0]
-        pull = float(np.sum(np.real(shown.conj() * self._left[:, index])))
-        size = float(np.sum(np.square(np.abs(shown)) * self._own[:, index]))
-        if size == 0:
-            return 0.0, 1.0, 0.0
+    def by_scale(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(N,) what it takes off to scale a frame that is shown against the uniform one, whose vector is u_i + u_0; the
+        scale; and its standard deviation; for each pattern."""
+        shown = self._spectra + self._spectra[:, :1]
+        pull = np.real(shown.conj() * self._left).sum(axis=0)
+        size = np.maximum((np.square(np.abs(shown)) * self._own).sum(axis=0), np.finfo(np.float64).tiny)
         # A pattern's deviation is a sum over twice as many numbers as there are frequencies.
         deviation = np.sqrt(self._unit / (2 * len(shown) * size))
-        return pull**2 / size / self._unit, 1 - pull / size, float(deviation)
+        return np.square(pull) / size / self._unit, 1 - pull / size, deviation
 
 
 def _modes(angles: FloatArray, step: float, n: int) -> ComplexArray:

@@ -127,7 +127,7 @@ def check_session(
     if at_first and not uniform_given:
         return Checked(sums, at_first)
     for own in work:
-        own.check()
+        own.check(unsteady)
     faults = [fault for own in work for fault in own.faults]
     count = signs.shape[1]
     wrong = {(fault.side, fault.index) for fault in faults}

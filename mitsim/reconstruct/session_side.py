@@ -28,9 +28,10 @@ _DEVIATIONS = 8.0
 _UNEXPLAINED = 0.05
 """Part of a response's energy, beyond the others' noise, that no separable camera explains where it is a fault: 22 %
 of its amplitude."""
-_FAR, _UNLIKE = 10.0, 0.05
-"""Squared deviation of a vector from the foretold one, in that of the median pattern, and as a part of its own square,
-from which it is wrong."""
+_FAR = 10.0
+"""Squared deviation of a vector from the foretold one, in that of the median pattern, from which it is suspected."""
+_WRONG, _UNLIKE = 30.0, 0.5
+"""The same, and that deviation as a part of the vector's own square, from which it is wrong whatever it shows."""
 _FAR_LINE = 15.0
 """Squared deviation of the first scene line's column, in that of the median one, from which the frame that all patterns
 are held against is wrong, as its error is in that column alone: of 56 good sides none has 8, a uniform frame of 0.95 or
@@ -123,8 +124,14 @@ class Side:
             energy=float(self.sums.energies[kept].sum()),
         )
 
-    def check(self) -> None:
-        """Find patterns that show no stripes, are out of their place or are not what others foretell."""
+    def check(self, unsteady: bool = False) -> None:
+        """Find patterns that show no stripes, are out of their place or are not what others foretell.
+
+        Parameters
+        ----------
+        unsteady
+            whether the lamp is known to be: frames against one uniform one may then be of any light.
+        """
         self._check_misfits()
         count = self.signs.shape[1]
         if count < _ENOUGH[0] or self.length < _ENOUGH[1]:
@@ -134,7 +141,7 @@ class Side:
         for index in sorted(self.unknown):
             self._foretell(index)
         for _ in range(int(MOST_FAULTS * count) + 2):
-            if not self._mend():
+            if not self._mend(self.pairs or not unsteady):
                 break
 
     def _check_misfits(self) -> None:
@@ -159,10 +166,11 @@ class Side:
 
     # ---- patterns that do not fit the others -------------------------------------------------------------------------
 
-    def _mend(self) -> bool:
-        """Whether a pattern was wrong, the one whose exchange or swap makes most fit, or that fits least."""
+    def _mend(self, steady: bool) -> bool:
+        """Whether a pattern was wrong: the one whose exchange or swap makes most fit, or, of ``steady`` light, that
+        fits least."""
         shadow = MovingShadow(self.vectors, self.signs, self.unknown)
-        if not self.pairs and shadow.first_line > _FAR_LINE:
+        if steady and not self.pairs and shadow.first_line > _FAR_LINE:
             raise MitsimError(
                 f"{self.side} stripes: their uniform frame, or a dark frame, is not of the light that their patterns "
                 "are of; look at these, and take the session again"
@@ -170,6 +178,9 @@ class Side:
         fixed = np.zeros(self.sums.done, dtype=bool)
         fixed[[0, *self.unknown]] = True
         deviations = np.where(fixed, 0.0, shadow.deviations)
+        if steady and not self.pairs and self._one_frame(shadow, deviations):
+            return True
+        worst = int(np.argmax(np.where(shadow.unlike > _UNLIKE, deviations, 0.0)))
         fixed[list(self._settled)] = True
         exchanges = np.where(fixed | (shadow.by_exchange < _EXPLAINED * deviations), -np.inf, shadow.by_exchange)
         flip = int(np.argmax(exchanges))
@@ -179,15 +190,38 @@ class Side:
             best = int(np.argmax(swaps))
             if swaps[best] > gain:
                 gain, places = float(swaps[best]), [*pairs[best]]
-        deviations[shadow.unlike < _UNLIKE] = 0.0
-        worst = int(np.argmax(deviations))
-        far = bool(deviations[worst] > _FAR)
-        if gain > _GAIN and not (far and gain < _EXPLAINED * deviations[worst]):
+        if gain > _GAIN:
             self._put_in_place(places)
-        elif far:
-            self._replace(worst, shadow)
+        elif steady and deviations[worst] > _WRONG and shadow.unlike[worst] > _UNLIKE:
+            self._leave_out(worst, "wrong", "does not fit the other patterns")
         else:
             return False
+        return True
+
+    def _one_frame(self, shadow: MovingShadow, deviations: FloatArray) -> bool:
+        """Whether a frame that is shown against a uniform one was black, the same as another, or dim."""
+        far = np.flatnonzero(deviations > _FAR)
+        light = self.vectors[:, 0]
+        for index in far[np.argsort(-deviations[far])]:
+            own = self.vectors[:, index]
+            if np.linalg.norm(own + light) / 2 < DARK * np.linalg.norm(light):
+                self._leave_out(int(index), "black", "is black")
+                return True
+            away = np.square(own[:, None] - self.vectors).sum(axis=0)
+            away[index] = np.inf
+            nearest = int(np.argmin(away))
+            if away[nearest] < _SAME * self.noise and np.square(own).sum() > _SEEN * self.noise:
+                self._leave_out(
+                    int(index), "repeated", f"repeats {self.side} stripes {nearest}", (self.side, nearest, 1)
+                )
+                return True
+        gains = np.where(shadow.by_scale()[0] > _EXPLAINED * deviations, shadow.by_scale()[0], 0.0)
+        gains[list(self._settled)] = 0.0
+        index = int(np.argmax(gains))
+        if gains[index] <= max(_FAR, float(np.max(shadow.by_exchange[1:]))):
+            return False
+        part = self._brightened(index)
+        self._add(index, *dimmed(part), "its numbers are divided by that")
         return True
 
     @staticmethod
@@ -226,30 +260,13 @@ class Side:
                 return True
         return False
 
-    def _replace(self, index: int, shadow: MovingShadow) -> None:
-        """Put what the others foretell in place of a pattern that does not fit them; a dim frame is made brighter."""
-        kind, detail, other = self._named(index)
+    def _leave_out(self, index: int, kind: str, detail: str, other: Half | None = None) -> None:
+        """Put what the others foretell in place of a pattern."""
         self.faults = [fault for fault in self.faults if fault.index != index]
         self.uncounted.add(index)
-        if kind == "wrong" and not self.pairs and shadow.by_scale(index)[0] > _EXPLAINED * shadow.deviations[index]:
-            part = self._brightened(index)
-            self._add(index, *dimmed(part), "its numbers are divided by that")
-            return
         self.unknown.add(index)
         self._foretell(index)
         self._add(index, kind, detail, "it is left out", other)
-
-    def _named(self, index: int) -> tuple[str, str, Half | None]:
-        """What a pattern shows instead of its own stripes."""
-        own, light = self.vectors[:, index], self.vectors[:, 0]
-        away = np.square(own[:, None] - self.vectors).sum(axis=0)
-        away[index] = np.inf
-        nearest = int(np.argmin(away))
-        if not self.pairs and np.linalg.norm(own + light) / 2 < DARK * np.linalg.norm(light):
-            return "black", "is black", None
-        if away[nearest] < _SAME * self.noise and np.square(own).sum() > _SEEN * self.noise:
-            return "repeated", f"repeats {self.side} stripes {nearest}", (self.side, nearest, 1)
-        return "wrong", "does not fit the other patterns", None
 
     def _brightened(self, index: int) -> float:
         """Divide a frame against one uniform one by the part of its light that it has, which is returned."""
@@ -257,10 +274,10 @@ class Side:
         self._settled.add(index)
         error = 0.0
         for _ in range(_TURNS):  # with the covariance that results
-            _, more, deviation = MovingShadow(self.vectors, self.signs, self.unknown).by_scale(index)
-            scale *= more
+            _, more, deviation = MovingShadow(self.vectors, self.signs, self.unknown).by_scale()
+            scale *= float(more[index])
             self.change(index, scale * shown - light)
-            error = deviation * float(np.linalg.norm(scale * shown))
+            error = float(deviation[index] * np.linalg.norm(scale * shown))
         self.extras[index] = error**2 + max(scale**2 - 1, 0.0) * self.noise
         return 1 / scale
 
