@@ -310,6 +310,8 @@ def checked_estimates(
     drift = session.recipe.drift
     # Who states that the lamp drifts asks what that costs, which is gone once it is divided out.
     unsteady = bool(drift.session_ramp or drift.session_flicker)
+    sensor = session.bench.sensor
+    step = 0.0 if sensor.largest_dn is None else 1 / sensor.gain_dn_per_e / lit.exposure_s
     with job.clock.stage("estimate"):
         judged = [
             check_session(
@@ -318,6 +320,7 @@ def checked_estimates(
                 session.order,
                 saturated=bool(stripes.saturated),
                 unsteady=unsteady,
+                step=step,
             )
             if kind == NOISY
             else Checked(stripes.sums[kind])

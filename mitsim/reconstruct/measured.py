@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -362,12 +362,19 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Ch
     session = readings.session
     signs = stripe_signs(session.listed.n).astype(np.float64)
     sums, variances = _sums(readings, signs.shape[1], job)
-    found = check_session(sums, signs, session.order, readings.clipped, saturated=bool(readings.saturated))
+    digital = session.listed.digital
+    check = partial(
+        check_session,
+        signs=signs,
+        order=session.order,
+        clipped=readings.clipped,
+        saturated=bool(readings.saturated),
+        step=(digital.step_dn or 0.0) / digital.gain_dn_per_e / digital.exposure_s,
+    )
+    found = check(sums)
     if wrong := found.wrong_uniform():
         sums, variances = _sums(readings, signs.shape[1], job, found.other_uniform(wrong))
-        found = check_session(
-            sums, signs, session.order, readings.clipped, uniform_given=True, saturated=bool(readings.saturated)
-        )
+        found = check(sums, uniform_given=True)
     noise = float(np.sqrt(max(float(np.mean(variances)), 0.0))) if session.listed.digital.noise_is_stated else None
     with job.clock.stage("estimate"):
         return found.estimate(signs, noise), noise, found

@@ -61,6 +61,8 @@ class MovingShadow:
         (N,) mean squared deviation of a vector from what the others foretell, in that of the median pattern.
     unlike
         (N,) the same squared deviation as a part of the vector's own square.
+    amended
+        (N,) squared length of what was taken for unknown vectors less those that were given.
     first_line
         the same deviation of the first column, which errors that all patterns share make, in that of the median column.
     by_exchange
@@ -85,9 +87,13 @@ class MovingShadow:
         self._own = own = self._joint(n / count**2, self._shown)
         self._left = self._beyond(modes, turned, columns)
         self.first_line = _first_line(modes, self._left @ signs.T)
+        before = spectra.copy() if unknown else spectra
         for index in [*unknown] * _TURNS:
             spectra[:, index] -= self._left[:, index] / own[:, index]
             self._left = self._beyond(modes, turned, spectra @ signs.T / count)
+        # Sums over positive frequencies, twice, are those over as many sensor rows as the taper leaves.
+        whole = 2 * stride / float(np.square(taper).sum())
+        self.amended = whole * np.square(np.abs(spectra - before)).sum(axis=0)
         squares = np.square(np.abs(spectra)).sum(axis=0)
         deviations = (np.square(np.abs(self._left)) / own).sum(axis=0)
         self._unit = (float(np.median(deviations)) + _ROUNDING * float(squares.mean()) / count) or 1.0

@@ -89,6 +89,7 @@ def check_session(
     uniform_given: bool = False,
     saturated: bool = False,
     unsteady: bool = False,
+    step: float = 0.0,
 ) -> Checked:
     """What of a session can be believed.
 
@@ -110,6 +111,8 @@ def check_session(
         and not refused.
     unsteady
         whether it is stated that the lamp is, so that its power is neither divided out nor said.
+    step
+        between two numbers of a frame, as the responses have it.
 
     Raises
     ------
@@ -119,7 +122,7 @@ def check_session(
     work = [Checking(own, signs) for own in sums]
     lamp = Lamp()
     if all(own.pairs is not None for own in sums):
-        pairs = Pairs(work, order, clipped)
+        pairs = Pairs(work, order, clipped, step)
         if saturated and pairs.many:
             return Checked(sums)
         lamp = pairs.check(not unsteady)

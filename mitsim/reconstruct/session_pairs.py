@@ -37,11 +37,15 @@ _TURNS = 3
 _ROUNDING = 1e-6
 """Part of the light that counts as noise at least: rounding of sums of single frames leaves 1e-12, of pairs of factors
 in single precision 1e-7."""
+_RANDOM = 2 / 3
+"""Variance of a pair's difference, in squared steps, that noise of half a step and rounding make: with more the mean of
+rounding is 0 within 1 %."""
 _LINEAR = 0.02
 """Deviation of a pair's sum, rms, as a part of its light, that a camera may make which is not linear: where no fault's
 name explains it, none is said. A linearity of 0.03 makes 0.5 % in most pairs, 1 % in uniform ones."""
 _FLICKERS = 2.0
-"""Robust scatter of the pairs' power over that by noise, which is known to 20 %, that is flicker."""
+"""Robust scatter of the pairs' power over that by noise, which is known to 20 %, that is flicker; of few pairs, whose
+scatter itself is known to 1.2 of it over the root of their number, more."""
 _FITS = 4.0
 """Mean squared deviation, in that of a good pair's sum, up to which a name fits."""
 _BOTH = 36.0
@@ -64,7 +68,9 @@ class _Shown:
 class Pairs:
     """Pairs of both ``sides``, frames in the ``order`` in which they were taken."""
 
-    def __init__(self, sides: list[Side], order: Sequence[Half], clipped: Callable[[Half], bool]) -> None:
+    def __init__(
+        self, sides: list[Side], order: Sequence[Half], clipped: Callable[[Half], bool], step: float = 0.0
+    ) -> None:
         self.sides, self.clipped = sides, clipped
         self.pairs = [own.sums.pairs for own in sides if own.sums.pairs is not None]
         self.count = sides[0].sums.done
@@ -104,7 +110,11 @@ class Pairs:
         for number, along in enumerate((self.common, *self.uniforms)):
             share = differences[number] @ along / max(float(np.dot(along, along)), 1e-300)
             differences[number] = differences[number] - np.outer(share, along)
-        least = (_ROUNDING * float(np.sqrt(np.square(self.ambient_and_all).mean()))) ** 2
+        # Rounding of a pair's sum that no noise makes random is one for all its pixels of like light.
+        alike = step / np.sqrt(6) if min(own.variance for own in sides) < _RANDOM * step**2 else 0.0
+        rounding = max(_ROUNDING**2 * float(np.square(self.ambient_and_all).mean()), alike**2)
+        shares = [float(np.abs(along).sum() / max(np.dot(along, along), 1e-300)) for along in self.uniforms]
+        least = [rounding * share**2 for share in (1.0, *shares)]
         self.flicker, self.floor = 0.0, 1.0
         self.light_noise = [1.0, 1.0]
         for _ in range(_TURNS):  # noise and flicker hang on each other
@@ -114,11 +124,11 @@ class Pairs:
                     rests, differences, [self.floor, *self.light_noise] if self.flicker else [1.0] * 3, strict=True
                 )
             ]
-            self.floor, *self.light_noise = (max(float(np.median(each)), least) for each in found)
+            self.floor, *self.light_noise = map(max, [float(np.median(each)) for each in found], least)
             # Means of rows and of columns share the frame's mean and its noise: twice independent ones' variance.
-            self.noise = float(np.sqrt(2 * self.floor / size))
+            self.noise = float(np.sqrt(2 * self.floor / size + alike**2 / np.square(self.common).mean()))
             self.flicker = float(np.sqrt(max(self.scatter**2 - self.noise**2, 0.0)))
-            if self.scatter < _FLICKERS * self.noise:
+            if self.scatter < _FLICKERS * (1 + 3 / np.sqrt(len(self.power))) * self.noise:
                 self.flicker = 0.0
                 break
         found = [
@@ -127,7 +137,7 @@ class Pairs:
         ]
         self.excess = np.maximum(found[0], np.concatenate(found[1:]))
         away_from_trend = np.abs(self.power - self.trend)
-        middle = float(np.median(self.excess))
+        middle = max(float(np.median(self.excess)), 1.0)
         scatter = 1.4826 * float(np.median(np.abs(self.excess - middle)))
         bad = away_from_trend > max(_DEVIATIONS * max(self.scatter, self.noise), _LEAST)
         bad |= self.excess > max(_EXCESS * middle, middle + _DEVIATIONS * scatter)

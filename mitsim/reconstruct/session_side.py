@@ -96,11 +96,15 @@ class Side:
         return self.sums.pairs is not None
 
     @property
-    def noise(self) -> float:
-        """Squared noise of one pattern's vector, all numbers together, from the responses' median misfit."""
+    def variance(self) -> float:
+        """Noise variance of a number of a response, from their median misfit."""
         spare = self.length * (len(self.sums.common) - 1)
-        squared = float(np.median(self.sums.misfits)) / max(spare, 1)
-        return squared * self.length / float(np.dot(self.sums.common, self.sums.common))
+        return float(np.median(self.sums.misfits)) / max(spare, 1)
+
+    @property
+    def noise(self) -> float:
+        """Squared noise of one pattern's vector, all numbers together."""
+        return self.variance * self.length / float(np.dot(self.sums.common, self.sums.common))
 
     def change(self, index: int, vector: FloatArray) -> None:
         """Put a ``vector`` in place of a pattern's own."""
@@ -138,8 +142,8 @@ class Side:
             for index in self.unknown:
                 self._forget(index)
             return
-        for index in sorted(self.unknown):
-            self._foretell(index)
+        if self.unknown:
+            self._foretell_unknown()
         for _ in range(int(MOST_FAULTS * count) + 2):
             if not self._mend(self.pairs or not unsteady):
                 break
@@ -265,7 +269,7 @@ class Side:
         self.faults = [fault for fault in self.faults if fault.index != index]
         self.uncounted.add(index)
         self.unknown.add(index)
-        self._foretell(index)
+        self._foretell_unknown()
         self._add(index, kind, detail, "it is left out", other)
 
     def _brightened(self, index: int) -> float:
@@ -289,11 +293,20 @@ class Side:
         self.extras[index] = float(np.square(others).sum(axis=0).mean()) if others.size else 0.0
         self.change(index, np.zeros(self.length))
 
-    def _foretell(self, index: int) -> None:
-        """Leave a pattern out: in its place comes what the others foretell, and the error of that counts.
+    def _foretell_unknown(self) -> None:
+        """In place of patterns that are left out comes what others foretell, and the error of that counts.
 
-        Of columns as they are, and not moved back: those that are would foretell more, but for the sensor's ends.
+        That is of columns as they are, as a moving shadow foretells nothing at the sensor's ends; where it does, what
+        both differ by is an error too: a period that no other pattern has is known by the motion alone.
         """
+        for index in sorted(self.unknown):
+            self._foretell(index)
+        amended = MovingShadow(self.vectors, self.signs, self.unknown).amended
+        for index in self.unknown:
+            self.extras[index] = max(self.extras[index], float(amended[index]))
+
+    def _foretell(self, index: int) -> None:
+        """The same of one pattern."""
         self.change(index, np.zeros(self.length))
         variance = 0.0
         for _ in range(_TURNS):
