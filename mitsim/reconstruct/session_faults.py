@@ -7,7 +7,7 @@ shadow (:mod:`mitsim.reconstruct.session_side`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -90,6 +90,7 @@ def check_session(
     saturated: bool = False,
     unsteady: bool = False,
     step: float = 0.0,
+    wrong: Mapping[Half, str] | None = None,
 ) -> Checked:
     """What of a session can be believed.
 
@@ -113,6 +114,8 @@ def check_session(
         whether it is stated that the lamp is, so that its power is neither divided out nor said.
     step
         between two numbers of a frame, as the responses have it.
+    wrong
+        frames that are known to be wrong, and why.
 
     Raises
     ------
@@ -122,10 +125,13 @@ def check_session(
     work = [Checking(own, signs) for own in sums]
     lamp = Lamp()
     if all(own.pairs is not None for own in sums):
-        pairs = Pairs(work, order, clipped, step)
+        pairs = Pairs(work, order, clipped, step, wrong or {})
         if saturated and pairs.many:
             return Checked(sums)
         lamp = pairs.check(not unsteady)
+    else:
+        for own in work:
+            own.leave_out_known(wrong or {})
     at_first = [fault for own in work for fault in own.faults if fault.index == 0]
     if at_first and not uniform_given:
         return Checked(sums, at_first)
@@ -133,11 +139,11 @@ def check_session(
         own.check(unsteady)
     faults = [fault for own in work for fault in own.faults]
     count = signs.shape[1]
-    wrong = {(fault.side, fault.index) for fault in faults}
-    if len(wrong) > max(2, MOST_FAULTS * 2 * count):
+    patterns = {(fault.side, fault.index) for fault in faults}
+    if len(patterns) > max(2, MOST_FAULTS * 2 * count):
         first = faults[0]
         raise MitsimError(
-            f"{len(wrong)} of {2 * count} patterns of the session are not what they should be, first {first.side} "
+            f"{len(patterns)} of {2 * count} patterns of the session are not what they should be, first {first.side} "
             f"stripes {first.index}: {first.detail}; too many to leave out: check the order of the frames, and take "
             "the session again"
         )

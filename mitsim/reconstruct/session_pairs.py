@@ -8,7 +8,7 @@ lamp's power, in the order of the session.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,9 +69,14 @@ class Pairs:
     """Pairs of both ``sides``, frames in the ``order`` in which they were taken."""
 
     def __init__(
-        self, sides: list[Side], order: Sequence[Half], clipped: Callable[[Half], bool], step: float = 0.0
+        self,
+        sides: list[Side],
+        order: Sequence[Half],
+        clipped: Callable[[Half], bool],
+        step: float,
+        wrong: Mapping[Half, str],
     ) -> None:
-        self.sides, self.clipped = sides, clipped
+        self.sides, self.clipped, self.wrong = sides, clipped, wrong
         self.pairs = [own.sums.pairs for own in sides if own.sums.pairs is not None]
         self.count = sides[0].sums.done
         places = {half: place for place, half in enumerate(order)}
@@ -141,6 +146,8 @@ class Pairs:
         scatter = 1.4826 * float(np.median(np.abs(self.excess - middle)))
         bad = away_from_trend > max(_DEVIATIONS * max(self.scatter, self.noise), _LEAST)
         bad |= self.excess > max(_EXCESS * middle, middle + _DEVIATIONS * scatter)
+        known = {(side, index) for side, index, _ in wrong}
+        bad |= [(own.side, index) in known for own in sides for index in range(self.count)]
         self.good = ~bad
         # A camera that is not linear by a percent makes sums that differ by its squares: no frame is wrong there.
         self.slight = self.excess * self.floor < _LINEAR**2 * np.square(self.ambient_and_all).mean()
@@ -325,12 +332,15 @@ class Pairs:
             penalty = ((kept - right) / (4 * deviation)) ** 2
             rest, kind, detail, other = self._best(number, index, sign)
             found.append((rest + penalty, penalty, sign, kind, detail, other))
-        found.sort(key=lambda one: one[0])
+        known = [sign for sign in (1, -1) if (own.side, index, sign) in self.wrong]
+        found.sort(key=lambda one: (one[2] not in known, one[0]))
         _, penalty, sign, kind, detail, other = found[0]
-        if kind == "wrong" and self.slight[number * self.count + index]:
+        if known:
+            kind, detail, other = "wrong", f"is wrong: {self.wrong[own.side, index, sign]}", None
+        elif kind == "wrong" and self.slight[number * self.count + index]:
             return
         own.uncounted.add(index)
-        if penalty > _BOTH and found[1][1] > _BOTH:
+        if len(known) == 2 or (not known and penalty > _BOTH and found[1][1] > _BOTH):
             if index:
                 own.unknown.add(index)
             else:  # by definition, where it is the other side's that all vectors are projected on

@@ -7,6 +7,7 @@ foretold and nothing is found.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -147,6 +148,17 @@ class Side:
         for _ in range(int(MOST_FAULTS * count) + 2):
             if not self._mend(self.pairs or not unsteady):
                 break
+
+    def leave_out_known(self, wrong: Mapping[Half, str]) -> None:
+        """Leave patterns without pairs out that are known to be ``wrong``; MitsimError for a uniform frame."""
+        for (side, index, sign), detail in wrong.items():
+            if side != self.side:
+                continue
+            if sign == UNIFORM:
+                raise MitsimError(f"{side} stripes: of their uniform frame, {detail}; take the session again")
+            self._add(index, "wrong", f"is wrong: {detail}", "it is left out")
+            self.unknown.add(index)
+            self.uncounted.add(index)
 
     def _check_misfits(self) -> None:
         """Responses that hold much that no separable camera explains, where the others do not."""
