@@ -390,10 +390,11 @@ class _Readings:
         if not lit.any():
             return frames
         few = len(frames) < 3
+        remedy = "one of them is wrong: take more" if few else "it is left out"
         for frame, part in zip(np.asarray(frames)[lit], parts[lit], strict=True):
             self.odd[frame.file] = (
                 f"frames: {frame.file}, with the projector off, has {part:+.1%} of a uniform frame's light more than "
-                f"the median of {len(frames)} such frames; {'one of them is wrong: take more' if few else 'it is left out'}"
+                f"the median of {len(frames)} such frames; {remedy}"
             )
         return frames if few else [frame for frame, one in zip(frames, lit, strict=True) if not one]
 
