@@ -80,9 +80,10 @@ class MovingShadow:
         columns = spectra @ signs.T / count
         self.step = _step(columns, angles, pixels)
         modes = _modes(angles, self.step, n)
-        # Patterns as they show in the modes, (frequencies, modes, N).
         turned = np.ascontiguousarray(modes.conj().transpose(0, 2, 1))
-        self._shown = (turned.reshape(-1, n) @ signs).reshape(*turned.shape[:2], count) / count
+        # Patterns as they show in the modes, real and imaginary parts (frequencies, 2 modes, N).
+        parts = np.concatenate([turned.real, turned.imag], axis=1)
+        self._shown = (parts.reshape(-1, n) @ (signs / count)).reshape(*parts.shape[:2], count)
         self._signs = signs
         self._own = own = self._joint(n / count**2, self._shown)
         self._left = self._beyond(modes, turned, columns)
@@ -108,11 +109,10 @@ class MovingShadow:
         return np.asarray(rest @ self._signs / self._signs.shape[1])
 
     @staticmethod
-    def _joint(size: FloatArray | float, shown: ComplexArray) -> FloatArray:
+    def _joint(size: FloatArray | float, shown: FloatArray) -> FloatArray:
         """(frequencies, patterns) squared length of patterns beyond the modes, of their whole ``size`` (patterns,) and
-        of what they have ``shown`` of the modes (frequencies, modes, patterns)."""
-        rest = size - np.square(shown.real).sum(axis=1) - np.square(shown.imag).sum(axis=1)
-        return np.asarray(np.maximum(rest, 1e-9 * size))
+        of what they have ``shown`` of the modes (frequencies, 2 modes, patterns)."""
+        return np.asarray(np.maximum(size - np.einsum("kri,kri->ki", shown, shown), 1e-9 * size))
 
     def by_swap(self, places: list[tuple[int, int]]) -> FloatArray:
         """What swapping two vectors takes off the squared deviations of all, for each pair of ``places``."""

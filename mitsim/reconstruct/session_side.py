@@ -201,11 +201,9 @@ class Side:
         exchanges = np.where(fixed | (shadow.by_exchange < _EXPLAINED * deviations), -np.inf, shadow.by_exchange)
         flip = int(np.argmax(exchanges))
         gain, places = float(exchanges[flip]), [flip]
-        if deviations.max() > _FAR:
-            swaps, pairs = self._swaps(shadow, np.where(fixed, -np.inf, shadow.deviations))
-            best = int(np.argmax(swaps))
-            if swaps[best] > gain:
-                gain, places = float(swaps[best]), [*pairs[best]]
+        swapped = self._swapped(shadow, np.where(fixed, -np.inf, deviations))
+        if swapped is not None and swapped[0] > gain:
+            gain, places = swapped
         if gain > _GAIN:
             self._put_in_place(places)
         elif steady and deviations[worst] > _WRONG and shadow.unlike[worst] > _UNLIKE:
@@ -241,13 +239,18 @@ class Side:
         return True
 
     @staticmethod
-    def _swaps(shadow: MovingShadow, deviations: FloatArray) -> tuple[FloatArray, list[tuple[int, int]]]:
-        """What swaps of those that deviate most take off, and what is swapped."""
-        tried = np.sort([index for index in np.argsort(-deviations)[:_TRIED] if np.isfinite(deviations[index])])
+    def _swapped(shadow: MovingShadow, deviations: FloatArray) -> tuple[float, list[int]] | None:
+        """What a swap of two that deviate takes off at most, and which two; None where there are no two."""
+        far = np.flatnonzero(deviations > _FAR / 2)
+        tried = np.sort(far[np.argsort(-deviations[far])[:_TRIED]])
         pairs = [(int(one), int(other)) for place, one in enumerate(tried) for other in tried[place + 1 :]]
+        if not pairs:
+            return None
         gains = shadow.by_swap(pairs)
         least = [max(deviations[one], deviations[other]) for one, other in pairs]
-        return np.where(gains < least, -np.inf, gains), pairs
+        gains = np.where(gains < least, -np.inf, gains)
+        best = int(np.argmax(gains))
+        return float(gains[best]), [*pairs[best]]
 
     def _put_in_place(self, places: list[int]) -> None:
         """Exchange the frames of one pattern, or swap two."""
@@ -288,12 +291,13 @@ class Side:
         """Divide a frame against one uniform one by the part of its light that it has, which is returned."""
         light, shown, scale = self.vectors[:, 0], self.vectors[:, index] + self.vectors[:, 0], 1.0
         self._settled.add(index)
-        error = 0.0
-        for _ in range(_TURNS):  # with the covariance that results
-            _, more, deviation = MovingShadow(self.vectors, self.signs, self.unknown).by_scale()
-            scale *= float(more[index])
+        for _ in range(_TURNS):  # as others then foretell it
+            scale *= float(MovingShadow(self.vectors, self.signs, self.unknown).by_scale()[1][index])
             self.change(index, scale * shown - light)
-            error = float(deviation[index] * np.linalg.norm(scale * shown))
+        shadow = MovingShadow(self.vectors, self.signs, self.unknown)
+        # What still does not fit may be of the scale too.
+        rest = float(np.sqrt(max(shadow.deviations[index], 1.0)))
+        error = rest * float(shadow.by_scale()[2][index] * np.linalg.norm(scale * shown))
         self.extras[index] = error**2 + max(scale**2 - 1, 0.0) * self.noise
         return 1 / scale
 
