@@ -462,6 +462,7 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Ch
         check_session,
         signs=signs,
         order=session.order,
+        name=session.frame_name,
         clipped=readings.clipped,
         saturated=bool(readings.saturated),
         step=(digital.step_dn or 0.0) / digital.gain_dn_per_e / digital.exposure_s,

@@ -8,13 +8,15 @@ shadow (:mod:`mitsim.reconstruct.session_side`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
+
+import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.calibration import Estimate, StripeSums, factors_of_sums
-from mitsim.reconstruct.session_findings import Fault, Lamp
+from mitsim.reconstruct.session_findings import Fault, Lamp, frame_words
 from mitsim.reconstruct.session_pairs import Pairs
 from mitsim.reconstruct.session_side import MOST_FAULTS
 from mitsim.reconstruct.session_side import Side as Checking
@@ -91,6 +93,7 @@ def check_session(
     unsteady: bool = False,
     step: float = 0.0,
     wrong: Mapping[Half, str] | None = None,
+    name: Callable[[Half], str] = frame_words,
 ) -> Checked:
     """What of a session can be believed.
 
@@ -116,6 +119,8 @@ def check_session(
         between two numbers of a frame, as the responses have it.
     wrong
         frames that are known to be wrong, and why.
+    name
+        of a frame.
 
     Raises
     ------
@@ -136,8 +141,12 @@ def check_session(
     if at_first and not uniform_given:
         return Checked(sums, at_first)
     for own in work:
-        own.check(unsteady)
-    faults = [fault for own in work for fault in own.faults]
+        own.check(unsteady, name)
+    faults = [
+        replace(fault, cost=float(np.sqrt(own.extras[fault.index] / max(np.square(own.vectors).sum(), 1e-300))))
+        for own in work
+        for fault in own.faults
+    ]
     count = signs.shape[1]
     patterns = {(fault.side, fault.index) for fault in faults}
     if len(patterns) > max(2, MOST_FAULTS * 2 * count):

@@ -31,6 +31,8 @@ class Fault:
         the frame that it repeats, or the pattern that it is swapped with.
     repair
         what is done about it, in words.
+    cost
+        relative error of its factor that this leaves beyond the noise.
     """
 
     side: Side
@@ -40,20 +42,25 @@ class Fault:
     detail: str
     repair: str
     other: Half | None = None
+    cost: float = 0.0
 
-    def _names(self, name: Callable[[Half], str]) -> list[str]:
-        """Names of its frames."""
-        return [name((self.side, self.index, sign)) for sign in ((1, -1) if self.sign is None else (self.sign,))]
+    def _names(self, name: Callable[[Half], str], index: int) -> list[str]:
+        """Names of a pattern's frames, both or that of its sign."""
+        return [name((self.side, index, sign)) for sign in ((1, -1) if self.sign is None else (self.sign,))]
 
     def words(self, name: Callable[[Half], str]) -> str:
         """A sentence; ``name`` says which frame it is."""
-        names = " and ".join(self._names(name))
-        other = f" ({name(self.other)})" if self.other is not None and self.other[2] != UNIFORM else ""
-        return f"frames: {names}: {self.detail}{other}; {self.repair}"
+        others = []
+        if self.other is not None:
+            others = self._names(name, self.other[1]) if self.other[2] == UNIFORM else [name(self.other)]
+        other = f" ({' and '.join(others)})" if others else ""
+        cost = f", at a factor error of {self.cost:.1e}" if self.cost else ""
+        names = " and ".join(self._names(name, self.index))
+        return f"frames: {names}: {self.detail}{other}; {self.repair}{cost}"
 
     def listed(self, name: Callable[[Half], str]) -> dict[str, Any]:
         """The same for a manifest; ``name`` says which frame it is."""
-        return {"frames": self._names(name), **asdict(self)}
+        return {"frames": self._names(name, self.index), **asdict(self)}
 
 
 @dataclass(frozen=True)
@@ -87,7 +94,7 @@ class Lamp:
 
     def warnings(self) -> Iterator[str]:
         """What is said of an unsteady lamp."""
-        left = f"frames are divided by its power, and {self.remaining:.1e} is left"
+        left = "frames are divided by its power" + (f", and {self.remaining:.1e} is left" if self.remaining else "")
         if self.drift:
             yield (
                 f"lamp: its power drifts by {self.drift:+.1%} over the session, a factor error of "

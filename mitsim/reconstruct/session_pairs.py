@@ -185,7 +185,7 @@ class Pairs:
                         0,
                         None,
                         "exchanged",
-                        "has its two frames exchanged",
+                        "in each other's place",
                         "they count in their right order",
                     )
                 )

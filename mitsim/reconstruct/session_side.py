@@ -7,7 +7,7 @@ foretold and nothing is found.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -129,13 +129,15 @@ class Side:
             energy=float(self.sums.energies[kept].sum()),
         )
 
-    def check(self, unsteady: bool = False) -> None:
+    def check(self, unsteady: bool = False, name: Callable[[Half], str] = frame_words) -> None:
         """Find patterns that show no stripes, are out of their place or are not what others foretell.
 
         Parameters
         ----------
         unsteady
             whether the lamp is known to be: frames against one uniform one may then be of any light.
+        name
+            of a frame.
         """
         self._check_misfits()
         count = self.signs.shape[1]
@@ -145,8 +147,15 @@ class Side:
             return
         if self.unknown:
             self._foretell_unknown()
+        steady = self.pairs or not unsteady
         for _ in range(int(MOST_FAULTS * count) + 2):
-            if not self._mend(self.pairs or not unsteady):
+            shadow = MovingShadow(self.vectors, self.signs, self.unknown)
+            if steady and not self.pairs and shadow.first_line > _FAR_LINE:
+                raise MitsimError(
+                    f"frames: {name((self.side, 0, UNIFORM))}, or a dark frame, is not of the light that patterns of "
+                    "its side are of; look at these, and take the session again"
+                )
+            if not self._mend(shadow, steady):
                 break
 
     def leave_out_known(self, wrong: Mapping[Half, str]) -> None:
@@ -172,7 +181,7 @@ class Side:
             if np.median(misfits / np.maximum(energies, 1e-300)) > _UNEXPLAINED and misfits[index] < 4 * middle:
                 continue
             part = misfits[index] / energies[index]
-            detail = f"shows no {self.side} stripes: {part:.0%} of its response is of other shape"
+            detail = f"no {self.side} stripes: {part:.0%} of their response is of other shape"
             self._add(int(index), "wrong", detail, "it is left out")
             self.unknown.add(int(index))
             self.uncounted.add(int(index))
@@ -182,15 +191,9 @@ class Side:
 
     # ---- patterns that do not fit the others -------------------------------------------------------------------------
 
-    def _mend(self, steady: bool) -> bool:
+    def _mend(self, shadow: MovingShadow, steady: bool) -> bool:
         """Whether a pattern was wrong: the one whose exchange or swap makes most fit, or, of ``steady`` light, that
         fits least."""
-        shadow = MovingShadow(self.vectors, self.signs, self.unknown)
-        if steady and not self.pairs and shadow.first_line > _FAR_LINE:
-            raise MitsimError(
-                f"{self.side} stripes: their uniform frame, or a dark frame, is not of the light that their patterns "
-                "are of; look at these, and take the session again"
-            )
         fixed = np.zeros(self.sums.done, dtype=bool)
         fixed[[0, *self.unknown]] = True
         deviations = np.where(fixed, 0.0, shadow.deviations)
@@ -207,7 +210,7 @@ class Side:
         if gain > _GAIN:
             self._put_in_place(places)
         elif steady and deviations[worst] > _WRONG and shadow.unlike[worst] > _UNLIKE:
-            self._leave_out(worst, "wrong", "does not fit the other patterns")
+            self._leave_out(worst, "wrong", "no stripes as the other patterns foretell them")
         else:
             return False
         return True
@@ -260,12 +263,12 @@ class Side:
         self.vectors = moved
         self._settled.update(places)
         if rest:
-            detail = f"is swapped with {self.side} stripes {rest[0]}"
+            detail = f"in the place of {self.side} stripes {rest[0]}, and those in theirs"
             self._add(first, "swapped", detail, "both count in their right order", (self.side, rest[0], UNIFORM))
         elif not self.pairs:
             self._add(first, "exchanged", "shows black where white should be", "it counts with its sign")
         elif not self._turned(first):
-            self._add(first, "exchanged", "has its two frames exchanged", "they count in their right order")
+            self._add(first, "exchanged", "in each other's place", "they count in their right order")
 
     def _turned(self, index: int) -> bool:
         """Whether a pattern's faulty frame is the other one of its pair: a frame may repeat the other, or that it."""

@@ -153,7 +153,7 @@ def test_a_wrong_frame_without_pairs_is_named_and_left_out() -> None:
 def test_a_wrong_uniform_frame_without_pairs_is_refused() -> None:
     """(Planted: the last column is looked at.)"""
     uniform = {("horizontal", 0, 0): 0.95 * frames()["horizontal", 0, 1]}
-    with pytest.raises(MitsimError, match="horizontal stripes: their uniform frame"):
+    with pytest.raises(MitsimError, match="horizontal stripes 0, or a dark frame"):
         judged({**frames(), **uniform}, pairs=False)
 
 
