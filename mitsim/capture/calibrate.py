@@ -45,7 +45,7 @@ from mitsim.reconstruct.calibration import (
     stripe_sums,
 )
 from mitsim.reconstruct.factors import Factors, load_calibration
-from mitsim.reconstruct.session_faults import Checked, check_session
+from mitsim.reconstruct.session_faults import Checked, Circumstances, check_session
 from mitsim.reconstruct.session_findings import frame_words
 from mitsim.rig.order import SIDES
 from mitsim.rig.recipe import SessionRecipe, load_recipe
@@ -312,18 +312,10 @@ def checked_estimates(
     unsteady = bool(drift.session_ramp or drift.session_flicker)
     sensor = session.bench.sensor
     step = 0.0 if sensor.largest_dn is None else 1 / sensor.gain_dn_per_e / lit.exposure_s
+    taken = Circumstances(session.order, saturated=bool(stripes.saturated), unsteady=unsteady, step=step)
     with job.clock.stage("estimate"):
         judged = [
-            check_session(
-                stripes.sums[kind],
-                session.signs,
-                session.order,
-                saturated=bool(stripes.saturated),
-                unsteady=unsteady,
-                step=step,
-            )
-            if kind == NOISY
-            else Checked(stripes.sums[kind])
+            check_session(stripes.sums[kind], session.signs, taken) if kind == NOISY else Checked(stripes.sums[kind])
             for kind in kinds
         ]
         found = [

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +28,7 @@ from mitsim.core.versions import versions
 from mitsim.reconstruct.calibration import Estimate, Seen, StripeSums, stripe_sums
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.ladder import Chosen, Ladder
-from mitsim.reconstruct.session_faults import Checked, check_session
+from mitsim.reconstruct.session_faults import Checked, Circumstances, check_session
 from mitsim.rig.digital import digital_of
 from mitsim.rig.framelist import DarkFile, SessionFrames, StripeFile, load_frames
 from mitsim.rig.order import SIDES, UNIFORM, Half, Side
@@ -458,19 +458,18 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Ch
     signs = stripe_signs(session.listed.n).astype(np.float64)
     sums, variances = _sums(readings, signs.shape[1], job)
     digital = session.listed.digital
-    check = partial(
-        check_session,
-        signs=signs,
-        order=session.order,
-        name=session.frame_name,
-        clipped=readings.clipped,
-        saturated=bool(readings.saturated),
+    taken = Circumstances(
+        session.order,
+        session.frame_name,
+        readings.clipped,
+        bool(readings.saturated),
         step=(digital.step_dn or 0.0) / digital.gain_dn_per_e / digital.exposure_s,
+        wrong=readings.wrong(),
     )
-    found = check(sums, wrong=readings.wrong())
+    found = check_session(sums, signs, taken)
     if wrong := found.wrong_uniform():
         sums, variances = _sums(readings, signs.shape[1], job, found.other_uniform(wrong))
-        found = check(sums, uniform_given=True, wrong=readings.wrong())
+        found = check_session(sums, signs, taken, uniform_given=True)
     noise = float(np.sqrt(max(float(np.mean(variances)), 0.0))) if session.listed.digital.noise_is_stated else None
     with job.clock.stage("estimate"):
         return found.estimate(signs, noise), noise, found

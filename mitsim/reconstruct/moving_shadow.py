@@ -64,7 +64,8 @@ class MovingShadow:
     amended
         (N,) squared length of what was taken for unknown vectors less those that were given.
     first_line
-        the same deviation of the first column, which errors that all patterns share make, in that of the median column.
+        squared length of the first column's deviation from the others, which errors that all patterns share make, and
+        of the median column's.
     by_exchange
         (N,) what -u_i in place of u_i takes off the squared deviations of all vectors, in the same unit.
     """
@@ -87,13 +88,13 @@ class MovingShadow:
         self._signs = signs
         self._own = own = self._joint(n / count**2, self._shown)
         self._left = self._beyond(modes, turned, columns)
-        self.first_line = _first_line(modes, self._left @ signs.T)
+        # Sums over positive frequencies, twice, are those over as many sensor rows as the taper leaves.
+        whole = 2 * stride / float(np.square(taper).sum())
+        self.first_line = _first_line(modes, self._left @ signs.T, whole)
         before = spectra.copy() if unknown else spectra
         for index in [*unknown] * _TURNS:
             spectra[:, index] -= self._left[:, index] / own[:, index]
             self._left = self._beyond(modes, turned, spectra @ signs.T / count)
-        # Sums over positive frequencies, twice, are those over as many sensor rows as the taper leaves.
-        whole = 2 * stride / float(np.square(taper).sum())
         self.amended = whole * np.square(np.abs(spectra - before)).sum(axis=0)
         squares = np.square(np.abs(spectra)).sum(axis=0)
         deviations = (np.square(np.abs(self._left)) / own).sum(axis=0)
@@ -145,12 +146,12 @@ def _modes(angles: FloatArray, step: float, n: int) -> ComplexArray:
     return np.asarray(np.linalg.qr(np.concatenate([phase[..., None] * slow for phase in phases], axis=2))[0])
 
 
-def _first_line(modes: ComplexArray, rest: ComplexArray) -> float:
-    """Squared deviation of the first of columns, in the median column's, of the ``rest`` (frequencies, n) that modes
-    leave of them."""
+def _first_line(modes: ComplexArray, rest: ComplexArray, whole: float) -> tuple[float, float]:
+    """Squared length of the first of columns beyond what the others foretell, and of the median one, of the ``rest``
+    (frequencies, n) that modes leave of them; sums times ``whole``."""
     kept = np.maximum(1 - np.square(np.abs(modes)).sum(axis=2), 1e-3)
-    lines = (np.square(np.abs(rest)) / kept).sum(axis=0)
-    return float(lines[0] / (np.median(lines) or 1.0))
+    lines = whole * np.square(np.abs(rest / kept)).sum(axis=0)
+    return float(lines[0]), float(np.median(lines))
 
 
 def _taper(pixels: int) -> FloatArray:

@@ -83,33 +83,18 @@ class Checked:
         return [fault.listed(name) for fault in self.faults]
 
 
-def check_session(
-    sums: tuple[StripeSums, StripeSums],
-    signs: FloatArray,
-    order: Sequence[Half],
-    clipped: Callable[[Half], bool] = lambda half: False,
-    uniform_given: bool = False,
-    saturated: bool = False,
-    unsteady: bool = False,
-    step: float = 0.0,
-    wrong: Mapping[Half, str] | None = None,
-    name: Callable[[Half], str] = frame_words,
-) -> Checked:
-    """What of a session can be believed.
+@dataclass(frozen=True)
+class Circumstances:
+    """How a session was taken.
 
-    Parameters
+    Attributes
     ----------
-    sums
-        of horizontal and of vertical stripes, all in.
-    signs
-        (n, N) H.
     order
         frames as they were taken.
+    name
+        of a frame.
     clipped
         whether many of a frame's pixels share its largest number.
-    uniform_given
-        whether the sums were made with the uniform response of a side that is right. If not, and one of the two is
-        wrong, nothing else is judged.
     saturated
         whether frames have saturated pixels, which make many pairs add up to less; those sessions are flagged for it,
         and not refused.
@@ -119,8 +104,33 @@ def check_session(
         between two numbers of a frame, as the responses have it.
     wrong
         frames that are known to be wrong, and why.
-    name
-        of a frame.
+    """
+
+    order: Sequence[Half]
+    name: Callable[[Half], str] = frame_words
+    clipped: Callable[[Half], bool] = lambda half: False
+    saturated: bool = False
+    unsteady: bool = False
+    step: float = 0.0
+    wrong: Mapping[Half, str] = field(default_factory=dict)
+
+
+def check_session(
+    sums: tuple[StripeSums, StripeSums], signs: FloatArray, taken: Circumstances, uniform_given: bool = False
+) -> Checked:
+    """What of a session can be believed.
+
+    Parameters
+    ----------
+    sums
+        of horizontal and of vertical stripes, all in.
+    signs
+        (n, N) H.
+    taken
+        how.
+    uniform_given
+        whether the sums were made with the uniform response of a side that is right. If not, and one of the two is
+        wrong, nothing else is judged.
 
     Raises
     ------
@@ -130,18 +140,20 @@ def check_session(
     work = [Checking(own, signs) for own in sums]
     lamp = Lamp()
     if all(own.pairs is not None for own in sums):
-        pairs = Pairs(work, order, clipped, step, wrong or {})
-        if saturated and pairs.many:
+        pairs = Pairs(work, taken.order, taken.clipped, taken.step, taken.wrong)
+        if taken.saturated and pairs.many:
             return Checked(sums)
-        lamp = pairs.check(not unsteady)
+        lamp = pairs.check(not taken.unsteady)
     else:
         for own in work:
-            own.leave_out_known(wrong or {})
+            own.leave_out_known(taken.wrong)
     at_first = [fault for own in work for fault in own.faults if fault.index == 0]
     if at_first and not uniform_given:
         return Checked(sums, at_first)
     for own in work:
-        own.check(unsteady, name)
+        own.check(taken.unsteady, taken.name)
+    if not (taken.unsteady or all(own.pairs for own in work)):
+        lamp = _against_one_frame(work)
     faults = [
         replace(fault, cost=float(np.sqrt(own.extras[fault.index] / max(np.square(own.vectors).sum(), 1e-300))))
         for own in work
@@ -163,3 +175,14 @@ def check_session(
         (len(work[0].uncounted), len(work[1].uncounted)),
         (float(work[0].extras.sum()), float(work[1].extras.sum())),
     )
+
+
+def _against_one_frame(sides: Sequence[Checking]) -> Lamp:
+    """How steady the lamp is where frames are shown against one uniform one."""
+    before = [own.extras.sum() for own in sides]
+    flicker = max([own.flicker() for own in sides])
+    parts = [
+        (own.extras.sum() - extra) / np.square(own.vectors).sum() for own, extra in zip(sides, before, strict=True)
+    ]
+    cost = float(np.sqrt(sum(parts)))
+    return Lamp(flicker=flicker, flicker_cost=cost, remaining=cost) if flicker else Lamp()

@@ -95,6 +95,7 @@ class Lamp:
     def warnings(self) -> Iterator[str]:
         """What is said of an unsteady lamp."""
         left = "frames are divided by its power" + (f", and {self.remaining:.1e} is left" if self.remaining else "")
+        left = left if self.corrected else "its error is in what is stated"
         if self.drift:
             yield (
                 f"lamp: its power drifts by {self.drift:+.1%} over the session, a factor error of "
@@ -103,8 +104,7 @@ class Lamp:
         if self.flicker:
             yield (
                 f"lamp: its power flickers by {self.flicker:.2%} from frame to frame, a factor error of "
-                f"{self.flicker_cost:.1e} if nothing is done; {left}, as pairs "
-                "do not tell how their two frames differ: use a steadier one, or expose for whole periods"
+                f"{self.flicker_cost:.1e} if nothing is done; {left}: use a steadier one, or expose for whole periods"
             )
 
 

@@ -76,6 +76,7 @@ class Pairs:
         step: float,
         wrong: Mapping[Half, str],
     ) -> None:
+        """Of both ``sides``; ``order``, ``clipped``, ``step`` and ``wrong`` are those of a session's circumstances."""
         self.sides, self.clipped, self.wrong = sides, clipped, wrong
         self.pairs = [own.sums.pairs for own in sides if own.sums.pairs is not None]
         self.count = sides[0].sums.done

@@ -33,10 +33,14 @@ _FAR = 10.0
 """Squared deviation of a vector from the foretold one, in that of the median pattern, from which it is suspected."""
 _WRONG, _UNLIKE = 30.0, 0.5
 """The same, and that deviation as a part of the vector's own square, from which it is wrong whatever it shows."""
-_FAR_LINE = 15.0
-"""Squared deviation of the first scene line's column, in that of the median one, from which the frame that all patterns
-are held against is wrong, as its error is in that column alone: of 56 good sides none has 8, a uniform frame of 0.95 or
-1.05 of its light made 20 at least."""
+_FAR_LINE, _SHARED = 20.0, 0.2
+"""Squared deviation of the first scene line's column, in that of the median one and of what noise makes of it, from
+which the frame that all patterns are held against is wrong, as its error is in that column alone; and the uniform
+frame's part of the variance of 2 Y - U. Of 56 good sides none has 16; a uniform frame of 0.95 or 1.05 of its light
+makes 26 at least."""
+_FLICKERS = 4.0
+"""Robust scatter of frames' scales over their deviation that is flicker; of few patterns more, as it scatters itself:
+of 56 good sides none has 3.3, and half a percent makes 5 at least."""
 _GAIN = 3.0
 """What putting patterns in their place must take off the squared deviations, in that of the median one, at least."""
 _EXPLAINED = 0.7
@@ -77,6 +81,7 @@ class Side:
     """
 
     def __init__(self, sums: StripeSums, signs: FloatArray) -> None:
+        """Of one side's ``sums``, of patterns ``signs`` H (n, N)."""
         self.sums, self.signs = sums, signs
         self.side: order.Side = "horizontal" if sums.side == SIDES[0] else "vertical"
         self.vectors = sums.vectors
@@ -108,7 +113,7 @@ class Side:
         return self.variance * self.length / float(np.dot(self.sums.common, self.sums.common))
 
     def change(self, index: int, vector: FloatArray) -> None:
-        """Put a ``vector`` in place of a pattern's own."""
+        """Put a ``vector`` in place of that of pattern ``index``."""
         if self.vectors is self.sums.vectors:
             self.vectors = self.vectors.copy()
         self.vectors[:, index] = vector
@@ -150,7 +155,8 @@ class Side:
         steady = self.pairs or not unsteady
         for _ in range(int(MOST_FAULTS * count) + 2):
             shadow = MovingShadow(self.vectors, self.signs, self.unknown)
-            if steady and not self.pairs and shadow.first_line > _FAR_LINE:
+            line, usual = shadow.first_line
+            if steady and not self.pairs and line > _FAR_LINE * (usual + _SHARED * self.noise):
                 raise MitsimError(
                     f"frames: {name((self.side, 0, UNIFORM))}, or a dark frame, is not of the light that patterns of "
                     "its side are of; look at these, and take the session again"
@@ -207,7 +213,7 @@ class Side:
         swapped = self._swapped(shadow, np.where(fixed, -np.inf, deviations))
         if swapped is not None and swapped[0] > gain:
             gain, places = swapped
-        if gain > _GAIN:
+        if gain > max(_GAIN, _EXPLAINED * deviations[worst] if shadow.unlike[worst] > _UNLIKE else 0.0):
             self._put_in_place(places)
         elif steady and deviations[worst] > _WRONG and shadow.unlike[worst] > _UNLIKE:
             self._leave_out(worst, "wrong", "no stripes as the other patterns foretell them")
@@ -232,10 +238,12 @@ class Side:
                     int(index), "repeated", f"repeats {self.side} stripes {nearest}", (self.side, nearest, 1)
                 )
                 return True
-        gains = np.where(shadow.by_scale()[0] > _EXPLAINED * deviations, shadow.by_scale()[0], 0.0)
+        gains, scales, _ = shadow.by_scale()
+        gains = np.where((gains > _EXPLAINED * deviations) & (scales > 0.5) & (scales < 1 / DARK), gains, 0.0)
         gains[list(self._settled)] = 0.0
         index = int(np.argmax(gains))
-        if gains[index] <= max(_FAR, float(np.max(shadow.by_exchange[1:]))):
+        worst = float(np.max(np.where(shadow.unlike > _UNLIKE, deviations, 0.0)))
+        if gains[index] <= max(_FAR, _EXPLAINED * worst, float(np.max(shadow.by_exchange[1:]))):
             return False
         part = self._brightened(index)
         self._add(index, *dimmed(part), "its numbers are divided by that")
@@ -303,6 +311,24 @@ class Side:
         error = rest * float(shadow.by_scale()[2][index] * np.linalg.norm(scale * shown))
         self.extras[index] = error**2 + max(scale**2 - 1, 0.0) * self.noise
         return 1 / scale
+
+    def flicker(self) -> float:
+        """Deviation of the light of frames that are shown against one uniform one, as a part of it; 0 where it is
+        within what is not known. Its error counts, the uniform frame's too, which is in every vector."""
+        count = self.signs.shape[1]
+        if count < _ENOUGH[0] or self.length < _ENOUGH[1]:
+            return 0.0
+        _, scales, deviations = MovingShadow(self.vectors, self.signs, self.unknown).by_scale()
+        good = np.setdiff1d(np.arange(1, count), [*self.unknown, *self._settled])
+        scatter = 1.4826 * float(np.median(np.abs(scales[good] - np.median(scales[good]))))
+        known = float(np.median(deviations[good]))
+        if scatter < _FLICKERS * (1 + 3 / np.sqrt(count)) * known:
+            return 0.0
+        light = self.vectors[:, :1]
+        found = float(np.sqrt(scatter**2 - known**2))
+        self.extras[good] += found**2 * np.square(self.vectors[:, good] + light).sum(axis=0)
+        self.extras += found**2 * float(np.square(light).sum())
+        return found
 
     # ---- what others foretell of a pattern ---------------------------------------------------------------------------
 

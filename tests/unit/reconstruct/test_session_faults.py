@@ -10,7 +10,7 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.calibration import StripeSums, stripe_sums
-from mitsim.reconstruct.session_faults import Checked, check_session
+from mitsim.reconstruct.session_faults import Checked, Circumstances, check_session
 from mitsim.rig.camera import centred_edges
 from mitsim.rig.mask import mls_mask
 from mitsim.rig.order import SIDES, Half, taken
@@ -55,7 +55,7 @@ def judged(shown: Frames, pairs: bool = True) -> Checked:
         for index in range(1, N):
             response, light = pair(own.side, index)
             own.put(own.seen(response, index, light))
-    return check_session(sums, SIGNS, ORDER)
+    return check_session(sums, SIGNS, Circumstances(ORDER))
 
 
 def error(found: Checked) -> tuple[float, float]:
@@ -162,3 +162,13 @@ def test_a_drifting_lamp_is_divided_out() -> None:
     assert not found.faults and found.lamp.drift == pytest.approx(0.05, rel=0.05)
     actual, stated = error(found)
     assert actual < 1.3 * stated
+
+
+def test_a_flickering_lamp_without_pairs_is_said_and_counts() -> None:
+    """(Planted: the uniform frame's own error does not count.)"""
+    rng = np.random.default_rng(5)
+    power = 1 + 0.01 * rng.standard_normal(len(ORDER))
+    found = judged(frames(lambda place: float(power[place])), pairs=False)
+    assert not found.faults and found.lamp.flicker == pytest.approx(0.01, rel=0.4)
+    actual, stated = error(found)
+    assert 0.3 * stated < actual < 1.3 * stated
