@@ -76,7 +76,15 @@ class Pairs:
         step: float,
         wrong: Mapping[Half, str],
     ) -> None:
-        """Of both ``sides``; ``order``, ``clipped``, ``step`` and ``wrong`` are those of a session's circumstances."""
+        """Add pairs up.
+
+        Parameters
+        ----------
+        sides
+            both.
+        order, clipped, step, wrong
+            as a session's circumstances have them.
+        """
         self.sides, self.clipped, self.wrong = sides, clipped, wrong
         self.pairs = [own.sums.pairs for own in sides if own.sums.pairs is not None]
         self.count = sides[0].sums.done
