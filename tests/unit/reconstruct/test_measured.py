@@ -314,7 +314,7 @@ def repeated(folder: Path, listed: dict[str, Any], shots: list[tuple[int, float]
 def test_a_wrong_repeat_or_exposure_is_named(
     tmp_path: Path, listed: dict[str, Any], shots: list[tuple[int, float]], words: str
 ) -> None:
-    """(Planted: frames are compared with themselves; the first of two that differ is named.)"""
+    """(Planted: repeats, and exposures, are compared with themselves.)"""
     good = repeated(tmp_path / "good", listed, shots, (-1, -1))
     assert good.ok, good.warnings
     bad = repeated(tmp_path / "bad", listed, shots, (5, 1))
@@ -323,7 +323,7 @@ def test_a_wrong_repeat_or_exposure_is_named(
 
 
 def test_a_dark_frame_with_light_is_named_and_left_out(tmp_path: Path) -> None:
-    """(Planted: the median is not taken off; it is left in.)"""
+    """(Planted: it is left in.)"""
     session = RealSession()
     folder = session.write(tmp_path / "frames", "uniform")
     for number in range(4):

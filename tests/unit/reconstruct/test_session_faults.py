@@ -128,8 +128,8 @@ def test_exchanged_frames_of_the_finest_stripes_are_put_back(index: int) -> None
 
 
 def test_a_wrong_frame_without_pairs_is_named_and_left_out() -> None:
-    """Each error that is left is that which is stated. (Planted: no check of misfits; no error of the foretold
-    pattern; a dim frame's scale is not squared in its noise, or turned over.)"""
+    """Each error that is left is that which is stated. (Planted: no error of the foretold pattern; a dim frame's scale
+    turned over.)"""
     good = frames()
     clean = judged(good, pairs=False)
     assert not clean.faults and error(clean)[0] < 1.3 * error(clean)[1]
@@ -166,9 +166,9 @@ def test_a_drifting_lamp_is_divided_out() -> None:
 
 def test_a_flickering_lamp_without_pairs_is_said_and_counts() -> None:
     """(Planted: the uniform frame's own error does not count.)"""
-    rng = np.random.default_rng(7)
+    rng = np.random.default_rng(12)
     power = 1 + 0.005 * rng.standard_normal(len(ORDER))
     found = judged(frames(lambda place: float(power[place])), pairs=False)
     assert not found.faults and found.lamp.flicker == pytest.approx(0.005, rel=0.4)
     actual, stated = error(found)
-    assert 0.3 * stated < actual < 1.3 * stated
+    assert 0.3 * stated < actual < 1.1 * stated
