@@ -41,6 +41,8 @@ BLACK, DARK, CODES, BRIGHTEST = 200.0, 20.0, 2**16, 5e4
 """DN, electrons a frame, codes, and DN of the brightest pixel at most."""
 NAMES = {"half exposure": "dim"}
 """What the calibration calls a fault of another name."""
+SHAPES = ("half lost", "shifted", "clipped")
+"""Faults of a frame's shape, which are `wrong` where no pair foretells it."""
 FIRST = False
 """Whether the uniform pattern is the one that is wrong."""
 FRAME_FAULTS = ("black", "half lost", "half exposure", "repeated", "shifted", "clipped")
@@ -155,6 +157,7 @@ class Fault:
     half: Half
     other: int
     part: float
+    uniform: bool
 
     @classmethod
     def of(cls, kind: str, count: int, rng: np.random.Generator, uniform: bool) -> Fault:
@@ -163,7 +166,13 @@ class Fault:
         if FIRST and kind in FRAME_FAULTS:
             first = 0
         side: Side = SIDES[int(rng.integers(2))]
-        return cls(kind, (side, first, 1 if uniform else int(rng.choice([1, -1]))), other, float(rng.uniform(0.3, 0.7)))
+        return cls(
+            kind,
+            (side, first, 1 if uniform else int(rng.choice([1, -1]))),
+            other,
+            float(rng.uniform(0.3, 0.7)),
+            uniform,
+        )
 
     def named(self, factors: Factors) -> bool:
         """Whether a calibration names it, and nothing else."""
@@ -173,7 +182,8 @@ class Fault:
         if len(faults) != 1 or lamp is not None:
             return False
         fault, (side, index, sign) = faults[0], self.half
-        if fault["side"] != side or fault["kind"] != NAMES.get(self.kind, self.kind):
+        kinds = (NAMES.get(self.kind, self.kind), *(["wrong"] if self.uniform and self.kind in SHAPES else []))
+        if fault["side"] != side or fault["kind"] not in kinds:
             return False
         if self.kind == "swapped":
             return {fault["index"], fault["other"][1]} == {index, self.other}

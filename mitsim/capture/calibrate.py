@@ -45,7 +45,8 @@ from mitsim.reconstruct.calibration import (
     stripe_sums,
 )
 from mitsim.reconstruct.factors import Factors, load_calibration
-from mitsim.reconstruct.session_faults import Checked, check_session, frame_words
+from mitsim.reconstruct.session_faults import Checked, Circumstances, check_session
+from mitsim.reconstruct.session_findings import frame_words
 from mitsim.rig.order import SIDES
 from mitsim.rig.recipe import SessionRecipe, load_recipe
 
@@ -308,12 +309,13 @@ def checked_estimates(
                 checkpoint.save(_STRIPES, stripes.arrays())
     drift = session.recipe.drift
     # Who states that the lamp drifts asks what that costs, which is gone once it is divided out.
-    steady = not (drift.session_ramp or drift.session_flicker)
+    unsteady = bool(drift.session_ramp or drift.session_flicker)
+    sensor = session.bench.sensor
+    step = 0.0 if sensor.largest_dn is None else 1 / sensor.gain_dn_per_e / lit.exposure_s
+    taken = Circumstances(session.order, saturated=bool(stripes.saturated), unsteady=unsteady, step=step)
     with job.clock.stage("estimate"):
         judged = [
-            check_session(stripes.sums[kind], session.signs, session.order, saturated=bool(stripes.saturated))
-            if kind == NOISY and steady
-            else Checked(stripes.sums[kind])
+            check_session(stripes.sums[kind], session.signs, taken) if kind == NOISY else Checked(stripes.sums[kind])
             for kind in kinds
         ]
         found = [

@@ -5,6 +5,7 @@ Numbers are those of a simulated session: frames of one, written to such a folde
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -27,7 +28,7 @@ from mitsim.core.versions import versions
 from mitsim.reconstruct.calibration import Estimate, Seen, StripeSums, stripe_sums
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.ladder import Chosen, Ladder
-from mitsim.reconstruct.session_faults import Checked, check_session
+from mitsim.reconstruct.session_faults import Checked, Circumstances, check_session
 from mitsim.rig.digital import digital_of
 from mitsim.rig.framelist import DarkFile, SessionFrames, StripeFile, load_frames
 from mitsim.rig.order import SIDES, UNIFORM, Half, Side
@@ -39,6 +40,12 @@ _FILLED = ("read_noise_e", "step_dn", "saturation_dn")
 _COMPARED = {"gain_dn_per_e": (0.05, 0.0), "black_level_dn": (0.02, 1.0), "saturation_dn": (0.02, 1.0)}
 """What both state, and from which relative and absolute difference they contradict: published gains are good to a few
 percent, level and end are settings, true to a digital number."""
+_UNLIKE, _MATTERS = 4.0, 0.02
+"""Squared difference of two frames that should be alike, in the session's median one, and its root as a part of their
+light, from which one is wrong: light that is twice the usual doubles the first, less than the second costs less than
+most sessions' noise."""
+_LIT = 0.01
+"""Light of a dark frame beyond the others', as a part of the uniform frame's, from which it is wrong."""
 _CLIPPED, _FEW = 2e-3, 10
 """Part of a frame's pixels, and how many, at its largest number that are no chance: of noisy ones a few are."""
 
@@ -130,7 +137,7 @@ def _calibrated(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) 
     readings = _Readings(session)
     estimate, noise, found = _estimate(readings, job)
     warnings: tuple[str, ...] = doubts if estimate.ok else (*doubts, str(estimate.status))
-    warnings += found.warnings(session.frame_name)
+    warnings += (*found.warnings(session.frame_name), *readings.odd.values())
     if readings.saturated:
         warnings += (
             f"saturation: {len(readings.saturated)} of {len(session.files)} frames have pixels at the full well or the "
@@ -246,15 +253,67 @@ class _Reading:
         return max(self.ladder.variance(self.rate), 0.0) / self.shots
 
 
+@dataclass(frozen=True)
+class _Compared:
+    """Two frames that should be alike: names, mean ``squared`` difference over mean squared light, that light, and how
+    much of the light of the second the first has. ``kind`` are those that noise makes differ alike."""
+
+    names: tuple[str, str]
+    kind: int
+    squared: float
+    light: float
+    part: float
+
+    @classmethod
+    def of(cls, names: tuple[str, str], kind: int, one: FloatArray, other: FloatArray) -> _Compared:
+        """Of rates (pixels,)."""
+        light = max(float(np.square(other).mean()), float(np.square(one).mean()))
+        product = float(np.dot(one.ravel(), other.ravel())) / other.size
+        size = float(np.square(other).mean())
+        return cls(names, kind, float(np.square(one - other).mean()), light, product / size if size else 0.0)
+
+
 @dataclass(frozen=True, eq=False)
 class _Readings:
-    """Frames of a ``session`` as electrons a second; names of those that are ``saturated`` are noted as they are read.
+    """Frames of a ``session`` as electrons a second; names of those that are ``saturated`` are noted as they are read,
+    how frames ``compared`` that should be alike, and which dark ones are ``odd``, in words.
 
     Measurements of all patterns are as in a simulated session: :meth:`mitsim.capture.responses.LitSession.noisy`.
     """
 
     session: SessionFrames
     saturated: set[str] = field(default_factory=set)
+    compared: dict[Half, list[_Compared]] = field(default_factory=dict)
+    odd: dict[str, str] = field(default_factory=dict)
+
+    def wrong(self) -> dict[Half, str]:
+        """Which halves of patterns have repeats or exposures that differ, in words."""
+        kinds: dict[int, list[float]] = {}
+        for each in self.compared.values():
+            for one in each:
+                kinds.setdefault(one.kind, []).append(one.squared)
+        usual = {kind: float(np.median(values)) for kind, values in kinds.items()}
+        found = {}
+        for half, each in self.compared.items():
+            far = [
+                one
+                for one in each
+                if one.squared > max(_UNLIKE * usual[one.kind], _MATTERS**2 * max(one.light, 1e-300))
+            ]
+            if not far:
+                continue
+            first = far[0]
+            # A frame that differs from two that are alike is the wrong one.
+            counts = Counter(name for one in far for name in one.names)
+            near = {name for one in each if one not in far for name in one.names}
+            name = max(first.names, key=lambda name: (counts[name], name not in near))
+            other = first.names[1 - first.names.index(name)]
+            part = first.part if name == first.names[0] else 1 / (first.part or np.inf)
+            which = "should be alike" if len(each) == 1 else "is the one that differs"
+            found[half] = (
+                f"{name} has {part:.3g} of the light of {other}, and {'both' if len(each) == 1 else 'it'} {which}"
+            )
+        return found
 
     def response(self, side: Side, index: int) -> tuple[FloatArray, float, FloatArray | None]:
         """Response (rows, columns) to a +-1 pattern [electrons/s], its mean noise variance, and the sum of its two
@@ -312,7 +371,7 @@ class _Readings:
         found = {}
         for exposure in {self.session.exposure_s(frame) for frame in self.session.dark}:
             frames = [frame for frame in self.session.dark if self.session.exposure_s(frame) == exposure]
-            found[exposure] = self._read(frames, True)
+            found[exposure] = self._read(self._alike(frames), True)
         if self._ladders is None:
             return dict.fromkeys(SIDES, found)
         each = [found[digital.exposure_s] for digital in self._ladders[SIDES[0]].digitals]
@@ -320,6 +379,24 @@ class _Readings:
             side: {each[0].exposure_s: _Reading(ladder.merged(own.rate for own in each), ladder, each[0].shots)}
             for side, ladder in self._ladders.items()
         }
+
+    def _alike(self, frames: list[DarkFile]) -> list[DarkFile]:
+        """Dark ``frames`` of one exposure without one that has light which the others have not; it is noted in
+        ``odd``."""
+        levels = np.array([float(self._read([frame], True).rate.mean()) for frame in frames])
+        uniform = self._read(self.session.repeated((SIDES[0], 0, UNIFORM)), True).rate.mean()
+        parts = (levels - np.median(levels)) / uniform
+        lit = np.abs(parts) > _LIT
+        if not lit.any():
+            return frames
+        few = len(frames) < 3
+        remedy = "one of them is wrong: take more" if few else "it is left out"
+        for frame, part in zip(np.asarray(frames)[lit], parts[lit], strict=True):
+            self.odd[frame.file] = (
+                f"frames: {frame.file}, with the projector off, has {part:+.1%} of a uniform frame's light more than "
+                f"the median of {len(frames)} such frames; {remedy}"
+            )
+        return frames if few else [frame for frame, one in zip(frames, lit, strict=True) if not one]
 
     def clipped(self, half: Half) -> bool:
         """Whether many pixels of a frame share its largest number."""
@@ -335,22 +412,40 @@ class _Readings:
         if self._ladders is None:
             return self._read(self.session.repeated(half), True)
         ladder = self._ladders[half[0]]
-        each = (
-            self._read(self.session.repeated(half, number), ladder.used(number))
-            for number in range(len(ladder.digitals))
-        )
-        return _Reading(ladder.merged(reading.rate for reading in each), ladder, self.session.listed.repeats)
+        rates = []
+        for number in range(len(ladder.digitals)):
+            frames, used = self.session.repeated(half, number), ladder.used(number)
+            rates.append(self._read(frames, used).rate)
+            both = np.asarray(used & ladder.used(0))
+            if number and both.any():
+                names = frames[0].file, self.session.repeated(half)[0].file
+                self._compare(half, _Compared.of(names, -number, rates[-1][both], rates[0][both]))
+        return _Reading(ladder.merged(rates), ladder, self.session.listed.repeats)
+
+    def _compare(self, half: Half, compared: _Compared) -> None:
+        """Note it, once."""
+        known = self.compared.setdefault(half, [])
+        if compared not in known:
+            known.append(compared)
 
     def _read(self, frames: Sequence[StripeFile | DarkFile], used: Chosen) -> _Reading:
         """The mean of ``frames`` of one exposure; ``used`` are the pixels that may not be saturated."""
         digital = self.session.listed.digital.model_copy(update={"exposure_s": self.session.exposure_s(frames[0])})
         total: FloatArray | None = None
-        for frame in frames:
+        before: FloatArray | None = None
+        for place, frame in enumerate(frames):
             values = read_image(self.session.folder / frame.file, self.session.wanted)
             end = own_end(values) if digital.saturation_dn is None else digital.saturation_dn
             if end is not None and ((values >= end) & used).any():
                 self.saturated.add(frame.file)
             total = values.astype(np.float64) if total is None else total + values
+            if len(frames) > 1 and isinstance(frame, StripeFile):
+                rate = digital.rate(values)
+                if before is not None:
+                    names = frame.file, frames[place - 1].file
+                    half = frame.side, frame.index, frame.sign
+                    self._compare(half, _Compared.of(names, frame.exposure, rate, before))
+                before = rate
         assert total is not None
         return _Reading(digital.rate(total / len(frames)), Ladder((digital,)), len(frames))
 
@@ -362,12 +457,19 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Ch
     session = readings.session
     signs = stripe_signs(session.listed.n).astype(np.float64)
     sums, variances = _sums(readings, signs.shape[1], job)
-    found = check_session(sums, signs, session.order, readings.clipped, saturated=bool(readings.saturated))
+    digital = session.listed.digital
+    taken = Circumstances(
+        session.order,
+        session.frame_name,
+        readings.clipped,
+        bool(readings.saturated),
+        step=(digital.step_dn or 0.0) / digital.gain_dn_per_e / digital.exposure_s,
+        wrong=readings.wrong(),
+    )
+    found = check_session(sums, signs, taken)
     if wrong := found.wrong_uniform():
         sums, variances = _sums(readings, signs.shape[1], job, found.other_uniform(wrong))
-        found = check_session(
-            sums, signs, session.order, readings.clipped, uniform_given=True, saturated=bool(readings.saturated)
-        )
+        found = check_session(sums, signs, taken, uniform_given=True)
     noise = float(np.sqrt(max(float(np.mean(variances)), 0.0))) if session.listed.digital.noise_is_stated else None
     with job.clock.stage("estimate"):
         return found.estimate(signs, noise), noise, found

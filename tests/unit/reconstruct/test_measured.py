@@ -283,3 +283,51 @@ def test_a_camera_fills_what_the_list_leaves_out_and_is_compared_with_the_rest(t
     assert stated.manifest.digital is not None and stated.manifest.digital.read_noise_e == 10
     (end,) = stated.warnings
     assert "saturation_dn is 4000 in the list, and 3910" in end
+
+
+def repeated(folder: Path, listed: dict[str, Any], shots: list[tuple[int, float]], wrong: tuple[int, int]) -> Factors:
+    """Factors of a session of pairs that takes each half in ``shots`` (repeat or exposure, exposure over the first);
+    that of half and shot ``wrong`` is half as bright."""
+    session = RealSession()
+    folder.mkdir()
+    for number, (*_, light) in enumerate(session.shown("pair")):
+        for shot, factor in shots:
+            part = 0.5 if (number, shot) == wrong else 1.0
+            frame = session.frame(part * light, factor * DIGITAL["exposure_s"])
+            write_image(folder / f"f_{len(shots) * number + shot}.png", frame)
+    write_list(folder, **listed)
+    return calibrate_frames(folder)
+
+
+@pytest.mark.parametrize(
+    ("listed", "shots", "words"),
+    [
+        (
+            {"repeats": 2},
+            [(0, 1.0), (1, 1.0)],
+            "f_10.png and 1 more (horizontal stripes 2 of sign -1): is wrong: f_11.png",
+        ),
+        ({"repeats": 3}, [(0, 1.0), (1, 1.0), (2, 1.0)], "is wrong: f_16.png has 0.5"),
+        ({"exposure_ladder": [1, 2]}, [(0, 1.0), (1, 2.0)], "is wrong: f_11.png has 0.5"),
+    ],
+)
+def test_a_wrong_repeat_or_exposure_is_named(
+    tmp_path: Path, listed: dict[str, Any], shots: list[tuple[int, float]], words: str
+) -> None:
+    """(Planted: repeats, and exposures, are compared with themselves.)"""
+    good = repeated(tmp_path / "good", listed, shots, (-1, -1))
+    assert good.ok, good.warnings
+    bad = repeated(tmp_path / "bad", listed, shots, (5, 1))
+    assert not bad.ok and len(bad.warnings) == 1 and words in bad.warnings[0], bad.warnings
+    assert max(error(bad, RealSession())) < 0.05
+
+
+def test_a_dark_frame_with_light_is_named_and_left_out(tmp_path: Path) -> None:
+    """(Planted: it is left in.)"""
+    session = RealSession()
+    folder = session.write(tmp_path / "frames", "uniform")
+    for number in range(4):
+        write_image(folder / f"dark_{number}.png", session.frame(np.full((4, 4), 0.1 * (number == 2))))
+    found = calibrate_frames(folder)
+    assert len(found.warnings) == 1 and "dark_2.png, with the projector off, has +10" in found.warnings[0]
+    assert max(error(found, session)) < 0.02

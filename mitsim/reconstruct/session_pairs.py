@@ -1,0 +1,512 @@
+"""Sums of a session's pairs in; frames that are not what they should be, what they should have been, and the lamp's
+power out.
+
+The two frames of a pair add up to one frame for all patterns, so that a frame which is black, dim, half lost, a repeat,
+shifted or clipped shows in the sum, and the other half foretells what it should have been. What the sums share is the
+lamp's power, in the order of the session.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.reconstruct.session_findings import DARK, Fault, Lamp, dimmed, frame_words
+from mitsim.reconstruct.session_side import MOST_FAULTS, Side
+from mitsim.rig.order import Half
+
+_MATTERS = 0.5
+"""Error by the lamp, over that by noise, from which it is corrected and said: both in quadrature are 12 % more."""
+_DEVIATIONS = 8.0
+"""Deviations from the rest, by their own robust scatter, that make a fault: noise alone goes so far in one session of
+10^12."""
+_LEAST = 2e-3
+"""Change of a pair's light that counts: that of one frame by 0.4 %, which costs less than most sessions' noise."""
+_EXCESS = 2.0
+"""Squared deviation of a pair's sum, over that of the others, that counts at least."""
+_EXPLAINED = 0.05
+"""Part of a faulty frame's squared deviation that the fault's name may leave unexplained."""
+_SHIFTS = 8
+"""Rows or columns by which a frame is tried to be shifted."""
+_TURNS = 3
+"""Steps in which noise and flicker, which hang on each other, are found: a fourth changes no digit."""
+_ROUNDING = 1e-6
+"""Part of the light that counts as noise at least: rounding of sums of single frames leaves 1e-12, of pairs of factors
+in single precision 1e-7."""
+_RANDOM = 2 / 3
+"""Variance of a pair's difference, in squared steps, that noise of half a step and rounding make: with more the mean of
+rounding is 0 within 1 %."""
+_LINEAR = 0.02
+"""Deviation of a pair's sum, rms, as a part of its light, that a camera may make which is not linear: where no fault's
+name explains it, none is said. A linearity of 0.03 makes 0.5 % in most pairs, 1 % in uniform ones."""
+_FLICKERS = 2.0
+"""Robust scatter of the pairs' power over that by noise, which is known to 20 %, that is flicker; of few pairs, whose
+scatter itself is known to 1.2 of it over the root of their number, more."""
+_FITS = 4.0
+"""Mean squared deviation, in that of a good pair's sum, up to which a name fits."""
+_BOTH = 36.0
+"""Squared deviation of a frame's light from the usual, in four times its robust scatter, that makes it no frame to
+foretell the other by."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """What is known of one frame, in deviations of a pair's noise: ``parts`` are means of its rows, of its columns, and
+    its vector."""
+
+    parts: tuple[FloatArray, FloatArray, FloatArray]
+
+    @property
+    def all(self) -> FloatArray:
+        return np.concatenate(self.parts)
+
+
+class Pairs:
+    """Pairs of both ``sides``, frames in the ``order`` in which they were taken."""
+
+    def __init__(
+        self,
+        sides: list[Side],
+        order: Sequence[Half],
+        clipped: Callable[[Half], bool],
+        step: float,
+        wrong: Mapping[Half, str],
+    ) -> None:
+        """Add pairs up.
+
+        Parameters
+        ----------
+        sides
+            both.
+        order, clipped, step, wrong
+            as a session's circumstances have them.
+        """
+        self.sides, self.clipped, self.wrong = sides, clipped, wrong
+        self.pairs = [own.sums.pairs for own in sides if own.sums.pairs is not None]
+        self.count = sides[0].sums.done
+        places = {half: place for place, half in enumerate(order)}
+        self.before = dict(zip(order[1:], order, strict=False))
+        span = max(len(order) - 1, 1)
+        self.times = np.array(
+            [[places[own.side, index, sign] / span for sign in (1, -1)] for own in sides for index in range(self.count)]
+        )
+        self.rows = np.concatenate([own.rows.sum(axis=1) for own in self.pairs])
+        self.columns = np.concatenate([own.columns.sum(axis=1) for own in self.pairs])
+        both = np.hstack([self.rows, self.columns])
+        self.ambient_and_all = np.median(both, axis=0)
+        self.common = self._uniform()
+        # Of a pair, what its dark frame has of ambient light.
+        light = float(self.ambient_and_all.sum())
+        self.dark = (1 - float(self.common.sum()) / light) / 2 if light else 0.0
+        size = max(float(np.dot(self.common, self.common)), 1e-300)
+        away = both - self.ambient_and_all
+        # Ambient light is in every sum, and no part of the lamp's power.
+        self.power = 1 + away @ self.common / size
+        self.lights = [np.median(own.light, axis=1) for own in self.pairs]
+        self.uniforms = [other.sums.common for other in reversed(sides)]
+        rests = [away - (self.power - 1)[:, None] * self.common]
+        halves = [
+            np.concatenate([np.hstack([own.rows[:, half], own.columns[:, half]]) for own in self.pairs])
+            for half in (0, 1)
+        ]
+        self.trend, self.scatter, self.steady = _trend(self.times.mean(axis=1), self.power)
+        differences = [halves[0] - halves[1]]
+        for number, own in enumerate(self.pairs):
+            along, vectors = self.uniforms[number], sides[number].sums.vectors
+            rest = (own.light - self.lights[number][:, None]).T
+            rest = rest - np.outer(rest @ along / max(float(np.dot(along, along)), 1e-300), along)
+            rests.append(rest)
+            differences.append(vectors.T)
+        for number, along in enumerate((self.common, *self.uniforms)):
+            share = differences[number] @ along / max(float(np.dot(along, along)), 1e-300)
+            differences[number] = differences[number] - np.outer(share, along)
+        # Rounding of a pair's sum that no noise makes random is one for all its pixels of like light.
+        alike = step / np.sqrt(6) if min(own.variance for own in sides) < _RANDOM * step**2 else 0.0
+        rounding = max(_ROUNDING**2 * float(np.square(self.ambient_and_all).mean()), alike**2)
+        shares = [float(np.abs(along).sum() / max(np.dot(along, along), 1e-300)) for along in self.uniforms]
+        least = [rounding * share**2 for share in (1.0, *shares)]
+        self.flicker, self.floor = 0.0, 1.0
+        self.light_noise = [1.0, 1.0]
+        for _ in range(_TURNS):  # noise and flicker hang on each other
+            found = [
+                _unshaken(rest, difference, self.flicker, noise)
+                for rest, difference, noise in zip(
+                    rests, differences, [self.floor, *self.light_noise] if self.flicker else [1.0] * 3, strict=True
+                )
+            ]
+            self.floor, *self.light_noise = map(max, [float(np.median(each)) for each in found], least)
+            # Means of rows and of columns share the frame's mean and its noise: twice independent ones' variance.
+            self.noise = float(np.sqrt(2 * self.floor / size + alike**2 / np.square(self.common).mean()))
+            self.flicker = float(np.sqrt(max(self.scatter**2 - self.noise**2, 0.0)))
+            if self.scatter < _FLICKERS * (1 + 3 / np.sqrt(len(self.power))) * self.noise:
+                self.flicker = 0.0
+                break
+        found = [
+            _unshaken(rest, difference, self.flicker, noise) / noise
+            for rest, difference, noise in zip(rests, differences, [self.floor, *self.light_noise], strict=True)
+        ]
+        self.excess = np.maximum(found[0], np.concatenate(found[1:]))
+        away_from_trend = np.abs(self.power - self.trend)
+        middle = max(float(np.median(self.excess)), 1.0)
+        scatter = 1.4826 * float(np.median(np.abs(self.excess - middle)))
+        bad = away_from_trend > max(_DEVIATIONS * max(self.scatter, self.noise), _LEAST)
+        bad |= self.excess > max(_EXCESS * middle, middle + _DEVIATIONS * scatter)
+        known = {(side, index) for side, index, _ in wrong}
+        bad |= [(own.side, index) in known for own in sides for index in range(self.count)]
+        self.good = ~bad
+        # A camera that is not linear by a percent makes sums that differ by its squares: no frame is wrong there.
+        self.slight = self.excess * self.floor < _LINEAR**2 * np.square(self.ambient_and_all).mean()
+        self.many = bool((bad & ~self.slight).sum() > max(2.0, MOST_FAULTS * len(bad)))
+
+    def _uniform(self) -> FloatArray:
+        """Means of rows and columns of the lamp's light: the response to the uniform pattern, of two that which differs
+        less from all pairs' light, but for even ambient light."""
+        found = []
+        for own in self.pairs:
+            light = np.concatenate([part[0, 0] - part[0, 1] for part in (own.rows, own.columns)])
+            light = light if light.sum() >= 0 else -light
+            found.append((float(np.std(light - self.ambient_and_all)), light))
+        return min(found, key=lambda one: one[0])[1]
+
+    def _of(self, number: int, values: FloatArray) -> FloatArray:
+        """Those of the ``values`` (2 N,) that belong to a side."""
+        return np.asarray(values[number * self.count : (number + 1) * self.count])
+
+    def check(self, steady: bool = True) -> Lamp:
+        """Find faulty frames, put what their pairs foretell in their place, and find how steady the lamp is, where it
+        should be ``steady``."""
+        bad = ~self.good
+        if self.many:
+            self._refuse(int(bad.sum()))
+        lamp = self._correct() if steady else Lamp()
+        for place in np.flatnonzero(bad):
+            self._repair(self.sides[place // self.count], int(place // self.count), int(place % self.count), lamp)
+        for own, pairs in zip(self.sides, self.pairs, strict=True):
+            fluxes = pairs.rows.mean(axis=2)
+            if self.good[self.sides.index(own) * self.count] and fluxes[0, 0] < fluxes[0, 1]:
+                own.faults.append(
+                    Fault(
+                        own.side,
+                        0,
+                        None,
+                        "exchanged",
+                        "in each other's place",
+                        "they count in their right order",
+                    )
+                )
+        return lamp
+
+    def _refuse(self, wrong: int) -> None:
+        """MitsimError: so many pairs are wrong."""
+        own = self.pairs[0].rows
+        next_one, this = own[:-1, 1] + own[1:, 0], own.sum(axis=1)
+        apart = [float(np.median(np.square(each - np.median(each, axis=0)).mean(axis=1))) for each in (next_one, this)]
+        remedy = "check the order of the frames and what was shown, and take the session again"
+        if apart[0] < _EXPLAINED * apart[1]:
+            remedy = (
+                "but each frame does with its other neighbour: frames are one step out of order; correct their names"
+            )
+        raise MitsimError(
+            f"the two frames of {wrong} of {len(self.good)} patterns do not add up to what others do; {remedy}"
+        )
+
+    # ---- the lamp ----------------------------------------------------------------------------------------------------
+
+    def _correct(self) -> Lamp:
+        """How steady the lamp is; vectors are divided by its power where that matters."""
+        good, mean = self.good, float(self.power[self.good].mean())
+        powers, trend = self.power / mean, self.trend / mean
+        # A pair's sum shares both frames' flicker.
+        flicker = float(np.sqrt(2)) * self.flicker
+        costs = []
+        for number, own in enumerate(self.sides):
+            inside = self._of(number, good)
+            vectors = own.vectors[:, inside]
+            size = max(float(np.sum(np.square(vectors))), 1e-300)
+            moved = float(np.sum(np.square(vectors * (self._of(number, trend) - 1)[inside])))
+            # Each frame's own power: half of it scales the response, half adds the uniform frame to it.
+            added = inside.sum() * float(np.square(self.uniforms[number]).sum()) * self.flicker**2
+            costs.append((moved / size, added / size + self.flicker**2, own.noise * self.count / size))
+        moved, shaken, noise = (float(np.sqrt(np.sum(part))) for part in zip(*costs, strict=True))
+        drifts = bool(np.ptp(trend) > _DEVIATIONS * self.steady and moved > _MATTERS * noise)
+        flickers = bool(flicker and shaken > _MATTERS * noise)
+        if not drifts and not flickers:
+            return Lamp()
+        used = powers if flickers else trend
+        # The uniform response is the mean of both sides' first ones, which had a power of their own.
+        scale = float(np.sqrt((used[0] + used[self.count]) / 2)) if good[0] and good[self.count] else 1.0
+        remaining = 0.0
+        for number, own in enumerate(self.sides):
+            self._divided(number, own, self._of(number, used), flicker if flickers else 0.0)
+            own.rescale(scale)
+            remaining += float(own.extras.sum() / np.sum(np.square(own.vectors)))
+        return Lamp(
+            drift=_end_to_end(self.times.mean(axis=1), trend) if drifts else 0.0,
+            flicker=flicker if flickers else 0.0,
+            drift_cost=moved if drifts else 0.0,
+            flicker_cost=shaken if flickers else 0.0,
+            remaining=float(np.sqrt(remaining)),
+            corrected=True,
+        )
+
+    def _divided(self, number: int, own: Side, powers: FloatArray, flicker: float) -> None:
+        """Divide a side's vectors by the power of their frames; what flicker leaves in them counts as their error.
+
+        Y(+1) = (1 + d) g P and Y(-1) = (1 - d) g (U - P) add up to g (U + d u), which tells d by the vector u of the
+        response, the better the longer that is; its least squares are taken with the flicker's own variance as prior.
+        """
+        pairs, uniform = self.pairs[number], self.uniforms[number]
+        noise, whole = self.light_noise[number], float(np.dot(uniform, uniform))
+        for index in np.flatnonzero(self._of(number, self.good)):
+            vector = own.vectors[:, index] / float(powers[index])
+            if index and flicker:
+                rest = (pairs.light[:, index] - self.lights[number]) / float(powers[index])
+                rest = rest - float(np.dot(rest, uniform)) / whole * uniform
+                # The sum's power, which the response is divided by, has d times this share of the response in it.
+                share = float(np.dot(vector, uniform)) / whole
+                across = vector - share * uniform
+                known = float(np.dot(across, across)) + 2 * noise / flicker**2
+                half = float(np.dot(rest, across)) / known
+                vector = vector * (1 + half * share) - half * uniform
+                own.extras[index] += noise / known * whole
+            elif index:
+                vector = vector - self._slope(number, int(index)) * uniform
+            own.change(int(index), vector)
+
+    def _slope(self, number: int, index: int) -> float:
+        """Half the difference of a drifting lamp's power in the two frames of a pair, as a part of it."""
+        place = number * self.count + index
+        before, after = self.times[place]
+        times = self.times.mean(axis=1)
+        near = np.argsort(np.abs(times - times[place]))[: min(9, len(times))]
+        if np.ptp(times[near]) == 0:
+            return 0.0
+        gradient = np.polyfit(times[near], self.trend[near], 1)[0]
+        return float(gradient * (before - after) / 2 / self.trend[place])
+
+    # ---- one faulty pair ---------------------------------------------------------------------------------------------
+
+    def _shown(self, number: int, index: int, sign: int) -> _Shown:
+        """A frame, in deviations of a pair's noise."""
+        own, pairs = self.sides[number].sums, self.pairs[number]
+        vector = (pairs.light[:, index] + (1 if sign > 0 else -1) * own.vectors[:, index]) / 2
+        half = 0 if sign > 0 else 1
+        scale = 1 / np.sqrt(self.floor)
+        return _Shown(
+            (
+                pairs.rows[index, half] * scale,
+                pairs.columns[index, half] * scale,
+                vector / np.sqrt(self.light_noise[number]),
+            )
+        )
+
+    def _expected(self, number: int, index: int, sign: int) -> _Shown:
+        """What the other frame of its pair foretells of a frame."""
+        more = float(self._of(number, self.trend)[index]) - 1
+        other = self._shown(number, index, -sign).parts
+        rows = len(other[0])
+        scale = 1 / np.sqrt(self.floor)
+        both = (self.ambient_and_all + more * self.common) * scale
+        vector = (self.lights[number] + more * self.uniforms[number]) / np.sqrt(self.light_noise[number])
+        return _Shown((both[:rows] - other[0], both[rows:] - other[1], vector - other[2]))
+
+    def _flux(self, number: int, index: int, sign: int) -> float:
+        """Light of a frame over that of all light."""
+        more = float(self._of(number, self.trend)[index]) - 1
+        rows = self.pairs[number].rows[index, 0 if sign > 0 else 1]
+        whole = float((self.ambient_and_all + more * self.common)[: rows.size].mean())
+        return float(rows.mean() / whole) if whole else 0.0
+
+    def _usual(self, number: int) -> tuple[float, float]:
+        """The flux of half the light, and its robust deviation."""
+        fluxes = [
+            self._flux(number, index, 1) for index in range(1, self.count) if self.good[number * self.count + index]
+        ]
+        middle = float(np.median(fluxes)) if fluxes else 0.5
+        return middle, max(1.4826 * float(np.median(np.abs(np.asarray(fluxes) - middle))) if fluxes else 0.0, 1e-3)
+
+    def _repair(self, own: Side, number: int, index: int, lamp: Lamp) -> None:
+        """Name the faulty frame of a pair, and take its vector from the other one."""
+        usual, deviation = self._usual(number)
+        found = []
+        for sign in (1, -1):
+            kept = self._flux(number, index, -sign)
+            right = usual if sign < 0 else 1 - usual
+            if index == 0:
+                right = 1 - self.dark if sign < 0 else self.dark
+            penalty = ((kept - right) / (4 * deviation)) ** 2
+            rest, kind, detail, other = self._best(number, index, sign)
+            found.append((rest + penalty, penalty, sign, kind, detail, other))
+        known = [sign for sign in (1, -1) if (own.side, index, sign) in self.wrong]
+        found.sort(key=lambda one: (one[2] not in known, one[0]))
+        _, penalty, sign, kind, detail, other = found[0]
+        if known:
+            kind, detail, other = "wrong", f"is wrong: {self.wrong[own.side, index, sign]}", None
+        elif kind == "wrong" and self.slight[number * self.count + index]:
+            return
+        own.uncounted.add(index)
+        if len(known) == 2 or (not known and penalty > _BOTH and found[1][1] > _BOTH):
+            if index:
+                own.unknown.add(index)
+            else:  # by definition, where it is the other side's that all vectors are projected on
+                own.change(0, self.uniforms[number])
+            own.faults.append(
+                Fault(
+                    own.side,
+                    index,
+                    None,
+                    kind,
+                    f"{detail}, and the other frame of its pair is wrong too",
+                    "both are left out",
+                    other,
+                )
+            )
+            return
+        power = float(self._of(number, self.trend)[index])
+        light, vector = self.pairs[number].light[:, index], own.sums.vectors[:, index]
+        sound = (light - sign * vector) / 2
+        both = self.lights[number] + (power - 1) * self.uniforms[number]
+        corrected = power / float(self.power[self.good].mean()) if lamp.corrected else 1.0
+        own.change(index, -sign * (2 * sound - both) / corrected)
+        own.extras[index] += own.noise
+        own.faults.append(
+            Fault(
+                own.side,
+                index,
+                sign,
+                kind,
+                detail,
+                "it is left out, and foretold by the other frame of its pair",
+                other,
+            )
+        )
+
+    def _best(self, number: int, index: int, sign: int) -> tuple[float, str, str, Half | None]:
+        """The name that leaves least of a frame unexplained, mean squared deviations, of those that explain it."""
+        shown, expected = self._shown(number, index, sign), self._expected(number, index, sign)
+        whole = float(np.square(shown.all - expected.all).mean())
+        names: list[tuple[float, str, str, Half | None]] = []
+        size = float(np.dot(expected.all, expected.all))
+        part = float(np.dot(shown.all, expected.all)) / size if size else 0.0
+        flux = float(shown.parts[0].sum() / expected.parts[0].sum()) if expected.parts[0].sum() else 0.0
+        if index == 0 and sign < 0 and self.dark < DARK:
+            flux = part = 1.0  # a dark frame of a dark room
+        if self.clipped((self.sides[number].side, index, sign)) and flux > DARK:
+            return 1.0, "clipped", "is clipped: many of its pixels share its largest number", None
+        if flux < DARK and all(
+            np.ptp(each) < DARK * 2 * np.ptp(whole_part) + 12
+            for each, whole_part in zip(shown.parts, expected.parts, strict=True)
+        ):
+            return 1.0, "black", "is black", None
+        names.append((float(np.square(shown.all - part * expected.all).mean()), *dimmed(part), None))
+        names += self._lost(shown, expected)
+        names += self._repeats(number, index, sign, shown)
+        names += self._shifted(number, shown, expected)
+        rest, kind, detail, other = min(names, key=lambda one: one[0])
+        if rest > max(_FITS, _EXPLAINED * whole):
+            return rest, "wrong", "is not what the other frame of its pair foretells", None
+        return rest, kind, detail, other
+
+    @staticmethod
+    def _lost(shown: _Shown, expected: _Shown) -> Iterator[tuple[float, str, str, Half | None]]:
+        """A frame that ends early or begins late, along its rows or columns."""
+        for axis, word in ((0, "rows"), (1, "columns")):
+            seen, whole = shown.parts[axis], expected.parts[axis]
+            missing, there = np.square(seen), np.square(seen - whole)
+            ahead = np.concatenate([[0.0], np.cumsum(there)])
+            behind = np.concatenate([np.cumsum(missing[::-1])[::-1], [0.0]])
+            early = ahead + behind
+            late = np.concatenate([[0.0], np.cumsum(missing)]) + np.concatenate([np.cumsum(there[::-1])[::-1], [0.0]])
+            for cost, first in ((early, False), (late, True)):
+                cut = int(np.argmin(cost[1:-1])) + 1
+                rest = float(cost[cut]) / len(seen)
+                lost = (cut if first else len(seen) - cut) / len(seen)
+                yield rest, "half lost", f"lost its {'first' if first else 'last'} {word}, {lost:.0%} of them", None
+
+    def _repeats(
+        self, number: int, index: int, sign: int, shown: _Shown
+    ) -> Iterator[tuple[float, str, str, Half | None]]:
+        """Other frames that it equals."""
+        for place, own in enumerate(self.sides):
+            scale = 1 / np.sqrt(self.floor)
+            pairs = self.pairs[place]
+            for half, signed in ((0, 1), (1, -1)):
+                away = np.square(pairs.rows[:, half] * scale - shown.parts[0]).sum(axis=1)
+                away += np.square(pairs.columns[:, half] * scale - shown.parts[1]).sum(axis=1)
+                numbers = len(shown.parts[0]) + len(shown.parts[1])
+                if place == number:
+                    vectors = (pairs.light + signed * own.sums.vectors) / 2 / np.sqrt(self.light_noise[number])
+                    away += np.square(vectors - shown.parts[2][:, None]).sum(axis=0)
+                    numbers += len(shown.parts[2])
+                    if signed == sign:
+                        away[index] = np.inf
+                if signed < 0:
+                    away[0] = np.inf  # dark, as a black frame is
+                if place != number:
+                    before = self.before.get((self.sides[number].side, index, sign))
+                    away[np.arange(self.count) != (before[1] if before and before[0] == own.side else -1)] = np.inf
+                nearest = int(np.argmin(away))
+                other: Half = (own.side, nearest, signed)
+                yield float(away[nearest]) / numbers, "repeated", f"repeats {frame_words(other)}", other
+
+    def _shifted(self, number: int, shown: _Shown, expected: _Shown) -> Iterator[tuple[float, str, str, Half | None]]:
+        """A frame that is moved by some rows or columns."""
+        for axis, word in ((0, "rows"), (1, "columns")):
+            length = len(shown.parts[axis])
+            if length < 4 * _SHIFTS:
+                continue
+            inner = slice(_SHIFTS, length - _SHIFTS)
+            still = np.square(shown.parts[1 - axis] - expected.parts[1 - axis])
+            vector, whole = shown.parts[2], expected.parts[2]
+            # Across its stripes a frame's vector moves; along them it becomes shorter.
+            part = float(np.dot(vector, whole)) / max(float(np.dot(whole, whole)), 1e-300)
+            scaled = np.square(vector - part * whole)
+            for shift in (*range(-_SHIFTS, 0), *range(1, _SHIFTS + 1)):
+                moved = np.square(shown.parts[axis] - np.roll(expected.parts[axis], shift))[inner]
+                third = scaled
+                if axis == number and len(vector) == length:
+                    third = np.square(vector - np.roll(whole, shift))[inner]
+                rest = float(np.concatenate([moved, still, third]).mean())
+                yield rest, "shifted", f"is shifted by {abs(shift)} of its {word}", None
+
+
+def _unshaken(rests: FloatArray, differences: FloatArray, flicker: float, noise: float) -> FloatArray:
+    """(pairs,) mean squared ``rests`` (pairs, numbers) of sums, less what flicker makes of the two frames'
+    ``differences`` (pairs, numbers): d of it, whose deviation is the ``flicker``, at a variance ``noise`` a number."""
+    squared = np.square(rests).sum(axis=1)
+    if flicker:
+        weight = noise / flicker**2
+        along = np.einsum("ij,ij->i", rests, differences)
+        squared = squared - np.square(along) / (np.square(differences).sum(axis=1) + weight)
+    return np.asarray(squared / rests.shape[1])
+
+
+def _trend(times: FloatArray, power: FloatArray) -> tuple[FloatArray, float, float]:
+    """A smooth power (pairs,) over the ``times``, the robust scatter round it, and the deviation of its two ends.
+
+    A parabola, fitted again without what is far from it.
+    """
+    away = np.abs(power - np.median(power))
+    kept = away <= max(6 * float(np.median(away)), 1e-12)
+    degree = min(2, max(len(np.unique(times)) - 2, 0))
+    found, scatter = np.full(power.shape, float(np.median(power))), 0.0
+    for _ in range(8):
+        if kept.sum() <= degree + 1:
+            break
+        found = np.polyval(np.polyfit(times[kept], power[kept], degree), times)
+        away = np.abs(power - found)
+        scatter = 1.4826 * float(np.median(away))
+        again = away <= max(4 * scatter, 1e-12)
+        if (again == kept).all():
+            break
+        kept = again
+    return found, scatter, 3 * scatter / float(np.sqrt(max(kept.sum(), 1)))
+
+
+def _end_to_end(times: FloatArray, trend: FloatArray) -> float:
+    first, last = int(np.argmin(times)), int(np.argmax(times))
+    return float(trend[last] - trend[first])

@@ -1,0 +1,382 @@
+"""Vectors of one side's stripe patterns in; those that are out of their place put back, those that are wrong left out.
+
+What a pattern's vector should be, the others foretell, as all are of one moving shadow
+(:mod:`mitsim.reconstruct.moving_shadow`). Where that is a shadow of nothing, and columns are independent, nothing is
+foretold and nothing is found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.reconstruct.calibration import StripeSums
+from mitsim.reconstruct.moving_shadow import MovingShadow
+from mitsim.reconstruct.session_findings import DARK, Fault, dimmed, frame_words
+from mitsim.rig import order
+from mitsim.rig.order import SIDES, UNIFORM, Half
+
+MOST_FAULTS = 0.1
+"""Part of the patterns that may be wrong before the session is refused: with more, what most share is in doubt."""
+_ENOUGH = 16, 64
+"""Patterns, and sensor rows, from which columns' covariance is known well enough."""
+_DEVIATIONS = 8.0
+"""Deviations of a misfit from the others, by their robust scatter, that make a fault."""
+_UNEXPLAINED = 0.05
+"""Part of a response's energy, beyond the others' noise, that no separable camera explains where it is a fault: 22 %
+of its amplitude."""
+_FAR = 10.0
+"""Squared deviation of a vector from the foretold one, in that of the median pattern, from which it is suspected."""
+_WRONG, _UNLIKE = 100.0, 0.5
+"""The same, and that deviation as a part of the vector's own square, from which it is wrong whatever it shows: a camera
+of 1.6 pixels a feature made 54 in a good session, other stripes 32 in one of twelve and 196 or more in eleven."""
+_FAR_LINE, _SHARED = 20.0, 0.2
+"""Squared deviation of the first scene line's column, in that of the median one and of what noise makes of it, from
+which the frame that all patterns are held against is wrong, as its error is in that column alone; and the uniform
+frame's part of the variance of 2 Y - U. Of 56 good sides none has 16; a uniform frame of 0.95 or 1.05 of its light
+makes 26 at least."""
+_FLICKERS = 4.0
+"""Robust scatter of frames' scales over their deviation that is flicker; of few patterns more, as it scatters itself:
+of 56 good sides none has 3.3, and half a percent makes 5 at least."""
+_GAIN = 3.0
+"""What putting patterns in their place must take off the squared deviations, in that of the median one, at least."""
+_EXPLAINED = 0.7
+"""What that is at least of the squared deviation of the pattern that is wrong. Of two, it is more than either's: one
+that is black, dim or a repeat fits better in another's place, but the other one not in its."""
+_TRIED = 64
+"""Patterns among which swaps are tried, those that deviate most."""
+_SAME = 4.0
+"""Squared distance of two vectors, in the noise of one, up to which they show the same: noise makes 2."""
+_SEEN = 64.0
+"""Squared length of a vector, over its noise, from which another that equals it is no chance: both are seen."""
+_FLOOR = 0.02
+"""Relative error of a factor that its columns' covariance is taken to have at least, as it is no exact law; chosen."""
+_TURNS = 8
+"""Steps that foretell left-out patterns with a covariance free of them, which has their foretold variance in their
+place; where another pattern of the same period is known, each step takes off half of the error."""
+
+
+class Side:
+    """One side of a session while it is checked: ``vectors`` (m, N) as they are repaired so far.
+
+    Attributes
+    ----------
+    sums, signs
+        as they came in; H (n, N).
+    side
+        ``horizontal`` or ``vertical``.
+    vectors
+        (m, N) as repaired so far.
+    faults
+        that were found.
+    uncounted
+        responses whose misfit does not count.
+    unknown
+        patterns whose vector the others must foretell.
+    extras
+        (N,) squared error of each vector beyond its noise.
+    """
+
+    def __init__(self, sums: StripeSums, signs: FloatArray) -> None:
+        """Of one side's ``sums``, of patterns ``signs`` H (n, N)."""
+        self.sums, self.signs = sums, signs
+        self.side: order.Side = "horizontal" if sums.side == SIDES[0] else "vertical"
+        self.vectors = sums.vectors
+        self.faults: list[Fault] = []
+        self.uncounted: set[int] = set()
+        self.unknown: set[int] = set()
+        self._settled: set[int] = set()
+        self.extras = np.zeros(sums.vectors.shape[1])
+
+    @property
+    def length(self) -> int:
+        """Sensor rows, or columns."""
+        return len(self.vectors)
+
+    @property
+    def pairs(self) -> bool:
+        """Whether a pattern has two frames."""
+        return self.sums.pairs is not None
+
+    @property
+    def variance(self) -> float:
+        """Noise variance of a number of a response, from their median misfit."""
+        spare = self.length * (len(self.sums.common) - 1)
+        return float(np.median(self.sums.misfits)) / max(spare, 1)
+
+    @property
+    def noise(self) -> float:
+        """Squared noise of one pattern's vector, all numbers together."""
+        return self.variance * self.length / float(np.dot(self.sums.common, self.sums.common))
+
+    def change(self, index: int, vector: FloatArray) -> None:
+        """Put a ``vector`` in place of that of pattern ``index``."""
+        if self.vectors is self.sums.vectors:
+            self.vectors = self.vectors.copy()
+        self.vectors[:, index] = vector
+
+    def rescale(self, factor: float) -> None:
+        """Make the uniform response's share in all vectors smaller by ``factor``, and them larger."""
+        self.vectors = self.vectors * factor
+
+    def result(self) -> StripeSums:
+        """The sums with what was changed."""
+        if self.vectors is self.sums.vectors and not self.uncounted:
+            return self.sums
+        kept = np.setdiff1d(np.arange(self.sums.done), sorted(self.uncounted))
+        return replace(
+            self.sums,
+            vectors=self.vectors,
+            misfit=float(self.sums.misfits[kept].sum()),
+            energy=float(self.sums.energies[kept].sum()),
+        )
+
+    def check(self, unsteady: bool = False, name: Callable[[Half], str] = frame_words) -> None:
+        """Find patterns that show no stripes, are out of their place or are not what others foretell.
+
+        Parameters
+        ----------
+        unsteady
+            whether the lamp is known to be: frames against one uniform one may then be of any light.
+        name
+            of a frame.
+        """
+        self._check_misfits()
+        count = self.signs.shape[1]
+        if count < _ENOUGH[0] or self.length < _ENOUGH[1]:
+            for index in self.unknown:
+                self._forget(index)
+            return
+        if self.unknown:
+            self._foretell_unknown()
+        steady = self.pairs or not unsteady
+        for _ in range(int(MOST_FAULTS * count) + 2):
+            shadow = MovingShadow(self.vectors, self.signs, self.unknown)
+            line, usual = shadow.first_line
+            if steady and not self.pairs and line > _FAR_LINE * (usual + _SHARED * self.noise):
+                raise MitsimError(
+                    f"frames: {name((self.side, 0, UNIFORM))}, or a dark frame, is not of the light that patterns of "
+                    "its side are of; look at these, and take the session again"
+                )
+            if not self._mend(shadow, steady):
+                break
+
+    def leave_out_known(self, wrong: Mapping[Half, str]) -> None:
+        """Leave patterns without pairs out that are known to be ``wrong``; MitsimError for a uniform frame."""
+        for (side, index, sign), detail in wrong.items():
+            if side != self.side:
+                continue
+            if sign == UNIFORM:
+                raise MitsimError(f"{side} stripes: of their uniform frame, {detail}; take the session again")
+            self._add(index, "wrong", f"is wrong: {detail}", "it is left out")
+            self.unknown.add(index)
+            self.uncounted.add(index)
+
+    def _check_misfits(self) -> None:
+        """Responses that hold much that no separable camera explains, where the others do not."""
+        misfits, energies = self.sums.misfits, self.sums.energies
+        middle = float(np.median(misfits))
+        scatter = 1.4826 * float(np.median(np.abs(misfits - middle)))
+        excess = misfits - middle - max(_UNEXPLAINED * float(np.median(energies)), _DEVIATIONS * scatter)
+        for index in np.flatnonzero(excess > _UNEXPLAINED * energies):
+            if index in self.uncounted or index in self.unknown:
+                continue
+            if np.median(misfits / np.maximum(energies, 1e-300)) > _UNEXPLAINED and misfits[index] < 4 * middle:
+                continue
+            part = misfits[index] / energies[index]
+            detail = f"no {self.side} stripes: {part:.0%} of their response is of other shape"
+            self._add(int(index), "wrong", detail, "it is left out")
+            self.unknown.add(int(index))
+            self.uncounted.add(int(index))
+
+    def _add(self, index: int, kind: str, detail: str, repair: str, other: Half | None = None) -> None:
+        self.faults.append(Fault(self.side, index, None if self.pairs else 1, kind, detail, repair, other))
+
+    # ---- patterns that do not fit the others -------------------------------------------------------------------------
+
+    def _mend(self, shadow: MovingShadow, steady: bool) -> bool:
+        """Whether a pattern was wrong: the one whose exchange or swap makes most fit, or, of ``steady`` light, that
+        fits least."""
+        fixed = np.zeros(self.sums.done, dtype=bool)
+        fixed[[0, *self.unknown]] = True
+        deviations = np.where(fixed, 0.0, shadow.deviations)
+        if steady and not self.pairs and self._one_frame(shadow, deviations):
+            return True
+        worst = int(np.argmax(np.where(shadow.unlike > _UNLIKE, deviations, 0.0)))
+        fixed[list(self._settled)] = True
+        exchanges = np.where(fixed | (shadow.by_exchange < _EXPLAINED * deviations), -np.inf, shadow.by_exchange)
+        flip = int(np.argmax(exchanges))
+        gain, places = float(exchanges[flip]), [flip]
+        swapped = self._swapped(shadow, np.where(fixed, -np.inf, deviations))
+        if swapped is not None and swapped[0] > gain:
+            gain, places = swapped
+        if gain > max(_GAIN, _EXPLAINED * deviations[worst] if shadow.unlike[worst] > _UNLIKE else 0.0):
+            self._put_in_place(places)
+        elif steady and deviations[worst] > _WRONG and shadow.unlike[worst] > _UNLIKE:
+            self._leave_out(worst, "wrong", "no stripes as the other patterns foretell them")
+        else:
+            return False
+        return True
+
+    def _one_frame(self, shadow: MovingShadow, deviations: FloatArray) -> bool:
+        """Whether a frame that is shown against a uniform one was black, the same as another, or dim."""
+        far = np.flatnonzero(deviations > _FAR)
+        light = self.vectors[:, 0]
+        for index in far[np.argsort(-deviations[far])]:
+            own = self.vectors[:, index]
+            if np.linalg.norm(own + light) / 2 < DARK * np.linalg.norm(light):
+                self._leave_out(int(index), "black", "is black")
+                return True
+            away = np.square(own[:, None] - self.vectors).sum(axis=0)
+            away[index] = np.inf
+            nearest = int(np.argmin(away))
+            if away[nearest] < _SAME * self.noise and np.square(own).sum() > _SEEN * self.noise:
+                self._leave_out(
+                    int(index), "repeated", f"repeats {self.side} stripes {nearest}", (self.side, nearest, 1)
+                )
+                return True
+        gains, scales, _ = shadow.by_scale()
+        gains = np.where((gains > _EXPLAINED * deviations) & (scales > 0.5) & (scales < 1 / DARK), gains, 0.0)
+        gains[list(self._settled)] = 0.0
+        index = int(np.argmax(gains))
+        worst = float(np.max(np.where(shadow.unlike > _UNLIKE, deviations, 0.0)))
+        if gains[index] <= max(_FAR, _EXPLAINED * worst, float(np.max(shadow.by_exchange[1:]))):
+            return False
+        part = self._brightened(index)
+        self._add(index, *dimmed(part), "its numbers are divided by that")
+        return True
+
+    @staticmethod
+    def _swapped(shadow: MovingShadow, deviations: FloatArray) -> tuple[float, list[int]] | None:
+        """What a swap of two that deviate takes off at most, and which two; None where there are no two."""
+        far = np.flatnonzero(deviations > _FAR / 2)
+        tried = np.sort(far[np.argsort(-deviations[far])[:_TRIED]])
+        pairs = [(int(one), int(other)) for place, one in enumerate(tried) for other in tried[place + 1 :]]
+        if not pairs:
+            return None
+        gains = shadow.by_swap(pairs)
+        least = [max(deviations[one], deviations[other]) for one, other in pairs]
+        gains = np.where(gains < least, -np.inf, gains)
+        best = int(np.argmax(gains))
+        return float(gains[best]), [*pairs[best]]
+
+    def _put_in_place(self, places: list[int]) -> None:
+        """Exchange the frames of one pattern, or swap two."""
+        first, *rest = places
+        moved = self.vectors.copy()
+        moved[:, places] = self.vectors[:, places[::-1]] if rest else -self.vectors[:, places]
+        self.vectors = moved
+        self._settled.update(places)
+        if rest:
+            detail = f"in the place of {self.side} stripes {rest[0]}, and those in theirs"
+            self._add(first, "swapped", detail, "both count in their right order", (self.side, rest[0], UNIFORM))
+        elif not self.pairs:
+            self._add(first, "exchanged", "shows black where white should be", "it counts with its sign")
+        elif not self._turned(first):
+            self._add(first, "exchanged", "in each other's place", "they count in their right order")
+
+    def _turned(self, index: int) -> bool:
+        """Whether a pattern's faulty frame is the other one of its pair: a frame may repeat the other, or that it."""
+        for place, fault in enumerate(self.faults):
+            if fault.index == index and fault.sign is not None:
+                other, detail = fault.other, fault.detail
+                if other is not None and other[:2] == (self.side, index):
+                    other = self.side, index, fault.sign
+                    detail = f"repeats {frame_words(other)}"
+                self.faults[place] = replace(fault, sign=-fault.sign, detail=detail, other=other)
+                return True
+        return False
+
+    def _leave_out(self, index: int, kind: str, detail: str, other: Half | None = None) -> None:
+        """Put what the others foretell in place of a pattern."""
+        self.faults = [fault for fault in self.faults if fault.index != index]
+        self.uncounted.add(index)
+        self.unknown.add(index)
+        self._foretell_unknown()
+        self._add(index, kind, detail, "it is left out", other)
+
+    def _brightened(self, index: int) -> float:
+        """Divide a frame against one uniform one by the part of its light that it has, which is returned."""
+        light, shown, scale = self.vectors[:, 0], self.vectors[:, index] + self.vectors[:, 0], 1.0
+        self._settled.add(index)
+        for _ in range(_TURNS):  # as others then foretell it
+            scale *= float(MovingShadow(self.vectors, self.signs, self.unknown).by_scale()[1][index])
+            self.change(index, scale * shown - light)
+        shadow = MovingShadow(self.vectors, self.signs, self.unknown)
+        # What still does not fit may be of the scale too.
+        rest = float(np.sqrt(max(shadow.deviations[index], 1.0)))
+        error = rest * float(shadow.by_scale()[2][index] * np.linalg.norm(scale * shown))
+        self.extras[index] = error**2 + max(scale**2 - 1, 0.0) * self.noise
+        return 1 / scale
+
+    def flicker(self) -> float:
+        """Deviation of the light of frames that are shown against one uniform one, as a part of it; 0 where it is
+        within what is not known. Its error counts, the uniform frame's too, which is in every vector."""
+        count = self.signs.shape[1]
+        if count < _ENOUGH[0] or self.length < _ENOUGH[1]:
+            return 0.0
+        _, scales, deviations = MovingShadow(self.vectors, self.signs, self.unknown).by_scale()
+        good = np.setdiff1d(np.arange(1, count), [*self.unknown, *self._settled])
+        scatter = 1.4826 * float(np.median(np.abs(scales[good] - np.median(scales[good]))))
+        known = float(np.median(deviations[good]))
+        if scatter < _FLICKERS * (1 + 3 / np.sqrt(count)) * known:
+            return 0.0
+        light = self.vectors[:, :1]
+        found = float(np.sqrt(scatter**2 - known**2))
+        self.extras[good] += found**2 * np.square(self.vectors[:, good] + light).sum(axis=0)
+        self.extras += found**2 * float(np.square(light).sum())
+        return found
+
+    # ---- what others foretell of a pattern ---------------------------------------------------------------------------
+
+    def _forget(self, index: int) -> None:
+        """Leave a pattern out where nothing foretells it; its error is then its own size, which the others' tells."""
+        others = np.delete(self.vectors[:, 1:], index - 1, axis=1) if index else self.vectors[:, 1:]
+        self.extras[index] = float(np.square(others).sum(axis=0).mean()) if others.size else 0.0
+        self.change(index, np.zeros(self.length))
+
+    def _foretell_unknown(self) -> None:
+        """In place of patterns that are left out comes what others foretell, and the error of that counts.
+
+        That is of columns as they are, as a moving shadow foretells nothing at the sensor's ends; where it does, what
+        both differ by is an error too: a period that no other pattern has is known by the motion alone.
+        """
+        for index in sorted(self.unknown):
+            self._foretell(index)
+        amended = MovingShadow(self.vectors, self.signs, self.unknown).amended
+        for index in self.unknown:
+            self.extras[index] = max(self.extras[index], float(amended[index]))
+
+    def _foretell(self, index: int) -> None:
+        """The same of one pattern."""
+        self.change(index, np.zeros(self.length))
+        variance = 0.0
+        for _ in range(_TURNS):
+            precision = self._precision(index, variance)
+            row = precision[index].copy()
+            variance, row[index] = float(1 / row[index]), 0.0
+            self.change(index, -self.vectors @ row * variance)
+        self.extras[index] = variance * self.length
+
+    def _precision(self, index: int, variance: float) -> FloatArray:
+        """(N, N) inverse covariance of the patterns' vectors, that of columns being a function of their distance; the
+        vector of a pattern has a ``variance`` round what it is."""
+        n, count = self.signs.shape
+        columns = self.vectors @ self.signs.T / count
+        covariance = columns.T @ columns / self.length
+        covariance += variance / count**2 * np.outer(self.signs[:, index], self.signs[:, index])
+        by_distance = np.array([np.trace(covariance, lag) / (n - lag) for lag in range(n)])
+        values, modes = np.linalg.eigh(by_distance[np.abs(np.subtract.outer(np.arange(n), np.arange(n)))])
+        values = np.maximum(values, 0.0) + _FLOOR**2 * by_distance[0] * n / count
+        shown = self.signs.T @ modes
+        whole = (shown * values) @ shown.T
+        if not whole.any():
+            return np.eye(count)
+        # Where H has more columns than rows and nothing is noise, patterns depend on each other to the last digit.
+        whole[np.diag_indices(count)] += (self.noise + self.extras) / self.length
+        whole[np.diag_indices(count)] += 1e-9 * np.trace(whole) / count
+        return np.asarray(np.linalg.inv(whole))
