@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from mitsim.core.arrays import FloatArray
-from mitsim.reconstruct.leaveoneout import BoolArray, LeaveOneOut, Pattern, energy_of
+from mitsim.core.arrays import FloatArray, sum_of_squares
+from mitsim.reconstruct.leaveoneout import BoolArray, LeaveOneOut, Pattern
 
 _SPREADS, _LEAST, _OTHERS = 4.0, 0.08, 2.0
 """Standard deviations, as half of the frames tell them, by which a frame's brightness may differ from what its
@@ -53,7 +53,7 @@ def odd_brightness(check: LeaveOneOut, weights: FloatArray, good: BoolArray) -> 
     middles, wholes = dict[Pattern, float](), dict[Pattern, float]()
     for pattern, seen, told in _beside(check, image, near, good):
         if pattern != first:
-            middles[pattern], wholes[pattern] = _median(seen / told), float(np.vdot(seen, told)) / energy_of(told)
+            middles[pattern], wholes[pattern] = _median(seen / told), float(np.vdot(seen, told)) / sum_of_squares(told)
     if len(middles) < 3:
         return None
     ratios = own[0] / own[1]
@@ -62,7 +62,7 @@ def odd_brightness(check: LeaveOneOut, weights: FloatArray, good: BoolArray) -> 
     # median deviation of normal numbers.
     error = 1.2533 * 1.4826 * _median(np.abs(ratios - middle)) / np.sqrt(ratios.size)
     spread = float(np.hypot(1.4826 * _median(away), error / max(_median(np.array(list(middles.values()))), 1e-300)))
-    darker, whole = _away(middle, middles), _away(float(np.vdot(*own)) / energy_of(own[1]), wholes)
+    darker, whole = _away(middle, middles), _away(float(np.vdot(*own)) / sum_of_squares(own[1]), wholes)
     least = max(least, _SPREADS * spread, _OTHERS * float(away.max()))
     return first if abs(darker) > least and darker * whole > 0 else None
 

@@ -14,10 +14,10 @@ import numpy as np
 from scipy import fft
 from scipy.optimize import minimize_scalar
 
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.reconstruct.accumulator import centred
 from mitsim.reconstruct.framefault import Fault, FrameFault
-from mitsim.reconstruct.leaveoneout import CHANCE, OFF, BoolArray, LeaveOneOut, Pattern, energy_of
+from mitsim.reconstruct.leaveoneout import CHANCE, OFF, BoolArray, LeaveOneOut, Pattern
 
 _EXPLAINS = 0.2
 """Part of what a frame is off by that a fault may leave: chosen, with room for what the others foretell badly."""
@@ -130,8 +130,8 @@ class Explanations:
 
     def _left(self, frames: dict[Pattern, FloatArray], weights: FloatArray) -> float:
         """Energy that ``frames`` of suspected patterns leave of all, but for a constant, their W being ``weights``."""
-        light = sum(energy_of(frames.get(pattern, foretold)) for pattern, foretold in self._foretold.items())
-        return light - energy_of(weights)
+        light = sum(sum_of_squares(frames.get(pattern, foretold)) for pattern, foretold in self._foretold.items())
+        return light - sum_of_squares(weights)
 
     def _beyond(self, frames: dict[Pattern, FloatArray], variance: float) -> float:
         """Energy beyond noise that all frames are off by with these, at a ``variance`` of a datum."""
@@ -183,7 +183,7 @@ class Explanations:
         found, off = [], dict[Pattern, float]()
         for pattern, each in self._measured.items():
             variance = float(check.noise.variance[pattern]) * (1 + 1 / good)
-            beyond = energy_of(each.light - mean) - each.light.size * variance
+            beyond = sum_of_squares(each.light - mean) - each.light.size * variance
             if beyond > CHANCE * variance * np.sqrt(2 * each.light.size) and beyond > OFF**2 * each.power:
                 off[pattern] = beyond
                 continue
@@ -214,7 +214,7 @@ class Explanations:
             )  # of a half each
             apart = (halves[one] + halves[other[0], -other[1]] - mean, halves[other] + halves[one[0], -one[1]] - mean)
             most = max(_EXPLAINS * min(off[one[0]], off[other[0]]), _LEFT * noise * float(np.sqrt(2 / mean.size)))
-            return max(energy_of(each) for each in apart) - noise < most
+            return max(sum_of_squares(each) for each in apart) - noise < most
 
         halves = {
             (pattern, sign): (each.light + sign * each.frame) / 2
@@ -266,7 +266,7 @@ class Explanations:
         if not check.exclusive:
             return
         told = self._weights[check.columns(*one.pattern)]
-        ratio = float(np.vdot(check.projected(one.frame, *one.pattern), told)) / max(energy_of(told), 1e-300)
+        ratio = float(np.vdot(check.projected(one.frame, *one.pattern), told)) / max(sum_of_squares(told), 1e-300)
         fault = Fault.DIM if ratio < 1 else Fault.BRIGHT
         words = f"holds {ratio:.2f} of the light that its neighbours' pixels tell"
         yield _Named(-np.inf, fault, one.numbers, words)
@@ -274,8 +274,8 @@ class Explanations:
     def _scaled(self, one: _Seen) -> Iterable[_Named]:
         if one.foretold is None:
             return
-        ratio = float(np.vdot(one.frame, one.foretold)) / max(energy_of(one.foretold), 1e-300)
-        left = energy_of(one.frame - ratio * one.foretold) - one.frame.size * one.variance
+        ratio = float(np.vdot(one.frame, one.foretold)) / max(sum_of_squares(one.foretold), 1e-300)
+        left = sum_of_squares(one.frame - ratio * one.foretold) - one.frame.size * one.variance
         if ratio > 0 and not self._check.signed:
             ratio, left = self._least_scale(one, ratio)
         if ratio > 0:
@@ -332,7 +332,7 @@ class Explanations:
             for sign in (1, -1):  # the other half of that pattern tells this one
                 partner = (each.light - sign * each.frame) / 2
                 mean = one.foretold + self._partner(one)
-                left = energy_of(one.frame - (mean - partner)) - one.frame.size * one.variance
+                left = sum_of_squares(one.frame - (mean - partner)) - one.frame.size * one.variance
                 yield self._of_pattern(left, one, check.number[(*other, sign)])
 
     def _crossed(self, one: _Seen, other: Pattern, there: FloatArray) -> float:
@@ -409,8 +409,8 @@ class Explanations:
     def _outside(self, frame: FloatArray, pattern: Pattern, variance: float) -> float:
         """Energy of a ``frame`` beyond noise that no light of the pixels of a ``pattern`` explains."""
         return (
-            energy_of(frame)
-            - energy_of(self._check.projected(frame, *pattern))
+            sum_of_squares(frame)
+            - sum_of_squares(self._check.projected(frame, *pattern))
             - self._check.prepared.spare * frame.size * variance
         )
 
@@ -431,9 +431,13 @@ class Explanations:
         # The noise of a frame is that of its mean light, which what is lost makes too little.
         variance = max(one.variance, float(self._check.noise.of(float(part.mean()), 1)))
         if one.foretold is not None:
-            return energy_of(self._level(part - one.foretold[window])) - part.size * variance
+            return sum_of_squares(self._level(part - one.foretold[window])) - part.size * variance
         left, right = self._ranges(one.pattern, *window)
-        return energy_of(part) - energy_of(left.T @ part @ right) - self._check.prepared.spare * part.size * variance
+        return (
+            sum_of_squares(part)
+            - sum_of_squares(left.T @ part @ right)
+            - self._check.prepared.spare * part.size * variance
+        )
 
     def _level(self, part: FloatArray) -> FloatArray:
         return centred(part) if self._check.prepared.centre else part
@@ -442,10 +446,12 @@ class Explanations:
         """Energy beyond noise of a ``window`` of the sensor, held against the ``still`` middle of it."""
         part = one.raw[window[0], window[1]]
         if one.foretold is not None:
-            return energy_of(self._level(part - one.foretold[still[0], still[1]])) - part.size * one.variance
+            return sum_of_squares(self._level(part - one.foretold[still[0], still[1]])) - part.size * one.variance
         left, right = self._ranges(one.pattern, *still)
         return (
-            energy_of(part) - energy_of(left.T @ part @ right) - self._check.prepared.spare * part.size * one.variance
+            sum_of_squares(part)
+            - sum_of_squares(left.T @ part @ right)
+            - self._check.prepared.spare * part.size * one.variance
         )
 
     def _by_range(self, one: _Seen, reach: int) -> tuple[int, int]:
@@ -458,7 +464,7 @@ class Explanations:
             parts = {}
             for step in range(-reach, reach + 1):
                 lines = frame[reach + step : len(frame) - reach + step]
-                parts[step] = energy_of(basis.T @ lines) / max(energy_of(lines), 1e-300)
+                parts[step] = sum_of_squares(basis.T @ lines) / max(sum_of_squares(lines), 1e-300)
             found.append(max(parts, key=lambda step: (parts[step], -abs(step))))
         return found[0], found[1]
 
@@ -478,9 +484,9 @@ class Explanations:
                 for one in seen:
                     if len(one.numbers) > 1 or number in one.numbers:
                         continue
-                    apart = energy_of(one.raw - shot)
+                    apart = sum_of_squares(one.raw - shot)
                     beyond = apart - shot.size * (one.variance + variance / len(signs))
-                    if apart < _ROUNDING * energy_of(shot):
+                    if apart < _ROUNDING * sum_of_squares(shot):
                         beyond = -np.inf
                     if beyond < 0.5 * _EXPLAINS * one.off and beyond < CHANCE * one.variance * np.sqrt(8 * shot.size):
                         words = f"repeats frame {number} ({check.shots[number].file})"

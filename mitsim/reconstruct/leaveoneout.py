@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import uniform_filter
 
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.manifests import RunManifest
 from mitsim.core.measurement import Measurement
 from mitsim.reconstruct.accumulator import centred
@@ -84,7 +84,7 @@ class FrameSums:
         if measurement.shots == 2 and others:
             # light - (total - light) / others
             beyond = (measurement.light * (1 + others) - total) / others
-            self.sums[pattern] = energy_of(beyond)
+            self.sums[pattern] = sum_of_squares(beyond)
 
 
 class LeaveOneOut:
@@ -235,7 +235,7 @@ class LeaveOneOut:
         # (1952), until a step brings these frames less than chance does.
         enough = _SETTLED * CHANCE * float(self.noise.variance.mean()) * np.sqrt(2 * self.size)
         left_over = rest + of_bad(weights) - weights
-        step, squared = left_over.copy(), energy_of(left_over)
+        step, squared = left_over.copy(), sum_of_squares(left_over)
         for _ in range(_MOST_STEPS):
             moved = step - of_bad(step)
             curvature = float(np.vdot(step, moved))
@@ -246,7 +246,7 @@ class LeaveOneOut:
             if length * squared < enough:
                 break
             left_over -= length * moved
-            before, squared = squared, energy_of(left_over)
+            before, squared = squared, sum_of_squares(left_over)
             step = left_over + squared / before * step
         return weights, float(np.vdot(weights, rest))
 
@@ -260,10 +260,10 @@ class LeaveOneOut:
         for each in self.measured():
             pattern, frame = (each.row, each.column), self.as_solved(each.frame)
             residual = frame - self.modelled(weights, each.row, each.column)
-            sums.residual[pattern], sums.power[pattern] = energy_of(residual), each.power
-            sums.energy[pattern] = energy_of(frame)
+            sums.residual[pattern], sums.power[pattern] = sum_of_squares(residual), each.power
+            sums.energy[pattern] = sum_of_squares(frame)
             if self.signed:
-                sums.sums[pattern] = energy_of((each.light * others - total) / (others - 1))
+                sums.sums[pattern] = sum_of_squares((each.light * others - total) / (others - 1))
         return sums
 
     def _good(self, bad: Iterable[Pattern]) -> set[Pattern]:
@@ -280,9 +280,3 @@ class LeaveOneOut:
         numbers = tuple(sorted(numbers))
         files = tuple(self.shots[number].file for number in numbers)
         return FrameFault(fault, numbers, files, f"{listed(numbers, files)} {words}")
-
-
-def energy_of(values: FloatArray) -> float:
-    """Sum of the squares of ``values``, any shape."""
-    flat = np.ascontiguousarray(values).ravel()
-    return float(np.dot(flat, flat))

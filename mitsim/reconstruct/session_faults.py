@@ -16,10 +16,9 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.calibration import Estimate, StripeSums, factors_of_sums
-from mitsim.reconstruct.session_findings import Fault, Lamp, frame_words
+from mitsim.reconstruct.session_findings import Lamp, SessionFault, frame_words
 from mitsim.reconstruct.session_pairs import Pairs
-from mitsim.reconstruct.session_side import MOST_FAULTS
-from mitsim.reconstruct.session_side import Side as Checking
+from mitsim.reconstruct.session_side import MOST_FAULTS, SideCheck
 from mitsim.rig.order import SIDES, Half, Side
 
 
@@ -42,7 +41,7 @@ class Checked:
     """
 
     sums: tuple[StripeSums, StripeSums]
-    faults: list[Fault] = field(default_factory=list)
+    faults: list[SessionFault] = field(default_factory=list)
     lamp: Lamp = field(default_factory=Lamp)
     left_out: tuple[int, int] = (0, 0)
     extra: tuple[float, float] = (0.0, 0.0)
@@ -137,7 +136,7 @@ def check_session(
     MitsimError
         where too many frames are wrong.
     """
-    work = [Checking(own, signs) for own in sums]
+    work = [SideCheck(own, signs) for own in sums]
     lamp = Lamp()
     if all(own.pairs is not None for own in sums):
         pairs = Pairs(work, taken.order, taken.clipped, taken.step, taken.wrong)
@@ -177,7 +176,7 @@ def check_session(
     )
 
 
-def _against_one_frame(sides: Sequence[Checking]) -> Lamp:
+def _against_one_frame(sides: Sequence[SideCheck]) -> Lamp:
     """How steady the lamp is where frames are shown against one uniform one."""
     before = [own.extras.sum() for own in sides]
     flicker = max([own.flicker() for own in sides])

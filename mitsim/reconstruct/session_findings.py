@@ -13,7 +13,7 @@ DARK = 0.03
 
 
 @dataclass(frozen=True)
-class Fault:
+class SessionFault:
     """One pattern, or one of its frames, that is not what it should be.
 
     Attributes

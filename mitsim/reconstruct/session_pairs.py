@@ -15,8 +15,8 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.session_findings import DARK, Fault, Lamp, dimmed, frame_words
-from mitsim.reconstruct.session_side import MOST_FAULTS, Side
+from mitsim.reconstruct.session_findings import DARK, Lamp, SessionFault, dimmed, frame_words
+from mitsim.reconstruct.session_side import MOST_FAULTS, SideCheck
 from mitsim.rig.order import Half
 
 _MATTERS = 0.5
@@ -70,7 +70,7 @@ class Pairs:
 
     def __init__(
         self,
-        sides: list[Side],
+        sides: list[SideCheck],
         order: Sequence[Half],
         clipped: Callable[[Half], bool],
         step: float,
@@ -189,7 +189,7 @@ class Pairs:
             fluxes = pairs.rows.mean(axis=2)
             if self.good[self.sides.index(own) * self.count] and fluxes[0, 0] < fluxes[0, 1]:
                 own.faults.append(
-                    Fault(
+                    SessionFault(
                         own.side,
                         0,
                         None,
@@ -253,7 +253,7 @@ class Pairs:
             corrected=True,
         )
 
-    def _divided(self, number: int, own: Side, powers: FloatArray, flicker: float) -> None:
+    def _divided(self, number: int, own: SideCheck, powers: FloatArray, flicker: float) -> None:
         """Divide a side's vectors by the power of their frames; what flicker leaves in them counts as their error.
 
         Y(+1) = (1 + d) g P and Y(-1) = (1 - d) g (U - P) add up to g (U + d u), which tells d by the vector u of the
@@ -329,7 +329,7 @@ class Pairs:
         middle = float(np.median(fluxes)) if fluxes else 0.5
         return middle, max(1.4826 * float(np.median(np.abs(np.asarray(fluxes) - middle))) if fluxes else 0.0, 1e-3)
 
-    def _repair(self, own: Side, number: int, index: int, lamp: Lamp) -> None:
+    def _repair(self, own: SideCheck, number: int, index: int, lamp: Lamp) -> None:
         """Name the faulty frame of a pair, and take its vector from the other one."""
         usual, deviation = self._usual(number)
         found = []
@@ -355,7 +355,7 @@ class Pairs:
             else:  # by definition, where it is the other side's that all vectors are projected on
                 own.change(0, self.uniforms[number])
             own.faults.append(
-                Fault(
+                SessionFault(
                     own.side,
                     index,
                     None,
@@ -374,7 +374,7 @@ class Pairs:
         own.change(index, -sign * (2 * sound - both) / corrected)
         own.extras[index] += own.noise
         own.faults.append(
-            Fault(
+            SessionFault(
                 own.side,
                 index,
                 sign,

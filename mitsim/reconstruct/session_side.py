@@ -16,7 +16,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.calibration import StripeSums
 from mitsim.reconstruct.moving_shadow import MovingShadow
-from mitsim.reconstruct.session_findings import DARK, Fault, dimmed, frame_words
+from mitsim.reconstruct.session_findings import DARK, SessionFault, dimmed, frame_words
 from mitsim.rig import order
 from mitsim.rig.order import SIDES, UNIFORM, Half
 
@@ -60,7 +60,7 @@ _TURNS = 8
 place; where another pattern of the same period is known, each step takes off half of the error."""
 
 
-class Side:
+class SideCheck:
     """One side of a session while it is checked: ``vectors`` (m, N) as they are repaired so far.
 
     Attributes
@@ -86,7 +86,7 @@ class Side:
         self.sums, self.signs = sums, signs
         self.side: order.Side = "horizontal" if sums.side == SIDES[0] else "vertical"
         self.vectors = sums.vectors
-        self.faults: list[Fault] = []
+        self.faults: list[SessionFault] = []
         self.uncounted: set[int] = set()
         self.unknown: set[int] = set()
         self._settled: set[int] = set()
@@ -194,7 +194,7 @@ class Side:
             self.uncounted.add(int(index))
 
     def _add(self, index: int, kind: str, detail: str, repair: str, other: Half | None = None) -> None:
-        self.faults.append(Fault(self.side, index, None if self.pairs else 1, kind, detail, repair, other))
+        self.faults.append(SessionFault(self.side, index, None if self.pairs else 1, kind, detail, repair, other))
 
     # ---- patterns that do not fit the others -------------------------------------------------------------------------
 
