@@ -150,15 +150,17 @@ class Settings:
 @dataclass(frozen=True)
 class Noise:
     """Monte Carlo error of one estimate: ``error`` at ``samples`` a cell, falling with samples^-rate; ``spread`` is the
-    relative variance of its square among estimates, 0 where many paths make it."""
+    relative variance of its square among estimates, 0 where many paths make it; ``heavy`` the number of equal paths
+    that would make it as unevenly, infinite where nobody counted them."""
 
     error: float
     samples: float
     rate: float
     spread: float = 0.0
+    heavy: float = math.inf
 
     @classmethod
-    def among(cls, seen: FloatArray, light: float, samples: int) -> Noise:
+    def among(cls, seen: FloatArray, light: float, samples: int, paths: FloatArray) -> Noise:
         """Of one of several looks, by random paths of which few may be heavy.
 
         Parameters
@@ -169,11 +171,15 @@ class Noise:
             norm of the frames of all light, which the error is relative to.
         samples
             of a look.
+        paths
+            light that each path of all looks brought.
         """
         energies = np.square(seen - seen.mean(axis=0)).reshape(len(seen), -1).sum(axis=1)
         mean = float(energies.mean())
         spread = float(energies.var(ddof=1)) / mean**2 if mean else 0.0
-        return cls(math.sqrt(float(energies.sum()) / (len(seen) - 1)) / light, samples, 0.5, spread)
+        squares = np.square(paths)
+        heavy = float(squares.sum()) ** 2 / float(np.square(squares).sum() or 1.0)
+        return cls(math.sqrt(float(energies.sum()) / (len(seen) - 1)) / light, samples, 0.5, spread, heavy)
 
     def samples_for(self, target: Number) -> Number:
         """Samples a cell at which the error is ``target``."""
@@ -312,6 +318,8 @@ class Forming:
         each with frames of its own.
     parted
         whether glass sends each line its own way, so that they share no paths.
+    occluded
+        parts of the projector's rows and of its columns that occluded pixels lie in.
     """
 
     pixels: float
@@ -328,6 +336,7 @@ class Forming:
     drawing: tuple[float, float] = (0.0, 0.0)
     lines: int = 1
     parted: bool = False
+    occluded: tuple[float, float] = (1.0, 1.0)
 
 
 @dataclass(frozen=True)

@@ -117,6 +117,9 @@ class Plan:
         why a result will be flagged.
     predicted
         seconds by stage.
+    predicted_range
+        between which nine of ten runs end, where few heavy paths bring most of the noise, so that their samples are not
+        known; None where ``predicted_seconds`` tells it.
     request, cost
         what it is for, and what that takes; None where it was decided without them.
     asked_seconds
@@ -134,6 +137,7 @@ class Plan:
     systematic_bound: float
     warnings: tuple[str, ...]
     predicted: Mapping[str, float] = field(default_factory=dict)
+    predicted_range: tuple[float, float] | None = None
     request: Request | None = None
     cost: Cost | None = None
     asked_seconds: float | None = None
@@ -158,7 +162,11 @@ class Plan:
         stages = {**self.predicted, **seconds}
         more = sum(stages.values()) - sum(self.predicted.values())
         colour = self.colour and self.colour.later(more)
-        return replace(self, predicted=stages, predicted_seconds=sum(stages.values()), colour=colour)
+        least, most = self.predicted_range or (0.0, 0.0)
+        ends = self.predicted_range and (least + more, most + more)
+        return replace(
+            self, predicted=stages, predicted_seconds=sum(stages.values()), predicted_range=ends, colour=colour
+        )
 
     def block(self) -> dict[str, Any]:
         """The plan as JSON holds it."""
@@ -173,6 +181,7 @@ class Plan:
         cost = {"memory": self.cost.memory_bytes, "disk": self.cost.disk_bytes} if self.cost else {}
         return {
             **{key: block[key] for key in keys},
+            "predicted_range": self.predicted_range,
             "sampling_target": self.sampling_target,
             "systematic_error": self.systematic_error,
             "systematic_bound": self.systematic_bound,
@@ -180,6 +189,17 @@ class Plan:
             "colour": block.get("colour"),
             **{f"predicted_{what}_bytes": count for what, count in cost.items()},
         }
+
+    @property
+    def range_words(self) -> str:
+        """What is said of the range of seconds in one line; nothing where there is none."""
+        if self.predicted_range is None:
+            return ""
+        least, most = self.predicted_range
+        return (
+            "Few heavy paths over sharp gloss bring most of the noise, so the samples are not known beforehand: "
+            f"nine of ten such runs take {least:.0f} to {most:.0f} s."
+        )
 
     @property
     def _uncoloured(self) -> ColourChoice | None:
@@ -206,7 +226,7 @@ class Plan:
         ]
         facts = (
             "Error if off: relative rms change of the frames without the effect.",
-            f"Predicted: {self.predicted_seconds:.2f} s. What is left out or made coarse adds up to "
+            f"Predicted: {self.predicted_seconds:.2f} s. {self.range_words} What is left out or made coarse adds up to "
             f"{self.systematic_error:.1e}, at most {self.systematic_bound:.1e}.",
         )
         headings = ("effect", "state", "reason", "error if off", "time [s]")

@@ -178,7 +178,7 @@ class Numbers:
 def paces_of(evidence: Evidence) -> Paces:
     """Those that the ``evidence`` measured, where it measured any."""
     forming = evidence.forming
-    products = float(_products(forming, Numbers.coarsest(), forming.lit, 1.0, 1.0, 1.0))
+    products = float(_products(forming, Numbers.coarsest(), (forming.lit, forming.lit), 1.0, 1.0, 1.0))
     slower = forming.seconds / (FIXED.frame + FIXED.product * products) if forming.seconds else 1.0
     product = forming.product or slower * FIXED.product
     # The frame that the pilot forms is small: beside its products there is what every frame takes.
@@ -246,25 +246,27 @@ def _phases(forming: Forming, numbers: Numbers) -> float:
 
 
 def _products(
-    forming: Forming, numbers: Numbers, lit: Number, cells: Number, layers: Number, anchors: Number
+    forming: Forming, numbers: Numbers, lit: tuple[Number, Number], cells: Number, layers: Number, anchors: Number
 ) -> Number:
-    """Multiplications of one frame, ``lit`` of whose rows of cells hold light, and of the probes that tell its error.
+    """Multiplications of one frame, ``lit`` of whose rows and columns of cells hold light, and of the probes that tell
+    its error.
 
     Parameters
     ----------
     forming, numbers
         what it depends on, and whether the shadow is wave-optical, and on a raster.
     lit, cells, layers, anchors
-        part of the rows, cells and layers, and anchors.
+        parts of the rows and of the columns, cells and layers, and anchors.
     """
-    rows = lit * forming.cells * cells * anchors
+    rows, columns = (part * forming.cells * cells * anchors for part in lit)
     pixels = forming.pixels
     if _by_fft(forming, numbers):
         phases = _phases(forming, numbers)
         return cast(Number, _CORRELATION * phases * layers * np.square(anchors) * (1 + GROUPS) * pixels**2 + 0 * rows)
-    probes = GROUPS * (PROBES + 1) * (np.minimum(rows, pixels) + pixels) * rows
+    probes = GROUPS * (PROBES + 1) * (np.minimum(columns, pixels) + pixels) * rows
     terms = forming.geometric_terms + (forming.terms - forming.geometric_terms) * numbers.waves
-    return cast(Number, terms * layers * (pixels * rows**2 + pixels**2 * rows + probes))
+    # The shorter side is multiplied out first.
+    return cast(Number, terms * layers * (pixels * rows * columns + pixels**2 * np.minimum(rows, columns) + probes))
 
 
 def _entries(forming: Forming, numbers: Numbers) -> Number:
@@ -280,10 +282,12 @@ def _entries(forming: Forming, numbers: Numbers) -> Number:
     return cast(Number, 2 * forming.pixels * forming.cells * sides * terms)
 
 
-def _lit_by_occluded(forming: Forming, lit: Number, numbers: Numbers) -> Number:
-    """Part of the rows of cells that hold light of occluded pixels in a frame ``lit`` of whose rows hold any: each
-    pixel lights its own, and a frame shows as many of them as of all pixels."""
-    return np.minimum(lit, _EDGES * numbers.occluded * np.square(lit) / forming.cells)
+def _lit_by_occluded(forming: Forming, numbers: Numbers) -> tuple[Number, Number]:
+    """Parts of the rows and of the columns of cells that hold light of occluded pixels in a frame: each pixel lights
+    its own, and a frame shows as many of them as of all pixels."""
+    most = _EDGES * numbers.occluded * np.square(forming.lit) / forming.cells
+    rows, columns = (np.minimum(forming.lit * part, most) for part in forming.occluded)
+    return rows, columns
 
 
 def forming_seconds(forming: Forming, numbers: Numbers, frames: Number, paces: Paces) -> Number:
@@ -300,15 +304,15 @@ def forming_seconds(forming: Forming, numbers: Numbers, frames: Number, paces: P
     """
     several = np.asarray(numbers.anchors) > 1
     coarse = numbers.coarse_cells, numbers.coarse_layers
-    lit = forming.lit
+    lit, every = (forming.lit, forming.lit), (1.0, 1.0)
     products = (
         _products(forming, numbers, lit, numbers.cells, numbers.layers, 1.0)
         + several * _products(forming, numbers, lit, *coarse, numbers.anchors)
         + (np.asarray(numbers.occluded_anchors) > 1)
-        * _products(forming, numbers, _lit_by_occluded(forming, lit, numbers), *coarse, numbers.occluded_anchors)
-        + numbers.indirect * _products(forming, numbers, 1.0, *coarse, 1.0)
+        * _products(forming, numbers, _lit_by_occluded(forming, numbers), *coarse, numbers.occluded_anchors)
+        + numbers.indirect * _products(forming, numbers, every, *coarse, 1.0)
         + (np.asarray(numbers.followed_anchors) > 1)
-        * _products(forming, numbers, 1.0, *numbers.of_followed, numbers.followed_anchors)
+        * _products(forming, numbers, every, *numbers.of_followed, numbers.followed_anchors)
     )
     if mixes(forming.classes, forming.shots, forming.pixels):
         products = products + numbers.mixed * forming.classes * forming.pixels**2

@@ -76,6 +76,8 @@ def _print_plan(plan: Plan) -> None:
     console.print(table)
     stages = ", ".join(f"{name} {seconds:.2f}" for name, seconds in plan.predicted.items())
     console.print(f"Predicted time from start to finish: {plan.predicted_seconds:.2f} s ({stages})")
+    if plan.range_words:
+        console.print(plan.range_words)
     if plan.colour is not None:
         console.print(plan.colour.words)
     if plan.asked_seconds is not None:

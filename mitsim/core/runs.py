@@ -242,7 +242,7 @@ class Capture:
             "exposure_s": self.exposure_s,
             **{
                 name: (manifest.plan or {}).get(name)
-                for name in ("accuracy", "asked_seconds", "predicted_seconds", "colour")
+                for name in ("accuracy", "asked_seconds", "predicted_seconds", "predicted_range", "colour")
             },
             "ambient_frame": None if manifest.ambient_frame is None else manifest.ambient_frame.model_dump(),
             **{name: getattr(manifest, name) for name in known},

@@ -106,7 +106,8 @@ class FollowedLight:
             return Effort.none()
         seen = [heavy_paths(tracer, integer(seed, "heavy"), samples) for seed in self._seeds]
         frames = self._beyond(simulation, seen, samples=samples)
-        return Effort(Noise.among(frames, light, samples), self._simulation().at_anchors[1].lanes)  # type: ignore[union-attr]
+        noise = Noise.among(frames, light, samples, np.concatenate([look.value for look in seen]))
+        return Effort(noise, self._simulation().at_anchors[1].lanes)  # type: ignore[union-attr]
 
     @property
     def _widths(self) -> dict[Part, FloatArray]:

@@ -151,7 +151,8 @@ class SwitchedEffects:
             return Effort.none()
         seen = [heavy_paths(tracer, integer(seed, "heavy"), samples) for seed in self.seeds]
         frames = self._form(self.simulation, followed=self._by_kind({"from_camera": seen}), samples=samples)
-        return Effort(Noise.among(frames, self.light, samples), tracer.lanes)
+        paths = np.concatenate([look.value for look in seen])
+        return Effort(Noise.among(frames, self.light, samples, paths), tracer.lanes)
 
     def indirect_effort(self) -> tuple[Effort, bool, tuple[int, ...]]:
         """What light over several surfaces takes, whether that is less where neighbouring pixels share it, and how

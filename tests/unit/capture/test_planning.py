@@ -17,6 +17,7 @@ from mitsim.capture.affordable import FIRST_LOOK
 from mitsim.capture.choice import _BOUND_OVER_ERROR, Choice, _needed, cheapest
 from mitsim.capture.evidence import GROUPS, LOOKS, MOST_PATHS, Effort, Noise
 from mitsim.capture.plan import Plan
+from mitsim.capture.prices import FIXED
 from mitsim.optics.frames import bound_of
 from mitsim.rig.patterns import Lighting
 from tests.unit.capture.invented_evidence import ONE_CLASS, plan
@@ -178,13 +179,13 @@ def test_paces_are_those_of_launches_as_the_run_has_them(
 class Heavy:
     """A look at evidence whose light from the camera turns out to have noise of such a variance in a sample."""
 
-    def __init__(self, variance: float, spread: float = 0.0) -> None:
+    def __init__(self, variance: float, spread: float = 0.0, paths: float = 50.0) -> None:
         self.evidence = replace(ONE_CLASS, followed_from_camera=replace(ONE_CLASS.followed, seconds=0.0))
-        self.variance, self.spread, self.looked = variance, spread, list[int]()
+        self.variance, self.spread, self.paths, self.looked = variance, spread, paths, list[int]()
 
     def heavy(self, samples: int) -> dict[str, Effort]:
         self.looked.append(samples)
-        noise = Noise(math.sqrt(self.variance / samples), samples, 0.5, self.spread)
+        noise = Noise(math.sqrt(self.variance / samples), samples, 0.5, self.spread, self.paths)
         return {"from_camera": Effort(noise, self.evidence.from_camera.paths)}
 
 
@@ -213,6 +214,41 @@ def test_rare_heavy_paths_are_sampled_from_the_first() -> None:
     assert most.settings.from_camera_samples * GROUPS * ONE_CLASS.from_camera.paths == pytest.approx(MOST_PATHS)
 
 
+def test_looks_go_on_while_few_heavy_paths_are_met() -> None:
+    """To the most, whatever they say that the run takes: 5 equal paths tell little of that; 50 end them at a tenth of
+    it. (Planted: looks end at a tenth whatever they met.)"""
+    plain = ONE_CLASS.from_camera.variance
+    many, few = Heavy(3 * plain, paths=50.0), Heavy(3 * plain, paths=5.0)
+    planned_with(many)
+    planned_with(few)
+    assert many.looked == few.looked[: len(many.looked)] and len(few.looked) > len(many.looked)
+    assert few.looked[-1] * LOOKS * ONE_CLASS.from_camera.paths == pytest.approx(2**23, rel=0.01)
+
+
+def test_a_run_of_heavy_paths_has_a_range_of_seconds() -> None:
+    """None where many paths make the noise; of some, five times their work at most and 0.7 at least, as the rest takes
+    what it takes; of fewer than four, what sampling stops at. (Planted: the rest grows too; a stage that is added is
+    in none of the ends.)"""
+    evidence, settings = ONE_CLASS, plan(3e-3, ONE_CLASS).settings
+    settings = replace(settings, from_camera_samples=100.0)
+    planned = replace(plan(3e-3, ONE_CLASS), settings=settings)
+    assert planning._range(evidence, planned) is None and planned.range_words == ""
+    pace, total = evidence.from_camera.seconds or FIXED.from_camera, planned.predicted_seconds
+    work = GROUPS * 100 * evidence.from_camera.paths * pace
+
+    def ends(paths: float) -> tuple[float, float] | None:
+        light = evidence.from_camera
+        return planning._range(
+            replace(evidence, from_camera=replace(light, noise=replace(light.noise, heavy=paths))), planned
+        )
+
+    assert ends(20.0) == pytest.approx((total - 0.3 * work, total + 4 * work))
+    assert ends(3.0) == pytest.approx((total - 0.3 * work, total - work + MOST_PATHS * pace))
+    later = replace(planned, predicted_range=(10.0, 60.0)).taking(plan=4.0)
+    assert later.predicted_range == (14.0, 64.0) and "take 14 to 64 s" in later.range_words
+    assert later.payload()["predicted_range"] == (14.0, 64.0) and planned.payload()["predicted_range"] is None
+
+
 def test_bounds_of_few_heavy_paths_take_more_samples() -> None:
     """Sampling stops where a bound meets the target: of groups that some equal heavy paths meet by chance, half of the
     bounds do with so many samples. (Planted: samples for the error alone, 9 % of the bounds.)"""
@@ -227,11 +263,14 @@ def test_bounds_of_few_heavy_paths_take_more_samples() -> None:
 
 
 def test_noise_tells_how_unlike_looks_are() -> None:
-    """Four looks of which one has all the noise: a relative variance of 16/9 about; of even noise next to none."""
+    """Four looks of which one has all the noise: a relative variance of 16/9 about; of even noise next to none. And as
+    how many equal ones paths are: one that brings ten times as much as a hundred others is as 3.9 would be."""
     rng = np.random.default_rng(6)
     even, one = rng.normal(size=(LOOKS, 4000)), np.zeros((LOOKS, 4000))
     one[2] = even[2]
-    assert Noise.among(even, 2.0, 8).spread < 0.01
-    assert Noise.among(even, 2.0, 8).error == pytest.approx(math.sqrt(4000) / 2, rel=0.05)
-    assert Noise.among(one, 2.0, 8).spread == pytest.approx(16 / 9, rel=0.01)
-    assert Noise.among(np.zeros((LOOKS, 3)), 2.0, 8) == Noise(0.0, 8, 0.5)
+    paths = np.append(np.ones(100), 10.0)
+    assert Noise.among(even, 2.0, 8, paths).spread < 0.01
+    assert Noise.among(even, 2.0, 8, paths).error == pytest.approx(math.sqrt(4000) / 2, rel=0.05)
+    assert Noise.among(one, 2.0, 8, paths).spread == pytest.approx(16 / 9, rel=0.01)
+    assert Noise.among(one, 2.0, 8, paths).heavy == pytest.approx(200**2 / 10100)
+    assert Noise.among(np.zeros((LOOKS, 3)), 2.0, 8, np.zeros(0)) == Noise(0.0, 8, 0.5, heavy=0.0)

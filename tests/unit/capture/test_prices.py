@@ -77,6 +77,16 @@ def test_forming_a_frame_is_as_many_products_as_its_matrices_have(
     assert forming_seconds(FORMING, replace(ONE, **change), 7.0, COUNTED) == pytest.approx(7 * multiplications)
 
 
+def test_occluded_pixels_in_a_column_are_a_narrow_matrix() -> None:
+    """They lie in all rows and a tenth of the columns: two columns of light by 20 rows, or as many of rows. (Planted:
+    as many columns as rows.)"""
+    numbers = replace(ONE, occluded=90.0, occluded_anchors=4.0)
+    for parts, rows, columns in (((1.0, 0.1), 20, 2), ((0.1, 1.0), 2, 20)):
+        narrow = 3 * (50 * rows * columns + 50**2 * 2 + GROUPS * (PROBES + 1) * (columns + 50) * rows)
+        found = forming_seconds(replace(FORMING, occluded=parts), numbers, 1.0, COUNTED)
+        assert found == pytest.approx(products(5, 3) + narrow)
+
+
 def test_shots_that_are_no_mixtures_hold_their_own_light_alone() -> None:
     """More classes than shots: frames are formed shot by shot, and what leaks in all of them once and for all."""
     forming = replace(FORMING, classes=9)
