@@ -106,8 +106,10 @@ class FollowedLight:
             return Effort.none()
         seen = [heavy_paths(tracer, integer(seed, "heavy"), samples) for seed in self._seeds]
         frames = self._beyond(simulation, seen, samples=samples)
-        noise = Noise.among(frames, light, samples, np.concatenate([look.value for look in seen]))
-        return Effort(noise, self._simulation().at_anchors[1].lanes)  # type: ignore[union-attr]
+        found = Noise.among(frames, light, samples, np.concatenate([look.value for look in seen]))
+        # What a path brings to its anchors is alike.
+        found = replace(found, heavy=found.heavy / _FEW_ANCHORS**2)
+        return Effort(found, self._simulation().at_anchors[1].lanes)  # type: ignore[union-attr]
 
     @property
     def _widths(self) -> dict[Part, FloatArray]:
