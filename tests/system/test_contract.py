@@ -48,7 +48,7 @@ def assert_seconds(seconds: dict[str, object], *stages: str) -> None:
 def test_plan(call: Callable[..., Any], lab: Any) -> None:
     options = "--patterns", "dots:4", "--json", "--quiet", "--variant", "llvm_ad_mono"
     plan = call("plan", *lab.rig, *options).payload
-    assert {"effects", "accuracy", "predicted_seconds"} <= plan.keys()
+    assert {"effects", "accuracy", "predicted_seconds", "predicted_range"} <= plan.keys()
     assert plan["accuracy"] == 0.005 and number(plan["predicted_seconds"], 1e-6)
     assert len({effect["name"] for effect in plan["effects"]}) == len(plan["effects"]) >= 5
     for effect in plan["effects"]:
@@ -65,7 +65,7 @@ def test_plan(call: Callable[..., Any], lab: Any) -> None:
 
 def test_capture(lab: Any) -> None:
     captured = lab.captured.payload
-    keys = {"frames", "shape", "seconds", "mc_error", "variant", "seed", "output"}
+    keys = {"frames", "shape", "seconds", "mc_error", "variant", "seed", "output", "predicted_range"}
     assert keys <= captured.keys()
     assert (captured["frames"], captured["shape"]) == (16, [64, 64])
     assert (captured["variant"], captured["seed"], captured["output"]) == ("llvm_ad_mono", 0, str(lab.run))

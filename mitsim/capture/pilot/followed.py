@@ -106,9 +106,8 @@ class FollowedLight:
             return Effort.none()
         seen = [heavy_paths(tracer, integer(seed, "heavy"), samples) for seed in self._seeds]
         frames = self._beyond(simulation, seen, samples=samples)
+        # The heaviest paths come to one anchor of several: each connection counts.
         found = Noise.among(frames, light, samples, np.concatenate([look.value for look in seen]))
-        # What a path brings to its anchors is alike.
-        found = replace(found, heavy=found.heavy / _FEW_ANCHORS**2)
         return Effort(found, self._simulation().at_anchors[1].lanes)  # type: ignore[union-attr]
 
     @property
