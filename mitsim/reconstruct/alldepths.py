@@ -176,16 +176,16 @@ class _Basis:
     """Orthonormal vectors (m, ``size``) that span the columns of all ``factors`` (m, n) but for a part of their energy;
     of those pixels that are lit ``alone``, where that is given, each with its patterns."""
 
-    def __init__(
-        self, factors: list[FloatArray], alone: list[tuple[npt.NDArray[np.intp], list[int]]] | None
-    ) -> None:
+    def __init__(self, factors: list[FloatArray], alone: list[tuple[npt.NDArray[np.intp], list[int]]] | None) -> None:
         self._alone = alone or [(np.arange(factors[0].shape[1]), [])]
         found = [np.linalg.eigh(sum(own @ own.T for own in (f[:, px] for f in factors))) for px, _ in self._alone]
         lost = [np.cumsum(np.maximum(energies, 0.0)) for energies, _ in found]
         self.size = max(int((each > _LEFT_OUT * each[-1]).sum()) for each in lost)
         self._vectors = [vectors[:, -self.size :] for _, vectors in found]
         self._by_pattern = {
-            index: vectors for (_, indices), vectors in zip(self._alone, self._vectors, strict=True) for index in indices
+            index: vectors
+            for (_, indices), vectors in zip(self._alone, self._vectors, strict=True)
+            for index in indices
         }
 
     def of(self, index: int) -> FloatArray:

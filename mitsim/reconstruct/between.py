@@ -76,9 +76,7 @@ class Between:
         found = [solveh_banded(*each, lower=True) for each in zip(normal, data, strict=True)]
         return np.array(found).reshape(len(seen), self._last + 3)
 
-    def _normal(
-        self, neighbours: npt.NDArray[np.intp]
-    ) -> tuple[FloatArray, npt.NDArray[np.intp], FloatArray]:
+    def _normal(self, neighbours: npt.NDArray[np.intp]) -> tuple[FloatArray, npt.NDArray[np.intp], FloatArray]:
         """Of fits to rows that are ``neighbours`` (fits, k): normal matrices (fits, 4, coefficients) by diagonal, first
         coefficient (fits, k, n) and weights (4, fits, k, n) of each number, 0 beyond the last knot."""
         place = (np.arange(self._last // _KNOTS + 1) + neighbours[..., None] * self._step) * _KNOTS
