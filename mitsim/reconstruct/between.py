@@ -72,7 +72,7 @@ class Between:
         """(rows, coefficients) of the spline of each row, from what is ``seen`` (rows, k, n) in the ``neighbours``
         (rows, k) of its own."""
         normal, start, weights = self._normal(neighbours)
-        data = sum(self._collected(start + a, weight * seen) for a, weight in enumerate(weights))
+        data = np.sum([self._collected(start + a, weight * seen) for a, weight in enumerate(weights)], axis=0)
         found = [solveh_banded(*each, lower=True) for each in zip(normal, data, strict=True)]
         return np.array(found).reshape(len(seen), self._last + 3)
 
@@ -93,7 +93,7 @@ class Between:
         """(fits, coefficients) sums of the ``values`` (fits, k, n) at each ``place`` (fits, k, n)."""
         fits, size = len(place), self._last + 3
         own = (np.arange(fits) * size)[:, None, None] + place
-        return np.bincount(own.ravel(), values.ravel(), fits * size).reshape(fits, size)
+        return np.asarray(np.bincount(own.ravel(), values.ravel(), fits * size).reshape(fits, size), dtype=np.float64)
 
     def _weights(self, place: FloatArray) -> tuple[npt.NDArray[np.intp], tuple[FloatArray, ...]]:
         """First of the four coefficients at each ``place`` [knots], and the weights of all four: uniform cubic
