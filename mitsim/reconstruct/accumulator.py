@@ -113,8 +113,15 @@ class Accumulator:
 
 
 def projected(left: Side, right: Side, frames: FloatArray) -> FloatArray:
-    """W (r_left, r_right) of all ``frames`` (K, m, K', m') at once, those of pattern i being ``frames[i]``: what
-    :attr:`Accumulator.sum` is, without the halves, the energy and the checks, in a tenth of the time."""
+    """:attr:`Accumulator.sum` of all frames at once, without the halves, the energy and the checks: half the time.
+
+    Parameters
+    ----------
+    left, right
+        the factorised model.
+    frames
+        (K, m, K', m'), of pattern (i, j) ``frames[i, :, j]``, centred where the model is.
+    """
     total = np.zeros((left.accumulated_size, right.accumulated_size))
     for slab, own in zip(left.slabs, frames, strict=True):
         seen = (slab.matrix.T @ own.reshape(len(own), -1)).reshape(-1, *own.shape[1:])
