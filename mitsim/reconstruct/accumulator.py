@@ -112,6 +112,25 @@ class Accumulator:
         return values.astype(np.float64, copy=False)
 
 
+def projected(left: Side, right: Side, frames: FloatArray) -> FloatArray:
+    """:attr:`Accumulator.sum` of all frames at once, without the halves, the energy and the checks: half the time.
+
+    Parameters
+    ----------
+    left, right
+        the factorised model.
+    frames
+        (K, m, K', m'), of pattern (i, j) ``frames[i, :, j]``, centred where the model is.
+    """
+    total = np.zeros((left.accumulated_size, right.accumulated_size))
+    for slab, own in zip(left.slabs, frames, strict=True):
+        seen = (slab.matrix.T @ own.reshape(len(own), -1)).reshape(-1, *own.shape[1:])
+        rows = np.arange(len(total))[slab.columns]
+        for j, other in enumerate(right.slabs):
+            total[rows[:, None], np.arange(total.shape[1])[other.columns]] += seen[:, j] @ other.matrix
+    return total
+
+
 def centred_columns(matrix: FloatArray) -> FloatArray:
     """C ``matrix``: the mean of each column taken out."""
     return np.asarray(matrix - matrix.mean(axis=0, keepdims=True))

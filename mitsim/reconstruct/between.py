@@ -45,33 +45,55 @@ class Between:
         self._last, self._step = (count - 1) * _KNOTS, step
         reach = min(_ROWS, (rows - 1) // 2)
         self._coefficients = np.empty((rows, self._last + 3))
-        inner = np.arange(reach, rows - reach)
-        self._coefficients[inner] = self._fitted(factor, inner, range(-reach, reach + 1))
-        for row in (*range(reach), *range(rows - reach, rows)):
-            first = min(max(row - reach, 0), rows - 2 * reach - 1) - row
-            self._coefficients[row] = self._fitted(factor, np.array([row]), range(first, first + 2 * reach + 1))[0]
+        inner, edges = np.arange(reach, rows - reach), np.array([*range(reach), *range(rows - reach, rows)], dtype=int)
+        self._coefficients[inner] = self._fitted(factor, inner, np.arange(-reach, reach + 1))
+        nearest = np.clip(edges - reach, 0, rows - 2 * reach - 1)[:, None] + np.arange(2 * reach + 1)
+        self._coefficients[edges] = self._fitted_each(factor[nearest], nearest - edges[:, None])
 
     def at(self, row: npt.NDArray[np.intp], column: FloatArray) -> FloatArray:
         """Numbers of each ``row`` at each ``column``, from 0 to n - 1, whole or not; the two broadcast."""
         start, weights = self._weights(column * _KNOTS)
-        return np.asarray(sum(weight * self._coefficients[row, start + k] for k, weight in enumerate(weights)))
+        first, numbers = row * self._coefficients.shape[1] + start, self._coefficients.ravel()
+        return np.asarray(sum(weight * numbers.take(first + k) for k, weight in enumerate(weights)))
 
-    def _fitted(self, factor: FloatArray, rows: npt.NDArray[np.intp], neighbours: range) -> FloatArray:
+    def _fitted(self, factor: FloatArray, rows: npt.NDArray[np.intp], neighbours: npt.NDArray[np.intp]) -> FloatArray:
         """(len(``rows``), coefficients) of the spline of each row, from its ``neighbours``' numbers."""
-        normal, data = np.zeros((4, self._last + 3)), np.zeros((self._last + 3, len(rows)))
-        for k in neighbours:
-            place = (np.arange(factor.shape[1]) + k * self._step) * _KNOTS
-            inside = (place >= 0) & (place <= self._last)
-            start, weights = self._weights(place[inside])
-            seen = factor[rows + k][:, inside].T
-            for a, weight in enumerate(weights):
-                np.add.at(data, start + a, weight[:, None] * seen)
-                for b in range(a, 4):
-                    np.add.at(normal[b - a], start + a, weight * weights[b])
+        normal, start, weights = self._normal(neighbours[None])
+        data = np.zeros((self._last + 3, len(rows)))
+        for k, first, parts in zip(neighbours, start[0], np.moveaxis(weights[:, 0], 1, 0), strict=True):
+            seen = factor[rows + k].T
+            for a, part in enumerate(parts):
+                # Columns are whole knots apart, so no place is named twice but by those without weight.
+                inside = part != 0
+                data[first[inside] + a] += part[inside, None] * seen[inside]
+        return np.asarray(solveh_banded(normal[0], data, lower=True).T)
+
+    def _fitted_each(self, seen: FloatArray, neighbours: npt.NDArray[np.intp]) -> FloatArray:
+        """(rows, coefficients) of the spline of each row, from what is ``seen`` (rows, k, n) in the ``neighbours``
+        (rows, k) of its own."""
+        normal, start, weights = self._normal(neighbours)
+        data = np.sum([self._collected(start + a, weight * seen) for a, weight in enumerate(weights)], axis=0)
+        found = [solveh_banded(*each, lower=True) for each in zip(normal, data, strict=True)]
+        return np.array(found).reshape(len(seen), self._last + 3)
+
+    def _normal(self, neighbours: npt.NDArray[np.intp]) -> tuple[FloatArray, npt.NDArray[np.intp], FloatArray]:
+        """Of fits to rows that are ``neighbours`` (fits, k): normal matrices (fits, 4, coefficients) by diagonal, first
+        coefficient (fits, k, n) and weights (4, fits, k, n) of each number, 0 beyond the last knot."""
+        place = (np.arange(self._last // _KNOTS + 1) + neighbours[..., None] * self._step) * _KNOTS
+        start, parts = self._weights(place)
+        weights = np.where((place >= 0) & (place <= self._last), parts, 0.0)
+        normal = np.zeros((len(neighbours), 4, self._last + 3))
         for a, b in product(range(4), repeat=2):
             if b >= a:
-                normal[b - a, a : self._last + a] += _STIFFNESS * _THIRD[a] * _THIRD[b]
-        return np.asarray(solveh_banded(normal, data, lower=True).T)
+                normal[:, b - a] += self._collected(start + a, weights[a] * weights[b])
+                normal[:, b - a, a : self._last + a] += _STIFFNESS * _THIRD[a] * _THIRD[b]
+        return normal, start, weights
+
+    def _collected(self, place: npt.NDArray[np.intp], values: FloatArray) -> FloatArray:
+        """(fits, coefficients) sums of the ``values`` (fits, k, n) at each ``place`` (fits, k, n)."""
+        fits, size = len(place), self._last + 3
+        own = (np.arange(fits) * size)[:, None, None] + place
+        return np.asarray(np.bincount(own.ravel(), values.ravel(), fits * size).reshape(fits, size), dtype=np.float64)
 
     def _weights(self, place: FloatArray) -> tuple[npt.NDArray[np.intp], tuple[FloatArray, ...]]:
         """First of the four coefficients at each ``place`` [knots], and the weights of all four: uniform cubic

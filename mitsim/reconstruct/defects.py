@@ -8,7 +8,7 @@ frames are set in rounds, each of which leaves the part h of the step before.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -73,20 +73,21 @@ class Defects:
         rows, columns = np.array(places, dtype=np.intp).T
         return Defects(rows, columns)
 
-    def left_out(self, shots: Capture, prepared: Prepared, weights: FloatArray) -> _LeftOut:
+    def left_out(
+        self, shots: Capture, measured: Callable[[], Iterable[Measurement]], prepared: Prepared, weights: FloatArray
+    ) -> _LeftOut:
         """The capture whose readings at these pixels are those that all others tell.
 
         Parameters
         ----------
-        shots
-            with these pixels.
+        shots, measured
+            with these pixels, and what gives all their measurements, any number of times.
         prepared, weights
             the factorised model, and W of ``shots``.
         """
-        readings = {(each.row, each.column): each.frame for each in shots.measured()}
         values = {
-            pattern: (centred(frame) if prepared.centre else frame)[self.rows, self.columns]
-            for pattern, frame in readings.items()
+            (each.row, each.column): (centred(each.frame) if prepared.centre else each.frame)[self.rows, self.columns]
+            for each in measured()
         }
         # Of a reading that is changed the means of its row and column take up their part.
         gain = (1 - 1 / prepared.left.sensor_size) * (1 - 1 / prepared.right.sensor_size) if prepared.centre else 1.0
@@ -97,7 +98,7 @@ class Defects:
             for (row, column), value in values.items():
                 left, right = prepared.left.slabs[row], prepared.right.slabs[column]
                 own, other = left.matrix[self.rows], right.matrix[self.columns]
-                told = np.einsum("pc,cd,pd->p", own, weights[left.columns][:, right.columns], other, optimize=True)
+                told = (own @ weights[left.columns][:, right.columns] * other).sum(axis=1)
                 leverage = np.square(own).sum(axis=1) * np.square(other).sum(axis=1)
                 step = (told - value) / np.maximum(1 - leverage / gain, 0.5)
                 value += step
@@ -111,7 +112,7 @@ class Defects:
                 change[places] += own.T @ (step[:, None] * other)
             weights += change
         moved = {pattern: (values[pattern] - first[pattern]) / gain for pattern in values}
-        return _LeftOut(shots, self, moved)
+        return _LeftOut(shots, measured, self, moved)
 
     def beyond_chance(self, rest: _LeftOut, noise: FrameNoise) -> Defects | None:
         """Those of them whose readings differ by more than noise from what all others tell; None where none does.
@@ -135,9 +136,15 @@ class Defects:
 class _LeftOut(Capture):
     """A capture whose readings at some pixels are ``moved``, by pattern."""
 
-    def __init__(self, whole: Capture, defects: Defects, moved: dict[tuple[int, int], FloatArray]) -> None:
+    def __init__(
+        self,
+        whole: Capture,
+        measured: Callable[[], Iterable[Measurement]],
+        defects: Defects,
+        moved: dict[tuple[int, int], FloatArray],
+    ) -> None:
         super().__init__(whole.manifest, whole.folder)
-        self._whole, self._defects, self.moved = whole, defects, moved
+        self._whole, self._measured, self._defects, self.moved = whole, measured, defects, moved
 
     @cached_property
     def patterns(self) -> tuple[FloatArray, FloatArray]:
@@ -150,9 +157,9 @@ class _LeftOut(Capture):
         return self._whole.ambient
 
     def measured(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
-        """As of the capture itself, with other readings at its defective pixels."""
+        """As of the capture itself, whose ``shape`` is known, with other readings at its defective pixels."""
         places = self._defects.rows, self._defects.columns
-        for each in self._whole.measured(shape):
+        for each in self._measured():
             frame, light = each.frame.copy(), each.light.copy()
             frame[places] += self.moved[each.row, each.column]
             # Of a pair's sum nothing is told but that it is no less than the difference.

@@ -18,7 +18,7 @@ from scipy.optimize import minimize_scalar
 
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
-from mitsim.reconstruct.accumulator import Accumulator, centred
+from mitsim.reconstruct.accumulator import Accumulator, centred, projected
 from mitsim.reconstruct.alldepths import AllDepths, searched
 from mitsim.reconstruct.arrivals import parallax_period
 from mitsim.reconstruct.causes import Evidence
@@ -26,6 +26,7 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import focused, stated_parallax
 from mitsim.reconstruct.misfit import CHANCE
 from mitsim.reconstruct.noise import factor_energy
+from mitsim.reconstruct.sides import factorise, group_pixels
 from mitsim.reconstruct.solver import Prepared, prepare
 
 _STEP = 1.0
@@ -151,7 +152,9 @@ class _Search:
             beyond = min(self._period, self._ends[1])
         self._tried = self._ends[0] - beyond, self._ends[1] + beyond
         self._shots, self._factors = shots, factors
-        self._all = AllDepths(shots, factors, self._tried)
+        rows, columns = shots.patterns
+        self._groups = group_pixels(rows, "auto"), group_pixels(columns, "auto")
+        self._all = AllDepths(shots, factors, self._tried, self._groups)
         self._inverse, self._factor_noise = 1 / stated_parallax(factors).depth_mm, factors.manifest.noise
         self.pixel = 1 / max(self._all.reach(axis) for axis in (0, 1))
         self._unknowns = self._all.shape[0] * self._all.shape[1]
@@ -202,9 +205,12 @@ class _Search:
 
     def left_over(self, shift: float) -> float:
         """Energy of the measurements that factors moved by ``shift`` of 1/z leave."""
-        prepared, sums = self._summed(shift)
-        problem = prepared.problem(sums)
-        return self._all.energy - float(np.square(problem.projected[problem.sigma > 0]).sum())
+        left, right = (
+            factorise(self._all.side(axis, shift), patterns, groups, "svd", "auto", False)
+            for axis, (patterns, groups) in enumerate(zip(self._all.patterns, self._groups, strict=True))
+        )
+        measured = np.outer(left.singular, right.singular) > 0
+        return self._all.energy - float(np.square(projected(left, right, self._all.stack)[measured]).sum())
 
     def _valleys(self, first: float, last: float) -> Iterator[tuple[float, float]]:
         """Energy left over at the bottom of the lowest valley between two changes of 1/z and of those that may be as

@@ -142,7 +142,8 @@ class FactorOfDepths:
             1/z - 1/z_0 [1/mm] of all scene pixels, or (n,) of each.
         """
         column = self._moved(shift)
-        shadows, known = self._seen(column, np.arange(self.factor.shape[1]))
+        row, within, known = self._sources(column)
+        shadows = self._shadow.at(row, within) * self._own_brightness
         passed = self._passed(column)
         mean = passed.mean(axis=0)
         # The image stays light relative to the board's, as the sensor as a whole sees it.
@@ -184,17 +185,10 @@ class FactorOfDepths:
         sensor rows where that is nothing."""
         rows, count = self.factor.shape
         column = np.arange(-margin, count + margin)
-        shadows, known = self._seen(np.broadcast_to(column, (rows, column.size)), column)
+        row, within, known = self._sources(np.broadcast_to(column, (rows, column.size)))
+        shadows = self._shadow.at(row, within) * self.brightness(column)
         shadows[:, margin : margin + count] = self.factor
         return shadows, _whole(known)
-
-    def _seen(
-        self, column: npt.NDArray[np.floating | np.integer], own: npt.NDArray[np.integer]
-    ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-        """Shadows (m, k) of places between columns, also beside the window, with the brightness of the columns ``own``
-        (k,); and whether the sensor sees them."""
-        row, within, known = self._sources(column)
-        return self._shadow.at(row, within) * self.brightness(own), known
 
     def _sources(
         self, column: npt.NDArray[np.floating | np.integer]
@@ -203,15 +197,24 @@ class FactorOfDepths:
         rows, count = self.factor.shape
         # Columns that one sensor pixel's step along the sensor makes up for.
         step = self._step
-        before, after = np.ceil(np.maximum(1 - column, 0) / step), np.ceil(np.maximum(column - count + 2, 0) / step)
-        steps = np.where(column < 0, -before, np.where(column > count - 1, after, 0)).astype(np.intp)
-        within, row = column - steps * step, np.arange(rows)[:, None] + steps
-        known = (row >= 0) & (row < rows) & (within >= 0) & (within <= count - 1)
-        return np.clip(row, 0, rows - 1), np.clip(within, 0.0, count - 1.0), known
+        within, row = np.array(column, dtype=np.float64), np.repeat(np.arange(rows)[:, None], column.shape[1], axis=1)
+        known = np.ones(within.shape, dtype=np.bool_)
+        outside = (within < 0) | (within > count - 1)
+        away, own = within[outside], row[outside]
+        steps = np.where(away < 0, -np.ceil((1 - away) / step), np.ceil((away - count + 2) / step)).astype(np.intp)
+        away, own = away - steps * step, own + steps
+        known[outside] = (own >= 0) & (own < rows) & (away >= 0) & (away <= count - 1)
+        within[outside], row[outside] = np.clip(away, 0.0, count - 1.0), np.clip(own, 0, rows - 1)
+        return row, within, known
 
     @cached_property
     def _shadow(self) -> Between:
-        return Between(self.factor / self.brightness(np.arange(self.factor.shape[1])), self._step)
+        return Between(self.factor / self._own_brightness, self._step)
+
+    @cached_property
+    def _own_brightness(self) -> FloatArray:
+        """(n,) of the calibrated columns."""
+        return self.brightness(np.arange(self.factor.shape[1]))
 
     @property
     def edges(self) -> FloatArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -260,8 +261,12 @@ class Accumulated:
         return faulty_frames(self._check(shots, depths.lam), beside, Evidence(factors, shots.patterns))
 
     def _check(self, shots: Capture, lam: float) -> FrameCheck:
-        measured = lambda: self.kept or shots.measured()  # noqa: E731
+        measured = self.measured(shots)
         return FrameCheck(self.prepared, self.weights, lam, shots.patterns, shots.manifest, self.noise, measured)
+
+    def measured(self, shots: Capture) -> Callable[[], Iterable[Measurement]]:
+        """What gives the measurements of ``shots``, any number of times: those that are kept, or reads them."""
+        return lambda: self.kept or shots.measured()
 
     def uncertainty(self, shots: Capture, factors: Factors, solution: Solution) -> Uncertainty:
         """Standard uncertainty of a solution.
@@ -308,14 +313,14 @@ def _without_defects(
         if now.defects is None:
             break
         found = now.defects.with_others(found)
-        rest = found.left_out(shots, data.prepared, data.weights)
+        rest = found.left_out(shots, data.measured(shots), data.prepared, data.weights)
         without = accumulated(rest, factors, method)
         solution = without.solution(lam, method)
         again = without.misfit(rest, factors, solution)
         now = again or now
     # What bright ones put into other pixels is none of these: they are taken in again.
     while found and (own := found.beyond_chance(rest, data.noise)) and len(own.rows) < len(found.rows):
-        found, rest = own, own.left_out(shots, data.prepared, data.weights)
+        found, rest = own, own.left_out(shots, data.measured(shots), data.prepared, data.weights)
         without = accumulated(rest, factors, method)
         solution = without.solution(lam, method)
         now = without.misfit(rest, factors, solution, with_defects=False) or now

@@ -50,23 +50,28 @@ _CURVES = {
 @dataclass(frozen=True, eq=False)
 class _Linear:
     """A measurement of linear light: its ``pattern``, the ``frame`` as the solver takes it, the ``light`` of all its
-    ``shots``, the mean ``variance`` of their noise, and the sum of the ``logarithm`` of the curve's slope."""
+    ``shots``, the mean ``variance`` of their noise, and of each shot what was ``read``, 0 to 1."""
 
     pattern: tuple[int, int]
     frame: FloatArray
     light: FloatArray
-    shots: int
     variance: float
-    logarithm: float
+    read: tuple[FloatArray, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class _Held:
-    """How far what is left is ``away`` from the noise that is expected, as a part of it, -2 log L, and W."""
+    """What is left in units of the noise that is expected, of the measurements and of signed patterns' sums, how many
+    numbers either are, and W."""
 
-    away: float
-    unlikely: float
+    spreads: tuple[float, ...]
+    numbers: int
     weights: FloatArray
+
+    @property
+    def away(self) -> float:
+        """How far that is from the noise, as a part of it."""
+        return max(abs(spread - 1) for spread in self.spreads)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,30 +97,35 @@ class ToneCurves:
         frames do not fit with it, or where the sensor's noise is not stated."""
         if not self.manifest.digital.noise_is_stated:
             return ""
-        most = self._held(_power(1.0)).unlikely
-        fits: dict[str, float] = {}
-        for words, curve in _CURVES.items():
-            held = self._held(curve)
-            if held.away < _NOISE and held.unlikely < most:
-                fits[words] = held.away
-        best = min(fits, key=lambda words: fits[words], default="")
+        fits = {words: held for words, curve in _CURVES.items() if (held := self._held(curve)).away < _NOISE}
+        if fits:
+            most = self._unlikely(_power(1.0), self._held(_power(1.0)))
+            fits = {words: held for words, held in fits.items() if self._unlikely(_CURVES[words], held) < most}
+        best = min(fits, key=lambda words: fits[words].away, default="")
         return best if best and self._fits_each(_CURVES[best]) else ""
 
     def _held(self, curve: Curve) -> _Held:
         """All measurements against the model, and of signed patterns the sums of their halves, which are all alike."""
-        sums, total, energy, noise, logarithms, count = self.prepared.accumulator(), np.zeros(()), 0.0, 0.0, 0.0, 0
+        sums, total, energy, noise, count = self.prepared.accumulator(), np.zeros(()), 0.0, 0.0, 0
         for each in self._linear(curve):
             sums.add(each.frame, *each.pattern)
             total, energy, count = total + each.light, energy + float(np.vdot(each.light, each.light)), count + 1
             noise += each.variance * each.frame.size
-            logarithms += each.shots * each.frame.size * np.log(each.variance) - 2 * each.logarithm
         problem = self.prepared.problem(sums)
         explained = float(np.square(problem.projected[problem.sigma > 0]).sum())
         spreads = [(problem.energy - explained) / (noise * self.prepared.spare)]
-        if each.shots == 2 and count > 1:
+        if len(each.read) == 2 and count > 1:
             spreads.append((energy - float(np.vdot(total, total)) / count) / (noise * (1 - 1 / count)))
-        unlikely = sum(count * total.size * float(np.log(max(spread, _TINY))) for spread in spreads) + logarithms
-        return _Held(max(abs(spread - 1) for spread in spreads), unlikely, problem.projected)
+        return _Held(tuple(spreads), count * total.size, problem.projected)
+
+    def _unlikely(self, curve: Curve, held: _Held) -> float:
+        """-2 log L of a ``curve``, by which the measurements are ``held`` against the model."""
+        unlikely = sum(held.numbers * float(np.log(max(spread, _TINY))) for spread in held.spreads)
+        for each in self._linear(curve):
+            slopes = (curve[1](np.maximum(np.abs(read), _LEAST)) for read in each.read)
+            logarithm = sum(float(np.log(values).sum()) for values in slopes)
+            unlikely += len(each.read) * each.frame.size * float(np.log(each.variance)) - 2 * logarithm
+        return unlikely
 
     def _fits_each(self, curve: Curve) -> bool:
         """Whether every measurement has no more than its noise left: a single one that is wrong bends no numbers."""
@@ -131,23 +141,24 @@ class ToneCurves:
 
     def _linear(self, curve: Curve) -> Iterator[_Linear]:
         """Measurements of light, dark current and ambient light, that the numbers are a ``curve`` of."""
-        digital, (light_of, slope) = self.manifest.digital, curve
+        digital, light_of = self.manifest.digital, curve[0]
         dark, top = digital.dark_current_e_per_s, digital.saturation_dn
         peak = float(digital.rate(np.array(top))) if top else max(float(each.light.max()) for each in self.measured())
         peak = max(peak + dark, _TINY)
 
+        def part(rate: FloatArray) -> FloatArray:
+            return np.asarray((rate + dark) / peak)
+
         def linear(read: FloatArray) -> FloatArray:
-            part = (read + dark) / peak
-            return np.asarray(peak * np.sign(part) * light_of(np.abs(part)) - dark)
+            return np.asarray(peak * np.sign(read) * light_of(np.abs(read)) - dark)
 
         for each in self.measured():
             pair = ((each.light + each.frame) / 2, (each.light - each.frame) / 2) if each.shots == 2 else (each.light,)
-            halves = [linear(read) for read in pair]
+            reads = tuple(part(rate) for rate in pair)
+            halves = [linear(read) for read in reads]
             light = np.asarray(sum(halves))
             frame = halves[0] - halves[1] if each.shots == 2 else light
             if each.shots == 1 and each.frame is not each.light:
-                frame = light - linear(each.light - each.frame)  # the ambient frame
+                frame = light - linear(part(each.light - each.frame))  # the ambient frame
             variance = float(np.maximum(digital.variance(light, each.shots), _TINY).mean())
-            slopes = (slope(np.maximum(np.abs(read + dark) / peak, _LEAST)) for read in pair)
-            logarithm = sum(float(np.log(values).sum()) for values in slopes)
-            yield _Linear((each.row, each.column), frame, light, each.shots, variance, logarithm)
+            yield _Linear((each.row, each.column), frame, light, variance, reads)

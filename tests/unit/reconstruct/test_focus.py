@@ -18,12 +18,16 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import Parallax
 from mitsim.core.runs import Capture
 from mitsim.optics.shadow import scene_factor
+from mitsim.reconstruct.accumulator import projected
+from mitsim.reconstruct.alldepths import AllDepths
 from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.depth import Depth, best_depth
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import FactorOfDepths, focused
 from mitsim.reconstruct.reconstruction import reconstruct
 from mitsim.reconstruct.result import Reconstruction
+from mitsim.reconstruct.sides import group_pixels
+from mitsim.reconstruct.solver import prepare
 from mitsim.rig.camera import centred_edges
 from mitsim.rig.mask import mls_mask
 from tests.ideal_sessions import PEAK, PITCH, PIXELS, Bench, picture
@@ -48,6 +52,9 @@ PARALLAX = Parallax(
     pixel_pitch_mm=PITCH,
     mask_distance_mm=2.0,
 )
+
+LEVEL = PARALLAX.model_copy(update={"row_mm": (0.0, 0.0)})
+"""Of a projector beside the camera alone."""
 
 
 def shadow(depth: float, axis: int, n: int = N, baseline: tuple[float, float] = BASELINE) -> np.ndarray:
@@ -389,3 +396,19 @@ def test_a_depth_without_factors_is_refused() -> None:
     small = replace(calibrated(), left=np.ones((PIXELS, 3)))
     with pytest.raises(MitsimError, match="3 x 40 projector pixels"):
         focused(small, 380.0)
+
+
+@pytest.mark.parametrize(("patterns", "own"), [("dots:4", True), ("hadamard:4", False)])
+def test_dots_own_basis_leaves_as_much_as_the_common_one(patterns: str, own: bool) -> None:
+    """Depth moves rows by less than a pixel here, and their dots' shadows span little."""
+    level = replace(calibrated(), manifest=calibrated().manifest.model_copy(update={"parallax": LEVEL}))
+    run, ends = shots(400.0, patterns), (-2e-4, 2e-4)
+    groups = tuple(group_pixels(each, "auto") for each in run.patterns)
+    one, each = AllDepths(run, level, ends), AllDepths(run, level, ends, (groups[0], groups[1]))
+    assert (each.stack.shape[1] < one.stack.shape[1] / 2) == own
+    for shift in (-2e-4, -0.7e-4, 0.0, 1.3e-4):
+        left = []
+        for depths in (one, each):
+            sides = prepare(depths.side(0, shift), depths.side(1, shift), *run.patterns)
+            left.append(depths.energy - float(np.square(projected(sides.left, sides.right, depths.stack)).sum()))
+        assert left[1] == pytest.approx(left[0], abs=1e-7 * one.energy)

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.linalg import hadamard
 
 from mitsim.core.errors import MitsimError
+from mitsim.reconstruct.accumulator import projected
 from mitsim.reconstruct.sides import pattern_blocks
 from mitsim.reconstruct.solver import prepare
 
@@ -232,3 +233,16 @@ def test_bad_models_are_refused(change, words):
     good = {"left": np.eye(5, 4), "right": np.eye(5, 4), "P_L": np.ones((4, 1)), "P_R": np.ones((4, 1))}
     with pytest.raises(MitsimError, match=words):
         prepare(**(good | change))
+
+
+@pytest.mark.parametrize("rows", families(9))
+@pytest.mark.parametrize("columns", families(9))
+def test_all_frames_at_once_are_the_sum_of_each(rows, columns):
+    rng = np.random.default_rng(3)
+    left, right = families(9)[rows], families(9)[columns]
+    prepared = prepare(rng.random((12, 9)), rng.random((14, 9)), left, right)
+    frames = rng.random((left.shape[1], 12, right.shape[1], 14))
+    sums = prepared.accumulator()
+    for i, j in np.ndindex(left.shape[1], right.shape[1]):
+        sums.add(frames[i, :, j], i, j)
+    np.testing.assert_allclose(projected(prepared.left, prepared.right, frames), sums.sum, rtol=1e-12, atol=1e-12)
