@@ -51,6 +51,10 @@ _THICK_STEPS = 2
 """Grid of a thick mask, whose every direction needs fields of its own, in steps of the thin one's."""
 _DISTANCES = 3
 """Of a tilted mask at which waves are worked out: it changes by a few percent, and waves less."""
+_NARROWEST = 0.5
+"""Mean width of a mask's openings, in wavelengths, from which its waves are worked out: between conducting edges half a
+wavelength is the cutoff of light polarised along them (Jackson, Classical Electrodynamics, 8.3), and below it hardly
+any passes that scalar theory would let through."""
 _LARGEST_GRID = 1 << 24
 """Cells of a grid: 256 MiB for each of a few complex arrays."""
 
@@ -163,11 +167,19 @@ def _of_fields(shadow: ShadowGeometry) -> ShadowGeometry:
 
 
 def grid_step(shadow: ShadowGeometry, wavelength_nm: float) -> float:
-    """Width [mm] of a grid cell for ``shadow`` at ``wavelength_nm``; a feature holds a whole number of them."""
+    """Width [mm] of a grid cell for ``shadow`` at ``wavelength_nm``; a feature that is wider holds a whole number of
+    them. MitsimError for a mask whose openings are too narrow for scalar waves."""
+    narrowest, feature, opening = _NARROWEST * wavelength_nm * 1e-6, shadow.mask.feature_mm, shadow.mask.opening_mm
+    if opening < narrowest:
+        raise MitsimError(
+            f"mask of features of {feature:g} mm: its openings are {opening:.3g} mm wide, and diffraction of light of "
+            f"{wavelength_nm:.0f} nm is worked out from {narrowest:.3g} mm, half a wavelength; give more as feature_mm "
+            "in the camera file's [mask] or mask_feature in the scene, or use --effects=-diffraction"
+        )
     fresnel_length = (wavelength_nm * 1e-6 * shadow.distance_mm * shadow.shrink) ** 0.5
-    feature = shadow.mask.feature_mm
     widest = min(_STEP_MM, fresnel_length / _STEPS_PER_FRESNEL_LENGTH) * (_THICK_STEPS if shadow.thickness_mm else 1)
-    return feature / float(np.ceil(feature / widest))
+    # Within a cell a finer mask counts by its mean: its orders are evanescent.
+    return feature / float(np.ceil(feature / widest)) if feature > widest else widest
 
 
 def _prepare(shadow: ShadowGeometry, wavelength_nm: float, lows: FloatArray, highs: FloatArray) -> EdgeWaves:

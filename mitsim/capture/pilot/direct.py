@@ -201,7 +201,7 @@ class FineLight:
             seen = light[0, :, 0]
             error, known = raster_error(geometry, bundle.rows, bundle.columns, self.base.depth, spectrum, seen)
             found = Estimate(error, _SURE_OF_RASTER * error) if known else Estimate(*(error * by for by in _OF_FINER))
-            return Drawn(found, geometry.drawn(waves), cells_to_choose(geometry))
+            return Drawn(found, geometry.drawn(waves), cells_to_choose(geometry, spectrum))
 
         without = drawn(None)
         return without, drawn(self.bench.spectrum) if geometry.diffracts else without
