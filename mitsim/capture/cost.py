@@ -116,7 +116,7 @@ def light_bytes(bench: Bench, classes: int, settings: Settings, lines: int = 1) 
             0.0 if settings.raster else factors,
             raster_bytes(
                 geometry.model_copy(update={"mask_cells": settings.raster_cells}),
-                bench.spectrum if geometry.diffracts else None,
+                bench.waves,
             ),
         )
     held = lines * GROUPS * filed * _ENTRY_BYTES + min(lines, workers()) * paths * deposit_bytes(settings)

@@ -38,6 +38,7 @@ from mitsim.core.parallel import in_threads
 from mitsim.optics.profile import Steps, smooth_box_means
 from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, both_axes
 from mitsim.optics.tilt import nodes_between, polynomials
+from mitsim.rig.mask import Mask
 from mitsim.rig.plate import FEW, Plate
 from mitsim.rig.projector import Spectrum
 
@@ -166,16 +167,27 @@ def _of_fields(shadow: ShadowGeometry) -> ShadowGeometry:
     return replace(shadow, mask=mask)
 
 
+def narrowest_mm(wavelength_nm: float) -> float:
+    """Mean width of a mask's openings [mm] from which waves of ``wavelength_nm`` are worked out."""
+    return _NARROWEST * wavelength_nm * 1e-6
+
+
+def check_openings(mask: Mask | Plate, wavelength_nm: float) -> None:
+    """MitsimError for a ``mask`` whose openings are too narrow for scalar waves of ``wavelength_nm``."""
+    if mask.opening_mm < narrowest_mm(wavelength_nm):
+        raise MitsimError(
+            f"mask of features of {mask.feature_mm:g} mm: its openings are {mask.opening_mm:.3g} mm wide, and "
+            f"diffraction of light of {wavelength_nm:.0f} nm is worked out from {narrowest_mm(wavelength_nm):.3g} mm, "
+            "half a wavelength; give more as feature_mm in the camera file's [mask] or mask_feature in the scene, or "
+            "use --effects=-diffraction"
+        )
+
+
 def grid_step(shadow: ShadowGeometry, wavelength_nm: float) -> float:
     """Width [mm] of a grid cell for ``shadow`` at ``wavelength_nm``; a feature that is wider holds a whole number of
     them. MitsimError for a mask whose openings are too narrow for scalar waves."""
-    narrowest, feature, opening = _NARROWEST * wavelength_nm * 1e-6, shadow.mask.feature_mm, shadow.mask.opening_mm
-    if opening < narrowest:
-        raise MitsimError(
-            f"mask of features of {feature:g} mm: its openings are {opening:.3g} mm wide, and diffraction of light of "
-            f"{wavelength_nm:.0f} nm is worked out from {narrowest:.3g} mm, half a wavelength; give more as feature_mm "
-            "in the camera file's [mask] or mask_feature in the scene, or use --effects=-diffraction"
-        )
+    check_openings(shadow.mask, wavelength_nm)
+    feature = shadow.mask.feature_mm
     fresnel_length = (wavelength_nm * 1e-6 * shadow.distance_mm * shadow.shrink) ** 0.5
     widest = min(_STEP_MM, fresnel_length / _STEPS_PER_FRESNEL_LENGTH) * (_THICK_STEPS if shadow.thickness_mm else 1)
     # Within a cell a finer mask counts by its mean: its orders are evanescent.

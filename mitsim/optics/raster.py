@@ -37,8 +37,9 @@ _CELLS_PER_PIXEL = 6
 """Raster cells along a pixel: at 4 a raster leaves twice as much (tests/physics/test_raster.py), for which a plan at an
 accuracy of 1e-3 has no room. Features far below a pixel need no more: of a frame in pixels of 12 um random masks of 1
 and of 4 um leave 2e-4 and 1e-3 in waves at 6 (against 48), 2e-4 and 6e-5 turned."""
-_LEFT_BEYOND = 3e-4
-"""Part of the light that waves may carry beyond a raster's edge: what the points at which they are squared leave."""
+_LEFT_BEYOND = 1e-3
+"""Bound of the part of the light that waves may carry beyond a raster's edge. A third of it is found there, as much as
+the points at which waves are squared leave (3.6e-4, a random mask of 31 features of 60 um)."""
 _LARGEST = 8192
 """Cells a side: a raster takes 512 MiB."""
 _POINTS, _LATTICE = 16, 7

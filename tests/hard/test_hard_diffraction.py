@@ -179,6 +179,20 @@ def test_a_mask_below_the_wavelength_warns(
     assert len(found) == warned and all("mask_feature 0.0005 mm" in w and "\n" not in w for w in found)
 
 
+def test_a_plan_with_openings_below_half_a_wavelength_goes_without_diffraction(
+    small_scene: Callable[..., Path], variant: str
+) -> None:
+    """Refused before the pilot looks, or flagged where diffraction is off. (Planted: the pilot's look has it on.)"""
+    from mitsim.capture.opening import open_bench
+
+    bench = open_bench(small_scene(mask_feature=1.5e-4))
+    with pytest.raises(MitsimError, match="half a wavelength"):
+        bench.plan("uniform", accuracy=0.1)
+    assert any(
+        "shadow is a guess" in said for said in bench.plan("uniform", accuracy=0.1, effects="-diffraction").warnings
+    )
+
+
 FINE = {
     "code": {"kind": "separable"},
     "tilted, dusty": {"kind": "separable", "tilt_row_mrad": 300.0, "dust_per_mm2": 100.0},
