@@ -48,6 +48,8 @@ many."""
 _POINTS_PER_FRESNEL_LENGTH = 80
 """Points in sqrt(lambda D) at which waves are squared: at 80 uniform light behind separable masks of order 6 and 9 is
 3.2e-4 and 2.2e-4 off its closed form, at 60 5.8e-4 and 6.8e-4, evenly (tests/physics/test_raster.py)."""
+_MOST_WAVE_POINTS = 1 << 16
+"""Points a side at most: 4e9 of them take a minute for each line, and some seconds more for each term."""
 _LEAST_WAVE_POINTS = 2
 """Points along a cell at least."""
 _GRID_CELLS = 3
@@ -214,6 +216,12 @@ def _fields(
     cell."""
     distance = shadow.distance_mm * shadow.shrink
     points = points_per_cell(wavelength_nm, distance, step)
+    if count * points > _MOST_WAVE_POINTS:
+        raise MitsimError(
+            f"mask of {len(shadow.mask.terms)} terms, {shadow.distance_mm:g} mm from the sensor: its waves are squared "
+            f"at {count * points} points a side there, more than {_MOST_WAVE_POINTS}; move it off the sensor, or take "
+            "fewer pixels"
+        )
     between = max(int(np.ceil(step / points / grid_step(shadow, wavelength_nm))), _GRID_CELLS)
     half = count * step / 2
     span = half + shadow.mask.extent_mm / 2 + step

@@ -100,6 +100,13 @@ def test_waves_beyond_a_small_mask_are_drawn(feature: float, order: int) -> None
     assert np.linalg.norm(frame - expected) < 3e-3 * np.linalg.norm(expected)
 
 
+def test_waves_of_too_many_points_are_refused() -> None:
+    """A random mask 1 um from 512 pixels needs 2 nm from point to point. (Planted: no limit: hours.)"""
+    camera = made(kind="random", features=31).model_copy(update={"mask_distance": 1e-3, "pixels": 512})
+    with pytest.raises(MitsimError, match=r"0\.001 mm from the sensor.* points a side there, more than 65536"):
+        raster(camera, 400.0, LINES)
+
+
 def test_fringes_of_far_edges_do_not_add_up() -> None:
     """Uniform light behind 511 features a side, of which the farthest are 15 mm away: to 5e-4 of its closed form.
     (Planted: the field at points, not its means from one to the next: 2.5e-3.)"""
