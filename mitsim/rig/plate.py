@@ -72,7 +72,7 @@ class Plate(ByValue):
             raise MitsimError(f"{self.words}: feature size is {self.feature_mm} mm; give a finite number above 0")
         if not (np.isfinite(values).all() if self.irradiance else values.min() >= 0 and values.max() <= 1):
             raise MitsimError(f"{self.words}: transmissions are {values.min():g} to {values.max():g}; give 0 to 1")
-        if not values.any():
+        if not values.max() > (0 if self.irradiance else _ROUNDING):
             raise MitsimError(f"{self.words}: no feature lets light through; open some")
         self._hold(values=values)
         if self.lines_mm is not None:
