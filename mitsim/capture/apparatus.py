@@ -110,6 +110,14 @@ class Apparatus:
         """The projector's photons by wavelength."""
         return self.projector.spectrum
 
+    @property
+    def waves(self) -> Spectrum | None:
+        """Lines of that light whose diffraction at the mask is worked out; None: of none."""
+        from mitsim.optics.diffraction import narrowest_mm
+
+        narrow = self.geometry.build_mask().opening_mm < narrowest_mm(float(self.spectrum.wavelengths_nm.max()))
+        return None if narrow or not self.geometry.diffracts else self.spectrum
+
     @cached_property
     def glint(self) -> Glint:
         """Light of the projector that mirrors alone bring to the sensor."""

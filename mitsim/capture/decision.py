@@ -39,6 +39,9 @@ if TYPE_CHECKING:
 
 _GREY = "no surface differs by wavelength; the mask's shadow is the mean over all lines"
 """What is said of a scene in greys."""
+_FEW_WAVELENGTHS = 2
+"""Mean width of a mask's openings below which scalar waves, and shadows, are a guess: half the openings of codes and of
+random masks are one feature, which is half the mean and a wavelength then."""
 _TOLD = 2.0
 """An estimate whose bound is above this much of it is told as a bound."""
 
@@ -102,11 +105,12 @@ class SceneFacts:
                 f"the mask's tilt is left out{whose}: it moves shadows by up to {geometry.tilt_shift_mm * 1e3:.2g} um; "
                 "render --estimator reference has it, or set it to 0 in the camera's [mask]"
             )
-        longest = float(bench.spectrum.wavelengths_nm.max())
-        if geometry.mask_feature * 1e6 < longest:
+        longest, opening = float(bench.spectrum.wavelengths_nm.max()), geometry.build_mask().opening_mm
+        if opening * 1e6 < _FEW_WAVELENGTHS * longest and not (plate and plate.irradiance):
             warnings.append(
-                f"mask_feature {geometry.mask_feature:g} mm is below the wavelength of {longest:.0f} nm; scalar theory "
-                "of masks needs features above it, so the shadow is a guess"
+                f"mask_feature {geometry.mask_feature:g} mm: the mask's openings are {opening:.3g} mm wide, less than "
+                f"{_FEW_WAVELENGTHS} wavelengths of {longest:.0f} nm; scalar theory of masks needs wider ones, so the "
+                "shadow is a guess"
             )
         notes = {name: effect.note(bench) for name, effect in EFFECTS.items()}
         loaded = bench.loaded

@@ -68,7 +68,7 @@ class Physics:
         return cls(
             geometry=bench.geometry,
             projector=bench.projector_optics,
-            spectrum=bench.spectrum if bench.geometry.diffracts else None,
+            spectrum=bench.waves,
             black_level=bench.projector.black_level,
             speckle=bench.speckle(),
             lamps=bench.loaded.lamps,

@@ -24,6 +24,7 @@ from mitsim.capture.simulation import AT_ANCHORS, Simulation, Stage
 from mitsim.core.arrays import Labels
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
+from mitsim.optics.diffraction import check_openings
 from mitsim.rig.patterns import Lighting
 
 OPENING_S = 1.5
@@ -93,7 +94,7 @@ def make_plan(
         for a scene that the factored estimator cannot render.
     """
     check_accuracy(accuracy)
-    _refuse_unfit(bench)
+    _refuse_unfit(bench, switches or {})
     started = time.perf_counter()
     look = pilot.Look(bench, lighting, accuracy, seed, lines)
     while True:
@@ -126,8 +127,8 @@ def plan_within(
     MitsimError
         as :func:`make_plan`.
     """
-    _refuse_unfit(bench)
     started, switches = time.perf_counter(), switches or {}
+    _refuse_unfit(bench, switches)
     around = OPENING_S + sum(frame_seconds(bench, len(lighting.weights)).values())
     look = pilot.Look(bench, lighting, FIRST_LOOK, seed)
     around += look.seconds
@@ -146,10 +147,12 @@ def plan_within(
     return replace(plan, asked_seconds=seconds, warnings=(*told(found, seconds, around), *plan.warnings))
 
 
-def _refuse_unfit(bench: Bench) -> None:
-    """MitsimError for a ``bench`` that the factored estimator cannot render."""
+def _refuse_unfit(bench: Bench, switches: Mapping[str, bool]) -> None:
+    """MitsimError for a ``bench`` that the factored estimator cannot render; ``switches`` may leave effects out."""
     if bench.loaded.unfit.factored is not None:
         raise bench.loaded.unfit.factored
+    if bench.geometry.diffracts and switches.get("diffraction") is not False:
+        check_openings(bench.geometry.build_mask(), float(bench.spectrum.wavelengths_nm.max()))
 
 
 def _decided(look: pilot.Look, accuracy: float, switches: Mapping[str, bool]) -> Plan:

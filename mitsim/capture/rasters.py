@@ -25,12 +25,20 @@ _MOST_BYTES = 2.0**32
 """Memory that more cells than the fewest are chosen for: twice as many of 320 pixels a side, 4 / 3 of 512."""
 
 
-def cells_to_choose(geometry: CameraGeometry) -> tuple[int, ...]:
-    """Raster cells a pixel, fewest first, that a plan may choose for a camera ``geometry`` whose mask is drawn."""
+def cells_to_choose(geometry: CameraGeometry, spectrum: Spectrum | None) -> tuple[int, ...]:
+    """Raster cells a pixel, fewest first, that a plan may choose for a camera whose mask is drawn.
+
+    Parameters
+    ----------
+    geometry, spectrum
+        as for :func:`drawing_seconds`.
+    """
     fewest = cells_per_pixel(geometry)
-    more = [math.ceil(by * fewest) for by in _FINER]
-    held = [cells for cells in more if raster_bytes(geometry.model_copy(update={"mask_cells": cells})) <= _MOST_BYTES]
-    return fewest, *held
+
+    def held(cells: int) -> bool:
+        return raster_bytes(geometry.model_copy(update={"mask_cells": cells}), spectrum) <= _MOST_BYTES
+
+    return fewest, *filter(held, (math.ceil(by * fewest) for by in _FINER))
 
 
 def drawing_seconds(geometry: CameraGeometry, spectrum: Spectrum | None) -> float:
@@ -47,7 +55,7 @@ def drawing_seconds(geometry: CameraGeometry, spectrum: Spectrum | None) -> floa
     waves = spectrum is not None
     if mask is None or not (geometry.drawn(waves) or geometry.may_be_drawn(waves)):
         return 0.0
-    cells, turned = float(cells_a_side(geometry)) ** 2, bool(mask.flaws.turn_deg)
+    cells, turned = float(cells_a_side(geometry, spectrum)) ** 2, bool(mask.flaws.turn_deg)
     if spectrum is None or mask.irradiance:
         return cells * (_TURNED_S if turned else _MEANS_S)
     seen = geometry.build_mask()
@@ -58,6 +66,12 @@ def drawing_seconds(geometry: CameraGeometry, spectrum: Spectrum | None) -> floa
     return cells * (_AROUND if turned else 1.0) * each * sum(count**2 for count in points)
 
 
-def raster_bytes(geometry: CameraGeometry) -> float:
-    """Memory of shadows on rasters behind a camera ``geometry`` whose mask is drawn [bytes]."""
-    return 8.0 * (_HELD + _AT_WORK) * cells_a_side(geometry) ** 2 + _BLOCK_BYTES
+def raster_bytes(geometry: CameraGeometry, spectrum: Spectrum | None) -> float:
+    """Memory of shadows on rasters behind a camera whose mask is drawn [bytes].
+
+    Parameters
+    ----------
+    geometry, spectrum
+        as for :func:`drawing_seconds`.
+    """
+    return 8.0 * (_HELD + _AT_WORK) * cells_a_side(geometry, spectrum) ** 2 + _BLOCK_BYTES

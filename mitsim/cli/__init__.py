@@ -86,6 +86,10 @@ def run() -> None:
     """Serve the command line in this process: exit 0 done, 1 done but flagged, 2 refused or failed, 128 + n ended by
     signal n."""
     try:
+        Path.cwd()
+    except FileNotFoundError:
+        _fail("the working folder does not exist any more; change to another one")
+    try:
         code = app(standalone_mode=False)
     except SystemExit as ended:
         if ended.code == 1:  # click's for a reader that went away

@@ -38,6 +38,7 @@ from mitsim.core.parallel import in_threads
 from mitsim.optics.profile import Steps, smooth_box_means
 from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, both_axes
 from mitsim.optics.tilt import nodes_between, polynomials
+from mitsim.rig.mask import Mask
 from mitsim.rig.plate import FEW, Plate
 from mitsim.rig.projector import Spectrum
 
@@ -51,6 +52,10 @@ _THICK_STEPS = 2
 """Grid of a thick mask, whose every direction needs fields of its own, in steps of the thin one's."""
 _DISTANCES = 3
 """Of a tilted mask at which waves are worked out: it changes by a few percent, and waves less."""
+_NARROWEST = 0.5
+"""Mean width of a mask's openings, in wavelengths, from which its waves are worked out: between conducting edges half a
+wavelength is the cutoff of light polarised along them (Jackson, Classical Electrodynamics, 8.3), and below it hardly
+any passes that scalar theory would let through."""
 _LARGEST_GRID = 1 << 24
 """Cells of a grid: 256 MiB for each of a few complex arrays."""
 
@@ -162,12 +167,31 @@ def _of_fields(shadow: ShadowGeometry) -> ShadowGeometry:
     return replace(shadow, mask=mask)
 
 
+def narrowest_mm(wavelength_nm: float) -> float:
+    """Mean width of a mask's openings [mm] from which waves of ``wavelength_nm`` are worked out."""
+    return _NARROWEST * wavelength_nm * 1e-6
+
+
+def check_openings(mask: Mask | Plate, wavelength_nm: float) -> None:
+    """MitsimError for a ``mask`` whose openings are too narrow for scalar waves of ``wavelength_nm``."""
+    if mask.opening_mm < narrowest_mm(wavelength_nm):
+        raise MitsimError(
+            f"mask of features of {mask.feature_mm:g} mm: its openings are {mask.opening_mm:.3g} mm wide, and "
+            f"diffraction of light of {wavelength_nm:.0f} nm is worked out from {narrowest_mm(wavelength_nm):.3g} mm, "
+            "half a wavelength; give more as feature_mm in the camera file's [mask] or mask_feature in the scene, or "
+            "use --effects=-diffraction"
+        )
+
+
 def grid_step(shadow: ShadowGeometry, wavelength_nm: float) -> float:
-    """Width [mm] of a grid cell for ``shadow`` at ``wavelength_nm``; a feature holds a whole number of them."""
-    fresnel_length = (wavelength_nm * 1e-6 * shadow.distance_mm * shadow.shrink) ** 0.5
+    """Width [mm] of a grid cell for ``shadow`` at ``wavelength_nm``; a feature that is wider holds a whole number of
+    them. MitsimError for a mask whose openings are too narrow for scalar waves."""
+    check_openings(shadow.mask, wavelength_nm)
     feature = shadow.mask.feature_mm
+    fresnel_length = (wavelength_nm * 1e-6 * shadow.distance_mm * shadow.shrink) ** 0.5
     widest = min(_STEP_MM, fresnel_length / _STEPS_PER_FRESNEL_LENGTH) * (_THICK_STEPS if shadow.thickness_mm else 1)
-    return feature / float(np.ceil(feature / widest))
+    # Within a cell a finer mask counts by its mean: its orders are evanescent.
+    return feature / float(np.ceil(feature / widest)) if feature > widest else widest
 
 
 def _prepare(shadow: ShadowGeometry, wavelength_nm: float, lows: FloatArray, highs: FloatArray) -> EdgeWaves:

@@ -35,9 +35,11 @@ from mitsim.rig.projector import Spectrum
 
 _CELLS_PER_PIXEL = 6
 """Raster cells along a pixel: at 4 a raster leaves twice as much (tests/physics/test_raster.py), for which a plan at an
-accuracy of 1e-3 has no room."""
-_CELLS_PER_FEATURE = 2
-"""And along a feature at least, where features are smaller than pixels."""
+accuracy of 1e-3 has no room. Features far below a pixel need no more: of a frame in pixels of 12 um random masks of 1
+and of 4 um leave 2e-4 and 1e-3 in waves at 6 (against 48), 2e-4 and 6e-5 turned."""
+_LEFT_BEYOND = 1e-3
+"""Bound of the part of the light that waves may carry beyond a raster's edge. A third of it is found there, as much as
+the points at which waves are squared leave (3.6e-4, a random mask of 31 features of 60 um)."""
 _LARGEST = 8192
 """Cells a side: a raster takes 512 MiB."""
 _POINTS, _LATTICE = 16, 7
@@ -46,6 +48,8 @@ many."""
 _POINTS_PER_FRESNEL_LENGTH = 80
 """Points in sqrt(lambda D) at which waves are squared: at 80 uniform light behind separable masks of order 6 and 9 is
 3.2e-4 and 2.2e-4 off its closed form, at 60 5.8e-4 and 6.8e-4, evenly (tests/physics/test_raster.py)."""
+_MOST_WAVE_POINTS = 1 << 16
+"""Points a side at most: 4e9 of them take a minute for each line, and some seconds more for each term."""
 _LEAST_WAVE_POINTS = 2
 """Points along a cell at least."""
 _GRID_CELLS = 3
@@ -79,7 +83,7 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
         raise MitsimError(f"{geometry.mask_words}: its shadow has a closed form; take that")
     pixel = geometry.pixel_pitch * shadow.shrink
     step = pixel / cells_per_pixel(geometry)
-    count = _cells(geometry, mask, step)
+    count = _cells(geometry, mask, step, spectrum)
     if count > _LARGEST:
         raise MitsimError(
             f"{mask.words}: its shadow needs a raster of {count} cells a side, more than {_LARGEST}; take fewer "
@@ -95,16 +99,31 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
     return Plate(step, values, mask.words, flaws=Flaws(mask.blur_mm if spectrum is None else 0.0), irradiance=True)
 
 
-def cells_a_side(geometry: CameraGeometry) -> int:
-    """Raster cells a side of far points' shadow behind the plate of ``geometry``; of nearer ones it has some more."""
+def cells_a_side(geometry: CameraGeometry, spectrum: Spectrum | None) -> int:
+    """Raster cells a side of far points' shadow; of nearer ones it has some more.
+
+    Parameters
+    ----------
+    geometry
+        the camera, with a plate.
+    spectrum
+        lines of the light; None: geometric.
+    """
     mask = geometry.build_mask()
     assert isinstance(mask, Plate)
-    return _cells(geometry, mask, geometry.pixel_pitch / cells_per_pixel(geometry))
+    return _cells(geometry, mask, geometry.pixel_pitch / cells_per_pixel(geometry), spectrum)
 
 
-def _cells(geometry: CameraGeometry, mask: Plate, step: float) -> int:
-    """Cells of a ``step`` [mm] a side of what can be seen of a ``mask``."""
-    return 2 * int(np.ceil(min(geometry.mask_reach, mask.flaws.reach(mask.extent_mm) / 2) / step))
+def _cells(geometry: CameraGeometry, mask: Plate, step: float, spectrum: Spectrum | None) -> int:
+    """Cells of a ``step`` [mm] a side of what can be seen of a ``mask``, and of the light that waves carry beyond it.
+
+    An edge sends lambda D / (4 pi^2 x) of light, as a length, beyond x of it; a mean opening has two along each axis.
+    """
+    half = mask.flaws.reach(mask.extent_mm) / 2
+    if spectrum is not None and not mask.irradiance:
+        product = float(spectrum.wavelengths_nm.max()) * 1e-6 * geometry.mask_distance
+        half += product / (np.pi**2 * mask.opening_mm * _LEFT_BEYOND)
+    return 2 * int(np.ceil(min(geometry.mask_reach, half) / step))
 
 
 def points_per_cell(wavelength_nm: float, distance_mm: float, step_mm: float) -> int:
@@ -123,9 +142,7 @@ def points_per_cell(wavelength_nm: float, distance_mm: float, step_mm: float) ->
 
 def cells_per_pixel(geometry: CameraGeometry) -> int:
     """Raster cells along a pixel of ``geometry``: as many as were chosen, else the fewest."""
-    return geometry.mask_cells or max(
-        _CELLS_PER_PIXEL, int(np.ceil(_CELLS_PER_FEATURE * geometry.pixel_pitch / geometry.mask_feature))
-    )
+    return geometry.mask_cells or _CELLS_PER_PIXEL
 
 
 def sharpened(values: FloatArray) -> FloatArray:
@@ -199,6 +216,12 @@ def _fields(
     cell."""
     distance = shadow.distance_mm * shadow.shrink
     points = points_per_cell(wavelength_nm, distance, step)
+    if count * points > _MOST_WAVE_POINTS:
+        raise MitsimError(
+            f"mask of {len(shadow.mask.terms)} terms, {shadow.distance_mm:g} mm from the sensor: its waves are squared "
+            f"at {count * points} points a side there, more than {_MOST_WAVE_POINTS}; move it off the sensor, or take "
+            "fewer pixels"
+        )
     between = max(int(np.ceil(step / points / grid_step(shadow, wavelength_nm))), _GRID_CELLS)
     half = count * step / 2
     span = half + shadow.mask.extent_mm / 2 + step

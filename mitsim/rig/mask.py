@@ -91,6 +91,12 @@ class Mask(ByValue):
         return ((0.5, ones, ones), (0.5, signed, signed))
 
     @property
+    def opening_mm(self) -> float:
+        """Mean width of its openings [mm]."""
+        is_open = np.ones_like(self.bits) if self.kind == "open" else self.bits
+        return mean_opening(is_open[:, None] > 0, np.diff(self.lines))
+
+    @property
     def amplitude(self) -> Mask:
         """The mask whose values are the factors of a field: itself, as roots of 0 and 1 are 0 and 1."""
         return self
@@ -116,6 +122,20 @@ class Mask(ByValue):
         position = np.floor(np.asarray(s, dtype=np.float64) / self.feature_mm + count / 2)
         inside = (position >= 0) & (position < count)
         return np.where(inside, position, 0).astype(np.intp), inside
+
+
+def mean_opening(is_open: BoolArray, widths: FloatArray) -> float:
+    """Mean width of openings down the rows of a mask, in the unit of ``widths``; 0 without one.
+
+    Parameters
+    ----------
+    is_open
+        (N, c) of each place.
+    widths
+        (N,) of the rows.
+    """
+    begins = np.diff(is_open, axis=0, prepend=False) & is_open
+    return float((widths @ is_open).sum() / max(np.count_nonzero(begins), 1))
 
 
 @cache

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import ByValue, FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.rig.flaws import NO_FLAWS, Flaws, dusted
-from mitsim.rig.mask import BoolArray, Term
+from mitsim.rig.mask import BoolArray, Term, mean_opening
 
 LEFT_OUT = 1e-7
 """Part of a transmission, rms, that singular vectors may leave: a tenth of the finest accuracy that a plan takes."""
@@ -72,7 +72,7 @@ class Plate(ByValue):
             raise MitsimError(f"{self.words}: feature size is {self.feature_mm} mm; give a finite number above 0")
         if not (np.isfinite(values).all() if self.irradiance else values.min() >= 0 and values.max() <= 1):
             raise MitsimError(f"{self.words}: transmissions are {values.min():g} to {values.max():g}; give 0 to 1")
-        if not values.any():
+        if not values.max() > (0 if self.irradiance else _ROUNDING):
             raise MitsimError(f"{self.words}: no feature lets light through; open some")
         self._hold(values=values)
         if self.lines_mm is not None:
@@ -126,6 +126,13 @@ class Plate(ByValue):
         """Mean transmission of the square, without dust."""
         width = np.diff(self.lines) / self.extent_mm
         return float(width @ self.values @ width)
+
+    @cached_property
+    def opening_mm(self) -> float:
+        """Mean width of its openings along rows, or along columns if that is less [mm]: of what lets half as much light
+        through as its clearest feature. Of a drawing it is that of what is drawn, however fine its pixels are."""
+        is_open, widths = self.values >= self.values.max() / 2, np.diff(self.lines)
+        return min(mean_opening(is_open, widths), mean_opening(is_open.T, widths))
 
     @cached_property
     def crosses(self) -> tuple[Term, ...] | None:

@@ -17,7 +17,7 @@ from mitsim.scene.mesh_lamps import emit_by_faces
 from mitsim.scene.origin import check_meshes, move_to_camera
 from mitsim.scene.projector import ProjectorGrid, locate_projector
 from mitsim.scene.texels import check_texels
-from mitsim.scene.thin import holding_thin_cylinders
+from mitsim.scene.thin import with_thin_shapes_as_meshes
 
 SENSOR_PLUGIN = "mitsim_lensless"
 _SMALL_LAMPS = ("DirectionalEmitter", "PointLight", "SpotLight")
@@ -91,8 +91,8 @@ def load_scene(
     checked.config.variant = mi.variant()
     moved = move_to_camera(checked.outline, checked.state)
     with looking_beside(checked.outline):
-        notes = emit_by_faces(checked)  # before thin cylinders are meshes, too
-        with holding_thin_cylinders(checked.outline, checked.state):
+        notes = emit_by_faces(checked)  # before thin shapes are meshes, too
+        with with_thin_shapes_as_meshes(checked.outline, checked.state):
             scene = mi.parser.instantiate(checked.config, checked.state)
     check_texels(path, scene, checked.limits)
     check_meshes(moved, scene)

@@ -47,7 +47,7 @@ Mesh = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 @contextmanager
-def holding_thin_cylinders(outline: Outline, state: mi.parser.ParserState) -> Iterator[None]:
+def with_thin_shapes_as_meshes(outline: Outline, state: mi.parser.ParserState) -> Iterator[None]:
     """Have thin cylinders and small lamps of a tree be meshes, whose files exist while the context lasts.
 
     Parameters
@@ -78,7 +78,7 @@ def holding_thin_cylinders(outline: Outline, state: mi.parser.ParserState) -> It
 
 
 def _thin(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Iterator[int]:
-    """Numbers of the nodes of thin cylinders; MitsimError for what cannot be held."""
+    """Numbers of the nodes of thin cylinders and small lamps; MitsimError for what cannot be held."""
     eyes = [placed(node.props)[:3, 3] for node in nodes if node.props.plugin_name() == "projector"] + [np.zeros(3)]
     places = [placed(nodes[index].props)[:3, 3] for index in standing(nodes)]
     for index, to_world in _seen(nodes):

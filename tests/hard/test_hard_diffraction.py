@@ -1,6 +1,7 @@
 """Diffraction where its numbers are extreme: against 30-digit Fresnel integrals, sums, and waves not paraxial."""
 
 import math
+import time
 import tracemalloc
 from collections.abc import Callable
 from itertools import pairwise
@@ -12,12 +13,14 @@ import pytest
 from scipy.special import fresnel
 
 from mitsim.core.errors import MitsimError
+from mitsim.optics.closed_form import FrameOptics
 from mitsim.optics.diffraction import EdgeWaves
 from mitsim.optics.profile import Steps
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
 from mitsim.rig.camera import CameraGeometry
 from mitsim.rig.mask import mls_mask
+from mitsim.rig.profile import MaskProfile
 from mitsim.rig.projector import Spectrum
 from tests.robustness import Recorder
 
@@ -174,3 +177,69 @@ def test_a_mask_below_the_wavelength_warns(
 
     found = [w for w in SceneFacts.of(open_bench(small_scene(mask_feature=feature))).warnings if "wavelength" in w]
     assert len(found) == warned and all("mask_feature 0.0005 mm" in w and "\n" not in w for w in found)
+
+
+def test_a_plan_with_openings_below_half_a_wavelength_goes_without_diffraction(
+    small_scene: Callable[..., Path], variant: str
+) -> None:
+    """Refused before the pilot looks, or flagged where diffraction is off. (Planted: the pilot's look has it on.)"""
+    from mitsim.capture.opening import open_bench
+
+    bench = open_bench(small_scene(mask_feature=1.5e-4))
+    with pytest.raises(MitsimError, match="half a wavelength"):
+        bench.plan("uniform", accuracy=0.1)
+    assert any(
+        "shadow is a guess" in said for said in bench.plan("uniform", accuracy=0.1, effects="-diffraction").warnings
+    )
+
+
+FINE = {
+    "code": {"kind": "separable"},
+    "tilted, dusty": {"kind": "separable", "tilt_row_mrad": 300.0, "dust_per_mm2": 100.0},
+    "two terms": {"kind": "flatcam", "over_etch_um": 1e-7},
+    "MURA": {"kind": "mura", "features": 101},
+    "random": {"kind": "random", "features": 1023},
+    "turned": {"kind": "random", "features": 31, "rotation_deg": 3.0},
+    "grey": {"kind": "separable", "order": 6, "opaque_transmission": 0.2},
+    "slit": {"kind": "drawing", "file": "slit.npy"},
+    "pinhole": {"kind": "drawing", "file": "pinhole.npy"},
+}
+"""Masks with openings of a few nanometres; slit and pinhole are one feature wide."""
+
+
+@pytest.mark.parametrize("name", FINE)
+def test_waves_through_openings_below_half_a_wavelength_are_refused(
+    tmp_path: Path, measured: Recorder, name: str
+) -> None:
+    """At once, of every kind of mask, and not where they are half a micrometre. (Planted: no limit.)"""
+    for file, place in (("slit", np.s_[:, 30]), ("pinhole", np.s_[30, 30])):
+        drawing = np.zeros((61, 61))
+        drawing[place] = 1
+        np.save(tmp_path / f"{file}.npy", drawing)
+    bare, at, line = CameraGeometry(pixels=32), Directions([0.0, 0.1], 0.0), Spectrum(np.array([638.0]), np.ones(1))
+
+    def frame(feature: float) -> np.ndarray:
+        camera = MaskProfile.model_validate({**FINE[name], "feature_mm": feature}).worn(bare, tmp_path)
+        return FrameOptics(camera, at, at, (400.0,), 1, line).frame(np.array([0]), np.ones(1))
+
+    started = time.process_time()
+    with pytest.raises(
+        MitsimError, match=r"of light of 638 nm is worked out from 0\.000319 mm.*\[mask\].*-diffraction"
+    ):
+        frame(1e-6)
+    measured(time.process_time() - started, at_most=3.0, what="refused", unit="s of processor time")
+    if name != "random":  # of half a micrometre it is drawn, like the turned one, and takes seconds
+        assert np.isfinite(frame(4e-4)).all()
+
+
+def test_fine_pixels_of_a_drawing_are_no_features(tmp_path: Path) -> None:
+    """An opening of 16 um is the same drawn in pixels of 2 um as in 128 of 0.125 um, below any wavelength. (Planted:
+    the limit asks for the feature.)"""
+    frames = []
+    for pixel, side in ((2e-3, 8), (1.25e-4, 128)):
+        np.save(tmp_path / f"{side}.npy", np.pad(np.ones((side, side)), side // 8))
+        table = {"kind": "drawing", "file": f"{side}.npy", "feature_mm": pixel}
+        camera = MaskProfile.model_validate(table).worn(CameraGeometry(pixels=32), tmp_path)
+        at, line = Directions([0.0, 0.1], 0.0), Spectrum(np.array([638.0]), np.ones(1))
+        frames.append(FrameOptics(camera, at, at, (400.0,), 1, line).frame(np.array([0]), np.ones(1)))
+    np.testing.assert_allclose(frames[1], frames[0], rtol=0, atol=1e-3 * frames[0].max())

@@ -88,6 +88,25 @@ def test_the_raster_gives_the_closed_forms_frame(kind: str) -> None:
     assert np.sqrt(np.mean(np.square(geometric - expected))) > 3e-3 * expected.mean()
 
 
+@pytest.mark.parametrize(("feature", "order"), [(0.006, 5), (0.001, 7)])
+def test_waves_beyond_a_small_mask_are_drawn(feature: float, order: int) -> None:
+    """Masks of 0.2 and 0.1 mm, 2 mm off, light a sensor of 0.5 mm by waves, features far below a pixel: to 3e-3 of the
+    closed form's frame. (Planted: a raster as wide as the mask: half of it is missing.)"""
+    camera = made(kind="separable", order=order, feature_mm=feature, over_etch_um=1e-6)
+    at, light, row = Directions.cells(np.linspace(-0.15, 0.15, 41)), np.ones((40, 40)), np.arange(40)
+    expected = sum(left @ light @ right.T for left, right in shadow_terms(camera, at, at, 400.0, LINES))
+    drawn = replace(ShadowGeometry.of(camera, 400.0), mask=raster(camera, 400.0, LINES))
+    frame = Correlation(drawn, at, at).image(light, row, row)
+    assert np.linalg.norm(frame - expected) < 3e-3 * np.linalg.norm(expected)
+
+
+def test_waves_of_too_many_points_are_refused() -> None:
+    """A random mask 1 um from 512 pixels needs 2 nm from point to point. (Planted: no limit: hours.)"""
+    camera = made(kind="random", features=31).model_copy(update={"mask_distance": 1e-3, "pixels": 512})
+    with pytest.raises(MitsimError, match=r"0\.001 mm from the sensor.* points a side there, more than 65536"):
+        raster(camera, 400.0, LINES)
+
+
 def test_fringes_of_far_edges_do_not_add_up() -> None:
     """Uniform light behind 511 features a side, of which the farthest are 15 mm away: to 5e-4 of its closed form.
     (Planted: the field at points, not its means from one to the next: 2.5e-3.)"""
@@ -241,7 +260,7 @@ def test_a_plan_may_choose_cells_that_memory_holds() -> None:
         profile = MaskProfile(kind="separable", feature_mm=0.06, rotation_deg=1.0)
         return profile.worn(CameraGeometry(pixels=pixels), Path())
 
-    assert [cells_to_choose(turned_by_a_degree(pixels)) for pixels in (40, 512)] == [(6, 8, 12), (6, 8)]
+    assert [cells_to_choose(turned_by_a_degree(pixels), None) for pixels in (40, 512)] == [(6, 8, 12), (6, 8)]
     camera = turned_by_a_degree(40)
     six, twelve = (raster(camera.model_copy(update={"mask_cells": cells}), 400.0).feature_mm for cells in (0, 12))
     assert six == pytest.approx(2 * twelve)

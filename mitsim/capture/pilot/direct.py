@@ -169,7 +169,7 @@ class FineLight:
         seconds = (time.perf_counter() - started) / len(timed)
         cells = max(simulation.fine.bundle.cells)
         geometry = self.bench.geometry
-        waves = self.bench.spectrum if geometry.diffracts else None
+        waves = self.bench.waves
         return Forming(
             pixels=geometry.frame_side,
             cells=cells,
@@ -201,10 +201,10 @@ class FineLight:
             seen = light[0, :, 0]
             error, known = raster_error(geometry, bundle.rows, bundle.columns, self.base.depth, spectrum, seen)
             found = Estimate(error, _SURE_OF_RASTER * error) if known else Estimate(*(error * by for by in _OF_FINER))
-            return Drawn(found, geometry.drawn(waves), cells_to_choose(geometry))
+            return Drawn(found, geometry.drawn(waves), cells_to_choose(geometry, spectrum))
 
-        without = drawn(None)
-        return without, drawn(self.bench.spectrum) if geometry.diffracts else without
+        without, waves = drawn(None), self.bench.waves
+        return without, drawn(waves) if waves else without
 
     def _lit(self, simulation: Simulation, light: sparse.csr_array) -> float:
         """Rows of cells that hold light in a shot, their mean."""

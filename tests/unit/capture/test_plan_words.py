@@ -20,6 +20,7 @@ from tests.unit.capture.invented_evidence import EVIDENCE, SIZES, changes, plan,
 def bench(cuts: bool = False, shift: float = 0.0, feature: float = 0.06) -> Bench:
     geometry = SimpleNamespace(
         wall_shift_features=shift, mask_thickness=0.5, mask_feature=feature, diffracts=True, mask_plate=None,
+        build_mask=lambda: SimpleNamespace(opening_mm=2 * feature),
         tilt_shift_mm=0.0, tilt_left_out=lambda waves: False, mask_tilt=(0.0, 0.0),
     )  # fmt: skip
     return SimpleNamespace(  # type: ignore[return-value]
@@ -48,7 +49,7 @@ def bench(cuts: bool = False, shift: float = 0.0, feature: float = 0.06) -> Benc
         (bench(shift=0.99), []),
         (bench(shift=1.0), ["0.5 mm shifts the far face by 1.0 features"]),
         (bench(feature=6.2e-4), []),
-        (bench(feature=6.1e-4), ["below the wavelength of 620 nm"]),
+        (bench(feature=6.1e-4), ["less than 2 wavelengths of 620 nm"]),
     ],
 )
 def test_devices_are_flagged_where_their_model_ends(

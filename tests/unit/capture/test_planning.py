@@ -76,7 +76,7 @@ def looks(made: Plan, monkeypatch: pytest.MonkeyPatch) -> Looks:
 
     monkeypatch.setattr(pilot, "Look", Look)
     monkeypatch.setattr(planning, "Candidates", Invented)
-    monkeypatch.setattr(planning, "_refuse_unfit", lambda bench: None)
+    monkeypatch.setattr(planning, "_refuse_unfit", lambda bench, switches: None)
     monkeypatch.setattr(planning, "_decided", decided)
     monkeypatch.setattr(planning, "frame_seconds", lambda bench, shots: FRAMES)
     return seen

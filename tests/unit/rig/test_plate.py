@@ -95,6 +95,14 @@ def test_what_is_not_few_grids_lies_in_their_rectangle() -> None:
     assert plate.grids is None and rows.tolist() == [False] + 8 * [True] and not columns[3] and columns.sum() == 8
 
 
+@pytest.mark.parametrize("most", [0.0, 5e-324, 1e-300, 1e-12])
+def test_a_mask_without_light_is_refused(most: float) -> None:
+    """What is rounding beside 1 is no light. (Planted: 0 alone is refused: no term is left of the others.)"""
+    with pytest.raises(MitsimError, match="no feature lets light through"):
+        Plate(0.06, most * np.eye(3), "it")
+    assert len(Plate(0.06, 1e-11 * np.eye(2), "it").terms) == 2
+
+
 def test_transmission_at_points_and_outside() -> None:
     plate = Plate(2.0, np.array([[0, 0.25, 0.5], [0.75, 1, 0], [0, 0, 0]]), "it")
     np.testing.assert_array_equal(plate.transmission([-3.1, -2.9, -0.9, 2.9], -0.5), [0, 0.25, 1, 0])
