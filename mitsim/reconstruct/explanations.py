@@ -24,6 +24,11 @@ _EXPLAINS = 0.2
 _LIKELY, _LEFT = 60.0, 3.0
 """Variances of a datum that a fault must explain, twice the logarithm of a likelihood ratio of 1e13: some of them are
 searched for among 10^4; and the standard deviations of noise that it may leave."""
+_OTHERS = 0.05
+"""Of what a frame is off by, the most that all others may be that no fault explains: of two cards beside the calibrated
+distance, which turn the sign of patterns that they move by half a period, others are off by a sixth."""
+_FORETOLD = Fault.SWAPPED, Fault.MISPLACED, Fault.DIM, Fault.BRIGHT, Fault.SHIFTED
+"""Faults that are told by what the other frames foretell alone, and so where the scene fits."""
 _STEPS = 12
 """Rounds in which patterns left out are foretold from the rest: each brings what overlapping patterns know to a half or
 less of its distance."""
@@ -102,12 +107,17 @@ class Explanations:
             self._rest[check.columns(*pattern)] -= check.projected(check.as_solved(each.frame), *pattern)
         self._least = self._left({}, weights)
 
-    def faults(self) -> list[FrameFault]:
-        """One for each that is found."""
+    def others_left(self, energy: float) -> float:
+        """Of the ``energy`` of patterns that are not suspected, what the model leaves."""
+        return energy + self._least
+
+    def faults(self, others_off: float) -> list[FrameFault]:
+        """One for each that is found; ``others_off`` is the energy beyond noise by which patterns are off that are not
+        suspected."""
         check = self._check
         seen = self._signed() if check.signed else [self._plain(pattern) for pattern in self._bad]
         repeats = self._repeats(seen)
-        named: list[list[_Named]] = []
+        explained: list[list[_Named]] = []
         for one in seen:
             same = [each for each in repeats.get(one.numbers, []) if each.left == -np.inf]
             chance = _LEFT * one.variance * np.sqrt(2 * one.frame.size)
@@ -116,7 +126,17 @@ class Explanations:
                 for each in (*same, *self._tried(one))
                 if each.left <= max(_EXPLAINS * one.off, chance) and one.off - each.left > _LIKELY * one.variance
             ]
-            named.append(sorted(fits, key=lambda each: each.left) or repeats.get(one.numbers, [])[:1])
+            explained.append(sorted(fits, key=lambda each: each.left))
+        others_off += sum(max(one.off, 0.0) for one, fits in zip(seen, explained, strict=True) if not fits)
+        named = [
+            [
+                each
+                for each in fits
+                if each.fault not in _FORETOLD or others_off <= _OTHERS * one.off or each.left == -np.inf
+            ]
+            or repeats.get(one.numbers, [])[:1]
+            for one, fits in zip(seen, explained, strict=True)
+        ]
         return list(self._pairs(named))
 
     # ---- what frames leave
