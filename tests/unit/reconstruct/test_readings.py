@@ -11,7 +11,7 @@ import pytest
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.reconstruction import reconstruct
-from tests.ideal_sessions import BLACK, CODES, Bench, bench, picture, shadow
+from tests.ideal_sessions import BLACK, CODES, READ, Bench, bench, picture, shadow
 from tests.unit.reconstruct.test_faults import Frames, with_frames
 
 CAMERA = Bench(shadow(), shadow(1.3))
@@ -87,6 +87,17 @@ def test_a_tone_curve_that_fits_with_too_little_noise() -> None:
     curved = with_frames(shots, lambda frames: [BLACK + span * ((f - BLACK) / span) ** (1 / 2.2) for f in frames])
     misfit = reconstruct(curved, factors).misfit
     assert misfit is not None and misfit.flagged and misfit.cause is Cause.GAMMA
+
+
+@pytest.mark.parametrize(("patterns", "peak", "seed"), [("uniform", 4673.0, 54), ("random:2", 3498.0, 69)])
+def test_too_much_noise_stated_is_no_tone_curve(patterns: str, peak: float, seed: int) -> None:
+    """A curve that makes numbers larger makes their noise as large as is stated; their likelihood counts that against
+    it."""
+    shots, factors = bench(peak=peak).run(patterns, picture(seed), seed), bench().calibrated(seed)
+    digital = shots.manifest.digital.model_copy(update={"read_noise_e": 6 * READ})
+    stated = Capture(shots.manifest.model_copy(update={"digital": digital}), memory=shots._memory)
+    misfit = reconstruct(stated, factors).misfit
+    assert misfit is not None and misfit.chi_square < 0.9 and misfit.reading is None
 
 
 def test_another_order_of_dim_light() -> None:
