@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.causes import Cause
@@ -63,6 +64,49 @@ def test_a_tone_curve(patterns: str) -> None:
         patterns, lambda frames: [BLACK + span * (np.maximum(f - BLACK, 0) / span) ** (1 / 2.2) for f in frames]
     )
     assert cause is Cause.GAMMA
+
+
+def test_the_tone_curve_of_displays() -> None:
+    """Linear in the dark, which no power is."""
+    span = CODES - 1 - BLACK
+
+    def encoded(frame: np.ndarray) -> np.ndarray:
+        light = np.maximum(frame - BLACK, 0) / span
+        return BLACK + span * np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+    assert said("dots:4", lambda frames: [encoded(frame) for frame in frames])[1].endswith("the curve of sRGB")
+
+
+@pytest.mark.parametrize("patterns", ["uniform", "dots:4", "hadamard:4", "random:4"])
+@pytest.mark.parametrize(
+    ("bits", "light", "words"), [(12, 12, "over 12 bits"), (10, 13, "over 10 bits instead of its own")]
+)
+def test_a_tone_curve_over_fewer_bits(patterns: str, bits: int, light: int, words: str) -> None:
+    """In a file of 13 bits numbers of 10 or 12, of light of as many or of all 13."""
+    span, of_light = 2.0**bits - 1 - BLACK, 2.0**light - 1 - BLACK
+    shots, factors = replace(CAMERA, peak=8e3).run(patterns, picture(1), 1), CAMERA.calibrated(1)
+    curved = with_frames(
+        shots, lambda frames: [BLACK + span * (np.maximum(f - BLACK, 0) / of_light) ** (1 / 1.8) for f in frames]
+    )
+    misfit = reconstruct(curved, factors).misfit
+    assert misfit is not None and misfit.flagged and misfit.cause is Cause.GAMMA
+    assert misfit.reason == f"the numbers are the light to the power of 1/1.8 {words}"
+
+
+def test_light_of_walls_is_no_tone_curve() -> None:
+    """Nearly half of all light spread over the sensor: a curve fits by chance, with too little noise in the dark."""
+    walls = bench(optics=lambda light: light + 0.42228 * gaussian_filter(light, 25), peak=4e3)
+    misfit = reconstruct(walls.run("random:2", picture(2), 2), bench().calibrated(2)).misfit
+    assert misfit is not None and misfit.flagged and misfit.cause is not Cause.GAMMA
+
+
+@pytest.mark.parametrize("patterns", ["uniform", "random:4"])
+def test_a_curve_between_is_none_of_its_neighbours(patterns: str) -> None:
+    span = CODES - 1 - BLACK
+    cause, _ = said(
+        patterns, lambda frames: [BLACK + span * (np.maximum(f - BLACK, 0) / span) ** (1 / 1.98) for f in frames]
+    )
+    assert cause is not None and cause is not Cause.GAMMA
 
 
 @pytest.mark.parametrize("patterns", ["dots:4", "hadamard:4", "random:4"])
