@@ -23,8 +23,6 @@ from mitsim.reconstruct.solver import Prepared
 _NOISE = 0.1
 """Of the sensor's noise, by which what is left of linear light may differ: chosen, neighbours among the curves differ
 by twice that."""
-_CHANCE = 6.0
-"""Standard deviations of a frame's noise energy that are left to chance."""
 _PARTS, _AROUND, _UNEVEN = 4, 5, 0.3
 """Parts of all readings, from the darkest to the brightest by the mean of so many a side around them, of which each
 must have its noise; and how far each may be from it: chosen, a curve that fits by chance makes too little in the dark.
@@ -116,8 +114,8 @@ class ToneCurves:
     measured: Callable[[], Iterable[Measurement]]
 
     def likeliest(self) -> str:
-        """The curve that the numbers went through, in words; empty where they are as likely without, where single
-        frames do not fit with it, or where the sensor's noise is not stated."""
+        """The curve that the numbers went through, in words; empty where they are as likely without, where dark or
+        bright ones do not fit with it, or where the sensor's noise is not stated."""
         if not self.manifest.digital.noise_is_stated:
             return ""
         digital = self.manifest.digital
@@ -140,7 +138,7 @@ class ToneCurves:
             if held.away < _NOISE and held.unlikely < most:
                 fits[words] = held.away
         best = min(fits, key=lambda words: fits[words], default="")
-        return best if best and self._fits_each(tried[best]) else ""
+        return best if best and self._fits_parts(tried[best]) else ""
 
     def _held(self, curve: _Curve) -> _Held:
         """All measurements against the model, and of signed patterns the sums of their halves, which are all alike."""
@@ -158,18 +156,14 @@ class ToneCurves:
         unlikely = sum(count * total.size * float(np.log(max(spread, _TINY))) for spread in spreads) + logarithms
         return _Held(max(abs(spread - 1) for spread in spreads), unlikely, problem.projected)
 
-    def _fits_each(self, curve: _Curve) -> bool:
-        """Whether every measurement has no more than its noise left: a single one that is wrong bends no numbers; and
-        whether dark and bright readings have theirs."""
+    def _fits_parts(self, curve: _Curve) -> bool:
+        """Whether dark and bright readings have their noise left, each part of them."""
         weights, prepared = self._held(curve).weights, self.prepared
         parts = np.zeros((2, _PARTS))
         for each in self._linear(curve):
             left, right = prepared.left.slabs[each.pattern[0]], prepared.right.slabs[each.pattern[1]]
             frame = centred(each.frame) if prepared.centre else each.frame
             residual = frame - left.matrix @ weights[left.columns][:, right.columns] @ right.matrix.T
-            spread = float(np.vdot(residual, residual)) / (frame.size * each.variance * prepared.spare)
-            if spread > 1 + 2 * _NOISE + _CHANCE * np.sqrt(2 / frame.size):
-                return False
             # By the light around a reading, which does not know of its noise.
             near = uniform_filter(each.light, _AROUND) - each.light / _AROUND**2
             part = np.searchsorted(np.quantile(near, np.arange(1, _PARTS) / _PARTS), near.ravel())
