@@ -2,8 +2,8 @@
 
 Curves are compared by the likelihood of the numbers as they were read (Box and Cox, 1964): where light is g(y) of
 numbers y, -2 log L = n log s + sum log v - 2 sum log g'(y) but for a constant, with v the variance of noise in that
-light, and s what the model leaves in units of it. A curve counts that is likelier than none, and of which s is 1:
-numbers that are crushed to 0 fit any image, but with less noise than the sensor makes.
+light, and s what the model leaves in units of it. A curve counts that is likelier than none, and of which s is 1 in
+the dark and in the light: numbers that are crushed to 0 fit any image, but with less noise than the sensor makes.
 """
 
 from __future__ import annotations
@@ -20,9 +20,6 @@ from mitsim.core.measurement import Measurement
 from mitsim.reconstruct.accumulator import centred
 from mitsim.reconstruct.solver import Prepared
 
-_NOISE = 0.1
-"""Of the sensor's noise, by which what is left of linear light may differ: chosen, neighbours among the curves differ
-by twice that."""
 _PARTS, _AROUND, _UNEVEN = 4, 5, 0.3
 """Parts of all readings, from the darkest to the brightest by the mean of so many a side around them, of which each
 must have its noise; and how far each may be from it: chosen, a curve that fits by chance makes too little in the dark.
@@ -135,7 +132,7 @@ class ToneCurves:
         fits: dict[str, float] = {}
         for words, curve in tried.items():
             held = self._held(curve)
-            if held.away < _NOISE and held.unlikely < most:
+            if held.unlikely < most:
                 fits[words] = held.away
         best = min(fits, key=lambda words: fits[words], default="")
         return best if best and self._fits_parts(tried[best]) else ""
