@@ -183,7 +183,8 @@ def defects_of(squares: FloatArray, variance: FloatArray, count: int) -> Defects
     typical, most = (1 - 2 / (9 * count)) ** 3, float(ratio.max())
     if not most > limit:
         return None
-    off = ratio > limit * max(1.0, float(np.median(ratio)) / typical)
+    # What the scene's light is off by at a pixel may be the same in all frames: the square of one number.
+    off = ratio > limit + _limit(1) * max(float(np.median(ratio)) / typical - 1, 0.0)
     # What bright ones are off by leaks into others: these first.
     off &= ratio > _LEAKS * most
     places = np.argwhere(off)

@@ -66,7 +66,7 @@ class FrameCheck(LeaveOneOut):
         suspects = self._suspects(sums, beside_noise)
         if suspects is None:  # too many
             return tuple(found)
-        named = Explanations(self, *suspects).faults() if suspects[0] else []
+        named = self._explained(sums, beside_noise, *suspects) if suspects[0] else []
         # What is known without the model is said where that does not say more; of clipped frames it explains the rest.
         clipped = {number for fault in found if fault.fault is Fault.CLIPPED for number in fault.numbers}
         named = [fault for fault in named if not clipped & set(fault.numbers)]
@@ -94,6 +94,20 @@ class FrameCheck(LeaveOneOut):
             bad[found[0]], weights = found[1:]
             sums = self.gathered(weights, bad)
         return bad, weights
+
+    def _explained(
+        self, sums: FrameSums, beside_noise: float, bad: dict[Pattern, bool], weights: FloatArray
+    ) -> list[FrameFault]:
+        """Faults of patterns that are suspected, :meth:`_suspects` as :meth:`faults` takes its parameters."""
+        explanations = Explanations(self, bad, weights)
+        good = np.ones(self.noise.variance.shape, dtype=np.bool_)
+        for pattern in bad:
+            good[pattern] = False
+        variance, energy, total = self.noise.variance[good], float(sums.energy[good].sum()), float(sums.power.sum())
+        beside = beside_noise * float(sums.power[good].sum()) / max(total, np.finfo(float).tiny)
+        off = explanations.others_left(energy) - float(variance.sum()) * self.size * self.prepared.spare - beside
+        chance = CHANCE / 2 * float(np.sqrt(2 * self.size * np.square(variance).sum()))
+        return explanations.faults(off if off > max(chance, (OFF / 2) ** 2 * energy) else 0.0)
 
     def out_of_step(self, sums: FrameSums) -> str:
         """How signed shots are a step beside their patterns, as ``sums`` of their light tell, or nothing.

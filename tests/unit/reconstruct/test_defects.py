@@ -91,3 +91,16 @@ def test_a_spot_of_light_is_no_defect() -> None:
     assert defects_of(squares, np.full((64, 64), 4.0), 4) is None
     many = np.where(np.random.default_rng(2).random((64, 64)) < 0.05, 400.0, 4.0)
     assert defects_of(many, np.full((64, 64), 4.0), 4) is None
+
+
+def test_light_that_fits_nowhere_is_no_defect() -> None:
+    """Print finer than a scene pixel leaves five times the noise, and more where shadows of two edges cross; a pixel
+    that is dead leaves more by far."""
+    squares = np.full((120, 120), 49 * 5.5)
+    squares[10::30] += 49 * 3
+    squares[:, 20::30] += 49 * 3
+    squares[10::30, 20::30] += 49 * 10
+    assert defects_of(squares, np.full((120, 120), 49.0), 49) is None
+    squares[70, 31] = 49 * 500
+    found = defects_of(squares, np.full((120, 120), 49.0), 49)
+    assert found is not None and found.places == [(70, 31)]

@@ -21,6 +21,7 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.pixeldepths import PixelDepths
 from mitsim.reconstruct.reconstruction import accumulated, reconstruct
 from tests.ideal_sessions import PEAK, Bench, picture
+from tests.ideal_sessions import shadow as plain_shadow
 from tests.unit.reconstruct.test_faults import dark, with_frames
 from tests.unit.reconstruct.test_focus import BASELINE, PARALLAX, N, shadow
 
@@ -97,6 +98,19 @@ def test_a_card_before_a_board(patterns: str, baseline: tuple[float, float], lea
 def tilted() -> np.ndarray:
     """Eight strips from 425 to 435 mm, as of a sheet that is turned by 5 degrees."""
     return np.tile(np.repeat(np.linspace(425, 435, 8), N // 8), (N, 1))
+
+
+@pytest.mark.parametrize("patterns", ["hadamard:2", "hadamard:4"])
+@pytest.mark.parametrize(("near", "far"), [(1.0, -1.0), (1.5, 2.0), (2.5, -2.0), (3.0, 1.0)])
+def test_no_frame_is_blamed_for_two_depths(patterns: str, near: float, far: float) -> None:
+    """Surfaces that move light by pixels [of the scene]: patterns of half that period turn their sign, as halves that
+    are exchanged do."""
+    where = np.zeros((16, 16), dtype=np.bool_)
+    where[4:12, 3:10] = True
+    surfaces = tuple((part, plain_shadow(), plain_shadow(by)) for part, by in ((where, near), (~where, far)))
+    scene = Layers(plain_shadow(), plain_shadow(), surfaces=surfaces)
+    misfit = reconstruct(scene.run(patterns, picture(2), 2), Bench(plain_shadow(), plain_shadow()).calibrated(2)).misfit
+    assert misfit is not None and misfit.flagged and not misfit.faults and misfit.cause is not Cause.FRAMES
 
 
 @pytest.mark.parametrize("depths", [tilted(), cards()], ids=["tilted", "cards"])

@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.reconstruction import reconstruct
-from tests.ideal_sessions import BLACK, CODES, Bench, bench, picture, shadow
+from tests.ideal_sessions import BLACK, CODES, READ, Bench, bench, picture, shadow
 from tests.unit.reconstruct.test_faults import Frames, with_frames
 
 CAMERA = Bench(shadow(), shadow(1.3))
@@ -65,6 +66,49 @@ def test_a_tone_curve(patterns: str) -> None:
     assert cause is Cause.GAMMA
 
 
+def test_the_tone_curve_of_displays() -> None:
+    """Linear in the dark, which no power is."""
+    span = CODES - 1 - BLACK
+
+    def encoded(frame: np.ndarray) -> np.ndarray:
+        light = np.maximum(frame - BLACK, 0) / span
+        return BLACK + span * np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+    assert said("dots:4", lambda frames: [encoded(frame) for frame in frames])[1].endswith("the curve of sRGB")
+
+
+@pytest.mark.parametrize("patterns", ["uniform", "dots:4", "hadamard:4", "random:4"])
+@pytest.mark.parametrize(
+    ("bits", "light", "words"), [(12, 12, "over 12 bits"), (10, 13, "over 10 bits instead of its own")]
+)
+def test_a_tone_curve_over_fewer_bits(patterns: str, bits: int, light: int, words: str) -> None:
+    """In a file of 13 bits numbers of 10 or 12, of light of as many or of all 13."""
+    span, of_light = 2.0**bits - 1 - BLACK, 2.0**light - 1 - BLACK
+    shots, factors = replace(CAMERA, peak=8e3).run(patterns, picture(1), 1), CAMERA.calibrated(1)
+    curved = with_frames(
+        shots, lambda frames: [BLACK + span * (np.maximum(f - BLACK, 0) / of_light) ** (1 / 1.8) for f in frames]
+    )
+    misfit = reconstruct(curved, factors).misfit
+    assert misfit is not None and misfit.flagged and misfit.cause is Cause.GAMMA
+    assert misfit.reason == f"the numbers are the light to the power of 1/1.8 {words}"
+
+
+def test_light_of_walls_is_no_tone_curve() -> None:
+    """Nearly half of all light spread over the sensor: a curve fits by chance, with too little noise in the dark."""
+    walls = bench(optics=lambda light: light + 0.42228 * gaussian_filter(light, 25), peak=4e3)
+    misfit = reconstruct(walls.run("random:2", picture(2), 2), bench().calibrated(2)).misfit
+    assert misfit is not None and misfit.flagged and misfit.cause is not Cause.GAMMA
+
+
+@pytest.mark.parametrize("patterns", ["uniform", "random:4"])
+def test_a_curve_between_is_none_of_its_neighbours(patterns: str) -> None:
+    span = CODES - 1 - BLACK
+    cause, _ = said(
+        patterns, lambda frames: [BLACK + span * (np.maximum(f - BLACK, 0) / span) ** (1 / 1.98) for f in frames]
+    )
+    assert cause is not None and cause is not Cause.GAMMA
+
+
 @pytest.mark.parametrize("patterns", ["dots:4", "hadamard:4", "random:4"])
 def test_a_tone_curve_of_dim_light(patterns: str) -> None:
     """Where dark current is a part of it that the curve makes larger."""
@@ -87,6 +131,17 @@ def test_a_tone_curve_that_fits_with_too_little_noise() -> None:
     curved = with_frames(shots, lambda frames: [BLACK + span * ((f - BLACK) / span) ** (1 / 2.2) for f in frames])
     misfit = reconstruct(curved, factors).misfit
     assert misfit is not None and misfit.flagged and misfit.cause is Cause.GAMMA
+
+
+@pytest.mark.parametrize(("patterns", "peak", "seed"), [("uniform", 4673.0, 54), ("random:2", 3498.0, 69)])
+def test_too_much_noise_stated_is_no_tone_curve(patterns: str, peak: float, seed: int) -> None:
+    """A curve that makes numbers larger makes their noise as large as is stated; their likelihood counts that against
+    it."""
+    shots, factors = bench(peak=peak).run(patterns, picture(seed), seed), bench().calibrated(seed)
+    digital = shots.manifest.digital.model_copy(update={"read_noise_e": 6 * READ})
+    stated = Capture(shots.manifest.model_copy(update={"digital": digital}), memory=shots._memory)
+    misfit = reconstruct(stated, factors).misfit
+    assert misfit is not None and misfit.chi_square < 0.9 and misfit.reading is None
 
 
 def test_another_order_of_dim_light() -> None:
