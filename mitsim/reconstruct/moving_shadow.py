@@ -17,9 +17,12 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 
-_MOVES = (0, -1), (1, -1), (-1, -1)
-"""Turns and sign of the frequencies that pixels show as k in [0, pi]: itself, 2 pi - k, whose phase is mirrored, and
-2 pi + k. Without them the finest stripes, of masks of two pixels a feature, seem to move the other way."""
+_MOVES = (0, -1), (1, -1), (-1, -1), (2, -1)
+"""Turns and sign of the frequencies that pixels show as k in [0, pi]: itself, 2 pi - k, whose phase is mirrored,
+2 pi + k and 4 pi - k. Without them the finest stripes, of masks of two pixels a feature, seem to move the other way."""
+_FINE = 0.4
+"""Pixels a line from which 4 pi - k, of 1.5 periods a pixel or more, is not resolved by the lines. Without it a good
+camera of 0.25 pixels a line had a deviation of 152 in its finest stripes; with it that of any is 31 at most."""
 _DEGREE = 3
 """Of the polynomial, where there are lines enough: falloff and obliquity of 120 mm at 400 mm are even and smooth."""
 _LINES = 8
@@ -142,7 +145,8 @@ def _modes(angles: FloatArray, step: float, n: int) -> ComplexArray:
     may vary with the scene line."""
     degree = max(min(_DEGREE, n // _LINES - 1), 0)
     slow = np.polynomial.legendre.legvander(np.linspace(-1, 1, n), degree)
-    phases = [np.exp(1j * step * np.outer(2 * np.pi * turns + sign * angles, np.arange(n))) for turns, sign in _MOVES]
+    moves = _MOVES if abs(step) < _FINE else _MOVES[:-1]
+    phases = [np.exp(1j * step * np.outer(2 * np.pi * turns + sign * angles, np.arange(n))) for turns, sign in moves]
     return np.asarray(np.linalg.qr(np.concatenate([phase[..., None] * slow for phase in phases], axis=2))[0])
 
 

@@ -29,6 +29,8 @@ _DEVIATIONS = 8.0
 _UNEXPLAINED = 0.05
 """Part of a response's energy, beyond the others' noise, that no separable camera explains where it is a fault: 22 %
 of its amplitude."""
+_NOISY = 4.0
+"""Robust scatter of misfits, over that by noise, up to which they are noise: of 60 good sides none has 1.5."""
 _FAR = 10.0
 """Squared deviation of a vector from the foretold one, in that of the median pattern, from which it is suspected."""
 _WRONG, _UNLIKE = 100.0, 0.5
@@ -39,9 +41,6 @@ _FAR_LINE, _SHARED = 20.0, 0.2
 which the frame that all patterns are held against is wrong, as its error is in that column alone; and the uniform
 frame's part of the variance of 2 Y - U. Of 56 good sides none has 16; a uniform frame of 0.95 or 1.05 of its light
 makes 26 at least."""
-_FLICKERS = 4.0
-"""Robust scatter of frames' scales over their deviation that is flicker; of few patterns more, as it scatters itself:
-of 56 good sides none has 3.3, and half a percent makes 5 at least."""
 _GAIN = 3.0
 """What putting patterns in their place must take off the squared deviations, in that of the median one, at least."""
 _EXPLAINED = 0.7
@@ -182,10 +181,11 @@ class SideCheck:
         middle = float(np.median(misfits))
         scatter = 1.4826 * float(np.median(np.abs(misfits - middle)))
         excess = misfits - middle - max(_UNEXPLAINED * float(np.median(energies)), _DEVIATIONS * scatter)
-        for index in np.flatnonzero(excess > _UNEXPLAINED * energies):
+        # Where no separable camera explains any, one that is no worse than others says nothing.
+        noise = middle * float(np.sqrt(2 / self.length / len(self.sums.common)))
+        least = 4 * middle if scatter > _NOISY * noise else 0.0
+        for index in np.flatnonzero((excess > _UNEXPLAINED * energies) & (misfits >= least)):
             if index in self.uncounted or index in self.unknown:
-                continue
-            if np.median(misfits / np.maximum(energies, 1e-300)) > _UNEXPLAINED and misfits[index] < 4 * middle:
                 continue
             part = misfits[index] / energies[index]
             detail = f"no {self.side} stripes: {part:.0%} of their response is of other shape"
@@ -240,7 +240,8 @@ class SideCheck:
                 )
                 return True
         gains, scales, _ = shadow.by_scale()
-        gains = np.where((gains > _EXPLAINED * deviations) & (scales > 0.5) & (scales < 1 / DARK), gains, 0.0)
+        explained = (deviations > 0) & (gains > _EXPLAINED * deviations)
+        gains = np.where(explained & (scales > 0.5) & (scales < 1 / DARK), gains, 0.0)
         gains[list(self._settled)] = 0.0
         index = int(np.argmax(gains))
         worst = float(np.max(np.where(shadow.unlike > _UNLIKE, deviations, 0.0)))
@@ -312,24 +313,6 @@ class SideCheck:
         error = rest * float(shadow.by_scale()[2][index] * np.linalg.norm(scale * shown))
         self.extras[index] = error**2 + max(scale**2 - 1, 0.0) * self.noise
         return 1 / scale
-
-    def flicker(self) -> float:
-        """Deviation of the light of frames that are shown against one uniform one, as a part of it; 0 where it is
-        within what is not known. Its error counts, the uniform frame's too, which is in every vector."""
-        count = self.signs.shape[1]
-        if count < _ENOUGH[0] or self.length < _ENOUGH[1]:
-            return 0.0
-        _, scales, deviations = MovingShadow(self.vectors, self.signs, self.unknown).by_scale()
-        good = np.setdiff1d(np.arange(1, count), [*self.unknown, *self._settled])
-        scatter = 1.4826 * float(np.median(np.abs(scales[good] - np.median(scales[good]))))
-        known = float(np.median(deviations[good]))
-        if scatter < _FLICKERS * (1 + 3 / np.sqrt(count)) * known:
-            return 0.0
-        light = self.vectors[:, :1]
-        found = float(np.sqrt(scatter**2 - known**2))
-        self.extras[good] += found**2 * np.square(self.vectors[:, good] + light).sum(axis=0)
-        self.extras += found**2 * float(np.square(light).sum())
-        return found
 
     # ---- what others foretell of a pattern ---------------------------------------------------------------------------
 
