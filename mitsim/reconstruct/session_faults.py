@@ -150,7 +150,7 @@ def check_session(
     at_first = [fault for own in work for fault in own.faults if fault.index == 0]
     if at_first and not uniform_given:
         return Checked(sums, at_first)
-    if not (taken.unsteady or all(own.pairs for own in work)):
+    if not taken.unsteady and all(own.enough and not own.pairs for own in work):
         lamp = lamp_of_frames(work, taken.order, taken.step)
     for own in work:
         own.check(taken.unsteady, taken.name)

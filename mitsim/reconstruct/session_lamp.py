@@ -10,12 +10,12 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.reconstruct.calibration import FLUX_NOISE
 from mitsim.reconstruct.session_findings import Lamp
-from mitsim.reconstruct.session_side import SideCheck
+from mitsim.reconstruct.session_side import SLIGHT, SideCheck
 from mitsim.rig.order import Half
 
 MATTERS = 0.5
 """Error by the lamp, over that by noise, from which it is corrected and said: both in quadrature are 12 % more."""
-STEADY = 8.0
+_STEADY = 8.0
 """Deviations of the trend's two ends from each other that are a drift: noise alone goes so far in no session."""
 _FLICKERS = 2.0
 """Robust scatter of the frames' power over that by noise, which is known to 20 %, that is flicker; of few frames, whose
@@ -26,6 +26,9 @@ their number, and no more is said to be one."""
 _DEGREE = 5, 8
 """Of the polynomial that the light of scene lines is of, at most: falloff, obliquity and the mask's ends, of sensors
 of 120 to 260 pixels 3 to 12 leave no more than noise; and scene lines for each of its numbers, at least."""
+_SEEN = 0.2
+"""Light of a frame, in that of the median one, from which its power is its own: of less, as a black one has, its
+deviation from the others is taken in theirs."""
 _TURNS = 8
 """Times that a trend is fitted again without what is far from it: a fourth changes nothing in most sessions."""
 
@@ -76,48 +79,56 @@ class _Frames:
         """Of frames at ``places`` (N,) in time; ``step`` between two numbers of a frame."""
         n, count = own.signs.shape
         flux = own.sums.fluxes
-        self.own, self.places, self.shown = own, places, flux + flux[0]
-        unit = float(np.median(np.abs(self.shown))) or 1.0
+        shown = flux + flux[0]
+        unit = float(np.median(shown))
+        shown = np.where(np.abs(shown) > _SEEN * np.abs(unit), shown, unit or 1.0)
         degree = max(min(_DEGREE[0], n // _DEGREE[1] - 1), 0)
-        lines = own.signs.T @ np.polynomial.legendre.legvander(np.linspace(-1, 1, n), degree) * (unit / n)
-        powers = np.vander(places - places.mean(), 3) * self.shown[:, None]
+        lines = own.signs.T @ np.polynomial.legendre.legvander(np.linspace(-1, 1, n), degree) / shown[:, None]
+        powers = np.vander(places - places.mean(), 3)
         both = np.hstack([lines, powers])
-        known = np.isin(np.arange(count), list(own.unknown))
-        kept = ~known
+        # A pattern of coarse stripes is hardly foretold by the light of others, but by the shadow.
+        far = own.far()
+        kept = ~far
         for _ in range(_TURNS):
             inverse = np.linalg.pinv(both[kept])
-            found = inverse @ flux[kept]
-            away = np.abs(flux - both @ found)
-            scatter = 1.4826 * float(np.median(away[~known])) * float(np.sqrt(count / (count - both.shape[1])))
-            again = ~known & (away <= max(6 * scatter, 1e-12 * unit))
+            found = inverse @ (flux / shown)[kept]
+            away = np.abs(flux / shown - both @ found)
+            scatter = 1.4826 * float(np.median(away[~far])) * float(np.sqrt(count / (count - both.shape[1])))
+            again = ~far & (away <= max(6 * scatter, 1e-12))
             if (again == kept).all():
                 break
             kept = again
-        self.trend = powers @ found[degree + 1 :] / self.shown
-        each = (flux - lines @ found[: degree + 1]) / self.shown
-        self.each = np.where(kept, each, self.trend)
-        self.uniform = float(lines[0] @ found[: degree + 1])
+        lines_found, powers_found = np.split(found, [degree + 1])
+        lines_inverse, powers_inverse = np.split(inverse, [degree + 1])
+        self.own, self.places, self.scatter = own, places, scatter
+        self.trend = powers @ powers_found
+        self.each = flux / shown - lines @ lines_found
+        beyond = np.where(kept | far, 0.0, self.each - self.trend)
+        self.slight = np.where(np.abs(beyond) < SLIGHT, np.square(beyond), 0.0)
+        self.each = np.where(kept, self.each, self.trend)
         # A response has twice a frame's numbers, whose rounding no noise may make random.
-        noise = FLUX_NOISE * np.sqrt(own.variance / own.length / len(own.sums.common))
-        self.noise, self.scatter = float(np.hypot(noise, step if own.variance < step**2 else 0.0)) / unit, scatter / unit
-        ends = powers[np.argmax(places)] / self.shown[np.argmax(places)] - powers[np.argmin(places)] / self.shown[np.argmin(places)]
-        self.steady = scatter * float(np.linalg.norm(ends @ inverse[degree + 1 :]))
-        flicker = np.sqrt(max(self.scatter**2 - self.noise**2, 0.0))
-        enough = flickers(self.scatter, self.noise, count) and flicker * np.sqrt(n) > _UNEVEN
-        self.flicker = float(flicker) if enough else 0.0
-        self.unknown = np.square(np.linalg.norm(lines @ inverse[: degree + 1], axis=1))
+        noise = FLUX_NOISE * float(np.sqrt(own.variance / own.length / len(own.sums.common)))
+        self.noise = float(np.hypot(noise, step if own.variance < step**2 else 0.0)) / abs(unit or 1.0)
+        ends = powers[int(np.argmax(places))] - powers[int(np.argmin(places))]
+        self.drifts = bool(abs(ends @ powers_found) > _STEADY * scatter * np.linalg.norm(ends @ powers_inverse))
+        self.flicker = float(np.sqrt(max(scatter**2 - self.noise**2, 0.0)))
+        if not flickers(scatter, self.noise, count) or self.flicker * np.sqrt(n) < _UNEVEN:
+            self.flicker = 0.0
+        self.unknown = np.square(lines @ lines_inverse).sum(axis=1)
 
     @property
     def light(self) -> FloatArray:
         """(N,) squared length of what each frame shows."""
         return np.asarray(np.square(self.own.vectors + self.own.vectors[:, :1]).sum(axis=0))
 
-    def divide(self, shares: FloatArray, scale: float) -> None:
+    def divide(self, shares: FloatArray, scale: float, unscaled: float) -> None:
         """Divide frames by their power, of which they have ``shares`` (N,) 1 - p_0 / p_i, and all by a ``scale``; what
-        flicker leaves counts as their error."""
+        flicker leaves counts as their error, and that of the scale, of a variance ``unscaled``."""
         uniform = self.own.vectors[:, :1]
         self.own.vectors = ((self.own.vectors + uniform) * (1 - shares) - uniform) / scale
         self.own.extras += (self.flicker**2 * self.unknown + self.noise**2) * self.light
+        self.own.extras += unscaled * np.square(self.own.vectors).sum(axis=0)
+        self.own.shaken = self.flicker
 
 
 def lamp_of_frames(sides: Sequence[SideCheck], order: Sequence[Half], step: float) -> Lamp:
@@ -137,44 +148,36 @@ def lamp_of_frames(sides: Sequence[SideCheck], order: Sequence[Half], step: floa
     found = [
         _Frames(own, np.array([places[own.side, index, 1] for index in range(own.sums.done)]), step) for own in sides
     ]
-    squares = [float(np.square(own.vectors).sum()) for own in sides]
-    moved, shaken, noise = (
-        float(np.sqrt(np.sum(part)))
-        for part in zip(
-            *(
-                (
-                    float(np.square(each.trend) @ each.light) / size,
-                    each.flicker**2 * float(each.light.sum() + len(each.light) * each.light[0] / 4) / size,
-                    each.own.noise * len(each.light) / size,
-                )
-                for each, size in zip(found, squares, strict=True)
-            ),
-            strict=True,
-        )
-    )
-    drifts = moved > MATTERS * noise and any(
-        abs(end_to_end(each.places, each.trend)) > STEADY * each.steady for each in found
-    )
-    shaking = shaken > MATTERS * noise
-    if not drifts and not shaking:
+    costs = []
+    for each in found:
+        each.own.extras += each.slight * each.light
+        # The uniform frame's own power is in every response.
+        shaken = each.flicker**2 * float(each.light.sum() + len(each.light) * each.light[0] / 4)
+        parts = float(np.square(each.trend) @ each.light), shaken, each.own.noise * len(each.light)
+        costs.append(np.array(parts) / float(np.square(each.own.vectors).sum()))
+    moved, shaken, noise = (float(part) for part in np.sqrt(np.sum(costs, axis=0)))
+    drifts = moved > MATTERS * noise and any(each.drifts for each in found)
+    shakes = shaken > MATTERS * noise
+    if not drifts and not shakes:
         return Lamp()
-    # Of each uniform frame, and of all frames, in that of the responses that the factors' scale is taken from.
-    first = float(np.mean([each.own.sums.fluxes[0] for each in found]))
-    uniforms = [each.uniform / first for each in found]
-    shares = [each.each if each.flicker and shaking else each.trend for each in found]
-    powers = [power / (1 - share) for power, share in zip(uniforms, shares, strict=True)]
-    mean = float(np.mean(powers))
-    for each, power, share in zip(found, uniforms, shares, strict=True):
-        each.divide(share, power / float(np.sqrt(mean)))
-    trends = np.concatenate([power / (1 - each.trend) / mean for each, power in zip(found, uniforms, strict=True)])
-    left = sum(
-        float(each.own.extras.sum() / np.square(each.own.vectors).sum()) for each in found
-    )
+    if drifts:  # the uniform frames' powers are those of the responses to the uniform pattern, taken with them
+        uniforms = [float(each.own.sums.fluxes[0]) for each in found]
+    else:
+        uniforms = [1 - float(each.trend.mean()) for each in found]
+    mean = float(np.mean([power / (1 - each.trend) for each, power in zip(found, uniforms, strict=True)]))
+    uniforms = [power / mean for power in uniforms]
+    trends = np.concatenate([power / (1 - each.trend) for each, power in zip(found, uniforms, strict=True)])
+    common = float(np.mean(uniforms)) if drifts else 1.0
+    flicker = float(np.sqrt(np.mean([each.flicker**2 for each in found]))) if shakes else 0.0
+    for each, power in zip(found, uniforms, strict=True):
+        # Of both, the latter are of a frame's own power, twice, less the uniform one's.
+        each.divide(each.each if shakes else each.trend, power / np.sqrt(common), (5 if drifts else 1) * flicker**2)
+    left = sum(float(each.own.extras.sum() / np.square(each.own.vectors).sum()) for each in found)
     return Lamp(
         drift=end_to_end(np.concatenate([each.places for each in found]), trends) if drifts else 0.0,
-        flicker=float(np.sqrt(np.mean([each.flicker**2 for each in found]))) if shaking else 0.0,
+        flicker=flicker,
         drift_cost=moved if drifts else 0.0,
-        flicker_cost=shaken if shaking else 0.0,
+        flicker_cost=shaken if shakes else 0.0,
         remaining=float(np.sqrt(left)),
         corrected=True,
     )

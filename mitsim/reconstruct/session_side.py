@@ -33,14 +33,18 @@ _NOISY = 4.0
 """Robust scatter of misfits, over that by noise, up to which they are noise: of 60 good sides none has 1.5."""
 _FAR = 10.0
 """Squared deviation of a vector from the foretold one, in that of the median pattern, from which it is suspected."""
-_WRONG, _UNLIKE = 100.0, 0.5
-"""The same, and that deviation as a part of the vector's own square, from which it is wrong whatever it shows: a camera
-of 1.6 pixels a feature made 54 in a good session, other stripes 32 in one of twelve and 196 or more in eleven."""
+_WRONG, _UNLIKE = 25.0, 0.2
+"""The same, and that deviation as a part of the vector's own square, from which it is wrong whatever it shows: of 262
+good sides none has 10 of such a part, of 1048 that show other stripes all but one have both, at half the noise's
+error."""
 _FAR_LINE, _SHARED = 20.0, 0.2
 """Squared deviation of the first scene line's column, in that of the median one and of what noise makes of it, from
 which the frame that all patterns are held against is wrong, as its error is in that column alone; and the uniform
 frame's part of the variance of 2 Y - U. Of 56 good sides none has 16; a uniform frame of 0.95 or 1.05 of its light
 makes 26 at least."""
+SLIGHT = 0.1
+"""Part of its light by which a frame without a pair must differ to be named dim, or bright: the coarsest stripes of a
+good side seemed 7 % dim, as its shadow is no polynomial. What less costs is in the stated error."""
 _GAIN = 3.0
 """What putting patterns in their place must take off the squared deviations, in that of the median one, at least."""
 _EXPLAINED = 0.7
@@ -78,6 +82,8 @@ class SideCheck:
         patterns whose vector the others must foretell.
     extras
         (N,) squared error of each vector beyond its noise.
+    shaken
+        how the power of the lamp that they are of scatters, as a part of it.
     """
 
     def __init__(self, sums: StripeSums, signs: FloatArray) -> None:
@@ -90,6 +96,7 @@ class SideCheck:
         self.unknown: set[int] = set()
         self._settled: set[int] = set()
         self.extras = np.zeros(sums.vectors.shape[1])
+        self.shaken = 0.0
 
     @property
     def length(self) -> int:
@@ -111,6 +118,18 @@ class SideCheck:
     def noise(self) -> float:
         """Squared noise of one pattern's vector, all numbers together."""
         return self.variance * self.length / float(np.dot(self.sums.common, self.sums.common))
+
+    @property
+    def enough(self) -> bool:
+        """Whether columns are known well enough to foretell patterns."""
+        return self.signs.shape[1] >= _ENOUGH[0] and self.length >= _ENOUGH[1]
+
+    def far(self) -> FloatArray:
+        """(N,) whether patterns are not what the others foretell, or left out."""
+        shadow = MovingShadow(self.vectors, self.signs, self.unknown)
+        far = (shadow.deviations > _WRONG) & (shadow.unlike > _UNLIKE)
+        far[list(self.unknown)] = True
+        return np.asarray(far)
 
     def change(self, index: int, vector: FloatArray) -> None:
         """Put a ``vector`` in place of that of pattern ``index``."""
@@ -146,7 +165,7 @@ class SideCheck:
         """
         self._check_misfits()
         count = self.signs.shape[1]
-        if count < _ENOUGH[0] or self.length < _ENOUGH[1]:
+        if not self.enough:
             for index in self.unknown:
                 self._forget(index)
             return
@@ -156,7 +175,8 @@ class SideCheck:
         for _ in range(int(MOST_FAULTS * count) + 2):
             shadow = MovingShadow(self.vectors, self.signs, self.unknown)
             line, usual = shadow.first_line
-            if steady and not self.pairs and line > _FAR_LINE * (usual + _SHARED * self.noise):
+            usual += _SHARED * self.noise + self.shaken**2 * float(np.square(self.vectors[:, 0]).sum())
+            if steady and not self.pairs and line > _FAR_LINE * usual:
                 raise MitsimError(
                     f"frames: {name((self.side, 0, UNIFORM))}, or a dark frame, is not of the light that patterns of "
                     "its side are of; look at these, and take the session again"
@@ -241,7 +261,8 @@ class SideCheck:
                 return True
         gains, scales, _ = shadow.by_scale()
         explained = (deviations > 0) & (gains > _EXPLAINED * deviations)
-        gains = np.where(explained & (scales > 0.5) & (scales < 1 / DARK), gains, 0.0)
+        dim = (np.abs(scales - 1) > SLIGHT) & (scales > 0.5) & (scales < 1 / DARK)
+        gains = np.where(explained & dim, gains, 0.0)
         gains[list(self._settled)] = 0.0
         index = int(np.argmax(gains))
         worst = float(np.max(np.where(shadow.unlike > _UNLIKE, deviations, 0.0)))
