@@ -437,7 +437,9 @@ def _restored(arrays: Mapping[str, FloatArray] | None, kinds: Sequence[str], ses
         misfit, energy = map(float, arrays[f"{kind}_{side}_sums"])
         common = arrays[f"{kind}_{side}_common"]
         sums = StripeSums(side, session.centre, common, vectors, misfit, energy, finished.shape[1])
-        for own, finished in zip((sums.misfits, sums.energies, sums.fluxes), arrays[f"{kind}_{side}_each"], strict=True):
+        for own, finished in zip(
+            (sums.misfits, sums.energies, sums.fluxes), arrays[f"{kind}_{side}_each"], strict=True
+        ):
             own[: sums.done] = finished
         if f"{kind}_{side}_light" in arrays:
             light, rows, columns = (arrays[f"{kind}_{side}_{part}"] for part in ("light", "rows", "columns"))

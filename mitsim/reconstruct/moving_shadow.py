@@ -129,15 +129,13 @@ class MovingShadow:
         change = 2 * np.real(moved.conj() * left) + np.square(np.abs(moved)) * size
         return np.asarray(-change.sum(axis=0) / self._unit)
 
-    def by_scale(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(N,) what it takes off to scale a frame that is shown against the uniform one, whose vector is u_i + u_0; the
-        scale; and its standard deviation; for each pattern."""
+    def by_scale(self) -> FloatArray:
+        """(N,) what it takes off to scale a frame that is shown against the uniform one, whose vector is u_i + u_0, for
+        each pattern."""
         shown = self._spectra + self._spectra[:, :1]
         pull = np.real(shown.conj() * self._left).sum(axis=0)
         size = np.maximum((np.square(np.abs(shown)) * self._own).sum(axis=0), np.finfo(np.float64).tiny)
-        # A pattern's deviation is a sum over twice as many numbers as there are frequencies.
-        deviation = np.sqrt(self._unit / (2 * len(shown) * size))
-        return np.square(pull) / size / self._unit, 1 - pull / size, deviation
+        return np.asarray(np.square(pull) / size / self._unit)
 
 
 def _modes(angles: FloatArray, step: float, n: int) -> ComplexArray:

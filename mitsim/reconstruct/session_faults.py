@@ -175,4 +175,3 @@ def check_session(
         (len(work[0].uncounted), len(work[1].uncounted)),
         (float(work[0].extras.sum()), float(work[1].extras.sum())),
     )
-

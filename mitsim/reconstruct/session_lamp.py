@@ -9,7 +9,7 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.reconstruct.calibration import FLUX_NOISE
-from mitsim.reconstruct.session_findings import Lamp
+from mitsim.reconstruct.session_findings import DARK, Lamp
 from mitsim.reconstruct.session_side import SLIGHT, SideCheck
 from mitsim.rig.order import Half
 
@@ -26,9 +26,6 @@ their number, and no more is said to be one."""
 _DEGREE = 5, 8
 """Of the polynomial that the light of scene lines is of, at most: falloff, obliquity and the mask's ends, of sensors
 of 120 to 260 pixels 3 to 12 leave no more than noise; and scene lines for each of its numbers, at least."""
-_SEEN = 0.2
-"""Light of a frame, in that of the median one, from which its power is its own: of less, as a black one has, its
-deviation from the others is taken in theirs."""
 _TURNS = 8
 """Times that a trend is fitted again without what is far from it: a fourth changes nothing in most sessions."""
 
@@ -81,7 +78,7 @@ class _Frames:
         flux = own.sums.fluxes
         shown = flux + flux[0]
         unit = float(np.median(shown))
-        shown = np.where(np.abs(shown) > _SEEN * np.abs(unit), shown, unit or 1.0)
+        shown = np.where(np.abs(shown) > DARK * np.abs(unit), shown, unit or 1.0)
         degree = max(min(_DEGREE[0], n // _DEGREE[1] - 1), 0)
         lines = own.signs.T @ np.polynomial.legendre.legvander(np.linspace(-1, 1, n), degree) / shown[:, None]
         powers = np.vander(places - places.mean(), 3)
@@ -100,12 +97,10 @@ class _Frames:
             kept = again
         lines_found, powers_found = np.split(found, [degree + 1])
         lines_inverse, powers_inverse = np.split(inverse, [degree + 1])
-        self.own, self.places, self.scatter = own, places, scatter
+        self.own, self.places = own, places
         self.trend = powers @ powers_found
         self.each = flux / shown - lines @ lines_found
-        beyond = np.where(kept | far, 0.0, self.each - self.trend)
-        self.slight = np.where(np.abs(beyond) < SLIGHT, np.square(beyond), 0.0)
-        self.each = np.where(kept, self.each, self.trend)
+        self.kept = kept
         # A response has twice a frame's numbers, whose rounding no noise may make random.
         noise = FLUX_NOISE * float(np.sqrt(own.variance / own.length / len(own.sums.common)))
         self.noise = float(np.hypot(noise, step if own.variance < step**2 else 0.0)) / abs(unit or 1.0)
@@ -120,6 +115,14 @@ class _Frames:
     def light(self) -> FloatArray:
         """(N,) squared length of what each frame shows."""
         return np.asarray(np.square(self.own.vectors + self.own.vectors[:, :1]).sum(axis=0))
+
+    def judge(self, shares: FloatArray) -> None:
+        """Find the part of its light that each frame has beyond what ``shares`` say; that of one which is not named
+        counts as its error."""
+        beyond = np.where(self.kept, 0.0, (self.each - shares) / (1 - shares))
+        self.own.parts = 1 / np.maximum(1 - beyond, DARK)
+        self.own.errors = (self.flicker**2 + self.noise**2) * self.unknown * self.light
+        self.own.extras += np.where(np.abs(self.own.parts - 1) < SLIGHT, np.square(beyond), 0.0) * self.light
 
     def divide(self, shares: FloatArray, scale: float, unscaled: float) -> None:
         """Divide frames by their power, of which they have ``shares`` (N,) 1 - p_0 / p_i, and all by a ``scale``; what
@@ -150,7 +153,6 @@ def lamp_of_frames(sides: Sequence[SideCheck], order: Sequence[Half], step: floa
     ]
     costs = []
     for each in found:
-        each.own.extras += each.slight * each.light
         # The uniform frame's own power is in every response.
         shaken = each.flicker**2 * float(each.light.sum() + len(each.light) * each.light[0] / 4)
         parts = float(np.square(each.trend) @ each.light), shaken, each.own.noise * len(each.light)
@@ -159,6 +161,8 @@ def lamp_of_frames(sides: Sequence[SideCheck], order: Sequence[Half], step: floa
     drifts = moved > MATTERS * noise and any(each.drifts for each in found)
     shakes = shaken > MATTERS * noise
     if not drifts and not shakes:
+        for each in found:
+            each.judge(np.zeros(len(each.places)))
         return Lamp()
     if drifts:  # the uniform frames' powers are those of the responses to the uniform pattern, taken with them
         uniforms = [float(each.own.sums.fluxes[0]) for each in found]
@@ -171,7 +175,9 @@ def lamp_of_frames(sides: Sequence[SideCheck], order: Sequence[Half], step: floa
     flicker = float(np.sqrt(np.mean([each.flicker**2 for each in found]))) if shakes else 0.0
     for each, power in zip(found, uniforms, strict=True):
         # Of both, the latter are of a frame's own power, twice, less the uniform one's.
-        each.divide(each.each if shakes else each.trend, power / np.sqrt(common), (5 if drifts else 1) * flicker**2)
+        shares = np.where(each.kept, each.each, each.trend) if shakes else each.trend
+        each.divide(shares, power / np.sqrt(common), (5 if drifts else 1) * flicker**2)
+        each.judge(shares)
     left = sum(float(each.own.extras.sum() / np.square(each.own.vectors).sum()) for each in found)
     return Lamp(
         drift=end_to_end(np.concatenate([each.places for each in found]), trends) if drifts else 0.0,

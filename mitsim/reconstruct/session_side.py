@@ -42,9 +42,9 @@ _FAR_LINE, _SHARED = 20.0, 0.2
 which the frame that all patterns are held against is wrong, as its error is in that column alone; and the uniform
 frame's part of the variance of 2 Y - U. Of 56 good sides none has 16; a uniform frame of 0.95 or 1.05 of its light
 makes 26 at least."""
-SLIGHT = 0.1
-"""Part of its light by which a frame without a pair must differ to be named dim, or bright: the coarsest stripes of a
-good side seemed 7 % dim, as its shadow is no polynomial. What less costs is in the stated error."""
+SLIGHT = 0.03
+"""Part of its light by which a frame without a pair must differ to be named dim, or bright, six times what half a
+percent of flicker makes; what less costs is in the stated error."""
 _GAIN = 3.0
 """What putting patterns in their place must take off the squared deviations, in that of the median one, at least."""
 _EXPLAINED = 0.7
@@ -82,6 +82,8 @@ class SideCheck:
         patterns whose vector the others must foretell.
     extras
         (N,) squared error of each vector beyond its noise.
+    parts, errors
+        (N,) of its light that each frame without a pair has, and squared error of its vector once it is divided by it.
     shaken
         how the power of the lamp that they are of scatters, as a part of it.
     """
@@ -97,6 +99,7 @@ class SideCheck:
         self._settled: set[int] = set()
         self.extras = np.zeros(sums.vectors.shape[1])
         self.shaken = 0.0
+        self.parts, self.errors = np.ones((2, len(self.extras)))
 
     @property
     def length(self) -> int:
@@ -245,10 +248,10 @@ class SideCheck:
     def _one_frame(self, shadow: MovingShadow, deviations: FloatArray) -> bool:
         """Whether a frame that is shown against a uniform one was black, the same as another, or dim."""
         far = np.flatnonzero(deviations > _FAR)
-        light = self.vectors[:, 0]
+        uniform = self.vectors[:, 0]
         for index in far[np.argsort(-deviations[far])]:
             own = self.vectors[:, index]
-            if np.linalg.norm(own + light) / 2 < DARK * np.linalg.norm(light):
+            if np.linalg.norm(own + uniform) / 2 < DARK * np.linalg.norm(uniform):
                 self._leave_out(int(index), "black", "is black")
                 return True
             away = np.square(own[:, None] - self.vectors).sum(axis=0)
@@ -259,16 +262,18 @@ class SideCheck:
                     int(index), "repeated", f"repeats {self.side} stripes {nearest}", (self.side, nearest, 1)
                 )
                 return True
-        gains, scales, _ = shadow.by_scale()
+        gains, light = shadow.by_scale(), self.parts
         explained = (deviations > 0) & (gains > _EXPLAINED * deviations)
-        dim = (np.abs(scales - 1) > SLIGHT) & (scales > 0.5) & (scales < 1 / DARK)
-        gains = np.where(explained & dim, gains, 0.0)
+        gains = np.where(explained & (np.abs(light - 1) > SLIGHT) & (light > DARK) & (light < 2), gains, 0.0)
         gains[list(self._settled)] = 0.0
         index = int(np.argmax(gains))
         worst = float(np.max(np.where(shadow.unlike > _UNLIKE, deviations, 0.0)))
         if gains[index] <= max(_FAR, _EXPLAINED * worst, float(np.max(shadow.by_exchange[1:]))):
             return False
-        part = self._brightened(index)
+        self._settled.add(index)
+        part = float(light[index])
+        self.change(index, (self.vectors[:, index] + uniform) / part - uniform)
+        self.extras[index] = self.errors[index] + max(1 / part**2 - 1, 0.0) * self.noise
         self._add(index, *dimmed(part), "its numbers are divided by that")
         return True
 
@@ -320,20 +325,6 @@ class SideCheck:
         self.unknown.add(index)
         self._foretell_unknown()
         self._add(index, kind, detail, "it is left out", other)
-
-    def _brightened(self, index: int) -> float:
-        """Divide a frame against one uniform one by the part of its light that it has, which is returned."""
-        light, shown, scale = self.vectors[:, 0], self.vectors[:, index] + self.vectors[:, 0], 1.0
-        self._settled.add(index)
-        for _ in range(_TURNS):  # as others then foretell it
-            scale *= float(MovingShadow(self.vectors, self.signs, self.unknown).by_scale()[1][index])
-            self.change(index, scale * shown - light)
-        shadow = MovingShadow(self.vectors, self.signs, self.unknown)
-        # What still does not fit may be of the scale too.
-        rest = float(np.sqrt(max(shadow.deviations[index], 1.0)))
-        error = rest * float(shadow.by_scale()[2][index] * np.linalg.norm(scale * shown))
-        self.extras[index] = error**2 + max(scale**2 - 1, 0.0) * self.noise
-        return 1 / scale
 
     # ---- what others foretell of a pattern ---------------------------------------------------------------------------
 
