@@ -36,7 +36,7 @@ _NUMBERS_AT_ONCE = 2**15
 _BINS = 512
 """Groups of rows, and of columns, whose light is kept of every frame: all of the anchor camera, 16 KiB a pair."""
 FLUX_NOISE = 1.5
-"""Standard deviation of a response's flux over that of its mean, by the Hann windows: the root of 3/8 over 1/2, twice."""
+"""Standard deviation of a response's flux over that of its mean, by Hann windows: 3/8 over 1/2 squared."""
 _TURNS, _TURNED = 30, 1e-13
 """Steps of the power iteration that splits a uniform response, and the change at which it has converged: where it has,
 each step took away 63 % or more, so that no more than the last change is left. A board's responses take four."""

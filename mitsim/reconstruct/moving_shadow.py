@@ -21,8 +21,9 @@ _MOVES = (0, -1), (1, -1), (-1, -1), (2, -1)
 """Turns and sign of the frequencies that pixels show as k in [0, pi]: itself, 2 pi - k, whose phase is mirrored,
 2 pi + k and 4 pi - k. Without them the finest stripes, of masks of two pixels a feature, seem to move the other way."""
 _FINE = 0.4
-"""Pixels a line from which 4 pi - k, of 1.5 periods a pixel or more, is not resolved by the lines. Without it a good
-camera of 0.25 pixels a line had a deviation of 152 in its finest stripes; with it that of any is 18 at most; of half as many lines too few are left to foretell with."""
+"""Pixels a line from which the lines resolve no 4 pi - k, of 1.5 periods a pixel or more. Without it, good cameras of
+0.25 pixels a line had a deviation of 152 in their finest stripes; with it 18 at most. Of 32 lines it would leave too
+few to foretell with."""
 _DEGREE = 3
 """Of the polynomial, where there are lines enough: falloff and obliquity of 120 mm at 400 mm are even and smooth."""
 _LINES = 8

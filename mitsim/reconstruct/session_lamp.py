@@ -1,5 +1,4 @@
-"""Light of a session's frames in, in the order in which they were taken; the lamp's power in each, and vectors divided by
-it, out."""
+"""Light of a session's frames in, as they were taken; the lamp's power in each, and vectors divided by it, out."""
 
 from __future__ import annotations
 
@@ -32,7 +31,7 @@ _TURNS = 8
 
 def flickers(scatter: float, noise: float, count: int) -> bool:
     """Whether the robust ``scatter`` of so many powers is more than their ``noise`` makes."""
-    return scatter > _FLICKERS * (1 + 3 / np.sqrt(count)) * noise
+    return scatter > _FLICKERS * (1 + 3 / float(np.sqrt(count))) * noise
 
 
 def trend_of(times: FloatArray, power: FloatArray, wanted: FloatArray) -> tuple[FloatArray, float, float]:

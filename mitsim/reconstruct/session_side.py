@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
@@ -127,12 +128,12 @@ class SideCheck:
         """Whether columns are known well enough to foretell patterns."""
         return self.signs.shape[1] >= _ENOUGH[0] and self.length >= _ENOUGH[1]
 
-    def far(self) -> FloatArray:
+    def far(self) -> npt.NDArray[np.bool_]:
         """(N,) whether patterns are not what the others foretell, or left out."""
         shadow = MovingShadow(self.vectors, self.signs, self.unknown)
         far = (shadow.deviations > _WRONG) & (shadow.unlike > _UNLIKE)
         far[list(self.unknown)] = True
-        return np.asarray(far)
+        return np.asarray(far, bool)
 
     def change(self, index: int, vector: FloatArray) -> None:
         """Put a ``vector`` in place of that of pattern ``index``."""
@@ -330,9 +331,13 @@ class SideCheck:
 
     def _forget(self, index: int) -> None:
         """Leave a pattern out where nothing foretells it; its error is then its own size, which the others' tells."""
-        others = np.delete(self.vectors[:, 1:], index - 1, axis=1) if index else self.vectors[:, 1:]
-        self.extras[index] = float(np.square(others).sum(axis=0).mean()) if others.size else 0.0
+        self.extras[index] = self._size(index)
         self.change(index, np.zeros(self.length))
+
+    def _size(self, index: int) -> float:
+        """Mean squared length of the other patterns' vectors, but for the uniform one."""
+        others = np.delete(self.vectors, [0, index], axis=1)
+        return float(np.square(others).sum(axis=0).mean()) if others.size else 0.0
 
     def _foretell_unknown(self) -> None:
         """In place of patterns that are left out comes what others foretell, and the error of that counts.
@@ -344,7 +349,7 @@ class SideCheck:
             self._foretell(index)
         amended = MovingShadow(self.vectors, self.signs, self.unknown).amended
         for index in self.unknown:
-            self.extras[index] = max(self.extras[index], float(amended[index]))
+            self.extras[index] = min(max(self.extras[index], float(amended[index])), self._size(index))
 
     def _foretell(self, index: int) -> None:
         """The same of one pattern."""
