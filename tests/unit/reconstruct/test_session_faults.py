@@ -171,10 +171,10 @@ def test_a_shifted_frame_of_a_noisy_session_without_pairs_is_named() -> None:
     assert (fault.side, fault.index, fault.kind) == (*half[:2], "wrong")
 
 
-@pytest.mark.parametrize(("index", "other"), [(5, 21), (12, 30), (3, 4)])
+@pytest.mark.parametrize(("index", "other"), [(1, 2), (9, 25), (17, 19)])
 def test_other_stripes_in_a_pair_that_adds_up_are_named(index: int, other: int) -> None:
     """(Planted: named from a deviation of half of a pattern's square and more.)"""
-    shown = frames()
+    shown = frames(noise=4e-3)
     for sign in (1, -1):
         shown["horizontal", index, sign] = shown["horizontal", other, sign]
     assert [fault.index for fault in judged(shown).faults] == [index]
