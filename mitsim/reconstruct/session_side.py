@@ -46,6 +46,9 @@ makes 26 at least."""
 SLIGHT = 0.03
 """Part of its light by which a frame without a pair must differ to be named dim, or bright, six times what half a
 percent of flicker makes; what less costs is in the stated error."""
+_REST = 0.1
+"""Part of a dim frame's squared deviation, once it is divided by its part, up to which it was dim, and no more is wrong
+with it than what does not follow the light: at half the exposure, half the dark signal."""
 _GAIN = 3.0
 """What putting patterns in their place must take off the squared deviations, in that of the median one, at least."""
 _EXPLAINED = 0.7
@@ -98,6 +101,7 @@ class SideCheck:
         self.uncounted: set[int] = set()
         self.unknown: set[int] = set()
         self._settled: set[int] = set()
+        self._dims: dict[int, float] = {}
         self.extras = np.zeros(sums.vectors.shape[1])
         self.shaken = 0.0
         self.parts, self.errors = np.ones((2, len(self.extras)))
@@ -213,7 +217,9 @@ class SideCheck:
                 continue
             part = misfits[index] / energies[index]
             detail = f"no {self.side} stripes: {part:.0%} of their response is of other shape"
-            self._add(int(index), "wrong", detail, "it is left out")
+            # One frame for the mean of many is of other noise alone.
+            kind, detail, other = self._repeated(int(index)) or ("wrong", detail, None)
+            self._add(int(index), kind, detail, "it is left out", other)
             self.unknown.add(int(index))
             self.uncounted.add(int(index))
 
@@ -241,7 +247,11 @@ class SideCheck:
         if gain > max(_GAIN, _EXPLAINED * deviations[worst] if shadow.unlike[worst] > _UNLIKE else 0.0):
             self._put_in_place(places)
         elif steady and deviations[worst] > _WRONG and shadow.unlike[worst] > _UNLIKE:
-            self._leave_out(worst, "wrong", "no stripes as the other patterns foretell them")
+            before = [fault for fault in self.faults if fault.index == worst and worst in self._dims]
+            if before and deviations[worst] < _REST * self._dims[worst]:
+                self._leave_out(worst, before[0].kind, before[0].detail)
+            else:
+                self._leave_out(worst, "wrong", "no stripes as the other patterns foretell them")
         else:
             return False
         return True
@@ -255,13 +265,8 @@ class SideCheck:
             if np.linalg.norm(own + uniform) / 2 < DARK * np.linalg.norm(uniform):
                 self._leave_out(int(index), "black", "is black")
                 return True
-            away = np.square(own[:, None] - self.vectors).sum(axis=0)
-            away[index] = np.inf
-            nearest = int(np.argmin(away))
-            if away[nearest] < _SAME * self.noise and np.square(own).sum() > _SEEN * self.noise:
-                self._leave_out(
-                    int(index), "repeated", f"repeats {self.side} stripes {nearest}", (self.side, nearest, 1)
-                )
+            if repeated := self._repeated(int(index)):
+                self._leave_out(int(index), *repeated)
                 return True
         gains, light = shadow.by_scale(), self.parts
         explained = (deviations > 0) & (gains > _EXPLAINED * deviations)
@@ -269,14 +274,25 @@ class SideCheck:
         gains[list(self._settled)] = 0.0
         index = int(np.argmax(gains))
         worst = float(np.max(np.where(shadow.unlike > _UNLIKE, deviations, 0.0)))
-        if gains[index] <= max(_FAR, _EXPLAINED * worst, float(np.max(shadow.by_exchange[1:]))):
+        if gains[index] <= max(_FAR, _EXPLAINED * worst):
             return False
         self._settled.add(index)
+        self._dims[index] = float(deviations[index])
         part = float(light[index])
         self.change(index, (self.vectors[:, index] + uniform) / part - uniform)
         self.extras[index] = self.errors[index] + max(1 / part**2 - 1, 0.0) * self.noise
         self._add(index, *dimmed(part), "its numbers are divided by that")
         return True
+
+    def _repeated(self, index: int) -> tuple[str, str, Half] | None:
+        """Kind, words and the other frame where one that is shown against a uniform one is the same as another."""
+        own = self.vectors[:, index]
+        away = np.square(own[:, None] - self.vectors).sum(axis=0)
+        away[index] = np.inf
+        nearest = int(np.argmin(away))
+        if self.pairs or away[nearest] > _SAME * self.noise or np.square(own).sum() < _SEEN * self.noise:
+            return None
+        return "repeated", f"repeats {self.side} stripes {nearest}", (self.side, nearest, 1)
 
     @staticmethod
     def _swapped(shadow: MovingShadow, deviations: FloatArray) -> tuple[float, list[int]] | None:
