@@ -205,7 +205,7 @@ class StripeSums:
         shape = len(self.vectors), len(self.common)
         shape = shape if self.side == "horizontal" else shape[::-1]
         checked = _response(response, f"{self.side} response {number}", shape, self.centre)
-        return self.seen_checked(checked, np.asarray(response), light)
+        return self._seen_checked(checked, np.asarray(response), light)
 
     def _pair_seen(self, response: FloatArray, light: FloatArray) -> PairSeen:
         across = self.side == "horizontal"
@@ -218,7 +218,7 @@ class StripeSums:
         )
         return PairSeen(vector, rows, columns)
 
-    def seen_checked(self, response: FloatArray, given: FloatArray, light: FloatArray | None) -> Seen:
+    def _seen_checked(self, response: FloatArray, given: FloatArray, light: FloatArray | None) -> Seen:
         """The same of a ``response`` that is checked and centred, and of it as it was ``given``."""
         across = self.side == "horizontal"
         vector = (response if across else response.T) @ (self.common / np.dot(self.common, self.common))
@@ -279,7 +279,7 @@ def stripe_sums(
     for sums, checked, response, light in zip(
         (left, right), (first, second), (horizontal, vertical), lights, strict=True
     ):
-        sums.put(sums.seen_checked(checked, np.asarray(response), light))
+        sums.put(sums._seen_checked(checked, np.asarray(response), light))
     return left, right
 
 

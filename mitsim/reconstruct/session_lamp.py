@@ -30,15 +30,29 @@ _TURNS = 8
 
 
 def flickers(scatter: float, noise: float, count: int) -> bool:
-    """Whether the robust ``scatter`` of so many powers is more than their ``noise`` makes."""
+    """Whether the powers of frames are those of a lamp that flickers.
+
+    Parameters
+    ----------
+    scatter, noise
+        of the powers, robust, and what noise makes of it.
+    count
+        of the frames.
+    """
     return scatter > _FLICKERS * (1 + 3 / float(np.sqrt(count))) * noise
 
 
-def trend_of(times: FloatArray, power: FloatArray, wanted: FloatArray) -> tuple[FloatArray, float, float]:
-    """A smooth power at the ``wanted`` times, the robust scatter of the ``power`` (frames,) at the ``times`` round it,
-    and the deviation of its two ends.
+def trend_of(times: FloatArray, power: FloatArray) -> tuple[FloatArray, float, float]:
+    """A smooth power (frames,) over the times, the robust scatter round it, and the deviation of its two ends.
 
     A parabola, fitted again without what is far from it.
+
+    Parameters
+    ----------
+    times
+        (frames,).
+    power
+        (frames,) of the lamp.
     """
     away = np.abs(power - np.median(power))
     kept = away <= max(6 * float(np.median(away)), 1e-12)
@@ -54,7 +68,7 @@ def trend_of(times: FloatArray, power: FloatArray, wanted: FloatArray) -> tuple[
         if (again == kept).all():
             break
         kept = again
-    return np.polyval(found, wanted), scatter, 3 * scatter / float(np.sqrt(max(kept.sum(), 1)))
+    return np.polyval(found, times), scatter, 3 * scatter / float(np.sqrt(max(kept.sum(), 1)))
 
 
 def end_to_end(times: FloatArray, trend: FloatArray) -> float:

@@ -87,10 +87,7 @@ class Pairs:
             np.concatenate([np.hstack([own.rows[:, half], own.columns[:, half]]) for own in self.pairs])
             for half in (0, 1)
         ]
-        at, self.scatter, self.steady = trend_of(self.times.mean(axis=1), self.power, self.times)
-        self.trend = at.mean(axis=1)
-        # Half the difference of a drifting lamp's power in the two frames of a pair, as a part of it.
-        self.slopes = np.diff(at[:, ::-1], axis=1)[:, 0] / 2 / self.trend
+        self.trend, self.scatter, self.steady = trend_of(self.times.mean(axis=1), self.power)
         differences = [halves[0] - halves[1]]
         for number, own in enumerate(self.pairs):
             along, vectors = self.uniforms[number], sides[number].sums.vectors
@@ -150,7 +147,7 @@ class Pairs:
         return min(found, key=lambda one: one[0])[1]
 
     def side_of(self, number: int, values: FloatArray) -> FloatArray:
-        """Those of the ``values`` (2 N,) that belong to a side."""
+        """Those of the ``values`` (2 N,) that belong to the side of a ``number``, 0 or 1."""
         return np.asarray(values[number * self.count : (number + 1) * self.count])
 
     def check(self, steady: bool = True) -> Lamp:
@@ -233,8 +230,6 @@ class Pairs:
                 half = float(np.dot(rest, across)) / known
                 vector = vector * (1 + half * share) - half * uniform
                 own.extras[index] += noise / known * whole
-            elif index:
-                vector = vector - self.side_of(number, self.slopes)[index] * uniform
             own.change(int(index), vector)
 
 
