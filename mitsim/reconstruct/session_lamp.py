@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.reconstruct.calibration import FLUX_NOISE
@@ -25,6 +26,11 @@ their number, and no more is said to be one."""
 _DEGREE = 5, 8
 """Of the polynomial that the light of scene lines is of, at most: falloff, obliquity and the mask's ends, of sensors
 of 120 to 260 pixels 3 to 12 leave no more than noise; and scene lines for each of its numbers, at least."""
+_LINES = 32
+"""Scene lines from which their light is smooth enough: that of 16 lines of a small sensor is of no such polynomial."""
+_SMOOTH = 1.5
+"""Scatter that a polynomial leaves, over that of one of two degrees more, up to which what is left is of frames, and
+not of lines whose light is not smooth: of good sides and of those with a lamp at fault it is 0.8 to 1.3."""
 _TURNS = 8
 """Times that a trend is fitted again without what is far from it: a fourth changes nothing in most sessions."""
 
@@ -92,22 +98,29 @@ class _Frames:
         shown = flux + flux[0]
         unit = float(np.median(shown))
         shown = np.where(np.abs(shown) > DARK * np.abs(unit), shown, unit or 1.0)
-        degree = max(min(_DEGREE[0], n // _DEGREE[1] - 1), 0)
-        lines = own.signs.T @ np.polynomial.legendre.legvander(np.linspace(-1, 1, n), degree) / shown[:, None]
         powers = np.vander(places - places.mean(), 3)
-        both = np.hstack([lines, powers])
         # A pattern of coarse stripes is hardly foretold by the light of others, but by the shadow.
         far = own.far()
-        kept = ~far
-        for _ in range(_TURNS):
-            inverse = np.linalg.pinv(both[kept])
-            found = inverse @ (flux / shown)[kept]
-            away = np.abs(flux / shown - both @ found)
-            scatter = 1.4826 * float(np.median(away[~far])) * float(np.sqrt(count / (count - both.shape[1])))
-            again = ~far & (away <= max(6 * scatter, 1e-12))
-            if (again == kept).all():
-                break
-            kept = again
+
+        def fitted(degree: int) -> tuple[FloatArray, FloatArray, FloatArray, npt.NDArray[np.bool_], float]:
+            """Lines' polynomials as patterns show them, least squares and their inverse, patterns that count, and the
+            robust scatter."""
+            lines = own.signs.T @ np.polynomial.legendre.legvander(np.linspace(-1, 1, n), degree) / shown[:, None]
+            both, kept = np.hstack([lines, powers]), ~far
+            for _ in range(_TURNS):
+                inverse = np.linalg.pinv(both[kept])
+                found = inverse @ (flux / shown)[kept]
+                away = np.abs(flux / shown - both @ found)
+                scatter = 1.4826 * float(np.median(away[~far])) * float(np.sqrt(count / (count - both.shape[1])))
+                again = ~far & (away <= max(6 * scatter, 1e-12))
+                if (again == kept).all():
+                    break
+                kept = again
+            return lines, found, inverse, kept, scatter
+
+        degree = min(_DEGREE[0], n // _DEGREE[1] - 1)
+        lines, found, inverse, kept, scatter = fitted(degree)
+        self.smooth = scatter < _SMOOTH * fitted(degree + 2)[-1]
         lines_found, powers_found = np.split(found, [degree + 1])
         lines_inverse, powers_inverse = np.split(inverse, [degree + 1])
         self.own, self.places = own, places
@@ -160,10 +173,14 @@ def lamp_of_frames(sides: Sequence[SideCheck], order: Sequence[Half], step: floa
     step
         between two numbers of a frame, as the responses have it.
     """
+    if len(sides[0].signs) < _LINES:
+        return Lamp()
     places = {half: place / max(len(order) - 1, 1) for place, half in enumerate(order)}
     found = [
         _Frames(own, np.array([places[own.side, index, 1] for index in range(own.sums.done)]), step) for own in sides
     ]
+    if not all(each.smooth for each in found):
+        return Lamp()
     costs = []
     for each in found:
         # The uniform frame's own power is in every response.
