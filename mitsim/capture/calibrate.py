@@ -414,7 +414,7 @@ class _Stripes:
                 name = f"{kind}_{sums.side}"
                 arrays[f"{name}_common"], arrays[f"{name}_vectors"] = sums.common, sums.vectors[:, : sums.done]
                 arrays[f"{name}_sums"] = [sums.misfit, sums.energy]
-                arrays[f"{name}_each"] = [sums.misfits[: sums.done], sums.energies[: sums.done]]
+                arrays[f"{name}_each"] = [each[: sums.done] for each in (sums.misfits, sums.energies, sums.fluxes)]
                 if sums.pairs is not None:
                     pairs = sums.pairs
                     arrays[f"{name}_light"] = pairs.light[:, : sums.done]
@@ -437,7 +437,10 @@ def _restored(arrays: Mapping[str, FloatArray] | None, kinds: Sequence[str], ses
         misfit, energy = map(float, arrays[f"{kind}_{side}_sums"])
         common = arrays[f"{kind}_{side}_common"]
         sums = StripeSums(side, session.centre, common, vectors, misfit, energy, finished.shape[1])
-        sums.misfits[: sums.done], sums.energies[: sums.done] = arrays[f"{kind}_{side}_each"]
+        for own, finished in zip(
+            (sums.misfits, sums.energies, sums.fluxes), arrays[f"{kind}_{side}_each"], strict=True
+        ):
+            own[: sums.done] = finished
         if f"{kind}_{side}_light" in arrays:
             light, rows, columns = (arrays[f"{kind}_{side}_{part}"] for part in ("light", "rows", "columns"))
             seen = [PairSeen(*parts) for parts in zip(light.T, rows, columns, strict=True)]

@@ -10,7 +10,7 @@ balanced, |Phi_L 1| = |Phi_R 1|, and their product reproduces the absolute respo
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -35,6 +35,8 @@ _NUMBERS_AT_ONCE = 2**15
 """Numbers of a response whose misfit is summed at a time: they and what is subtracted stay in the cache."""
 _BINS = 512
 """Groups of rows, and of columns, whose light is kept of every frame: all of the anchor camera, 16 KiB a pair."""
+FLUX_NOISE = 1.5
+"""Standard deviation of a response's flux over that of its mean, by Hann windows: 3/8 over 1/2 squared."""
 _TURNS, _TURNED = 30, 1e-13
 """Steps of the power iteration that splits a uniform response, and the change at which it has converged: where it has,
 each step took away 63 % or more, so that no more than the last change is left. A board's responses take four."""
@@ -94,12 +96,15 @@ class Seen:
         ||Y_i - u_i common^T||^2 and ||Y_i||^2.
     pair
         of its two frames, where their sum is known.
+    flux
+        its mean light, more of it towards the sensor's middle; 0 where that of its frames is known.
     """
 
     vector: FloatArray
     misfit: float
     energy: float
     pair: PairSeen | None = None
+    flux: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +163,7 @@ class StripeSums:
         sums of ||Y_i - u_i v^T||^2 and of ||Y_i||^2.
     done
         responses that are in.
-    misfits, energies
+    misfits, energies, fluxes
         (N,) what each response added.
     pairs
         of its two frames; None where a response is not the difference of two, or their sum is not known.
@@ -173,10 +178,11 @@ class StripeSums:
     done: int = 0
     misfits: FloatArray = field(init=False)
     energies: FloatArray = field(init=False)
+    fluxes: FloatArray = field(init=False)
     pairs: PairSums | None = None
 
     def __post_init__(self) -> None:
-        self.misfits, self.energies = np.zeros(self.vectors.shape[1]), np.zeros(self.vectors.shape[1])
+        self.misfits, self.energies, self.fluxes = np.zeros((3, self.vectors.shape[1]))
 
     def add(self, response: npt.ArrayLike) -> None:
         """Add the next ``response`` (rows, columns); MitsimError for another shape or values that are not finite."""
@@ -199,8 +205,7 @@ class StripeSums:
         shape = len(self.vectors), len(self.common)
         shape = shape if self.side == "horizontal" else shape[::-1]
         checked = _response(response, f"{self.side} response {number}", shape, self.centre)
-        seen = self.seen_checked(checked)
-        return seen if light is None else replace(seen, pair=self._pair_seen(np.asarray(response), light))
+        return self._seen_checked(checked, np.asarray(response), light)
 
     def _pair_seen(self, response: FloatArray, light: FloatArray) -> PairSeen:
         across = self.side == "horizontal"
@@ -213,8 +218,8 @@ class StripeSums:
         )
         return PairSeen(vector, rows, columns)
 
-    def seen_checked(self, response: FloatArray) -> Seen:
-        """The same of a ``response`` that is checked and centred."""
+    def _seen_checked(self, response: FloatArray, given: FloatArray, light: FloatArray | None) -> Seen:
+        """The same of a ``response`` that is checked and centred, and of it as it was ``given``."""
         across = self.side == "horizontal"
         vector = (response if across else response.T) @ (self.common / np.dot(self.common, self.common))
         rows, columns = (vector, self.common) if across else (self.common, vector)
@@ -225,7 +230,9 @@ class StripeSums:
             explained = np.multiply.outer(rows[start : start + step], columns)
             misfit += sum_of_squares(np.subtract(block, explained, out=explained))
             energy += sum_of_squares(block)
-        return Seen(vector, misfit, energy)
+        if light is None:
+            return Seen(vector, misfit, energy, flux=_flux(given))
+        return Seen(vector, misfit, energy, self._pair_seen(given, light))
 
     def put(self, seen: Seen) -> None:
         """Count in what was ``seen`` of the next response."""
@@ -233,6 +240,7 @@ class StripeSums:
         self.misfit += seen.misfit
         self.energy += seen.energy
         self.misfits[self.done], self.energies[self.done] = seen.misfit, seen.energy
+        self.fluxes[self.done] = seen.flux
         if seen.pair is not None:
             self.pairs = self.pairs or PairSums.empty(seen.pair, self.vectors.shape[1])
             self.pairs.put(self.done, seen.pair)
@@ -271,8 +279,7 @@ def stripe_sums(
     for sums, checked, response, light in zip(
         (left, right), (first, second), (horizontal, vertical), lights, strict=True
     ):
-        seen = sums.seen_checked(checked)
-        sums.put(seen if light is None else replace(seen, pair=sums._pair_seen(np.asarray(response), light)))
+        sums.put(sums._seen_checked(checked, np.asarray(response), light))
     return left, right
 
 
@@ -413,6 +420,13 @@ def _marginals(frame: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Means of a ``frame`` (rows, columns) over groups of rows, and over groups of columns, ``_BINS`` at most."""
     rows, columns = frame.shape
     return _grouped(frame @ np.full(columns, 1 / columns)), _grouped(np.full(rows, 1 / rows) @ frame)
+
+
+def _flux(frame: FloatArray) -> float:
+    """Mean light of a ``frame`` (rows, columns), by Hann windows: a mask's shadow that moves over the sensor leaves it,
+    and comes in, where they are dark."""
+    rows, columns = (np.hanning(length + 2)[1:-1] for length in frame.shape)
+    return float(rows @ frame @ columns / (rows.sum() * columns.sum()))
 
 
 def _grouped(values: FloatArray) -> FloatArray:

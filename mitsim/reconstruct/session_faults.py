@@ -1,8 +1,8 @@
 """Sums over a calibration session's responses in; frames that are not what they should be, and sums without them, out.
 
 Three things hold for every good session, whatever the camera: the two frames of a pair add up to one frame for all
-patterns, the lamp is one lamp (:mod:`mitsim.reconstruct.session_pairs`), and columns of a factor are one mask's moving
-shadow (:mod:`mitsim.reconstruct.session_side`).
+patterns (:mod:`mitsim.reconstruct.session_pairs`), the lamp is one lamp (:mod:`mitsim.reconstruct.session_lamp`), and
+columns of a factor are one mask's moving shadow (:mod:`mitsim.reconstruct.session_side`).
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.calibration import Estimate, StripeSums, factors_of_sums
 from mitsim.reconstruct.session_findings import Lamp, SessionFault, frame_words
+from mitsim.reconstruct.session_frames import WrongPairs
+from mitsim.reconstruct.session_lamp import lamp_of_frames
 from mitsim.reconstruct.session_pairs import Pairs
 from mitsim.reconstruct.session_side import MOST_FAULTS, SideCheck
 from mitsim.rig.order import SIDES, Half, Side
@@ -143,16 +145,17 @@ def check_session(
         if taken.saturated and pairs.many:
             return Checked(sums)
         lamp = pairs.check(not taken.unsteady)
+        WrongPairs(pairs).repair(lamp)
     else:
         for own in work:
             own.leave_out_known(taken.wrong)
     at_first = [fault for own in work for fault in own.faults if fault.index == 0]
     if at_first and not uniform_given:
         return Checked(sums, at_first)
+    if not taken.unsteady and all(own.enough and not own.pairs for own in work):
+        lamp = lamp_of_frames(work, taken.order, taken.step)
     for own in work:
         own.check(taken.unsteady, taken.name)
-    if not (taken.unsteady or all(own.pairs for own in work)):
-        lamp = _against_one_frame(work)
     faults = [
         replace(fault, cost=float(np.sqrt(own.extras[fault.index] / max(np.square(own.vectors).sum(), 1e-300))))
         for own in work
@@ -174,14 +177,3 @@ def check_session(
         (len(work[0].uncounted), len(work[1].uncounted)),
         (float(work[0].extras.sum()), float(work[1].extras.sum())),
     )
-
-
-def _against_one_frame(sides: Sequence[SideCheck]) -> Lamp:
-    """How steady the lamp is where frames are shown against one uniform one."""
-    before = [own.extras.sum() for own in sides]
-    flicker = max([own.flicker() for own in sides])
-    parts = [
-        (own.extras.sum() - extra) / np.square(own.vectors).sum() for own, extra in zip(sides, before, strict=True)
-    ]
-    cost = float(np.sqrt(sum(parts)))
-    return Lamp(flicker=flicker, flicker_cost=cost, remaining=cost) if flicker else Lamp()

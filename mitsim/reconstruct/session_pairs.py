@@ -1,26 +1,22 @@
-"""Sums of a session's pairs in; frames that are not what they should be, what they should have been, and the lamp's
-power out.
+"""Sums of a session's pairs in; which are wrong, and the lamp's power, out.
 
 The two frames of a pair add up to one frame for all patterns, so that a frame which is black, dim, half lost, a repeat,
-shifted or clipped shows in the sum, and the other half foretells what it should have been. What the sums share is the
-lamp's power, in the order of the session.
+shifted or clipped shows in the sum. What the sums share is the lamp's power, in the order of the session.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.session_findings import DARK, Lamp, SessionFault, dimmed, frame_words
+from mitsim.reconstruct.session_findings import Lamp
+from mitsim.reconstruct.session_lamp import MATTERS, end_to_end, flickers, trend_of
 from mitsim.reconstruct.session_side import MOST_FAULTS, SideCheck
 from mitsim.rig.order import Half
 
-_MATTERS = 0.5
-"""Error by the lamp, over that by noise, from which it is corrected and said: both in quadrature are 12 % more."""
 _DEVIATIONS = 8.0
 """Deviations from the rest, by their own robust scatter, that make a fault: noise alone goes so far in one session of
 10^12."""
@@ -30,8 +26,6 @@ _EXCESS = 2.0
 """Squared deviation of a pair's sum, over that of the others, that counts at least."""
 _EXPLAINED = 0.05
 """Part of a faulty frame's squared deviation that the fault's name may leave unexplained."""
-_SHIFTS = 8
-"""Rows or columns by which a frame is tried to be shifted."""
 _TURNS = 3
 """Steps in which noise and flicker, which hang on each other, are found: a fourth changes no digit."""
 _ROUNDING = 1e-6
@@ -43,26 +37,6 @@ rounding is 0 within 1 %."""
 _LINEAR = 0.02
 """Deviation of a pair's sum, rms, as a part of its light, that a camera may make which is not linear: where no fault's
 name explains it, none is said. A linearity of 0.03 makes 0.5 % in most pairs, 1 % in uniform ones."""
-_FLICKERS = 2.0
-"""Robust scatter of the pairs' power over that by noise, which is known to 20 %, that is flicker; of few pairs, whose
-scatter itself is known to 1.2 of it over the root of their number, more."""
-_FITS = 4.0
-"""Mean squared deviation, in that of a good pair's sum, up to which a name fits."""
-_BOTH = 36.0
-"""Squared deviation of a frame's light from the usual, in four times its robust scatter, that makes it no frame to
-foretell the other by."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Shown:
-    """What is known of one frame, in deviations of a pair's noise: ``parts`` are means of its rows, of its columns, and
-    its vector."""
-
-    parts: tuple[FloatArray, FloatArray, FloatArray]
-
-    @property
-    def all(self) -> FloatArray:
-        return np.concatenate(self.parts)
 
 
 class Pairs:
@@ -113,7 +87,7 @@ class Pairs:
             np.concatenate([np.hstack([own.rows[:, half], own.columns[:, half]]) for own in self.pairs])
             for half in (0, 1)
         ]
-        self.trend, self.scatter, self.steady = _trend(self.times.mean(axis=1), self.power)
+        self.trend, self.scatter, self.steady = trend_of(self.times.mean(axis=1), self.power)
         differences = [halves[0] - halves[1]]
         for number, own in enumerate(self.pairs):
             along, vectors = self.uniforms[number], sides[number].sums.vectors
@@ -142,7 +116,7 @@ class Pairs:
             # Means of rows and of columns share the frame's mean and its noise: twice independent ones' variance.
             self.noise = float(np.sqrt(2 * self.floor / size + alike**2 / np.square(self.common).mean()))
             self.flicker = float(np.sqrt(max(self.scatter**2 - self.noise**2, 0.0)))
-            if self.scatter < _FLICKERS * (1 + 3 / np.sqrt(len(self.power))) * self.noise:
+            if not flickers(self.scatter, self.noise, len(self.power)):
                 self.flicker = 0.0
                 break
         found = [
@@ -172,33 +146,16 @@ class Pairs:
             found.append((float(np.std(light - self.ambient_and_all)), light))
         return min(found, key=lambda one: one[0])[1]
 
-    def _of(self, number: int, values: FloatArray) -> FloatArray:
-        """Those of the ``values`` (2 N,) that belong to a side."""
+    def side_of(self, number: int, values: FloatArray) -> FloatArray:
+        """Those of the ``values`` (2 N,) that belong to the side of a ``number``, 0 or 1."""
         return np.asarray(values[number * self.count : (number + 1) * self.count])
 
     def check(self, steady: bool = True) -> Lamp:
-        """Find faulty frames, put what their pairs foretell in their place, and find how steady the lamp is, where it
-        should be ``steady``."""
+        """How steady the lamp is, where it should be ``steady``; MitsimError where too many pairs are wrong."""
         bad = ~self.good
         if self.many:
             self._refuse(int(bad.sum()))
-        lamp = self._correct() if steady else Lamp()
-        for place in np.flatnonzero(bad):
-            self._repair(self.sides[place // self.count], int(place // self.count), int(place % self.count), lamp)
-        for own, pairs in zip(self.sides, self.pairs, strict=True):
-            fluxes = pairs.rows.mean(axis=2)
-            if self.good[self.sides.index(own) * self.count] and fluxes[0, 0] < fluxes[0, 1]:
-                own.faults.append(
-                    SessionFault(
-                        own.side,
-                        0,
-                        None,
-                        "exchanged",
-                        "in each other's place",
-                        "they count in their right order",
-                    )
-                )
-        return lamp
+        return self._correct() if steady else Lamp()
 
     def _refuse(self, wrong: int) -> None:
         """MitsimError: so many pairs are wrong."""
@@ -224,16 +181,16 @@ class Pairs:
         flicker = float(np.sqrt(2)) * self.flicker
         costs = []
         for number, own in enumerate(self.sides):
-            inside = self._of(number, good)
+            inside = self.side_of(number, good)
             vectors = own.vectors[:, inside]
             size = max(float(np.sum(np.square(vectors))), 1e-300)
-            moved = float(np.sum(np.square(vectors * (self._of(number, trend) - 1)[inside])))
+            moved = float(np.sum(np.square(vectors * (self.side_of(number, trend) - 1)[inside])))
             # Each frame's own power: half of it scales the response, half adds the uniform frame to it.
             added = inside.sum() * float(np.square(self.uniforms[number]).sum()) * self.flicker**2
             costs.append((moved / size, added / size + self.flicker**2, own.noise * self.count / size))
         moved, shaken, noise = (float(np.sqrt(np.sum(part))) for part in zip(*costs, strict=True))
-        drifts = bool(np.ptp(trend) > _DEVIATIONS * self.steady and moved > _MATTERS * noise)
-        flickers = bool(flicker and shaken > _MATTERS * noise)
+        drifts = bool(np.ptp(trend) > _DEVIATIONS * self.steady and moved > MATTERS * noise)
+        flickers = bool(flicker and shaken > MATTERS * noise)
         if not drifts and not flickers:
             return Lamp()
         used = powers if flickers else trend
@@ -241,11 +198,11 @@ class Pairs:
         scale = float(np.sqrt((used[0] + used[self.count]) / 2)) if good[0] and good[self.count] else 1.0
         remaining = 0.0
         for number, own in enumerate(self.sides):
-            self._divided(number, own, self._of(number, used), flicker if flickers else 0.0)
+            self._divided(number, own, self.side_of(number, used), flicker if flickers else 0.0)
             own.rescale(scale)
             remaining += float(own.extras.sum() / np.sum(np.square(own.vectors)))
         return Lamp(
-            drift=_end_to_end(self.times.mean(axis=1), trend) if drifts else 0.0,
+            drift=end_to_end(self.times.mean(axis=1), trend) if drifts else 0.0,
             flicker=flicker if flickers else 0.0,
             drift_cost=moved if drifts else 0.0,
             flicker_cost=shaken if flickers else 0.0,
@@ -261,7 +218,7 @@ class Pairs:
         """
         pairs, uniform = self.pairs[number], self.uniforms[number]
         noise, whole = self.light_noise[number], float(np.dot(uniform, uniform))
-        for index in np.flatnonzero(self._of(number, self.good)):
+        for index in np.flatnonzero(self.side_of(number, self.good)):
             vector = own.vectors[:, index] / float(powers[index])
             if index and flicker:
                 rest = (pairs.light[:, index] - self.lights[number]) / float(powers[index])
@@ -273,205 +230,7 @@ class Pairs:
                 half = float(np.dot(rest, across)) / known
                 vector = vector * (1 + half * share) - half * uniform
                 own.extras[index] += noise / known * whole
-            elif index:
-                vector = vector - self._slope(number, int(index)) * uniform
             own.change(int(index), vector)
-
-    def _slope(self, number: int, index: int) -> float:
-        """Half the difference of a drifting lamp's power in the two frames of a pair, as a part of it."""
-        place = number * self.count + index
-        before, after = self.times[place]
-        times = self.times.mean(axis=1)
-        near = np.argsort(np.abs(times - times[place]))[: min(9, len(times))]
-        if np.ptp(times[near]) == 0:
-            return 0.0
-        gradient = np.polyfit(times[near], self.trend[near], 1)[0]
-        return float(gradient * (before - after) / 2 / self.trend[place])
-
-    # ---- one faulty pair ---------------------------------------------------------------------------------------------
-
-    def _shown(self, number: int, index: int, sign: int) -> _Shown:
-        """A frame, in deviations of a pair's noise."""
-        own, pairs = self.sides[number].sums, self.pairs[number]
-        vector = (pairs.light[:, index] + (1 if sign > 0 else -1) * own.vectors[:, index]) / 2
-        half = 0 if sign > 0 else 1
-        scale = 1 / np.sqrt(self.floor)
-        return _Shown(
-            (
-                pairs.rows[index, half] * scale,
-                pairs.columns[index, half] * scale,
-                vector / np.sqrt(self.light_noise[number]),
-            )
-        )
-
-    def _expected(self, number: int, index: int, sign: int) -> _Shown:
-        """What the other frame of its pair foretells of a frame."""
-        more = float(self._of(number, self.trend)[index]) - 1
-        other = self._shown(number, index, -sign).parts
-        rows = len(other[0])
-        scale = 1 / np.sqrt(self.floor)
-        both = (self.ambient_and_all + more * self.common) * scale
-        vector = (self.lights[number] + more * self.uniforms[number]) / np.sqrt(self.light_noise[number])
-        return _Shown((both[:rows] - other[0], both[rows:] - other[1], vector - other[2]))
-
-    def _flux(self, number: int, index: int, sign: int) -> float:
-        """Light of a frame over that of all light."""
-        more = float(self._of(number, self.trend)[index]) - 1
-        rows = self.pairs[number].rows[index, 0 if sign > 0 else 1]
-        whole = float((self.ambient_and_all + more * self.common)[: rows.size].mean())
-        return float(rows.mean() / whole) if whole else 0.0
-
-    def _usual(self, number: int) -> tuple[float, float]:
-        """The flux of half the light, and its robust deviation."""
-        fluxes = [
-            self._flux(number, index, 1) for index in range(1, self.count) if self.good[number * self.count + index]
-        ]
-        middle = float(np.median(fluxes)) if fluxes else 0.5
-        return middle, max(1.4826 * float(np.median(np.abs(np.asarray(fluxes) - middle))) if fluxes else 0.0, 1e-3)
-
-    def _repair(self, own: SideCheck, number: int, index: int, lamp: Lamp) -> None:
-        """Name the faulty frame of a pair, and take its vector from the other one."""
-        usual, deviation = self._usual(number)
-        found = []
-        for sign in (1, -1):
-            kept = self._flux(number, index, -sign)
-            right = usual if sign < 0 else 1 - usual
-            if index == 0:
-                right = 1 - self.dark if sign < 0 else self.dark
-            penalty = ((kept - right) / (4 * deviation)) ** 2
-            rest, kind, detail, other = self._best(number, index, sign)
-            found.append((rest + penalty, penalty, sign, kind, detail, other))
-        known = [sign for sign in (1, -1) if (own.side, index, sign) in self.wrong]
-        found.sort(key=lambda one: (one[2] not in known, one[0]))
-        _, penalty, sign, kind, detail, other = found[0]
-        if known:
-            kind, detail, other = "wrong", f"is wrong: {self.wrong[own.side, index, sign]}", None
-        elif kind == "wrong" and self.slight[number * self.count + index]:
-            return
-        own.uncounted.add(index)
-        if len(known) == 2 or (not known and penalty > _BOTH and found[1][1] > _BOTH):
-            if index:
-                own.unknown.add(index)
-            else:  # by definition, where it is the other side's that all vectors are projected on
-                own.change(0, self.uniforms[number])
-            own.faults.append(
-                SessionFault(
-                    own.side,
-                    index,
-                    None,
-                    kind,
-                    f"{detail}, and the other frame of its pair is wrong too",
-                    "both are left out",
-                    other,
-                )
-            )
-            return
-        power = float(self._of(number, self.trend)[index])
-        light, vector = self.pairs[number].light[:, index], own.sums.vectors[:, index]
-        sound = (light - sign * vector) / 2
-        both = self.lights[number] + (power - 1) * self.uniforms[number]
-        corrected = power / float(self.power[self.good].mean()) if lamp.corrected else 1.0
-        own.change(index, -sign * (2 * sound - both) / corrected)
-        own.extras[index] += own.noise
-        own.faults.append(
-            SessionFault(
-                own.side,
-                index,
-                sign,
-                kind,
-                detail,
-                "it is left out, and foretold by the other frame of its pair",
-                other,
-            )
-        )
-
-    def _best(self, number: int, index: int, sign: int) -> tuple[float, str, str, Half | None]:
-        """The name that leaves least of a frame unexplained, mean squared deviations, of those that explain it."""
-        shown, expected = self._shown(number, index, sign), self._expected(number, index, sign)
-        whole = float(np.square(shown.all - expected.all).mean())
-        names: list[tuple[float, str, str, Half | None]] = []
-        size = float(np.dot(expected.all, expected.all))
-        part = float(np.dot(shown.all, expected.all)) / size if size else 0.0
-        flux = float(shown.parts[0].sum() / expected.parts[0].sum()) if expected.parts[0].sum() else 0.0
-        if index == 0 and sign < 0 and self.dark < DARK:
-            flux = part = 1.0  # a dark frame of a dark room
-        if self.clipped((self.sides[number].side, index, sign)) and flux > DARK:
-            return 1.0, "clipped", "is clipped: many of its pixels share its largest number", None
-        if flux < DARK and all(
-            np.ptp(each) < DARK * 2 * np.ptp(whole_part) + 12
-            for each, whole_part in zip(shown.parts, expected.parts, strict=True)
-        ):
-            return 1.0, "black", "is black", None
-        names.append((float(np.square(shown.all - part * expected.all).mean()), *dimmed(part), None))
-        names += self._lost(shown, expected)
-        names += self._repeats(number, index, sign, shown)
-        names += self._shifted(number, shown, expected)
-        rest, kind, detail, other = min(names, key=lambda one: one[0])
-        if rest > max(_FITS, _EXPLAINED * whole):
-            return rest, "wrong", "is not what the other frame of its pair foretells", None
-        return rest, kind, detail, other
-
-    @staticmethod
-    def _lost(shown: _Shown, expected: _Shown) -> Iterator[tuple[float, str, str, Half | None]]:
-        """A frame that ends early or begins late, along its rows or columns."""
-        for axis, word in ((0, "rows"), (1, "columns")):
-            seen, whole = shown.parts[axis], expected.parts[axis]
-            missing, there = np.square(seen), np.square(seen - whole)
-            ahead = np.concatenate([[0.0], np.cumsum(there)])
-            behind = np.concatenate([np.cumsum(missing[::-1])[::-1], [0.0]])
-            early = ahead + behind
-            late = np.concatenate([[0.0], np.cumsum(missing)]) + np.concatenate([np.cumsum(there[::-1])[::-1], [0.0]])
-            for cost, first in ((early, False), (late, True)):
-                cut = int(np.argmin(cost[1:-1])) + 1
-                rest = float(cost[cut]) / len(seen)
-                lost = (cut if first else len(seen) - cut) / len(seen)
-                yield rest, "half lost", f"lost its {'first' if first else 'last'} {word}, {lost:.0%} of them", None
-
-    def _repeats(
-        self, number: int, index: int, sign: int, shown: _Shown
-    ) -> Iterator[tuple[float, str, str, Half | None]]:
-        """Other frames that it equals."""
-        for place, own in enumerate(self.sides):
-            scale = 1 / np.sqrt(self.floor)
-            pairs = self.pairs[place]
-            for half, signed in ((0, 1), (1, -1)):
-                away = np.square(pairs.rows[:, half] * scale - shown.parts[0]).sum(axis=1)
-                away += np.square(pairs.columns[:, half] * scale - shown.parts[1]).sum(axis=1)
-                numbers = len(shown.parts[0]) + len(shown.parts[1])
-                if place == number:
-                    vectors = (pairs.light + signed * own.sums.vectors) / 2 / np.sqrt(self.light_noise[number])
-                    away += np.square(vectors - shown.parts[2][:, None]).sum(axis=0)
-                    numbers += len(shown.parts[2])
-                    if signed == sign:
-                        away[index] = np.inf
-                if signed < 0:
-                    away[0] = np.inf  # dark, as a black frame is
-                if place != number:
-                    before = self.before.get((self.sides[number].side, index, sign))
-                    away[np.arange(self.count) != (before[1] if before and before[0] == own.side else -1)] = np.inf
-                nearest = int(np.argmin(away))
-                other: Half = (own.side, nearest, signed)
-                yield float(away[nearest]) / numbers, "repeated", f"repeats {frame_words(other)}", other
-
-    def _shifted(self, number: int, shown: _Shown, expected: _Shown) -> Iterator[tuple[float, str, str, Half | None]]:
-        """A frame that is moved by some rows or columns."""
-        for axis, word in ((0, "rows"), (1, "columns")):
-            length = len(shown.parts[axis])
-            if length < 4 * _SHIFTS:
-                continue
-            inner = slice(_SHIFTS, length - _SHIFTS)
-            still = np.square(shown.parts[1 - axis] - expected.parts[1 - axis])
-            vector, whole = shown.parts[2], expected.parts[2]
-            # Across its stripes a frame's vector moves; along them it becomes shorter.
-            part = float(np.dot(vector, whole)) / max(float(np.dot(whole, whole)), 1e-300)
-            scaled = np.square(vector - part * whole)
-            for shift in (*range(-_SHIFTS, 0), *range(1, _SHIFTS + 1)):
-                moved = np.square(shown.parts[axis] - np.roll(expected.parts[axis], shift))[inner]
-                third = scaled
-                if axis == number and len(vector) == length:
-                    third = np.square(vector - np.roll(whole, shift))[inner]
-                rest = float(np.concatenate([moved, still, third]).mean())
-                yield rest, "shifted", f"is shifted by {abs(shift)} of its {word}", None
 
 
 def _unshaken(rests: FloatArray, differences: FloatArray, flicker: float, noise: float) -> FloatArray:
@@ -483,30 +242,3 @@ def _unshaken(rests: FloatArray, differences: FloatArray, flicker: float, noise:
         along = np.einsum("ij,ij->i", rests, differences)
         squared = squared - np.square(along) / (np.square(differences).sum(axis=1) + weight)
     return np.asarray(squared / rests.shape[1])
-
-
-def _trend(times: FloatArray, power: FloatArray) -> tuple[FloatArray, float, float]:
-    """A smooth power (pairs,) over the ``times``, the robust scatter round it, and the deviation of its two ends.
-
-    A parabola, fitted again without what is far from it.
-    """
-    away = np.abs(power - np.median(power))
-    kept = away <= max(6 * float(np.median(away)), 1e-12)
-    degree = min(2, max(len(np.unique(times)) - 2, 0))
-    found, scatter = np.full(power.shape, float(np.median(power))), 0.0
-    for _ in range(8):
-        if kept.sum() <= degree + 1:
-            break
-        found = np.polyval(np.polyfit(times[kept], power[kept], degree), times)
-        away = np.abs(power - found)
-        scatter = 1.4826 * float(np.median(away))
-        again = away <= max(4 * scatter, 1e-12)
-        if (again == kept).all():
-            break
-        kept = again
-    return found, scatter, 3 * scatter / float(np.sqrt(max(kept.sum(), 1)))
-
-
-def _end_to_end(times: FloatArray, trend: FloatArray) -> float:
-    first, last = int(np.argmin(times)), int(np.argmax(times))
-    return float(trend[last] - trend[first])
