@@ -34,10 +34,10 @@ _NOISY = 4.0
 """Robust scatter of misfits, over that by noise, up to which they are noise: of 60 good sides none has 1.5."""
 _FAR = 10.0
 """Squared deviation of a vector from the foretold one, in that of the median pattern, from which it is suspected."""
-_WRONG, _UNLIKE = 40.0, 0.2
-"""The same, and that deviation as a part of the vector's own square, from which it is wrong whatever it shows: of 660
-good sides of 64 and 260 of 128 patterns none has more than 10 and 20 of such a part; of 1040 that show other stripes
-1036 have 30, the others at 1.5 times the noise's error."""
+_WRONG, _UNLIKE = 40.0, 0.1
+"""The same, and that deviation as a part of the vector's own square, from which it is wrong whatever it shows: of 600
+good sides of 64 and 260 of 128 patterns none has more than 17 and 20 of such a part; nearly all that show other stripes
+have both, the rest cost little more than the noise."""
 _FAR_LINE, _SHARED = 20.0, 0.2
 """Squared deviation of the first scene line's column, in that of the median one and of what noise makes of it, from
 which the frame that all patterns are held against is wrong, as its error is in that column alone; and the uniform
