@@ -52,7 +52,7 @@ class FrameCheck(LeaveOneOut):
         part = np.maximum(sums.residual - noise - share, 0.0) / np.maximum(sums.power, np.finfo(float).tiny)
         return bool(np.median(part) > OFF**2)
 
-    def faults(self, sums: FrameSums, beside_noise: float) -> tuple[FrameFault, ...]:
+    def faults(self, sums: FrameSums, beside_noise: float, fits: bool = True) -> tuple[FrameFault, ...]:
         """The frames at fault.
 
         Parameters
@@ -61,12 +61,14 @@ class FrameCheck(LeaveOneOut):
             of all measurements.
         beside_noise
             energy that rendering, the factors' noise and print put into all of them.
+        fits
+            whether what frames foretell counts only where they fit; not of a scene whose depths are known to differ.
         """
         found = [*self._same(sums), *self._clipped(sums), *self._noiseless(sums)]
         suspects = self._suspects(sums, beside_noise)
         if suspects is None:  # too many
             return tuple(found)
-        named = self._explained(sums, beside_noise, *suspects) if suspects[0] else []
+        named = self._explained(sums, beside_noise, fits, *suspects) if suspects[0] else []
         # What is known without the model is said where that does not say more; of clipped frames it explains the rest.
         clipped = {number for fault in found if fault.fault is Fault.CLIPPED for number in fault.numbers}
         named = [fault for fault in named if not clipped & set(fault.numbers)]
@@ -96,10 +98,12 @@ class FrameCheck(LeaveOneOut):
         return bad, weights
 
     def _explained(
-        self, sums: FrameSums, beside_noise: float, bad: dict[Pattern, bool], weights: FloatArray
+        self, sums: FrameSums, beside_noise: float, fits: bool, bad: dict[Pattern, bool], weights: FloatArray
     ) -> list[FrameFault]:
         """Faults of patterns that are suspected, :meth:`_suspects` as :meth:`faults` takes its parameters."""
         explanations = Explanations(self, bad, weights)
+        if not fits:
+            return explanations.faults(-np.inf)
         good = np.ones(self.noise.variance.shape, dtype=np.bool_)
         for pattern in bad:
             good[pattern] = False

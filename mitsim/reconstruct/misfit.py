@@ -381,7 +381,7 @@ def faulty_frames(check: FrameCheck, beside_noise: float, evidence: Evidence) ->
     sums = Residuals(check.prepared, check.weights, check.noise, evidence)
     for measurement in check.measured():
         sums.add(measurement)
-    return check.faults(sums.by_pattern, beside_noise)
+    return check.faults(sums.by_pattern, beside_noise, fits=False)
 
 
 @dataclass(frozen=True, eq=False)

@@ -167,7 +167,8 @@ class ToneCurves:
             variance = np.maximum(self.manifest.digital.variance(each.light, each.shots), _TINY).ravel()
             for energy, values in zip(parts, (np.square(residual).ravel(), variance), strict=True):
                 energy += np.bincount(part, values, _PARTS)
-        return bool((np.abs(parts[0] / parts[1] / prepared.spare - 1) < _UNEVEN).all())
+        expected = parts[1] * prepared.spare
+        return bool((np.abs(parts[0] - expected) <= _UNEVEN * expected).all())
 
     def _linear(self, curve: _Curve) -> Iterator[_Linear]:
         """Measurements of light, dark current and ambient light, that the numbers are a ``curve`` of."""
