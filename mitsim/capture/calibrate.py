@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -52,8 +53,9 @@ from mitsim.rig.recipe import SessionRecipe, load_recipe
 
 NOISY, NOISE_FREE = "noisy", "noise_free"
 """Kinds of responses that factors are estimated from."""
-_SAVED_EVERY = 8
-"""Responses between two checkpoints: half of those that are looked at at once, or twice as many at 2048 pixels."""
+_SAVED_EVERY, _SAVED_AFTER_S = 8, 0.5
+"""Responses between two checkpoints, half of those that are looked at at once, or twice as many at 2048 pixels; and
+seconds, as each takes some ten milliseconds."""
 _STRIPES = "stripes"
 """The part of a checkpoint that holds the sums over finished responses."""
 
@@ -300,13 +302,16 @@ def checked_estimates(
         ]
         stripes = _Stripes(dict(zip(kinds, both, strict=True)), sum(each.saturated for side in first for each in side))
         del first
+    saved = time.monotonic()
     for side, sums in zip(SIDES, zip(*stripes.sums.values(), strict=True), strict=True):
         for looked in lit.each(side, partial(_looked, lit, kinds, sums), job, sums[0].done):
             for own, (seen, saturated) in zip(sums, looked, strict=True):
                 own.put(seen)
                 stripes.saturated += saturated
-            if sums[0].done % _SAVED_EVERY == 0 or sums[0].done == count:
+            due = sums[0].done % _SAVED_EVERY == 0 and time.monotonic() >= saved + _SAVED_AFTER_S
+            if due or sums[0].done == count:
                 checkpoint.save(_STRIPES, stripes.arrays())
+                saved = time.monotonic()
     drift = session.recipe.drift
     # Who states that the lamp drifts asks what that costs, which is gone once it is divided out.
     unsteady = bool(drift.session_ramp or drift.session_flicker)

@@ -209,6 +209,12 @@ def test_no_two_shots_of_a_session_share_noise(monkeypatch: pytest.MonkeyPatch, 
 # ---- resumed ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.fixture(autouse=True)
+def every_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Checkpoints are kept however little time has passed."""
+    monkeypatch.setattr("mitsim.capture.calibrate._SAVED_AFTER_S", 0.0)
+
+
 class Kept(Checkpoint):
     """A checkpoint in memory that ends the session after so many parts."""
 

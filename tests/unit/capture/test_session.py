@@ -321,6 +321,12 @@ def geometric_sessions(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mitsim.capture.session.make_plan", planned)
 
 
+@pytest.fixture(autouse=True)
+def every_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Checkpoints are kept however little time has passed."""
+    monkeypatch.setattr("mitsim.capture.calibrate._SAVED_AFTER_S", 0.0)
+
+
 @pytest.fixture
 def kill_after(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """The session ends right after so many checkpoints are written from now on."""
