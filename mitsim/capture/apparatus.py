@@ -110,7 +110,7 @@ class Apparatus:
         """The projector's photons by wavelength."""
         return self.projector.spectrum
 
-    @property
+    @cached_property
     def waves(self) -> Spectrum | None:
         """Lines of that light whose diffraction at the mask is worked out; None: of none."""
         from mitsim.optics.diffraction import narrowest_mm

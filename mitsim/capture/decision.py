@@ -31,7 +31,7 @@ from mitsim.capture.prices import (
     truth_seconds,
 )
 from mitsim.capture.request import check_accuracy
-from mitsim.transport.glint import polished_shapes
+from mitsim.transport.left_out import polished_shapes
 
 if TYPE_CHECKING:
     from mitsim.capture.bench import Bench

@@ -68,13 +68,6 @@ def has_mirrors(scene: mi.Scene) -> bool:
     return bool(delta_bsdfs(scene, int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)))
 
 
-def polished_shapes(scene: mi.Scene) -> tuple[int, ...]:
-    """Places, among the shapes of a ``scene``, of those that reflect or bend light into single directions."""
-    polished = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
-    shapes = enumerate(scene.shapes())
-    return tuple(number for number, shape in shapes if shape.bsdf() is not None and shape.bsdf().flags() & polished)
-
-
 def trace_glint(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, max_depth: int = 16) -> Beams:
     """All beams that leave the projector, meet perfect mirrors or lenses alone, and reach the sensor.
 

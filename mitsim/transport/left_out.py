@@ -176,3 +176,10 @@ class _LeftOutWalk(CameraWalk):
         self.lobe = dr.select(turned, shape, self.lobe)
         self.density = dr.select(turned, self.came_pdf, self.density)
         return passing
+
+
+def polished_shapes(scene: mi.Scene) -> tuple[int, ...]:
+    """Places, among the shapes of a ``scene``, of those that reflect or bend light into single directions."""
+    polished = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
+    shapes = enumerate(scene.shapes())
+    return tuple(number for number, shape in shapes if shape.bsdf() is not None and shape.bsdf().flags() & polished)
