@@ -58,7 +58,7 @@ docs: $(DOCS_READY)
 # All figures of docs/robustness.md anew, by all tests that are marked with `robustness`.
 robustness: setup
 	@rm -f docs/_build/robustness.json
-	@$(VENV)/bin/python -m pytest -m robustness $(PARALLEL) --robustness docs/robustness.md
+	@$(VENV)/bin/python -m pytest -m robustness $(PARALLEL) --robustness=docs/robustness.md
 
 # Planted bugs that the quick tests must see; not part of any test run.
 mutants: setup

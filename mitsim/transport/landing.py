@@ -43,7 +43,7 @@ def landing(receiver: Receiver, si: mi.SurfaceInteraction3f, direction: mi.Vecto
     ray, length = mi.Ray3f(si.p, direction, si.time, si.wavelengths), mi.Float(0)
 
     def further(active: mi.Bool, ray: mi.Ray3f, length: mi.Float) -> tuple[object, ...]:
-        met = passage.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
+        met = passage.next_surface(ray, active)
         before = inverse @ met.p
         active &= met.is_valid() & (before.z > 0)
         passed = passage.through(met, ray.d, active)

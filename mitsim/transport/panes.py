@@ -215,7 +215,7 @@ class _Search:
         """A ``ray`` beyond the next surface before the target; what is opaque stops its light, not the search."""
         origin = ray.place + ray.direction * ray.clear
         onward = mi.Ray3f(origin, ray.direction, self.si.time, self.si.wavelengths)
-        met = self.passage.scene.ray_intersect(onward, mi.RayFlags.All, False, ray.active)
+        met = self.passage.next_surface(onward, ray.active)
         distance = met.t + ray.clear
         before = ray.active & met.is_valid() & (distance < self.reach(ray))
         place_a, place_b = ray.moved(distance, met.n)

@@ -97,7 +97,7 @@ class Passage:
         ray = self.leaving_to(si, target)
 
         def further(active: mi.Bool, ray: mi.Ray3f, part: mi.Spectrum) -> tuple[mi.Bool, mi.Ray3f, mi.Spectrum]:
-            met = self.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
+            met = self.next_surface(ray, active)
             active &= met.is_valid()
             part = dr.select(active, part * self.straight(met, active), part)
             active &= dr.max(part) > 0
@@ -136,7 +136,7 @@ class Passage:
             return visit(si, ray.d, light, si.is_valid(), state)
 
         def further(active: mi.Bool, ray: mi.Ray3f, light: mi.Spectrum, *state: object) -> tuple[object, ...]:
-            si = self.scene.ray_intersect(ray, mi.RayFlags.All, True, active)
+            si = self.next_surface(ray, active, coherent=True)
             active &= si.is_valid()
             # Before the visit, which may turn the surface to where it is seen from.
             passed = self.through(si, ray.d, active)
@@ -147,6 +147,23 @@ class Passage:
 
         begun = mi.Bool(True), ray, light, *state
         return dr.while_loop(begun, lambda active, *_: active, further)[3:]  # type: ignore[no-any-return]
+
+    def next_surface(self, ray: mi.Ray3f, active: mi.Bool, coherent: bool = False) -> mi.SurfaceInteraction3f:
+        """Where a ray that goes on meets the next surface: never behind its start, so that it gets on.
+
+        Of triangles as long and thin as those of a wire, single precision may put the point 0.01 mm along the wire,
+        behind the ray's start; then it is the ray's own.
+
+        Parameters
+        ----------
+        ray, active
+            rays, and the lanes that count.
+        coherent
+            whether rays of neighbouring lanes are alike, which are found faster.
+        """
+        si = self.scene.ray_intersect(ray, mi.RayFlags.All, coherent, active)
+        si.p = dr.select(dr.dot(si.p - ray.o, ray.d) > 0, si.p, ray(si.t))
+        return si
 
     @staticmethod
     def straight(si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
