@@ -11,8 +11,8 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 def test_a_ray_gets_on_beside_a_long_thin_triangle() -> None:
-    """Of triangles of 136 x 0.007 mm, a wire's, Mitsuba has points behind the ray's start; a ray that went on from there
-    would meet them for ever. (Planted: the surface's point as Mitsuba has it.)"""
+    """Of triangles of 136 x 0.007 mm, a wire's, Mitsuba has points behind the ray's start; a ray that went on from
+    there would meet them for ever. (Planted: the surface's point as Mitsuba has it.)"""
     wire = mi.Mesh("wire", vertex_count=3, face_count=1)
     parameters = mi.traverse(wire)
     corners = np.array([[94.29, -22.52, 369.56], [-37.09, 14.19, 353.72], [-37.09, 14.197, 353.72]])
