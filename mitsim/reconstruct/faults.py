@@ -36,6 +36,11 @@ STEPS = (
     "one step early: each shot shows the pattern of the next",
 )
 """Ways in which shots are a step beside their patterns."""
+_COSTS, _FEWEST_PAIRS = 0.5, 4
+"""Of the noise's energy, from which a lamp of other power from shot to shot is named: uncertainties are then a fifth
+too small; and the fewest pairs that tell a median."""
+_MEDIAN_SQUARE = 0.455
+"""Median of the square of a normal number of variance 1."""
 _QUIET, _AVERAGED = 0.5, 0.01
 """Part of the sensor's noise, without rounding, that frames may have at least: half where numbers are digital, stated
 gains are that wrong; where they are not, means of up to 100 shots may have been given."""
@@ -67,8 +72,10 @@ class FrameCheck(LeaveOneOut):
         found = [*self._same(sums), *self._clipped(sums), *self._noiseless(sums)]
         suspects = self._suspects(sums, beside_noise)
         if suspects is None:  # too many
-            return tuple(found)
+            return tuple(found or self._flicker(sums))
         named = self._explained(sums, beside_noise, fits, *suspects) if suspects[0] else []
+        if not named and not found:
+            return tuple(self._flicker(sums))
         # What is known without the model is said where that does not say more; of clipped frames it explains the rest.
         clipped = {number for fault in found if fault.fault is Fault.CLIPPED for number in fault.numbers}
         named = [fault for fault in named if not clipped & set(fault.numbers)]
@@ -224,6 +231,27 @@ class FrameCheck(LeaveOneOut):
             for (pattern, half), count in sums.clipped.items():
                 numbers = [self.number[(*pattern, (1 - 2 * half) if self.signed else 0)]]
                 yield self.fault(Fault.CLIPPED, numbers, f"has {count} readings at its largest number")
+
+    def _flicker(self, sums: FrameSums) -> Iterable[FrameFault]:
+        """All shots, where the sums of signed pairs, which are one and the same light, tell that the lamp's power
+        differs from shot to shot by what costs more than part of the noise."""
+        powers = [(pattern, *power) for pattern, power in sums.powers.items()]
+        if len(powers) < _FEWEST_PAIRS or not self.manifest.digital.noise_is_stated:
+            return
+        noise = np.array([self.noise.variance[pattern] * self.size for pattern, *_ in powers])
+        common, apart, whole, difference = np.array([power for _, *power in powers]).T
+        # Behind a mask with a constant term the solver takes part of the light alone.
+        taken = np.array([sums.energy[pattern] for pattern, *_ in powers]) / difference
+        cost = taken * (np.square(common) * difference + np.square(apart) * whole)
+        times = float(np.median(cost / np.maximum(noise, np.finfo(float).tiny))) / _MEDIAN_SQUARE
+        if times > _COSTS:
+            differ = 100 * float(np.sqrt(np.square(common).mean() + np.square(apart).mean()))
+            yield self.fault(
+                Fault.FLICKER,
+                list(range(len(self.shots))),
+                f"differ by {differ:.2g} % in their lamp's power, as sums of pairs tell, which puts {times:.2g} times "
+                "the noise into the image: use a steadier lamp, or expose for whole periods of it",
+            )
 
     def _noiseless(self, sums: FrameSums) -> Iterable[FrameFault]:
         """Frames with less noise than their sensor has: only where readings can show it."""

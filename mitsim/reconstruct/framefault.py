@@ -20,6 +20,7 @@ class Fault(Enum):
     SHIFTED = "shifted"
     CLIPPED = "clipped"
     NOISELESS = "free of noise"
+    FLICKER = "of another lamp power each"
 
 
 @dataclass(frozen=True)

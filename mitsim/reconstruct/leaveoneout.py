@@ -30,6 +30,8 @@ CHANCE = 6.0
 """Standard deviations of a frame's noise energy that are left to chance: 1e-9 for each of up to 65536 shots."""
 OFF = 7e-3
 """Part of a frame, rms, by which it may be off: twice what all measurements together may, as print is not averaged."""
+_ALIKE = 1e-3
+"""Square of the sine between sum and difference of a pair's halves, below which one of them is as good as black."""
 _SETTLED, _MOST_STEPS = 0.1, 100
 """Of :data:`CHANCE`, the energy below which a step of foretelling changes nothing that counts; and the most steps,
 which patterns that know nothing of each other do not need: chosen."""
@@ -43,7 +45,9 @@ class FrameSums:
     of the measurement as the solver takes it. ``sums``: of signed patterns, energy by which the halves' sum differs
     from that of all others. ``halves``: light of a signed pattern's shots. ``digests``: patterns, and which of their
     shots, by a number that frames which are one and the same share. ``clipped``: of the shots that are, readings at
-    their largest number.
+    their largest number. ``powers``: of signed patterns, how much brighter than their pair's mean light both halves
+    are, and the first beside the second, as parts of it, by what the sum of the halves differs from that of all others;
+    and the energies of sum and difference. Patterns with a black half do not tell the two apart.
     """
 
     counts: tuple[int, int]
@@ -58,6 +62,7 @@ class FrameSums:
         self.digests: dict[int, list[tuple[Pattern, int]]] = {}
         self.clipped: dict[tuple[Pattern, int], int] = {}
         self.halves: dict[Pattern, tuple[float, float]] = {}
+        self.powers: dict[Pattern, tuple[float, float, float, float]] = {}
 
     def add(self, measurement: Measurement, residual: float, power: float, energy: float, total: FloatArray) -> None:
         """Count in one measurement.
@@ -85,6 +90,15 @@ class FrameSums:
             # light - (total - light) / others
             beyond = (measurement.light * (1 + others) - total) / others
             self.sums[pattern] = sum_of_squares(beyond)
+            both, signed = measurement.light, measurement.frame
+            # beyond = common both + apart signed, by least squares.
+            whole, difference, shared = sum_of_squares(both), sum_of_squares(signed), float(np.vdot(both, signed))
+            square = whole * difference - shared**2
+            if square > _ALIKE * whole * difference:
+                with_both, with_signed = float(np.vdot(beyond, both)), float(np.vdot(beyond, signed))
+                common = (with_both * difference - with_signed * shared) / square
+                apart = (with_signed * whole - with_both * shared) / square
+                self.powers[pattern] = common, apart, whole, difference
 
 
 class LeaveOneOut:

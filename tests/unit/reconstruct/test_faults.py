@@ -128,6 +128,28 @@ def test_frames_that_are_exchanged_are_named(patterns: str) -> None:
     assert said.fault.name == "SWAPPED" and said.numbers == (2, 5)
 
 
+def powered(frames: Frames, powers: np.ndarray) -> Frames:
+    """The frames with the lamp at these powers."""
+    own = BLACK + GAIN * DARK
+    return [own + (each - own) * power for each, power in zip(frames, powers, strict=True)]
+
+
+@pytest.mark.parametrize("patterns", ["hadamard:4", "hadamard:8"])
+def test_a_lamp_that_flickers_between_the_halves_of_pairs(patterns: str) -> None:
+    """All pairs have the same sum; power that differs from shot to shot goes into their differences, slow drift does
+    not. (Planted: the part common to both halves alone; any cost allowed.)"""
+    count = 2 * int(patterns.split(":")[1]) ** 2
+    flicker = 1 + 0.04 * np.random.default_rng(5).standard_normal(count)
+    found = image(patterns, lambda frames: powered(frames, flicker))
+    assert not found.ok and found.misfit is not None
+    (said,) = found.misfit.faults
+    assert said.fault.name == "FLICKER" and said.numbers == tuple(range(count))
+    differs = float(said.words.split("differ by ")[1].split(" %")[0])
+    assert abs(differs / (100 * flicker.std()) - 1) < 0.15
+    assert image(patterns, lambda frames: powered(frames, np.linspace(1, 0.99, count))).ok
+    assert image(patterns, list).ok
+
+
 @pytest.mark.parametrize("pair", [(6, 17), (3, 23), (4, 30)])
 def test_halves_of_two_pairs_exchanged(pair: tuple[int, int]) -> None:
     """Their other halves exchanged would do as well, but for a comb over the image."""
