@@ -35,13 +35,14 @@ def started(command: Sequence[str], session: bool) -> subprocess.Popen[str]:
 
 def running(least: int | str, *arguments: object, session: bool = False) -> subprocess.Popen[str]:
     """Start mitsim; back as soon as ``least`` frames, or the file of that name, are written; for 0 as soon as the
-    output folder is there. ``session``: in a process group of its own, which a terminal would have signalled."""
+    output folder is there, or it is over. ``session``: in a process group of its own, which a terminal would have
+    signalled."""
     folder = Path(str(arguments[arguments.index("-o") + 1]))
     command = [sys.executable, "-m", "mitsim", *map(str, arguments)]
     process = started(command, session)
     limit = time.monotonic() + 120
     wanted, count = (least, 1) if isinstance(least, str) else ("frame_*.exr", least)
-    while len(list(folder.glob(wanted))) < count or not folder.exists():
+    while (len(list(folder.glob(wanted))) < count or not folder.exists()) and process.poll() != 0:
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < limit
         time.sleep(0.001)

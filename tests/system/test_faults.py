@@ -58,8 +58,9 @@ def stopped(call: Callable[..., Any], lab: Any, run: Path, whole: Path, how: sig
     done = cut_short(how, least, "capture", *lab.rig, "-o", run, "--patterns", PATTERNS, "--json")
     said = {signal.SIGINT: "mitsim: interrupted" + RESUME, signal.SIGTERM: "mitsim: ended by SIGTERM" + RESUME}
     status = -how if how == signal.SIGKILL else 128 + how
-    assert (done.returncode, done.stderr) == (status, said.get(how, ""))
-    # The last frames take milliseconds: the signal may find the result printed, but then all of it.
+    # The last frames take milliseconds: the signal may find the result printed, but then all of it, or the run over.
+    if least < 490 or done.returncode != 0:
+        assert (done.returncode, done.stderr) == (status, said.get(how, ""))
     assert done.stdout == "" or (least >= 490 and json.loads(done.stdout)["frames"] == 512)
     assert len(list(run.glob("frame_*.exr"))) >= least
     assert_resumed(call, lab, run, whole)
