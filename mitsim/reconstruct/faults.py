@@ -238,13 +238,16 @@ class FrameCheck(LeaveOneOut):
         powers = [(pattern, *power) for pattern, power in sums.powers.items()]
         if len(powers) < _FEWEST_PAIRS or not self.manifest.digital.noise_is_stated:
             return
-        noise = np.array([self.noise.variance[pattern] * self.size for pattern, *_ in powers])
-        common, apart, whole, difference = np.array([power for _, *power in powers]).T
+        variance = np.array([self.noise.variance[pattern] for pattern, *_ in powers])
+        common, apart, whole, difference, square = np.array([power for _, *power in powers]).T
         # Behind a mask with a constant term the solver takes part of the light alone.
         taken = np.array([sums.energy[pattern] for pattern, *_ in powers]) / difference
         cost = taken * (np.square(common) * difference + np.square(apart) * whole)
-        times = float(np.median(cost / np.maximum(noise, np.finfo(float).tiny))) / _MEDIAN_SQUARE
-        if times > _COSTS:
+        noise = np.maximum(variance * self.size, np.finfo(float).tiny)
+        # What noise makes of it, where halves are alike, or one is black for the most part.
+        chance = taken * variance * (np.square(whole) + np.square(difference)) / square
+        times = float(np.median(cost / noise)) / _MEDIAN_SQUARE
+        if times > _COSTS + CHANCE * float(np.median(chance / noise)):
             differ = 100 * float(np.sqrt(np.square(common).mean() + np.square(apart).mean()))
             yield self.fault(
                 Fault.FLICKER,

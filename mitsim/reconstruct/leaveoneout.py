@@ -47,7 +47,8 @@ class FrameSums:
     shots, by a number that frames which are one and the same share. ``clipped``: of the shots that are, readings at
     their largest number. ``powers``: of signed patterns, how much brighter than their pair's mean light both halves
     are, and the first beside the second, as parts of it, by what the sum of the halves differs from that of all others;
-    and the energies of sum and difference. Patterns with a black half do not tell the two apart.
+    and the energies of sum and difference with the determinant of their products. Patterns with a black half do not
+    tell the two apart.
     """
 
     counts: tuple[int, int]
@@ -62,7 +63,7 @@ class FrameSums:
         self.digests: dict[int, list[tuple[Pattern, int]]] = {}
         self.clipped: dict[tuple[Pattern, int], int] = {}
         self.halves: dict[Pattern, tuple[float, float]] = {}
-        self.powers: dict[Pattern, tuple[float, float, float, float]] = {}
+        self.powers: dict[Pattern, tuple[float, float, float, float, float]] = {}
 
     def add(self, measurement: Measurement, residual: float, power: float, energy: float, total: FloatArray) -> None:
         """Count in one measurement.
@@ -98,7 +99,7 @@ class FrameSums:
                 with_both, with_signed = float(np.vdot(beyond, both)), float(np.vdot(beyond, signed))
                 common = (with_both * difference - with_signed * shared) / square
                 apart = (with_signed * whole - with_both * shared) / square
-                self.powers[pattern] = common, apart, whole, difference
+                self.powers[pattern] = common, apart, whole, difference, square
 
 
 class LeaveOneOut:
