@@ -62,7 +62,10 @@ def stopped(call: Callable[..., Any], lab: Any, run: Path, whole: Path, how: sig
     if least < 490 or done.returncode != 0:
         words = said.get(how, "")
         # Between the folder and its manifest nothing is kept yet.
-        assert done.returncode == status and done.stderr in (words, words.replace(RESUME, "") if least == 0 else words)
+        assert done.returncode == status and done.stderr in (
+            words,
+            words.replace(RESUME, "\n") if least == 0 else words,
+        )
     assert done.stdout == "" or (least >= 490 and json.loads(done.stdout)["frames"] == 512)
     assert len(list(run.glob("frame_*.exr"))) >= least
     assert_resumed(call, lab, run, whole)
