@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from mitsim.study.colour.by_line import reconstruct_colours
     from mitsim.study.metrics import psnr, ssim
 
-__version__ = "0.4.0"
+__version__ = "0.5.0"
 
 _HOMES = {
     "open_bench": "capture.opening",
