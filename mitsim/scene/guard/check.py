@@ -42,6 +42,14 @@ _RIGID = ("mitsim_lensless", "mitsim_projector", "projector")
 """What is turned and moved only."""
 _METALS = ("conductor", "roughconductor")
 """Materials that are copper where nothing else is said."""
+_PLACES = {
+    "to_world": (("Transform",), "a <transform>"),
+    **dict.fromkeys(("center", "p0", "p1", "position"), (("Vector",), "a <point>")),
+    **dict.fromkeys(("radius", "scene_distance"), (("Float", "Integer"), "a <float>")),
+    **dict.fromkeys(("face_normals", "flip_normals"), (("Bool",), "a <boolean>")),
+    "filename": (("String",), "a <string>"),
+}
+"""What places and sizes are given by, which mitsim reads before Mitsuba does: types of the property, and its tag."""
 _Type = mi.Properties.Type
 
 
@@ -171,6 +179,9 @@ class _Tree:
 
     def _check_property(self, node: mi.parser.SceneNode, name: str) -> None:
         tag, kind, plugin = self.outline.tag(node, name), node.props.type(name), node.props.plugin_name()
+        kinds, given_by = _PLACES.get(name, ((kind.name,), ""))
+        if kind.name not in kinds:
+            raise tag.refusal(name, f"a {kind.name.lower()}", f"it is given by {given_by}")
         if kind == _Type.Transform:
             matrix = np.array(_words(node, name), dtype=np.float64).reshape(4, 4)
             limits.check_transform(tag, name, matrix, name == "to_world" and plugin in _RIGID)

@@ -23,6 +23,21 @@ def refusal(path: Path, defines: dict[str, str] | None = None, **options: bool) 
     return message
 
 
+@pytest.mark.parametrize(
+    ("shape", "given"),
+    [
+        ('<shape type="sphere"><point name="to_world" x="5" y="5" z="300"/></shape>', "to_world: got a vector"),
+        ('<shape type="sphere"><float name="center" value="3"/></shape>', "center: got a float"),
+        ('<shape type="cylinder"><string name="p1" value="1 2 3"/></shape>', "p1: got a string"),
+        ('<shape type="sphere"><vector name="radius" value="1, 2, 3"/></shape>', "radius: got a vector"),
+    ],
+)
+def test_places_and_sizes_of_another_kind(small_scene: Write, shape: str, given: str) -> None:
+    """(Planted: no kind asked for; a point's ``matrix`` is six of its coordinates.)"""
+    message = refusal(small_scene(extra=shape))
+    assert given in message and "it is given by a <" in message
+
+
 def test_a_good_scene_loads(small_scene: Write) -> None:
     loaded = load_scene(small_scene(mask="flatcam", mask_distance=3))
     assert loaded.pixels.n == 16 and loaded.lamps == () and not loaded.mirrors
