@@ -47,7 +47,6 @@ _PLACES = {
     **dict.fromkeys(("center", "p0", "p1", "position"), (("Vector",), "a <point>")),
     **dict.fromkeys(("radius", "scene_distance"), (("Float", "Integer"), "a <float>")),
     **dict.fromkeys(("face_normals", "flip_normals"), (("Bool",), "a <boolean>")),
-    "filename": (("String",), "a <string>"),
 }
 """What places and sizes are given by, which mitsim reads before Mitsuba does: types of the property, and its tag."""
 _Type = mi.Properties.Type
@@ -181,7 +180,8 @@ class _Tree:
         tag, kind, plugin = self.outline.tag(node, name), node.props.type(name), node.props.plugin_name()
         kinds, given_by = _PLACES.get(name, ((kind.name,), ""))
         if kind.name not in kinds:
-            raise tag.refusal(name, f"a {kind.name.lower()}", f"it is given by {given_by}")
+            got = "an object" if kind == _Type.ResolvedReference else f"a {kind.name.lower()}"
+            raise tag.refusal(name, got, f"it is given by {given_by}")
         if kind == _Type.Transform:
             matrix = np.array(_words(node, name), dtype=np.float64).reshape(4, 4)
             limits.check_transform(tag, name, matrix, name == "to_world" and plugin in _RIGID)
