@@ -382,5 +382,5 @@ def test_paces_are_measured_of_what_was_chosen_alone(bench: Bench) -> None:
     simulation = Simulation(bench, Settings(depth=400.0, anchors=2))
     timed = planning._timed(EVIDENCE, simulation, np.arange(bench.n**2), 0)
     for name in ("direct", "anchored"):
-        assert 0 < getattr(timed, name).seconds < 1e-4, "a path takes microseconds at most, a sample of them far more"
+        assert 0 < getattr(timed, name).seconds < 1e-3, "a path takes microseconds at most, a sample of them far more"
     assert timed.indirect == EVIDENCE.indirect and timed.followed == EVIDENCE.followed
