@@ -88,16 +88,21 @@ def test_the_raster_gives_the_closed_forms_frame(kind: str) -> None:
     assert np.sqrt(np.mean(np.square(geometric - expected))) > 3e-3 * expected.mean()
 
 
+def off_the_closed_form(camera: CameraGeometry, lines: Spectrum, cells: int) -> float:
+    """What a frame of uniform light from so many ``cells`` a side differs by, drawn and in closed form, relative."""
+    at, light, row = Directions.cells(np.linspace(-0.15, 0.15, cells + 1)), np.ones((cells, cells)), np.arange(cells)
+    expected = sum(left @ light @ right.T for left, right in shadow_terms(camera, at, at, 400.0, lines))
+    drawn = replace(ShadowGeometry.of(camera, 400.0), mask=raster(camera, 400.0, lines))
+    frame = Correlation(drawn, at, at).image(light, row, row)
+    return float(np.linalg.norm(frame - expected) / np.linalg.norm(expected))
+
+
 @pytest.mark.parametrize(("feature", "order"), [(0.006, 5), (0.001, 7)])
 def test_waves_beyond_a_small_mask_are_drawn(feature: float, order: int) -> None:
     """Masks of 0.2 and 0.1 mm, 2 mm off, light a sensor of 0.5 mm by waves, features far below a pixel: to 3e-3 of the
     closed form's frame. (Planted: a raster as wide as the mask: half of it is missing.)"""
     camera = made(kind="separable", order=order, feature_mm=feature, over_etch_um=1e-6)
-    at, light, row = Directions.cells(np.linspace(-0.15, 0.15, 41)), np.ones((40, 40)), np.arange(40)
-    expected = sum(left @ light @ right.T for left, right in shadow_terms(camera, at, at, 400.0, LINES))
-    drawn = replace(ShadowGeometry.of(camera, 400.0), mask=raster(camera, 400.0, LINES))
-    frame = Correlation(drawn, at, at).image(light, row, row)
-    assert np.linalg.norm(frame - expected) < 3e-3 * np.linalg.norm(expected)
+    assert off_the_closed_form(camera, LINES, 40) < 3e-3
 
 
 def test_waves_of_too_many_points_are_refused() -> None:
@@ -112,11 +117,7 @@ def test_fringes_of_far_edges_do_not_add_up() -> None:
     (Planted: the field at points, not its means from one to the next: 2.5e-3.)"""
     profile = MaskProfile(kind="separable", feature_mm=0.06, over_etch_um=1e-9)
     camera, line = profile.worn(CameraGeometry(pixels=64), Path()), Spectrum(np.array([562.0]), np.ones(1))
-    at, light, row = Directions.cells(np.linspace(-0.15, 0.15, 65)), np.ones((64, 64)), np.arange(64)
-    expected = sum(left @ light @ right.T for left, right in shadow_terms(camera, at, at, 400.0, line))
-    drawn = replace(ShadowGeometry.of(camera, 400.0), mask=raster(camera, 400.0, line))
-    frame = Correlation(drawn, at, at).image(light, row, row)
-    assert np.linalg.norm(frame - expected) < 5e-4 * np.linalg.norm(expected)
+    assert off_the_closed_form(camera, line, 64) < 5e-4
 
 
 def test_sharpened_cells_are_read_half_as_blurred() -> None:
