@@ -114,10 +114,7 @@ def light_bytes(bench: Bench, classes: int, settings: Settings, lines: int = 1) 
     if settings.raster or geometry.drawn(geometry.diffracts):
         factors = max(
             0.0 if settings.raster else factors,
-            raster_bytes(
-                geometry.model_copy(update={"mask_cells": settings.raster_cells}),
-                bench.waves,
-            ),
+            raster_bytes(geometry.model_copy(update={"mask_cells": settings.raster_cells}), bench.waves),
         )
     held = lines * GROUPS * filed * _ENTRY_BYTES + min(lines, workers()) * paths * deposit_bytes(settings)
     return factors + _LANES_BYTES + _FOLLOWED_BYTES * followed + held

@@ -53,9 +53,9 @@ class WrongPairs:
                 int(place % self.session.count),
                 lamp,
             )
-        for own, pairs in zip(self.session.sides, self.session.pairs, strict=True):
+        for number, (own, pairs) in enumerate(zip(self.session.sides, self.session.pairs, strict=True)):
             fluxes = pairs.rows.mean(axis=2)
-            if self.session.good[self.session.sides.index(own) * self.session.count] and fluxes[0, 0] < fluxes[0, 1]:
+            if self.session.good[number * self.session.count] and fluxes[0, 0] < fluxes[0, 1]:
                 own.faults.append(
                     SessionFault(
                         own.side,

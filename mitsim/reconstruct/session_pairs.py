@@ -25,7 +25,7 @@ _LEAST = 2e-3
 _EXCESS = 2.0
 """Squared deviation of a pair's sum, over that of the others, that counts at least."""
 _EXPLAINED = 0.05
-"""Part of a faulty frame's squared deviation that the fault's name may leave unexplained."""
+"""Part of two sums' squared deviation that is left where their frames are exchanged."""
 _TURNS = 3
 """Steps in which noise and flicker, which hang on each other, are found: a fourth changes no digit."""
 _ROUNDING = 1e-6
@@ -190,22 +190,22 @@ class Pairs:
             costs.append((moved / size, added / size + self.flicker**2, own.noise * self.count / size))
         moved, shaken, noise = (float(np.sqrt(np.sum(part))) for part in zip(*costs, strict=True))
         drifts = bool(np.ptp(trend) > _DEVIATIONS * self.steady and moved > MATTERS * noise)
-        flickers = bool(flicker and shaken > MATTERS * noise)
-        if not drifts and not flickers:
+        shakes = bool(flicker and shaken > MATTERS * noise)
+        if not drifts and not shakes:
             return Lamp()
-        used = powers if flickers else trend
+        used = powers if shakes else trend
         # The uniform response is the mean of both sides' first ones, which had a power of their own.
         scale = float(np.sqrt((used[0] + used[self.count]) / 2)) if good[0] and good[self.count] else 1.0
         remaining = 0.0
         for number, own in enumerate(self.sides):
-            self._divided(number, own, self.side_of(number, used), flicker if flickers else 0.0)
+            self._divided(number, own, self.side_of(number, used), flicker if shakes else 0.0)
             own.rescale(scale)
             remaining += float(own.extras.sum() / np.sum(np.square(own.vectors)))
         return Lamp(
             drift=end_to_end(self.times.mean(axis=1), trend) if drifts else 0.0,
-            flicker=flicker if flickers else 0.0,
+            flicker=flicker if shakes else 0.0,
             drift_cost=moved if drifts else 0.0,
-            flicker_cost=shaken if flickers else 0.0,
+            flicker_cost=shaken if shakes else 0.0,
             remaining=float(np.sqrt(remaining)),
             corrected=True,
         )

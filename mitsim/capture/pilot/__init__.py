@@ -244,7 +244,7 @@ class Look:
     def _left_out(self) -> LeftOut:
         return _left_out(self.switched.simulation, self.seed)
 
-    def _of_lines(self, pixels: tuple[int, ...]) -> tuple[float, float]:
+    def _rows_and_columns(self, pixels: tuple[int, ...]) -> tuple[float, float]:
         """Parts of the projector's rows and of its columns that ``pixels`` lie in."""
         rows, columns = (np.unique(each).size / self.bench.n for each in np.divmod(pixels, self.bench.n))
         return rows, columns
@@ -300,7 +300,7 @@ class Look:
             shared=shared,
             repeats=repeats,
             from_camera=switched.effort("from_camera"),
-            forming=replace(self.forming, lines=self._lines, occluded=self._of_lines(self._base.occluded)),
+            forming=replace(self.forming, lines=self._lines, occluded=self._rows_and_columns(self._base.occluded)),
             apart=switched.apart,
             unresolved=unresolved / (self._light + sharp.irradiance + unmet) if unresolved else 0.0,
             left_out=left_out / (left_out + found) if left_out else 0.0,
