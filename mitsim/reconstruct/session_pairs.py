@@ -25,7 +25,8 @@ _LEAST = 2e-3
 _EXCESS = 2.0
 """Squared deviation of a pair's sum, over that of the others, that counts at least."""
 _EXPLAINED = 0.05
-"""Part of two sums' squared deviation that is left where their frames are exchanged."""
+"""Scatter of the sums of frames and their other neighbours, over that of pairs' sums, below which frames are one step
+out of order."""
 _TURNS = 3
 """Steps in which noise and flicker, which hang on each other, are found: a fourth changes no digit."""
 _ROUNDING = 1e-6
