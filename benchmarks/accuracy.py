@@ -34,16 +34,16 @@ import numpy as np
 import numpy.typing as npt
 
 import mitsim as ms
-from mitsim.capture.choice import predicted
-from mitsim.capture.evidence import Estimate
-from mitsim.capture.exposer import Exposer
-from mitsim.capture.light import Sampling, trace_light
-from mitsim.capture.planning import make_plan
-from mitsim.core.framefile import read_frame
+from mitsim.acquire.exposure import Exposer
+from mitsim.core.exr import read_frame
 from mitsim.core.job import Job
 from mitsim.core.seeds import integer
+from mitsim.light.light import Sampling, trace_light
+from mitsim.light.settings import Estimate
 from mitsim.optics.frames import monte_carlo_bound, monte_carlo_error
-from mitsim.study.knobs import Stand
+from mitsim.planner.choose import predicted
+from mitsim.planner.planner import make_plan
+from mitsim.studies.framework.knobs import Stand
 
 SCENES = (
     *("photograph", "colour_chart", "resolution_target", "keystone", "gift_card", "corner", "cards", "metal_blade"),

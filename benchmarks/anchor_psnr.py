@@ -21,9 +21,9 @@ from collections.abc import Iterator
 import numpy as np
 from skimage import color, data
 
+from mitsim.metrics import psnr
 from mitsim.reconstruct.solver import prepare
-from mitsim.study.metrics import psnr
-from mitsim.study.solver_cost import dots, paper_factor
+from mitsim.studies.solver import dots, paper_factor
 
 N = 128
 PHOTOGRAPHS = ("astronaut", "camera", "coffee", "chelsea", "rocket", "moon", "hubble_deep_field", "coins")

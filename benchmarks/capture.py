@@ -21,8 +21,8 @@ import time
 from pathlib import Path
 
 import mitsim as ms
-from mitsim.core.versions import versions
-from mitsim.study import find_study
+from mitsim.core.environment import versions
+from mitsim.studies import find_study
 
 SCENE, PATTERNS, ACCURACY = "photograph", "dots:7", 1e-3
 

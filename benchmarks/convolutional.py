@@ -4,12 +4,12 @@
         [--sensor whole cropped] [--periods 1 2 3 5 7]
 
 PICTURE shows the point spread function, such as `psf_sample.tif` of the repository Waller-Lab/DiffuserCam-Tutorial (BSD
-3-Clause); ``rendered`` takes that of a diffuser that Mitsuba traces (mitsim.transport.diffuser). A scene of 128 x 128
+3-Clause); ``rendered`` takes that of a diffuser that Mitsuba traces (mitsim.transport.plugins.diffuser). A scene of 128 x 128
 pixels; the sensor is as large as the picture (cropped), or gets all light (whole); electronics of
 calibration/imx249.toml.
 
 Quality: PSNR at the best lambda to a quarter of a decade, peak 1, no gain or offset fit; under equal peak and equal
-frame exposure (mitsim.study.exposures).
+frame exposure (mitsim.report.exposures).
 
 Speed: CPU seconds on one thread, all within this run. Iterative: conjugate gradients on frames, to two marks: an error
 against the truth within 1 % of the direct solution's (0.09 dB; residual 1e-6), and a difference from it below 1e-6
@@ -34,15 +34,15 @@ from solver import dots, frames_of, paper_factor, summed
 
 from mitsim.core.configuration import shipped
 from mitsim.core.parallel import single_threaded_blas
+from mitsim.devices.mask_profile import load_psf
+from mitsim.devices.patterns import parse_patterns
+from mitsim.devices.sensor import load_sensor
+from mitsim.metrics import psnr
 from mitsim.reconstruct.convolution import ConvolutionalCamera
 from mitsim.reconstruct.dots import Classes
 from mitsim.reconstruct.solver import prepare
-from mitsim.rig.patterns import parse_patterns
-from mitsim.rig.psf import load_psf
-from mitsim.rig.sensor import load_sensor
-from mitsim.study.diffusercam import best_image, race, take
-from mitsim.study.exposures import CONVENTIONS
-from mitsim.study.metrics import psnr
+from mitsim.report.exposures import CONVENTIONS
+from mitsim.studies.diffusercam import best_image, race, take
 
 N = 128
 PERIODS = (1, 2, 3, 5, 7)
@@ -78,7 +78,7 @@ def quality(psf: np.ndarray, case: Case, seed: int) -> Iterator[Row]:
 
 
 def speed(psf: np.ndarray, case: Case, seed: int) -> Iterator[Row]:
-    """CPU seconds of both solvers (mitsim.study.diffusercam.race)."""
+    """CPU seconds of both solvers (mitsim.studies.diffusercam.race)."""
     sensor, truth = load_sensor(shipped("calibration", "imx249.toml")), photograph(PHOTOGRAPHS[0], False)
     classes, whole = (Classes(camera_of(psf, cropped), case[1]) for cropped in (case[0], False))
     row = race(classes, whole, truth, sensor, seed)
@@ -103,7 +103,7 @@ def rendered(reduce: int) -> np.ndarray:
     from mitsim.core.environment import load_variant
 
     load_variant("llvm_ad_mono")
-    from mitsim.transport.diffuser import Diffuser, point_spread
+    from mitsim.transport.plugins.diffuser import Diffuser, point_spread
 
     return point_spread(Diffuser(), (1200 // reduce, 1600 // reduce), 5.86e-3 * reduce)
 

@@ -5,7 +5,7 @@
 
 Shipped prints, and shades of noise, lie 400 mm before a small camera of 64 x 64 sensor and n x n scene pixels. What
 print within a pixel does is the same in all sessions of a print, so each session takes the next of ``--places`` ways to
-lay it: a part of 7/8 anywhere, turned. Light of board and prints is traced once. RESULT.json holds, by print and
+lay it: a part of 7/8 anywhere, turned. SampledLight of board and prints is traced once. RESULT.json holds, by print and
 family, the part of all pixels of all sessions that are within 1.96 standard uncertainties of the truth, and the rms of
 error over uncertainty; an interrupted run goes on where it was. 200 sessions of four prints and five families take 12
 minutes on two cores.
@@ -32,19 +32,18 @@ from scipy.ndimage import gaussian_filter
 from skimage import data, io
 from skimage.transform import resize
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.calibrate import estimate
-from mitsim.capture.light import Light
-from mitsim.capture.opening import open_bench
-from mitsim.capture.responses import LitSession
-from mitsim.capture.session import Session
+from mitsim.acquire.capture import expose
+from mitsim.api.bench import Bench, open_bench
+from mitsim.calibrate.calibrate import estimate
+from mitsim.calibrate.session import LitSession, Session
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
+from mitsim.devices.camera import centred_edges
+from mitsim.devices.session import load_recipe
+from mitsim.light.light import SampledLight
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.reconstruction import reconstruct
-from mitsim.rig.camera import centred_edges
-from mitsim.rig.recipe import load_recipe
+from mitsim.reconstruct.reconstruct import reconstruct
 
 ROOT = Path(__file__).parent.parent
 PRINTS = ("shades", "photograph", "colour_chart", "resolution_target")
@@ -87,9 +86,9 @@ def calibrated(board: LitSession, seed: int) -> Factors:
     return Factors.of(noisy, CalibrationManifest(camera=camera, centre=session.centre, board_reflectance=reflectance))
 
 
-def session(light: Light, family: str, factors: Factors, seed: int) -> dict[str, float]:
+def session(light: SampledLight, family: str, factors: Factors, seed: int) -> dict[str, float]:
     """What one image is worth: part of its pixels inside, mean square of error over uncertainty, and what is stated."""
-    shots = light.expose(family, seed=seed, exposure_fraction=EXPOSURE)
+    shots = expose(light, family, seed=seed, exposure_fraction=EXPOSURE)
     image = reconstruct(shots, factors)
     assert image.uncertainty is not None and image.uncertainties is not None and shots.truth is not None
     error = (image.image - shots.truth) / image.uncertainty

@@ -24,11 +24,11 @@ import numpy as np
 from skimage import io
 from skimage.draw import disk
 
-from mitsim.capture.opening import open_bench
+from mitsim.api.bench import open_bench
+from mitsim.metrics import psnr
 from mitsim.reconstruct.depth import Depth
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.reconstruction import reconstruct
-from mitsim.study.metrics import psnr
+from mitsim.reconstruct.reconstruct import reconstruct
 
 ROOT = Path(__file__).parent.parent
 PRINTS = ("photograph", "ramp", "stars", "text")

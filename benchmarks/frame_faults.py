@@ -31,12 +31,12 @@ from skimage import io, transform
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.runs import Capture
+from mitsim.devices.camera import centred_edges
+from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.reconstruction import reconstruct
-from mitsim.rig.camera import centred_edges
-from mitsim.rig.mask import mls_mask
+from mitsim.reconstruct.reconstruct import reconstruct
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))

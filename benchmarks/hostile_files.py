@@ -21,12 +21,13 @@ import OpenEXR
 import scipy.io
 from PIL import Image, ImageCms
 
-from mitsim.core.framefile import write_frame
-from mitsim.core.plainfile import stderr_silenced
-from mitsim.core.versions import versions
-from mitsim.exchange.export import export_run
-from mitsim.study.experiment import Found, Point, Scope, Setup
-from mitsim.study.points import Store
+from mitsim.core.environment import versions
+from mitsim.core.exr import write_frame
+from mitsim.core.files import stderr_silenced
+from mitsim.exchange.formats import export_run
+from mitsim.studies.framework.experiment import Found, Scope
+from mitsim.studies.framework.run import Store
+from mitsim.studies.framework.setup import Point, Setup
 from tests.exchanged import made
 from tests.hard.fuzz import bytes_changed
 from tests.real_session import RealSession

@@ -27,9 +27,9 @@ from skimage import data, io
 from skimage.transform import resize
 
 import mitsim
-from mitsim.reconstruct.reconstruction import accumulated, reconstruct
+from mitsim.metrics import psnr
+from mitsim.reconstruct.reconstruct import accumulated, reconstruct
 from mitsim.reconstruct.regularisation import automatic_lambda
-from mitsim.study.metrics import psnr
 
 SCENES = (
     "photograph", "colour_chart", "resolution_target", "keystone", "lamp_bench", "cards", "corner", "gift_card",

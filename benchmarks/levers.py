@@ -31,14 +31,13 @@ import drjit as dr
 import numpy as np
 
 import mitsim as ms
-from mitsim.capture.bench import Bench
-from mitsim.capture.filing import FiledLight
-from mitsim.capture.simulation import Simulation, Stage
-from mitsim.rig.patterns import PatternFamily, parse_patterns
+from mitsim.api.bench import Bench
+from mitsim.devices.patterns import PatternFamily, parse_patterns
+from mitsim.light.passes import FiledLight, Simulation, Stage
+from mitsim.transport.accumulator import fetched
 from mitsim.transport.direct import DirectTracer
-from mitsim.transport.histogram import INDIRECT
-from mitsim.transport.ledger import fetched
-from mitsim.transport.repeats import block_moments, chosen_repeats
+from mitsim.transport.indirect import block_moments, chosen_repeats
+from mitsim.transport.records import INDIRECT
 
 ROOT = Path(__file__).parents[1]
 SCENES = ("cookie_bag", "corner", "compact_disc", "gift_card", "metal_blade")

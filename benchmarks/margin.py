@@ -28,12 +28,12 @@ import numpy as np
 
 import mitsim as ms
 from mitsim.core.parallel import single_threaded_blas
+from mitsim.metrics import psnr
 from mitsim.optics.separable import best_term
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
 from mitsim.reconstruct.solver import prepare
-from mitsim.study.metrics import psnr
-from mitsim.study.pictures import SIDE, TEST_IMAGES, picture
+from mitsim.studies.framework.pictures import SIDE, TEST_IMAGES, picture
 
 CARD = 11
 """Columns of cells beside the window that the field stop of 20 degrees lets through."""

@@ -16,15 +16,15 @@ from pathlib import Path
 
 import numpy as np
 
-from mitsim.optics.closed_form import FrameOptics, raster_error
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.mask_profile import MaskProfile
+from mitsim.devices.plate import Plate
+from mitsim.devices.projector import Spectrum
+from mitsim.optics.image_formation import FrameOptics, raster_error
+from mitsim.optics.mask_defects import tilted_terms
 from mitsim.optics.separable import best_term
 from mitsim.optics.shadow import Directions, ShadowGeometry, geometric_terms
 from mitsim.optics.terms import shadow_terms
-from mitsim.optics.tilt import tilted_terms
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.plate import Plate
-from mitsim.rig.profile import MaskProfile
-from mitsim.rig.projector import Spectrum
 
 N, HALF = 128, 60 / 400
 DEPTH_MM = 400.0

@@ -3,7 +3,7 @@
     python benchmarks/misfit.py RESULT.json [--seeds 4] [--families ...] [--offsets -2 2 ...] [--prints ...]
 
 The photograph's sheet stands beside the calibrated 400 mm by each of the offsets [mm]; prints of ``--prints`` stand at
-it. Light is traced once for each, and calibration once; the noise of a run is that of its seed. RESULT.json holds, for
+it. SampledLight is traced once for each, and calibration once; the noise of a run is that of its seed. RESULT.json holds, for
 each print, offset and family, an entry a seed: chi-square, the unexplained part of the measurements, its largest by
 tile, their limits, whether the image is flagged, the likely cause, and what the image is off by, rms. An interrupted
 run goes on where it was. 4 seeds of four families, two offsets and three prints are 80 images of 512 x 512 pixels.
@@ -18,11 +18,12 @@ from typing import Any
 
 import numpy as np
 
-from mitsim.capture.light import Light
-from mitsim.capture.opening import open_bench
+from mitsim.acquire.capture import expose
+from mitsim.api.bench import open_bench
+from mitsim.light.light import SampledLight
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import UNEXPLAINED, UNEXPLAINED_TILE
-from mitsim.reconstruct.reconstruction import reconstruct
+from mitsim.reconstruct.reconstruct import reconstruct
 
 ROOT = Path(__file__).parent.parent
 FAMILIES = ("uniform", "dots:4", "dots:7", "hadamard:8")
@@ -31,16 +32,16 @@ DISTANCE = 400.0
 """Of the calibration's board and of fitting prints [mm]."""
 
 
-def light(name: str, offset: float) -> Light:
-    """Light of a shipped scene whose sheet is moved by ``offset`` [mm]."""
+def light(name: str, offset: float) -> SampledLight:
+    """SampledLight of a shipped scene whose sheet is moved by ``offset`` [mm]."""
     scene = ROOT / "scenes" / name / "scene.xml"
     bench = open_bench(scene, sheet_z=f"{DISTANCE + offset:g}") if offset else open_bench(scene)
     return bench.light(accuracy=1e-3)
 
 
-def judged(traced: Light, family: str, seed: int, factors: Factors) -> dict[str, Any]:
+def judged(traced: SampledLight, family: str, seed: int, factors: Factors) -> dict[str, Any]:
     """What the misfit says of one run."""
-    shots = traced.expose(family, seed=seed)
+    shots = expose(traced, family, seed=seed)
     image = reconstruct(shots, factors)
     found = image.misfit
     assert found is not None and shots.truth is not None
@@ -78,7 +79,7 @@ def main() -> None:
     done = json.loads(options.result.read_text()) if options.result.is_file() else {}
     factors: Factors | None = None
     for name, offset in [("photograph", offset) for offset in options.offsets] + [(one, 0.0) for one in options.prints]:
-        traced: Light | None = None
+        traced: SampledLight | None = None
         for family in options.families:
             case = f"{name} {offset:+g} mm {family}"
             runs = done.setdefault(case, [])

@@ -25,12 +25,12 @@ from typing import Any
 
 import numpy as np
 
+from mitsim.devices.camera import CameraGeometry, centred_edges
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.solver import Prepared, prepare
-from mitsim.rig.camera import CameraGeometry, centred_edges
-from mitsim.study.exposures import CONVENTIONS, EQUAL_PEAK, EQUAL_TOTAL
-from mitsim.study.pictures import SIDE, TEST_IMAGES, picture
-from mitsim.study.solver_cost import dots
+from mitsim.report.exposures import CONVENTIONS, EQUAL_PEAK, EQUAL_TOTAL
+from mitsim.studies.framework.pictures import SIDE, TEST_IMAGES, picture
+from mitsim.studies.solver import dots
 
 N, WIDTH_MM = 128, 120.0
 BANDS = {(2.0, 1): (21.0, 23.0), (2.0, 7): (34.0, 35.5), (0.75, 1): (16.9, 19.0), (0.75, 7): (30.0, 30.5)}

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 import mitsim as ms
-from mitsim.capture.calibrate import estimate
-from mitsim.capture.run import digital_scale
-from mitsim.capture.session import Session
+from mitsim.acquire.capture import digital_scale
+from mitsim.calibrate.calibrate import estimate
+from mitsim.calibrate.session import Session
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.reconstruct.factors import Factors

@@ -46,7 +46,7 @@ from typing import Any
 import numpy as np
 
 import mitsim as ms
-from mitsim.core.versions import versions
+from mitsim.core.environment import versions
 
 CAMERAS = ("perspective", "python", "origins", "directions", "bare", "window", "reference", "stratified")
 SAME = ("window", "reference", "stratified")

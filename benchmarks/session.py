@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import mitsim as ms
-from mitsim.core.versions import versions
-from mitsim.rig.recipe import SessionRecipe, load_recipe, recipe_text
+from mitsim.core.environment import versions
+from mitsim.devices.session import SessionRecipe, load_recipe, recipe_text
 
 GOAL = 15.0
 """Seconds that issue 17 allows."""

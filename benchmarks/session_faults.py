@@ -3,7 +3,7 @@
     python benchmarks/session_faults.py RESULT.json [--sessions 20] [--clean 200] [--faults ...] [--seed 0] [--n 64 128]
 
 Sessions of ideal cameras in numpy (a mask's geometric shadow, light that falls off, Poisson and read noise, rounding),
-written as files and read by :func:`mitsim.reconstruct.measured.calibrate_frames`. Each has a camera of its own by its
+written as files and read by :func:`mitsim.reconstruct.captured_session.calibrate_frames`. Each has a camera of its own by its
 seed: 64 or 128 projector pixels, a separable, FlatCam or MURA mask, sensor, read noise, ambient light, repeats, and an
 exposure that leaves 1 to 10 times the anchor calibration's factor error, ``NOISE``. ``--sessions`` of each fault are
 taken, and ``--clean`` of none. RESULT.json has counts with their binomial errors, and quantiles of the actual factor
@@ -22,17 +22,17 @@ from typing import Any
 
 import numpy as np
 
+from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.core.versions import versions
+from mitsim.devices.camera import centred_edges
+from mitsim.devices.mask import mls_mask
+from mitsim.devices.patterns import stripe_signs
+from mitsim.devices.session import SIDES, UNIFORM, Half, Side, taken
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.calibration import predicted_error
+from mitsim.reconstruct.captured_session import calibrate_frames
+from mitsim.reconstruct.estimate_factors import predicted_error
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.measured import calibrate_frames
-from mitsim.rig.camera import centred_edges
-from mitsim.rig.mask import mls_mask
-from mitsim.rig.order import SIDES, UNIFORM, Half, Side, taken
-from mitsim.rig.patterns import stripe_signs
 
 NOISE = 2.3e-3
 """Relative error of both factors, in quadrature, that the shipped session leaves with the anchor camera."""

@@ -24,10 +24,9 @@ from pathlib import Path
 import mpmath
 import numpy as np
 
-from mitsim.reconstruct.accumulator import Accumulator
-from mitsim.reconstruct.reconstruction import reconstruct
-from mitsim.reconstruct.solver import Prepared, prepare
-from mitsim.study.solver_cost import dots, paper_factor
+from mitsim.reconstruct.reconstruct import reconstruct
+from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
+from mitsim.studies.solver import dots, paper_factor
 
 N, K = 128, 7
 EPS = float(np.finfo(np.float64).eps)

@@ -14,7 +14,6 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from mitsim.core.colours import ColourManifest, Line, MosaicManifest
 from mitsim.core.imagelist import Raw
 from mitsim.core.manifests import (
     AmbientFile,
@@ -26,16 +25,15 @@ from mitsim.core.manifests import (
     RunManifest,
     ShotFile,
 )
-from mitsim.rig.board import BoardShape
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.chart import ChartPlace
-from mitsim.rig.drift import Drift
-from mitsim.rig.efficiency import EfficiencyCurve
-from mitsim.rig.framelist import DarkFile, FrameList, StripeFile
-from mitsim.rig.profile import MaskProfile
-from mitsim.rig.projector import Coherence, ProjectorModel
-from mitsim.rig.recipe import SessionRecipe
-from mitsim.rig.sensor import SensorModel
+from mitsim.core.spectral_manifests import ColourManifest, Line, MosaicManifest
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.chart import ChartPlace
+from mitsim.devices.drift import Drift
+from mitsim.devices.framelist import DarkFile, FrameList, StripeFile
+from mitsim.devices.mask_profile import MaskProfile
+from mitsim.devices.projector import Coherence, ProjectorModel
+from mitsim.devices.sensor import EfficiencyCurve, SensorModel
+from mitsim.devices.session import BoardShape, SessionRecipe
 
 FORMATS = Path(__file__).with_name("formats.md")
 MODELS = (

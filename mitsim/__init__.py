@@ -17,55 +17,53 @@ import sys
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+from mitsim.version import __version__ as __version__
+
 if TYPE_CHECKING:
-    from mitsim.capture.bench import Bench
-    from mitsim.capture.light import Light
-    from mitsim.capture.modelling import calibrate_model
-    from mitsim.capture.opening import open_bench
-    from mitsim.capture.plan import Plan
-    from mitsim.capture.render import Rendered
-    from mitsim.capture.request import Request
+    from mitsim.acquire.reference import Rendered
+    from mitsim.api.bench import Bench, open_bench
+    from mitsim.api.light import Light
+    from mitsim.bench.request import Request
+    from mitsim.calibrate.model_fit import calibrate_model
+    from mitsim.calibrate.plan import CalibrationPlan, plan_calibration
     from mitsim.core.errors import ArgumentError, MitsimError
     from mitsim.core.job import Clock, Job
-    from mitsim.core.mosaics import MosaicCapture, load_mosaic
     from mitsim.core.resources import Limits
-    from mitsim.core.runs import Capture, load_run
+    from mitsim.core.runs import Capture, MosaicCapture, load_mosaic, load_run
+    from mitsim.devices.model_fit import Modelling
+    from mitsim.devices.session import load_recipe
+    from mitsim.light.plan import Plan
+    from mitsim.metrics import psnr, ssim
+    from mitsim.reconstruct.captured_session import calibrate_frames
     from mitsim.reconstruct.factors import Factors, load_calibration
-    from mitsim.reconstruct.measured import calibrate_frames
-    from mitsim.reconstruct.reconstruction import reconstruct
+    from mitsim.reconstruct.reconstruct import reconstruct
     from mitsim.reconstruct.result import Reconstruction
-    from mitsim.rig.modelling import Modelling
-    from mitsim.rig.recipe import load_recipe
-    from mitsim.study.calibration_plan import CalibrationPlan, plan_calibration
-    from mitsim.study.colour.by_line import reconstruct_colours
-    from mitsim.study.metrics import psnr, ssim
-
-__version__ = "0.5.0"
+    from mitsim.report.colour.by_line import reconstruct_colours
 
 _HOMES = {
-    "open_bench": "capture.opening",
+    "open_bench": "api.bench",
     "load_run": "core.runs",
-    "load_mosaic": "core.mosaics",
+    "load_mosaic": "core.runs",
     "load_calibration": "reconstruct.factors",
-    "load_recipe": "rig.recipe",
-    "calibrate_frames": "reconstruct.measured",
-    "calibrate_model": "capture.modelling",
-    "plan_calibration": "study.calibration_plan",
-    "reconstruct": "reconstruct.reconstruction",
-    "reconstruct_colours": "study.colour.by_line",
-    "psnr": "study.metrics",
-    "ssim": "study.metrics",
-    "Bench": "capture.bench",
-    "Plan": "capture.plan",
-    "Request": "capture.request",
-    "Light": "capture.light",
+    "load_recipe": "devices.session",
+    "calibrate_frames": "reconstruct.captured_session",
+    "calibrate_model": "calibrate.model_fit",
+    "plan_calibration": "calibrate.plan",
+    "reconstruct": "reconstruct.reconstruct",
+    "reconstruct_colours": "report.colour.by_line",
+    "psnr": "metrics",
+    "ssim": "metrics",
+    "Bench": "api.bench",
+    "Plan": "light.plan",
+    "Request": "bench.request",
+    "Light": "api.light",
     "Capture": "core.runs",
-    "MosaicCapture": "core.mosaics",
-    "CalibrationPlan": "study.calibration_plan",
+    "MosaicCapture": "core.runs",
+    "CalibrationPlan": "calibrate.plan",
     "Factors": "reconstruct.factors",
     "Reconstruction": "reconstruct.result",
-    "Rendered": "capture.render",
-    "Modelling": "rig.modelling",
+    "Rendered": "acquire.reference",
+    "Modelling": "devices.model_fit",
     "Job": "core.job",
     "Clock": "core.job",
     "Limits": "core.resources",

@@ -9,14 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mitsim.core.colours import MosaicManifest
 from mitsim.core.manifests import AmbientFile, Digital, Patterns, RunManifest
-from mitsim.core.mosaics import LineTruth, MosaicCapture
-from mitsim.core.recorders import AMBIENT, RunMemory, frame_name
-from mitsim.core.runs import Capture
+from mitsim.core.runs import AMBIENT, Capture, LineTruth, MosaicCapture, RunMemory, frame_name
+from mitsim.core.spectral_manifests import MosaicManifest
+from mitsim.devices.chart import ChartPlace
+from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.colour import chart
-from mitsim.rig.chart import ChartPlace
-from mitsim.rig.patterns import parse_patterns
 from tests import ideal_sessions
 
 N, LINES = 24, (638.0, 520.0, 445.0)

@@ -147,11 +147,11 @@ def shared_scene(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path
 def variant() -> str:
     """``llvm_ad_mono`` selected and the plugin registered, for tests that use Mitsuba themselves."""
     from mitsim.core.environment import load_variant
-    from mitsim.transport import plugins
+    from mitsim.transport.plugins import all
 
     mi = load_variant("llvm_ad_mono")
     mi.set_log_level(mi.LogLevel.Error)
-    plugins.register()
+    all.register()
     return "llvm_ad_mono"
 
 
@@ -162,7 +162,7 @@ def shipped_bench(variant: str) -> Callable[..., object]:
     No longer: kernels of Dr.Jit hold the surfaces of every scene that is open, so one that stays open makes those of
     all later tests larger, and others than in a process that never had it: they would be compiled anew.
     """
-    from mitsim.capture.opening import open_bench
+    from mitsim.api.bench import open_bench
 
     @cache
     def load(name: str, **defines: str) -> object:

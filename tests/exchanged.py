@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mitsim.core.manifests import AmbientFile, CalibrationManifest, Digital, Patterns, RunHead, RunManifest, ShotFile
-from mitsim.core.recorders import AMBIENT, claimed, frame_name
+from mitsim.core.runs import AMBIENT, claimed, frame_name
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.status import Status, Verdict
 

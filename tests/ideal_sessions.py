@@ -12,14 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from mitsim.core.manifests import CalibrationManifest, Digital, FactorNoise, Patterns, RunManifest
-from mitsim.core.recorders import RunMemory, frame_name
-from mitsim.core.runs import Capture
+from mitsim.core.runs import Capture, RunMemory, frame_name
+from mitsim.devices.camera import centred_edges
+from mitsim.devices.mask import mls_mask
+from mitsim.devices.patterns import parse_patterns
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.status import Status, Verdict
-from mitsim.rig.camera import centred_edges
-from mitsim.rig.mask import mls_mask
-from mitsim.rig.patterns import parse_patterns
 
 N, PIXELS, PITCH = 16, 96, 0.02
 PEAK, READ, GAIN, BLACK, CODES, DARK = 2e4, 4.0, 0.2, 100.0, 2**13, 50.0

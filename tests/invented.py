@@ -1,6 +1,6 @@
 """Sensors that no maker sells: every number stated, for tests of the chain from light to digits."""
 
-from mitsim.rig.sensor import SensorModel
+from mitsim.devices.sensor import SensorModel
 
 
 def sensor(**changes: object) -> SensorModel:

@@ -14,14 +14,14 @@ from typing import Any
 
 import pytest
 
-USERS = ("mitsim.capture.run", "mitsim.capture.session", "mitsim.capture.render")
+USERS = ("mitsim.acquire.capture", "mitsim.calibrate.session", "mitsim.acquire.reference")
 """Modules that plan."""
 _kept: dict[str, Any] = {}
 
 
 def question(bench: Any, lighting: Any, accuracy: float, seed: int, switches: Mapping[str, bool], lines: int) -> str:
     """A digest of all that decides a plan: what is seen, by which rig, in which light, and how well."""
-    from mitsim.core.framefile import checksum
+    from mitsim.core.exr import checksum
 
     files = sorted(checksum(path) for path in bench.loaded.files)
     light = lighting.labels.tobytes(), lighting.weights.tobytes(), lighting.weights.shape
@@ -52,7 +52,7 @@ def keeping(make_plan: Callable[..., Any]) -> Callable[..., Any]:
 @contextmanager
 def plans_kept() -> Iterator[None]:
     """Within, captures, calibrations and renders take plans that are there already."""
-    from mitsim.capture.planning import make_plan
+    from mitsim.planner.planner import make_plan
 
     kept = keeping(make_plan)
     with pytest.MonkeyPatch.context() as patch:

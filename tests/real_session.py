@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from mitsim.core.framefile import write_frame
-from mitsim.rig.order import SIDES
-from mitsim.rig.patterns import stripe_signs
+from mitsim.core.exr import write_frame
+from mitsim.devices.patterns import stripe_signs
+from mitsim.devices.session import SIDES
 
 DIGITAL = {
     "exposure_s": 0.02,

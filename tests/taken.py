@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.exposer import Exposer
-from mitsim.capture.light import Light
-from mitsim.rig.patterns import Lighting
+from mitsim.acquire.exposure import Exposer
+from mitsim.api.bench import Bench
+from mitsim.devices.patterns import Lighting
+from mitsim.light.light import SampledLight
 from mitsim.sensor.chain import electrons_from_irradiance
 
 
@@ -32,8 +32,8 @@ class RealBench:
     """
 
     bench: Bench
-    board: Light
-    thing: Light
+    board: SampledLight
+    thing: SampledLight
 
     @classmethod
     def of(cls, bench: Bench, accuracy: float, patterns: str = "dots:7") -> RealBench:
@@ -41,7 +41,7 @@ class RealBench:
         board = bench.with_board(0.99).light(patterns, accuracy=accuracy)
         return cls(bench, board.merged(), bench.light(patterns, accuracy=accuracy).merged())
 
-    def white(self, light: Light) -> float:
+    def white(self, light: SampledLight) -> float:
         """Exposure [s] after which a white picture fills four fifths of the camera's range."""
         (frame,) = light.frames(Lighting.uniform(self.bench.n), 0)
         return 0.8 / self._filled(float(frame.irradiance.max()))
@@ -50,7 +50,7 @@ class RealBench:
         sensor, wavelength = self.bench.sensor, self.bench.rig.projector.effective_wavelength_nm
         return float(electrons_from_irradiance(irradiance, 1.0, sensor, wavelength)) / sensor.superpixel_full_well_e
 
-    def take(self, light: Light, pictures: list[Path], exposure_s: float, names: list[Path]) -> None:
+    def take(self, light: SampledLight, pictures: list[Path], exposure_s: float, names: list[Path]) -> None:
         """A frame of each of the ``pictures`` that the projector shows, under the ``names`` that the camera gives.
 
         16 bits, PNG or TIFF by the ending. The projector lights a pixel of the simulation by the mean of the picture's

@@ -1,7 +1,7 @@
 """Who may import whom (the house rules), read from the source text, and that importing mitsim does nothing.
 
-The table of rooms in docs/architecture.md says the same. Exceptions to the general rule - a stage imports only core and
-rig - carry their reason here.
+Rooms stand on floors: a file imports from floors below its own room, or inside its room, and nowhere is there a circle
+between files. Imports in functions and those for type checkers count. docs/architecture.md says the same.
 """
 
 import ast
@@ -9,6 +9,7 @@ import pkgutil
 import re
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -18,49 +19,58 @@ from mitsim.core.configuration import shipped
 from tests.exchanged import made
 
 PACKAGE = Path(mitsim.__file__).parent
-STAGES = {"scene", "transport", "optics", "sensor", "reconstruct"}
-GROUND = {"core", "rig"}
-ALLOWED = {
-    "core": set(),
-    # Pure data: what the devices are. Every stage may see it.
-    "rig": {"core"},
-    **{stage: GROUND for stage in STAGES},
-    # The factored estimator ends in the closed-form shadow.
-    "transport": GROUND | {"optics"},
-    # The composer: it alone sees all stages of a capture, and hands a session's responses to the calibration.
-    "capture": GROUND | STAGES,
-    # Files for others are of runs and of factors.
-    "exchange": GROUND | {"reconstruct"},
-    "study": GROUND | {"capture", "reconstruct", "optics", "sensor"},
-    "cli": GROUND | {"capture", "study", "exchange"} | STAGES,
-    "__main__": {"cli", "core"},
-    # The face, `mitsim` itself: names for type checkers alone; what a user asks for is imported when it is asked for.
-    "": set(),
-}
-FACE = GROUND | STAGES | {"capture", "study"}
-"""Rooms whose names the face may give to type checkers."""
-MITSUBA_ROOMS = ("mitsim.scene", "mitsim.transport", "mitsim.capture", "mitsim.core.environment")
+FLOORS = (
+    "version",
+    "core",
+    "devices",
+    "scene sensor optics reconstruct",
+    "transport metrics",
+    "bench",
+    "light",
+    "planner",
+    "acquire",
+    "calibrate",
+    "api",
+    "report",
+    "studies",
+    "exchange",
+    # The command line stands on the face, as a user's own program does.
+    "mitsim",
+    "cli",
+    "__main__",
+)
+"""Rooms, and files that stand by themselves, from the ground up."""
+FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms.split()}
+MITSUBA_ROOMS = (
+    "mitsim.scene",
+    "mitsim.transport",
+    "mitsim.bench",
+    "mitsim.light",
+    "mitsim.planner",
+    "mitsim.acquire",
+    "mitsim.studies.accuracy",
+    "mitsim.core.environment",
+)
 RENDERER = {"mitsuba", "drjit"}
 CHECKS_A_REQUEST = (
     "mitsim.cli",
-    "mitsim.capture.request",
+    "mitsim.bench.request",
     "mitsim.core.manifests",
     "mitsim.core.imagelist",
-    "mitsim.rig.sensor",
-    "mitsim.rig.recipe",
-    "mitsim.rig.framelist",
-    "mitsim.exchange.export",
-    "mitsim.exchange.load",
-    "mitsim.exchange.known",
+    "mitsim.devices.sensor",
+    "mitsim.devices.session",
+    "mitsim.devices.framelist",
+    "mitsim.exchange.formats",
+    "mitsim.exchange.loaders",
 )
 """What looks at words, manifests and lists before work begins."""
 
 
-def imports_of(module: str, source: str | ast.AST, is_package: bool) -> list[str]:
-    """Absolute dotted names of everything a module imports, anywhere in its text (lazy imports count)."""
+def imports_of(module: str, source: str, is_package: bool) -> list[str]:
+    """Absolute dotted names of everything a module imports, anywhere in its text."""
     package = module.split(".") if is_package else module.split(".")[:-1]
     found = []
-    for node in ast.walk(ast.parse(source) if isinstance(source, str) else source):
+    for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -70,35 +80,23 @@ def imports_of(module: str, source: str | ast.AST, is_package: bool) -> list[str
     return found
 
 
-def for_type_checkers(source: str) -> tuple[ast.Module, ast.Module]:
-    """A module without its `if TYPE_CHECKING:` blocks at the top level, and these blocks alone."""
-    tree = ast.parse(source)
-    blocks = [node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
-    assert not any(block.orelse for block in blocks)
-    rest = [node for node in tree.body if node not in blocks]
-    return ast.Module(rest, []), ast.Module([node for block in blocks for node in block.body], [])
+def room_of(name: str) -> str:
+    """The room of a module or of a name in it: the face is ``mitsim``."""
+    parts = name.split(".")
+    return parts[1] if len(parts) > 1 and parts[1] in FLOOR else "mitsim"
 
 
 def violations(module: str, source: str, is_package: bool = False) -> list[str]:
-    if module != "mitsim":
-        return broken_rules(module, imports_of(module, source, is_package), ALLOWED)
-    run, checked = (imports_of(module, part, True) for part in for_type_checkers(source))
-    return broken_rules(module, run, ALLOWED) + broken_rules(module, checked, {"": FACE})
-
-
-def broken_rules(module: str, names: list[str], allowed: dict[str, set[str]]) -> list[str]:
-    """A sentence for each of the imported ``names`` that a module's room may not import."""
-    room = module.split(".")[1] if "." in module else ""
+    """A sentence for each import of a module that the house does not allow."""
     broken = []
-    for name in names:
-        parts = name.split(".")
+    for name in imports_of(module, source, is_package):
+        top = name.split(".")[0]
         in_rooms = any(module == place or module.startswith(place + ".") for place in MITSUBA_ROOMS)
-        if parts[0] in RENDERER and not in_rooms:
+        if top in RENDERER and not in_rooms:
             broken.append(f"{module} imports {name}: only {', '.join(MITSUBA_ROOMS)} may")
-        if parts[0] != "mitsim" or len(parts) == 1 or parts[1] == "__version__":
-            continue
-        if parts[1] != room and parts[1] not in allowed.get(room, set()):
-            broken.append(f"{module} imports {name}: {room or 'mitsim'} may import {allowed.get(room)}")
+        own, other = room_of(module), room_of(name)
+        if top == "mitsim" and own != other and FLOOR[other] >= FLOOR[own]:
+            broken.append(f"{module} imports {name}: {other} is not below {own}")
     return broken
 
 
@@ -110,40 +108,72 @@ def modules() -> list[tuple[str, Path]]:
     return found
 
 
+def sources() -> dict[str, tuple[str, bool]]:
+    """Text of every module, and whether it is a package, by its name."""
+    return {name: (path.read_text(encoding="utf-8"), path.name == "__init__.py") for name, path in modules()}
+
+
+def circles(texts: Mapping[str, tuple[str, bool]]) -> list[list[str]]:
+    """Modules that import each other, over however many others."""
+    graph = {}
+    for module, (source, is_package) in texts.items():
+        named = imports_of(module, source, is_package)
+        ends = {name if name in texts else name.rpartition(".")[0] for name in named}
+        graph[module] = (ends & set(texts)) - {module}
+    below: dict[str, set[str]] = {}
+    for start in graph:
+        seen, left = set(), list(graph[start])
+        while left:
+            if (at := left.pop()) not in seen:
+                seen.add(at)
+                left += graph[at]
+        below[start] = seen
+    return sorted({tuple(sorted(b for b in below[a] if a in below[b])) for a in graph if a in below[a]})  # type: ignore[arg-type]
+
+
 def test_import_directions() -> None:
-    broken = [
-        line
-        for name, path in modules()
-        for line in violations(name, path.read_text(encoding="utf-8"), path.name == "__init__.py")
-    ]
+    broken = [line for name, (source, package) in sources().items() for line in violations(name, source, package)]
     assert not broken, "\n".join(broken)
 
 
-def test_every_room_has_rules() -> None:
-    rooms = {"", *(name.split(".")[1] for name, _ in modules() if "." in name)}
-    assert rooms == set(ALLOWED), f"rooms and rules differ: {rooms ^ set(ALLOWED)}"
+def test_no_file_imports_itself_over_others() -> None:
+    """(Planted: a name of the bench asked of the light, for type checkers alone, in a function.)"""
+    texts = sources()
+    assert not circles(texts)
+    source, package = texts["mitsim.bench.bench"]
+    for planted in (
+        "\nfrom mitsim.light.light import SampledLight\n",
+        "\ndef f():\n    from mitsim.light.light import SampledLight\n",
+        "\nif TYPE_CHECKING:\n    from mitsim.light.light import SampledLight\n",
+    ):
+        found = circles({**texts, "mitsim.bench.bench": (source + planted, package)})
+        assert any("mitsim.bench.bench" in circle and "mitsim.light.light" in circle for circle in found)
+
+
+def test_every_room_has_a_floor() -> None:
+    rooms = {name.split(".")[1] for name, _ in modules() if "." in name} | {"mitsim"}
+    assert rooms == set(FLOOR), f"rooms and floors differ: {rooms ^ set(FLOOR)}"
 
 
 @pytest.mark.parametrize(
     ("module", "source"),
     [
-        ("mitsim.core.seeds", "from mitsim.rig import mask"),
+        ("mitsim.core.arrays", "from mitsim.devices import mask"),
         ("mitsim.sensor.chain", "def f():\n    from ..optics import shadow"),
         ("mitsim.sensor.chain", "from mitsim import scene"),
-        ("mitsim.reconstruct.calibration", "import mitsim.sensor.chain"),
+        ("mitsim.reconstruct.estimate_factors", "import mitsim.sensor.chain"),
         ("mitsim.reconstruct.solver", "import drjit"),
-        ("mitsim.core.llvm", "import mitsuba as mi"),
-        ("mitsim.rig.camera", "from mitsim.optics import shadow"),
-        ("mitsim.study.report", "from mitsim.scene.load import load_scene"),
-        ("mitsim.sensor.chain", "from mitsim.capture.plan import Settings"),
-        ("mitsim.study.report", "from mitsim.transport import source"),
-        ("mitsim.exchange.hdf5", "from mitsim.capture.bench import Bench"),
+        ("mitsim.core.manifests", "import mitsuba as mi"),
+        ("mitsim.devices.camera", "from mitsim.optics import shadow"),
+        ("mitsim.sensor.chain", "from mitsim.light.settings import Settings"),
+        ("mitsim.bench.bench", "from mitsim.light.light import SampledLight"),
+        ("mitsim.planner.planner", "from mitsim.acquire.capture import capture"),
+        ("mitsim.acquire.capture", "from mitsim.api.bench import Bench"),
         ("mitsim.reconstruct.factors", "from mitsim.exchange.packed import Packed"),
-        ("mitsim.rig.recipe", "def f():\n    from mitsim.capture import bench"),
-        ("mitsim.scene.load", "if TYPE_CHECKING:\n    from mitsim.capture.bench import Bench"),
-        ("mitsim.__main__", "import mitsim.capture.bench"),
-        ("mitsim", "from mitsim import core"),
-        ("mitsim", "def __getattr__(name):\n    from mitsim.capture.bench import open_bench"),
+        ("mitsim.devices.session", "def f():\n    from mitsim.bench import bench"),
+        ("mitsim.scene.load", "if TYPE_CHECKING:\n    from mitsim.bench.bench import Apparatus"),
+        ("mitsim.report.report", "from mitsim.studies import find_study"),
+        ("mitsim.core.files", "import mitsim"),
         ("mitsim", "if TYPE_CHECKING:\n    from mitsim.cli import app"),
         ("mitsim", "if TYPE_CHECKING:\n    import mitsuba"),
     ],
@@ -157,11 +187,10 @@ def test_the_rules_catch_a_planted_violation(module: str, source: str) -> None:
     [
         ("mitsim.transport.direct", "import mitsuba\nfrom mitsim.optics import shadow"),
         ("mitsim.core.environment", "import mitsuba"),
-        ("mitsim.sensor.chain", "from . import model\nfrom ..core import units"),
-        ("mitsim.core.jsonfile", "import mitsim"),
-        ("mitsim.reconstruct.factors", "from mitsim.rig.patterns import PatternFamily"),
-        ("mitsim.cli", "def f():\n    from mitsim.study.demo import demo"),
-        ("mitsim", "if TYPE_CHECKING:\n    from mitsim.capture.bench import Bench"),
+        ("mitsim.sensor.chain", "from . import moments\nfrom ..core import units"),
+        ("mitsim.reconstruct.factors", "from mitsim.devices.patterns import PatternFamily"),
+        ("mitsim.cli", "import mitsim\ndef f():\n    from mitsim.studies.demo import demo"),
+        ("mitsim", "if TYPE_CHECKING:\n    from mitsim.api.bench import Bench"),
     ],
 )
 def test_the_rules_let_through_what_is_allowed(module: str, source: str) -> None:
@@ -375,14 +404,13 @@ if "mitsuba" in sys.modules:
 
 BACKENDS = re.compile(r"llvm|cuda|thread_count", re.IGNORECASE)
 KNOWS_BACKENDS = {
-    "mitsim.core.llvm": "finds the library",
-    "mitsim.core.environment": "chooses the variant",
+    "mitsim.core.environment": "finds the library and chooses the variant",
     "mitsim.cli.options": "says in the help what there is to choose",
 }
 SUMS = {"sum", "mean", "prod", "prefix_sum", "cumsum", "block_sum", "block_reduce", "block_prefix_sum", "reduce"}
 OF_A_LANE = {
-    "mitsim.transport.sampling": "the channels of a spectrum",
-    "mitsim.transport.grating": "the orders of a grating",
+    "mitsim.transport.sampler": "the channels of a spectrum",
+    "mitsim.transport.plugins.grating": "the orders of a grating",
 }
 
 

@@ -187,8 +187,8 @@ def measured_responses() -> dict[str, object]:
 
 def exchanged_file() -> dict[str, object]:
     """The files that docs/exchange.md reads."""
-    from mitsim.capture.opening import open_bench
-    from mitsim.exchange.export import export_run
+    from mitsim.api.bench import open_bench
+    from mitsim.exchange.formats import export_run
 
     bench = made(Path())
     export_run(bench.run, "hdf5", "all.h5", bench.calibration)

@@ -15,7 +15,7 @@ import numpy as np
 
 from mitsim.core.errors import MitsimError
 from mitsim.scene.guard.estimators import STRAIGHT
-from mitsim.scene.guard.vocabulary import PLUGINS
+from mitsim.scene.guard.limits import PLUGINS
 from tests.conftest import write_png, write_small_scene
 
 PLATE = '<shape type="rectangle"><transform name="to_world"><rotate y="1" angle="180"/><scale x="20" y="20"/>'
@@ -179,12 +179,12 @@ def _replaced(tag: str, plugin: str) -> Iterator[tuple[str, str]]:
 
 def cases() -> list[tuple[str, str]]:
     """(tag, plugin) of all that the guard allows."""
-    return [(tag, plugin) for tag, plugins in PLUGINS.items() for plugin in plugins.split()]
+    return [(tag, plugin) for tag, all in PLUGINS.items() for plugin in all.split()]
 
 
 def outcome(path: Path, variant: str) -> dict[str, str]:
     """For each verb that gave no finite frame: its refusal, or "uncaught" and what came."""
-    from mitsim.capture.opening import open_bench
+    from mitsim.api.bench import open_bench
 
     found: dict[str, str] = {}
 
@@ -211,12 +211,12 @@ def outcome(path: Path, variant: str) -> dict[str, str]:
 
 def main() -> None:
     from mitsim.core.environment import load_variant
-    from mitsim.transport import plugins
+    from mitsim.transport.plugins import all
 
     variant, folder, names = sys.argv[1], Path(sys.argv[2]), sys.argv[3:]
     mi = load_variant(variant)
     mi.set_log_level(mi.LogLevel.Error)
-    plugins.register()
+    all.register()
     all_found = {}
     for tag, plugin in cases():
         if not names or f"{tag}_{plugin}" in names:

@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from mitsim.core.framefile import read_frame
+from mitsim.core.exr import read_frame
 from mitsim.core.pictures import lightness
 
 COMMANDS = {

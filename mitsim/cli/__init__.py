@@ -1,6 +1,6 @@
 """The command line: parse, call the Python face, print. No physics; heavy imports happen in the verb that needs them.
 
-Options that make up a request come from :class:`mitsim.capture.request.Request`, so that they are the same in Python.
+Options that make up a request come from :class:`mitsim.bench.request.Request`, so that they are the same in Python.
 Errors of the library speak of arguments; :func:`~mitsim.cli.options.spoken` writes them as options.
 """
 
@@ -162,7 +162,7 @@ def demo(
     quiet: Quiet = False,
 ) -> int:
     """The main job: plan, capture, calibrate and reconstruct under five pattern families, and report.html."""
-    from mitsim.study.folder import check_study_folder
+    from mitsim.studies.framework.folder import check_study_folder
 
     request = mitsim.Request.of(patterns=patterns, accuracy=accuracy, seed=seed)
     check_study_folder(output, "demo")
@@ -171,7 +171,7 @@ def demo(
     with job_of(quiet or as_json) as job:
         with job.clock.stage("open scene"):
             bench = bench_of(scene, variant, camera, projector, define, outside)
-        from mitsim.study.demo import demo as run_demo  # only now: it takes seconds to import
+        from mitsim.studies.demo import demo as run_demo  # only now: it takes seconds to import
 
         result = run_demo(bench, output, request, job)
     return finish(as_json, result.payload(), result.lines(), result.warnings)
@@ -333,8 +333,8 @@ def render(
     quiet: Quiet = False,
 ) -> int:
     """Expected irradiance under the scene's own light, by either estimator."""
-    from mitsim.capture.request import check_samples
-    from mitsim.core.output import check_apart, check_output, output_file
+    from mitsim.bench.request import check_samples
+    from mitsim.core.files import check_apart, check_output, output_file
 
     if output.suffix.lower() != ".exr":
         raise MitsimError(f"--output {output}: the frame is an OpenEXR file; give a name that ends in .exr")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mitsim.cli.colour import MOSAIC, NO, Colour, check_colour, in_colour, of_calibration, variant_for
-from mitsim.cli.modelling import calibrate_model, modelling_of
 from mitsim.cli.options import (
     DAY,
     SPELLED,
@@ -43,9 +42,11 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.worker import RESUME, advise
 
 if TYPE_CHECKING:
-    from mitsim.capture.bench import Bench
+    from mitsim.api.bench import Bench
     from mitsim.core.job import Job
-    from mitsim.rig.recipe import SessionRecipe
+    from mitsim.devices.model_fit import Modelling
+    from mitsim.devices.session import SessionRecipe
+
 
 app = typer.Typer()
 
@@ -115,10 +116,10 @@ def calibrate(
         return _calibrate_frames(frames, check_no_plan(None, None, output), camera, others, as_json, quiet)
     if scene is None:
         raise MitsimError("calibrate: give a scene, or --frames DIR with the frames of a real session")
-    from mitsim.capture.request import Exposure
-    from mitsim.core.output import check_output
+    from mitsim.bench.request import Exposure
+    from mitsim.core.files import check_output
     from mitsim.core.resources import memory_from_here, memory_since
-    from mitsim.rig.recipe import load_recipe
+    from mitsim.devices.session import load_recipe
 
     request = request_of(accuracy=accuracy, seed=seed)
     session = load_recipe(recipe)
@@ -223,10 +224,10 @@ def _calibrate_frames(
         name = SPELLED.get(others[0], f"--{others[0].replace('_', '-')}")
         raise MitsimError(f"--frames {folder}: frames and their list decide; leave out {name}")
     from mitsim.core.resources import memory_from_here, memory_since
-    from mitsim.rig.framelist import load_frames
+    from mitsim.devices.framelist import load_frames
 
     session = load_frames(folder)  # refused before the estimator is imported
-    from mitsim.reconstruct.measured import calibrate_frames
+    from mitsim.reconstruct.captured_session import calibrate_frames
 
     held = memory_from_here()
     with job_of(quiet or as_json) as job:
@@ -270,8 +271,8 @@ class Wanted:
         MitsimError
             for a missing PSNR, values that are not allowed, and a file that cannot be written.
         """
-        from mitsim.capture.request import Request, check_psnr
-        from mitsim.core.output import prepare_output
+        from mitsim.bench.request import Request, check_psnr
+        from mitsim.core.files import prepare_output
 
         if psnr is None:
             raise MitsimError("--plan: give the PSNR that the image is to have, such as --psnr 35")
@@ -292,9 +293,9 @@ class Wanted:
         as_json
             one JSON object instead of text.
         """
-        from mitsim.core.output import output_file, whole_file
-        from mitsim.rig.recipe import recipe_text
-        from mitsim.study.calibration_plan import plan_calibration
+        from mitsim.calibrate.plan import plan_calibration
+        from mitsim.core.files import output_file, whole_file
+        from mitsim.devices.session import recipe_text
 
         with nullcontext() if self.output is None else output_file(self.output):
             found = plan_calibration(bench, self.psnr, self.patterns, recipe, **request, job=job)
@@ -323,3 +324,80 @@ def check_no_plan(psnr: float | None, patterns: str | None, output: Path | None)
     if output is None:
         raise MitsimError("Missing option '-o' / '--output': give the calibration folder to make")
     return output
+
+
+# -------- `mitsim calibrate --model`
+
+
+def modelling_of(model: str, frames_used: int | None, fit: str | None, accuracy: float) -> Modelling:
+    """What `--model` is asked for; MitsimError for words that it does not know.
+
+    Parameters
+    ----------
+    model, frames_used, fit, accuracy
+        the options; None where not given.
+    """
+    from mitsim.devices.model_fit import FITTED, Modelling
+
+    names = FITTED if fit is None else tuple(name.strip() for name in fit.split(","))
+    words: Any = model  # checked there
+    return Modelling(words, **({} if frames_used is None else {"frames": frames_used}), fitted=names, accuracy=accuracy)
+
+
+def calibrate_model(context: typer.Context, modelling: Modelling, output: Path) -> int:
+    """Factors of a model that is fitted to a few frames.
+
+    Parameters
+    ----------
+    context
+        of `mitsim calibrate`, with all its options.
+    modelling, output
+        what is fitted, and the CAL folder.
+
+    Raises
+    ------
+    MitsimError
+        for a missing scene, options that a fit does not have, and whatever it refuses.
+    """
+    from mitsim.bench.request import Exposure
+    from mitsim.core.files import check_output
+    from mitsim.devices.framelist import load_frames
+    from mitsim.devices.session import load_recipe
+
+    asked = context.params
+    if asked["scene"] is None:
+        raise MitsimError("--model: give the scene too, which states the camera and projector as they were to be built")
+    frames_alone = ("recipe", "seed", "accuracy") if asked["frames"] else ()
+    for name in ("resume", "write_frames", "colour", *frames_alone):
+        if is_given(context, name):
+            other = " of --frames" if name in frames_alone else ""
+            raise MitsimError(f"--{name.replace('_', '-')}: is of no use with --model{other}; leave it out")
+    request_of(accuracy=asked["accuracy"], seed=asked["seed"])
+    recipe, frames = load_recipe(asked["recipe"]), asked["frames"] and load_frames(asked["frames"])
+    check_output(output)
+    if frames is None:
+        check_camera(asked["camera"], Exposure(None, recipe.exposure_fraction))
+    bench_words = (asked[name] for name in ("scene", "variant", "camera", "projector", "define", "outside"))
+    with job_of(asked["quiet"] or asked["as_json"], asked["max_seconds"], asked["max_memory"]) as job:
+        with job.clock.stage("open scene"):
+            bench = bench_of(*bench_words)
+        from mitsim.calibrate.model_fit import calibrate_model as fit_model
+
+        factors = fit_model(bench, modelling, frames, recipe, asked["seed"], output, job)
+    result = factors.manifest.result
+    return finish(asked["as_json"], {**result, "output": str(output)}, model_lines(result, output), factors.warnings)
+
+
+def model_lines(result: Mapping[str, Any], output: Path) -> list[str]:
+    """What people read of a fit's ``result``, in the folder ``output``."""
+    numbers = [
+        f"{name.replace('_', ' ')} {number['value']:.6g} +-{number['standard_error']:.2g} {number['unit']}"
+        for name, number in result["parameters"].items()
+        if number["standard_error"] is not None
+    ]
+    return [
+        f"{result['model']} model fitted to {result['frames']} frames in {result['seconds']['total']:.1f} s: {output}",
+        *numbers,
+        f"unexplained {result['unexplained_residual']:.2%}, chi-square {result['chi_square']:.3g} a datum, condition "
+        f"{result['condition']:.2e}",
+    ]

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mitsim.cli.screen import finish
-from mitsim.core.colours import (
+from mitsim.core.errors import MitsimError
+from mitsim.core.spectral_manifests import (
     BANDS,
     CALIBRATION,
     LINES,
@@ -24,14 +25,12 @@ from mitsim.core.colours import (
     read_mosaic,
     spectral_of,
 )
-from mitsim.core.errors import MitsimError
 
 if TYPE_CHECKING:
-    from mitsim.capture.bench import Bench
-    from mitsim.capture.plan import Plan
+    from mitsim.api.bench import Bench
     from mitsim.core.job import Job
-    from mitsim.core.mosaics import MosaicCapture
-    from mitsim.core.runs import Capture
+    from mitsim.core.runs import Capture, MosaicCapture
+    from mitsim.light.plan import Plan
     from mitsim.reconstruct.factors import Factors
 
 NO, MOSAIC, AUTO = "no", "mosaic", "auto"
@@ -77,8 +76,8 @@ def variant_for(colour: str, variant: str, camera: str | None) -> str:
     """
     if colour == NO:
         return variant
-    from mitsim.capture.opening import check_devices
-    from mitsim.rig.sensor import load_sensor
+    from mitsim.bench.open import check_devices
+    from mitsim.devices.sensor import load_sensor
 
     path, _ = check_devices(camera, None)
     mosaic = load_sensor(path).mosaic
@@ -114,8 +113,8 @@ def check_colour(colour: str, variant: str, projector: str | None, seconds: floa
     """
     if colour == NO:
         return
-    from mitsim.capture.opening import check_devices
-    from mitsim.capture.request import check_untimed
+    from mitsim.bench.open import check_devices
+    from mitsim.bench.request import check_untimed
     from mitsim.core.configuration import load_model
 
     check_untimed(seconds)
@@ -123,7 +122,7 @@ def check_colour(colour: str, variant: str, projector: str | None, seconds: floa
     if colour == AUTO:
         check_undecided(variant)
         return
-    from mitsim.rig.projector import ProjectorModel
+    from mitsim.devices.projector import ProjectorModel
 
     model = load_model(path, ProjectorModel)
     lit = model.in_bands(bands_of(colour)) if colour.startswith(BANDS) else model
@@ -152,11 +151,11 @@ def plan_of(bench: Bench, colour: str, request: dict[str, Any]) -> Plan:
         return bench.choose_colour(**request).plan
     if colour == NO:
         return bench.plan(**request)
-    from mitsim.capture.colour import ColourBench, plan_lines
-    from mitsim.capture.request import Request
+    from mitsim.acquire.spectral import ColourBench, plan_lines
+    from mitsim.bench.request import Request
 
     if colour == MOSAIC:
-        from mitsim.capture.mosaic import plan_mosaic
+        from mitsim.acquire.mosaic import plan_mosaic
 
         return plan_mosaic(bench, Request.of(**request))
     return plan_lines(ColourBench.of(in_colour(bench, colour), RUN), Request.of(**request))
@@ -185,7 +184,7 @@ def mosaic_options(options: Mapping[str, Any], way: str) -> dict[str, Any]:
 
     MitsimError for a way that there is not, and for options that these images have not.
     """
-    from mitsim.reconstruct.asked import check_joint
+    from mitsim.reconstruct.request import check_joint
 
     check_way(way)
     check_joint(options["lam"])
@@ -271,9 +270,9 @@ def reconstruct_lines(
     options
         those that every line is solved with.
     """
+    from mitsim.core.files import check_output
     from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
-    from mitsim.core.output import check_output
-    from mitsim.rig.chart import load_chart
+    from mitsim.devices.chart import load_chart
 
     # Refused before the solver and colour-science are imported.
     if is_mosaic(run):
@@ -288,7 +287,7 @@ def reconstruct_lines(
     # What it holds is looked into later: an image of the same inputs may be replaced.
     check_output(output, overwrite=is_coloured(output))
     from mitsim.core.resources import memory_from_here, memory_since
-    from mitsim.study.colour.by_line import reconstruct_colours
+    from mitsim.report.colour.by_line import reconstruct_colours
 
     held = memory_from_here()
     found = reconstruct_colours(run, calibration, output, place, **options)

@@ -35,7 +35,7 @@ from mitsim.cli.screen import finish
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.seeds import check_root
-from mitsim.rig.families import NAMES, read_name
+from mitsim.devices.families import NAMES, read_name
 
 app = typer.Typer()
 
@@ -64,7 +64,7 @@ def export(
     quiet: Quiet = False,
 ) -> int:
     """Write a run in a format that other programs read."""
-    from mitsim.exchange.export import export_run
+    from mitsim.exchange.formats import export_run
 
     if format == "png":
         refuse_unused(context, ["overwrite"], "on a folder of pictures, which takes the place of none")
@@ -120,7 +120,7 @@ def import_(
     quiet: Quiet = False,
 ) -> int:
     """Make a run folder of a real camera's frames, or of a file that `mitsim export` wrote."""
-    from mitsim.exchange.load import READERS, import_file
+    from mitsim.exchange.loaders import READERS, import_file
 
     if output is None and calibration_output is None:
         raise MitsimError("import: nothing to make; give -o RUN, --calibration-output CAL, or both")
@@ -131,7 +131,7 @@ def import_(
         payload = import_file(source, output, calibration_output, channel)
     else:
         from mitsim.core.imagelist import BARE, Raw
-        from mitsim.exchange.known import RealCapture
+        from mitsim.exchange.formats import RealCapture
 
         if output is None or calibration_output is not None:
             raise MitsimError(f"{source}: frames hold no calibration; give -o RUN, and no --calibration-output")
@@ -193,7 +193,7 @@ def patterns(
     check_root(seed)
     if family != "stripes":
         read_name(family, projector_pixels)  # refused before numpy is imported
-    from mitsim.exchange.drawn import SESSION, cells_told, draw_family, draw_stripes, session_of
+    from mitsim.exchange.pictures import SESSION, cells_told, draw_family, draw_stripes, session_of
 
     if family != "stripes":
         refuse_unused(context, ["signed_capture"], "on patterns, whose signed ones are pairs; it is for stripes")
@@ -248,7 +248,7 @@ def transport(
 ) -> int:
     """Trace a scene's light by projector pixel and write it, for frames of any pattern without mitsim."""
     from mitsim.core.configuration import locate
-    from mitsim.core.output import check_apart, output_file
+    from mitsim.core.files import check_apart, output_file
 
     request = request_of(patterns=patterns, accuracy=accuracy, seconds=seconds, seed=seed, effects=effects)
     check_shown([patterns], scene, define, outside)

@@ -72,10 +72,10 @@ def reconstruct(
     quiet: Quiet = False,
 ) -> int:
     """Recover the image from frames and a calibration alone; of coloured folders, one of each line, and in colour."""
-    from mitsim.core.colours import JOINT, is_coloured, is_mosaic
+    from mitsim.core.files import check_output
     from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
-    from mitsim.core.output import check_output
-    from mitsim.reconstruct.asked import IMAGE_FILE, check_asked, check_parallax
+    from mitsim.core.spectral_manifests import JOINT, is_coloured, is_mosaic
+    from mitsim.reconstruct.request import IMAGE_FILE, check_asked, check_parallax
 
     strength = number_of("lambda", lam)
     depth = None if focus is None else number_of("focus", focus, ("auto", "map"))
@@ -101,7 +101,7 @@ def reconstruct(
         check_parallax(manifest.parallax, str(calibration))
     check_output(output, overwrite=(output / IMAGE_FILE).is_file())
     from mitsim.core.resources import memory_from_here, memory_since
-    from mitsim.study.quality import reconstruct as reconstruct_folder
+    from mitsim.report.quality import reconstruct as reconstruct_folder
 
     held = memory_from_here()
     result = reconstruct_folder(run, calibration, output, strength, method, overwrite, **place)

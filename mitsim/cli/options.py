@@ -16,11 +16,11 @@ from mitsim.cli.screen import showing_progress
 from mitsim.core.errors import ArgumentError, MitsimError
 
 if TYPE_CHECKING:
-    from mitsim.capture.bench import Bench
-    from mitsim.capture.request import Exposure
+    from mitsim.api.bench import Bench
+    from mitsim.bench.request import Exposure
     from mitsim.core.job import Job
-    from mitsim.rig.recipe import SessionRecipe
-    from mitsim.study.experiment import Scope
+    from mitsim.devices.session import SessionRecipe
+    from mitsim.studies.framework.experiment import Scope
 
 _OPTIONS = {"lam": "lambda"}
 """Options that are not called like the argument."""
@@ -82,7 +82,7 @@ def variant_of(name: str) -> str:
 
 def request_of(**values: object) -> dict[str, Any]:
     """Checked ``values`` of a request's fields, without an accuracy that was not given; refused before work."""
-    from mitsim.capture.request import Request
+    from mitsim.bench.request import Request
 
     values = {name: value for name, value in values.items() if name != "accuracy" or value is not None}
     request = Request.of(**values).model_dump()
@@ -112,8 +112,9 @@ def scope_of(
     MitsimError
         for a define that is none.
     """
-    from mitsim.study.experiment import Scope, Setup
-    from mitsim.study.pictures import QUICK_IMAGES, TEST_IMAGES
+    from mitsim.studies.framework.experiment import Scope
+    from mitsim.studies.framework.pictures import QUICK_IMAGES, TEST_IMAGES
+    from mitsim.studies.framework.setup import Setup
 
     parameters = tuple(sorted(defines_of(define).items()))
     setup = Setup(scene or "photograph", None, parameters, camera, projector, variant, outside)
@@ -136,8 +137,8 @@ def swept(name: str, scope: Scope, patterns: str, over: Sequence[str], measure: 
     MitsimError
         for options that the study does not have, or that cannot be read.
     """
-    from mitsim.rig.families import read_name
-    from mitsim.study.asked import check_drifts, check_sweep, measures_of, values_of
+    from mitsim.devices.families import read_name
+    from mitsim.report.exposures import check_drifts, check_sweep, measures_of, values_of
 
     varied = tuple(values_of(text) for text in over)
     if name == "sweep":
@@ -157,11 +158,11 @@ def swept(name: str, scope: Scope, patterns: str, over: Sequence[str], measure: 
 def check_setup(scope: Scope, scene: str | None) -> None:
     """MitsimError where the files that a ``scope`` names cannot be used, before the renderer is imported; a study
     without a ``scene`` of its own may take others."""
-    from mitsim.capture.opening import check_devices, check_scene
-    from mitsim.capture.request import Exposure
+    from mitsim.bench.open import check_devices, check_scene
+    from mitsim.bench.request import Exposure
     from mitsim.core.configuration import load_model
-    from mitsim.rig.sensor import load_sensor
-    from mitsim.study.asked import NO_SCENE
+    from mitsim.devices.sensor import load_sensor
+    from mitsim.report.exposures import NO_SCENE
 
     camera, projector = check_devices(scope.setup.camera, scope.setup.projector)
     # A study in colour may see through colour filters; all fill a part of the full well.
@@ -171,7 +172,7 @@ def check_setup(scope: Scope, scene: str | None) -> None:
         varied = {name: values[0] for name, values in knobs.items() if name not in NO_SCENE}
         shown = knobs.get("patterns", (scope.patterns,) if scope.measures else ())
         check_scene(scope.setup.scene, {**dict(scope.setup.parameters), **varied}, scope.setup.outside, shown)
-    from mitsim.rig.projector import ProjectorModel  # last: it imports numpy
+    from mitsim.devices.projector import ProjectorModel  # last: it imports numpy
 
     load_model(projector, ProjectorModel)
 
@@ -181,7 +182,7 @@ def recipe_for(name: str, recipe: Path | None) -> SessionRecipe | None:
 
     MitsimError for a study that takes none, and for a file that is no recipe.
     """
-    from mitsim.rig.recipe import load_recipe
+    from mitsim.devices.session import load_recipe
 
     if recipe is None:
         return None
@@ -202,8 +203,8 @@ def check_work(output: Path, resume: bool, kind: str, several: bool = False) -> 
     several
         whether it is to hold several such folders.
     """
+    from mitsim.core.files import check_output
     from mitsim.core.manifests import MANIFEST, resumable
-    from mitsim.core.output import check_output
 
     begun = (output / MANIFEST).is_file()
     if resume and begun and not several:
@@ -221,15 +222,15 @@ def check_shown(patterns: Sequence[str], scene: str, define: Sequence[str] | Non
     scene, define, outside
         as for :func:`bench_of`.
     """
-    from mitsim.capture.opening import check_scene
+    from mitsim.bench.open import check_scene
 
     check_scene(scene, defines_of(define), outside, patterns)
 
 
 def check_camera(camera: str | None, exposure: Exposure) -> None:
     """MitsimError, before the renderer is imported, for a ``camera`` that cannot have an ``exposure``."""
-    from mitsim.capture.opening import check_devices
-    from mitsim.rig.sensor import load_sensor
+    from mitsim.bench.open import check_devices
+    from mitsim.devices.sensor import load_sensor
 
     path, _ = check_devices(camera, None)
     exposure.check(load_sensor(path), path)

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 from mitsim.core.errors import MitsimError, printable
 
 if TYPE_CHECKING:
-    from mitsim.capture.plan import Plan
     from mitsim.core.job import Progress
+    from mitsim.light.plan import Plan
 
 
 SECONDS_A_LINE = 60.0
@@ -101,7 +101,7 @@ def finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequence
     """
     with written():
         if as_json:
-            from mitsim.core.jsonfile import plain
+            from mitsim.core.files import plain
 
             print(json.dumps(plain(payload), allow_nan=False))
         else:

@@ -34,9 +34,9 @@ def characterise(
 ) -> int:
     """Measure a camera after EMVA 1288 on simulated frames; figures found beside those that its file sets."""
     from mitsim.core.configuration import locate
-    from mitsim.rig.sensor import load_sensor
-    from mitsim.study.emva import Procedure, capacity_of, efficiency_of
-    from mitsim.study.folder import check_study_folder
+    from mitsim.devices.sensor import load_sensor
+    from mitsim.studies.emva_procedure import Procedure, capacity_of, efficiency_of
+    from mitsim.studies.framework.folder import check_study_folder
 
     sensor = load_sensor(locate(camera, "calibration", ".toml"))
     procedure = Procedure(pixels, steps, frames, seed, wavelength)
@@ -45,7 +45,7 @@ def characterise(
     if sensor.quantum_efficiency_curve is None:
         refuse_unused(context, ["wavelength"], f"on {camera}, whose file has no curve of quantum efficiency")
     check_study_folder(output, "characterise")
-    from mitsim.study.characterise import characterise as run_characterise
+    from mitsim.studies.characterise import characterise as run_characterise
 
     with job_of(quiet or as_json) as job:
         done = run_characterise(sensor, procedure, output, job)
@@ -72,12 +72,12 @@ def sense(
     quiet: Quiet = False,
 ) -> int:
     """Put an image of any renderer behind a camera's sensor: digital numbers with its noise."""
-    from mitsim.capture.request import Exposure
-    from mitsim.capture.sensing import check_ending, check_f_number, check_image, check_wavelength
+    from mitsim.acquire.sense import check_ending, check_f_number, check_image, check_wavelength
+    from mitsim.bench.request import Exposure
     from mitsim.core.configuration import locate
-    from mitsim.core.output import check_apart, output_file
+    from mitsim.core.files import check_apart, output_file
     from mitsim.core.seeds import check_root
-    from mitsim.rig.sensor import load_sensor
+    from mitsim.devices.sensor import load_sensor
 
     sensor = load_sensor(locate(camera, "calibration", ".toml"))
     seconds = number_of("exposure", exposure)
@@ -94,8 +94,8 @@ def sense(
     check_image(image)
     check_apart(output, [image])
     with output_file(output, overwrite=True) as place:
-        from mitsim.capture.sense import irradiance_behind_lens, read_image
-        from mitsim.capture.sense import sense as run_sense
+        from mitsim.acquire.sense import irradiance_behind_lens, read_image
+        from mitsim.acquire.sense import sense as run_sense
 
         light, notes = read_image(image, channel)
         light = light * scale if f_number is None else irradiance_behind_lens(light * scale, f_number)

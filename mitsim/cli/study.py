@@ -84,8 +84,9 @@ def study(
     knob; what `accuracy` costs in time, on a scene and, of none, in the `solver`; what `diffraction` at the mask does;
     how good a `calibration` session is, and why; `merge` joins the parts of --shard.
     """
-    from mitsim.study import EXPOSED, OF_NO_SCENE, find_study, is_experiment
-    from mitsim.study.folder import check_study_folder
+    from mitsim.studies import find_study, is_experiment
+    from mitsim.studies.framework.folder import check_study_folder
+    from mitsim.studies.names import EXPOSED, OF_NO_SCENE
 
     if name == "merge":
         others = [each for each in context.params if each not in _OF_MERGE]
@@ -96,12 +97,12 @@ def study(
     warnings: Sequence[str] = ()
     with job_of(quiet or as_json) as job:
         if name == "merge":
-            from mitsim.study.campaign import merge
+            from mitsim.studies.framework.campaign import merge
 
             result: Any = merge(scenes or (), output, experiment)
         elif is_experiment(name):
-            from mitsim.study.campaign import Where, run_experiment
-            from mitsim.study.points import Shard
+            from mitsim.studies.framework.campaign import Where, run_experiment
+            from mitsim.studies.framework.run import Shard
 
             scope = scope_of(_only(scenes), variant, camera, projector, define, outside, quick)
             scope = swept(name, replace(scope, seeds=(seed,)), patterns, over or (), measure)

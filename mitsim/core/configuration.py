@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 import pydantic
 
 from mitsim.core.errors import MitsimError, cut
-from mitsim.core.plainfile import read_text
+from mitsim.core.files import read_text
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -1,22 +1,207 @@
-"""An OpenEXR file's path in; size, channels and decoded bytes out, as far as the file can hold what its header claims.
+"""Frames on disk: named 2-D channels and metadata in, one OpenEXR file out, and back.
 
-OpenEXR's own reader takes the header: it allocates nothing by what that claims, and damaged ones raise. Three things
-are left to check here. It compares the names of channels with each other, which takes 18 s for a list of 100 000, so it
-is given the beginning of the file alone. It passes over an attribute that claims 2 GB, for which the older reader in
-Mitsuba allocates them. And reading the pixels allocates what a header claims, 4 GiB for a file of 300 bytes.
+Channels are float32 (expected electrons, variances) or uint32 (digital numbers), stored losslessly. Every
+metadata entry is a header attribute `mitsim.<key>` holding JSON text: EXR's own numbers are 32-bit and would
+cut seeds and exposure times short.
 """
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import io
+import json
 import os
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import OpenEXR
 
-from mitsim.core.plainfile import MOST_SIDE
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError, cut
+from mitsim.core.files import (
+    FRAME_LIMITS,
+    MOST_SIDE,
+    check_plain,
+    fits_a_frame,
+    parse_json,
+    resolved,
+    stderr_silenced,
+    whole_file,
+)
+
+Value = str | int | float
+Channel = npt.NDArray[np.float32] | npt.NDArray[np.uint32]
+Channels = Mapping[str, Channel]
+Metadata = Mapping[str, Value]
+
+_PREFIX = "mitsim."
+
+
+def write_frame(path: Path | str, channels: Channels, metadata: Metadata) -> None:
+    """Write a frame, all or nothing: the file appears under its name only when complete.
+
+    Parameters
+    ----------
+    path
+        of the file.
+    channels
+        (rows, columns) each, of one shape, float32 or uint32; nothing is converted silently.
+    metadata
+        texts and numbers.
+
+    Raises
+    ------
+    TypeError, ValueError
+        for channels or metadata that cannot be stored as they are.
+    MitsimError
+        when the file cannot be written.
+    """
+    _check_channels(channels)
+    # Noise does not compress: ZIP saves a tenth of the room for four times the time.
+    header: dict[str, Any] = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header.update({_PREFIX + key: json.dumps(_scalar(value)) for key, value in metadata.items()})
+    pixels = {name: np.ascontiguousarray(values) for name, values in channels.items()}
+    with whole_file(path) as part:
+        # Opened here first: OpenEXR reports a folder it cannot write to on stderr, past any caller.
+        part.touch()
+        try:
+            OpenEXR.File(header, pixels).write(str(part))
+        except RuntimeError as error:
+            raise OSError(_one_line(error)) from error
+
+
+def read_frame(path: Path | str) -> tuple[dict[str, Channel], dict[str, Value]]:
+    """Channels (2-D, float32 or uint32; half floats become float32) and metadata of the frame ``path``.
+
+    Files of other programs are read too; their metadata is then empty. MitsimError for a file that is
+    missing, is not OpenEXR, or is damaged.
+    """
+    path = Path(path)
+    check_plain(path, "frame")
+    try:
+        header = read_header(path)
+        if not fits_a_frame((header.height, header.width)):
+            raise ValueError(f"claims {header.width}x{header.height} pixels; {FRAME_LIMITS} are read")
+        with _open(path) as file:
+            header = file.header()
+            # Both are emptied when the file closes, so they are copied here.
+            metadata = {key[len(_PREFIX) :]: _plain(header[key]) for key in header if key.startswith(_PREFIX)}
+            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+    except (OSError, RuntimeError, ValueError, TypeError) as error:
+        raise MitsimError(
+            f"frame {path}: damaged or incomplete OpenEXR file ({_one_line(error)}); write or copy it again"
+        ) from error
+    wide = {name: c.astype(np.float32) if c.dtype == np.float16 else c for name, c in channels.items()}
+    return wide, metadata
+
+
+def checksum(path: Path | str) -> str:
+    """SHA-256 of the bytes of the file ``path`` as 64 hexadecimal digits. MitsimError when it cannot be read."""
+    digest = hashlib.sha256()
+    check_plain(path)
+    try:
+        with open(path, "rb") as file:
+            for block in iter(lambda: file.read(1 << 20), b""):
+                digest.update(block)
+    except OSError as error:
+        raise MitsimError(f"file {path}: cannot be read ({error.strerror}); check the path") from error
+    return digest.hexdigest()
+
+
+def verify(folder: Path, name: str, checksums: Mapping[str, str], remedy: str) -> None:
+    """Check that a file is the one whose checksum was noted; files without one are taken as they are.
+
+    Parameters
+    ----------
+    folder, name
+        of the file.
+    checksums
+        SHA-256 by name.
+    remedy
+        what to do where they differ.
+
+    Raises
+    ------
+    MitsimError
+        when they differ, or the name leads out of the folder by a link.
+    """
+    if not resolved(folder / name).is_relative_to(resolved(folder)):
+        raise MitsimError(f"{folder / name}: leads out of its folder; copy the file there")
+    expected = checksums.get(name)
+    if expected is not None and checksum(folder / name) != expected:
+        raise MitsimError(f"{folder / name}: not the file that was written (its checksum differs); {remedy}")
+
+
+def finite_channel(channels: Channels, name: str, path: Path) -> FloatArray:
+    """One channel of a frame in double precision.
+
+    Parameters
+    ----------
+    channels
+        of the frame, (rows, columns) each.
+    name
+        of the one that is needed.
+    path
+        of the file, for messages.
+
+    Raises
+    ------
+    MitsimError
+        when it is not there, or holds a value that is not finite.
+    """
+    if name not in channels:
+        raise MitsimError(f"{path}: channels are {', '.join(channels)}; {name} is needed")
+    values = channels[name].astype(np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):
+        total = values.sum()
+    if not np.isfinite(total) and (bad := int(np.count_nonzero(~np.isfinite(values)))):
+        raise MitsimError(f"{path}: {bad} values are not finite; capture or calibrate again")
+    return values
+
+
+def _check_channels(channels: Channels) -> None:
+    if not channels:
+        raise ValueError("write_frame: no channels given; a frame needs at least one")
+    shapes = {np.shape(values) for values in channels.values()}
+    if len(shapes) != 1 or len(next(iter(shapes))) != 2 or 0 in next(iter(shapes)):
+        raise ValueError(f"write_frame: channel shapes are {sorted(shapes)}; all must be one non-empty 2-D shape")
+    for name, values in channels.items():
+        if np.asarray(values).dtype not in (np.float32, np.uint32):
+            raise TypeError(f"write_frame: channel {name!r} is {np.asarray(values).dtype}; make it float32 or uint32")
+
+
+def _plain(text: str) -> Value:
+    value = parse_json(text)
+    if not isinstance(value, (str, int, float)):
+        raise ValueError(f"metadata {cut(text)!r} is no text or number")
+    return value
+
+
+def _scalar(value: Value) -> Value:
+    plain: Any = value.item() if isinstance(value, np.generic) else value
+    if not isinstance(plain, (str, int, float)):
+        raise TypeError(f"write_frame: metadata value {value!r} is {type(value).__name__}; use str, int or float")
+    return plain
+
+
+def _open(path: Path) -> Any:
+    # OpenEXR prints a warning to stdout for pixels it cannot read, where --json promises JSON alone, and its C++ part
+    # one to stderr, past Python; it raises later on. The lock keeps two threads from restoring each other's streams.
+    with stderr_silenced(), contextlib.redirect_stdout(io.StringIO()):
+        return OpenEXR.File(str(path), separate_channels=True)
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+# -------- An OpenEXR file's path in
 
 MAGIC = b"\x76\x2f\x31\x01"
 """First bytes of every OpenEXR file."""

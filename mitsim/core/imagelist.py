@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.plainfile import MOST_SIDE, check_plain
+from mitsim.core.files import MOST_SIDE, check_plain
 
 if TYPE_CHECKING:
     import numpy as np

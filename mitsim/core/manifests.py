@@ -25,7 +25,7 @@ from pydantic import (
 
 from mitsim.core.configuration import LARGEST, NonNegative, Positive, validated
 from mitsim.core.errors import MitsimError, cut
-from mitsim.core.jsonfile import plain, read_json, write_json
+from mitsim.core.files import plain, read_json, write_json
 
 if TYPE_CHECKING:  # and where it computes: numpy takes 0.1 s to import, and a refusal needs none of it
     import numpy as np
@@ -148,7 +148,7 @@ class ShotFile(_Part):
 
 
 class _Family(Protocol):
-    """Patterns of :mod:`mitsim.rig.patterns`."""
+    """Patterns of :mod:`mitsim.devices.patterns`."""
 
     @property
     def name(self) -> str: ...
@@ -173,7 +173,7 @@ class Patterns(_Part):
 
     @classmethod
     def of(cls, family: _Family, files: Sequence[str]) -> Patterns:
-        """Patterns of a ``family`` (:class:`mitsim.rig.patterns.PatternFamily`), its shots in ``files`` by index.
+        """Patterns of a ``family`` (:class:`mitsim.devices.patterns.PatternFamily`), its shots in ``files`` by index.
 
         MitsimError when there are more pixels or shots than a reader takes.
         """

@@ -5,8 +5,12 @@ from __future__ import annotations
 import hashlib
 import math
 import shutil
+import threading
 import zlib
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,11 +20,21 @@ import numpy as np
 from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError, cut
-from mitsim.core.framefile import Channel, Channels, Metadata, checksum, finite_channel, read_frame, verify
-from mitsim.core.manifests import MANIFEST, Digital, RunManifest, read_manifest
-from mitsim.core.measurement import Ambient, Measurement
+from mitsim.core.exr import (
+    Channel,
+    Channels,
+    Metadata,
+    Value,
+    checksum,
+    finite_channel,
+    read_frame,
+    verify,
+    write_frame,
+)
+from mitsim.core.files import output_folder, sweep
+from mitsim.core.manifests import MANIFEST, Digital, RunHead, RunManifest, read_head, read_manifest, write_manifest
 from mitsim.core.pictures import card, scaled, span
-from mitsim.core.recorders import TRUTH, Recorder, claimed, frame_name
+from mitsim.core.spectral_manifests import MosaicManifest, read_mosaic, write_colours
 
 _SHOWN = 3
 """Frames that a notebook shows: with the truth they fill a line."""
@@ -366,3 +380,407 @@ def _clipped(dn: FloatArray, top: float, digital: Digital, factor: int) -> int:
 
 def _size(shape: tuple[int, ...]) -> str:
     return "x".join(map(str, shape))
+
+
+# -------- Shots of one pattern in, what was measured under it out
+
+
+@dataclass(frozen=True, eq=False)
+class Ambient:
+    """What a camera sees with the projector off, as it is taken off every frame of a run.
+
+    Attributes
+    ----------
+    rate
+        (rows, columns) mean over the shots [electrons/s].
+    variance
+        (rows, columns) of that mean [(electrons/s)^2], of what the manifest states of the sensor's noise. It is one
+        draw, the same in all frames.
+    shots
+        that were averaged.
+    """
+
+    rate: FloatArray
+    variance: FloatArray
+    shots: int
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """What was measured under one pattern.
+
+    Attributes
+    ----------
+    frame
+        (rows, columns) [electrons/s], of a signed pattern the difference of its halves; of others without ambient
+        light.
+    row, column
+        indices (i, j) of the pattern.
+    light
+        (rows, columns) [electrons/s] sum of its shots as they were read: what their shot noise is of.
+    shots
+        their number.
+    saturated
+        readings of them at the full well or the ADC's end.
+    factor
+        largest whole number that divides all of their digital numbers; 1 where they are not whole.
+    digests
+        of each shot, which no two that were read apart share; 0 where all of its numbers are equal.
+    clipped
+        of each shot, readings at its largest number, below the end of their range, where noise leaves fewer; 0 where
+        it leaves as many.
+    """
+
+    frame: FloatArray
+    row: int
+    column: int
+    light: FloatArray
+    shots: int
+    saturated: int
+    factor: int = 1
+    digests: tuple[int, ...] = ()
+    clipped: tuple[int, ...] = ()
+
+    def __add__(self, other: Measurement) -> Measurement:
+        """Both halves of a signed pattern as one measurement."""
+        shots, saturated = self.shots + other.shots, self.saturated + other.saturated
+        light, factor = self.light + other.light, math.gcd(self.factor, other.factor)
+        frame, digests = self.frame + other.frame, self.digests + other.digests
+        clipped = self.clipped + other.clipped
+        return Measurement(frame, self.row, self.column, light, shots, saturated, factor, digests, clipped)
+
+    @property
+    def power(self) -> float:
+        """Sum of the squares of its shots [(electrons/s)^2]."""
+        # For halves p and q, p^2 + q^2 = ((p - q)^2 + (p + q)^2) / 2.
+        halves = (self.light,) if self.shots == 1 else (self.frame, self.light)
+        return float(sum(np.vdot(values, values) for values in halves)) / len(halves)
+
+
+# -------- A run behind colour filters, in memory or in its folder
+
+
+@dataclass(frozen=True, eq=False)
+class LineTruth:
+    """What a perfect image of a line would show.
+
+    Attributes
+    ----------
+    reflectance
+        (n, n), relative to the board.
+    standard_error
+        (n, n) of it, from sampling.
+    board
+        reflectance of the board that counts as 1.
+    """
+
+    reflectance: FloatArray
+    standard_error: FloatArray
+    board: float
+
+
+@dataclass(frozen=True, eq=False)
+class MosaicCapture:
+    """All shots of a family, seen through a mosaic of colour filters.
+
+    Attributes
+    ----------
+    shots
+        the frames. Their own truth is the lines' by the light that all pixels together see of each.
+    manifest
+        lines, filters, and what each passes.
+    truths
+        of each line by its name; none of a real camera.
+    """
+
+    shots: Capture
+    manifest: MosaicManifest
+    truths: Mapping[str, LineTruth]
+
+    @property
+    def weights(self) -> FloatArray:
+        """(4, lines) electrons per photon of each of 2 x 2 pixels, row by row."""
+        return np.array(self.manifest.weights, dtype=np.float64)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Why the capture is flagged."""
+        return self.shots.warnings
+
+    def truth(self, board: float | None = None) -> FloatArray | None:
+        """(n, n, lines) of all lines, relative to a ``board`` of that reflectance; None without truths."""
+        if not self.truths:
+            return None
+        each = (self.truths[name] for name in self.manifest.names)
+        return np.stack([one.reflectance * (one.board / (board or one.board)) for one in each], axis=-1)
+
+    @checked
+    def save(self, folder: Path | str) -> Path:
+        """Write the folder that `mitsim capture --colour mosaic` writes, to a new or empty ``folder``; returns it.
+
+        MitsimError when it holds something, or cannot be written.
+        """
+        path = self.shots.save(folder)
+        self.write_lines(path)
+        return path
+
+    def write_lines(self, folder: Path) -> None:
+        """Write the lines' truths and colour.json beside the frames in ``folder``, colour.json last."""
+        for name, truth in self.truths.items():
+            with output_folder(folder / name, overwrite=True) as place:
+                channels = {"reflectance": truth.reflectance, "standard_error": truth.standard_error}
+                single = {key: values.astype(np.float32) for key, values in channels.items()}
+                write_frame(place / TRUTH, single, {"board_reflectance": truth.board})
+        write_colours(folder, self.manifest)
+
+    def summary(self) -> dict[str, Any]:
+        """What the command line reports: the keys of a capture, and of colour.json."""
+        return {**self.manifest.model_dump(), **self.shots.summary()}
+
+    def __repr__(self) -> str:
+        return f"MosaicCapture({', '.join(self.manifest.names)} behind {self.manifest.mosaic}: {self.shots!r})"
+
+    def _repr_html_(self) -> str:
+        return self.shots._repr_html_()
+
+
+@checked
+def load_mosaic(folder: Path | str) -> MosaicCapture:
+    """The run behind colour filters in ``folder``. MitsimError when it is not a complete one."""
+    folder = Path(folder)
+    manifest = read_mosaic(folder)
+    files = {name: folder / name / TRUTH for name in manifest.names}
+    truths = {name: _truth(path) for name, path in files.items() if path.is_file()}
+    return MosaicCapture(load_run(folder), manifest, truths if len(truths) == len(files) else {})
+
+
+def _truth(path: Path) -> LineTruth:
+    channels, metadata = read_frame(path)
+    board = metadata.get("board_reflectance")
+    return LineTruth(
+        finite_channel(channels, "reflectance", path),
+        finite_channel(channels, "standard_error", path),
+        1.0 if board is None else float(board),
+    )
+
+
+# -------- Shots of a run in, as they are exposed
+
+TRUTH, AMBIENT = "truth.exr", "ambient.exr"
+
+
+def frame_name(index: int) -> str:
+    """File name of shot number ``index`` in its run folder."""
+    return f"frame_{index:05d}.exr"
+
+
+class Recorder(ABC):
+    """Keeps what a run writes, file by file, from any thread.
+
+    Attributes
+    ----------
+    folder
+        where the files lie; None in memory.
+    files
+        channels and metadata by file name, in memory alone.
+    """
+
+    folder: Path | None = None
+
+    def __init__(self) -> None:
+        self.files: dict[str, tuple[Channels, Metadata]] = {}
+
+    @abstractmethod
+    def begin(self) -> None:
+        """Begin to write: all input has been checked."""
+
+    @abstractmethod
+    def keeps(self, index: int) -> bool:
+        """Whether shot number ``index`` is there already; it then counts as written."""
+
+    def write(self, name: str, channels: Channels, metadata: Metadata) -> None:
+        """Write a file of the run, whole or not at all.
+
+        Parameters
+        ----------
+        name
+            of the file.
+        channels, metadata
+            of it, (rows, columns) each.
+        """
+        self._write(name, channels, metadata)
+
+    def write_frame(self, index: int, channels: Channels, metadata: Metadata) -> None:
+        """Write one shot.
+
+        Parameters
+        ----------
+        index
+            its number.
+        channels, metadata
+            of its file, (rows, columns) each.
+        """
+        self.write(frame_name(index), channels, {**self._identity(index, channels), **metadata})
+
+    def write_truth(self, reflectance: FloatArray, board: float, standard_error: FloatArray | None = None) -> None:
+        """Write the truth.
+
+        Parameters
+        ----------
+        reflectance, board
+            (n, n), relative to a board of that reflectance.
+        standard_error
+            (n, n) of it, where known.
+        """
+        channels: dict[str, Channel] = {"reflectance": reflectance.astype(np.float32)}
+        if standard_error is not None:
+            channels["standard_error"] = standard_error.astype(np.float32)
+        self.write(TRUTH, channels, {"board_reflectance": board})
+
+    @abstractmethod
+    def finish(self, manifest: RunManifest) -> RunManifest:
+        """The ``manifest`` of the finished run, with what only the recorder knows."""
+
+    @abstractmethod
+    def _write(self, name: str, channels: Channels, metadata: Metadata) -> None: ...
+
+    def _identity(self, index: int, channels: Channels) -> dict[str, Value]:
+        """What tells a frame on disk from others; nothing in memory."""
+        return {}
+
+
+class RunMemory(Recorder):
+    """Keeps a run in memory."""
+
+    def begin(self) -> None:
+        """Nothing is there yet."""
+
+    def keeps(self, index: int) -> bool:
+        """Whether shot number ``index`` is there already: never."""
+        return False
+
+    def finish(self, manifest: RunManifest) -> RunManifest:
+        """The ``manifest`` as it is."""
+        return manifest
+
+    def _write(self, name: str, channels: Channels, metadata: Metadata) -> None:
+        self.files[name] = channels, metadata
+
+
+class RunFolder(Recorder):
+    """Keeps a run in a folder, whole, resumable and checked; made by :func:`claimed`.
+
+    A frame is kept on resume when it is the one that a finished run's checksum names, or, in an interrupted run, when
+    it is readable, carries this run's digest, and its pixels have the checksum that was noted with it.
+    """
+
+    folder: Path
+
+    def __init__(self, folder: Path, head: RunHead, known: Mapping[str, str]) -> None:
+        """A run in its folder.
+
+        Parameters
+        ----------
+        folder, head
+            where it lies, and the configuration.
+        known
+            checksums of an earlier, finished run, by file name.
+        """
+        super().__init__()
+        self.folder, self.head = folder, head
+        self._known, self._checksums, self._lock = known, dict[str, str](), threading.Lock()
+
+    def begin(self) -> None:
+        """Mark the folder as an unfinished run of this configuration, and clear what a killed process left."""
+        sweep(self.folder)
+        configuration, digest = self.head.configuration, self.head.configuration_sha256
+        head = RunHead(status="incomplete", configuration=configuration, configuration_sha256=digest)
+        write_manifest(self.folder, head)
+
+    def keeps(self, index: int) -> bool:
+        """Whether shot number ``index`` is there already; it then counts as written."""
+        name = frame_name(index)
+        path = self.folder / name
+        if not path.is_file():
+            return False
+        actual = checksum(path)
+        same = self._known[name] == actual if name in self._known else self._is_ours(path, index)
+        if same:
+            self._note(name, actual)
+        return same
+
+    def finish(self, manifest: RunManifest) -> RunManifest:
+        """Write the ``manifest`` of the finished run, with checksums; returns it."""
+        checksums = dict(sorted(self._checksums.items()))
+        manifest = manifest.model_copy(update={"status": "complete", "checksums": checksums})
+        write_manifest(self.folder, manifest)
+        return manifest
+
+    def _write(self, name: str, channels: Channels, metadata: Metadata) -> None:
+        write_frame(self.folder / name, channels, metadata)
+        self._note(name, checksum(self.folder / name))
+
+    def _note(self, name: str, value: str) -> None:
+        with self._lock:
+            self._checksums[name] = value
+
+    def _is_ours(self, path: Path, index: int) -> bool:
+        try:
+            channels, metadata = read_frame(path)
+        except MitsimError:
+            return False
+        return all(metadata.get(key) == value for key, value in self._identity(index, channels).items())
+
+    def _identity(self, index: int, channels: Channels) -> dict[str, Value]:
+        """What tells a frame from one of another run, another place in this one, or one that was damaged."""
+        return {"run": self.head.configuration_sha256, "index": index, "pixels_sha256": _pixels(channels)}
+
+
+def _pixels(channels: Channels) -> str:
+    """SHA-256 of the channels' names and values: in an interrupted run no manifest holds checksums of files yet."""
+    digest = hashlib.sha256()
+    for name, values in sorted(channels.items()):
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(values).data)
+    return digest.hexdigest()
+
+
+@contextmanager
+def claimed(path: Path, head: RunHead, resume: bool) -> Iterator[RunFolder]:
+    """A folder for a run, checked before any work; if that fails before writing, a new folder is removed.
+
+    Parameters
+    ----------
+    path
+        of the folder.
+    head
+        the configuration of the run.
+    resume
+        whether the folder may hold an unfinished or finished run of the same configuration.
+
+    Raises
+    ------
+    MitsimError
+        for a place that cannot be written, that holds something else, or, with ``resume``, another configuration.
+    """
+    known: Mapping[str, str] = {}
+    again = resume and (path / MANIFEST).is_file()
+    if again:
+        known = check_same(path, head)
+    with output_folder(path, overwrite=again) as folder:
+        yield RunFolder(folder, head, known)
+
+
+def check_same(path: Path, head: RunHead) -> Mapping[str, str]:
+    """Checksums of the frames in ``path`` of a finished run that ``head`` begins; none of an interrupted one.
+
+    MitsimError for a run of another configuration.
+    """
+    before = read_head(path)
+    if before.configuration_sha256 != head.configuration_sha256:
+        changed = [key for key, value in head.configuration.items() if before.configuration.get(key) != value]
+        raise MitsimError(
+            f"resume=True: {path} holds a run of another configuration ({', '.join(changed) or 'unknown'} differ); "
+            "use the same options, or another folder"
+        )
+    return read_manifest(path, RunManifest).checksums if before.status == "complete" else {}

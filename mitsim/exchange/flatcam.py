@@ -17,15 +17,28 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.colours import RUN, ColourManifest
 from mitsim.core.errors import MitsimError
-from mitsim.core.framefile import Channels, Metadata
+from mitsim.core.exr import Channels, Metadata
 from mitsim.core.manifests import CalibrationManifest, RunManifest, ShotFile
-from mitsim.exchange.coloured import Coloured, unpacked_colours
-from mitsim.exchange.matlab_file import Variables, array_in, matrix_in, read_variables, text_in, write_variables
-from mitsim.exchange.matlab_lines import COLOURED, colours_in, endings, lines_in
-from mitsim.exchange.matlab_variables import calibration_in, dn_per_rate, factors_in_dn, of_folders, run_in
-from mitsim.exchange.packed import FACTORS, Packed, checked_channel, shots_of, unpacked_run
+from mitsim.core.spectral_manifests import RUN, ColourManifest
+from mitsim.exchange.matlab import (
+    COLOURED,
+    Variables,
+    array_in,
+    calibration_in,
+    colours_in,
+    dn_per_rate,
+    endings,
+    factors_in_dn,
+    lines_in,
+    matrix_in,
+    of_folders,
+    read_variables,
+    run_in,
+    text_in,
+    write_variables,
+)
+from mitsim.exchange.packed import FACTORS, Coloured, Packed, checked_channel, shots_of, unpacked_colours, unpacked_run
 from mitsim.exchange.planes import PLANES, check_channel
 
 _COLOURS = (("r",), ("gr", "gb"), ("b",))

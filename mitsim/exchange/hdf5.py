@@ -15,27 +15,30 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitsim import __version__
-from mitsim.core.colours import CALIBRATION, MOSAIC, RUN, ColourManifest
+from mitsim.core.arrayfile import whole_hdf5
 from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.framefile import Channels, Metadata, Value
-from mitsim.core.hdf5file import whole_hdf5
-from mitsim.core.jsonfile import MOST_BYTES, parse_json
+from mitsim.core.exr import Channels, Metadata, Value
+from mitsim.core.files import FRAME_LIMITS, MOST_BYTES, MOST_PIXELS, check_plain, fits_a_frame, parse_json
 from mitsim.core.manifests import CalibrationManifest, RunManifest
-from mitsim.core.plainfile import FRAME_LIMITS, MOST_PIXELS, check_plain, fits_a_frame
-from mitsim.core.recorders import TRUTH
 from mitsim.core.resources import Cost, Limits
-from mitsim.core.runs import Capture
-from mitsim.exchange.coloured import Coloured, Filtered, line_of, run_parts, unpacked_colours, unpacked_filters
+from mitsim.core.runs import TRUTH, Capture
+from mitsim.core.spectral_manifests import CALIBRATION, MOSAIC, RUN, ColourManifest
 from mitsim.exchange.packed import (
     FACTORS,
+    Coloured,
+    Filtered,
     Packed,
     checked_channel,
+    line_of,
     manifest_text,
+    run_parts,
     shots_of,
     unpacked,
+    unpacked_colours,
+    unpacked_filters,
     unpacked_run,
 )
+from mitsim.version import __version__
 
 if TYPE_CHECKING:
     import h5py

@@ -16,21 +16,20 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.configuration import locate, validated
+from mitsim.core.environment import versions
 from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.framefile import Channel, Channels, Metadata, checksum
-from mitsim.core.imagefile import Numbers, image_pages, read_images
+from mitsim.core.exr import Channel, Channels, Metadata, checksum
+from mitsim.core.files import read_json
 from mitsim.core.imagelist import image_files
-from mitsim.core.jsonfile import read_json
+from mitsim.core.images import Numbers, image_pages, read_images
 from mitsim.core.manifests import AmbientFile, CalibrationManifest, Digital, Patterns, RunHead, RunManifest
-from mitsim.core.recorders import AMBIENT, frame_name
 from mitsim.core.resources import Cost, Limits
-from mitsim.core.versions import versions
-from mitsim.exchange.known import RealCapture
+from mitsim.core.runs import AMBIENT, frame_name
+from mitsim.devices.patterns import PatternFamily, parse_patterns
+from mitsim.devices.sensor import SensorModel, digital_of, load_sensor
+from mitsim.exchange.formats import RealCapture
 from mitsim.exchange.packed import FACTORS, Packed, packed_calibration
 from mitsim.exchange.planes import PLANES
-from mitsim.rig.digital import digital_of
-from mitsim.rig.patterns import PatternFamily, parse_patterns
-from mitsim.rig.sensor import SensorModel, load_sensor
 
 _SECONDS_PER_PIXEL = 1e-7
 """Of an import, which reads every frame twice and writes it once: some 30 s for 256 megapixels on a slow disk."""

@@ -14,12 +14,10 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.core.files import whole_file
 from mitsim.core.manifests import SIDES, CalibrationManifest, RunManifest
-from mitsim.core.output import whole_file
-from mitsim.core.recorders import TRUTH
-from mitsim.core.runs import Capture, load_run
-from mitsim.exchange.coloured import Coloured, Filtered, line_of
-from mitsim.exchange.packed import FACTORS, Packed
+from mitsim.core.runs import TRUTH, Capture, load_run
+from mitsim.exchange.packed import FACTORS, Coloured, Filtered, Packed, line_of
 from mitsim.reconstruct.mosaic import behind
 
 if TYPE_CHECKING:

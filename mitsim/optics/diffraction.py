@@ -35,12 +35,12 @@ from scipy.special import fresnel
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads
-from mitsim.optics.profile import Steps, smooth_box_means
+from mitsim.devices.mask import Mask
+from mitsim.devices.plate import FEW, Plate
+from mitsim.devices.projector import Spectrum
+from mitsim.optics.edge_profile import Steps, smooth_box_means
+from mitsim.optics.mask_defects import nodes_between, polynomials
 from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, both_axes
-from mitsim.optics.tilt import nodes_between, polynomials
-from mitsim.rig.mask import Mask
-from mitsim.rig.plate import FEW, Plate
-from mitsim.rig.projector import Spectrum
 
 ComplexArray = npt.NDArray[np.complex128]
 _STEP_MM = 2.5e-4

@@ -1,6 +1,6 @@
 """Frames of a family: from light of its classes to the expected irradiance of every shot, and its Monte Carlo error.
 
-The closed form of one light distribution is :mod:`mitsim.optics.closed_form`.
+The closed form of one light distribution is :mod:`mitsim.optics.image_formation`.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from scipy.special import stdtrit
 from mitsim.core.arrays import FloatArray
 from mitsim.core.parallel import in_threads
 from mitsim.core.seeds import stream
-from mitsim.optics.closed_form import Entries, FrameOptics, IntArray
-from mitsim.rig.camera import side_of
-from mitsim.rig.patterns import Lighting
+from mitsim.devices.camera import side_of
+from mitsim.devices.patterns import Lighting
+from mitsim.optics.image_formation import Entries, FrameOptics, IntArray
 
 _AT_ONCE, _BYTES_AT_ONCE = 32, 2**27
 """Frames formed at a time: enough to keep all processors busy; and their bytes, where fewer have as many: 4 frames of a
@@ -117,7 +117,7 @@ def frames_in_memory(classes: int, shots: int, pixels: float) -> int:
     Parameters
     ----------
     classes, shots, pixels
-        of the family, and a side of the sensor (:func:`mitsim.rig.camera.side_of`).
+        of the family, and a side of the sensor (:func:`mitsim.devices.camera.side_of`).
     """
     return (classes if mixes(classes, shots, pixels) else 0) + 3 * at_once(pixels)
 
@@ -128,7 +128,7 @@ def formed_frames(classes: int, shots: int, pixels: float) -> int:
     Parameters
     ----------
     classes, shots, pixels
-        of the family, and a side of the sensor (:func:`mitsim.rig.camera.side_of`).
+        of the family, and a side of the sensor (:func:`mitsim.devices.camera.side_of`).
     """
     return classes if mixes(classes, shots, pixels) else 2 * shots
 
@@ -139,7 +139,7 @@ def mixes(classes: int, shots: int, pixels: float) -> bool:
     Parameters
     ----------
     classes, shots, pixels
-        of the family, and a side of the sensor (:func:`mitsim.rig.camera.side_of`).
+        of the family, and a side of the sensor (:func:`mitsim.devices.camera.side_of`).
     """
     return classes <= min(_LARGEST_BASIS, shots, _BASIS_BYTES // (_FLOAT * pixels**2))
 

@@ -6,7 +6,7 @@ weighted by the density of s, the convolution of two boxes: a trapezoid. Its int
 difference of a piecewise-quadratic distribution function, so the mean is exact. (Four corner values of the
 profile's second cumulative sum give the same number in exact arithmetic, but they cancel in float64: the
 sums reach N**2/2 features while the second difference is a hundredth of one.) Point directions leave the pixel's box.
-Profiles whose features are not even, or blurred, are those of :mod:`mitsim.optics.profile`.
+Profiles whose features are not even, or blurred, are those of :mod:`mitsim.optics.edge_profile`.
 
 A thick mask has two faces, the entrance ``thickness`` further from the sensor than the exit. A ray of slope t (x/z seen
 from its sensor point) that leaves through s entered at s' = s + thickness t, and for a point source at (tau z, z) that
@@ -19,7 +19,7 @@ A cell takes the clear profile of its centre.
 
 A mask whose centre is off the axis by o is a centred one seen from its own axis: u - o, and tau - o/z. One that is
 tilted along the axis, its distance d + a s + b, is met by a ray of slope t = tau - u/z at s + t (a s + b) / (1 - a t),
-times sqrt(1 + a^2) along it (:mod:`mitsim.optics.tilt`).
+times sqrt(1 + a^2) along it (:mod:`mitsim.optics.mask_defects`).
 
 All coordinates are index coordinates, centred, in mm; tau is a pure number.
 """
@@ -34,10 +34,10 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import ByValue, FloatArray, SeparableTerm
 from mitsim.core.errors import MitsimError
-from mitsim.optics.profile import Steps
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.mask import Mask
-from mitsim.rig.plate import Plate
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.mask import Mask
+from mitsim.devices.plate import Plate
+from mitsim.optics.edge_profile import Steps
 
 SeparableTerms = list[SeparableTerm]
 EVEN = ((0.0, 0.0), (0.0, 0.0))

@@ -30,9 +30,8 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.projector import Coherence
-from mitsim.rig.rig import Rig
+from mitsim.devices.camera import CameraGeometry, Rig
+from mitsim.devices.projector import Coherence
 
 _NODES = 16
 """Of Gauss and Legendre's rule over half a triangle that two projector pixels' points are apart: six digits of the

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.projector import Spectrum
 from mitsim.optics.diffraction import wave_terms
-from mitsim.optics.motion import moving_terms
-from mitsim.optics.raster import raster
+from mitsim.optics.fft_shadow import raster
+from mitsim.optics.mask_defects import moving_terms, tilted_terms
 from mitsim.optics.shadow import Directions, Places, SeparableTerms, ShadowGeometry, geometric_terms
-from mitsim.optics.tilt import tilted_terms
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.projector import Spectrum
 
 
 def shadow_terms(

@@ -13,15 +13,12 @@ from scipy.ndimage import gaussian_filter, median_filter
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.core.manifests import Parallax
 from mitsim.core.runs import Capture
-from mitsim.reconstruct.alldepths import AllDepths
+from mitsim.reconstruct.depth import AllDepths
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import pixels_of_parallax, stated_parallax
+from mitsim.reconstruct.focus import STEP, dotted, pixels_of_parallax, stated_parallax, unambiguous
 from mitsim.reconstruct.solver import prepare
 
-STEP = 0.5
-"""Projector pixels of parallax between displacements that are looked at; a dot's image is some two wide."""
 LAMBDAS = 1e-5, 1e-6, 1e-7
 """Of the largest sigma^2: at less, noise rules, at more, dots blur (cookie_bag under dots:7x16 at 1.4 s: median errors
 of 1.2, 0.6, 0.4 mm)."""
@@ -76,7 +73,7 @@ class Arrivals:
             )
         self.pixel = 1 / max(moves)
         periods = [own.shape[1] for own in shots.patterns]
-        self.width = min(self._span, _unambiguous(np.where(self._open, moves, 0.0) * self.pixel, periods) * self.pixel)
+        self.width = min(self._span, unambiguous(np.where(self._open, moves, 0.0) * self.pixel, periods) * self.pixel)
         self.reach = beside + self.width / 2 + (max(OFFSETS) + _MARGIN) * self.pixel
         self.depths = AllDepths(shots, factors, (-self.reach, self.reach))
         self._margin = int(np.ceil(self.reach / self.pixel)) + 1
@@ -153,50 +150,8 @@ class Arrivals:
         return found
 
 
-def parallax_period(patterns: tuple[FloatArray, FloatArray], parallax: Parallax) -> float:
-    """Change of 1/z [1/mm] that moves the light of dots onto the place of others; inf for other patterns, and where
-    depth moves no light.
-
-    Parameters
-    ----------
-    patterns
-        P_L (n, K) and P_R (n', K').
-    parallax
-        of the calibration.
-    """
-    ends = [pixels_of_parallax(parallax, axis, len(lit))[:2] for axis, lit in enumerate(patterns)]
-    moves = np.array([max(map(abs, each)) for each in ends])
-    if not (moves.any() and all(_dotted(lit) for lit in patterns)):
-        return np.inf
-    pixel = 1 / moves.max()
-    return float(_unambiguous(moves * pixel, [lit.shape[1] for lit in patterns]) * pixel)
-
-
-def _dotted(patterns: FloatArray) -> bool:
-    """Whether each pixel is lit by one of the (n, K) ``patterns``, as dots light it."""
-    values = np.sort(patterns, axis=1)
-    return not values[:, :-1].any() and bool((values[:, -1] == 1).all())
-
-
 def _classes(patterns: FloatArray) -> np.ndarray:
     """(n,) which of the (n, K) ``patterns`` lights each pixel; MitsimError where it is not one of them, as of dots."""
-    if not _dotted(patterns):
+    if not dotted(patterns):
         raise MitsimError("focus map: needs shifting dots, such as dots:7x16, whose displacement tells depth")
     return np.asarray(patterns.argmax(axis=1))
-
-
-def _unambiguous(moves: FloatArray, periods: list[int]) -> float:
-    """Projector pixels of parallax by which light moves onto the place of another dot's of the same frame.
-
-    Parameters
-    ----------
-    moves
-        projector pixels along both axes for one of parallax; 0 of an axis that has none.
-    periods
-        of the dots.
-    """
-    for parallax in np.arange(1.0, np.prod(periods) + 1, STEP / 4):
-        turns = moves * parallax / periods
-        if np.round(turns).any() and (np.abs(turns - np.round(turns)) * periods < STEP / 2).all():
-            return float(np.ceil(parallax))
-    return np.inf

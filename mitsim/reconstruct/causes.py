@@ -16,9 +16,9 @@ from functools import cached_property
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.measurement import Measurement
-from mitsim.reconstruct.calibration import SEPARABLE_RESIDUAL
+from mitsim.core.runs import Measurement
 from mitsim.reconstruct.detail import LitFrame, blocks_of, orthonormal, print_part, slope_of
+from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.sides import IndexArray, group_pixels
 

@@ -25,8 +25,8 @@ from scipy import fft
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.devices.patterns import PatternFamily
 from mitsim.reconstruct.status import Status, Verdict
-from mitsim.rig.patterns import PatternFamily
 
 Operator = Callable[[FloatArray], FloatArray]
 """From an image (n, n) to another."""

@@ -16,12 +16,10 @@ import numpy as np
 from scipy.ndimage import maximum_filter, uniform_filter
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.measurement import Ambient, Measurement
-from mitsim.core.runs import Capture
-from mitsim.reconstruct.accumulator import centred
+from mitsim.core.runs import Ambient, Capture, Measurement
 from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.sides import IndexArray
-from mitsim.reconstruct.solver import Prepared
+from mitsim.reconstruct.solver import Prepared, centred
 
 _SPREADS = 7.0
 """Standard deviations of noise, 1e-12 for a pixel, beyond which its residual's energy is no chance."""

@@ -14,15 +14,15 @@ import numpy as np
 from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray, SeparableTerm
 from mitsim.core.errors import MitsimError, cut
-from mitsim.core.framefile import Channels, Metadata, checksum, finite_channel, read_frame, verify, write_frame
+from mitsim.core.exr import Channels, Metadata, checksum, finite_channel, read_frame, verify, write_frame
+from mitsim.core.files import output_folder
 from mitsim.core.manifests import SIDES, CalibrationManifest, FactorNoise, read_manifest, write_manifest
-from mitsim.core.output import output_folder
 from mitsim.core.pictures import card, scaled, span
 from mitsim.core.runs import Capture
-from mitsim.reconstruct.accumulator import centred_columns
-from mitsim.reconstruct.calibration import Estimate, squared_condition
+from mitsim.devices.patterns import PatternFamily, parse_patterns
+from mitsim.reconstruct.estimate_factors import Estimate, squared_condition
+from mitsim.reconstruct.solver import centred_columns
 from mitsim.reconstruct.status import Status, Verdict
-from mitsim.rig.patterns import PatternFamily, parse_patterns
 
 if TYPE_CHECKING:
     from scipy.sparse.linalg import LinearOperator
@@ -124,7 +124,7 @@ class Factors:
 
     @checked
     def write(self, folder: Path) -> Path:
-        """The same in a ``folder`` that this process holds already (:func:`mitsim.core.output.output_folder`)."""
+        """The same in a ``folder`` that this process holds already (:func:`mitsim.core.files.output_folder`)."""
         metadata: dict[str, str | float] = {"unit": "sqrt(e-/s)"}
         if self.manifest.board_reflectance is not None:
             metadata["reflectance"] = self.manifest.board_reflectance

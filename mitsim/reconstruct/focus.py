@@ -25,12 +25,13 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import Parallax
-from mitsim.core.measurement import Ambient, Measurement
-from mitsim.core.runs import Capture
-from mitsim.reconstruct.asked import check_parallax
+from mitsim.core.runs import Ambient, Capture, Measurement
 from mitsim.reconstruct.between import Between
 from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.request import check_parallax
 
+STEP = 0.5
+"""Projector pixels of parallax between displacements that are looked at; a dot's image is some two wide."""
 _NEIGHBOURS = 4
 """Columns that a cubic takes: of 2 to 8 it leaves least (a sheet at 360 mm, 128 pixels: 3.1e-3, 2.1e-3, 2.1e-3, 2.1e-3
 of the measurements); more neighbours add noise."""
@@ -317,3 +318,45 @@ class _Part(Capture):
         if whole is None:
             return None
         return Ambient(whole.rate[part.rows, part.columns], whole.variance[part.rows, part.columns], whole.shots)
+
+
+def parallax_period(patterns: tuple[FloatArray, FloatArray], parallax: Parallax) -> float:
+    """Change of 1/z [1/mm] that moves the light of dots onto the place of others; inf for other patterns, and where
+    depth moves no light.
+
+    Parameters
+    ----------
+    patterns
+        P_L (n, K) and P_R (n', K').
+    parallax
+        of the calibration.
+    """
+    ends = [pixels_of_parallax(parallax, axis, len(lit))[:2] for axis, lit in enumerate(patterns)]
+    moves = np.array([max(map(abs, each)) for each in ends])
+    if not (moves.any() and all(dotted(lit) for lit in patterns)):
+        return np.inf
+    pixel = 1 / moves.max()
+    return float(unambiguous(moves * pixel, [lit.shape[1] for lit in patterns]) * pixel)
+
+
+def dotted(patterns: FloatArray) -> bool:
+    """Whether each pixel is lit by one of the (n, K) ``patterns``, as dots light it."""
+    values = np.sort(patterns, axis=1)
+    return not values[:, :-1].any() and bool((values[:, -1] == 1).all())
+
+
+def unambiguous(moves: FloatArray, periods: list[int]) -> float:
+    """Projector pixels of parallax by which light moves onto the place of another dot's of the same frame.
+
+    Parameters
+    ----------
+    moves
+        projector pixels along both axes for one of parallax; 0 of an axis that has none.
+    periods
+        of the dots.
+    """
+    for parallax in np.arange(1.0, np.prod(periods) + 1, STEP / 4):
+        turns = moves * parallax / periods
+        if np.round(turns).any() and (np.abs(turns - np.round(turns)) * periods < STEP / 2).all():
+            return float(np.ceil(parallax))
+    return np.inf

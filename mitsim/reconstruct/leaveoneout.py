@@ -16,12 +16,11 @@ from scipy.ndimage import uniform_filter
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.manifests import RunManifest
-from mitsim.core.measurement import Measurement
-from mitsim.reconstruct.accumulator import centred
+from mitsim.core.runs import Measurement
 from mitsim.reconstruct.framefault import Fault, FrameFault, listed
 from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.sides import group_pixels
-from mitsim.reconstruct.solver import Prepared
+from mitsim.reconstruct.solver import Prepared, centred
 
 Pattern = tuple[int, int]
 BoolArray = npt.NDArray[np.bool_]

@@ -22,8 +22,7 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import Parallax
-from mitsim.core.measurement import Ambient, Measurement
-from mitsim.core.runs import Capture
+from mitsim.core.runs import Ambient, Capture, Measurement
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import LEAST_PART, FactorOfDepths, Focused, stated_parallax
 

@@ -15,18 +15,19 @@ from typing import Any
 
 import numpy as np
 
-from mitsim.core.arrays import FloatArray
-from mitsim.core.measurement import Measurement
-from mitsim.reconstruct.accumulator import centred
-from mitsim.reconstruct.calibration import decibels
+from mitsim.core.arrays import FloatArray, SeparableTerm
+from mitsim.core.runs import Measurement
 from mitsim.reconstruct.causes import Cause, Evidence, Signatures, likely_cause
 from mitsim.reconstruct.defects import Defects, defects_of
+from mitsim.reconstruct.detail import Model
+from mitsim.reconstruct.estimate_factors import decibels
 from mitsim.reconstruct.faults import FrameCheck
 from mitsim.reconstruct.framefault import FrameFault
 from mitsim.reconstruct.leaveoneout import FrameSums
 from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.readings import Reading, Readings, multiple
-from mitsim.reconstruct.solver import Prepared
+from mitsim.reconstruct.sides import Side
+from mitsim.reconstruct.solver import Prepared, centred
 from mitsim.reconstruct.status import Status, Verdict
 
 UNEXPLAINED = 3.5e-3
@@ -445,3 +446,41 @@ def _chance(noise: FrameNoise, pixels: float) -> float:
     variance v in n data varies by sqrt(2 n) v."""
     total = max(float(noise.variance.sum()), _TINY)
     return CHANCE * float(np.sqrt(2 * np.square(noise.variance).sum() / pixels)) / total
+
+
+# -------- Separable terms that factors lack, an image in
+
+
+@dataclass(frozen=True, eq=False)
+class Lack:
+    """What ``terms`` beside a ``model``'s factors, centred as these are, do to its ``image`` (n, n'); one or more."""
+
+    model: Model
+    terms: tuple[SeparableTerm, ...]
+    image: FloatArray
+
+    @property
+    def energy(self) -> float:
+        """Energy that they put into all frames outside of the model's range."""
+        left, right = (lit @ lit.T for lit in self.model.patterns)
+        total = 0.0
+        for a, b in self.terms:
+            for c, d in self.terms:
+                total += float(np.vdot(self.image, ((a.T @ c) * left) @ self.image @ ((d.T @ b) * right)))
+        return max(total - float(np.square(self.struck).sum()), 0.0)
+
+    @cached_property
+    def struck(self) -> FloatArray:
+        """(r, r') what they add to the coefficients W of all frames."""
+        sides, patterns = self.model.sides, self.model.patterns
+        return np.asarray(
+            sum(_seen(sides[0], a, patterns[0]) @ self.image @ _seen(sides[1], b, patterns[1]).T for a, b in self.terms)
+        )
+
+
+def _seen(side: Side, term: FloatArray, patterns: FloatArray) -> FloatArray:
+    """(r, n) sum_i U_i^T L diag(p_i), of one side of a ``term`` L (m, n) and its ``patterns`` (n, K)."""
+    seen = np.zeros((len(side.singular), term.shape[1]))
+    for slab, lit in zip(side.slabs, patterns.T, strict=True):
+        seen[slab.columns] += (slab.matrix.T @ term) * lit
+    return seen

@@ -9,7 +9,7 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.manifests import FactorNoise, RunManifest
-from mitsim.core.measurement import Measurement
+from mitsim.core.runs import Measurement
 from mitsim.reconstruct.solver import Prepared
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.manifests import RunManifest
-from mitsim.core.measurement import Measurement
+from mitsim.core.runs import Measurement
 from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.faults import STEPS
 from mitsim.reconstruct.noise import FrameNoise

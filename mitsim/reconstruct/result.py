@@ -12,15 +12,13 @@ import numpy as np
 from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.framefile import write_frame
-from mitsim.core.jsonfile import plain, read_json, write_json
-from mitsim.core.output import output_folder, whole_file
+from mitsim.core.exr import write_frame
+from mitsim.core.files import output_folder, plain, read_json, whole_file, write_json
 from mitsim.core.pictures import card, png, scaled, span
-from mitsim.reconstruct.asked import IMAGE_FILE
-from mitsim.reconstruct.cost import Predicted
 from mitsim.reconstruct.depth import Depth
-from mitsim.reconstruct.depthmap import DepthMap
+from mitsim.reconstruct.depth_map import DepthMap
 from mitsim.reconstruct.misfit import Misfit
+from mitsim.reconstruct.request import IMAGE_FILE, Predicted
 from mitsim.reconstruct.status import Status
 from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Uncertainty
 
@@ -165,7 +163,7 @@ class Reconstruction:
 
     @checked
     def write(self, folder: Path, more: Mapping[str, Any] | None = None) -> Path:
-        """The same in a ``folder`` that this process holds already (:func:`mitsim.core.output.output_folder`); ``more``
+        """The same in a ``folder`` that this process holds already (:func:`mitsim.core.files.output_folder`); ``more``
         are further entries of result.json."""
         write_frame(
             folder / IMAGE_FILE, {"reflectance": self.image.astype(np.float32)}, {"method": self.inputs["method"]}

@@ -15,13 +15,13 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.calibration import Estimate, StripeSums, factors_of_sums
+from mitsim.devices.session import SIDES, Half, Side
+from mitsim.reconstruct.estimate_factors import Estimate, StripeSums, factors_of_sums
 from mitsim.reconstruct.session_findings import Lamp, SessionFault, frame_words
 from mitsim.reconstruct.session_frames import WrongPairs
 from mitsim.reconstruct.session_lamp import lamp_of_frames
 from mitsim.reconstruct.session_pairs import Pairs
 from mitsim.reconstruct.session_side import MOST_FAULTS, SideCheck
-from mitsim.rig.order import SIDES, Half, Side
 
 
 @dataclass
@@ -71,7 +71,7 @@ class Checked:
         signs
             (n, N) H.
         noise
-            as ``stated_noise`` of :func:`mitsim.reconstruct.calibration.factors_of_sums`.
+            as ``stated_noise`` of :func:`mitsim.reconstruct.estimate_factors.factors_of_sums`.
         """
         return factors_of_sums(*self.sums, signs, noise, self.left_out, self.extra)
 

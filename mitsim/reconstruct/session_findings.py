@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from mitsim.rig.order import UNIFORM, Half, Side
+from mitsim.devices.session import UNIFORM, Half, Side
 
 DARK = 0.03
 """Light of a black frame, as a part of what it should have: stray light and the projector's own black level."""

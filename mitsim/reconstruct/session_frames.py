@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
+from mitsim.devices.session import Half
 from mitsim.reconstruct.session_findings import DARK, Lamp, SessionFault, dimmed, frame_words
 from mitsim.reconstruct.session_pairs import Pairs
 from mitsim.reconstruct.session_side import SideCheck
-from mitsim.rig.order import Half
 
 _EXPLAINED = 0.05
 """Part of a faulty frame's squared deviation that the fault's name may leave unexplained."""

@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
-from mitsim.reconstruct.calibration import FLUX_NOISE
+from mitsim.devices.session import Half
+from mitsim.reconstruct.estimate_factors import FLUX_NOISE
 from mitsim.reconstruct.session_findings import DARK, Lamp
 from mitsim.reconstruct.session_side import SLIGHT, SideCheck
-from mitsim.rig.order import Half
 
 MATTERS = 0.5
 """Error by the lamp, over that by noise, from which it is corrected and said: both in quadrature are 12 % more."""

@@ -12,10 +12,10 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.devices.session import Half
 from mitsim.reconstruct.session_findings import Lamp
 from mitsim.reconstruct.session_lamp import MATTERS, end_to_end, flickers, trend_of
 from mitsim.reconstruct.session_side import MOST_FAULTS, SideCheck
-from mitsim.rig.order import Half
 
 _DEVIATIONS = 8.0
 """Deviations from the rest, by their own robust scatter, that make a fault: noise alone goes so far in one session of

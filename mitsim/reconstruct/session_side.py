@@ -15,11 +15,11 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.calibration import StripeSums
+from mitsim.devices import session
+from mitsim.devices.session import SIDES, UNIFORM, Half
+from mitsim.reconstruct.estimate_factors import StripeSums
 from mitsim.reconstruct.moving_shadow import MovingShadow
 from mitsim.reconstruct.session_findings import DARK, SessionFault, dimmed, frame_words
-from mitsim.rig import order
-from mitsim.rig.order import SIDES, UNIFORM, Half
 
 MOST_FAULTS = 0.1
 """Part of the patterns that may be wrong before the session is refused: with more, what most share is in doubt."""
@@ -95,7 +95,7 @@ class SideCheck:
     def __init__(self, sums: StripeSums, signs: FloatArray) -> None:
         """Of one side's ``sums``, of patterns ``signs`` H (n, N)."""
         self.sums, self.signs = sums, signs
-        self.side: order.Side = "horizontal" if sums.side == SIDES[0] else "vertical"
+        self.side: session.Side = "horizontal" if sums.side == SIDES[0] else "vertical"
         self.vectors = sums.vectors
         self.faults: list[SessionFault] = []
         self.uncounted: set[int] = set()

@@ -26,7 +26,7 @@ IndexArray = npt.NDArray[np.intp]
 Method = Literal["svd", "gram"]
 Structure = Literal["auto", "block", "full"]
 Strips = tuple[slice, ...]
-Halves = tuple[Strips, Strips]
+StripHalves = tuple[Strips, Strips]
 _STRIPS = 8
 """Strips of sensor rows that alternate between the two halves: some on either side of all that varies slowly over the
 sensor, and each wider than a feature of the mask or a neighbour's crosstalk."""
@@ -75,7 +75,7 @@ class Side:
         number of blocks; K; m; n; independent data rows, m K (less K once frames are centred).
     dual
         (n, r) V' with B = U S V'^T; None: V' is the basis, which is orthonormal
-        (:mod:`mitsim.reconstruct.prior` has others).
+        (:mod:`mitsim.reconstruct.solver` has others).
     spread
         condition of what the basis is made with, which magnifies rounding; 1 of an orthonormal one.
     """
@@ -115,8 +115,8 @@ class Side:
         return len(self.singular) if self.projected else self.scene_size
 
     @cached_property
-    def halves(self) -> Halves:
-        """Sensor rows of the two halves that :mod:`mitsim.reconstruct.halves` holds against each other, as strips: an
+    def halves(self) -> StripHalves:
+        """Sensor rows of the two halves that :mod:`mitsim.reconstruct.regularisation` holds against each other, as strips: an
         array of them would copy each frame that it picks from."""
         width = -(-self.sensor_size // _STRIPS)
         strips = tuple(slice(first, first + width) for first in range(0, self.sensor_size, width))

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
-from mitsim.reconstruct.accumulator import centred
 from mitsim.reconstruct.leaveoneout import CHANCE, OFF, BoolArray, LeaveOneOut, Pattern
+from mitsim.reconstruct.solver import centred
 
 EXPLAINS = 0.2
 """Part of what a frame is off by that a fault may leave: chosen, with room for what the others foretell badly."""

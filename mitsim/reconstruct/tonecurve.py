@@ -16,9 +16,8 @@ from scipy.ndimage import uniform_filter
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.manifests import RunManifest
-from mitsim.core.measurement import Measurement
-from mitsim.reconstruct.accumulator import centred
-from mitsim.reconstruct.solver import Prepared
+from mitsim.core.runs import Measurement
+from mitsim.reconstruct.solver import Prepared, centred
 
 _PARTS, _AROUND, _UNEVEN = 4, 5, 0.3
 """Parts of all readings, from the darkest to the brightest by the mean of so many a side around them, of which each

@@ -25,9 +25,8 @@ from scipy.fft import dctn, idctn
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.regularisation import DiagonalProblem, automatic_lambda, noise_variance
-from mitsim.reconstruct.solver import Prepared
+from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.reconstruct.status import Status, Verdict
 
 _BALANCE, _STEP = 3.0, 2.0

@@ -20,7 +20,7 @@ d_L diag(p_i) has independent numbers of variance s_L^2 rho[a, p], rho[a, p] = |
 
 and the same with the sides exchanged. G is taken apart into a few products of a row and a column. (For patterns whose
 blocks share no row, such as ``random``, and for neighbours alike, rho leaves out what is correlated between
-coefficients.) Where the basis V is not orthonormal (:mod:`mitsim.reconstruct.prior`) V makes the image, its dual sees
+coefficients.) Where the basis V is not orthonormal (:mod:`mitsim.reconstruct.solver`) V makes the image, its dual sees
 light; formulas are the same.
 
 Print that changes within a projector pixel casts another shadow than the board's. A ramp of slope g a pixel has its
@@ -42,13 +42,12 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.framefile import Channel
+from mitsim.core.exr import Channel
 from mitsim.core.manifests import FactorNoise
 from mitsim.reconstruct.detail import PRINT, Model, disagreement
-from mitsim.reconstruct.halves import Halves
-from mitsim.reconstruct.lacking import Lack
+from mitsim.reconstruct.misfit import Lack
 from mitsim.reconstruct.noise import FrameNoise
-from mitsim.reconstruct.regularisation import DiagonalProblem, coefficient_noise
+from mitsim.reconstruct.regularisation import DiagonalProblem, Halves, coefficient_noise
 from mitsim.reconstruct.sides import Side
 from mitsim.reconstruct.spectrum import scene_spectrum
 

@@ -13,9 +13,9 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.rig.camera import CameraGeometry
+from mitsim.devices.camera import CameraGeometry
+from mitsim.scene.guard.limits import PLUGINS
 from mitsim.scene.guard.outline import Outline, Tag
-from mitsim.scene.guard.vocabulary import PLUGINS
 
 _CENTRES = {"sphere": "center", "cylinder": "p0"}
 """Points of shapes that are places beside ``to_world``, and single precision in Mitsuba."""

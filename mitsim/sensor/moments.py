@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy import special
 
 from mitsim.core.arrays import FloatArray
-from mitsim.rig.sensor import SensorModel
+from mitsim.devices.sensor import SensorModel
 from mitsim.sensor.chain import (
     Digital,
     add_dark_current,

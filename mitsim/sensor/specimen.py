@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import stream
-from mitsim.rig.sensor import SensorModel
+from mitsim.devices.sensor import SensorModel
 
 Map = npt.NDArray[np.float32]
 """(rows, columns) numbers of seven digits, more than any is known to."""

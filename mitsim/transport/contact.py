@@ -2,7 +2,7 @@
 
 A ray that has passed a surface starts a little beyond it, and does not see what stands closer: a print in contact with
 glass comes out black. Mitsuba's own integrators start 9e-5 of the coordinates beyond, 0.036 mm at 400 mm, the tracers
-of this room :data:`mitsim.transport.passage.CLEAR`.
+of this room :data:`mitsim.transport.transmission.CLEAR`.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.transport.passage import CLEAR, lets_through
-from mitsim.transport.sampling import generator
+from mitsim.transport.sampler import generator
+from mitsim.transport.transmission import CLEAR, lets_through
 
 _OWN, _MITSUBA = 2 * CLEAR, 1.1 * 1500 * 2.0**-24
 """Gaps, for each mm of coordinates, that our tracers and Mitsuba's integrators still see: their own offsets, with what

@@ -14,14 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.projector import Lines
-from mitsim.transport.histogram import check_finite
-from mitsim.transport.landing import landing
-from mitsim.transport.paths import LANES_PER_LAUNCH
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.projector import Lines
+from mitsim.transport.connect import Receiver, SensorPoints, landing, sampled_wavelengths
+from mitsim.transport.integrator import LANES_PER_LAUNCH
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
-from mitsim.transport.receiver import Receiver, SensorPoints, sampled_wavelengths
-from mitsim.transport.sampling import shuffled, stratified, streams, told_apart
+from mitsim.transport.records import check_finite
+from mitsim.transport.sampler import shuffled, stratified, streams, told_apart
 
 IntArray = npt.NDArray[np.int64]
 

@@ -11,7 +11,7 @@ Value collected, for tan-angle t (the integrand of the reference estimator witho
 
 Most of the projector's light is followed from its own side (:mod:`mitsim.transport.direct`, `.indirect`). From here
 comes what that side cannot find: light whose last surface before the sensor is a mirror, and of indirect light the part
-over sharp turns (:func:`mitsim.transport.paths.camera_part`).
+over sharp turns (:func:`mitsim.transport.integrator.camera_part`).
 
 A path's light is filed under the direction and depth of its first vertex that is no mirror: through plane mirrors, of
 that vertex's image, which is where the camera sees it. Paths end at random (Russian roulette) with a probability that
@@ -20,23 +20,26 @@ keeps the estimate unbiased; there is no last bounce.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from mitsim.rig.camera import CameraGeometry
-from mitsim.transport.cells import CellAxis, CellGrid
+from mitsim.core.spectral_manifests import MOST_LINES
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.lamps import SPECTRA_NM, Band, Response
+from mitsim.transport.connect import SensorPoints, sampled_wavelengths
 from mitsim.transport.connection import Connection, ProjectorConnector
 from mitsim.transport.coordinates import rows_columns, x_y
-from mitsim.transport.histogram import Deposits, Sightings
-from mitsim.transport.panes import refracted_way
-from mitsim.transport.passage import Passage
-from mitsim.transport.paths import FollowingTracer, Walk, camera_part, is_delta
+from mitsim.transport.integrator import FollowingTracer, Walk, camera_part, is_delta
 from mitsim.transport.projector import ProjectorOptics
-from mitsim.transport.receiver import SensorPoints, sampled_wavelengths
-from mitsim.transport.sampling import stratified, streams
+from mitsim.transport.records import CellAxis, CellGrid, Deposits, Sightings
+from mitsim.transport.sampler import shuffled, stratified, streams
+from mitsim.transport.transmission import Passage, refracted_way
 
 _MARGIN = 1e-4
 """Part of a cell that paths keep clear of its edges: 2e-7 of tan-angle, above float32's rounding of 3e-8."""
@@ -107,7 +110,7 @@ class FromCameraTracer(FollowingTracer):
         return self.projector.by_line
 
     def wavelengths(self, rng: mi.PCG32, sample: mi.UInt32, shared: mi.PCG32) -> tuple[mi.Color0f, mi.Spectrum]:
-        """Wavelengths of each path, and weights as :func:`mitsim.transport.receiver.sampled_wavelengths` has them.
+        """Wavelengths of each path, and weights as :func:`mitsim.transport.connect.sampled_wavelengths` has them.
 
         Parameters
         ----------
@@ -285,7 +288,7 @@ class CameraWalk(Walk):
     def _projector_hit(self, si: mi.SurfaceInteraction3f) -> None:
         """Light of a projector's lens that the path has run into.
 
-        Over mirrors alone it is the beams' (:mod:`mitsim.transport.glint`); over one other surface, unless that is
+        Over mirrors alone it is the beams' (:mod:`mitsim.transport.specular`); over one other surface, unless that is
         seen in a mirror, it is the projector's side's.
         """
         hit = self.connector.hit(self.ray, si.t, self.rng, self._foreign, self.since)
@@ -359,3 +362,145 @@ def _place(axis: CellAxis, index: mi.UInt32, jitter: mi.Float) -> mi.Float:
     """Tan-angle of a place in a cell."""
     start, size = dr.opaque(mi.Float, axis.start), dr.opaque(mi.Float, axis.size)
     return start + (mi.Float(index) + jitter) * size
+
+
+# -------- Lamps' light by their own spectra
+
+
+@dataclass(frozen=True, eq=False)
+class Counted:
+    """How lamps' light is counted.
+
+    Attributes
+    ----------
+    response
+        of the camera.
+    bands
+        one for each wavelength of a path; of no width where less are wanted.
+    units
+        irradiance [W m^-2] of each line of the projector that a count of 1 stands for.
+    first
+        number of the first band among all that lamps' light is told apart by.
+    """
+
+    response: Response
+    bands: Sequence[Band]
+    units: Sequence[float]
+    first: int = 0
+
+
+class LampTracer(FromCameraTracer):
+    """Lamps' light alone, at wavelengths of its own. The light of band b is deposited as that of pixel n^2 + b, b from
+    the first, as an irradiance of the projector's line, or of each of its lines."""
+
+    of_projector = False
+    by_line = True
+
+    def __init__(self, like: FromCameraTracer, counted: Counted) -> None:
+        """The paths of a tracer.
+
+        Parameters
+        ----------
+        like
+            what is followed.
+        counted
+            bands, and what they count.
+        """
+        super().__init__(like.scene, like.camera, like.projector, like.grid, like.paths, like.geometry, like.points)
+        self.counted = counted
+        self._alone: mi.UInt32 | None = None
+
+    @property
+    def apart(self) -> Sequence[LampTracer]:
+        """Itself, or where glass parts wavelengths, the same for each band alone."""
+        if not self.projector.parted:
+            return [self]
+        return [self._of(band) for band, (first, last) in enumerate(self.counted.bands) if last > first]
+
+    def _of(self, band: int) -> LampTracer:
+        again = copy(self)
+        again._alone = dr.opaque(mi.UInt32, band)
+        return again
+
+    def wavelengths(
+        self, rng: mi.PCG32, sample: mi.UInt32, shared: mi.PCG32
+    ) -> tuple[mi.Color0f, mi.UnpolarizedSpectrum]:
+        """Wavelengths of each path, and what its light counts at them.
+
+        Parameters
+        ----------
+        rng
+            not asked.
+        sample, shared
+            number of each path's sample, and the numbers that all samples of its cell share.
+        """
+        place = stratified(shuffled(sample, shared), shared).x
+        counts = mi.Float(self.counted.response.counts.astype(np.float32))
+        steps = len(self.counted.response.counts) - 1
+        step = (SPECTRA_NM[1] - SPECTRA_NM[0]) / steps
+        wavelengths, weights = [], []
+        for first, last in self.counted.bands:
+            width = dr.opaque(mi.Float, last - first)
+            wavelength = dr.opaque(mi.Float, first) + place * width
+            position = (wavelength - SPECTRA_NM[0]) / step
+            below = dr.minimum(mi.UInt32(dr.maximum(position, 0)), steps - 1)
+            low, high = dr.gather(mi.Float, counts, below), dr.gather(mi.Float, counts, below + 1)
+            count = low + (high - low) * (position - mi.Float(below))
+            wavelengths.append(wavelength)
+            weights.append(MOST_LINES * count * width / (SPECTRA_NM[1] - SPECTRA_NM[0]))
+        if self._alone is not None:
+            chosen = [self._alone == band for band in range(len(weights))]
+            weights = [dr.select(here, weight, 0) for here, weight in zip(chosen, weights, strict=True)]
+            own = [dr.select(here, wavelength, 0) for here, wavelength in zip(chosen, wavelengths, strict=True)]
+            wavelengths = [sum(own, mi.Float(0))] * len(own)
+        return type(dr.zeros(mi.Ray3f).wavelengths)(*wavelengths), mi.Spectrum(*weights)
+
+    def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
+        return [self._by_band(found) for found in super()._launch(seed, sample, lane)]
+
+    def _by_band(self, found: Deposits) -> Deposits:
+        """An entry for each band of those that were ``found``, path by path."""
+        assert found.lines is not None, "told apart by band"
+        light = found.lines.T.ravel().astype(np.float64)
+        several = Deposits(
+            **{
+                name: np.repeat(getattr(found, name), MOST_LINES)
+                for name in ("anchor_row", "anchor_column", "row", "column", "inverse_depth", "kind")
+            },
+            pixel=(found.pixel[:, None] + self.counted.first + np.arange(MOST_LINES)).ravel(),
+            value=light * self.counted.units[0],
+            lane=None if found.lane is None else np.repeat(found.lane, MOST_LINES),
+        )
+        if not self.projector.by_line:
+            return several
+        units = np.zeros(MOST_LINES)
+        units[: len(self.counted.units)] = self.counted.units
+        return replace(several, lines=(units[:, None] * light).astype(np.float32))
+
+
+class Together:
+    """Light that several tracers follow, of the same samples of each."""
+
+    def __init__(self, *tracers: FromCameraTracer) -> None:
+        """``tracers`` of one scene."""
+        self.tracers = tracers
+
+    @property
+    def lanes(self) -> int:
+        """Paths in one sample."""
+        return sum(tracer.lanes for tracer in self.tracers)
+
+    def trace(self, seed: int, first: int = 0, samples: int = 1) -> Deposits:
+        """Light of some samples, their sum; see :meth:`mitsim.transport.integrator.Tracer.trace`.
+
+        Parameters
+        ----------
+        seed, first, samples
+            as there.
+        """
+        return Deposits.joined([tracer.trace(seed, first, samples) for tracer in self.tracers])
+
+    def trace_looks(self, seeds: Sequence[int], samples: int = 1) -> list[Deposits]:
+        """``samples`` as :meth:`trace` finds them for each of some ``seeds``."""
+        looks = [tracer.trace_looks(seeds, samples) for tracer in self.tracers]
+        return [Deposits.joined(parts) for parts in zip(*looks, strict=True)]

@@ -17,9 +17,9 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.arrays import FloatArray, Labels
-from mitsim.rig.camera import CameraGeometry
+from mitsim.devices.camera import CameraGeometry
 from mitsim.transport.coordinates import turn_and_origin
-from mitsim.transport.host import channels, lanes_of, per_lane, vectors
+from mitsim.transport.plugins.base import channels, lanes_of, per_lane, vectors
 from mitsim.transport.projector import PinholeRays, ProjectorOptics, wavelength_sets
 
 _POINTS, _NEAREST = 512, 1e-4
@@ -27,7 +27,7 @@ _POINTS, _NEAREST = 512, 1e-4
 _MOST_BALLS = 2**12
 """Balls that are looked at, every so many of more: two million points, some 0.5 s."""
 _SHARP = 10.0
-"""Density [1/sr] of a turn below which its light is left to connections, as in :mod:`mitsim.transport.lobes`."""
+"""Density [1/sr] of a turn below which its light is left to connections, as in :mod:`mitsim.transport.sharp_lobes`."""
 _GOLDEN = math.pi * (3 - math.sqrt(5))
 """Angle by which points about a spot follow each other: evenly spread at any number."""
 _FEWEST_MET = 3.0

@@ -1,12 +1,12 @@
 """Indirect light from the projector's side: every pixel's rays, followed over any number of surfaces to the sensor.
 
 At each surface after the first the light that a path carries is connected to the sensor: its centre, a random point,
-or each of several anchors, for which a path is the same and is followed once (:mod:`mitsim.transport.receiver`). So
+or each of several anchors, for which a path is the same and is followed once (:mod:`mitsim.transport.connect`). So
 every path that meets a second surface counts, and it counts for its own pixel. Of the connections of a path, to one
 anchor, one is handed out, drawn in proportion to its light, and it carries the light of all.
 
 Where the last surface turns light sharply, connections rarely meet the lobe; there the camera's side
-(:mod:`mitsim.transport.from_camera`) finds the light instead. :func:`mitsim.transport.paths.camera_part` divides it.
+(:mod:`mitsim.transport.from_camera`) finds the light instead. :func:`mitsim.transport.integrator.camera_part` divides it.
 
 Light that only mirrors have turned before the last surface (a caustic) is direct light; the camera's side has no part
 in it. Paths end at random (Russian roulette) with a probability that keeps the estimate unbiased.
@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
+from dataclasses import dataclass
 from functools import cached_property
 
 import drjit as dr
@@ -23,14 +24,14 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.rig.camera import CameraGeometry
-from mitsim.transport.histogram import DIRECT, Deposits, Sightings
-from mitsim.transport.ledger import Ledger
-from mitsim.transport.paths import KINDS, FollowingTracer, Walk, camera_part, is_delta
+from mitsim.core.arrays import FloatArray, mean_of_neighbours
+from mitsim.devices.camera import CameraGeometry
+from mitsim.transport.accumulator import Ledger
+from mitsim.transport.connect import Receiver, SensorPoints, Way, sampled_wavelengths
+from mitsim.transport.integrator import KINDS, FollowingTracer, Walk, camera_part, is_delta
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
-from mitsim.transport.receiver import Receiver, SensorPoints, Way, sampled_wavelengths
-from mitsim.transport.repeats import Turns, by_pixel
-from mitsim.transport.sampling import stratified, streams
+from mitsim.transport.records import DIRECT, Deposits, Sightings
+from mitsim.transport.sampler import stratified, streams
 
 _ROOMS = (4**2, 12**2)
 """Anchors that a path has room for: few numbers of them, as each is a kernel of its own, 0.4 s to compile; more
@@ -69,7 +70,7 @@ class IndirectTracer(FollowingTracer):
         self.turns: Turns | None = None
 
     def repeating(self, repeats: Sequence[int]) -> IndirectTracer:
-        """The same to one point of the sensor, blocks of pixels (:mod:`mitsim.transport.repeats`) as often as
+        """The same to one point of the sensor, blocks of pixels (:mod:`mitsim.transport.indirect`) as often as
         ``repeats`` (blocks^2,) say."""
         return self._taking(by_pixel(repeats, self.projector.n))
 
@@ -175,7 +176,7 @@ class IndirectWalk(Walk):
         return [Deposits.fetched(caustics, DIRECT, self.anchor)] if caustics else []
 
     def vertex(self, first: bool) -> None:
-        """Find, connect and leave the next surface, as :meth:`mitsim.transport.paths.Walk.vertex` does; ``first`` is
+        """Find, connect and leave the next surface, as :meth:`mitsim.transport.integrator.Walk.vertex` does; ``first`` is
         not connected."""
         # To the first surface rays of neighbouring pixels go side by side, which take half the time of others.
         si = self.scene.ray_intersect(self.ray, mi.RayFlags.All, first, self.active)
@@ -265,7 +266,7 @@ class AnchorsWalk(IndirectWalk):
         Parameters
         ----------
         further
-            as for :meth:`mitsim.transport.paths.Walk.deposits`.
+            as for :meth:`mitsim.transport.integrator.Walk.deposits`.
         """
         self.follow(further)
         return self._fetched(tuple(self.held))
@@ -338,3 +339,101 @@ def _differing(seen: Sightings) -> list[mi.Float]:
     """What differs between the anchors of a path, of :class:`Sightings`."""
     lines = () if seen.lines is None else seen.lines
     return [seen.value, seen.row, seen.column, seen.inverse_depth, *lines]
+
+
+# -------- Blocks of projector pixels whose indirect light is followed more often than that of others
+
+SIDE = 4
+"""Pixels a side of a block, below the 7 of usual shifting dots, whose classes then differ."""
+MEMBERS = SIDE**2
+"""Pixels of a block."""
+_MOST = 8
+"""Paths of a pixel in a sample, at most: what a short look takes for noisy may be a single path."""
+_SCALES = (0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
+"""Paths of a block of mean noise that are tried: whole numbers fit one scale better than another."""
+
+
+def blocks_of(pixels: int) -> int:
+    """Blocks a side of ``pixels``."""
+    return -(-pixels // SIDE)
+
+
+def block_moments(pixel: npt.NDArray[np.int64], light: FloatArray, pixels: int) -> FloatArray:
+    """(blocks, blocks) sums of squares of ``light`` by the block of its ``pixel``.
+
+    Parameters
+    ----------
+    pixel, light
+        (m,) of paths.
+    pixels
+        of the projector, a side.
+    """
+    row, column = np.divmod(pixel, pixels)
+    count = blocks_of(pixels)
+    place = row // SIDE * count + column // SIDE
+    return np.asarray(np.bincount(place, np.square(light), count**2).reshape(count, count), dtype=np.float64)
+
+
+def chosen_repeats(moments: FloatArray) -> npt.NDArray[np.int64]:
+    """(blocks, blocks) paths of each block's pixels in a sample, of the least variance times cost.
+
+    ``moments`` (blocks, blocks) are smoothed over neighbours first; blocks without light count a tenth of the mean.
+    """
+    if not moments.any():
+        return np.ones(moments.shape, dtype=np.int64)
+    smooth = mean_of_neighbours(moments)
+    wanted = np.sqrt(smooth + 0.1 * smooth.mean())
+    tried = [np.clip(np.rint(scale * wanted / wanted.mean()), 1, _MOST).astype(np.int64) for scale in _SCALES]
+    return min(tried, key=lambda repeats: float(np.prod(effect_of(repeats, smooth))))
+
+
+def effect_of(repeats: npt.NDArray[np.int64], moments: FloatArray) -> tuple[float, float]:
+    """Variance and paths of a sample with ``repeats``, each over those without, by ``moments`` of the light."""
+    total = float(moments.sum())
+    return float((moments / repeats).sum()) / total if total else 1.0, float(repeats.mean())
+
+
+@dataclass(frozen=True, eq=False)
+class Turns:
+    """Which block, or pixel, each of a sample's units of paths belongs to.
+
+    Attributes
+    ----------
+    unit, turn, count
+        (units,) its number, which of its paths in the sample this is, and how many there are.
+    """
+
+    unit: mi.UInt32
+    turn: mi.UInt32
+    count: mi.UInt32
+
+    @classmethod
+    def of(cls, repeats: npt.NDArray[np.int64]) -> Turns:
+        """Those of units that have so many ``repeats`` (units,)."""
+        unit = np.repeat(np.arange(len(repeats)), repeats)
+        starts = np.cumsum(repeats) - repeats
+        turn = np.arange(len(unit)) - starts[unit]
+        return cls(*(mi.UInt32(each.astype(np.uint32)) for each in (unit, turn, repeats[unit])))
+
+    def __len__(self) -> int:
+        return int(dr.width(self.unit))
+
+    def at(self, index: mi.UInt32, sample: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
+        """Unit, number of its own sample, and weight of entry ``index`` in ``sample``."""
+        unit, turn, count = (dr.gather(mi.UInt32, each, index) for each in (self.unit, self.turn, self.count))
+        return unit, sample * count + turn, dr.rcp(mi.Float(count))
+
+
+def by_pixel(repeats: Sequence[int], pixels: int) -> npt.NDArray[np.int64]:
+    """(pixels^2,) repeats of each pixel, from those of the blocks row by row.
+
+    Parameters
+    ----------
+    repeats
+        of (blocks^2,) blocks.
+    pixels
+        a side.
+    """
+    count = blocks_of(pixels)
+    whole = np.kron(np.reshape(repeats, (count, count)), np.ones((SIDE, SIDE), dtype=np.int64))
+    return np.ascontiguousarray(whole[:pixels, :pixels]).ravel()

@@ -22,9 +22,9 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.rig.projector import Lines
+from mitsim.devices.projector import Lines
 from mitsim.transport.coordinates import Numbers, turn_and_origin
-from mitsim.transport.host import channels, lanes_of, per_lane
+from mitsim.transport.plugins.base import channels, lanes_of, per_lane
 
 _WAVELENGTH_SETS = 8
 """Sets of four wavelengths: 15 nm apart, finer than any measured spectrum that a scene would hold."""

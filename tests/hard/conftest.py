@@ -33,6 +33,6 @@ def folders(tmp_path: Path) -> tuple[Path, Path]:
 
 @pytest.fixture(scope="module")
 def white(shared_scene: Callable[..., Path], variant: str) -> Any:
-    from mitsim.capture.opening import open_bench  # here: most hard tests do without the renderer
+    from mitsim.api.bench import open_bench  # here: most hard tests do without the renderer
 
     return open_bench(shared_scene("white_hard"), variant)

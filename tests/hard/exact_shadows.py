@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 from hypothesis import strategies as st
 
+from mitsim.devices.mask import Mask
 from mitsim.optics.shadow import Directions, ShadowGeometry
-from mitsim.rig.mask import Mask
 
 EPS = np.finfo(float).eps
 power = lambda low, high: st.floats(low, high).map(lambda x: 10.0**x)  # noqa: E731

@@ -21,10 +21,10 @@ from types import FrameType
 import numpy as np
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.framefile import read_frame, write_frame
+from mitsim.core.exr import read_frame, write_frame
 from mitsim.core.runs import load_run
 from mitsim.scene.guard.check import check_file
-from mitsim.scene.guard.vocabulary import PLUGINS
+from mitsim.scene.guard.limits import PLUGINS
 from tests.hard.hostile import GOOD, MESH, OBJ, beside, file
 
 LONGEST = 5.0
@@ -162,14 +162,14 @@ def scene_changed(content: str, chance: random.Random) -> str:
         at = chance.randrange(2, len(lines) - 2)
         quotes = [i for i, letter in enumerate(lines[at]) if letter == '"']
         kind = chance.randrange(7)
-        plugins = [*re.finditer(r'<(\w+) type="(\w+)"', lines[at])]
+        all = [*re.finditer(r'<(\w+) type="(\w+)"', lines[at])]
         if kind < 4 and len(quotes) >= 2:
             first = chance.randrange(0, len(quotes) - 1, 2)
             lines[at] = lines[at][: quotes[first] + 1] + chance.choice(_VALUES) + lines[at][quotes[first + 1] :]
         elif kind == 4:
             lines[at] = ""
-        elif kind == 5 and plugins:
-            found = chance.choice(plugins)
+        elif kind == 5 and all:
+            found = chance.choice(all)
             lines[at] = (
                 lines[at][: found.start(2)] + chance.choice(PLUGINS[found[1]].split()) + lines[at][found.end(2) :]
             )
@@ -306,11 +306,11 @@ def main() -> None:
     kind, first, count, seconds = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4])
     if kind in ("load", "mesh", "image"):
         from mitsim.core.environment import load_variant
-        from mitsim.transport import plugins
+        from mitsim.transport.plugins import all
 
         mi = load_variant("llvm_ad_mono")
         mi.set_log_level(mi.LogLevel.Error)
-        plugins.register()
+        all.register()
     else:
         resource.setrlimit(resource.RLIMIT_AS, (_ROOM, resource.RLIM_INFINITY))
     signal.signal(signal.SIGALRM, _hangs)

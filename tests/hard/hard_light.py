@@ -9,7 +9,7 @@ distribution where few seeds tell it: 7 for eight), plus what is stated; each te
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench
+from mitsim.api.bench import Bench
 from mitsim.transport.direct import DirectTracer
 
 N, SCALE, PLACE, Z = 16, 111000.0, 60.0, 400.0

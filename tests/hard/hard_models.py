@@ -7,10 +7,10 @@ import re
 import numpy as np
 import pytest
 
+from mitsim.devices.camera import centred_edges
+from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.solver import Prepared
-from mitsim.rig.camera import centred_edges
-from mitsim.rig.mask import mls_mask
 
 EPS = float(np.finfo(np.float64).eps)
 NUMBER = r"(inf|\d\.\de[+-]\d\d)"

@@ -11,15 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.evidence import GROUPS, Settings
-from mitsim.capture.opening import open_bench
-from mitsim.capture.planning import make_plan
-from mitsim.optics.closed_form import FrameOptics
+from mitsim.api.bench import Bench, open_bench
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.patterns import Lighting
+from mitsim.light.settings import GROUPS, Settings
 from mitsim.optics.frames import ExpectedFrames, Filed
+from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.patterns import Lighting
+from mitsim.planner.planner import make_plan
 from tests.hard.hard_light import N, Z, glossy
 from tests.robustness import Recorder
 
@@ -65,7 +64,7 @@ def test_a_capture_tells_of_fireflies(
     bench = open_bench(small_scene(**glossy(1e-3)))
     plan = make_plan(bench, Lighting.uniform(N), 2e-2, 1, {"diffraction": False})
     plan = replace(plan, settings=Settings(Z, direct_samples=32), sampling_target=1e9, warnings=())
-    monkeypatch.setattr("mitsim.capture.run.make_plan", lambda *_: plan)
+    monkeypatch.setattr("mitsim.acquire.capture.make_plan", lambda *_: plan)
     for seed, fireflies in ((27, True), (4, False)):
         result = bench.capture("uniform", tmp_path / f"run{seed}", accuracy=2e-2, seed=seed)
         heaviest = result.manifest.heaviest_group

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.framefile import write_frame
-from mitsim.core.jsonfile import write_json
-from mitsim.core.output import write_text
-from mitsim.exchange.drawn import draw_family
-from mitsim.exchange.export import export_run
-from mitsim.exchange.load import import_file
-from mitsim.rig.sensor import SensorModel, load_sensor
-from mitsim.study.experiment import Found, Point, Setup
-from mitsim.study.points import Store
-from mitsim.study.table import Table
+from mitsim.core.exr import write_frame
+from mitsim.core.files import write_json, write_text
+from mitsim.devices.sensor import SensorModel, load_sensor
+from mitsim.exchange.formats import export_run
+from mitsim.exchange.loaders import import_file
+from mitsim.exchange.pictures import draw_family
+from mitsim.report.table import Table
+from mitsim.studies.framework.experiment import Found
+from mitsim.studies.framework.run import Store
+from mitsim.studies.framework.setup import Point, Setup
 from tests.exchanged import Made, made
 from tests.unit.core.test_hdf5file import room
 
@@ -42,7 +42,7 @@ def sensor() -> SensorModel:
 
 
 def sensed(path: Path) -> None:
-    from mitsim.capture.sense import sense
+    from mitsim.acquire.sense import sense
 
     sense(NOISE, sensor()).save(path)
 

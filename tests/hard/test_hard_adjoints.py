@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mitsim.optics.separable import centred as centred_terms
-from mitsim.reconstruct.accumulator import centred
-from mitsim.reconstruct.solver import prepare
+from mitsim.reconstruct.solver import centred, prepare
 from mitsim.reconstruct.tv import solve_tv
 from tests.hard.hard_models import EPS, frames_of, shadow, summed
 

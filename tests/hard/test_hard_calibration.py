@@ -19,13 +19,13 @@ from hypothesis import strategies as st
 from scipy.linalg import hadamard
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.framefile import write_frame
+from mitsim.core.exr import write_frame
+from mitsim.devices.camera import centred_edges
+from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.calibration import LARGEST_ERROR, UNKNOWN_NOISE, Estimate, estimate_factors
+from mitsim.reconstruct.estimate_factors import LARGEST_ERROR, UNKNOWN_NOISE, Estimate, estimate_factors
 from mitsim.reconstruct.result import Reconstruction
-from mitsim.rig.camera import centred_edges
-from mitsim.rig.mask import mls_mask
-from mitsim.study.quality import reconstruct
+from mitsim.report.quality import reconstruct
 from tests.robustness import Recorder
 
 pytestmark = pytest.mark.robustness("Calibration")
@@ -342,16 +342,16 @@ def test_a_saturated_session_is_flagged(
 ) -> None:
     """Rendered: an ADC of 8 bits ends at 6 % of the full well; the folder says how many frames reached it.
 
-    (That no frame is counted without cause: tests/unit/capture/test_session.py::test_the_folder.)
+    (That no frame is counted without cause: tests/unit/calibrate/test_session.py::test_the_folder.)
     """
-    from mitsim.capture.effects import EFFECTS
-    from mitsim.capture.opening import open_bench
-    from mitsim.capture.planning import make_plan
+    from mitsim.api.bench import open_bench
+    from mitsim.bench.effects import EFFECTS
+    from mitsim.planner.planner import make_plan
 
     def simple_plan(*arguments: object) -> object:
         return make_plan(*arguments, switches=dict.fromkeys(EFFECTS, False))
 
-    monkeypatch.setattr("mitsim.capture.session.make_plan", simple_plan)
+    monkeypatch.setattr("mitsim.calibrate.session.make_plan", simple_plan)
     camera = tmp_path / "camera.toml"
     camera.write_text(
         'name = "short"\npixel_pitch_um = 5.86\nbinning = 2\nfull_well_e = 32360.0\nread_noise_e = 6.7\n'

@@ -13,15 +13,15 @@ import pytest
 from scipy.special import fresnel
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.closed_form import FrameOptics
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.mask import mls_mask
+from mitsim.devices.mask_profile import MaskProfile
+from mitsim.devices.projector import Spectrum
 from mitsim.optics.diffraction import EdgeWaves
-from mitsim.optics.profile import Steps
+from mitsim.optics.edge_profile import Steps
+from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.mask import mls_mask
-from mitsim.rig.profile import MaskProfile
-from mitsim.rig.projector import Spectrum
 from tests.robustness import Recorder
 
 pytestmark = pytest.mark.robustness("Optics")
@@ -172,8 +172,8 @@ def test_features_from_a_micrometre_to_a_millimetre(measured: Recorder, feature:
 def test_a_mask_below_the_wavelength_warns(
     small_scene: Callable[..., Path], variant: str, feature: float, warned: bool
 ) -> None:
-    from mitsim.capture.decision import SceneFacts
-    from mitsim.capture.opening import open_bench
+    from mitsim.api.bench import open_bench
+    from mitsim.planner.explain import SceneFacts
 
     found = [w for w in SceneFacts.of(open_bench(small_scene(mask_feature=feature))).warnings if "wavelength" in w]
     assert len(found) == warned and all("mask_feature 0.0005 mm" in w and "\n" not in w for w in found)
@@ -183,7 +183,7 @@ def test_a_plan_with_openings_below_half_a_wavelength_goes_without_diffraction(
     small_scene: Callable[..., Path], variant: str
 ) -> None:
     """Refused before the pilot looks, or flagged where diffraction is off. (Planted: the pilot's look has it on.)"""
-    from mitsim.capture.opening import open_bench
+    from mitsim.api.bench import open_bench
 
     bench = open_bench(small_scene(mask_feature=1.5e-4))
     with pytest.raises(MitsimError, match="half a wavelength"):

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import special, stats
 
-from mitsim.rig.sensor import SensorModel
+from mitsim.devices.sensor import SensorModel
 from mitsim.sensor import moments
 from tests.invented import sensor
 from tests.robustness import Recorder

@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.opening import open_bench
-from mitsim.capture.planning import make_plan
+from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
-from mitsim.rig.patterns import Lighting
+from mitsim.devices.patterns import Lighting
+from mitsim.planner.planner import make_plan
 from mitsim.transport.direct import DirectTracer
 from tests.hard.hard_light import HALF, PLACE, SCALE, SEVEN, SLOW, N, Z, gauss, matt, mean, plate, seen_alone
 from tests.robustness import Recorder

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mitsim.optics.profile import Steps, sampled_box_means
-from mitsim.optics.samplers import ProfileSampler
-from mitsim.rig.mask import mls_mask
+from mitsim.devices.mask import mls_mask
+from mitsim.optics.edge_profile import Steps, sampled_box_means
+from mitsim.optics.fft_shadow import ProfileSampler
 from tests.hard.exact_shadows import EPS, exact_mean, power
 from tests.robustness import Recorder
 

@@ -11,12 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.evidence import Settings
-from mitsim.capture.opening import open_bench
-from mitsim.capture.simulation import Simulation
+from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
-from mitsim.rig.patterns import Lighting
+from mitsim.devices.patterns import Lighting
+from mitsim.light.passes import Simulation
+from mitsim.light.settings import Settings
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.indirect import IndirectTracer
 from tests.hard.hard_light import SCALE, SEVEN, SLOW, N, Z, gauss, matt, mean, seen_alone

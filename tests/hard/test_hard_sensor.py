@@ -14,11 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import special, stats
 
-from mitsim.capture.exposer import Exposer
+from mitsim.acquire.exposure import Exposer
 from mitsim.core.configuration import shipped, validated
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
-from mitsim.rig.sensor import SensorModel, load_sensor
+from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.sensor import chain, moments
 from tests.invented import sensor
 from tests.robustness import Recorder

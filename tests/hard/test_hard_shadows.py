@@ -13,9 +13,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from mitsim.core.errors import MitsimError
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.mask import Mask
 from mitsim.optics.shadow import Directions, ShadowGeometry, geometric_terms
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.mask import Mask
 from tests.hard.exact_shadows import EPS, exact_mean, exact_shadow, mask_edges, power
 from tests.robustness import Recorder
 

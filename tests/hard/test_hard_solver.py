@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.solver import ROUNDING_LIMIT, prepare
 from mitsim.reconstruct.tv import solve_tv
-from mitsim.study.solver_cost import dots
+from mitsim.studies.solver import dots
 from tests.hard.hard_models import EPS, LAMBDAS, check_ending, frames_of, shadow, spread, summed
 from tests.robustness import Recorder
 
@@ -195,7 +195,7 @@ def test_gram_is_flagged_where_the_default_is_not() -> None:
 
 def test_the_report_s_numbers_are_json() -> None:
     """An infinite condition becomes null, as JSON has no infinity; the status still says inf."""
-    from mitsim.core.jsonfile import plain
+    from mitsim.core.files import plain
 
     prepared = prepare(np.eye(3, 4), np.eye(5, 4), np.ones((4, 1)), np.ones((4, 1)))
     solution = prepared.solve(summed(prepared, {(0, 0): np.ones((3, 5))}), 0.1)

@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.opening import open_bench
-from mitsim.capture.planning import make_plan
-from mitsim.rig.patterns import Lighting
-from mitsim.transport.lobes import SharpLight, sharp_light
+from mitsim.api.bench import Bench, open_bench
+from mitsim.devices.patterns import Lighting
+from mitsim.planner.planner import make_plan
+from mitsim.transport.sharp_lobes import SharpLight, sharp_light
 from tests.hard.hard_light import GLINT, SEVEN, SIGMAS, SLOW, N, glossy, lobe, mean, seen_alone
 from tests.robustness import Recorder
 
@@ -60,7 +59,7 @@ def test_a_lobe_that_would_be_missed_flags_the_plan(
 ) -> None:
     """Too much to trace at 1e-3 and below, 95 % of the light would lack, and no group tell: the plan says so."""
     bench = open_bench(small_scene(**glossy(alpha)))
-    monkeypatch.setattr("mitsim.capture.pilot.sharp._AFFORDABLE", 0.0)
+    monkeypatch.setattr("mitsim.planner.pilot_direct._AFFORDABLE", 0.0)
     plan = make_plan(bench, Lighting.uniform(N), 2e-2, 1, {"diffraction": False})
     said = [warning for warning in plan.warnings if "too sharp" in warning]
     assert bool(said) is not seen
@@ -88,6 +87,6 @@ def test_light_over_sharp_lobes_alone_flags_the_plan(
     """
     bench = open_bench(small_scene(**glossy(1e-4, sheet=False)))
     assert not any("too sharp" in warning for warning in make_plan(bench, Lighting.uniform(N), 2e-2, 1).warnings)
-    monkeypatch.setattr("mitsim.capture.pilot.sharp._AFFORDABLE", 0.0)
+    monkeypatch.setattr("mitsim.planner.pilot_direct._AFFORDABLE", 0.0)
     plan = make_plan(bench, Lighting.uniform(N), 1e-2, 1)
     assert plan.systematic_error > 0.9 and any("100% of the direct light" in warning for warning in plan.warnings)

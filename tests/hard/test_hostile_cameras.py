@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from mitsim.core.configuration import read_toml
-from mitsim.rig.sensor import load_sensor
+from mitsim.devices.sensor import load_sensor
 from tests.hard.hostile.folders import Damage, folder, pipe, raw, refusal, sparse
 
 pytestmark = pytest.mark.robustness("Input")

@@ -11,7 +11,7 @@ import OpenEXR
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.framefile import read_frame, write_frame
+from mitsim.core.exr import read_frame, write_frame
 from tests.hard.hostile.folders import PIXELS, Damage, folder, linked, pipe, refusal, solved
 
 pytestmark = pytest.mark.robustness("Input")

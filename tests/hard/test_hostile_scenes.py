@@ -251,7 +251,7 @@ def test_colours_of_vertices(tmp_path: Path, variant: str, bsdf: str, worst: str
 
 def test_a_referenced_bitmap_keeps_the_limit_of_its_use(tmp_path: Path, variant: str) -> None:
     """Mitsuba calls it by a number, not by the parameter that it is given for."""
-    from mitsim.core.framefile import write_frame
+    from mitsim.core.exr import write_frame
     from mitsim.scene.load import load_scene
 
     texture = '<texture id="t" type="bitmap"><string name="filename" value="t.exr"/></texture>'
@@ -268,7 +268,7 @@ def test_a_referenced_bitmap_keeps_the_limit_of_its_use(tmp_path: Path, variant:
 
 def test_an_attribute_of_2_gb(tmp_path: Path) -> None:
     """OpenEXR's own reader passes over it; the one in Mitsuba allocates it."""
-    from mitsim.core.framefile import write_frame
+    from mitsim.core.exr import write_frame
 
     write_frame(tmp_path / "p.exr", {"Y": np.zeros((4, 4), np.float32)}, {"run": "x"})
     picture_bytes = (tmp_path / "p.exr").read_bytes()

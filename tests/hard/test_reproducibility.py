@@ -1,6 +1,6 @@
 """The same seed gives the same bits: whatever the number of threads, the process, the clock, or how work is cut.
 
-Interrupted and resumed runs are bit-equal too: tests/system/test_resume.py, tests/unit/capture/test_run.py.
+Interrupted and resumed runs are bit-equal too: tests/system/test_resume.py, tests/unit/acquire/test_run.py.
 """
 
 import hashlib
@@ -16,16 +16,15 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from mitsim.capture import light
-from mitsim.capture.bench import Bench
-from mitsim.capture.evidence import GROUPS, LOOKS, Changes, Part, Settings
-from mitsim.capture.light import trace_light
-from mitsim.capture.opening import open_bench
-from mitsim.capture.pilot import direct, looks
-from mitsim.capture.planning import make_plan
+from mitsim.api.bench import Bench, open_bench
 from mitsim.core import parallel
-from mitsim.core.framefile import read_frame
+from mitsim.core.exr import read_frame
+from mitsim.light import light
+from mitsim.light.light import trace_light
+from mitsim.light.settings import GROUPS, LOOKS, Changes, Part, Settings
 from mitsim.optics import frames
+from mitsim.planner import pilot_direct, pilot_samples
+from mitsim.planner.planner import make_plan
 from mitsim.transport.direct import DirectTracer
 from tests.robustness import Recorder
 
@@ -126,7 +125,7 @@ def test_sums_do_not_depend_on_threads_of_blas(measured: Recorder) -> None:
     for count in THREADS:
         with threadpool_limits(count):
             naive.add(float(np.vdot(a[0], a[1])))
-            norms.add(looks.norm(a))
+            norms.add(pilot_samples.norm(a))
             products.add(Changes.between({Part("a"): a, Part("b"): b}, 1.0).products.tobytes())
     measured(len(naive), what="answers of BLAS")
     measured(max(len(norms), len(products)), at_most=1, what="ours")
@@ -161,7 +160,7 @@ def test_the_plan_does_not_depend_on_the_clock(
     for seed in range(2):
         rng = np.random.default_rng(seed)
         times = iter(np.cumsum(rng.exponential(10.0 ** rng.uniform(-6, 3, 1000))))
-        monkeypatch.setattr(direct.time, "perf_counter", lambda times=times: float(next(times)))
+        monkeypatch.setattr(pilot_direct.time, "perf_counter", lambda times=times: float(next(times)))
         plans.append(make_plan(bench, family, 5e-2, 3))
     first, second = plans
     assert first.predicted_seconds != second.predicted_seconds

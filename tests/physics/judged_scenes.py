@@ -20,7 +20,7 @@ from tests.physics import third_judge as judge
 from tests.physics.third_judge import Array, Camera, Cylinder, Projector, Rectangle, Scene, Shape, Slab, Sphere, vector
 
 if TYPE_CHECKING:
-    from mitsim.capture.bench import Bench
+    from mitsim.api.bench import Bench
 
 N, SCALE = 64, 151250.0
 PROJECTOR = Projector(vector(60, 0, 0), N, SCALE, -0.3, 0.0, -0.15, 0.15)
@@ -317,7 +317,7 @@ def opened(judged: Judged, folder: Path, open_bench: Callable[..., Bench]) -> Be
 
 def verdict(judged: Judged, bench: Bench, patterns: str = "dots:3", accuracy: float = 1e-2, seed: int = 0) -> Verdict:
     """Frames of a family by the factored estimator against the judge's."""
-    from mitsim.capture.lightfile import error_bound
+    from mitsim.light.light_file import error_bound
 
     light = bench.light(patterns, accuracy=accuracy, seed=seed, effects=LEFT_OUT)
     lighting = bench.family(patterns, seed).lighting

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from mitsim.capture.bench import Bench
-from mitsim.transport.cells import aligned_grid
+from mitsim.api.bench import Bench
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.from_camera import FromCameraTracer, Paths
 from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.records import aligned_grid
 
 SEEDS, SIGMAS = 8, 7.0
 METAL = """<bsdf type="twosided"><bsdf type="roughconductor"><string name="material" value="none"/>

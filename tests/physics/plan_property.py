@@ -14,15 +14,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mitsim.capture import effects
-from mitsim.capture.bench import Bench
-from mitsim.capture.evidence import Estimate, Settings
-from mitsim.capture.light import Sampling, trace_light
-from mitsim.capture.plan import Plan
-from mitsim.capture.simulation import Simulation
+from mitsim.api.bench import Bench
+from mitsim.bench import effects
 from mitsim.core.seeds import integer
+from mitsim.devices.patterns import Lighting
+from mitsim.light.light import Sampling, trace_light
+from mitsim.light.passes import Simulation
+from mitsim.light.plan import Plan
+from mitsim.light.settings import Estimate, Settings
 from mitsim.optics.frames import monte_carlo_bound, monte_carlo_error
-from mitsim.rig.patterns import Lighting
 
 GROUPS = 6
 STUDENT = 2.02

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mitsim.capture.bench import Bench
+from mitsim.api.bench import Bench
 
 SEEDS = 8
 """Of the reference: their spread tells the standard error to a quarter."""

@@ -8,10 +8,10 @@ under uniform light, 545 under 25 shifting dots, 92.6 under 64, each within 1 %.
 import numpy as np
 import pytest
 
+from mitsim.devices.camera import centred_edges
+from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.solver import prepare
-from mitsim.rig.camera import centred_edges
-from mitsim.rig.mask import mls_mask
 
 
 @pytest.mark.parametrize(("k", "condition"), [(1, 7.03e6), (5, 545.0), (8, 92.6)])

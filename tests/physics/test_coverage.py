@@ -32,17 +32,16 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.calibrate import estimate
-from mitsim.capture.opening import open_bench
-from mitsim.capture.session import Session
+from mitsim.api.bench import Bench, open_bench
+from mitsim.calibrate.calibrate import estimate
+from mitsim.calibrate.session import Session
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
+from mitsim.devices.session import load_recipe
 from mitsim.reconstruct.detail import PRINT
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.reconstruction import reconstruct
+from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.uncertainty import Uncertainty
-from mitsim.rig.recipe import load_recipe
 
 pytestmark = pytest.mark.slow
 PRINTS, SESSIONS, N = 8, 25, 16

@@ -11,12 +11,12 @@ import pytest
 from scipy.integrate import quad
 
 from mitsim.core.errors import MitsimError
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.projector import Spectrum
 from mitsim.optics.diffraction import EdgeWaves, grid_step, wave_profiles
-from mitsim.optics.profile import Steps, sampled_box_means, smooth_box_means
+from mitsim.optics.edge_profile import Steps, sampled_box_means, smooth_box_means
 from mitsim.optics.shadow import Directions, ShadowGeometry
 from mitsim.optics.terms import shadow_terms
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.projector import Spectrum
 
 STEP = 2.5e-4
 LAMBDA_NM = 550.0

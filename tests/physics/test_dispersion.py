@@ -17,23 +17,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.colour import ColourBench, line_alone
-from mitsim.capture.lamplight import lit_by_lamps
-from mitsim.capture.opening import open_bench
-from mitsim.capture.render import reference
-from mitsim.core.colours import RUN
+from mitsim.acquire.reference import reference
+from mitsim.acquire.spectral import ColourBench, line_alone
+from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
-from mitsim.transport.cells import aligned_grid
+from mitsim.core.spectral_manifests import RUN
+from mitsim.light.lamps import lit_by_lamps
+from mitsim.transport.accumulator import Ledger
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.flux import FluxTracer
-from mitsim.transport.from_camera import FromCameraTracer, Paths
-from mitsim.transport.glint import trace_glint
-from mitsim.transport.histogram import Bundle, Deposits
+from mitsim.transport.from_camera import Counted, FromCameraTracer, LampTracer, Paths
 from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.lamps import Counted, LampTracer
-from mitsim.transport.ledger import Ledger
-from mitsim.transport.neighbours import NeighbourTracer
+from mitsim.transport.path_reuse import NeighbourTracer
+from mitsim.transport.records import Bundle, Deposits, aligned_grid
+from mitsim.transport.specular import trace_glint
 from tests.conftest import write_small_scene
 
 N, SAMPLES = 8, 16

@@ -14,15 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.evidence import Settings
-from mitsim.capture.light import Sampling, trace_light
-from mitsim.capture.opening import open_bench
-from mitsim.capture.planning import make_plan
-from mitsim.capture.render import projected
-from mitsim.capture.simulation import Simulation
+from mitsim.acquire.reference import projected
+from mitsim.api.bench import Bench, open_bench
 from mitsim.core.configuration import shipped
-from mitsim.rig.patterns import Lighting
+from mitsim.devices.patterns import Lighting
+from mitsim.light.light import Sampling, trace_light
+from mitsim.light.passes import Simulation
+from mitsim.light.settings import Settings
+from mitsim.planner.planner import make_plan
 from tests.physics.radiosity import gauss, solid_angle
 from tests.physics.test_estimators_agree import (
     LIMIT,
@@ -177,7 +176,7 @@ def reference_with_lens(bench: Bench, shown: np.ndarray, spp: int) -> tuple[np.n
     """Mean and its variance by the reference, the projector's lens a disk that shines."""
     import mitsuba as mi
 
-    from mitsim.transport.aperture import aperture_scene_parts, register
+    from mitsim.transport.plugins.lens import aperture_scene_parts, register
 
     register()
     with projected(bench, shown):

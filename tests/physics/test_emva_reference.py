@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.seeds import stream
-from mitsim.rig.sensor import SensorModel
+from mitsim.devices.sensor import SensorModel
 from mitsim.sensor.chain import expose
 from mitsim.sensor.emva import Session, figures, pair_of, pairs_of, stack_of
 from tests.invented import sensor

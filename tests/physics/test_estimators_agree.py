@@ -31,12 +31,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.light import Light, Sampling, trace_light
-from mitsim.capture.plan import Plan
-from mitsim.capture.planning import make_plan
-from mitsim.capture.render import projected
-from mitsim.rig.patterns import Lighting
+from mitsim.acquire.reference import projected
+from mitsim.api.bench import Bench
+from mitsim.devices.patterns import Lighting
+from mitsim.light.light import SampledLight, Sampling, trace_light
+from mitsim.light.plan import Plan
+from mitsim.planner.planner import make_plan
 
 PASSES = 8
 FAMILY_ALPHA, CASES = 1e-3, 26
@@ -58,7 +58,7 @@ class Pair:
     variance: np.ndarray
     factored: np.ndarray
     groups: np.ndarray
-    light: Light
+    light: SampledLight
     bench: Bench
     plan: Plan
     shown: np.ndarray
@@ -112,7 +112,7 @@ def classes_of(shown: np.ndarray) -> Lighting:
     return Lighting(shown.astype(np.int64).ravel() * dark, weights)
 
 
-def frame_of(bench: Bench, plan: Plan, shown: np.ndarray) -> tuple[np.ndarray, np.ndarray, Light]:
+def frame_of(bench: Bench, plan: Plan, shown: np.ndarray) -> tuple[np.ndarray, np.ndarray, SampledLight]:
     """The factored frame (mean, and of each group), and the light that arrives."""
     lighting = classes_of(shown)
     light = trace_light(bench, plan, lighting, 11, Sampling(by_pixel=False))
@@ -343,7 +343,7 @@ class NothingInTheWay:
 
 
 def without_occlusion(pair: Pair) -> np.ndarray:
-    """Light as if the camera saw the far card through the near one."""
+    """SampledLight as if the camera saw the far card through the near one."""
     loaded = replace(pair.bench.loaded, scene=NothingInTheWay(pair.bench.loaded.scene))
     return frame_of(replace(pair.bench, loaded=loaded), pair.plan, pair.shown)[0]
 
@@ -406,7 +406,7 @@ def test_the_estimators_agree_on_a_scene_with_depth(shared_scene: Callable[..., 
 
     The sensor is small (0.75 mm), so one depth for all light leaves a shift of 0.4 um, next to 60 um features.
     """
-    from mitsim.capture.opening import open_bench
+    from mitsim.api.bench import open_bench
 
     ball = """<shape type="sphere"><point name="center" x="-10" y="12" z="330"/> <float name="radius" value="25"/>
         <bsdf type="diffuse"><spectrum name="reflectance" value="0.8"/></bsdf></shape>"""

@@ -15,9 +15,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from mitsim.metrics import psnr
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.reconstruction import reconstruct
-from mitsim.study.metrics import psnr
+from mitsim.reconstruct.reconstruct import reconstruct
 
 pytestmark = pytest.mark.slow
 

@@ -55,8 +55,8 @@ def path(scene: Path, spp: int, seed: int) -> Measured:
     """Mitsuba's ``path``. Runs of one seed share each path's first reflection, so it cancels in total - direct."""
     import mitsuba as mi
 
-    from mitsim.capture.opening import open_bench
-    from mitsim.capture.render import projected
+    from mitsim.acquire.reference import projected
+    from mitsim.api.bench import open_bench
 
     bench = open_bench(scene, for_render=True)
     family = bench.family(f"dots:{K}", 0)
@@ -80,9 +80,9 @@ def factored(scene: Path, spp: int, seed: int) -> Measured:
 
     Light of one reflection is traced apart from light of more.
     """
-    from mitsim.capture.evidence import Settings
-    from mitsim.capture.opening import open_bench
-    from mitsim.capture.simulation import Simulation
+    from mitsim.api.bench import open_bench
+    from mitsim.light.passes import Simulation
+    from mitsim.light.settings import Settings
 
     bench = open_bench(scene, for_render=True)
     family = bench.family(f"dots:{K}", 0)

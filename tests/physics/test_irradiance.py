@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.patterns import Lighting
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.patterns import Lighting
 
 pytestmark = pytest.mark.usefixtures("variant")
 SCALE, Z, ALBEDO = 111000.0, 400.0, 0.5
@@ -181,9 +181,9 @@ def centroid(frame: np.ndarray) -> tuple[float, float]:
 
 def factored_frame(path: Path, light: np.ndarray) -> np.ndarray:
     """Frame of the factored estimator when projector pixel (r, c) emits ``light[r, c]`` of its power."""
-    from mitsim.capture.evidence import Settings
-    from mitsim.capture.opening import open_bench
-    from mitsim.capture.simulation import Simulation
+    from mitsim.api.bench import open_bench
+    from mitsim.light.passes import Simulation
+    from mitsim.light.settings import Settings
 
     simulation = Simulation(open_bench(path), Settings(depth=Z, subdivision=4))
     labels = np.arange(light.size)

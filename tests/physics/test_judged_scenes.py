@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.opening import open_bench
+from mitsim.api.bench import open_bench
 from mitsim.transport.direct import DirectTracer
 from tests.physics import third_judge as judge
 from tests.physics.judged_scenes import OPEN, opened, scenes, verdict

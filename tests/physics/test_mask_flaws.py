@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from scipy import ndimage, special
 
-from mitsim.optics.glint import SeparableTerm
-from mitsim.optics.samplers import geometric_samplers, wave_samplers
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.mask import mls_mask
+from mitsim.devices.mask_flaws import NO_FLAWS
+from mitsim.devices.mask_profile import MaskProfile
+from mitsim.devices.plate import Plate
+from mitsim.devices.projector import Spectrum
+from mitsim.optics.fft_shadow import geometric_samplers, wave_samplers
+from mitsim.optics.mirror_frames import SeparableTerm
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.flaws import NO_FLAWS
-from mitsim.rig.mask import mls_mask
-from mitsim.rig.plate import Plate
-from mitsim.rig.profile import MaskProfile
-from mitsim.rig.projector import Spectrum
 
 BARE = CameraGeometry(pixels=40, mask_offset_row=0.0131)
 AT = Directions(np.linspace(-0.1, 0.12, 7), 0.003)
@@ -111,7 +111,7 @@ def test_glint_sees_the_same_flaws() -> None:
 @pytest.mark.parametrize("kind", ["turned", "dusty", "both"])
 def test_a_frame_equals_rays_counted_through_a_turned_or_dusty_mask(kind: str) -> None:
     """A point source: its rays to 30 x 30 points of each pixel. Of a disc the mask's own cells are asked, whose area
-    tests/unit/rig/test_flaws.py tells. (Planted: turned the other way; rows for columns; dust on the sensor's side of
+    tests/unit/devices/test_flaws.py tells. (Planted: turned the other way; rows for columns; dust on the sensor's side of
     the offset.)"""
     flaws = {
         "turned": {"rotation_deg": 3.0},

@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.opening import open_bench
+from mitsim.api.bench import open_bench
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.mask import Mask
+from mitsim.devices.projector import Spectrum
 from mitsim.optics.diffraction import wave_terms
-from mitsim.optics.samplers import SeparableTerm, geometric_samplers, wave_samplers
+from mitsim.optics.fft_shadow import SeparableTerm, geometric_samplers, wave_samplers
 from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, geometric_terms
 from mitsim.optics.terms import shadow_terms
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.mask import Mask
-from mitsim.rig.projector import Spectrum
 from tests.physics.slopes import slope_of_reference
 
 LINES = Spectrum(np.array([450.0, 638.0]), np.array([0.4, 0.6]))

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
+from mitsim.devices.camera import CameraGeometry, centred_edges
+from mitsim.devices.mask import Mask
+from mitsim.devices.projector import Spectrum
 from mitsim.optics.shadow import Directions, ShadowGeometry, geometric_terms
 from mitsim.optics.terms import shadow_terms
-from mitsim.rig.camera import CameraGeometry, centred_edges
-from mitsim.rig.mask import Mask
-from mitsim.rig.projector import Spectrum
 
 WIDTH, THICK = 0.06, 0.1
 

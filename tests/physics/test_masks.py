@@ -15,23 +15,23 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
-from mitsim.capture.decision import SceneFacts
-from mitsim.capture.effects import EFFECTS
-from mitsim.capture.modelling import model_of
-from mitsim.capture.opening import open_bench
-from mitsim.capture.session import Session
+from mitsim.api.bench import open_bench
+from mitsim.bench.effects import EFFECTS
+from mitsim.calibrate.model_fit import model_of
+from mitsim.calibrate.session import Session
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
-from mitsim.optics.closed_form import FrameOptics
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.mask import mls_mask
+from mitsim.devices.plate import Plate
+from mitsim.devices.projector import Spectrum
+from mitsim.devices.session import load_recipe
+from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
+from mitsim.planner.explain import SceneFacts
 from mitsim.reconstruct.causes import Cause
-from mitsim.reconstruct.reconstruction import reconstruct
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.mask import mls_mask
-from mitsim.rig.plate import Plate
-from mitsim.rig.projector import Spectrum
-from mitsim.rig.recipe import load_recipe
+from mitsim.reconstruct.reconstruct import reconstruct
 from tests.physics.slopes import slope_of_reference
 
 LINES = Spectrum(np.array([450.0, 638.0]), np.array([0.4, 0.6]))

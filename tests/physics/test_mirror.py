@@ -16,15 +16,15 @@ import numpy as np
 import pytest
 from scipy.signal import max_len_seq
 
-from mitsim.capture.light import Sampling, trace_light
-from mitsim.capture.planning import make_plan
-from mitsim.optics.glint import GlintFrames, glint_frames
-from mitsim.optics.samplers import geometric_samplers
-from mitsim.rig.patterns import Lighting, parse_patterns
-from mitsim.transport.aperture import aperture_scene_parts, register
-from mitsim.transport.glint import trace_glint
-from mitsim.transport.glint_rays import GlintRays
+from mitsim.devices.patterns import Lighting, parse_patterns
+from mitsim.light.light import Sampling, trace_light
+from mitsim.optics.fft_shadow import geometric_samplers
+from mitsim.optics.mirror_frames import GlintFrames, glint_frames
+from mitsim.planner.planner import make_plan
+from mitsim.transport.plugins.lens import aperture_scene_parts, register
 from mitsim.transport.projector import ProjectorOptics
+from mitsim.transport.specular import trace_glint
+from mitsim.transport.specular_rays import GlintRays
 from tests.physics.test_diffraction import by_point_source
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -16,7 +16,7 @@ import pytest
 from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import UNEXPLAINED, UNEXPLAINED_TILE
-from mitsim.reconstruct.reconstruction import reconstruct
+from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.status import Verdict
 
 pytestmark = pytest.mark.slow

@@ -19,10 +19,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.opening import open_bench
-from mitsim.transport.aperture import aperture_scene_parts, register
-from mitsim.transport.histogram import AMBIENT, DIRECT, INDIRECT
+from mitsim.api.bench import Bench, open_bench
+from mitsim.transport.plugins.lens import aperture_scene_parts, register
+from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT
 from tests.physics.passages import LAMP, METAL, MIRROR, SEEDS, SIGMAS, THIN, all_light, direct_light, mean, plate
 from tests.unit.transport.test_panes import WALL, slab
 

@@ -16,9 +16,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.opening import open_bench
-from mitsim.transport.histogram import AMBIENT, DIRECT
+from mitsim.api.bench import Bench, open_bench
+from mitsim.transport.records import AMBIENT, DIRECT
 from tests.conftest import write_png
 from tests.physics.passages import LAMP, METAL, MIRROR, SEEDS, SIGMAS, THIN, all_light, direct_light, mean, plate
 

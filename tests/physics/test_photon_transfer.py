@@ -15,7 +15,7 @@ from scipy import stats
 
 from mitsim.core.configuration import shipped
 from mitsim.core.seeds import stream
-from mitsim.rig.sensor import SensorModel, load_sensor, paper_sensor
+from mitsim.devices.sensor import SensorModel, load_sensor, paper_sensor
 from mitsim.sensor import chain, moments
 
 Record = Callable[[str, object], None]

@@ -2,7 +2,7 @@
 
 All of it: effects left out, anchors, layers and cells, sampling (:mod:`tests.physics.plan_property`). An error whose
 lower bound (95 %) is above the accuracy fails. That nothing cheaper would do
-is held by tests/unit/capture/test_choice.py.
+is held by tests/unit/planner/test_choice.py.
 """
 
 from collections.abc import Callable
@@ -12,10 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.opening import open_bench
-from mitsim.capture.planning import make_plan
-from mitsim.rig.patterns import Lighting
+from mitsim.api.bench import Bench, open_bench
+from mitsim.devices.patterns import Lighting
+from mitsim.planner.planner import make_plan
 from tests.physics.plan_property import Effort, answer, planned, total_error
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -15,21 +15,20 @@ import pytest
 from PIL import Image
 from scipy.special import fresnel
 
-from mitsim.capture.decision import SceneFacts
-from mitsim.capture.effects import EFFECTS, Physics
-from mitsim.capture.opening import open_bench
-from mitsim.capture.rasters import cells_to_choose
+from mitsim.api.bench import open_bench
+from mitsim.bench.effects import EFFECTS, Physics
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
-from mitsim.optics import raster as rasters
-from mitsim.optics.closed_form import FrameOptics, raster_error
-from mitsim.optics.correlation import Correlation
-from mitsim.optics.raster import raster
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.mask_profile import MaskProfile
+from mitsim.devices.projector import Spectrum
+from mitsim.light.cost_model import cells_to_choose
+from mitsim.optics import fft_shadow as rasters
+from mitsim.optics.fft_shadow import Correlation, raster
+from mitsim.optics.image_formation import FrameOptics, raster_error
 from mitsim.optics.shadow import Directions, ShadowGeometry
 from mitsim.optics.terms import shadow_terms
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.profile import MaskProfile
-from mitsim.rig.projector import Spectrum
+from mitsim.planner.explain import SceneFacts
 
 BARE = CameraGeometry(pixels=40, mask_offset_row=0.013)
 LINES = Spectrum(np.array([450.0, 638.0]), np.array([0.4, 0.6]))

@@ -14,18 +14,17 @@ import pytest
 from scipy import stats
 
 from mitsim import psnr, reconstruct
-from mitsim.capture.bench import Bench
-from mitsim.capture.light import Sampling, trace_light
-from mitsim.capture.opening import open_bench
-from mitsim.capture.plan import Plan
-from mitsim.capture.planning import make_plan
+from mitsim.api.bench import Bench, open_bench
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
-from mitsim.optics.closed_form import FrameOptics, raster_error
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.mask_profile import MaskProfile
+from mitsim.devices.patterns import Lighting
+from mitsim.light.light import Sampling, trace_light
+from mitsim.light.plan import Plan
+from mitsim.optics.image_formation import FrameOptics, raster_error
 from mitsim.optics.shadow import Directions
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.patterns import Lighting
-from mitsim.rig.profile import MaskProfile
+from mitsim.planner.planner import make_plan
 from tests.physics.test_estimators_agree import pair_of, z_of_whole
 
 Write = Callable[..., Path]

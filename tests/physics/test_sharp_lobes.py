@@ -13,11 +13,10 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.light import Light, Sampling, trace_light
-from mitsim.capture.opening import open_bench
-from mitsim.capture.planning import make_plan
-from mitsim.rig.patterns import Lighting
+from mitsim.api.bench import Bench, open_bench
+from mitsim.devices.patterns import Lighting
+from mitsim.light.light import SampledLight, Sampling, trace_light
+from mitsim.planner.planner import make_plan
 from tests.hard.hard_light import GLINT, PLACE, SCALE, gauss, glossy, lobe
 
 N, PIXELS, SIGMAS = 32, 64, 5.0
@@ -25,10 +24,10 @@ ALONE = {"interreflection": False, "diffraction": False}
 
 
 @pytest.fixture
-def traced(small_scene: Callable[..., Path], variant: str) -> Callable[..., Light]:
-    """Light of a scene under uniform light on an open sensor of 6.4 mm."""
+def traced(small_scene: Callable[..., Path], variant: str) -> Callable[..., SampledLight]:
+    """SampledLight of a scene under uniform light on an open sensor of 6.4 mm."""
 
-    def trace(accuracy: float, seed: int = 0, **numbers: object) -> Light:
+    def trace(accuracy: float, seed: int = 0, **numbers: object) -> SampledLight:
         path = small_scene("lobes", n=N, mask="open", pitch=0.1, **{"sheet_z": -500, **numbers})
         bench = open_bench(path, variant, for_render=True)
         lighting = Lighting.uniform(N)
@@ -38,11 +37,11 @@ def traced(small_scene: Callable[..., Path], variant: str) -> Callable[..., Ligh
     return trace
 
 
-def frame(light: Light) -> np.ndarray:
+def frame(light: SampledLight) -> np.ndarray:
     return next(iter(light.frames(Lighting.uniform(N), 0))).irradiance
 
 
-def predicted(light: Light) -> float:
+def predicted(light: SampledLight) -> float:
     return float(np.hypot(light.sampling_error, light.plan.systematic_error))
 
 
@@ -57,7 +56,7 @@ def points(bench: Bench, step: int) -> tuple[np.ndarray, np.ndarray]:
     ("alpha", "accuracy"),
     [(3e-2, 5e-3), (1e-2, 5e-3), (3e-3, 1e-2), (1e-3, 1e-2), (3e-4, 1e-2), (1e-4, 2e-2)],
 )
-def test_a_plate_of_any_roughness(traced: Callable[..., Light], alpha: float, accuracy: float) -> None:
+def test_a_plate_of_any_roughness(traced: Callable[..., SampledLight], alpha: float, accuracy: float) -> None:
     light = traced(accuracy, **glossy(alpha, sheet=False))
     index, place = points(light.bench, 6)
     expected = np.array([[lobe(alpha, row, column) for column in place] for row in place])
@@ -110,7 +109,7 @@ def on_ball(alpha: float, sensor: np.ndarray, count: int = 700) -> float:
 
 @pytest.mark.parametrize(("alpha", "accuracy"), [(2e-2, 1e-2), (5e-3, 1e-2)])
 @pytest.mark.slow
-def test_a_ball(traced: Callable[..., Light], alpha: float, accuracy: float) -> None:
+def test_a_ball(traced: Callable[..., SampledLight], alpha: float, accuracy: float) -> None:
     """A highlight that one or two of the projector's pixels light."""
     place = '<point name="center" x="10" y="5" z="370"/><float name="radius" value="20"/>'
     rough = f'<string name="distribution" value="ggx"/><float name="alpha" value="{alpha}"/>'
@@ -213,7 +212,9 @@ def mesh(folder: Path, rings: int, mirror: int, flat: bool) -> Surface:
     return point, normal if flat else shading / np.linalg.norm(shading, axis=1)[:, None], normal, area
 
 
-def check_against(traced: Callable[..., Light], shape: str, judge: Callable[[np.ndarray], float]) -> Light:
+def check_against(
+    traced: Callable[..., SampledLight], shape: str, judge: Callable[[np.ndarray], float]
+) -> SampledLight:
     """Frames asked at 5e-3 are within it, over a few sensor points, for two seeds."""
     for seed in range(2):
         light = traced(5e-3, seed=seed, extra=shape)
@@ -227,7 +228,7 @@ def check_against(traced: Callable[..., Light], shape: str, judge: Callable[[np.
 
 @pytest.mark.slow
 @pytest.mark.parametrize("alpha", [2e-2, 5e-3])
-def test_a_cylinder(traced: Callable[..., Light], alpha: float) -> None:
+def test_a_cylinder(traced: Callable[..., SampledLight], alpha: float) -> None:
     """Curved in one direction; of the part that lights the sensor a few pixels' rays meet a little each."""
     ends = '<point name="p0" x="10" y="-145" z="370"/><point name="p1" x="10" y="155" z="370"/>'
     rough = f'<string name="distribution" value="ggx"/><float name="alpha" value="{alpha}"/>'
@@ -239,7 +240,7 @@ def test_a_cylinder(traced: Callable[..., Light], alpha: float) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("rings", "mirror", "flat"), [(18, 600, False), (5, 40, True)])
-def test_a_small_mesh(traced: Callable[..., Light], tmp_path: Path, rings: int, mirror: int, flat: bool) -> None:
+def test_a_small_mesh(traced: Callable[..., SampledLight], tmp_path: Path, rings: int, mirror: int, flat: bool) -> None:
     """1224 faces with vertex normals, and 80 flat ones, each of them a mirror for a part of the sensor or none.
 
     A highlight near a projector pixel's edge sends its tails from the next one: seen from one anchor they left 8.7e-3
@@ -269,7 +270,7 @@ def card(opacity: str) -> str:
 
 
 @pytest.mark.slow
-def test_a_sharp_lobe_behind_a_half_open_card(traced: Callable[..., Light]) -> None:
+def test_a_sharp_lobe_behind_a_half_open_card(traced: Callable[..., SampledLight]) -> None:
     """The lobe's own light, a quarter of it (seen failing: where the first surface alone was looked at, 1e-4 of it)."""
     plate = glossy(1e-3, sheet=False)
     plate["extra"] += card('<float name="opacity" value="0.5"/>')
@@ -333,7 +334,7 @@ def pane(x: float) -> str:
 
 
 @pytest.mark.slow
-def test_a_sharp_lobe_behind_panes(traced: Callable[..., Light], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sharp_lobe_behind_panes(traced: Callable[..., SampledLight], monkeypatch: pytest.MonkeyPatch) -> None:
     """One pane in each way; without reflections inside of the glass, which are told as left out (some 1e-3)."""
     monkeypatch.setitem(ALONE, "mirrors", False)
     plate = glossy(1e-3, sheet=False)

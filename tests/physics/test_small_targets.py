@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.opening import open_bench
-from mitsim.capture.shooting import Totals
+from mitsim.acquire.capture import Totals
+from mitsim.api.bench import open_bench
 from mitsim.core.errors import MitsimError
-from mitsim.rig.patterns import Lighting
+from mitsim.devices.patterns import Lighting
 
 Z, SCALE, ALBEDO, ASIDE = 400.0, 111000.0, 0.9, 60.0
 PER_AREA = ALBEDO * SCALE / Z**4

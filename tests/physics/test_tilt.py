@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from scipy.special import fresnel
 
-from mitsim.capture.decision import SceneFacts
-from mitsim.capture.opening import open_bench
+from mitsim.api.bench import open_bench
 from mitsim.core.configuration import shipped
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.mask_profile import MaskProfile
+from mitsim.devices.projector import Spectrum
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.profile import MaskProfile
-from mitsim.rig.projector import Spectrum
+from mitsim.planner.explain import SceneFacts
 
 BARE = CameraGeometry(pixels=96, pixel_pitch=0.03, mask_offset_row=0.1, mask_offset_column=-0.21)
 LINE = Spectrum(np.array([550.0]), np.array([1.0]))

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mitsim.core.framefile import read_frame
+from mitsim.core.exr import read_frame
 
 PATTERNS = "hadamard:16"  # 512 frames: long enough to be hit in the middle
 

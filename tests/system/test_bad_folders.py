@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.capture.opening import open_bench
-from mitsim.core.framefile import checksum, read_frame, write_frame
+from mitsim.api.bench import open_bench
+from mitsim.core.exr import checksum, read_frame, write_frame
 from tests.system.refusals import Refused, mentions
 
 Edit = Callable[[dict[str, Any]], object]

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from mitsim.rig.recipe import load_recipe
+from mitsim.devices.session import load_recipe
 from tests.system.refusals import Refused, mentions
 
 pytestmark = pytest.mark.usefixtures("kept_plans")

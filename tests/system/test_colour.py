@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.configuration import shipped
-from mitsim.core.framefile import read_frame
+from mitsim.core.exr import read_frame
 from tests.system.conftest import tree
 from tests.unit.transport.test_neighbours import WALL
 

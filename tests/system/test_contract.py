@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.study import accuracy, solver
-from mitsim.study.solver_cost import make_problem, time_solver
+from mitsim.studies import solver
+from mitsim.studies.accuracy import study as accuracy
+from mitsim.studies.solver import make_problem, time_solver
 
 VERBS = (
     *("demo", "plan", "capture", "calibrate", "reconstruct", "render", "study", "characterise", "sense", "export"),
@@ -169,7 +170,7 @@ def test_render(call: Callable[..., Any], lab: Any, tmp_path: Path, estimator: s
 
 @pytest.mark.slow
 def test_study_accuracy(call: Callable[..., Any], lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of no time, which leaves all but one run out; what whole rows hold is held by unit/study/test_accuracy.py."""
+    """Of no time, which leaves all but one run out; what whole rows hold is held by unit/studies/test_accuracy.py."""
     monkeypatch.setattr(accuracy, "BUDGET_S", 0.0)
     monkeypatch.setattr(accuracy, "QUOTED", 3e-2)
     options = "--patterns", "uniform", "-o", tmp_path / "study", "--json", "--quiet"
@@ -265,7 +266,7 @@ def test_a_fault_of_the_program_is_one_line_and_its_traceback_is_kept(
     def broken(*arguments: object) -> None:
         raise ZeroDivisionError("planted\x1b[31m\nand more")
 
-    monkeypatch.setattr("mitsim.capture.run.make_plan", broken)
+    monkeypatch.setattr("mitsim.acquire.capture.make_plan", broken)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     line = call("plan", *lab.rig).refusal
     assert line.startswith("a fault of mitsim's own, ZeroDivisionError: planted [31m and more; its traceback is in /")

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from mitsim.capture.effects import SWITCHES
+from mitsim.bench.effects import SWITCHES
 
 ROW = {"name", "state", "reason", "error_if_off", "seconds"}
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import mitsim as ms
-from mitsim.core.framefile import read_frame
+from mitsim.core.exr import read_frame
 from tests.exchanged import frame_of
 from tests.system.refusals import mentions
 

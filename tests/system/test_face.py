@@ -18,8 +18,9 @@ import numpy as np
 import pytest
 
 import mitsim as ms
-from mitsim.capture import light, run
-from mitsim.core.framefile import read_frame
+from mitsim.acquire import capture
+from mitsim.core.exr import read_frame
+from mitsim.light import light
 
 pytestmark = pytest.mark.usefixtures("variant")
 ACCURACY, SEED = 0.02, 4
@@ -78,7 +79,7 @@ assert ms.reconstruct is importlib.import_module(f"mitsim.{ms._HOMES['reconstruc
 
 def test_the_function_is_no_room() -> None:
     room = importlib.import_module("mitsim.reconstruct")
-    assert ms.reconstruct is importlib.import_module("mitsim.reconstruct.reconstruction").reconstruct is not room
+    assert ms.reconstruct is importlib.import_module("mitsim.reconstruct.reconstruct").reconstruct is not room
     ms.reconstruct = room  # as Python does when the room is imported
     assert callable(ms.reconstruct)
 
@@ -182,11 +183,11 @@ def test_a_loaded_capture_is_the_one_in_memory(shots: ms.Capture, tmp_path: Path
 
 
 def test_images_from_memory_and_from_disk_are_equal(shots: ms.Capture, factors: ms.Factors, tmp_path: Path) -> None:
-    run, cal = ms.load_run(shots.save(tmp_path / "run")), ms.load_calibration(factors.save(tmp_path / "cal"))
+    capture, cal = ms.load_run(shots.save(tmp_path / "run")), ms.load_calibration(factors.save(tmp_path / "cal"))
     assert np.array_equal(cal.left, factors.left) and np.array_equal(cal.right, factors.right)
     assert cal.fingerprint == factors.fingerprint and str(cal.status) == str(factors.status)
     for method in ("tikhonov", "markov", "tv"):
-        first, second = ms.reconstruct(shots, factors, method=method), ms.reconstruct(run, cal, method=method)
+        first, second = ms.reconstruct(shots, factors, method=method), ms.reconstruct(capture, cal, method=method)
         assert np.array_equal(first.image, second.image) and first.inputs == second.inputs, method
         assert first.save(tmp_path / method) == second.save(tmp_path / method), "the same inputs may be written again"
 
@@ -215,7 +216,7 @@ def traced(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         purposes.append("truth")
         return truth(*arguments)
 
-    for module in (light, run):
+    for module in (light, capture):
         monkeypatch.setattr(module, "trace_light", counted)
     monkeypatch.setattr(light, "trace_truth", counted_truth)
     return purposes
@@ -270,7 +271,7 @@ def test_light_is_exposed_with_other_seeds_and_times_but_no_other_light(bench: m
 @pytest.mark.parametrize("patterns", ["uniform", "dots:3", "hadamard:2", "random:3"])
 def test_the_operator_and_its_adjoint(factors: ms.Factors, patterns: str) -> None:
     """<A x, y> = <x, A^H y>, and A x is Phi_L (P o X) Phi_R^T for every pattern P."""
-    from mitsim.rig.patterns import parse_patterns
+    from mitsim.devices.patterns import parse_patterns
 
     operator, family = factors.operator(patterns, seed=2), parse_patterns(patterns, 16, 2)
     rng = np.random.default_rng(1)

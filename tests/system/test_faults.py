@@ -19,8 +19,8 @@ import numpy as np
 import psutil
 import pytest
 
-from mitsim.core.framefile import read_frame
-from mitsim.core.output import LOCK
+from mitsim.core.exr import read_frame
+from mitsim.core.files import LOCK
 from tests.system.interrupted import PATTERNS, RESUME, assert_equal_runs, cut_short, ended, running
 
 pytestmark = pytest.mark.robustness("Faults")
@@ -232,10 +232,10 @@ def test_damaged_frames_of_an_interrupted_run_are_made_again(
 def test_resume_with_another_version_is_refused(
     refused: Callable[..., str], lab: Any, interrupted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from mitsim.core.versions import versions
+    from mitsim.core.environment import versions
 
     for package in ("mitsim", "mitsuba", "numpy"):
-        monkeypatch.setattr("mitsim.core.versions.versions", lambda name=package: {**versions(), name: "99.0"})
+        monkeypatch.setattr("mitsim.core.environment.versions", lambda name=package: {**versions(), name: "99.0"})
         line = refused("capture", *lab.rig, "-o", interrupted, "--patterns", PATTERNS, "--resume")
         assert "resume" in line and "another configuration (versions differ)" in line
 

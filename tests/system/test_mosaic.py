@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.core.framefile import read_frame
+from mitsim.core.exr import read_frame
 from tests.system.conftest import CAMERA, tree
 from tests.system.test_colour import LINES, SHEET, electrons, projector, spectrum
-from tests.unit.capture.test_lamps import POSITION
+from tests.unit.bench.test_lamps import POSITION
 
 CURVES = {
     "R": {638: 0.4, 520: 0.1, 445: 0.05},

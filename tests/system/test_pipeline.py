@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.core.framefile import read_frame
+from mitsim.core.exr import read_frame
 
 FAMILIES = {"uniform": (1, 30.0), "dots:4": (16, 62.0), "hadamard:4": (32, 55.0), "random:4": (16, 50.0)}
 """Frames, and the least PSNR [dB] of an image with automatic lambda."""

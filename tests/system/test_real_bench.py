@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 import mitsim as ms
-from mitsim.core.framefile import read_frame
+from mitsim.core.exr import read_frame
 from tests.taken import RealBench
 from tests.test_docs import blocks, examples
 

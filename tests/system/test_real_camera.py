@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.capture.exposer import Exposer
+from mitsim.acquire.exposure import Exposer
 from mitsim.core.arrays import FloatArray
-from mitsim.core.framefile import read_frame, write_frame
+from mitsim.core.exr import read_frame, write_frame
 from tests.real_session import RealSession, write_image
 from tests.system.refusals import mentions
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.core.framefile import read_frame
+from mitsim.core.exr import read_frame
 from tests.system.interrupted import PATTERNS, RESUME, assert_equal_runs, cut_short
 
 pytestmark = pytest.mark.robustness("Faults")

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-TOY = "tests.unit.study.toy_study"
+TOY = "tests.unit.studies.toy_study"
 ROOT = Path(__file__).parents[2]
 
 

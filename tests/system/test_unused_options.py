@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mitsim.exchange.export import export_run
+from mitsim.exchange.formats import export_run
 from tests.exchanged import Made, made
 
 

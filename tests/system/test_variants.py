@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.core.framefile import read_frame
+from mitsim.core.exr import read_frame
 from tests.system.conftest import ACCURACY
 from tests.unit.transport.test_indirect import MATT
 from tests.unit.transport.test_neighbours import WALL

@@ -67,13 +67,13 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Whatever traces light ends at once."""
     import mitsuba as mi
 
-    from mitsim.capture import simulation
+    from mitsim.light import passes
     from mitsim.transport import flux
 
     def works(*_: object, **__: object) -> None:
         raise Worked
 
-    monkeypatch.setattr(simulation.Stage, "trace", works)
+    monkeypatch.setattr(passes.Stage, "trace", works)
     monkeypatch.setattr(flux.FluxTracer, "sums", works)
     monkeypatch.setattr(mi, "render", works)
     yield

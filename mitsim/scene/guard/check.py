@@ -19,14 +19,12 @@ import mitsuba as mi
 import numpy as np
 import pydantic
 
-from mitsim.rig.camera import CameraGeometry
+from mitsim.devices.camera import CameraGeometry
 from mitsim.scene.guard import limits
 from mitsim.scene.guard.estimators import SMALL_LAMPS, Unfit
-from mitsim.scene.guard.files import SceneFiles
 from mitsim.scene.guard.headers import MOST_TEXELS, check_image, check_obj, check_ply, is_grey
-from mitsim.scene.guard.limits import Range
-from mitsim.scene.guard.outline import DEEPEST, MOST_ELEMENTS, Outline, Tag
-from mitsim.scene.guard.vocabulary import PLUGINS, check_plugin, check_variant
+from mitsim.scene.guard.limits import PLUGINS, Range, check_plugin, check_variant
+from mitsim.scene.guard.outline import DEEPEST, MOST_ELEMENTS, Outline, SceneFiles, Tag
 
 _IMAGES = ("bitmap", "envmap")
 _READERS = (*_IMAGES, "ply", "obj")

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import mitsuba as mi
 
 from mitsim.core.errors import MitsimError
-from mitsim.scene.guard.vocabulary import PLUGINS
+from mitsim.scene.guard.limits import PLUGINS
 
 if TYPE_CHECKING:
     from mitsim.scene.guard.outline import Outline

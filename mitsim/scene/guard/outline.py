@@ -11,7 +11,9 @@ twice"). It knows the lines of objects, not those of their numbers.
 
 from __future__ import annotations
 
+import os
 import re
+import stat
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,10 +21,10 @@ from typing import TYPE_CHECKING
 from xml.parsers import expat
 
 from mitsim.core.errors import MitsimError, cut
-from mitsim.scene.guard.files import SceneFiles
 
 if TYPE_CHECKING:
     import mitsuba as mi
+
 
 DEEPEST = 16
 """Elements inside elements, references followed: shipped scenes have 5; Mitsuba's stack ends below 10 000."""
@@ -285,3 +287,91 @@ def one_line(error: BaseException) -> str:
     if "Traceback" in text:  # raised by our own plugin: the last line says what, the rest is Python's stack
         lines = [re.sub(r" Traceback .*", "", lines[0]), re.sub(r"^[\w.]*Error: ", "", lines[-1])]
     return " ".join(lines)[:400] if lines else type(error).__name__
+
+
+# -------- The files of a scene
+
+_NATIVE = (".so", ".dylib", ".dll")
+_MOST_BYTES_OF_A_SCENE = 512 << 20
+"""An environment map of 8192 x 4096 texels of float32, as large as one may be, has 400 MiB."""
+_MOST_SPECTRUM = 1 << 20
+"""Some 50 000 lines; measured spectra have 1000."""
+
+
+class SceneFiles:
+    """What one scene may read; ``used`` lists it, the scene first.
+
+    Parameters
+    ----------
+    scene
+        the scene's XML; all else lies in its folder.
+    outside
+        allows files outside that folder.
+    """
+
+    def __init__(self, scene: Path, outside: bool = False) -> None:
+        self.folder = scene.parent
+        self.outside = outside
+        self.used: dict[Path, None] = {}
+
+    def scene(self, path: Path) -> Path:
+        """``path`` itself; MitsimError when it is no plain file, or when native code lies where Mitsuba looks."""
+        if not path.is_file():
+            raise MitsimError(f"{path}: no such scene file; give the path of a Mitsuba scene XML")
+        self.used[path] = None
+        # Mitsuba looks for a plugin in the folder "plugins" beside the scene and in the working folder, its own last.
+        for folder in (path.parent, Path()):
+            _check_native(path, folder)
+        return path
+
+    def included(self, tag: Tag, name: str) -> Path:
+        """The file ``name`` of the ``<include>`` at ``tag``, beside the file that names it; MitsimError as a
+        resource."""
+        path = self._found(tag, tag.path.parent, name)
+        _check_native(tag.path, path.parent)
+        return path
+
+    def spectrum(self, tag: Tag, folder: Path, name: str) -> None:
+        """Allow the file of a spectrum; MitsimError as for :meth:`resource`.
+
+        Parameters
+        ----------
+        tag, name
+            that asks for it, and by which name.
+        folder
+            where Mitsuba looks for it first.
+        """
+        if self._found(tag, folder, name).stat().st_size > _MOST_SPECTRUM:
+            raise tag.refusal("filename", repr(name), "the file is over 1 MiB; a spectrum is smaller")
+
+    def resource(self, tag: Tag, name: str) -> Path:
+        """The bitmap or mesh ``name`` at ``tag``: Mitsuba looks for it from the scene's folder, also where an included
+        file names it. MitsimError when it lies elsewhere, or is no plain file of at most 512 MiB."""
+        return self._found(tag, self.folder, name)
+
+    def _found(self, tag: Tag, folder: Path, name: str) -> Path:
+        path = folder / name
+        try:
+            status = path.stat()
+            inside = path.resolve().is_relative_to(self.folder.resolve())
+        except (OSError, ValueError, RuntimeError):
+            raise tag.refusal("filename", repr(name), f"no such file in {folder}; mend the name") from None
+        if not (inside or self.outside):
+            rule = f"files lie in the scene's folder {self.folder}; copy it there, or use --allow-outside-files"
+            raise tag.refusal("filename", repr(name), rule)
+        if not stat.S_ISREG(status.st_mode) or not 0 < status.st_size <= _MOST_BYTES_OF_A_SCENE:
+            rule = f"a plain file of 1 byte to {_MOST_BYTES_OF_A_SCENE >> 20} MiB is needed"
+            raise tag.refusal("filename", repr(name), rule)
+        self.used[path] = None
+        return path
+
+
+def _check_native(scene: Path, folder: Path) -> None:
+    try:
+        beside = [entry for entry in os.scandir(folder) if entry.name.lower() == "plugins" and entry.is_dir()]
+        libraries = [Path(entry.path) for place in beside for entry in os.scandir(place.path)]
+    except OSError as error:
+        raise MitsimError(f"{scene}: {error.filename}: cannot be read ({error.strerror}); check the folder") from None
+    for library in sorted(libraries):
+        if library.suffix.lower() in _NATIVE:
+            raise MitsimError(f"{scene}: {library} would run native code; move it away from the scene")

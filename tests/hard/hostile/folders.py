@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.framefile import write_frame
+from mitsim.core.exr import write_frame
 from mitsim.core.runs import load_run
 from mitsim.reconstruct.factors import load_calibration
-from mitsim.reconstruct.reconstruction import reconstruct
+from mitsim.reconstruct.reconstruct import reconstruct
 
 LONGEST = 5.0
 """Seconds of processor time, so that a busy machine makes no verdict; the slowest takes 1 s here."""

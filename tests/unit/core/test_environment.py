@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.core import environment, llvm
+from mitsim.core import environment
+from mitsim.core import environment as llvm
 from mitsim.core.errors import MitsimError
-from mitsim.core.framefile import write_frame
+from mitsim.core.exr import write_frame
 
 
 def in_child(program: str, **env: str) -> subprocess.CompletedProcess[str]:

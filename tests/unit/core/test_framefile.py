@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.framefile import checksum, read_frame, write_frame
+from mitsim.core.exr import checksum, read_frame, write_frame
 
 DN = np.array([[0, 1, 4095], [2**24 + 1, 2**32 - 1, 7]], dtype=np.uint32)
 ELECTRONS = np.array([[0.1, -1.5, 3e30], [np.inf, 1e-30, 2.0]], dtype=np.float32)
@@ -50,7 +50,7 @@ def test_a_failed_write_leaves_the_old_frame_and_nothing_else(tmp_path: Path, mo
             Path(name).write_bytes(b"half a fra")
             raise RuntimeError("No space left on device")
 
-    monkeypatch.setattr("mitsim.core.framefile.OpenEXR.File", Broken)
+    monkeypatch.setattr("mitsim.core.exr.OpenEXR.File", Broken)
     with pytest.raises(MitsimError, match=r"a\.exr: cannot be written \(No space left"):
         write_frame(path, {"DN": DN + 1}, {"version": 2})
     assert checksum(path) == before

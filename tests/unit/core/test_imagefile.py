@@ -17,9 +17,9 @@ import tifffile
 from PIL import Image, PngImagePlugin
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.framefile import write_frame
-from mitsim.core.imagefile import _look, _told, image_size, own_end, read_image, read_images
+from mitsim.core.exr import write_frame
 from mitsim.core.imagelist import Raw, Wanted, image_files
+from mitsim.core.images import _look, _told, image_size, own_end, read_image, read_images
 
 NUMBERS = (np.arange(35).reshape(5, 7) * 113).astype(np.uint16)
 LARGE = np.arange(35, dtype=np.uint32).reshape(5, 7) * 120_000_000

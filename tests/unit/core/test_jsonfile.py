@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.core import jsonfile
+from mitsim.core import files
+from mitsim.core.environment import versions as all_versions
 from mitsim.core.errors import MitsimError
-from mitsim.core.versions import versions as all_versions
 
 
 def test_json_comes_back(tmp_path: Path) -> None:
@@ -20,8 +20,8 @@ def test_json_comes_back(tmp_path: Path) -> None:
         "worst": np.inf,
         "name": "µm",
     }
-    jsonfile.write_json(tmp_path / "m.json", written)
-    assert jsonfile.read_json(tmp_path / "m.json") == {
+    files.write_json(tmp_path / "m.json", written)
+    assert files.read_json(tmp_path / "m.json") == {
         "array": [[1.5, 2.0]],
         "count": 2**40,
         "where": "a/b",
@@ -34,31 +34,31 @@ def test_json_comes_back(tmp_path: Path) -> None:
 
 
 def test_what_json_cannot_hold_is_refused_and_the_old_file_stays(tmp_path: Path) -> None:
-    jsonfile.write_json(tmp_path / "m.json", {"a": 1})
+    files.write_json(tmp_path / "m.json", {"a": 1})
     with pytest.raises(TypeError, match="object"):
-        jsonfile.write_json(tmp_path / "m.json", {"a": object()})
-    assert jsonfile.read_json(tmp_path / "m.json") == {"a": 1}
+        files.write_json(tmp_path / "m.json", {"a": object()})
+    assert files.read_json(tmp_path / "m.json") == {"a": 1}
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    jsonfile.write_json(tmp_path / "m.json", {"a": 1})
+    files.write_json(tmp_path / "m.json", {"a": 1})
 
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "replace", full)
     with pytest.raises(MitsimError, match="No space left"):
-        jsonfile.write_json(tmp_path / "m.json", {"a": 2})
+        files.write_json(tmp_path / "m.json", {"a": 2})
     assert json.loads((tmp_path / "m.json").read_text()) == {"a": 1}
     assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_reading_names_the_file(tmp_path: Path) -> None:
     with pytest.raises(MitsimError, match=r"m\.json: cannot be read"):
-        jsonfile.read_json(tmp_path / "m.json")
+        files.read_json(tmp_path / "m.json")
     (tmp_path / "m.json").write_text('{"a": ')
     with pytest.raises(MitsimError, match=r"m\.json: not valid JSON"):
-        jsonfile.read_json(tmp_path / "m.json")
+        files.read_json(tmp_path / "m.json")
 
 
 def test_versions_names_what_decides_the_numbers() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mitsim.core import llvm
+from mitsim.core import environment
 from mitsim.core.errors import MitsimError
 
 DEBIAN = Path("/usr/lib/x86_64-linux-gnu")
@@ -22,7 +22,7 @@ def needs(name: str) -> Path:
 
 @pytest.fixture(autouse=True)
 def _clean(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.delenv(llvm.VARIABLE, raising=False)
+    monkeypatch.delenv(environment.VARIABLE, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
@@ -30,7 +30,7 @@ def fake_libraries(monkeypatch: pytest.MonkeyPatch, folder: Path, *names: str) -
     paths = [folder / name for name in names]
     for path in paths:
         path.touch()
-    monkeypatch.setattr(llvm, "_names", lambda: paths)
+    monkeypatch.setattr(environment, "_names", lambda: paths)
     return paths
 
 
@@ -46,13 +46,13 @@ def fake_libraries(monkeypatch: pytest.MonkeyPatch, folder: Path, *names: str) -
     ],
 )
 def test_the_version_is_read_from_the_name(name: str, version: int | None) -> None:
-    assert llvm.version(Path("/nowhere") / name) == version
+    assert environment.version(Path("/nowhere") / name) == version
 
 
 def test_a_link_tells_its_target_s_version(tmp_path: Path) -> None:
     (tmp_path / "libLLVM-15.so.1").touch()
     (tmp_path / "libLLVM.so").symlink_to(tmp_path / "libLLVM-15.so.1")
-    assert llvm.version(tmp_path / "libLLVM.so") == 15
+    assert environment.version(tmp_path / "libLLVM.so") == 15
 
 
 def test_old_libraries_are_no_candidates_and_links_count_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -60,11 +60,11 @@ def test_old_libraries_are_no_candidates_and_links_count_once(tmp_path: Path, mo
     (tmp_path / "libLLVM-19.so").symlink_to(tmp_path / "libLLVM.so.19.1")
     names = ["libLLVM.so.20.1", "libLLVM.so.19.1", "libLLVM-19.so", "libLLVM-15.so.1", "libLLVM-14.so.1"]
     fake_libraries(monkeypatch, tmp_path, *names)
-    assert [path.name for path in llvm.candidates()] == ["libLLVM.so.20.1", "libLLVM.so.19.1"]
+    assert [path.name for path in environment.candidates()] == ["libLLVM.so.20.1", "libLLVM.so.19.1"]
 
 
 def test_names_cover_debian_s_spelling() -> None:
-    names = {str(path) for path in llvm._names()}
+    names = {str(path) for path in environment._names()}
     folder = f"/usr/lib/{os.uname().machine}-linux-gnu"
     assert {f"{folder}/libLLVM.so.19.1", f"{folder}/libLLVM-19.so", f"{folder}/libLLVM-17.so.1"} <= names
     assert not any(f"libLLVM-{old}.so" in name for name in names for old in (14, 15, 16))
@@ -72,16 +72,16 @@ def test_names_cover_debian_s_spelling() -> None:
 
 def test_a_library_that_fails_the_probe_is_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake_libraries(monkeypatch, tmp_path, "libLLVM.so.20.1", "libLLVM.so.19.1")
-    monkeypatch.setattr(llvm, "probe", lambda path: llvm.Probe("19" in path.name, "seen"))
-    assert llvm.find_llvm().name == "libLLVM.so.19.1"
+    monkeypatch.setattr(environment, "probe", lambda path: environment.Probe("19" in path.name, "seen"))
+    assert environment.find_llvm().name == "libLLVM.so.19.1"
 
 
 def test_without_a_library_the_error_names_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake_libraries(monkeypatch, tmp_path, "libLLVM-14.so.1")
     with pytest.raises(MitsimError, match=r"none found.*install") as caught:
-        llvm.select_llvm()
+        environment.select_llvm()
     assert "\n" not in str(caught.value)
-    assert llvm.VARIABLE not in os.environ
+    assert environment.VARIABLE not in os.environ
 
 
 @pytest.mark.parametrize("name", ["libLLVM-14.so.1", "libLLVM-15.so.1"])
@@ -89,71 +89,71 @@ def test_select_refuses_a_named_old_library_without_loading_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     (tmp_path / name).touch()
-    monkeypatch.setenv(llvm.VARIABLE, str(tmp_path / name))
-    monkeypatch.setattr(llvm, "probe", lambda _: pytest.fail("an old library was loaded"))
+    monkeypatch.setenv(environment.VARIABLE, str(tmp_path / name))
+    monkeypatch.setattr(environment, "probe", lambda _: pytest.fail("an old library was loaded"))
     with pytest.raises(MitsimError, match=rf"{name} is LLVM 1[45].*17 or newer"):
-        llvm.select_llvm()
+        environment.select_llvm()
 
 
 def test_a_named_library_must_exist_and_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(llvm.VARIABLE, str(tmp_path / "libLLVM.so.19.1"))
+    monkeypatch.setenv(environment.VARIABLE, str(tmp_path / "libLLVM.so.19.1"))
     with pytest.raises(MitsimError, match="does not exist"):
-        llvm.find_llvm()
+        environment.find_llvm()
     (tmp_path / "libLLVM.so.19.1").write_text("no library")
     with pytest.raises(MitsimError, match="fails"):
-        llvm.find_llvm()
+        environment.find_llvm()
 
 
 def test_a_good_probe_is_remembered_until_the_library_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (path,) = fake_libraries(monkeypatch, tmp_path, "libLLVM.so.19.1")
     probed: list[Path] = []
 
-    def probe(library: Path) -> llvm.Probe:
+    def probe(library: Path) -> environment.Probe:
         probed.append(library)
-        return llvm.Probe(True, "works")
+        return environment.Probe(True, "works")
 
-    monkeypatch.setattr(llvm, "probe", probe)
-    llvm.find_llvm()
-    llvm.find_llvm()
+    monkeypatch.setattr(environment, "probe", probe)
+    environment.find_llvm()
+    environment.find_llvm()
     assert len(probed) == 1
     path.write_text("a new build")
-    llvm.find_llvm()
+    environment.find_llvm()
     assert len(probed) == 2
 
 
 def test_a_bad_probe_is_not_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake_libraries(monkeypatch, tmp_path, "libLLVM.so.19.1")
-    answers = iter([llvm.Probe(False, "out of memory")] * 2 + [llvm.Probe(True, "works")])
-    monkeypatch.setattr(llvm, "probe", lambda _: next(answers))
+    answers = iter([environment.Probe(False, "out of memory")] * 2 + [environment.Probe(True, "works")])
+    monkeypatch.setattr(environment, "probe", lambda _: next(answers))
     for _ in range(2):
         with pytest.raises(MitsimError, match="out of memory"):
-            llvm.find_llvm()
-    assert llvm.find_llvm().name == "libLLVM.so.19.1"
+            environment.find_llvm()
+    assert environment.find_llvm().name == "libLLVM.so.19.1"
 
 
 def test_a_cache_that_cannot_be_written_does_no_harm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake_libraries(monkeypatch, tmp_path, "libLLVM.so.19.1")
     (tmp_path / "blocked").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "blocked"))
-    monkeypatch.setattr(llvm, "probe", lambda _: llvm.Probe(True, "works"))
-    assert llvm.find_llvm().name == "libLLVM.so.19.1"
+    monkeypatch.setattr(environment, "probe", lambda _: environment.Probe(True, "works"))
+    assert environment.find_llvm().name == "libLLVM.so.19.1"
 
 
 def test_llvm_15_dies_in_the_child_and_is_reported() -> None:
     # LLVM 15 loads and then aborts the process while compiling; that this line is reached is half of the
     # test.
-    result = llvm.probe(needs("libLLVM-15.so.1"))
+    result = environment.probe(needs("libLLVM-15.so.1"))
     assert not result.ok and "signal 6" in result.detail and "\n" not in result.detail
 
 
 def test_llvm_14_is_reported() -> None:
-    assert not llvm.probe(needs("libLLVM-14.so.1")).ok
+    assert not environment.probe(needs("libLLVM-14.so.1")).ok
 
 
 def test_the_library_of_this_machine_works() -> None:
-    path = llvm.select_llvm()
-    assert (llvm.version(path) or llvm.OLDEST) >= llvm.OLDEST
-    assert os.environ[llvm.VARIABLE] == str(path)
+    path = environment.select_llvm()
+    assert (environment.version(path) or environment.OLDEST) >= environment.OLDEST
+    assert os.environ[environment.VARIABLE] == str(path)
 
 
 def test_the_set_up_asks_for_a_library_by_a_function_that_is_there() -> None:

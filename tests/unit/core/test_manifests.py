@@ -12,7 +12,7 @@ import pytest
 from pydantic import TypeAdapter
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.jsonfile import read_json, write_json
+from mitsim.core.files import read_json, write_json
 from mitsim.core.manifests import (
     MOST_PIXELS,
     MOST_SHOTS,
@@ -22,8 +22,8 @@ from mitsim.core.manifests import (
     RunManifest,
     read_manifest,
 )
-from mitsim.rig.patterns import PatternFamily, parse_patterns
-from mitsim.rig.sensor import SensorModel
+from mitsim.devices.patterns import PatternFamily, parse_patterns
+from mitsim.devices.sensor import SensorModel
 
 RUN: dict[str, Any] = {
     "kind": "capture",

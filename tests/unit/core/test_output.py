@@ -8,20 +8,20 @@ from pathlib import Path
 
 import pytest
 
-from mitsim.core import output
+from mitsim.core import files
 from mitsim.core.errors import MitsimError
-from mitsim.core.framefile import verify
-from mitsim.core.output import LOCK, check_apart, output_file, output_folder, prepare_output, whole_file
+from mitsim.core.exr import verify
+from mitsim.core.files import LOCK, check_apart, output_file, output_folder, prepare_output, whole_file
 
 
 def test_prepare_output_makes_the_folder(tmp_path: Path) -> None:
-    assert output.prepare_output(str(tmp_path / "run")) == tmp_path / "run"
+    assert files.prepare_output(str(tmp_path / "run")) == tmp_path / "run"
     assert (tmp_path / "run").is_dir()
-    output.prepare_output(tmp_path / "run")  # empty: still free
+    files.prepare_output(tmp_path / "run")  # empty: still free
     (tmp_path / "run" / "frame").touch()
     with pytest.raises(MitsimError, match="holds files already"):
-        output.prepare_output(tmp_path / "run")
-    output.prepare_output(tmp_path / "run", overwrite=True)
+        files.prepare_output(tmp_path / "run")
+    files.prepare_output(tmp_path / "run", overwrite=True)
     assert (tmp_path / "run" / "frame").exists()
 
 
@@ -33,19 +33,19 @@ def test_prepare_output_refuses_before_work(tmp_path: Path) -> None:
         (tmp_path / "file" / "run", "does not exist"),
     ]:
         with pytest.raises(MitsimError, match=reason):
-            output.prepare_output(path)
+            files.prepare_output(path)
 
 
 def test_prepare_output_for_a_file(tmp_path: Path) -> None:
     path = tmp_path / "frame.exr"
-    assert output.prepare_output(path, kind="file") == path
+    assert files.prepare_output(path, kind="file") == path
     assert not path.exists()
     path.touch()
     with pytest.raises(MitsimError, match="exists already"):
-        output.prepare_output(path, kind="file")
-    output.prepare_output(path, overwrite=True, kind="file")
+        files.prepare_output(path, kind="file")
+    files.prepare_output(path, overwrite=True, kind="file")
     with pytest.raises(MitsimError, match="is a folder"):
-        output.prepare_output(tmp_path, kind="file")
+        files.prepare_output(tmp_path, kind="file")
 
 
 @pytest.mark.parametrize("kind", ["folder", "file"])
@@ -54,7 +54,7 @@ def test_a_place_that_takes_no_files_is_refused(kind: str) -> None:
     if not Path("/proc/self").is_dir():
         pytest.skip("needs /proc")
     with pytest.raises(MitsimError, match="output /proc/mitsim"):
-        output.prepare_output(Path("/proc/mitsim"), kind=kind)
+        files.prepare_output(Path("/proc/mitsim"), kind=kind)
 
 
 @pytest.mark.parametrize("kind", ["folder", "file"])
@@ -66,7 +66,7 @@ def test_a_folder_without_write_access_is_refused(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr("tempfile.TemporaryFile", refuse)
     path = tmp_path / "frame.exr" if kind == "file" else tmp_path
     with pytest.raises(MitsimError, match="not writable"):
-        output.prepare_output(path, kind=kind)
+        files.prepare_output(path, kind=kind)
 
 
 def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_a_name_that_is_not_utf8_is_refused_before_work(tmp_path: Path, kind: st
     """OpenEXR cannot open it, nor a terminal print it: it ended in a traceback after all the work."""
     path = Path(str(tmp_path) + "/\udcff.exr")  # the byte 0xff, as Python reads it from a command line
     with pytest.raises(MitsimError, match="is not UTF-8 text") as caught:
-        output.prepare_output(path, kind=kind)
+        files.prepare_output(path, kind=kind)
     assert str(caught.value).isprintable() and not list(tmp_path.iterdir())
 
 
@@ -134,11 +134,11 @@ def test_an_unfinished_calibration_is_not_to_be_emptied(tmp_path: Path) -> None:
     (tmp_path / "left.exr").touch()
     (tmp_path / "responses.part.npz").touch()
     with pytest.raises(MitsimError, match="an unfinished calibration with 1 finished parts; go on with resume=True"):
-        output.prepare_output(tmp_path)
+        files.prepare_output(tmp_path)
     for text in ("{", "[" * 100_000, "[1]", '{"status": "complete"}'):
         (tmp_path / "manifest.json").write_text(text)
         with pytest.raises(MitsimError, match="holds files already; choose a new one or empty it"):
-            output.prepare_output(tmp_path)
+            files.prepare_output(tmp_path)
 
 
 def test_no_device_pipe_or_socket_is_replaced(tmp_path: Path) -> None:

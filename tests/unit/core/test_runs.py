@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.framefile import read_frame
+from mitsim.core.exr import read_frame
 from mitsim.core.manifests import Digital, Patterns, RunHead, RunManifest
-from mitsim.core.recorders import Recorder, RunMemory, claimed, frame_name
-from mitsim.core.runs import Capture, load_run
-from mitsim.rig.patterns import parse_patterns
+from mitsim.core.runs import Capture, Recorder, RunMemory, claimed, frame_name, load_run
+from mitsim.devices.patterns import parse_patterns
 
 N, PIXELS = 6, 5
 CONFIGURATION = {"scene": "none", "seed": 3}

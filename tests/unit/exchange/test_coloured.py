@@ -16,10 +16,9 @@ from scipy.io import loadmat, savemat
 import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.exchange import tensors
-from mitsim.exchange.export import export_run
+from mitsim.exchange.formats import RealCapture, export_run
 from mitsim.exchange.hdf5 import open_hdf5
-from mitsim.exchange.known import RealCapture
-from mitsim.exchange.load import import_file
+from mitsim.exchange.loaders import import_file
 from mitsim.exchange.real import import_frames
 from tests.exchanged import COLUMNS, ROWS, SCENE, Made, bytes_of, made
 from tests.unit.exchange.test_real import known

@@ -13,11 +13,11 @@ import pytest
 
 import mitsim as ms
 from mitsim.core.errors import MitsimError
-from mitsim.core.framefile import read_frame, write_frame
+from mitsim.core.exr import read_frame, write_frame
 from mitsim.exchange import packed
-from mitsim.exchange.export import export_run
+from mitsim.exchange.formats import export_run
 from mitsim.exchange.hdf5 import open_hdf5
-from mitsim.exchange.load import import_file
+from mitsim.exchange.loaders import import_file
 from tests.exchanged import COLUMNS, ROWS, SCENE, Made, bytes_of, made
 
 

@@ -15,10 +15,11 @@ from scipy.io import loadmat, savemat, whosmat
 
 import mitsim as ms
 from mitsim.core.errors import MitsimError
-from mitsim.core.framefile import read_frame
-from mitsim.exchange import matlab, matlab_file
-from mitsim.exchange.export import export_run
-from mitsim.exchange.load import import_file
+from mitsim.core.exr import read_frame
+from mitsim.exchange import matlab
+from mitsim.exchange import matlab as matlab_file
+from mitsim.exchange.formats import export_run
+from mitsim.exchange.loaders import import_file
 from tests.exchanged import COLUMNS, DIGITAL, ROWS, SCENE, Made, bytes_of, made
 
 CASES = ["dots", "signed", "real output", "ambient"]

@@ -17,12 +17,11 @@ from PIL import Image
 
 import mitsim as ms
 from mitsim.core.errors import MitsimError
-from mitsim.core.framefile import write_frame
+from mitsim.core.exr import write_frame
 from mitsim.core.imagelist import Raw, Wanted
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.exchange import real
-from mitsim.exchange.export import export_run
-from mitsim.exchange.known import RealCapture
+from mitsim.exchange.formats import RealCapture, export_run
 from mitsim.exchange.real import LEFT_OUT, import_frames
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.status import Status, Verdict

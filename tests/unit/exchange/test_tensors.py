@@ -11,7 +11,7 @@ import pytest
 import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.exchange import tensors
-from mitsim.exchange.export import export_run
+from mitsim.exchange.formats import export_run
 from tests.exchanged import COLUMNS, ROWS, SCENE, made
 
 

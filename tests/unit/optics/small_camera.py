@@ -7,11 +7,11 @@ to get wrong.
 import numpy as np
 from scipy import sparse
 
-from mitsim.optics.closed_form import FrameOptics
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.patterns import Lighting
 from mitsim.optics.frames import ExpectedFrames, Filed
+from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.patterns import Lighting
 
 Z, WINDOW = 40.0, (-0.13, 0.17)
 CAMERA = CameraGeometry(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.anchors import anchor_positions, anchor_weights
+from mitsim.optics.image_formation import anchor_positions, anchor_weights
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 6])

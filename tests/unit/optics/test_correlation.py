@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics import raster as rasters
-from mitsim.optics.anchors import anchor_positions, anchor_weights
-from mitsim.optics.closed_form import FrameOptics
-from mitsim.optics.correlation import Correlation
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.mask_profile import MaskProfile
+from mitsim.devices.plate import Plate
+from mitsim.optics import fft_shadow as rasters
+from mitsim.optics.fft_shadow import Correlation
+from mitsim.optics.image_formation import FrameOptics, anchor_positions, anchor_weights
 from mitsim.optics.shadow import Directions, ShadowGeometry, geometric_terms
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.plate import Plate
-from mitsim.rig.profile import MaskProfile
 
 BARE = CameraGeometry(
     pixels=12, pixel_pitch=0.03, mask_offset_row=0.013, mask_offset_column=-0.04, pixel_fill_factor=0.6, fov=8.0

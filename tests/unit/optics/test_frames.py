@@ -6,11 +6,10 @@ from itertools import pairwise, product
 import numpy as np
 import pytest
 
-from mitsim.optics.anchors import anchor_positions, anchor_weights
-from mitsim.optics.closed_form import FrameOptics
+from mitsim.devices.mask import Mask
+from mitsim.optics.image_formation import FrameOptics, anchor_positions, anchor_weights
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
-from mitsim.rig.mask import Mask
 from tests.unit.optics.small_camera import CAMERA, WINDOW, Z, cell_optics
 
 ROWS, COLUMNS = np.array([0, 9, 31, 48, 70, 95]), np.array([2, 20, 40, 57, 88, 95])

@@ -6,7 +6,6 @@ from scipy import sparse
 from scipy.linalg import hadamard
 
 from mitsim.optics import frames as frames_module
-from mitsim.optics.closed_form import FrameOptics
 from mitsim.optics.frames import (
     ClassFrames,
     ExpectedFrames,
@@ -19,6 +18,7 @@ from mitsim.optics.frames import (
     frames_in_memory,
     mixes,
 )
+from mitsim.optics.image_formation import FrameOptics
 from tests.unit.optics.small_camera import (
     BESIDE,
     CAMERA,

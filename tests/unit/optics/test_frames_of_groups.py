@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from mitsim.optics.closed_form import FrameOptics
 from mitsim.optics.frames import (
     ClassFrames,
     Filed,
@@ -14,6 +13,7 @@ from mitsim.optics.frames import (
     monte_carlo_error,
     shares_of_bound,
 )
+from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions
 from tests.unit.optics.small_camera import (
     BESIDE,

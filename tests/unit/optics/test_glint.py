@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.glint import Beams, _bilinear, _cuts, _gradients, glint_frames
-from mitsim.optics.samplers import ProfileSampler, geometric_samplers, wave_samplers
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.projector import Spectrum
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.projector import Spectrum
+from mitsim.optics.fft_shadow import ProfileSampler, geometric_samplers, wave_samplers
+from mitsim.optics.mirror_frames import Beams, _bilinear, _cuts, _gradients, glint_frames
 
 PITCH = 0.05
 LABELS = np.arange(9) % 3

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from mitsim.optics.closed_form import FrameOptics
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.drift import MaskMotion
+from mitsim.devices.projector import Spectrum
 from mitsim.optics.diffraction import wave_profiles
+from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry
 from mitsim.optics.terms import shadow_terms
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.drift import MaskMotion
-from mitsim.rig.projector import Spectrum
 
 DEPTH = 400.0
 CAMERA = CameraGeometry(pixels=24, pixel_pitch=0.25, mask_offset_row=0.1, mask_offset_column=-0.07)
@@ -72,7 +72,7 @@ def test_fine_nodes_are_as_good_as_finer_ones(monkeypatch: pytest.MonkeyPatch) -
     small = CameraGeometry(pixels=512).model_copy(update={"mask_motion": MaskMotion(rotation_mrad=1.0)})
     cell, few = Directions.cells(np.array([0.05, 0.0523])), (3, 4, 5, 250, 508, 509)
     shadow = [operator(shadow_terms(small, cell, cell, DEPTH, places=(few, few)))]
-    monkeypatch.setattr("mitsim.optics.motion.NODE_UM", 0.05)
+    monkeypatch.setattr("mitsim.optics.mask_defects.NODE_UM", 0.05)
     shadow.append(operator(shadow_terms(small, cell, cell, DEPTH, places=(few, few))))
     still = operator(shadow_terms(small.model_copy(update={"mask_motion": None}), cell, cell, DEPTH, places=(few, few)))
     assert np.linalg.norm(shadow[0] - shadow[1]) < 0.01 * np.linalg.norm(shadow[1] - still)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from mitsim.optics.profile import Steps, sampled_box_means
+from mitsim.devices.camera import centred_edges
+from mitsim.devices.mask import mls_mask
+from mitsim.optics.edge_profile import Steps, sampled_box_means
 from mitsim.optics.shadow import scene_factor
-from mitsim.rig.camera import centred_edges
-from mitsim.rig.mask import mls_mask
 
 
 def test_neighbours_of_equal_value_are_merged_and_outside_is_zero() -> None:

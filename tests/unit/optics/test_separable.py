@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import hadamard
 
 from mitsim.optics.separable import best_term, centred, lacking, relative_difference
-from mitsim.reconstruct.calibration import estimate_factors
+from mitsim.reconstruct.estimate_factors import estimate_factors
 
 Terms = list[tuple[np.ndarray, np.ndarray]]
 

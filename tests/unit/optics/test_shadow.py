@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mitsim.core.errors import MitsimError
+from mitsim.devices.camera import CameraGeometry, centred_edges
+from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import Directions, ShadowGeometry, geometric_terms, scene_factor, shadow_factor
 from mitsim.optics.terms import shadow_terms
-from mitsim.rig.camera import CameraGeometry, centred_edges
-from mitsim.rig.mask import mls_mask
 
 ANCHOR = (0.06, centred_edges(512, 0.01172), centred_edges(128, 120 / 128), 2.0, 400.0)
 

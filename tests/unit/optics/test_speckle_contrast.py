@@ -8,10 +8,9 @@ from scipy.special import ndtri
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
+from mitsim.devices.camera import CameraGeometry, Rig
+from mitsim.devices.projector import Coherence, ProjectorModel
 from mitsim.optics.speckle import contrast_of
-from mitsim.rig.camera import CameraGeometry
-from mitsim.rig.projector import Coherence, ProjectorModel
-from mitsim.rig.rig import Rig
 from tests.invented import sensor
 
 N, POINTS, SIDE = 8, 6, 0.5  # projector pixels a side, points a pixel, a pixel's side [mm]

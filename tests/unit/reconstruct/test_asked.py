@@ -7,7 +7,7 @@ import math
 import pytest
 
 from mitsim.core.errors import ArgumentError
-from mitsim.reconstruct.asked import METHODS, check_asked, check_joint
+from mitsim.reconstruct.request import METHODS, check_asked, check_joint
 
 TAKEN = [
     *(("auto", method, None, 0) for method in METHODS),

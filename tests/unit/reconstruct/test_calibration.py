@@ -5,8 +5,10 @@ import pytest
 from scipy.linalg import hadamard
 
 from mitsim.core.errors import MitsimError
+from mitsim.devices.camera import centred_edges
+from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.calibration import (
+from mitsim.reconstruct.estimate_factors import (
     StripeSums,
     _rank_one_split,
     estimate_factors,
@@ -14,8 +16,6 @@ from mitsim.reconstruct.calibration import (
     squared_condition,
 )
 from mitsim.reconstruct.solver import prepare
-from mitsim.rig.camera import centred_edges
-from mitsim.rig.mask import mls_mask
 
 N, M = 16, 40
 H = hadamard(N).astype(float)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
+from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.convolution import ConvolutionalCamera, conjugate_gradients, solve_iteratively
 from mitsim.reconstruct.dots import MOST_FACTORISED, Classes
 from mitsim.reconstruct.status import Verdict
-from mitsim.rig.patterns import parse_patterns
 
 SENSORS = [None, (15, 12), (8, 15)]
 """All light; cropped on all sides, unevenly; higher than wide, narrower than all light."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mitsim.reconstruct.defects import Defects, defects_of
-from mitsim.reconstruct.reconstruction import accumulated, reconstruct
+from mitsim.reconstruct.reconstruct import accumulated, reconstruct
 from tests.ideal_sessions import BLACK, CODES, bench, picture
 from tests.unit.reconstruct.test_faults import Frames, with_frames
 

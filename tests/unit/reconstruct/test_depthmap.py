@@ -13,13 +13,11 @@ import pytest
 
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.runs import Capture
-from mitsim.reconstruct.alldepths import AllDepths
 from mitsim.reconstruct.causes import Cause
-from mitsim.reconstruct.depth import Depth
-from mitsim.reconstruct.depthmap import depth_map
+from mitsim.reconstruct.depth import AllDepths, Depth
+from mitsim.reconstruct.depth_map import PixelDepths, depth_map
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.pixeldepths import PixelDepths
-from mitsim.reconstruct.reconstruction import accumulated, reconstruct
+from mitsim.reconstruct.reconstruct import accumulated, reconstruct
 from tests.ideal_sessions import PEAK, Bench, picture
 from tests.ideal_sessions import shadow as plain_shadow
 from tests.unit.reconstruct.test_faults import dark, with_frames
@@ -258,7 +256,7 @@ def test_the_step_is_the_derivative() -> None:
 def test_files_and_the_summary_have_the_depths(tmp_path: object) -> None:
     from pathlib import Path
 
-    from mitsim.core.framefile import read_frame
+    from mitsim.core.exr import read_frame
 
     run, factors = shots(cards(), "dots:4x8"), calibrated()
     image = reconstruct(run, factors, focus="map")

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
+from mitsim.devices.camera import centred_edges
+from mitsim.devices.mask import mls_mask
+from mitsim.devices.patterns import parse_patterns
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.detail import LitFrame, Model, disagreement, moved_responses, print_part, slope_of
 from mitsim.reconstruct.misfit import UNEXPLAINED
-from mitsim.reconstruct.reconstruction import accumulated, reconstruct
+from mitsim.reconstruct.reconstruct import accumulated, reconstruct
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.uncertainty import Propagation
-from mitsim.rig.camera import centred_edges
-from mitsim.rig.mask import mls_mask
-from mitsim.rig.patterns import parse_patterns
 from tests.ideal_sessions import PITCH, PIXELS, Bench, N, shadow
 
 FINE = 8

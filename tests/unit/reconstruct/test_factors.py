@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.linalg import hadamard
 
-from mitsim.capture.request import Request
+from mitsim.bench.request import Request
 from mitsim.core.errors import MitsimError
 from mitsim.core.manifests import CalibrationManifest
-from mitsim.reconstruct.calibration import estimate_factors
+from mitsim.devices.patterns import PatternFamily, parse_patterns
+from mitsim.reconstruct.estimate_factors import estimate_factors
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.status import Status, Verdict
-from mitsim.rig.patterns import PatternFamily, parse_patterns
 
 N, ROWS, COLUMNS = 12, 20, 17
 FAMILIES = ("uniform", "dots:3", "dots:5", "hadamard:4", "random:3")

@@ -17,19 +17,17 @@ from mitsim.core.configuration import validated
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import Parallax
 from mitsim.core.runs import Capture
+from mitsim.devices.camera import centred_edges
+from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.accumulator import projected
-from mitsim.reconstruct.alldepths import AllDepths
 from mitsim.reconstruct.causes import Cause
-from mitsim.reconstruct.depth import Depth, best_depth
+from mitsim.reconstruct.depth import AllDepths, Depth, best_depth
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import FactorOfDepths, focused
-from mitsim.reconstruct.reconstruction import reconstruct
+from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.result import Reconstruction
 from mitsim.reconstruct.sides import group_pixels
-from mitsim.reconstruct.solver import prepare
-from mitsim.rig.camera import centred_edges
-from mitsim.rig.mask import mls_mask
+from mitsim.reconstruct.solver import prepare, projected
 from tests.ideal_sessions import PEAK, PITCH, PIXELS, Bench, picture
 from tests.unit.reconstruct.test_faults import dark, with_frames
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mitsim.reconstruct import halves
+from mitsim.reconstruct import regularisation
 from mitsim.reconstruct.regularisation import coefficient_noise, is_misfit, noise_variance
 from mitsim.reconstruct.solver import prepare
 
@@ -103,6 +103,6 @@ def test_medians_of_known_squares() -> None:
     """Of rows with 5, 4, 1 and no known numbers, against numpy's; 0.4549 is the median of a normal number's square."""
     squares = np.random.default_rng(0).random((4, 5))
     squares[1, 2], squares[2, 1:], squares[3] = np.nan, np.nan, np.nan
-    found = halves._medians(squares)
+    found = regularisation._medians(squares)
     assert found[:3] == pytest.approx(np.nanmedian(squares[:3], axis=1) / 0.4549, rel=1e-14)
     assert np.isnan(found[3])

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.core.framefile import read_frame
+from mitsim.core.exr import read_frame
+from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.detail import Model
 from mitsim.reconstruct.factors import Factors, load_calibration
-from mitsim.reconstruct.lacking import Lack
-from mitsim.reconstruct.reconstruction import accumulated, reconstruct
+from mitsim.reconstruct.misfit import Lack
+from mitsim.reconstruct.reconstruct import accumulated, reconstruct
 from mitsim.reconstruct.solver import prepare
-from mitsim.rig.patterns import parse_patterns
 from tests.ideal_sessions import Bench, picture, shadow
 
 SECOND = 0.05 * shadow()[::-1], shadow()[::-1]
@@ -78,7 +78,7 @@ def test_what_factors_explain_is_no_lack() -> None:
 def test_misfit_is_foretold_and_the_mask_named(patterns: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Scenes without print within pixels, to 5 %: it is foretold from an image that is itself off, by 0.02 rms at
     `dots:4`. (Planted: the cause never told by what is foretold.)"""
-    monkeypatch.setattr(importlib.import_module("mitsim.reconstruct.reconstruction"), "print_energy", lambda *_: 0.0)
+    monkeypatch.setattr(importlib.import_module("mitsim.reconstruct.reconstruct"), "print_energy", lambda *_: 0.0)
     camera, factors = doubled()
     shots = camera.run(patterns, picture(), 0)
     found, unaware = (reconstruct(shots, each) for each in (factors, replace(factors, lacking=())))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.manifests import Digital
-from mitsim.reconstruct.ladder import Ladder
+from mitsim.reconstruct.captured_session import Ladder
 
 FIRST = Digital(
     exposure_s=0.1, gain_dn_per_e=0.5, black_level_dn=20, dark_current_e_per_s=100, read_noise_e=10, saturation_dn=1020

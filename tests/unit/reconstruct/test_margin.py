@@ -10,12 +10,12 @@ import pytest
 
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.runs import Capture
+from mitsim.devices.camera import centred_edges
+from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.margin import Margin
-from mitsim.reconstruct.reconstruction import reconstruct
-from mitsim.rig.camera import centred_edges
-from mitsim.rig.mask import mls_mask
+from mitsim.reconstruct.reconstruct import reconstruct
 from tests.ideal_sessions import PITCH, PIXELS, Bench, picture
 from tests.unit.reconstruct.test_focus import PARALLAX, WINDOW, N, shadow
 

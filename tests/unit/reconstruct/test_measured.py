@@ -12,9 +12,9 @@ from PIL import Image
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.manifests import Digital
+from mitsim.devices.framelist import load_frames
+from mitsim.reconstruct.captured_session import calibrate_frames
 from mitsim.reconstruct.factors import Factors, load_calibration
-from mitsim.reconstruct.measured import calibrate_frames
-from mitsim.rig.framelist import load_frames
 from tests.real_session import COLUMNS, DIGITAL, ROWS, RealSession, write_image, write_list
 
 

@@ -14,7 +14,7 @@ from mitsim.core.manifests import Digital
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.misfit import CHANCE, UNEXPLAINED, Misfit, shown
-from mitsim.reconstruct.reconstruction import reconstruct
+from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.result import Reconstruction
 from mitsim.reconstruct.solver import Prepared
 from mitsim.reconstruct.status import Status, Verdict

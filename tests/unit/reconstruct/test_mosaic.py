@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
+from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.mosaic import PLANES, JointMosaic
-from mitsim.rig.patterns import parse_patterns
 
 N, PIXELS, LINES = 6, 10, 3
 

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.prior import NEIGHBOURS, covariance_root
-from mitsim.reconstruct.reconstruction import reconstruct
-from mitsim.reconstruct.solver import Prepared, Solution, prepare
-from mitsim.rig.patterns import parse_patterns
+from mitsim.devices.patterns import parse_patterns
+from mitsim.reconstruct.reconstruct import reconstruct
+from mitsim.reconstruct.solver import NEIGHBOURS, Prepared, Solution, covariance_root, prepare
 from tests.ideal_sessions import Bench
 
 ROWS, COLUMNS = 8, 7

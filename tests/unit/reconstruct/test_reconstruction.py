@@ -12,19 +12,17 @@ import pytest
 
 import mitsim.reconstruct
 from mitsim.core.errors import MitsimError
-from mitsim.core.framefile import read_frame
+from mitsim.core.exr import read_frame
 from mitsim.core.manifests import CalibrationManifest, Digital, Patterns, RunHead, RunManifest
-from mitsim.core.recorders import RunMemory, frame_name
 from mitsim.core.resources import Cost
-from mitsim.core.runs import Capture, load_run
-from mitsim.reconstruct.asked import METHODS
-from mitsim.reconstruct.cost import Predicted, predicted
+from mitsim.core.runs import Capture, RunMemory, frame_name, load_run
+from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.reconstruction import accumulated, reconstruct
+from mitsim.reconstruct.reconstruct import accumulated, reconstruct
+from mitsim.reconstruct.request import METHODS, Predicted, predicted
 from mitsim.reconstruct.result import may_replace
 from mitsim.reconstruct.status import Status, Verdict
-from mitsim.rig.patterns import parse_patterns
-from mitsim.study.quality import reconstruct as reconstruct_folders
+from mitsim.report.quality import reconstruct as reconstruct_folders
 from tests import ideal_sessions
 from tests.ideal_sessions import picture
 
@@ -227,7 +225,7 @@ def test_the_folders_are_refused_before_work(
     folders = shots.save(tmp_path / "run"), factors.save(tmp_path / "cal"), tmp_path / "image"
     reconstruct_folders(*folders, 1.0)
     reconstruct_folders(*folders, 1.0)
-    monkeypatch.setattr("mitsim.study.quality.solve", lambda *_: pytest.fail("work was done first"))
+    monkeypatch.setattr("mitsim.report.quality.solve", lambda *_: pytest.fail("work was done first"))
     with pytest.raises(MitsimError, match=r"other inputs \(lambda differ\).*overwrite=True"):
         reconstruct_folders(*folders, 2.0)
     (tmp_path / "image" / "result.json").unlink()

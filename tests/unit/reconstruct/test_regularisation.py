@@ -9,8 +9,10 @@ from skimage import data
 
 import mitsim as ms
 from mitsim.core.errors import MitsimError
+from mitsim.devices.camera import centred_edges
+from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.reconstruction import accumulated
+from mitsim.reconstruct.reconstruct import accumulated
 from mitsim.reconstruct.regularisation import (
     RISK_POWER,
     DiagonalProblem,
@@ -23,8 +25,6 @@ from mitsim.reconstruct.regularisation import (
 )
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.tv import solve_tv
-from mitsim.rig.camera import centred_edges
-from mitsim.rig.mask import mls_mask
 from tests.ideal_sessions import PIXELS, Bench, shadow
 
 N = 128

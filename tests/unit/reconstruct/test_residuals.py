@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.manifests import Digital, FactorNoise, Patterns
+from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct import misfit
 from mitsim.reconstruct.causes import Evidence
 from mitsim.reconstruct.detail import LitFrame, Model, orthonormal
@@ -13,7 +14,6 @@ from mitsim.reconstruct.misfit import Residuals
 from mitsim.reconstruct.noise import FrameNoise, factor_energy
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.uncertainty import Propagation
-from mitsim.rig.patterns import parse_patterns
 from tests.ideal_sessions import bench
 from tests.unit.reconstruct.test_factors import N, factors
 from tests.unit.reconstruct.test_misfit import SHIFT, recovered

@@ -11,9 +11,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.separation import Separation, separate
+from mitsim.devices.patterns import PatternFamily, parse_patterns
+from mitsim.reconstruct.dots import Separation, separate
 from mitsim.reconstruct.solver import Prepared, prepare
-from mitsim.rig.patterns import PatternFamily, parse_patterns
 from tests.ideal_sessions import picture, shadow
 
 N = 32

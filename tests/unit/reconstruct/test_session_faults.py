@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
+from mitsim.devices.camera import centred_edges
+from mitsim.devices.mask import mls_mask
+from mitsim.devices.patterns import stripe_signs
+from mitsim.devices.session import SIDES, Half, taken
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.calibration import StripeSums, stripe_sums
+from mitsim.reconstruct.estimate_factors import StripeSums, stripe_sums
 from mitsim.reconstruct.session_faults import Checked, Circumstances, check_session
-from mitsim.rig.camera import centred_edges
-from mitsim.rig.mask import mls_mask
-from mitsim.rig.order import SIDES, Half, taken
-from mitsim.rig.patterns import stripe_signs
 
 N, PIXELS = 32, (90, 100)
 SIGNS = stripe_signs(N).astype(float)

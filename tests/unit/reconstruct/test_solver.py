@@ -7,9 +7,8 @@ from hypothesis import strategies as st
 from scipy.linalg import hadamard
 
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.accumulator import projected
 from mitsim.reconstruct.sides import pattern_blocks
-from mitsim.reconstruct.solver import prepare
+from mitsim.reconstruct.solver import prepare, projected
 
 
 def dots(n, k):

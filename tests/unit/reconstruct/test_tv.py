@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from skimage.restoration import denoise_tv_chambolle
 
-from mitsim.reconstruct.accumulator import Accumulator
 from mitsim.reconstruct.regularisation import DiagonalProblem
-from mitsim.reconstruct.solver import Prepared, prepare
+from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
 from mitsim.reconstruct.status import Verdict
 from mitsim.reconstruct.tv import AUTO_WEIGHT, automatic_weight, solve_tv
 

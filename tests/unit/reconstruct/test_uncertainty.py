@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from scipy.fft import idctn
 
-from mitsim.core.framefile import read_frame
+from mitsim.core.exr import read_frame
 from mitsim.core.manifests import Digital, FactorNoise
+from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.detail import EDGES, PRINT, Model, print_energy
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.reconstruction import accumulated, reconstruct
+from mitsim.reconstruct.reconstruct import accumulated, reconstruct
 from mitsim.reconstruct.regularisation import DiagonalProblem, automatic_lambda
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.spectrum import scene_spectrum
 from mitsim.reconstruct.uncertainty import Propagation
-from mitsim.rig.patterns import parse_patterns
 from tests.ideal_sessions import CALIBRATION_ERROR, Bench, bench, picture, shadow
 
 N, PIXELS = 6, 14

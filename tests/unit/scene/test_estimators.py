@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.losses import known_losses
-from mitsim.capture.opening import open_bench
+from mitsim.api.bench import open_bench
 from mitsim.core.errors import MitsimError
+from mitsim.planner.explain import known_losses
 
 pytestmark = pytest.mark.usefixtures("variant")
 Write = Callable[..., Path]
@@ -156,7 +156,7 @@ def test_glossy_materials_are_no_mirrors(small_scene: Write, bsdf: str) -> None:
 @pytest.mark.slow
 def test_plans_captures_and_frames_say_once_what_they_lack(small_scene: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     """And end with 1; a calibration lacks nothing, as a board stands in the scene's place, and no lamp shines."""
-    monkeypatch.setattr("mitsim.capture.pilot._CAUSTIC_PATHS", 2**12)
+    monkeypatch.setattr("mitsim.planner.pilot._CAUSTIC_PATHS", 2**12)
     bench = open_bench(small_scene(extra=BALL.format("conductor") + BULB))
     lamps = bench.loaded.unfit.lamps
     assert lamps is not None and bench.with_board(0.9).loaded.unfit.lamps is None

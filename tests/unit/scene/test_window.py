@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mitsim.capture.opening import check_scene
+from mitsim.bench.open import check_scene
 from mitsim.core.errors import MitsimError
 from mitsim.scene.window import lit_side
 

@@ -11,8 +11,9 @@ from scipy import special, stats
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
-from mitsim.rig.sensor import SensorModel, paper_sensor
-from mitsim.sensor import chain, compiled, moments
+from mitsim.devices.sensor import SensorModel, paper_sensor
+from mitsim.sensor import chain, moments
+from mitsim.sensor import chain as compiled
 from tests.invented import sensor
 
 

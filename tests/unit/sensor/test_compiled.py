@@ -12,7 +12,7 @@ from scipy import stats
 from mitsim.core.parallel import in_threads
 from mitsim.core.seeds import stream
 from mitsim.sensor import chain
-from mitsim.sensor.compiled import by_pixel
+from mitsim.sensor.chain import by_pixel
 from tests.invented import sensor
 
 SEED = 2011

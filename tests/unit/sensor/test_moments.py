@@ -7,7 +7,7 @@ from scipy import special, stats
 
 from mitsim.core.configuration import shipped
 from mitsim.core.seeds import stream
-from mitsim.rig.sensor import SensorModel, load_sensor
+from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.sensor import moments
 from mitsim.sensor.chain import poisson_quantile
 from tests.invented import sensor

@@ -10,10 +10,9 @@ import pytest
 
 from mitsim.core.configuration import shipped, validated
 from mitsim.core.errors import MitsimError
-from mitsim.rig.sensor import SensorModel, load_sensor
-from mitsim.sensor.chain import expose
+from mitsim.devices.sensor import SensorModel, load_sensor
+from mitsim.sensor.chain import expose, ripple_level, ripple_response
 from mitsim.sensor.moments import frame_moments
-from mitsim.sensor.shutter import ripple_level, ripple_response
 
 SENSOR = load_sensor(shipped("calibration", "imx249.toml"))
 ROWS, HERTZ, AMPLITUDE = 40, 120.0, 0.7

@@ -12,7 +12,7 @@ from scipy import stats
 from mitsim.core.configuration import shipped, validated
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
-from mitsim.rig.sensor import SensorModel, load_sensor
+from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.sensor import chain, moments
 from mitsim.sensor.specimen import (
     dark_current_variance,

@@ -10,11 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.opening import open_bench
-from mitsim.transport.aimed import AimedTracer
-from mitsim.transport.direct import DirectTracer
-from mitsim.transport.lobes import sharp_light
+from mitsim.api.bench import Bench, open_bench
+from mitsim.transport.direct import AimedTracer, DirectTracer
+from mitsim.transport.sharp_lobes import sharp_light
 from tests.conftest import write_png
 from tests.physics.test_sharp_lobes import on_ball
 

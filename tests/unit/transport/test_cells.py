@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mitsim.transport.cells import aligned_grid
+from mitsim.transport.records import aligned_grid
 
 
 @settings(max_examples=60, deadline=None)

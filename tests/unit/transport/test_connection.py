@@ -11,11 +11,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsim.transport import aperture
-from mitsim.transport.aperture import aperture_scene_parts
 from mitsim.transport.connection import Connection, LensHit, ProjectorConnector
+from mitsim.transport.plugins import lens as aperture
+from mitsim.transport.plugins.lens import aperture_scene_parts
 from mitsim.transport.projector import ProjectorOptics
-from mitsim.transport.sampling import generator
+from mitsim.transport.sampler import generator
 from tests.unit.transport.closed_forms import stock_projector
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from mitsim.capture.opening import open_bench
+from mitsim.api.bench import open_bench
 from mitsim.core.errors import MitsimError
 from mitsim.scene.load import LoadedScene
 from tests.physics.passages import THIN, plate

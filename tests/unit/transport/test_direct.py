@@ -11,14 +11,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.opening import open_bench
+from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
-from mitsim.optics.anchors import anchor_positions
-from mitsim.rig.camera import CameraGeometry
-from mitsim.transport import paths
+from mitsim.devices.camera import CameraGeometry
+from mitsim.optics.image_formation import anchor_positions
+from mitsim.transport import integrator
 from mitsim.transport.direct import DirectTracer
-from mitsim.transport.histogram import DIRECT, Deposits
+from mitsim.transport.records import DIRECT, Deposits
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, Z, RADIANCE = 16, 400.0, 0.5 * 111000 / 400**2
@@ -192,7 +191,7 @@ def test_seeds_samples_and_launches(white: Bench, monkeypatch: pytest.MonkeyPatc
     assert not np.isin(whole.row, other.row).any()
     # A sequence in pieces, in samples or in launches, is the same sequence.
     pieces = Deposits.joined([trace.trace(1, 0, 1), trace.trace(1, 1, 3)])
-    monkeypatch.setattr(paths.Tracer, "lanes_per_launch", 300)
+    monkeypatch.setattr(integrator.Tracer, "lanes_per_launch", 300)
     launches = trace.trace(1, 0, 4)
     for parts in (pieces, launches):
         assert np.array_equal(parts.pixel, whole.pixel) and np.allclose(parts.row, whole.row, atol=1e-6)

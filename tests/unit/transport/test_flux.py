@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.evidence import Settings
-from mitsim.capture.opening import open_bench
-from mitsim.capture.truth import trace_truth
+from mitsim.api.bench import Bench, open_bench
+from mitsim.light.settings import Settings
+from mitsim.light.truth import trace_truth
 from mitsim.transport.flux import FluxTracer
 from tests.hard.hard_light import gauss, glossy, lobe
 

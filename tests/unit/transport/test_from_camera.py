@@ -12,13 +12,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.opening import open_bench
+from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
-from mitsim.transport import paths
-from mitsim.transport.cells import CellGrid, aligned_grid
+from mitsim.transport import integrator
 from mitsim.transport.from_camera import FromCameraTracer, Paths
-from mitsim.transport.histogram import AMBIENT, Deposits
+from mitsim.transport.records import AMBIENT, CellGrid, Deposits, aligned_grid
 from tests.unit.transport.closed_forms import mean, seen
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -82,7 +80,7 @@ def test_seeds_and_launches(outdoors: Bench, monkeypatch: pytest.MonkeyPatch) ->
     assert all(np.array_equal(getattr(whole, name), getattr(again, name)) for name in vars(whole))
     assert np.isin(whole.row, other.row).mean() < 0.01
     pieces = Deposits.joined([trace.trace(6, 0, 1), trace.trace(6, 1, 3)])
-    monkeypatch.setattr(paths.Tracer, "lanes_per_launch", 300)
+    monkeypatch.setattr(integrator.Tracer, "lanes_per_launch", 300)
     for parts in (pieces, trace.trace(6, 0, 4)):
         assert np.allclose(parts.row, whole.row, atol=1e-6) and np.allclose(parts.value, whole.value, rtol=1e-5)
 

@@ -10,10 +10,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsim.capture.opening import open_bench, reopened
+from mitsim.api.bench import open_bench, reopened
 from mitsim.core.errors import MitsimError
-from mitsim.rig.projector import Lines
-from mitsim.transport.glass import GlassModel, is_glass, tune
+from mitsim.devices.projector import Lines
+from mitsim.transport.plugins.glass import GlassModel, is_glass, tune
 
 pytestmark = pytest.mark.usefixtures("variant")
 LANES = 1000

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.optics.glint import glint_frames
-from mitsim.optics.samplers import geometric_samplers
-from mitsim.transport.glint import has_mirrors, trace_glint
-from mitsim.transport.glint_rays import GlintRays
+from mitsim.optics.fft_shadow import geometric_samplers
+from mitsim.optics.mirror_frames import glint_frames
 from mitsim.transport.projector import PinholeRays, ProjectorOptics
+from mitsim.transport.specular import has_mirrors, trace_glint
+from mitsim.transport.specular_rays import GlintRays
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, SCALE = 8, 111000.0

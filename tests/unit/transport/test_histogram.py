@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from mitsim.transport.cells import CellAxis, CellGrid
-from mitsim.transport.histogram import AMBIENT, DIRECT, Bundle, Deposits, Sightings
+from mitsim.transport.records import AMBIENT, DIRECT, Bundle, CellAxis, CellGrid, Deposits, Sightings
 
 PIXELS = 9  # a projector of 3 x 3
 GRID = CellGrid(CellAxis(-0.2, 0.05, 8), CellAxis(-0.1, 0.02, 15))
@@ -167,7 +166,7 @@ def test_small_light_beside_great_light_is_counted() -> None:
     """4096 paths of 1 beside one of 2^24, where float32 has steps of 2: what is fetched and filed is exact."""
     import mitsuba as mi
 
-    from mitsim.transport.ledger import Ledger
+    from mitsim.transport.accumulator import Ledger
 
     light = np.ones(4097, np.float32)
     light[0] = 2.0**24
@@ -193,7 +192,7 @@ def test_ledgers_of_several_lines_are_fetched_together() -> None:
     import mitsuba as mi
 
     from mitsim.core.errors import MitsimError
-    from mitsim.transport.ledger import Ledger, fetched
+    from mitsim.transport.accumulator import Ledger, fetched
 
     found, alone = deposits(inside=False), bundle(anchors=1)
     pixel = np.minimum(found.pixel, PIXELS - 1).astype(np.uint32)

@@ -10,15 +10,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.opening import open_bench
+from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
-from mitsim.transport import paths
-from mitsim.transport.cells import aligned_grid
+from mitsim.transport import integrator
+from mitsim.transport.connect import SensorPoints
 from mitsim.transport.from_camera import FromCameraTracer, Paths
-from mitsim.transport.histogram import DIRECT, INDIRECT, Deposits
 from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.receiver import SensorPoints
+from mitsim.transport.records import DIRECT, INDIRECT, Deposits, aligned_grid
 from tests.unit.transport.closed_forms import mean, seen
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -84,7 +82,7 @@ def test_both_sides_together_find_all_light(shared_scene: Callable[..., Path], m
     loaded = bench.loaded
 
     def found(side: str, sharp: float, seeds: int = 16) -> np.ndarray:
-        monkeypatch.setattr(paths, "_SHARP", sharp)
+        monkeypatch.setattr(integrator, "_SHARP", sharp)
         parts = loaded.scene, loaded.camera, bench.projector_optics, grid, Paths(interreflection=True)
         one = tracer(bench) if side == "projector" else FromCameraTracer(*parts)
         return np.array([one.trace(seed, 0, 256).value.sum() / 256 for seed in range(seeds)])
@@ -123,7 +121,7 @@ def test_both_sides_find_the_same_light_at_every_anchor(
     )
     found = np.zeros((2, SEEDS, 4, 4))
     for side, (tracer_, sharp) in enumerate(sides):
-        monkeypatch.setattr(paths, "_SHARP", sharp)
+        monkeypatch.setattr(integrator, "_SHARP", sharp)
         for seed in range(SEEDS):
             light = tracer_.trace(seed, 0, 256)
             anchor = 2 * light.anchor_row + light.anchor_column
@@ -179,7 +177,7 @@ def test_seeds_and_launches(hollow: Bench, monkeypatch: pytest.MonkeyPatch) -> N
     assert all(np.array_equal(getattr(whole, name), getattr(again, name)) for name in vars(whole))
     assert np.isin(whole.row, other.row).mean() < 0.01
     pieces = Deposits.joined([trace.trace(6, 0, 20), trace.trace(6, 20, 44)])
-    monkeypatch.setattr(paths.Tracer, "lanes_per_launch", 3000)
+    monkeypatch.setattr(integrator.Tracer, "lanes_per_launch", 3000)
     order = np.argsort(whole.value)
     for parts in (pieces, trace.trace(6, 0, 64)):
         mine = np.argsort(parts.value)

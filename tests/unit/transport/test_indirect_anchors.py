@@ -13,15 +13,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.colour import ColourBench
-from mitsim.capture.opening import open_bench
-from mitsim.core.colours import RUN
-from mitsim.transport.cells import aligned_grid
-from mitsim.transport.histogram import DIRECT, INDIRECT, Bundle, Deposits
+from mitsim.acquire.spectral import ColourBench
+from mitsim.api.bench import Bench, open_bench
+from mitsim.core.spectral_manifests import RUN
+from mitsim.transport.accumulator import Ledger, fetched
+from mitsim.transport.connect import SensorPoints
 from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.ledger import Ledger, fetched
-from mitsim.transport.receiver import SensorPoints
+from mitsim.transport.records import DIRECT, INDIRECT, Bundle, Deposits, aligned_grid
 from tests.conftest import write_small_scene
 from tests.unit.transport.test_indirect import CORNER, MIRROR, N
 from tests.unit.transport.test_neighbours import WALL

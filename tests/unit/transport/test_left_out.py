@@ -7,14 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.opening import open_bench
-from mitsim.capture.planning import make_plan
-from mitsim.rig.patterns import Lighting
-from mitsim.transport.cells import CellGrid, aligned_grid
+from mitsim.api.bench import Bench, open_bench
+from mitsim.devices.patterns import Lighting
+from mitsim.planner.planner import make_plan
 from mitsim.transport.from_camera import FromCameraTracer, Paths
 from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.left_out import LeftOut, left_out_light
+from mitsim.transport.missed import LeftOut, left_out_light
+from mitsim.transport.records import CellGrid, aligned_grid
 from tests.physics.test_sharp_lobes import on_ball
 from tests.unit.transport.test_panes import BALL, WALL, slab
 
@@ -52,7 +51,7 @@ def test_a_wall_that_is_lit_and_seen_by_a_mirror(
     100/430 to 0.3, seen at 40/430 to 0.176, to 64 mm up and down. A larger lens, of
     20 mm, casts the same light, and paths meet it six times as often; it blurs the strip of 29 mm by 0.5 mm.
     """
-    monkeypatch.setattr("mitsim.transport.left_out._LENS", 0.05)
+    monkeypatch.setattr("mitsim.transport.missed._LENS", 0.05)
     found, error = left_out(open_bench(shared_scene("twice", extra=MIRROR, sheet_z=WALL)), NONE)
     low = max(-140 + WALL * 100 / 430, -80 + WALL * 40 / 430)
     x, y = (np.linspace(*ends, 400) for ends in ((low, -140 + WALL * 0.3), (-64.0, 64.0)))
@@ -143,7 +142,7 @@ def test_a_ball_is_seldom_met_however_broad_its_lobe(
     The light is that of unfolded ways, by an integral: the ball's image from the sensor's (lit), the ball from there.
     With a lens of 20 mm, as above.
     """
-    monkeypatch.setattr("mitsim.transport.left_out._LENS", 0.05)
+    monkeypatch.setattr("mitsim.transport.missed._LENS", 0.05)
     name, radius = "tests.physics.test_sharp_lobes", 12.0
     sphere = f'<shape type="sphere"><point name="center" x="-26" y="0" z="398"/><float name="radius" value="{radius}"/>'
     metal = gloss("", 0.03).split("</transform>")[1]

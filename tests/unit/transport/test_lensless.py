@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mitsim.rig.camera import CameraGeometry
+from mitsim.devices.camera import CameraGeometry
 
 pytestmark = pytest.mark.usefixtures("variant")
 SIGMAS = 5.0
@@ -157,7 +157,7 @@ def test_a_narrow_view_keeps_its_light(fov: float) -> None:
 def test_registering_twice_does_nothing() -> None:
     import mitsuba as mi
 
-    from mitsim.transport import lensless
+    from mitsim.transport.plugins import lensless
 
     lensless.register()
     lensless.register()
@@ -173,8 +173,8 @@ def test_registering_needs_a_variant() -> None:
 def test_the_manual_lists_the_parameters_of_the_geometry() -> None:
     """The table of the module's docstring: every field that a scene states but the film's, in order, with its
     default."""
-    from mitsim.rig.camera import CameraGeometry
-    from mitsim.transport import lensless
+    from mitsim.devices.camera import CameraGeometry
+    from mitsim.transport.plugins import lensless
 
     rows = re.findall(r"^``(\w+)`` +(\S+) +(\S+) ", lensless.__doc__, re.M)
     films = "pixels", "rows", "columns", "roi"

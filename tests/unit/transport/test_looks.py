@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture import effects
-from mitsim.capture.bench import Bench
-from mitsim.capture.evidence import Settings
-from mitsim.capture.opening import open_bench
-from mitsim.capture.simulation import Simulation
-from mitsim.transport.histogram import Deposits
-from mitsim.transport.paths import Tracer
+from mitsim.api.bench import Bench, open_bench
+from mitsim.bench import effects
+from mitsim.light.passes import Simulation
+from mitsim.light.settings import Settings
+from mitsim.transport.integrator import Tracer
+from mitsim.transport.records import Deposits
 
 pytestmark = pytest.mark.usefixtures("variant")
 SEEDS = (7, 2**32 - 1, 11, 12, 13)

@@ -11,8 +11,9 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from mitsim.capture.opening import open_bench
-from mitsim.transport import aperture, glass, grating, lensless
+from mitsim.api.bench import open_bench
+from mitsim.transport.plugins import glass, grating, lensless
+from mitsim.transport.plugins import lens as aperture
 from tests.conftest import write_png
 
 PICTURE = """<string name="filename" value="picture.png"/> <boolean name="raw" value="true"/>

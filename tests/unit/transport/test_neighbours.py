@@ -12,15 +12,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.opening import open_bench
+from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
-from mitsim.transport.cells import aligned_grid
-from mitsim.transport.histogram import INDIRECT, Bundle, Deposits
+from mitsim.transport.accumulator import Ledger
+from mitsim.transport.connect import SensorPoints
 from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.ledger import Ledger
-from mitsim.transport.neighbours import NeighbourTracer
-from mitsim.transport.receiver import SensorPoints
+from mitsim.transport.path_reuse import NeighbourTracer
+from mitsim.transport.records import INDIRECT, Bundle, Deposits, aligned_grid
 from tests.unit.transport.closed_forms import seen
 from tests.unit.transport.test_indirect import MATT, MIRROR, SHINY, SPHERE
 

@@ -17,12 +17,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.capture.colour import ColourBench
-from mitsim.capture.opening import open_bench
-from mitsim.core.colours import RUN
-from mitsim.transport.cells import aligned_grid
-from mitsim.transport.histogram import Bundle, Deposits
-from mitsim.transport.ledger import Ledger
+from mitsim.acquire.spectral import ColourBench
+from mitsim.api.bench import open_bench
+from mitsim.core.spectral_manifests import RUN
+from mitsim.transport.accumulator import Ledger
+from mitsim.transport.records import Bundle, Deposits, aligned_grid
 from tests.conftest import write_small_scene
 from tests.unit.transport.closed_forms import seen
 from tests.unit.transport.test_neighbours import BENT, OBJECT, WALL, tracers

@@ -10,14 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.opening import open_bench
-from mitsim.transport.cells import aligned_grid
+from mitsim.api.bench import Bench, open_bench
 from mitsim.transport.from_camera import FromCameraTracer, Paths
-from mitsim.transport.histogram import AMBIENT, DIRECT, INDIRECT, Deposits
 from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.neighbours import NeighbourTracer
-from mitsim.transport.paths import ANY, FollowingTracer
+from mitsim.transport.integrator import ANY, FollowingTracer
+from mitsim.transport.path_reuse import NeighbourTracer
+from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT, Deposits, aligned_grid
 from tests.unit.transport.closed_forms import mean, seen
 from tests.unit.transport.test_indirect import CORNER, MATT, MIRROR, SPHERE
 

@@ -13,10 +13,8 @@ import numpy as np
 import pytest
 from scipy.optimize import fsolve
 
-from mitsim.capture.bench import Bench
-from mitsim.capture.opening import open_bench
-from mitsim.transport.panes import flat_panes, refracted_way
-from mitsim.transport.passage import Passage
+from mitsim.api.bench import Bench, open_bench
+from mitsim.transport.transmission import Passage, flat_panes, refracted_way
 
 pytestmark = pytest.mark.usefixtures("variant")
 WALL = 440.0

@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsim.transport.passage import Passage
+from mitsim.transport.transmission import Passage
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.capture.opening import open_bench
-from mitsim.transport.repeats import Turns, block_moments, blocks_of, by_pixel, chosen_repeats, effect_of
+from mitsim.api.bench import open_bench
+from mitsim.transport.indirect import Turns, block_moments, blocks_of, by_pixel, chosen_repeats, effect_of
 from tests.unit.transport.test_neighbours import SCENES, SIGMAS, summed, tracers
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -1,0 +1,1 @@
+"""Captures: light exposed as noisy frames, mono, by lines and behind colour filters; the reference estimator."""

@@ -1,0 +1,265 @@
+"""One expected frame of a scene under its own light: a bench in, irradiance and its error out, by either estimator."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mitsim.bench.bench import Apparatus
+from mitsim.bench.request import FEWEST_PASSES, REFERENCE, check_accuracy, check_samples
+from mitsim.core.arguments import checked
+from mitsim.core.arrays import FloatArray
+from mitsim.core.environment import versions
+from mitsim.core.errors import MitsimError
+from mitsim.core.exr import write_frame
+from mitsim.core.job import Job
+from mitsim.core.resources import Cost
+from mitsim.core.seeds import integer
+from mitsim.devices.patterns import Lighting
+from mitsim.light.light import Sampling, trace_light
+from mitsim.planner.explain import unseen_lamps
+from mitsim.planner.memory import frames_cost
+from mitsim.planner.planner import make_plan
+
+if TYPE_CHECKING:
+    from mitsim.scene.load import LoadedScene
+
+_SAMPLERS = ("IndependentSampler", "OrthogonalSampler")
+"""The others of Mitsuba 3.9.1 order their strata by a hash that is no random permutation of few of them: some two of a
+path's numbers correlate, over 2^19 paths by 0.8 (stratified), 0.26 (ldsampler) and 0.15 (multijitter) at 4 a pixel."""
+_SAMPLES = 64
+"""Samples a pixel where neither request nor scene states them, as the shipped scenes have it: a few seconds."""
+_SAMPLES_A_PASS = 64
+"""Samples a pixel of one pass: 2^24 paths of a 512 x 512 sensor, which fit in memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """One frame of irradiance [W m^-2].
+
+    Attributes
+    ----------
+    mean, error
+        (m, m', channels) irradiance, and its standard error.
+    facts
+        estimator, spp (None: factored), seconds, variant, seed, and notes of what the scene's objects were changed in.
+    warnings
+        why the frame is flagged.
+    """
+
+    mean: FloatArray
+    error: FloatArray
+    facts: Mapping[str, Any]
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def mc_error(self) -> float:
+        """||standard error|| / ||frame||, with the noise's own energy taken off the frame's."""
+        noise = float(np.square(self.error).sum())
+        energy = float(np.square(self.mean).sum()) - noise
+        return math.sqrt(noise / energy) if energy > 0 else math.inf
+
+    def summary(self) -> dict[str, Any]:
+        """What the command line reports, but for the file's name."""
+        return {**self.facts, "mean": float(self.mean.mean()), "mc_error": self.mc_error, "warnings": self.warnings}
+
+    @checked
+    def save(self, path: Path | str) -> Path:
+        """Write the frame and its error to the OpenEXR file ``path``, which is replaced; returns it.
+
+        MitsimError when it cannot be written.
+        """
+        names = ("Y",) if self.mean.shape[2] == 1 else ("R", "G", "B")
+        channels = {name: self.mean[..., i].astype(np.float32) for i, name in enumerate(names)}
+        channels |= {f"error.{name}": self.error[..., i].astype(np.float32) for i, name in enumerate(names)}
+        facts = {key: self.facts[key] for key in ("estimator", "seed", "variant")}
+        write_frame(path, channels, {"unit": "W/m^2", **facts, **versions()})
+        return Path(path)
+
+    def __repr__(self) -> str:
+        rows, columns = self.mean.shape[:2]
+        return f"Rendered({rows} x {columns}: {self.facts['estimator']}, relative noise {self.mc_error:.1e})"
+
+    def _repr_html_(self) -> str:
+        from mitsim.core.pictures import card, scaled, span
+
+        grey = self.mean.mean(axis=2)
+        facts = f"mean {grey.mean():.3g} W/m^2, relative noise {self.mc_error:.1e}"
+        pictures = {f"irradiance\n{span(grey, 'W/m^2')}": scaled(grey)}
+        return card(f"Rendered: {self.facts['estimator']}", pictures, (facts, *self.warnings))
+
+
+def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) -> tuple[FloatArray, FloatArray]:
+    """Render with the scene's own integrator in independent passes, summed in float64.
+
+    Within a pass the paths of a pixel start from Owen-scrambled Sobol points (place in the pixel, opening of the mask);
+    passes are scrambled anew, so that their spread is the error.
+
+    Parameters
+    ----------
+    loaded
+        the scene.
+    spp
+        samples a pixel, at least 4: passes are compared to tell the noise.
+    seed
+        root of the passes' streams.
+    job
+        progress, and limits that the first pass is held against.
+
+    Returns
+    -------
+    (m, m', channels) irradiance [W m^-2] and its standard error.
+
+    Raises
+    ------
+    MitsimError
+        for too few or too many samples, an integrator that cannot render this sensor or would lose light of this scene,
+        or work beyond the job's limits.
+    """
+    import mitsuba as mi
+
+    from mitsim.scene.guard.outline import one_line
+
+    if loaded.unfit.reference is not None:
+        raise loaded.unfit.reference
+    if loaded.parting and mi.is_spectral:
+        rule = f"{mi.variant()} carries several wavelengths on a path, which this glass parts; use a mono variant"
+        raise loaded.parting[0].refusal("type", "'mitsim_glass'", rule)
+    check_samples(REFERENCE, spp)
+    job = job or Job()
+    passes = max(FEWEST_PASSES, math.ceil(spp / _SAMPLES_A_PASS))
+    each = math.ceil(spp / passes)
+    total: FloatArray | float = 0.0
+    squares: FloatArray | float = 0.0
+    started = time.perf_counter()
+    for index in range(passes):
+        child = integer(seed, "reference", index)
+        loaded.camera.stratify((integer(seed, "reference points", index), each))
+        try:
+            image = np.array(mi.render(loaded.scene, sensor=loaded.camera, spp=each, seed=child), dtype=np.float64)
+        except RuntimeError as error:
+            cause: BaseException = error
+            while cause.__cause__ is not None:  # what Dr.Jit raises says only that something below it failed
+                cause = cause.__cause__
+            raise MitsimError(
+                f"{loaded.path}: Mitsuba cannot render this scene in {mi.variant()}: {one_line(cause)}; change what it "
+                "names, or try another --variant"
+            ) from None
+        finally:
+            loaded.camera.stratify(None)
+        total, squares = total + image, squares + image**2
+        job.progress("reference", (index + 1) / passes)
+        if index == 0:
+            Cost(seconds=(time.perf_counter() - started) * passes).check(f"{spp} samples a pixel", job.limits)
+    mean = np.asarray(total) / passes
+    variance = np.maximum(np.asarray(squares) / passes - mean**2, 0) / (passes - 1)
+    return mean.reshape(*mean.shape[:2], -1), np.sqrt(variance).reshape(*mean.shape[:2], -1)
+
+
+def _of_sampler(loaded: LoadedScene) -> tuple[str, ...]:
+    """What is wrong with the numbers that the scene's sampler draws for a path's turns."""
+    sampler = loaded.camera.sampler().class_name()
+    if sampler in _SAMPLERS:
+        return ()
+    return (
+        f"{loaded.path}: the points of sampler {sampler} depend on each other (at 4 paths by 15 to 80 %), so light "
+        'over several turns may come out wrong; use <sampler type="independent"/>, the first turn is stratified anyway',
+    )
+
+
+def _samples(bench: Apparatus, estimator: str, spp: int | None) -> int:
+    """Samples a pixel: ``spp`` as asked for, or those of the scene; MitsimError for too few or too many."""
+    check_samples(estimator, spp)
+    stated = bench.loaded.samples
+    if spp is not None or stated is None:
+        return spp or _SAMPLES
+    try:
+        check_samples(estimator, stated)
+    except MitsimError as error:
+        raise MitsimError(f"{bench.loaded.path}: sample_count of its sampler, taken for {error}") from None
+    return stated
+
+
+@contextmanager
+def projected(bench: Apparatus, pattern: FloatArray) -> Iterator[None]:
+    """Show a ``pattern`` (n, n) of 0..1 on the ``bench``'s projector while the context lasts, for the reference."""
+    import mitsuba as mi
+
+    parameters = mi.traverse(bench.loaded.projector)
+    white = np.array(parameters["irradiance.data"])
+    grid = bench.loaded.pixels
+    texels = np.zeros_like(white)
+    rows = slice(grid.first_row, grid.first_row + grid.n)
+    columns = slice(grid.first_column, grid.first_column + grid.n)
+    texels[rows, columns] = white[rows, columns] * pattern.reshape(grid.n, grid.n, *([1] * (white.ndim - 2)))
+    try:
+        parameters["irradiance.data"] = mi.TensorXf(texels)
+        parameters.update()
+        yield
+    finally:
+        parameters["irradiance.data"] = mi.TensorXf(white)
+        parameters.update()
+
+
+def render(
+    bench: Apparatus,
+    estimator: str,
+    spp: int | None,
+    accuracy: float,
+    seed: int,
+    effects: Mapping[str, bool] | None = None,
+    job: Job | None = None,
+) -> Rendered:
+    """One frame of a bench under its own light; see :meth:`mitsim.api.bench.Bench.render`.
+
+    Parameters
+    ----------
+    bench
+        what is rendered; the reference works on any scene with a ``mitsim_lensless`` sensor and any integrator, the
+        factored estimator needs a projector too.
+    estimator, spp, accuracy, seed, effects, job
+        as there.
+
+    Raises
+    ------
+    MitsimError
+        as there.
+    """
+    job = job or Job()
+    spp = _samples(bench, estimator, spp)
+    check_accuracy(accuracy)
+    warnings: tuple[str, ...] = ()
+    started = time.perf_counter()
+    if estimator == REFERENCE:
+        mean, error = reference(bench.loaded, spp, seed, job)
+        warnings = (bench.loaded.unfit.caustics,) if bench.loaded.unfit.caustics else ()
+        warnings += _of_sampler(bench.loaded)
+        warnings += tuple(unseen_lamps(bench.loaded, spp * mean.shape[0] * mean.shape[1], "the reference"))
+    else:
+        uniform = Lighting.uniform(bench.n)
+        with job.planning(str(bench.loaded.path)):
+            plan = make_plan(bench, uniform, accuracy, seed, effects)
+        frames_cost(bench, plan.settings, uniform, plan.predicted_seconds).check(str(bench.loaded.path), job.limits)
+        light = trace_light(bench, plan, uniform, seed, Sampling(by_pixel=False), job.progress)
+        warnings = light.warnings
+        frame = next(iter(light.frames(uniform, seed)))
+        mean = frame.irradiance[..., None]
+        error = np.full_like(mean, math.sqrt(frame.variance))
+    if not mean.any():
+        warnings += ("the frame is wholly dark; check the scene's light, the mask and the field stop",)
+    facts = {
+        "estimator": estimator,
+        "spp": spp if estimator == REFERENCE else None,
+        "seconds": time.perf_counter() - started,
+        "variant": bench.variant,
+        "seed": seed,
+        "notes": bench.loaded.notes,
+    }
+    return Rendered(mean, error, facts, warnings)

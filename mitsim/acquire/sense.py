@@ -1,0 +1,264 @@
+"""An image of irradiance or radiance in, what a camera's sensor makes of it out: digital numbers, in memory or a file.
+
+No scene and no renderer of ours: whatever writes OpenEXR or NPY can be put behind this sensor. Image pixels are the
+sensor's (binned) pixels; nothing is resampled.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mitsim.bench.request import Exposure
+from mitsim.core.arrayfile import Npy
+from mitsim.core.arrays import FloatArray
+from mitsim.core.environment import versions
+from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.exr import Channel, finite_channel, read_frame, write_frame
+from mitsim.core.files import FRAME_LIMITS, check_plain, fits_a_frame, whole_file
+from mitsim.core.resources import Cost, Limits
+from mitsim.core.seeds import stream
+from mitsim.devices.sensor import EXPOSURE_S, SensorModel
+from mitsim.sensor.chain import Digital, electrons_from_irradiance, expose, exposure_for_peak
+
+_LUMINANCE = {"R": 0.2126, "G": 0.7152, "B": 0.0722}
+"""Weights of linear RGB in luminance (ITU-R BT.709)."""
+_PIXEL_BYTES = 100
+"""Of memory for a pixel: some ten arrays of double precision, as read, scaled, as electrons and as numbers."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sensed:
+    """One frame.
+
+    Attributes
+    ----------
+    digital
+        (rows, columns) digital numbers.
+    electrons
+        (rows, columns) expected photoelectrons, without dark current.
+    sensor, exposure_s, wavelength_nm, seed
+        what they were taken with.
+    notes
+        what was assumed of the image.
+    """
+
+    digital: Digital
+    electrons: FloatArray
+    sensor: SensorModel
+    exposure_s: float
+    wavelength_nm: float
+    seed: int
+    notes: tuple[str, ...] = ()
+
+    @property
+    def saturated(self) -> int:
+        """Pixels that reached the full well or the ADC's end, as a capture counts them."""
+        from mitsim.sensor.moments import saturated_pixels
+
+        return saturated_pixels(self.digital, self.electrons, self.exposure_s, self.sensor)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Why the frame is flagged."""
+        if not self.saturated:
+            return ()
+        return (f"saturation: {self.saturated} pixels are at the full well or the ADC's end; expose for less",)
+
+    def summary(self) -> dict[str, Any]:
+        """What the command line reports, but for the file's name."""
+        return {
+            "camera": self.sensor.name,
+            "shape": list(self.digital.shape),
+            "exposure_s": self.exposure_s,
+            "wavelength_nm": self.wavelength_nm,
+            "seed": self.seed,
+            "mean_dn": float(self.digital.mean()),
+            "largest_dn": float(self.digital.max()),
+            "saturated_pixels": self.saturated,
+            "notes": list(self.notes),
+            "warnings": list(self.warnings),
+        }
+
+    def save(self, path: Path | str) -> Path:
+        """Write the numbers to ``path``, which is replaced, by its ending; returns it.
+
+        ``.exr`` has channels DN and electrons with metadata, ``.npy`` the numbers, ``.png`` 16 bits of grey.
+        MitsimError for another ending, for a PNG of numbers that 16 bits do not hold, or where nothing can be written.
+        """
+        path = Path(path)
+        check_ending(path, self.sensor)
+        if path.suffix.lower() == ".exr":
+            whole = self.digital.dtype == np.uint32
+            numbers: Channel = self.digital.astype(np.uint32) if whole else self.digital.astype(np.float32)
+            facts = {"exposure_s": self.exposure_s, "wavelength_nm": self.wavelength_nm, "seed": self.seed}
+            channels = {"DN": numbers, "electrons": self.electrons.astype(np.float32)}
+            write_frame(path, channels, {"camera": self.sensor.name, **facts, **versions()})
+            return path
+        if path.suffix.lower() == ".npy":
+            with whole_file(path) as part, open(part, "wb") as file:
+                np.save(file, self.digital, allow_pickle=False)
+            return path
+        from PIL import Image
+
+        with whole_file(path) as part:
+            Image.fromarray(np.asarray(self.digital, dtype=np.uint16)).save(part, format="PNG")
+        return path
+
+
+def sense(
+    irradiance: FloatArray,
+    sensor: SensorModel,
+    exposure: Exposure | None = None,
+    seed: int = 0,
+    wavelength_nm: float = 550.0,
+    notes: tuple[str, ...] = (),
+) -> Sensed:
+    """What a sensor reads under an image of irradiance.
+
+    Parameters
+    ----------
+    irradiance
+        (rows, columns) mean over each (binned) pixel [W m^-2].
+    sensor
+        the camera.
+    exposure
+        seconds, or the part of the full well that the brightest pixel fills; 0.8 unless given.
+    seed
+        of the noise; the camera's fixed pattern has its own.
+    wavelength_nm
+        one that stands for the light, and turns watts into photons.
+    notes
+        what is assumed of the image, for the result.
+
+    Raises
+    ------
+    MitsimError
+        for an image that is no frame of numbers from 0, no light where the exposure is to follow from it, or a camera
+        whose file has no quantum efficiency.
+    """
+    check_wavelength(wavelength_nm)
+    if sensor.mosaic is not None:
+        raise MitsimError(
+            f"sensor {sensor.name!r}: has a mosaic {sensor.mosaic} of colour filters, which an image of one channel "
+            "does not tell apart; use a monochrome camera, or capture a scene with --colour mosaic"
+        )
+    light = np.asarray(irradiance, dtype=np.float64)
+    if light.ndim != 2 or not light.size or not (light.min() >= 0 and light.max() < np.inf):
+        shown = f"the range is {light.min()} to {light.max()}" if light.size else "it is empty"
+        raise MitsimError(
+            f"image: its shape is {light.shape} and {shown}; give rows x columns of irradiance, finite and 0 or more"
+        )
+    asked = exposure or Exposure()
+    seconds = asked.seconds
+    if seconds is None:
+        seconds = exposure_for_peak(float(light.max()), asked.fraction, sensor, wavelength_nm)
+        shortest, longest = EXPOSURE_S
+        if not shortest <= seconds <= longest:
+            raise MitsimError(
+                f"image: its brightest pixel, {light.max():g} W/m^2, fills the sensor in {seconds:g} s; exposures are "
+                f"{shortest:g} to {longest:g} s; check the image's unit and scale"
+            )
+    electrons = electrons_from_irradiance(light, seconds, sensor, wavelength_nm)
+    shot, read = (stream(seed, "sense", noise) for noise in ("shot", "read"))
+    digital = expose(electrons, seconds, sensor, shot, read)
+    return Sensed(digital, electrons, sensor, seconds, wavelength_nm, seed, notes)
+
+
+def read_image(path: Path | str, channel: str | None = None) -> tuple[FloatArray, tuple[str, ...]]:
+    """The image in an OpenEXR or NPY file ``path`` (rows, columns), and what was assumed of it.
+
+    Of several channels ``channel`` is taken; where it is None, the only one, or Y, or the luminance of R, G and B.
+    Channels whose names begin with "error." are those of `mitsim render`, and no light. MitsimError for a file that is
+    missing, damaged or of another kind, or a channel that is not there.
+    """
+    path = Path(path)
+    check_image(path)
+    if path.suffix.lower() == ".npy":
+        if channel is not None:
+            raise MitsimError(f"image {path}: an array has no channel {channel!r}; name none")
+        try:
+            with open(path, "rb") as file:
+                array = Npy.of(file, path.stat().st_size)
+                if array.dtype.kind not in "buif":
+                    raise ValueError(f"{array.dtype} are no real numbers")
+                if not fits_a_frame(array.shape):
+                    raise ValueError(f"its shape is {array.shape}; {FRAME_LIMITS} are allowed")
+                Cost(memory_bytes=_PIXEL_BYTES * math.prod(array.shape)).check(f"image {path}", Limits())
+                return np.asarray(array.part(file), dtype=np.float64), ()
+        except (OSError, ValueError) as error:
+            raise MitsimError(f"image {path}: not an array of numbers ({error}); save one by numpy.save") from error
+    channels = {name: values for name, values in read_frame(path)[0].items() if not name.startswith("error.")}
+    return _light_of(channels, channel, path)
+
+
+def _light_of(channels: Mapping[str, Channel], channel: str | None, path: Path) -> tuple[FloatArray, tuple[str, ...]]:
+    if channel is None and {*_LUMINANCE} <= {*channels}:
+        light = sum(weight * finite_channel(channels, name, path) for name, weight in _LUMINANCE.items())
+        return np.asarray(light), ("channels R, G and B: taken as one, their luminance (ITU-R BT.709)",)
+    name = channel or ("Y" if "Y" in channels else next(iter(channels)) if len(channels) == 1 else None)
+    if name is None or name not in channels:
+        asked = "several channels" if name is None else f"no channel {name!r}"
+        raise MitsimError(f"image {path}: has {asked}; its channels are {', '.join(channels)}; name one by channel")
+    return finite_channel(channels, name, path), ()
+
+
+def irradiance_behind_lens(radiance: FloatArray, f_number: float) -> FloatArray:
+    """Irradiance [W m^-2] on the axis behind a lens: E = pi L / (4 N^2), for an object far away.
+
+    Parameters
+    ----------
+    radiance
+        (rows, columns) [W m^-2 sr^-1].
+    f_number
+        N, 0.5 or more; ArgumentError otherwise.
+    """
+    check_f_number(f_number)
+    return np.asarray(radiance * (math.pi / (4 * f_number**2)))
+
+
+# -------- What `mitsim sense` takes
+
+IMAGES, ENDINGS = (".exr", ".npy"), (".png", ".exr", ".npy")
+"""Files that an image is read from, and digital numbers are written to."""
+_LARGEST_PNG = 2**16 - 1
+"""What 16 bits of grey hold."""
+_WAVELENGTHS_NM = 1.0, 1e6
+"""As a projector's."""
+
+
+def check_image(path: Path) -> None:
+    """MitsimError for a ``path`` that no image is read from."""
+    if path.suffix.lower() not in IMAGES:
+        raise MitsimError(f"image {path}: give an OpenEXR (.exr) or NumPy (.npy) file")
+    check_plain(path, "image")
+
+
+def check_wavelength(wavelength_nm: float) -> None:
+    """ArgumentError for light of a ``wavelength_nm`` [nm] that there is not."""
+    low, high = _WAVELENGTHS_NM
+    if not low <= wavelength_nm <= high:
+        raise ArgumentError("wavelength", f"{wavelength_nm:g}: give {low:g} to {high:g} nm")
+
+
+def check_f_number(f_number: float) -> None:
+    """ArgumentError for an ``f_number`` that no lens has."""
+    if not 0.5 <= f_number < math.inf:
+        raise ArgumentError("f_number", f"{f_number:g}: no lens in air is below 0.5; give its f-number")
+
+
+def check_ending(path: Path, sensor: SensorModel) -> None:
+    """MitsimError for a ``path`` that no frame is written to, or whose kind cannot hold a ``sensor``'s numbers."""
+    ending = path.suffix.lower()
+    if ending not in ENDINGS:
+        raise MitsimError(f"output {path}: give a name that ends in {', '.join(ENDINGS)}")
+    if ending == ".png" and (sensor.largest_dn is None or sensor.largest_dn > _LARGEST_PNG):
+        numbers = "real numbers" if sensor.largest_dn is None else f"numbers up to {sensor.largest_dn}"
+        raise MitsimError(
+            f"output {path}: sensor {sensor.name!r} gives {numbers}, 16 bits end at {_LARGEST_PNG}; use .exr"
+        )

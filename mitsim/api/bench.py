@@ -1,0 +1,496 @@
+"""What one does with a bench: a scene, camera and projector in; plans, light, frames, factors and renderings out.
+
+The objects below this floor are data; here they have their verbs, each of which calls the room that does the work.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from mitsim.bench.bench import Apparatus
+from mitsim.bench.open import open_apparatus
+from mitsim.core.arguments import checked
+from mitsim.core.environment import DEFAULT_VARIANT
+
+# What needs numpy, or the renderer, is imported where it is used: what opens a bench refuses a misspelt name first.
+if TYPE_CHECKING:
+    from typing import Self
+
+    from mitsim.acquire.reference import Rendered
+    from mitsim.acquire.spectral import Coloured
+    from mitsim.api.light import Light
+    from mitsim.core.job import Job
+    from mitsim.core.runs import Capture, MosaicCapture
+    from mitsim.devices.session import BoardShape, SessionRecipe
+    from mitsim.light.plan import Plan
+    from mitsim.reconstruct.factors import Factors
+
+
+@checked
+def open_bench(
+    scene: Path | str,
+    variant: str = DEFAULT_VARIANT,
+    camera: Path | str | None = None,
+    projector: Path | str | None = None,
+    allow_outside_files: bool = False,
+    for_render: bool = False,
+    **parameters: object,
+) -> Bench:
+    """Load a scene with its camera and projector; selects the Mitsuba variant for the process.
+
+    Parameters
+    ----------
+    scene
+        name of a shipped scene, or path of a scene XML or of the folder that holds it (``./name`` for a folder that is
+        called like a shipped scene).
+    variant
+        of Mitsuba.
+    camera, projector
+        name of a shipped device, or path of its TOML file; None: IMX249 and MP-CL1.
+    allow_outside_files
+        whether the scene may read files outside its folder.
+    for_render
+        only light matters: the camera's electronics need not fit, and the scene needs no projector.
+    **parameters
+        values of the scene's ``<default>`` parameters, text or numbers.
+
+    Raises
+    ------
+    MitsimError
+        for anything wrong with the files, a camera file whose pixel pitch is not the scene's, or a mask of the
+        scene's where the camera file has one.
+    """
+    apparatus = open_apparatus(scene, variant, camera, projector, allow_outside_files, for_render, **parameters)
+    return Bench(**{each.name: getattr(apparatus, each.name) for each in fields(apparatus)})
+
+
+class Bench(Apparatus):
+    """An apparatus that is ready to plan, capture and calibrate; its attributes are those of
+    :class:`mitsim.bench.bench.Apparatus`."""
+
+    def __repr__(self) -> str:
+        path, (rows, columns) = self.loaded.path, self.geometry.frame_shape
+        rig = f"{self.sensor.name} with {rows} x {columns} pixels, {self.projector.name}"
+        return f"Bench({path.parent.name}/{path.name}: {rig})"
+
+    @checked
+    def plan(self, patterns: str = "dots:7", **request: Any) -> Plan:
+        """What will be simulated, why, and what it costs, by a short look at the scene.
+
+        Parameters
+        ----------
+        patterns
+            ``uniform``, ``dots:K``, ``dots:RxC``, ``hadamard:K`` or ``random:K``.
+        **request
+            other fields of :class:`mitsim.bench.request.Request`, such as ``accuracy`` or ``effects``.
+
+        Raises
+        ------
+        MitsimError
+            for a request that cannot be served, or when no light of the projector reaches the camera.
+        """
+        from mitsim.acquire.capture import plan_request
+        from mitsim.bench.request import Request
+
+        return plan_request(self, Request.of(patterns=patterns, **request))
+
+    @checked
+    def light(self, patterns: str = "dots:7", job: Job | None = None, **request: Any) -> Light:
+        """Light of the scene by projector pixel, traced once, from which any family can be exposed.
+
+        Parameters
+        ----------
+        patterns
+            the family whose frames are to have the accuracy.
+        job
+            clock, progress and limits.
+        **request
+            other fields of :class:`mitsim.bench.request.Request`.
+
+        Raises
+        ------
+        MitsimError
+            as :meth:`plan`.
+        """
+        from mitsim.acquire.capture import trace_request
+        from mitsim.api.light import Light
+        from mitsim.core.job import Job
+
+        job = job or Job()
+        with job.planning(patterns):
+            plan = self.plan(patterns, **request)
+        traced = trace_request(self, plan, job)
+        return Light(**{each.name: getattr(traced, each.name) for each in fields(traced)})
+
+    @checked
+    def capture(
+        self,
+        plan: Plan | str = "dots:7",
+        output: Path | str | None = None,
+        resume: bool = False,
+        job: Job | None = None,
+        **request: Any,
+    ) -> Capture:
+        """One noisy frame for each shot of a pattern family.
+
+        Parameters
+        ----------
+        plan
+            a plan of this bench, or the name of a family.
+        output
+            folder that the frames are written to as they are made; None keeps them in memory.
+        resume
+            go on with an interrupted capture of the same request in ``output``, bit-equal to an uninterrupted one.
+        job
+            clock, progress and limits.
+        **request
+            other fields of :class:`mitsim.bench.request.Request`; of a plan, all but patterns, accuracy and effects.
+
+        Raises
+        ------
+        MitsimError
+            for a request that cannot be served, an output that cannot be written or holds something else, or more
+            memory, disk or time than the job's limits allow.
+        """
+        from mitsim.core.job import Job
+
+        job = job or Job()
+        with job.clock.stage("imports"):
+            from mitsim.acquire.capture import capture, request_of
+
+        known = None if isinstance(plan, str) else plan
+        return capture(self, request_of(plan, request), job, output, resume, known)
+
+    @checked
+    def capture_lines(
+        self,
+        patterns: Plan | str = "dots:7",
+        output: Path | str | None = None,
+        resume: bool = False,
+        job: Job | None = None,
+        **request: Any,
+    ) -> dict[str, Capture]:
+        """Sequential colour: a capture of each spectral line of the projector, by its name, as ``638nm``.
+
+        All lines are traced on the same paths; each capture is what a projector of this line alone would give, and has
+        the accuracy. Needs a spectral variant.
+
+        Parameters
+        ----------
+        patterns
+            name of the family, or a plan of this bench, of :meth:`choose_colour`.
+        output
+            folder that holds a run's folder for each line, and colour.json; None keeps them in memory.
+        resume, job
+            as for :meth:`capture`.
+        **request
+            other fields of :class:`mitsim.bench.request.Request`, but for ``seconds``.
+
+        Raises
+        ------
+        MitsimError
+            as :meth:`capture`; for another variant, a projector of more than four lines, and lamps where the camera's
+            efficiency is not known.
+        """
+        from mitsim.core.job import Job
+
+        job = job or Job()
+        with job.clock.stage("imports"):
+            from mitsim.acquire.capture import request_of
+            from mitsim.acquire.spectral import capture_lines
+
+        known = None if isinstance(patterns, str) else patterns
+        return capture_lines(self, request_of(patterns, request), job, output, resume, known)
+
+    @checked
+    def choose_colour(self, patterns: str = "dots:7", **request: Any) -> Coloured[Self]:
+        """Mono, bands or lines: the cheapest that is predicted to leave at most half of the accuracy of the colours.
+
+        Looks at the scene in this variant and in the spectral one, and sets that of the bench that it returns.
+
+        Parameters
+        ----------
+        patterns
+            name of the family.
+        **request
+            other fields of :class:`mitsim.bench.request.Request`, but for ``seconds``.
+
+        Raises
+        ------
+        MitsimError
+            as :meth:`capture_lines` where lines or bands are called for; for a bench in a spectral variant.
+        """
+        from mitsim.acquire.spectral import choose_colour
+        from mitsim.bench.request import Request
+
+        return choose_colour(self, Request.of(patterns=patterns, **request))
+
+    @checked
+    def in_variant(self, variant: str) -> Bench:
+        """The same bench loaded anew into a ``variant``, which is set from then on; objects of the variant before must
+        not be used with it. MitsimError as :func:`mitsim.open_bench`."""
+        from mitsim.bench.open import reopened
+
+        return reopened(self, variant)
+
+    @checked
+    def calibrate_lines(
+        self,
+        seed: int = 0,
+        accuracy: float = 1e-3,
+        recipe: SessionRecipe | None = None,
+        output: Path | str | None = None,
+        resume: bool = False,
+        job: Job | None = None,
+    ) -> dict[str, Factors]:
+        """Sequential colour: the camera's factors at each spectral line of the projector, by its name.
+
+        Parameters
+        ----------
+        seed, accuracy, recipe, resume, job
+            as for :meth:`calibrate`.
+        output
+            folder that holds a calibration's folder for each line, and colour.json; None keeps them in memory.
+
+        Raises
+        ------
+        MitsimError
+            as :meth:`calibrate`, for a variant that is not spectral, and a projector of more than four lines.
+        """
+        from mitsim.core.job import Job
+
+        job = job or Job()
+        with job.clock.stage("imports"):
+            from mitsim.calibrate.spectral import calibrate_lines
+
+        return calibrate_lines(self, seed, accuracy, recipe, output, resume, job)
+
+    @checked
+    def capture_mosaic(
+        self,
+        patterns: str = "dots:7",
+        output: Path | str | None = None,
+        resume: bool = False,
+        job: Job | None = None,
+        **request: Any,
+    ) -> MosaicCapture:
+        """All lines of the projector at once, seen by a camera under a mosaic of colour filters: one frame a shot.
+
+        Needs a spectral variant, and a camera whose file has a ``mosaic``.
+
+        Parameters
+        ----------
+        patterns
+            name of the family.
+        output
+            RUN folder, with the lines' truths and colour.json beside; None keeps all in memory.
+        resume, job
+            as for :meth:`capture`.
+        **request
+            other fields of :class:`mitsim.bench.request.Request`, but for ``seconds``.
+
+        Raises
+        ------
+        MitsimError
+            as :meth:`capture_lines`, for a camera without a mosaic, lines that its curves do not hold, a sensor of an
+            odd number of pixels, and a projector with speckle, which is not simulated behind filters.
+        """
+        from mitsim.core.job import Job
+
+        job = job or Job()
+        with job.clock.stage("imports"):
+            from mitsim.acquire.mosaic import capture_mosaic
+            from mitsim.bench.request import Request
+
+        return capture_mosaic(self, Request.of(patterns=patterns, **request), job, output, resume)
+
+    @checked
+    def calibrate_mosaic(
+        self,
+        seed: int = 0,
+        accuracy: float = 1e-3,
+        recipe: SessionRecipe | None = None,
+        output: Path | str | None = None,
+        resume: bool = False,
+        job: Job | None = None,
+    ) -> dict[str, Factors]:
+        """The factors of a camera under a mosaic of colour filters at each spectral line of the projector, by its name.
+
+        One session a line, whose light the filters dim; each pixel's reading is divided by what its filter passes of
+        the line, as the camera's file states it. Factors are those of pixels without filters, one electron a photon.
+
+        Parameters
+        ----------
+        seed, accuracy, output, resume, job
+            as for :meth:`calibrate_lines`.
+        recipe
+            how each session is run; None: the shipped one, with four shots of each pattern.
+
+        Raises
+        ------
+        MitsimError
+            as :meth:`calibrate_lines` and :meth:`capture_mosaic`, and for a filter that passes nothing of a line.
+        """
+        from mitsim.core.job import Job
+
+        job = job or Job()
+        with job.clock.stage("imports"):
+            from mitsim.calibrate.spectral import calibrate_mosaic
+
+        return calibrate_mosaic(self, seed, accuracy, recipe, output, resume, job)
+
+    @checked
+    def calibrate(
+        self,
+        seed: int = 0,
+        accuracy: float = 1e-3,
+        recipe: SessionRecipe | None = None,
+        output: Path | str | None = None,
+        resume: bool = False,
+        job: Job | None = None,
+    ) -> Factors:
+        """The camera's two factors, from a rendered Hadamard session on a white board.
+
+        Parameters
+        ----------
+        seed
+            root of every random stream.
+        accuracy
+            relative rms error of the expected responses.
+        recipe
+            how the session is run; None: the shipped one.
+        output
+            CAL folder that is written, with its unfinished parts meanwhile; None keeps the factors in memory.
+        resume
+            go on with an interrupted session in ``output``.
+        job
+            clock, progress and limits.
+
+        Raises
+        ------
+        MitsimError
+            as :meth:`capture`.
+        """
+        from mitsim.core.job import Job
+
+        job = job or Job()
+        with job.clock.stage("imports"):
+            from mitsim.calibrate.calibrate import calibrate
+
+        return calibrate(self, seed, accuracy, recipe, output, resume, job)
+
+    @checked
+    def calibrate_depths(
+        self,
+        seed: int = 0,
+        accuracy: float = 1e-3,
+        recipe: SessionRecipe | None = None,
+        output: Path | str | None = None,
+        resume: bool = False,
+        job: Job | None = None,
+    ) -> dict[float, Factors]:
+        """The camera's two factors at each of a recipe's depths, by depth [mm].
+
+        Parameters
+        ----------
+        seed, accuracy, recipe, resume, job
+            as :meth:`calibrate`.
+        output
+            folder of a CAL folder for each depth, called by its millimetres; None keeps the factors in memory.
+
+        Raises
+        ------
+        MitsimError
+            as :meth:`calibrate`, and for a recipe without depths, or with one at which the mask is.
+        """
+        from mitsim.calibrate.calibrate import calibrate_depths
+
+        return calibrate_depths(self, seed, accuracy, recipe, output, resume, job)
+
+    @checked
+    def write_session(
+        self,
+        frames: Path | str,
+        output: Path | str | None = None,
+        seed: int = 0,
+        accuracy: float = 1e-3,
+        recipe: SessionRecipe | None = None,
+        job: Job | None = None,
+    ) -> Factors:
+        """What :meth:`calibrate` does; and the session's frames, as a real camera's user has them, in a folder from
+        which :func:`mitsim.calibrate_frames` makes the same factors.
+
+        Parameters
+        ----------
+        frames
+            new or empty folder.
+        output, seed, accuracy, recipe, job
+            as :meth:`calibrate`.
+
+        Raises
+        ------
+        MitsimError
+            as :meth:`calibrate`, for a recipe with depths, and a folder that holds something or has no room.
+        """
+        from mitsim.calibrate.calibrate import write_session
+
+        return write_session(self, frames, output, seed, accuracy, recipe, job)
+
+    @checked
+    def render(
+        self,
+        estimator: Literal["reference", "factored"] = "reference",
+        spp: int | None = None,
+        accuracy: float = 1e-3,
+        seed: int = 0,
+        effects: Mapping[str, bool] | None = None,
+        job: Job | None = None,
+    ) -> Rendered:
+        """The expected irradiance under the scene's own light.
+
+        Parameters
+        ----------
+        estimator
+            ``reference``: the scene's own integrator, path by path; ``factored``: what all captures are made with.
+        spp
+            samples a pixel of the reference; None: the ``sample_count`` of the scene's sampler, or 64 without.
+        accuracy, effects
+            of the factored estimator: relative error, and effects switched on or off by name.
+        seed
+            root of every random stream.
+        job
+            clock, progress and limits.
+
+        Raises
+        ------
+        MitsimError
+            for another estimator, an integrator that cannot render this sensor, or work beyond the job's limits.
+        """
+        from mitsim.acquire.reference import render
+
+        return render(self, estimator, spp, accuracy, seed, effects, job)
+
+    @checked
+    def with_board(self, reflectance: float, shape: BoardShape | None = None, depth: float | None = None) -> Self:
+        """The same rig before a diffuse board.
+
+        Parameters
+        ----------
+        reflectance
+            of the board.
+        shape
+            its size, bow and tilt; None: flat, and larger than the view.
+        depth
+            distance of its middle [mm]; None: on the aligned plane.
+
+        Raises
+        ------
+        MitsimError
+            for a reflectance or a depth that no board has.
+        """
+        from mitsim.bench.board import before_board
+
+        return before_board(self, reflectance, shape, depth)

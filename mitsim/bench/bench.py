@@ -1,0 +1,274 @@
+"""A loaded scene, camera and projector in; what they are together, and where the projector's light falls, out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+from mitsim.core.arguments import checked
+from mitsim.core.errors import ArgumentError
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+    from mitsim.bench.mirror_light import Glint
+    from mitsim.core.manifests import Parallax
+    from mitsim.devices.camera import CameraGeometry, Rig
+    from mitsim.devices.lamps import Lamplight
+    from mitsim.devices.patterns import PatternFamily
+    from mitsim.devices.projector import Lines, ProjectorModel, Spectrum
+    from mitsim.devices.sensor import SensorModel
+    from mitsim.scene.load import LoadedScene
+    from mitsim.transport.projector import ProjectorOptics
+
+
+_SPECKLED_SHOTS = 8
+"""Shots whose contrast stands for a family's: those of dots differ by less than a percent, by where the window ends."""
+
+
+def check_depth(depth: float) -> float:
+    """``depth`` [mm], or ArgumentError when it is not in front of the camera."""
+    if not 0 < depth < math.inf:
+        raise ArgumentError("depth", f"{depth:g}: give millimetres above 0")
+    return depth
+
+
+@dataclass(frozen=True)
+class Apparatus:
+    """A loaded scene with the camera's electronics and the projector's light.
+
+    Attributes
+    ----------
+    loaded
+        the scene.
+    rig
+        camera, sensor and projector, as pure data.
+    variant
+        of Mitsuba.
+    defines
+        parameters that the scene was loaded with.
+    lines
+        lines of the projector's light that spectral variants trace; None: wavelengths drawn from all.
+    lamplight
+        how the camera counts lamps' light of all wavelengths; None: as light of the projector's effective wavelength.
+    """
+
+    loaded: LoadedScene
+    rig: Rig
+    variant: str
+    defines: dict[str, str]
+    lines: Lines | None = None
+    lamplight: Lamplight | None = None
+
+    @property
+    def geometry(self) -> CameraGeometry:
+        """The camera's geometry, as the scene states it."""
+        return self.rig.camera
+
+    @property
+    def sensor(self) -> SensorModel:
+        """The camera's electronics."""
+        return self.rig.sensor
+
+    @property
+    def counting(self) -> SensorModel:
+        """The electronics whose efficiency counts lamps' light, with their colour filters."""
+        return self.sensor
+
+    @property
+    def projector(self) -> ProjectorModel:
+        """The projector's light and lens."""
+        return self.rig.projector
+
+    @property
+    def n(self) -> int:
+        """Projector pixels a side."""
+        return self.loaded.pixels.n
+
+    @cached_property
+    def projector_optics(self) -> ProjectorOptics:
+        """The projector as the tracers want it."""
+        from mitsim.transport.projector import ProjectorOptics
+
+        grid, model = self.loaded.pixels, self.projector
+        return ProjectorOptics(
+            self.loaded.projector,
+            grid.n,
+            grid.first_row,
+            grid.first_column,
+            grid.canvas,
+            model.aperture_radius_mm,
+            model.focus_mm or self.geometry.scene_distance,
+            model.blur_pixels,
+            self.lines,
+            bool(self.loaded.parting),
+        )
+
+    @property
+    def spectrum(self) -> Spectrum:
+        """The projector's photons by wavelength."""
+        return self.projector.spectrum
+
+    @cached_property
+    def waves(self) -> Spectrum | None:
+        """Lines of that light whose diffraction at the mask is worked out; None: of none."""
+        from mitsim.optics.diffraction import narrowest_mm
+
+        narrow = self.geometry.build_mask().opening_mm < narrowest_mm(float(self.spectrum.wavelengths_nm.max()))
+        return None if narrow or not self.geometry.diffracts else self.spectrum
+
+    @cached_property
+    def glint(self) -> Glint:
+        """Light of the projector that mirrors alone bring to the sensor."""
+        from mitsim.bench.mirror_light import Glint
+        from mitsim.transport.specular import trace_glint
+
+        return Glint(trace_glint(self.loaded.scene, self.loaded.camera, self.projector_optics))
+
+    @property
+    def windows(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Row and column tan-angles of the projector's window on the aligned plane."""
+        return self.loaded.pixels.row_tan, self.loaded.pixels.column_tan
+
+    @checked
+    def windows_at(self, depth: float) -> tuple[tuple[float, float], tuple[float, float]]:
+        """The same on a plane at ``depth`` [mm]; ArgumentError for one that is not in front of the camera."""
+        check_depth(depth)
+        if depth == self.geometry.scene_distance:
+            return self.windows
+        if depth not in self._windows:
+            from mitsim.scene.projector import window_at
+
+            loaded = self.loaded
+            found = window_at(str(loaded.path), loaded.projector, loaded.camera, loaded.pixels, depth)
+            self._windows[depth] = found
+        return self._windows[depth]
+
+    @cached_property
+    def _windows(self) -> dict[float, tuple[tuple[float, float], tuple[float, float]]]:
+        """Those that were asked for, by their depth."""
+        return {}
+
+    @property
+    def parallax(self) -> Parallax:
+        """How the factors of a calibration on the aligned plane move with depth, as its manifest states it."""
+        return self.parallax_from(self.geometry.scene_distance)
+
+    @checked
+    def parallax_from(self, depth: float) -> Parallax:
+        """The same of a calibration at ``depth`` [mm]; ArgumentError for one that is not beyond the mask."""
+        from mitsim.core.manifests import Parallax
+
+        if depth <= self.geometry.mask_distance:
+            raise ArgumentError("depth", f"{depth:g}: the mask is at {self.geometry.mask_distance:g} mm; give more")
+        window = self.windows_at(depth)
+        farther = self.windows_at(2 * depth)  # in 1/z halfway to infinity: far enough that rounding of uv does not show
+        shift = 1 / (2 * depth) - 1 / depth
+        # Seen from the frames' middle, c off the axis: tangents are c / z less.
+        centres = [self._centre(axis) for axis in (0, 1)]
+        rows, columns = (
+            ((far[0] - near[0]) / shift - centre, (far[1] - near[1]) / shift - centre)
+            for near, far, centre in zip(window, farther, centres, strict=True)
+        )
+        row_tan, column_tan = (
+            (first - centre / depth, last - centre / depth)
+            for (first, last), centre in zip(window, centres, strict=True)
+        )
+        return Parallax(
+            depth_mm=depth,
+            row_tan=row_tan,
+            column_tan=column_tan,
+            row_mm=rows,
+            column_mm=columns,
+            pixel_pitch_mm=self.geometry.pixel_pitch,
+            row_pitch_mm=self.geometry.row_pitch,
+            mask_distance_mm=self.geometry.mask_distance,
+            stop_tan=self.geometry.tan_half_fov,
+        )
+
+    def _centre(self, axis: int) -> float:
+        """Middle of a frame's rows (``axis`` 0) or columns (1) [mm], of a region of interest."""
+        centres = self.geometry.centres(axis)
+        return 0.0 if self.geometry.roi is None else float(centres[0] + centres[-1]) / 2
+
+    @property
+    def field_stop_cuts(self) -> bool:
+        """Whether some sensor point does not see all of the projector's window through the field stop."""
+        geometry = self.geometry
+        return any(
+            max(map(abs, window)) + half / geometry.scene_distance > geometry.tan_half_fov
+            for window, half in zip(self.windows, geometry.half_sides, strict=True)
+        )
+
+    @checked
+    def family(self, patterns: str, seed: int = 0) -> PatternFamily:
+        """The family ``patterns`` on this projector, ``seed`` for random ones; MitsimError when it does not fit."""
+        from mitsim.devices.patterns import parse_patterns
+
+        return parse_patterns(patterns, self.n, seed)
+
+    def speckle(self, family: PatternFamily | None = None) -> float:
+        """Contrast of laser speckle in a sensor pixel: as the projector states it, or, computed, under the patterns of
+        a ``family`` (rms over some of its shots; None: a white picture)."""
+        if self.projector.speckle is None:
+            return self.projector.speckle_contrast
+        import numpy as np
+
+        from mitsim.optics.speckle import contrast_of
+
+        key = None if family is None else (family.left.tobytes(), family.right.tobytes())
+        if key not in self._contrasts:
+            rows, columns = ((far - near) * self.geometry.scene_distance / self.n for near, far in self.windows)
+            shots = () if family is None else family.shots[:: -(-len(family.shots) // _SPECKLED_SHOTS)]
+            lit = [family.light(shot) for shot in shots] if family else [np.ones((self.n, self.n))]
+            each = [contrast_of(self.rig, (rows, columns), light) for light in lit if light.any()]
+            self._contrasts[key] = float(np.sqrt(np.mean(np.square(each))))
+        return self._contrasts[key]
+
+    @cached_property
+    def _contrasts(self) -> dict[tuple[bytes, bytes] | None, float]:
+        """Those that were computed, by their family's patterns."""
+        return {}
+
+    def identity(self) -> dict[str, Any]:
+        """What must be equal for a calibration to fit a capture: camera geometry, electronics, projector grid, and the
+        lines of its light, of which the mask's diffraction depends."""
+        grid, lines = self.loaded.pixels, self.projector.lines
+        return {
+            "geometry": self.geometry.identity,
+            "sensor": self.sensor.identity,
+            "projector": {
+                "name": self.projector.name,
+                "n": grid.n,
+                "row_tan": [round(value, 7) for value in grid.row_tan],
+                "column_tan": [round(value, 7) for value in grid.column_tan],
+                "lines_nm": list(lines.wavelengths_nm),
+                "radiant_shares": [round(share, 7) for share in lines.shares],
+            },
+        }
+
+    def provenance(self) -> dict[str, Any]:
+        """Where the scene came from: path, checksums of the XML and all that it reads, parameters, variant."""
+        from mitsim.core.exr import checksum
+
+        return {
+            "scene": str(self.loaded.path),
+            "scene_sha256": checksum(self.loaded.path),
+            "scene_files": {str(path): checksum(path) for path in self.loaded.files[1:]},
+            "defines": self.defines,
+            "variant": self.variant,
+            **({} if self.lines is None else {"lines": asdict(self.lines)}),
+            **({} if self.lamplight is None else {"lamps_nm": list(self.lamplight.range_nm)}),
+            "projector_model": {
+                **self.projector.model_dump(mode="json", exclude={"contrast_ratio"}),
+                "black_level": self.projector.black_level,
+            },
+        }
+
+    @checked
+    def in_bands(self, count: int) -> Self:
+        """The same bench whose projector has ``count`` bands of its lines as lines; MitsimError as
+        :meth:`mitsim.devices.projector.ProjectorModel.in_bands`."""
+        return replace(self, rig=replace(self.rig, projector=self.projector.in_bands(count)))

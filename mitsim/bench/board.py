@@ -1,0 +1,116 @@
+"""A calibration's white board: its shape in a recipe in; a Mitsuba object, and the pixels that miss it, out."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsim.bench.bench import check_depth
+from mitsim.bench.open import Opened
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import ArgumentError
+from mitsim.devices.session import CELLS, BoardShape
+from mitsim.scene.guard.estimators import Unfit
+from mitsim.transport.coordinates import turn_and_origin
+from mitsim.transport.plugins.base import per_lane
+from mitsim.transport.projector import PinholeRays
+
+if TYPE_CHECKING:
+    from mitsim.bench.bench import Apparatus
+
+_INSIDE = 1e-3
+"""Projector pixels from a pixel's corners to the rays that are tried: more than rounding moves a board's edge."""
+
+
+def before_board(
+    bench: Opened, reflectance: float, shape: BoardShape | None = None, depth: float | None = None
+) -> Opened:
+    """The rig of a ``bench`` before a diffuse board; see :meth:`mitsim.api.bench.Bench.with_board`."""
+    if not 0 <= reflectance <= 1:
+        raise ArgumentError("reflectance", f"{reflectance:g}: give a number from 0 to 1")
+    where = bench.geometry.scene_distance if depth is None else check_depth(depth)
+    board = board_object(bench, reflectance, shape or BoardShape(), where)
+    loaded = bench.loaded
+    scene = mi.load_dict({"type": "scene", "camera": loaded.camera, "projector": loaded.projector, "board": board})
+    bare = replace(loaded, scene=scene, lamps=(), small_lamps=(), mirrors=False, glossy=False)
+    alone = replace(bare, unfit=Unfit(), shapes=(), coloured=(), parting=())
+    return replace(bench, loaded=alone)
+
+
+def board_object(bench: Apparatus, reflectance: float, shape: BoardShape, depth: float) -> Any:
+    """A diffuse board before the camera, as Mitsuba loads it.
+
+    Parameters
+    ----------
+    bench
+        whose camera it faces.
+    reflectance, shape
+        of the board.
+    depth
+        of its middle [mm].
+    """
+    half = shape.half_side(bench.geometry, depth)
+    bsdf = {"type": "diffuse", "reflectance": {"type": "uniform", "value": reflectance}}
+    turned, camera = np.eye(4), np.eye(4)
+    turned[:3, :3] = shape.turn
+    camera[:3, :3], camera[:3, 3] = camera_place(bench)
+    middle = mi.ScalarAffineTransform4f().translate([0, 0, depth])
+    place = middle @ mi.ScalarAffineTransform4f(turned.tolist())
+    world = mi.ScalarAffineTransform4f(camera.tolist())
+    if shape.bow_mm:
+        return _bowed(shape, half, np.array((world @ place).matrix, dtype=np.float64), bsdf)
+    return {"type": "rectangle", "to_world": world @ place.rotate([0, 1, 0], 180).scale([half, half, 1]), "bsdf": bsdf}
+
+
+def missed_pixels(bench: Apparatus) -> int:
+    """Projector pixels of a ``bench`` before its board that do not light a whole piece of it, seen by the camera: the
+    ray of a corner misses the board, or meets a side that the projector or the camera does not see."""
+    n = bench.n
+    rays, eye = PinholeRays(bench.projector_optics, [None]), camera_place(bench)[1]
+    row, column = np.divmod(np.arange(n * n), n)
+    missed = np.zeros(n * n, dtype=bool)
+    for down, right in itertools.product((_INSIDE, 1 - _INSIDE), repeat=2):
+        directions = rays.directions(np.stack([row + down, column + right], axis=1))
+        ray = mi.Ray3f(mi.Point3f(rays.origin.tolist()), mi.Vector3f(directions.T.astype(np.float32)))
+        met = bench.loaded.scene.ray_intersect(ray)
+        facing = (dr.dot(met.n, -ray.d) > 0) & (dr.dot(met.n, mi.Point3f(eye.tolist()) - met.p) > 0)
+        missed |= ~per_lane(met.is_valid() & facing, n * n)
+    return int(np.count_nonzero(missed))
+
+
+def camera_place(bench: Apparatus) -> tuple[FloatArray, FloatArray]:
+    """(3, 3) turn and (3,) place [mm] of a ``bench``'s camera in the world."""
+    return turn_and_origin(bench.loaded.camera.world_transform())
+
+
+def _bowed(shape: BoardShape, half: float, place: FloatArray, bsdf: dict[str, Any]) -> mi.Mesh:
+    """A bowed board.
+
+    Parameters
+    ----------
+    shape, half
+        its bow, and half of its side [mm].
+    place
+        (4, 4) from its own frame to the world.
+    bsdf
+        of its surface.
+    """
+    points, normals = shape.surface(half)
+    side = CELLS + 1
+    corner = (np.arange(CELLS)[:, None] * side + np.arange(CELLS)).reshape(-1, 1)
+    # Both triangles of a facet turn their front to -z, where the camera is.
+    faces = np.concatenate([corner + [0, side, 1], corner + [1, side, side + 1]])
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(bsdf)
+    mesh = mi.Mesh("board", side * side, len(faces), has_vertex_normals=True, props=properties)
+    arrays = mi.traverse(mesh)
+    arrays["vertex_positions"] = (points.reshape(-1, 3) @ place[:3, :3].T + place[:3, 3]).ravel()
+    arrays["vertex_normals"] = (normals.reshape(-1, 3) @ place[:3, :3].T).ravel()
+    arrays["faces"] = faces.ravel()
+    arrays.update()
+    return mesh

@@ -1,0 +1,294 @@
+"""Every effect that a scene may call for, in one table: a bench and the effects that are on in, the physics out.
+
+An effect that is off takes its neutral value, which passes light through unchanged. Plan, pilot, simulation, studies
+and tests read :data:`EFFECTS`; nothing else knows what effects there are. To add one: give it a field of
+:class:`Physics` (or of the camera or projector in it) and compute it where that field is read; enter it here; test it;
+describe it in docs/physics.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import BaseModel
+
+from mitsim.core.errors import ArgumentError
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+    from mitsim.bench.bench import Apparatus
+    from mitsim.devices.camera import CameraGeometry
+    from mitsim.devices.projector import Spectrum
+    from mitsim.transport.projector import ProjectorOptics
+
+DIRECT, FOLLOWED = "direct", "followed"
+"""Light of one surface from the projector, and all that is followed over more or from the camera: what is traced."""
+
+
+@dataclass(frozen=True, eq=False)
+class Physics:
+    """What is simulated of a bench.
+
+    Attributes
+    ----------
+    geometry
+        the camera.
+    projector
+        the projector's pixels and lens.
+    spectrum
+        light whose diffraction at the mask is simulated; None: the mask's shadow is geometric.
+    black_level
+        light of a black projector pixel, as a part of a white one's.
+    speckle
+        speckle contrast of the frames.
+    lamps
+        emitters beside the projector.
+    mirrors
+        whether light is followed over surfaces that reflect or transmit in single directions.
+    interreflection
+        whether light is followed over several surfaces.
+    """
+
+    geometry: CameraGeometry
+    projector: ProjectorOptics
+    spectrum: Spectrum | None
+    black_level: float
+    speckle: float
+    lamps: tuple[mi.Emitter, ...]
+    mirrors: bool
+    interreflection: bool
+
+    @classmethod
+    def of(cls, bench: Apparatus) -> Physics:
+        """Everything that ``bench`` has."""
+        return cls(
+            geometry=bench.geometry,
+            projector=bench.projector_optics,
+            spectrum=bench.waves,
+            black_level=bench.projector.black_level,
+            speckle=bench.speckle(),
+            lamps=bench.loaded.lamps,
+            mirrors=bench.loaded.mirrors,
+            interreflection=True,
+        )
+
+    @classmethod
+    def simulated(cls, bench: Apparatus, effects: Collection[str]) -> Physics:
+        """What ``bench`` has of ``effects``; all others take their neutral values."""
+        physics = cls.of(bench)
+        for effect in EFFECTS.values():
+            if effect.name not in effects:
+                physics = effect.without(physics)
+        return physics
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One effect: what it is, and all that others must know to simulate and to judge it.
+
+    Attributes
+    ----------
+    name
+        in plans, on the command line and in manifests.
+    neutral
+        its neutral values, by field of :class:`Physics`; ``part.field`` names one of the camera or projector.
+    absent
+        why a plan leaves it off where a bench does not have it.
+    note
+        what a plan says of a bench that has it.
+    retraced
+        light (:data:`DIRECT`, :data:`FOLLOWED`) that must be traced anew to see the frames without it.
+    kind
+        kind of traced light that is left out to the same end; None: nothing is.
+    first_look
+        whether it shapes direct light so much that the pilot has it on while it looks for anchors, layers and cells.
+    followed
+        whether its light is followed over several surfaces or from the camera, which takes time.
+    in_shadow
+        whether it costs time in the mask's shadow.
+    in_frames
+        whether it is part of the expected frames; the others are drawn with the sensor's noise.
+    in_reference
+        whether the reference estimator has it.
+    in_truth
+        whether a calibration board in the scene's place has it too, so that it cancels in apparent reflectance.
+    """
+
+    name: str
+    neutral: Mapping[str, object]
+    absent: str = ""
+    note: Callable[[Apparatus], str] = field(default=lambda bench: "")
+    retraced: Callable[[Physics], frozenset[str]] = field(default=lambda physics: frozenset())
+    kind: Literal["indirect", "ambient"] | None = None
+    first_look: bool = False
+    followed: bool = False
+    in_shadow: bool = False
+    in_frames: bool = True
+    in_reference: bool = False
+    in_truth: bool = False
+
+    def present(self, bench: Apparatus) -> bool:
+        """Whether ``bench`` has it: one of its values is not the neutral one."""
+        physics = Physics.of(bench)
+        return any(_value(physics, name) != value for name, value in self.neutral.items())
+
+    def without(self, physics: Physics) -> Physics:
+        """``physics`` with its neutral values."""
+        for name, value in self.neutral.items():
+            owner, _, last = name.rpartition(".")
+            if not owner:
+                physics = _changed(physics, name, value)
+            else:
+                physics = _changed(physics, owner, _changed(getattr(physics, owner), last, value))
+        return physics
+
+
+def _value(physics: Physics, name: str) -> object:
+    value: object = physics
+    for part in name.split("."):
+        value = getattr(value, part)
+    return value
+
+
+def _changed(owner: Any, name: str, value: object) -> Any:
+    if getattr(owner, name) == value:
+        return owner  # with what it remembers
+    return owner.model_copy(update={name: value}) if isinstance(owner, BaseModel) else replace(owner, **{name: value})
+
+
+def _registry(*effects: Effect) -> Mapping[str, Effect]:
+    table: dict[str, Effect] = {}
+    for effect in effects:
+        if effect.name in table:
+            raise ValueError(f"effect {effect.name!r} is registered twice")
+        table[effect.name] = effect
+    return MappingProxyType(table)
+
+
+def _always(*light: str) -> Callable[[Physics], frozenset[str]]:
+    return lambda physics: frozenset(light)
+
+
+def _diffraction(bench: Apparatus) -> str:
+    wavelength = bench.projector.effective_wavelength_nm
+    number, lines = bench.geometry.fresnel_number(wavelength), len(bench.spectrum.weights)
+    counted = f"{lines} line{'s' if lines > 1 else ''}"
+    return f"a mask feature's Fresnel number is {number:.1f} at {wavelength:.0f} nm, {counted}"
+
+
+def _lamps(bench: Apparatus) -> str:
+    counted = ", counted from {:g} to {:g} nm".format(*bench.lamplight.range_nm) if bench.lamplight else ""
+    lamps = len(bench.loaded.lamps)
+    counted = f"{lamps} emitter{'s' if lamps > 1 else ''} beside the projector{counted}"
+    return "; ".join((counted, *bench.loaded.notes))
+
+
+def _lens(bench: Apparatus) -> str:
+    lens, far = bench.projector_optics, bench.geometry.scene_distance
+    spot = 2 * lens.aperture * abs(far - lens.focus) / lens.focus  # similar triangles
+    return f"a lens of radius {lens.aperture:g} mm, sharp at {lens.focus:g} mm: spots of {spot:.3g} mm at {far:g} mm"
+
+
+EFFECTS: Mapping[str, Effect] = _registry(
+    Effect(
+        "interreflection",
+        {"interreflection": False},
+        # Lamps' light bounces as well, and only paths that were never followed tell how much of it.
+        retraced=lambda physics: frozenset({FOLLOWED} if physics.lamps else ()),
+        kind="indirect",
+        followed=True,
+        in_reference=True,
+    ),
+    Effect(
+        "mirrors",
+        {"mirrors": False},
+        absent="no surface reflects or transmits light in single directions",
+        retraced=_always(FOLLOWED),
+        first_look=True,
+        followed=True,
+        in_reference=True,
+    ),
+    Effect(
+        "ambient",
+        {"lamps": ()},
+        absent="the projector is the only emitter",
+        note=_lamps,
+        kind="ambient",
+        followed=True,
+        in_reference=True,
+    ),
+    Effect(
+        "diffraction",
+        {"spectrum": None},
+        absent="the mask's shadow is geometric, or a picture that has it",
+        note=_diffraction,
+        first_look=True,
+        in_shadow=True,
+    ),
+    Effect("mask-thickness", {"geometry.mask_thickness": 0.0}, absent="the mask is thin", in_reference=True),
+    Effect(
+        "pixel-response",
+        {"geometry.pixel_fill_factor": 1.0, "geometry.angular_exponent": 0.0},
+        absent="pixels are fully sensitive, whatever the angle",
+        retraced=_always(DIRECT, FOLLOWED),
+        in_reference=True,
+        in_truth=True,
+    ),
+    Effect(
+        "aperture",
+        {"projector.aperture": 0.0},
+        absent="the projector is a pinhole: sharp at all distances",
+        note=_lens,
+        retraced=_always(DIRECT, FOLLOWED),
+        first_look=True,
+        in_truth=True,
+    ),
+    Effect(
+        "blur",
+        {"projector.blur": 0.0},
+        absent="the projector's pixels are sharp",
+        retraced=_always(DIRECT, FOLLOWED),
+        first_look=True,
+        in_truth=True,
+    ),
+    Effect("black-level", {"black_level": 0.0}, absent="the projector's black is black"),
+    Effect("speckle", {"speckle": 0.0}, absent="the projector file gives no speckle contrast", in_frames=False),
+)
+"""All effects, in the order of a plan's rows."""
+
+DISCRETISED = ("anchors", "layers")
+"""What a plan counts instead of switching it: points of the sensor and depths; off means one."""
+SWITCHES = (*DISCRETISED, *EFFECTS)
+"""Names that a user may switch on or off."""
+
+
+def present(bench: Apparatus) -> tuple[str, ...]:
+    """Names of the effects that ``bench`` has."""
+    return tuple(name for name, effect in EFFECTS.items() if effect.present(bench))
+
+
+def names(which: Callable[[Effect], bool]) -> frozenset[str]:
+    """Names of the effects for which ``which`` holds."""
+    return frozenset(name for name, effect in EFFECTS.items() if which(effect))
+
+
+def parse_switches(text: str) -> dict[str, bool]:
+    """A ``text`` such as ``+ambient,-diffraction`` as {name: on}; MitsimError for no effect, or a missing sign."""
+    switches: dict[str, bool] = {}
+    for word in filter(None, (part.strip() for part in text.split(","))):
+        if word[0] not in "+-" or word[1:] not in SWITCHES:
+            allowed = ", ".join(SWITCHES)
+            raise ArgumentError("effects", f"{text!r}: {word!r} is not +NAME or -NAME; the names are {allowed}")
+        if switches.get(word[1:], word[0] == "+") != (word[0] == "+"):
+            raise ArgumentError("effects", f"{text!r}: {word[1:]} is switched both on and off; keep one")
+        switches[word[1:]] = word[0] == "+"
+    return switches
+
+
+def check_switches(switches: Mapping[str, bool]) -> dict[str, bool]:
+    """``switches`` {name: on} as they are; MitsimError for a name that is no effect."""
+    return parse_switches(",".join(f"{'+' if on else '-'}{name}" for name, on in switches.items()))

@@ -1,0 +1,232 @@
+"""What is asked of a bench: one model for the command line's options, the arguments of Python, and the manifest."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from mitsim.bench.effects import check_switches, parse_switches
+from mitsim.core.configuration import refusal, validated
+from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.seeds import check_root
+from mitsim.devices.families import NAMES, check_patterns
+from mitsim.devices.sensor import EXPOSURE_FRACTION, EXPOSURE_S, SensorModel
+
+if TYPE_CHECKING:
+    from mitsim.devices.camera import Rig
+
+LOWEST_ACCURACY, HIGHEST_ACCURACY = 1e-6, 0.3
+"""Below, single precision in the renderer (6e-8 a connection) and the pilot's samples tell nothing; above, no frame is
+worth its name."""
+LONGEST_S = 1e6
+"""Seconds that may be asked for: eleven days, far beyond what any accuracy takes."""
+PSNR_DB = 1.0, 100.0
+"""PSNR that may be asked of an image: below, its error is its whole range; above, the truth is not known."""
+REFERENCE, FACTORED = ESTIMATORS = ("reference", "factored")
+"""Of the expected irradiance."""
+FEWEST_PASSES = 4
+"""Passes of the reference are compared to tell the noise; four tell it to 40 %."""
+MOST_SAMPLES = 2**20
+"""An error of a thousandth of one sample's: an hour a pixel row, beyond use."""
+_LEAST_NOISE = 1e-3
+"""Rendering noise of a thousandth of the sensor's adds a millionth to its variance: sampling beyond buys nothing."""
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """One exposure for a whole session: ``seconds`` by hand, or the brightest pixel at ``fraction`` of full well."""
+
+    seconds: float | None = None
+    fraction: float = 0.8
+
+    def __post_init__(self) -> None:
+        shortest, longest = EXPOSURE_S
+        if self.seconds is not None and not shortest <= self.seconds <= longest:
+            raise ArgumentError("exposure", f"{self.seconds:g}: give {shortest:g} to {longest:g} seconds, or auto")
+        least, most = EXPOSURE_FRACTION
+        if not least <= self.fraction <= most:
+            raise ArgumentError(
+                "exposure_fraction", f"{self.fraction:g}: give a part of the full well, {least:g} to {most:g}"
+            )
+
+    def check(self, sensor: SensorModel, camera_file: Path | str) -> None:
+        """MitsimError when the ``sensor``, of a ``camera_file``, sees through colour filters, whose frames are captured
+        otherwise, or the time is to follow from a full well that it does not have."""
+        if sensor.mosaic is not None:
+            raise MitsimError(
+                f"camera {camera_file}: has a mosaic {sensor.mosaic}, whose frames show all lines at once; "
+                "capture and calibrate it with --colour mosaic, in Python capture_mosaic and calibrate_mosaic"
+            )
+        if self.seconds is None and not math.isfinite(sensor.full_well_e):
+            raise MitsimError(
+                f"camera {camera_file}: full_well_e is inf, so there is no full well to fill; "
+                "give a finite one, or an exposure in seconds"
+            )
+
+    def choose(self, rig: Rig, peak_irradiance: float) -> float:
+        """Exposure time [s] of ``rig`` for frames whose brightest expected pixel has ``peak_irradiance`` [W m^-2]."""
+        if self.seconds is not None:
+            return self.seconds
+        from mitsim.sensor.chain import exposure_for_peak  # here: it needs numpy, and checking a request does not
+
+        wavelength = rig.projector.effective_wavelength_nm
+        return exposure_for_peak(peak_irradiance, self.fraction, rig.sensor, wavelength)
+
+
+def check_accuracy(accuracy: float) -> float:
+    """``accuracy``, or ArgumentError when it is outside what the estimator can promise."""
+    if not LOWEST_ACCURACY <= accuracy <= HIGHEST_ACCURACY:
+        raise ArgumentError(
+            "accuracy", f"{accuracy}: give a relative error from {LOWEST_ACCURACY:g} to {HIGHEST_ACCURACY:g}"
+        )
+    return accuracy
+
+
+def check_psnr(psnr: float) -> float:
+    """``psnr`` [dB], or ArgumentError when no image of worth has it."""
+    if not PSNR_DB[0] <= psnr <= PSNR_DB[1]:
+        raise ArgumentError("psnr", f"{psnr:g}: give {PSNR_DB[0]:g} to {PSNR_DB[1]:g} dB")
+    return psnr
+
+
+def check_samples(estimator: str, spp: int | None) -> None:
+    """ArgumentError for an ``estimator`` that there is not, or too few or too many samples ``spp`` a pixel of the
+    reference; None: those of the scene."""
+    if estimator not in ESTIMATORS:
+        raise ArgumentError("estimator", f"{estimator!r}: use {' or '.join(ESTIMATORS)}")
+    if estimator == REFERENCE and spp is not None and not FEWEST_PASSES <= spp <= MOST_SAMPLES:
+        raise ArgumentError("spp", f"{spp}: give at least {FEWEST_PASSES} samples a pixel, at most {MOST_SAMPLES}")
+
+
+def check_untimed(seconds: float | None) -> None:
+    """ArgumentError where a run in colour is to take so many ``seconds``."""
+    if seconds is not None:
+        raise ArgumentError(
+            "seconds", f"{seconds:g}: runs in colour are not planned by time; give an accuracy, or leave colour out"
+        )
+
+
+class Request(BaseModel):
+    """Which shots of a scene are wanted, and how well."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+
+    patterns: str = Field("dots:7", description=NAMES)
+    accuracy: float = Field(1e-3, description="relative rms error of the expected frames")
+    seconds: float | None = Field(None, description="take the finest accuracy that a run of so many seconds buys")
+    seed: int = Field(0, description="root of every random stream")
+    exposure: float | Literal["auto"] = Field("auto", description="seconds a frame, or auto")
+    exposure_fraction: float = Field(0.8, description="brightest pixel, as a part of full well")
+    effects: dict[str, bool] = Field({}, description="effects switched on or off, whatever they are worth")
+    noise_fraction: float | None = Field(None, description="stop sampling at this part of the sensor's noise")
+    ambient_frame: Literal["auto", "yes", "no"] = Field("auto", description="whether a frame of ambient light is taken")
+    ambient_shots: int | None = Field(None, description="shots of that frame; None: by the patterns")
+
+    def __init__(self, **values: Any) -> None:
+        """Of the fields' ``values``, as they are; MitsimError as :meth:`of`."""
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            raise refusal(type(self), error, "request") from error
+
+    @classmethod
+    def of(cls, **values: object) -> Request:
+        """The request of these ``values``; effects may be written ``"+ambient,-diffraction"``.
+
+        Raises
+        ------
+        MitsimError
+            for a name that is no field, or a value that a field cannot have.
+        """
+        if isinstance(values.get("effects"), str):
+            values["effects"] = parse_switches(str(values["effects"]))
+        return validated(cls, values, "request")
+
+    def changed(self, **values: object) -> Request:
+        """The same request with other ``values``; MitsimError as :meth:`of`."""
+        return Request.of(**{**self.model_dump(exclude_unset=True), **values})
+
+    @property
+    def deciding(self) -> dict[str, Any]:
+        """What is asked, as the manifest's configuration holds it: an accuracy or seconds."""
+        return self.model_dump(mode="json", exclude={"accuracy" if self.seconds is not None else "seconds"})
+
+    @field_validator("patterns")
+    @classmethod
+    def _of_a_family(cls, patterns: str) -> str:
+        return check_patterns(patterns)
+
+    @field_validator("accuracy")
+    @classmethod
+    def _promised(cls, accuracy: float) -> float:
+        return check_accuracy(accuracy)
+
+    @field_validator("seconds")
+    @classmethod
+    def _some_time(cls, seconds: float | None) -> float | None:
+        if seconds is not None and not 0 < seconds <= LONGEST_S:
+            raise ArgumentError("seconds", f"{seconds:g}: give a number above 0, at most {LONGEST_S:g}")
+        return seconds
+
+    @field_validator("seed")
+    @classmethod
+    def _a_root(cls, seed: int) -> int:
+        return check_root(seed)
+
+    @field_validator("effects")
+    @classmethod
+    def _known(cls, effects: dict[str, bool]) -> dict[str, bool]:
+        return check_switches(effects)
+
+    @field_validator("noise_fraction")
+    @classmethod
+    def _worth_it(cls, fraction: float | None) -> float | None:
+        if fraction is not None and not _LEAST_NOISE <= fraction <= 1:
+            raise ArgumentError(
+                "noise_fraction", f"{fraction}: give a part of the sensor's noise from {_LEAST_NOISE:g} to 1"
+            )
+        return fraction
+
+    @field_validator("ambient_frame", mode="before")
+    @classmethod
+    def _a_choice(cls, choice: object) -> object:
+        if choice not in ("auto", "yes", "no"):
+            raise ArgumentError("ambient_frame", f"{choice!r}: use auto, yes or no")
+        return choice
+
+    @field_validator("ambient_shots")
+    @classmethod
+    def _a_number_of_shots(cls, shots: int | None) -> int | None:
+        if shots is None:
+            return None
+        from mitsim.core.manifests import MOST_SHOTS  # here: it takes 7 ms to import, and most requests have no shots
+
+        if not 1 <= shots <= MOST_SHOTS:
+            raise ArgumentError(
+                "ambient_shots", f"{shots}: give 1 to {MOST_SHOTS} shots, or none for the patterns' own"
+            )
+        return shots
+
+    def model_post_init(self, _: object) -> None:
+        """MitsimError for an exposure that no camera has, and for seconds beside what they decide."""
+        self.timing  # noqa: B018 - checks itself
+        if self.seconds is None:
+            return
+        if "accuracy" in self.model_fields_set:
+            raise ArgumentError(
+                "seconds", f"{self.seconds:g}: the accuracy is what they buy; give seconds or an accuracy, not both"
+            )
+        if self.noise_fraction is not None:
+            raise ArgumentError(
+                "noise_fraction",
+                f"{self.noise_fraction:g}: stops sampling by another rule than seconds; give one of both",
+            )
+
+    @property
+    def timing(self) -> Exposure:
+        """How the exposure time is found."""
+        return Exposure(None if self.exposure == "auto" else self.exposure, self.exposure_fraction)

@@ -1,0 +1,1 @@
+"""Calibrations: sessions rendered or planned, and the factors that they give."""

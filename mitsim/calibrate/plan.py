@@ -1,0 +1,348 @@
+"""A bench, patterns of a capture to come and a wanted PSNR in; the calibration session that its image needs, out.
+
+A calibration's noise is its exposure's and its repeats'. The capture is simulated, the session's light traced and its
+responses formed, all once; then factors with the noise of any exposure are drawn in closed form
+(:mod:`mitsim.calibrate.predict`), the image is solved with them as a user would, and judged by the truth. PSNR rises
+with the light of a session until the noise of the capture, or what the camera cannot resolve, is all that is left: the
+least light that reaches the wanted PSNR is found between two sessions of which one does and one does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from mitsim.acquire.capture import capture
+from mitsim.acquire.exposure import Exposer
+from mitsim.bench.bench import Apparatus
+from mitsim.bench.request import Exposure, Request, check_psnr
+from mitsim.calibrate.predict import Foreseen
+from mitsim.calibrate.session import Session, session_seconds
+from mitsim.core.arguments import checked
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.core.job import Job
+from mitsim.core.runs import Capture
+from mitsim.devices.sensor import EXPOSURE_FRACTION
+from mitsim.devices.session import MOST_REPEATS, SessionRecipe, load_recipe
+from mitsim.metrics import psnr as psnr_of
+from mitsim.metrics import truth_for
+from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.reconstruct import reconstruct
+from mitsim.reconstruct.result import Reconstruction
+
+_DRAWS = 8
+"""Sessions whose mean PSNR is taken: single ones scatter by 0.4 dB, as few directions of an image carry most of what
+factors' noise does to it; the mean by 0.14 dB."""
+_NEAR_DB = 0.05
+"""Beyond the wanted PSNR, at which no less light is looked for."""
+_STEP = 8.0
+"""By which light is changed until the wanted PSNR lies between two sessions: some 6 dB."""
+_DIGITS = 3
+"""Of an exposure fraction: a thousandth of the light is 0.004 dB."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Images with factors of a session by ``recipe`` (None: without noise): mean PSNR [dB], and its standard deviation
+    from session to session.
+
+    ``largest`` is the source of most of the first image's stated uncertainty; empty where none is stated.
+    """
+
+    recipe: SessionRecipe | None
+    psnr_db: float
+    spread_db: float
+    largest: str
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationPlan:
+    """What a calibration session must be for a wanted image.
+
+    Attributes
+    ----------
+    psnr_asked, patterns
+        wanted PSNR [dB], and of the capture.
+    recipe
+        of the session that reaches it; else of the one that comes nearest.
+    trial, ceiling
+        images with factors of that session, and with factors without noise.
+    frames, exposure_s
+        of the session, and of each [s].
+    electrons, photons
+        that a pixel gets in a frame, mean over pixels and stripes.
+    simulation_s
+        predicted of `mitsim calibrate`, without the program's start [s].
+    seconds
+        that this plan took, by stage.
+    flags
+        why the promise may not hold.
+    """
+
+    psnr_asked: float
+    patterns: str
+    recipe: SessionRecipe
+    trial: Trial
+    ceiling: Trial
+    frames: int
+    exposure_s: float
+    electrons: float
+    photons: float
+    simulation_s: float
+    seconds: dict[str, float]
+    flags: tuple[str, ...]
+
+    @property
+    def reached(self) -> bool:
+        """Whether the wanted PSNR is."""
+        return self.trial.psnr_db >= self.psnr_asked
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Why it is not, in a line, and what else may break the promise."""
+        if self.reached:
+            return self.flags
+        most = f", most of its error is {self.ceiling.largest}" if self.ceiling.largest else ""
+        if self.ceiling.psnr_db < self.psnr_asked:
+            said = (
+                f"PSNR {self.psnr_asked:g} dB cannot be reached under {self.patterns}: with a calibration without "
+                f"noise the image has {self.ceiling.psnr_db:.1f} dB{most}; improve the capture, not the calibration"
+            )
+        else:
+            said = (
+                f"PSNR {self.psnr_asked:g} dB is not reached by {self.recipe.repeats} repeats: "
+                f"{self.trial.psnr_db:.1f} dB; the ceiling is {self.ceiling.psnr_db:.1f} dB{most}"
+            )
+        return (said, *self.flags)
+
+    def payload(self) -> dict[str, Any]:
+        """The JSON of the command line."""
+        return {
+            "psnr_asked": self.psnr_asked,
+            "patterns": self.patterns,
+            "reached": self.reached,
+            "psnr": self.trial.psnr_db,
+            "psnr_spread": self.trial.spread_db,
+            "psnr_ceiling": self.ceiling.psnr_db,
+            "ceiling_source": self.ceiling.largest or None,
+            "recipe": self.recipe.model_dump(mode="json", exclude_defaults=True),
+            "exposure_fraction": self.recipe.exposure_fraction,
+            "repeats": self.recipe.repeats,
+            "frames": self.frames,
+            "exposure_s": self.exposure_s,
+            "exposure_total_s": self.frames * self.exposure_s,
+            "electrons_a_pixel": self.electrons,
+            "photons_a_pixel": self.photons,
+            "electrons_a_pixel_total": self.frames * self.electrons,
+            "photons_a_pixel_total": self.frames * self.photons,
+            "simulation_s": self.simulation_s,
+            "seconds": self.seconds,
+            "warnings": self.warnings,
+        }
+
+    def lines(self) -> list[str]:
+        """For people."""
+        recipe, total = self.recipe, self.frames * self.exposure_s
+        return [
+            f"PSNR {self.psnr_asked:g} dB under {self.patterns}: predicted {self.trial.psnr_db:.1f} dB "
+            f"(one session +-{self.trial.spread_db:.1f}), without noise of the calibration "
+            f"{self.ceiling.psnr_db:.1f} dB",
+            f"Session: exposure_fraction {recipe.exposure_fraction:g}, repeats {recipe.repeats}, "
+            f"{recipe.signed_capture}: {self.frames} frames of {self.exposure_s:.3g} s, {total:.3g} s of exposure",
+            f"Light: {self.electrons:.3g} electrons ({self.photons:.3g} photons) a pixel and frame in the mean, "
+            f"{self.frames * self.electrons:.3g} ({self.frames * self.photons:.3g}) in all frames",
+            f"Simulation: {self.simulation_s:.1f} s predicted",
+        ]
+
+
+@checked
+def plan_calibration(
+    bench: Apparatus,
+    psnr: float,
+    patterns: str = "dots:7",
+    recipe: SessionRecipe | None = None,
+    accuracy: float = 1e-3,
+    seed: int = 0,
+    job: Job | None = None,
+) -> CalibrationPlan:
+    """The least exposure, or where one shot of each frame is too little the fewest repeats, with which the image of a
+    capture reaches a PSNR.
+
+    Parameters
+    ----------
+    bench
+        scene, camera and projector.
+    psnr
+        that is wanted [dB].
+    patterns
+        of the capture, which is exposed as `mitsim capture` does by default.
+    recipe
+        of the session; None: the shipped one. Its exposure fraction is the largest that is taken; its repeats are
+        found.
+    accuracy, seed
+        of the light, and of every random stream.
+    job
+        clock, progress and limits.
+
+    Returns
+    -------
+    CalibrationPlan
+        flagged where no calibration reaches that PSNR.
+
+    Raises
+    ------
+    MitsimError
+        for another PSNR than 1 to 100 dB, patterns that do not fit, and as :meth:`mitsim.api.bench.Bench.capture`.
+    """
+    check_psnr(psnr)
+    recipe, job = _foreseeable((recipe or load_recipe()).of_one_depth()), job or Job()
+    Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.rig.camera_file)
+    job.progress("capture", 0.0)
+    with job.clock.stage("capture"):
+        shots = capture(bench, Request.of(patterns=patterns, seed=seed, accuracy=accuracy))
+    session = Session(bench, recipe, seed)
+    job.progress("session", 0.2)
+    with job.clock.stage("session"):
+        own = replace(job, clock=Job().clock)
+        plan = session.plan(accuracy, own)
+        foreseen = Foreseen.of(session.lit(session.trace(plan, own), own), own)
+    search = _Search(shots, foreseen, recipe, job)
+    with job.clock.stage("solve"):
+        ceiling = search.trial(None)
+        trial = search.least(psnr, ceiling)
+    lit = foreseen.by(trial.recipe or recipe)
+    taken = session_seconds(session.board, session.signs.shape[1], lit.session.shots, plan.settings)
+    # Half of the projector's pixels are lit in every frame but the uniform ones.
+    electrons = float(Exposer(bench.rig, lit.exposure_s, seed).electrons(lit.white).mean()) / 2
+    return CalibrationPlan(
+        psnr_asked=psnr,
+        patterns=patterns,
+        recipe=lit.session.recipe.model_copy(update={"source": f"planned for {psnr:g} dB; {recipe.source}"}),
+        trial=trial,
+        ceiling=ceiling,
+        frames=lit.session.shots,
+        exposure_s=lit.exposure_s,
+        electrons=electrons,
+        photons=electrons / bench.sensor.efficiency(bench.projector.effective_wavelength_nm),
+        simulation_s=plan.taking(start=0.0, **taken).predicted_seconds,
+        seconds=job.clock.seconds(),
+        flags=(*shots.warnings, *session.warnings, *_unknown(foreseen)),
+    )
+
+
+def _foreseeable(recipe: SessionRecipe) -> SessionRecipe:
+    """The ``recipe``; MitsimError where it has what a plan does not know."""
+    if len(recipe.exposure_ladder) > 1 or recipe.dark_frames:
+        raise MitsimError(
+            f"recipe: has {len(recipe.exposure_ladder)} exposures of a frame and {recipe.dark_frames} dark frames; a "
+            "plan knows sessions of one exposure without dark frames, so leave exposure_ladder and dark_frames out"
+        )
+    return recipe
+
+
+def _unknown(foreseen: Foreseen) -> tuple[str, ...]:
+    """What sessions do that the plan does not know."""
+    if not foreseen.lit.speckle:
+        return ()
+    return (f"speckle of contrast {foreseen.lit.speckle:g}: it is in every frame, and not in the plan's calibration",)
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """Images of ``shots`` by factors of ``foreseen`` sessions of a ``recipe`` with another exposure or repeats."""
+
+    shots: Capture
+    foreseen: Foreseen
+    recipe: SessionRecipe
+    job: Job
+
+    def trial(self, recipe: SessionRecipe | None) -> Trial:
+        """Images by sessions of a ``recipe``; None: without noise."""
+        draws = range(_DRAWS if recipe else 1)
+        images = [self._image(self.foreseen.factors(recipe, draw)) for draw in draws]
+        found = [psnr_of(image.image, self._truth) for image in images]
+        budget = images[0].uncertainties.budget if images[0].uncertainties else {}
+        largest = max(budget, key=lambda name: budget[name], default="").replace("_", " ")
+        return Trial(recipe, float(np.mean(found)), float(np.std(found, ddof=1)) if len(found) > 1 else 0.0, largest)
+
+    def least(self, wanted: float, ceiling: Trial) -> Trial:
+        """The session of least light whose images have the ``wanted`` PSNR; the one of most light if none has, and the
+        recipe's own where the ``ceiling`` is below."""
+        trials: dict[float, Trial] = {}
+
+        def quality(dose: float) -> float:
+            if dose not in trials:
+                trials[dose] = self.trial(self._by(dose))
+                self.job.progress(f"session {len(trials)}", min(0.4 + 0.06 * len(trials), 0.98))
+            return trials[dose].psnr_db
+
+        out_of_reach = quality(1.0) < wanted and ceiling.psnr_db < wanted
+        smallest = EXPOSURE_FRACTION[0] / self.recipe.exposure_fraction
+        return trials[1.0 if out_of_reach else least_dose(quality, wanted, smallest)]
+
+    @property
+    def _truth(self) -> FloatArray:
+        truth = truth_for(self.shots, self.recipe.board_reflectance)
+        assert truth is not None
+        return truth
+
+    def _image(self, factors: Factors) -> Reconstruction:
+        return reconstruct(self.shots, factors)
+
+    def _by(self, dose: float) -> SessionRecipe:
+        """The recipe with so many times the light of one shot of each frame, or of that part of one."""
+        if dose > 1:
+            return self.recipe.model_copy(update={"repeats": round(dose)})
+        fraction = float(f"{dose * self.recipe.exposure_fraction:.{_DIGITS}g}")
+        return self.recipe.model_copy(update={"repeats": 1, "exposure_fraction": fraction})
+
+
+def least_dose(quality: Callable[[float], float], wanted: float, smallest: float) -> float:
+    """The least dose of light that is good enough; the largest one if none is.
+
+    Parameters
+    ----------
+    quality
+        PSNR [dB] by dose, which rises; asked for the same dose more than once. Beyond 1, doses are whole repeats.
+    wanted
+        that is good enough [dB].
+    smallest
+        dose; the largest has ``MOST_REPEATS``.
+    """
+    low = high = 1.0
+    while quality(low) >= wanted:
+        if low == smallest:
+            return low
+        low, high = max(low / _STEP, smallest), low
+    while quality(high) < wanted:
+        if high == MOST_REPEATS:
+            return high
+        low, high = high, min(high * _STEP, float(MOST_REPEATS))
+    while not _found(low, high, quality(high) - wanted):
+        dose = _between(low, high, quality(low) - wanted, quality(high) - wanted)
+        low, high = (low, dose) if quality(dose) >= wanted else (dose, high)
+    return high
+
+
+def _found(low: float, high: float, beyond_db: float) -> bool:
+    """Whether no dose between ``low`` and ``high`` is worth a look; ``beyond_db`` is what the latter has too much."""
+    return (low >= 1 and high - low <= 1) or beyond_db <= _NEAR_DB or high / low < 1 + 10.0 ** (1 - _DIGITS)
+
+
+def _between(low: float, high: float, under_db: float, over_db: float) -> float:
+    """The dose at which a straight line over log dose meets what is wanted, well within; whole repeats.
+
+    Parameters
+    ----------
+    low, high
+        doses.
+    under_db, over_db
+        their PSNR beyond what is wanted, below 0 and not.
+    """
+    part = min(max((_NEAR_DB / 2 - under_db) / (over_db - under_db), 0.2), 0.8)
+    dose = float(low * (high / low) ** part)
+    return min(max(float(round(dose)), low + 1), high - 1) if low >= 1 else dose

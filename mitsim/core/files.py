@@ -1,0 +1,407 @@
+"""Places to write to: checked before any work, held against other processes, and filled with whole files only."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import stat
+import tempfile
+import threading
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, Literal
+
+from mitsim.core.errors import MitsimError, cut
+
+LOCK = ".mitsim.lock"
+"""Held, in a folder, by the process that writes there; a killed process leaves the file behind, but not the lock. That
+of a file stands beside it, the file's name before this."""
+_NAME_BYTES = 120
+"""Of a file's name that hidden files beside it begin with, so that none of theirs passes the 255 of a file system."""
+_KINDS = {stat.S_IFCHR: "a device", stat.S_IFBLK: "a device", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket"}
+_LONGEST_HEAD = 1 << 20
+"""An unfinished manifest is a few kB; what is larger is not looked into."""
+FRAMES, PARTS = "frame_*.exr", "*.part.npz"
+"""What an unfinished capture and an unfinished calibration have finished, as their folders name it."""
+
+
+@contextmanager
+def whole_file(path: Path | str) -> Iterator[Path]:
+    """A name beside ``path`` to write to; on leaving it takes the place of ``path``, and after an error it is removed.
+
+    MitsimError when the file cannot be written, or is no plain file; a link stays, and its file is replaced.
+    """
+    path = Path(path)
+    _check_name(path)
+    _check_plain(path)
+    target = resolved(path)
+    if target.is_symlink():
+        raise MitsimError(f"file {path}: cannot be written (it is a link that leads to itself); remove it")
+    part = _beside(target, f".{os.getpid()}-{threading.get_ident()}.part")
+    try:
+        yield part
+        os.replace(part, target)
+    except OSError as error:
+        raise MitsimError(
+            f"file {path}: cannot be written ({error.strerror or error}); choose a writable folder with room"
+        ) from error
+    finally:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def write_text(path: Path | str, text: str) -> None:
+    """Write ``text`` to ``path`` in UTF-8, all or nothing. MitsimError when it cannot be written."""
+    with whole_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def sweep(folder: Path) -> None:
+    """Remove what killed processes left half-written in a ``folder`` that this one holds."""
+    for part in folder.glob(".*.part"):
+        part.unlink(missing_ok=True)
+
+
+def prepare_output(path: Path | str, overwrite: bool = False, kind: Literal["folder", "file"] = "folder") -> Path:
+    """Make sure, before any work, that output can be written; nothing is deleted.
+
+    Parameters
+    ----------
+    path
+        the place; a folder is created if its parent exists.
+    overwrite
+        whether it may be a folder that holds files already, or an existing file.
+    kind
+        ``folder`` or ``file``.
+
+    Raises
+    ------
+    MitsimError
+        when the parent is missing, or the place is not writable, is of the other kind, holds something and
+        ``overwrite`` is off, or has a name that is not UTF-8, which OpenEXR cannot open.
+    """
+    path = Path(path)
+    _check_name(path)
+    if not path.parent.is_dir():
+        raise MitsimError(f"output {path}: the folder {path.parent} does not exist; create it or choose another")
+    if kind == "file":
+        _prepare_file(path, overwrite)
+    else:
+        _prepare_folder(path, overwrite)
+    return path
+
+
+def _check_name(path: Path) -> None:
+    """MitsimError for a name that OpenEXR and HDF5 cannot open."""
+    try:
+        os.fspath(path.absolute()).encode()
+    except UnicodeEncodeError:
+        raise MitsimError(f"output {path}: is not UTF-8 text; choose a folder with another name") from None
+
+
+def check_output(path: Path | str, overwrite: bool = False, kind: Literal["folder", "file"] = "folder") -> None:
+    """Refuse a place that :func:`prepare_output` would refuse, before what is slow to import; nothing is left behind.
+
+    Parameters
+    ----------
+    path, overwrite, kind
+        as there.
+
+    Raises
+    ------
+    MitsimError
+        as there.
+    """
+    new = not os.path.lexists(path)
+    try:
+        prepare_output(path, overwrite, kind)
+    finally:
+        if new and kind == "folder":
+            with suppress(OSError):
+                os.rmdir(path)
+
+
+@contextmanager
+def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
+    """The folder ``path`` for the time of a work, in which no other process may claim it; ``overwrite`` allows one that
+    holds files. If the work fails before writing, a new folder is removed.
+
+    MitsimError as for :func:`prepare_output`, and when another process holds the folder.
+    """
+    new = not Path(path).exists()
+    folder = prepare_output(path, overwrite)
+    try:
+        with _locked(folder, folder / LOCK):
+            prepare_output(path, overwrite)  # nobody finished a work there between the first look and the lock
+            yield folder
+    except BaseException:
+        if new:
+            with suppress(OSError):  # not empty: what was written stays
+                folder.rmdir()
+        raise
+
+
+@contextmanager
+def output_file(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
+    """The file ``path`` for the time of a work, in which no other process may claim it; ``overwrite`` allows one that
+    exists.
+
+    MitsimError as for :func:`prepare_output`, and when another process holds the file.
+    """
+    path = prepare_output(path, overwrite, "file")
+    with _locked(path, _beside(resolved(path), LOCK)):
+        yield prepare_output(path, overwrite, "file")  # nobody wrote it between the first look and the lock
+
+
+def check_apart(path: Path | str, inputs: Iterable[Path | str]) -> None:
+    """Refuse to replace what a work reads.
+
+    Parameters
+    ----------
+    path
+        its output.
+    inputs
+        files that it reads, and folders of which it reads files.
+
+    Raises
+    ------
+    MitsimError
+        when the output is one of the files, by whatever name, or a file in one of the folders.
+    """
+    place = resolved(path)
+    for each in map(Path, inputs):
+        same = place == resolved(each) or (place.exists() and each.exists() and place.samefile(each))
+        if same or (each.is_dir() and place.exists() and place.is_relative_to(resolved(each))):
+            raise MitsimError(f"output {path}: would replace {each}, which is read; choose another name")
+
+
+@contextmanager
+def whole_folder(path: Path | str) -> Iterator[Path]:
+    """The new or empty folder ``path``, for files that appear together: after an error none of them is left.
+
+    MitsimError as for :func:`output_folder`.
+    """
+    with output_folder(path) as folder:
+        try:
+            yield folder
+        except BaseException:
+            for item in folder.iterdir():
+                if item.name != LOCK:
+                    shutil.rmtree(item) if item.is_dir() and not item.is_symlink() else item.unlink()
+            raise
+
+
+def _beside(path: Path, ending: str) -> Path:
+    """A hidden name in the folder of ``path`` that begins as its own."""
+    name = path.name.encode()[:_NAME_BYTES].decode(errors="ignore")
+    return path.with_name(f".{name}{ending}")
+
+
+def _check_plain(path: Path) -> None:
+    """MitsimError where ``path`` leads to a device, a named pipe or a socket, which a file would replace."""
+    try:
+        mode = path.stat().st_mode
+    except OSError:
+        return
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        kind = _KINDS.get(stat.S_IFMT(mode), "no plain file")
+        raise MitsimError(f"output {path}: is {kind}, which a file would replace; give the name of a file")
+
+
+@contextmanager
+def _locked(path: Path, name: Path) -> Iterator[None]:
+    """Hold the lock of the output ``path``, whose file has this ``name``; MitsimError where another process does."""
+    from filelock import FileLock, Timeout  # here: it takes 20 ms to import, and no refusal needs it
+
+    lock = FileLock(name)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        raise MitsimError(f"output {path}: another mitsim is writing there; wait for it, or choose another") from None
+    try:
+        yield
+    finally:
+        name.unlink(missing_ok=True)  # before the lock is given back: who waits for it looks for the name
+        lock.release()
+
+
+def _prepare_file(path: Path, overwrite: bool) -> None:
+    if path.is_dir():
+        raise MitsimError(f"output {path}: is a folder, but a file is to be written; give a file name")
+    _check_plain(path)
+    if path.exists() and not overwrite:
+        raise MitsimError(f"output {path}: exists already; remove it or choose another name")
+    _try_writing(path, path.parent)
+
+
+def _prepare_folder(path: Path, overwrite: bool) -> None:
+    if path.exists() and not path.is_dir():
+        raise MitsimError(f"output {path}: is a file, but a folder is needed; choose another name")
+    try:
+        path.mkdir(exist_ok=True)
+        occupied = any(item.name != LOCK for item in path.iterdir())
+    except OSError as error:
+        raise MitsimError(f"output {path}: cannot be used ({error.strerror}); choose another place") from error
+    if occupied and not overwrite:
+        raise MitsimError(
+            f"output {path}: the folder holds files already{_unfinished(path) or '; choose a new one or empty it'}"
+        )
+    _try_writing(path, path)
+
+
+def _unfinished(folder: Path) -> str:
+    """What a killed capture or calibration left in the folder, and how to go on; nothing when there is none."""
+    try:
+        manifest = json.loads(read_text(folder / "manifest.json", _LONGEST_HEAD))
+    except (MitsimError, ValueError, RecursionError):
+        return ""
+    if not isinstance(manifest, dict) or manifest.get("status") != "incomplete":
+        return ""
+    kind = manifest.get("kind")
+    name, pattern = ("parts", PARTS) if kind == "calibration" else ("frames", FRAMES)
+    return f": an unfinished {kind} with {len([*folder.glob(pattern)])} finished {name}; go on with resume=True"
+
+
+def _try_writing(path: Path, folder: Path) -> None:
+    # Permission bits do not tell (root, read-only mounts, quotas): only a file that was really written does.
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(b"mitsim")
+    except OSError as error:
+        raise MitsimError(
+            f"output {path}: the folder {folder} is not writable ({error.strerror}); choose another place"
+        ) from error
+
+
+# -------- JSON files
+
+MOST_BYTES = 32 << 20
+"""A little more than the largest manifest that a capture writes: 65536 shots of 4096 x 256 patterns make 29 MB."""
+
+
+def plain(value: Any) -> Any:
+    """``value`` as JSON can hold it: arrays become lists, paths text, pydantic models dictionaries, NaN and
+    infinities null (JSON has no such numbers). TypeError for anything else."""
+    if hasattr(value, "model_dump"):
+        value = value.model_dump()
+    if hasattr(value, "tolist"):  # arrays and numbers of numpy, which plain data can do without
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, (str, bool, int)):
+        return value
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    raise TypeError(f"plain: {value!r} is {type(value).__name__}, which JSON cannot hold; convert it first")
+
+
+def json_text(obj: Any) -> str:
+    """``obj`` (see :func:`plain`) as indented JSON."""
+    return json.dumps(plain(obj), indent=1, allow_nan=False) + "\n"
+
+
+def write_json(path: Path | str, obj: Any) -> None:
+    """Write ``obj`` to ``path`` as :func:`json_text`, all or nothing. MitsimError when the file cannot be written."""
+    text = json_text(obj)
+    with whole_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def parse_json(text: str) -> Any:
+    """The object in a JSON ``text``. ValueError when it is not JSON, has a key twice, or is nested too deep."""
+    try:
+        return json.loads(text, object_pairs_hook=_once)
+    except RecursionError:
+        raise ValueError("it is nested too deep") from None
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    unique: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in unique:
+            raise ValueError(f"key {cut(key)!r} is there twice")
+        unique[key] = value
+    return unique
+
+
+def read_json(path: Path | str) -> Any:
+    """The object in the JSON file ``path`` of at most 32 MiB. MitsimError when it cannot be read, is not JSON, or has a
+    key twice."""
+    try:
+        return parse_json(read_text(path, MOST_BYTES))
+    except ValueError as error:
+        raise MitsimError(f"file {path}: not valid JSON ({error}); write or copy it again") from error
+
+
+# -------- Files that others wrote
+
+_silence = threading.RLock()
+MOST_SIDE = 16384
+"""Pixels a side of the largest picture that is read: of the largest sensor and environment map that are simulated."""
+MOST_PIXELS = 1 << 26
+"""Of a frame or other picture, 8192 x 8192: sixteen times the largest sensors that coded masks are used with (2048 a
+side); an import of one predicts 1.7 GB and takes 2.5 s of processor time. Of a larger sensor a region or binned frames
+are read."""
+FRAME_LIMITS = f"at most {MOST_SIDE} pixels a side and {MOST_PIXELS} in all"
+"""For messages."""
+
+
+def fits_a_frame(shape: Sequence[int]) -> bool:
+    """Whether a picture of this ``shape`` (rows, columns) is no larger than a frame may be."""
+    return max(shape, default=0) <= MOST_SIDE and math.prod(shape) <= MOST_PIXELS
+
+
+def check_plain(path: Path | str, what: str = "file") -> os.stat_result:
+    """The status of the plain file ``path``, called ``what`` in errors. MitsimError when it cannot be looked at, or is
+    a folder, pipe or device, from which reading may never end."""
+    try:
+        status = os.stat(path)
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise MitsimError(f"{what} {path}: cannot be read ({reason}); check the path") from error
+    if stat.S_ISDIR(status.st_mode):
+        raise MitsimError(f"{what} {path}: cannot be read (Is a directory); check the path")
+    if not stat.S_ISREG(status.st_mode):
+        raise MitsimError(f"{what} {path}: cannot be read (a pipe or device, no plain file); check the path")
+    return status
+
+
+def resolved(path: Path | str) -> Path:
+    """Where ``path`` leads, links followed as far as they lead: ``Path.resolve`` raises RuntimeError for one that leads
+    to itself, before Python 3.13."""
+    return Path(os.path.realpath(path))
+
+
+@contextmanager
+def stderr_silenced() -> Iterator[None]:
+    """What native code writes to stderr of a damaged file, past Python, goes nowhere: it raises too. One thread at a
+    time, so that two do not restore each other's stream."""
+    with _silence:
+        stderr = os.dup(2)
+        try:
+            with open(os.devnull, "wb") as nowhere:
+                os.dup2(nowhere.fileno(), 2)
+            yield
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+
+
+def read_text(path: Path | str, most: int) -> str:
+    """The UTF-8 text of the plain file ``path``. MitsimError as ``check_plain``, and for over ``most`` bytes;
+    ValueError when it is no UTF-8."""
+    size = check_plain(path).st_size
+    if size > most:
+        raise MitsimError(f"file {path}: has {size} bytes; at most {most} are allowed")
+    try:
+        with open(path, "rb") as file:
+            return file.read(most).decode("utf-8")
+    except OSError as error:
+        raise MitsimError(f"file {path}: cannot be read ({error.strerror}); check the path") from error

@@ -1,0 +1,401 @@
+"""Pictures of other programs, as PNG, TIFF, NPY, OpenEXR or bare numbers: a path in; size, or numbers as stored, out.
+
+Nothing is scaled, inverted, turned or made grey: a file whose numbers its reader would change is refused. What a header
+claims is bounded before pixels are read, and files are copied, not mapped: one that is cut short meanwhile is refused.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import math
+import os
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any, BinaryIO, Literal, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.arrayfile import Npy
+from mitsim.core.errors import MitsimError
+from mitsim.core.files import FRAME_LIMITS, check_plain, fits_a_frame, stderr_silenced
+from mitsim.core.imagelist import BARE, FORMATS, FRAME, Wanted
+from mitsim.core.resources import Cost, Limits
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+Numbers = npt.NDArray[Any]
+"""(rows, columns) numbers of a picture: whole, or real; where colours are wanted, (rows, columns, 3 or 4)."""
+_SIGNATURE, _HEAD = b"\x89PNG\r\n\x1a\n", 26
+"""First bytes of a PNG, and bytes up to its colour type (ISO/IEC 15948, 5.2 and 11.2.2)."""
+_PNG_BITS = (1, 2, 4, 8, 16)
+"""Of a grey number in a PNG."""
+_GREY, _COLOURS = 0, (2, 6)
+"""Colour types of a PNG: one number a pixel; red, green, blue, without and with alpha."""
+_ANIMATED = b"acTL"
+"""Chunk before the pixels of a PNG of several frames (ISO/IEC 15948:2023, 11.3.6.1)."""
+_MOST_CHUNKS = 1000
+"""Before the pixels of a PNG; programs write some ten."""
+_BITS, _COMPRESSION, _PHOTOMETRIC, _SAMPLES = 258, 259, 262, 339
+"""Tags of TIFF 6.0: BitsPerSample, Compression, PhotometricInterpretation, SampleFormat."""
+_BIG = 43
+"""Version of a TIFF whose places have 8 bytes, and numbers of entries too (BigTIFF)."""
+_PLAIN = 1
+"""Compression of a TIFF that has none."""
+_PAGE_KIND, _ORIENTATION, _TILES, _PARTS = 254, 274, (322, 323), 330
+"""Tags of TIFF 6.0: NewSubfileType, Orientation, TileWidth and TileLength; SubIFDs of TIFF/EP, where raw files keep
+the picture itself."""
+_NO_PAGE = 0b101
+"""Bits of NewSubfileType: a reduced picture of another page, a mask of one."""
+_TILE_MARGIN = 1024
+"""Pixels by which a tile may exceed a picture, chosen beyond usual tiles (64 to 512): readers allocate whole ones."""
+_UPRIGHT = 1
+"""Orientation of a picture whose row 0 is at the top and column 0 at the left, as stored."""
+_MOST_PAGES = 1 << 16
+"""Of a file: as many as shots of a run."""
+_PIXEL_BYTES = 24
+"""Of memory for a pixel while a page is read and checked; measured at most 21, of a PNG of 16 bits."""
+_BLACK_IS_ZERO, _RGB = 1, 2
+"""PhotometricInterpretation of files that are read; 0 stores black as the largest number."""
+_UNSIGNED = 1
+"""SampleFormat of whole numbers from 0, which is also meant where the tag is missing."""
+_CHANNEL = "DN"
+"""Channel of an OpenEXR file of several that is read."""
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What a file's header says: pages, size of the first, what reads the numbers of each page, and bytes of memory
+    that a pixel takes meanwhile."""
+
+    pages: int
+    size: tuple[int, int]
+    read: Callable[[], Iterator[Numbers]]
+    pixel_bytes: float = _PIXEL_BYTES
+
+
+def image_pages(path: Path | str, wanted: Wanted = FRAME) -> tuple[int, tuple[int, int]]:
+    """How many pages a picture has, and rows and columns of the first, from its header.
+
+    Parameters
+    ----------
+    path, wanted
+        as for :func:`read_images`, whose errors it raises.
+    """
+    path = Path(path)
+    with _told(path, wanted):
+        found = _look(path, wanted)
+        return found.pages, found.size
+
+
+def image_size(path: Path | str, wanted: Wanted = FRAME) -> tuple[int, int]:
+    """Rows and columns of a picture, from its header; of several pages, of the first.
+
+    Parameters
+    ----------
+    path, wanted
+        as for :func:`read_images`, whose errors it raises.
+    """
+    return image_pages(path, wanted)[1]
+
+
+def read_image(path: Path | str, wanted: Wanted = FRAME) -> Numbers:
+    """Numbers of a picture of one page.
+
+    Parameters
+    ----------
+    path, wanted
+        as for :func:`read_images`.
+
+    Raises
+    ------
+    MitsimError
+        as there, and for several pages.
+    """
+    path = Path(path)
+    pages, _ = image_pages(path, wanted)
+    if pages != 1:
+        raise wanted.refusal(path, f"has {pages} pages; give each {wanted.what} a file of its own")
+    return next(read_images(path, wanted))
+
+
+def read_images(path: Path | str, wanted: Wanted = FRAME) -> Iterator[Numbers]:
+    """Numbers of every page of a picture as they are stored: no gamma, no scale.
+
+    PNG, TIFF (of one page or more), NPY of whole or real numbers (rows x columns, or pages before them), OpenEXR with a
+    channel `DN` or one channel, and bare numbers.
+
+    Parameters
+    ----------
+    path
+        of the file.
+    wanted
+        what is read.
+
+    Raises
+    ------
+    MitsimError
+        for a file that is missing, damaged, animated, to be shown turned, of another kind or size, in colours that are
+        not wanted, with numbers that its reader would change, that are not finite, or that memory does not hold.
+    """
+    path = Path(path)
+    with _told(path, wanted):
+        found = _look(path, wanted)
+        Cost(memory_bytes=found.pixel_bytes * math.prod(found.size)).check(f"{wanted.what} {path}", Limits())
+        for values in found.read():
+            _check_size(path, wanted, values.shape[0], values.shape[1])
+            bad = np.count_nonzero(~np.isfinite(values))
+            if bad:
+                raise wanted.refusal(path, f"{bad} values are not finite; write it again")
+            yield values.astype(values.dtype.newbyteorder("="), copy=False)
+
+
+def own_end(values: Numbers) -> float | None:
+    """Largest number that a file of such ``values`` can hold: 255 or 65535; None where cameras seldom reach it."""
+    return float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" and values.dtype.itemsize < 4 else None
+
+
+def _look(path: Path, wanted: Wanted) -> _Found:
+    """What the header of a file says, before pixels are read: what it claims is allocated."""
+    check_plain(path, wanted.what)
+    ending = path.suffix.lower()
+    if ending not in _READERS:
+        raise wanted.refusal(path, f"ends in {ending or 'nothing'}; read are {', '.join(_READERS)}")
+    found = _READERS[ending](path, wanted)
+    _check_size(path, wanted, *found.size)
+    return found
+
+
+def _check_size(path: Path, wanted: Wanted, rows: int, columns: int) -> None:
+    if not (0 < rows <= wanted.most and 0 < columns <= wanted.most):
+        raise wanted.refusal(path, f"{rows} x {columns} pixels; 1 to {wanted.most} a side are allowed")
+    if not fits_a_frame((rows, columns)):
+        raise wanted.refusal(path, f"{rows} x {columns} pixels; {FRAME_LIMITS} are read; bin it, or cut out a part")
+
+
+def _png(path: Path, wanted: Wanted) -> _Found:
+    with open(path, "rb") as file:
+        head = file.read(_HEAD)
+        if len(head) < _HEAD or not head.startswith(_SIGNATURE):
+            raise ValueError("it does not begin as a PNG")
+        if _ANIMATED in _kinds_of_chunks(file):
+            raise wanted.refusal(path, f"is an animated PNG of several; give each {wanted.what} a file of its own")
+    columns, rows = (int.from_bytes(head[place : place + 4], "big") for place in (16, 20))
+    bits, colour = head[24], head[25]
+    if not (colour == _GREY and bits in wanted.bits) and not (wanted.colour and colour in _COLOURS and bits == 8):
+        raise wanted.refusal(
+            path, f"is no {_allowed('PNG', (bits for bits in wanted.bits if bits in _PNG_BITS), wanted)}"
+        )
+
+    def read() -> Iterator[Numbers]:
+        """Its one page."""
+        with _opened(path, "PNG") as picture:
+            if "transparency" in picture.info:
+                raise wanted.refusal(path, "names a number that is transparent; save it without transparency")
+            # Some versions of Pillow give 16 bits of a PNG as 32.
+            values = np.array(picture).astype(bool if bits == 1 else np.uint8 if bits <= 8 else np.uint16)
+            _check_upright(path, picture, wanted)  # a PNG may say it behind its pixels
+            yield values
+
+    return _Found(1, (rows, columns), read)
+
+
+def _kinds_of_chunks(file: BinaryIO) -> set[bytes]:
+    """Kinds of the chunks of a PNG ``file`` that stand before its pixels."""
+    kinds: set[bytes] = set()
+    file.seek(len(_SIGNATURE))
+    for _ in range(_MOST_CHUNKS):
+        length, kind = int.from_bytes(file.read(4), "big"), file.read(4)
+        if kind in (b"IDAT", b""):
+            return kinds
+        kinds.add(kind)
+        file.seek(length + 4, os.SEEK_CUR)
+    raise ValueError(f"it has over {_MOST_CHUNKS} chunks before its pixels")
+
+
+def _check_upright(path: Path, picture: Image, wanted: Wanted) -> None:
+    """MitsimError for a ``picture`` that is to be shown turned or mirrored: what is stored is then another picture."""
+    turned = picture.getexif().get(_ORIENTATION, _UPRIGHT)
+    if turned != _UPRIGHT:
+        raise wanted.refusal(
+            path, f"has the orientation {turned}: it is to be shown turned or mirrored; save it as it is to be read"
+        )
+
+
+def _tiff(path: Path, wanted: Wanted) -> _Found:
+    def read() -> Iterator[Numbers]:
+        """Its pages."""
+        with _opened(path, "TIFF", packed) as picture:
+            for page in range(pages):
+                picture.seek(page)
+                unsigned = _check_tags(path, picture, wanted)
+                _check_size(path, wanted, picture.height, picture.width)
+                with stderr_silenced():
+                    values = np.array(picture)
+                # Pillow holds 32 bits as if they had a sign.
+                yield values.view(np.uint32) if unsigned and values.dtype == np.int32 else values
+
+    with _opened(path, "TIFF") as picture:
+        _check_tags(path, picture, wanted)
+        size = picture.height, picture.width
+        packed = picture.tag_v2.get(_COMPRESSION, _PLAIN) != _PLAIN  # type: ignore[attr-defined]
+    pages = _pages_of(path)
+    if pages > _MOST_PAGES:
+        raise wanted.refusal(path, f"has over {_MOST_PAGES} pages; give fewer")
+    held = path.stat().st_size / max(math.prod(size), 1) if packed else 0.0
+    return _Found(pages, size, read, held + _PIXEL_BYTES)
+
+
+def _pages_of(path: Path) -> int:
+    """How many pages a TIFF has, one more than :data:`_MOST_PAGES` at most. Pillow takes a millisecond for each."""
+    with open(path, "rb") as file:
+        order: Literal["little", "big"] = "little" if file.read(2) == b"II" else "big"
+        big = int.from_bytes(file.read(2), order) == _BIG
+        file.seek(8 if big else 4)
+        counted, entry, place = (8, 20, 8) if big else (2, 12, 4)
+        following, pages = int.from_bytes(file.read(place), order), 0
+        while following and pages <= _MOST_PAGES:
+            file.seek(following)
+            file.seek(int.from_bytes(file.read(counted), order) * entry, os.SEEK_CUR)
+            following, pages = int.from_bytes(file.read(place), order), pages + 1
+    return pages
+
+
+def _check_tags(path: Path, picture: Image, wanted: Wanted) -> bool:
+    """Whether numbers of a page of a TIFF ``picture`` have no sign; MitsimError for a page that is not ``wanted``."""
+    tags: Any = picture.tag_v2  # type: ignore[attr-defined]
+    bits, photometric, samples = tags.get(_BITS, (1,)), tags.get(_PHOTOMETRIC), tags.get(_SAMPLES, (_UNSIGNED,))
+    grey = photometric == _BLACK_IS_ZERO and len(bits) == 1 and bits[0] in wanted.bits
+    if not grey and not (wanted.colour and photometric == _RGB and set(bits) == {8}):
+        raise wanted.refusal(path, f"is no {_allowed('TIFF', wanted.bits, wanted)}")
+    if tags.get(_PAGE_KIND, 0) & _NO_PAGE or _PARTS in tags:
+        raise wanted.refusal(path, "holds previews, masks or parts beside the picture; save the picture alone")
+    if any(tags.get(tag, 0) > max(picture.size) + _TILE_MARGIN for tag in _TILES):
+        raise wanted.refusal(path, "is of tiles larger than the picture; save it in strips")
+    _check_upright(path, picture, wanted)
+    return bool(samples[0] == _UNSIGNED)
+
+
+def _npy(path: Path, wanted: Wanted) -> _Found:
+    with open(path, "rb") as file:
+        array = Npy.of(file, path.stat().st_size)
+    kinds, sides = "buif" if 1 in wanted.bits else "uif", array.shape[-2:]
+    if len(array.shape) not in (2, 3) or array.dtype.kind not in kinds:
+        told = f"{array.dtype} of shape {array.shape}"
+        raise wanted.refusal(path, f"holds {told}; rows x columns of numbers are needed, or pages of them")
+    pages = array.shape[0] if len(array.shape) == 3 else 1
+    # Columns first, a page is scattered over the whole file.
+    at_once = array.bytes / max(math.prod(sides), 1) if array.fortran else float(array.dtype.itemsize)
+
+    def read() -> Iterator[Numbers]:
+        """Its pages."""
+        with open(path, "rb") as file:
+            for page in range(pages):
+                yield array.part(file, page if len(array.shape) == 3 else None)
+
+    return _Found(pages, (sides[0], sides[1]), read, at_once + _PIXEL_BYTES)
+
+
+def _exr(path: Path, wanted: Wanted) -> _Found:
+    from mitsim.core.exr import (
+        read_frame,
+        read_header,  # most work reads no picture of this kind
+    )
+
+    header = read_header(path)
+
+    def read() -> Iterator[Numbers]:
+        """Its one page."""
+        channels = read_frame(path)[0]
+        name = _CHANNEL if _CHANNEL in channels or len(channels) > 1 else next(iter(channels))
+        if name not in channels:
+            names = ", ".join(channels)
+            raise wanted.refusal(path, f"its channels are {names}; {_CHANNEL}, or a single one, is needed")
+        yield channels[name]
+
+    return _Found(1, (header.height, header.width), read)
+
+
+def _bare(path: Path, wanted: Wanted) -> _Found:
+    raw = wanted.raw
+    if raw is None:
+        raise wanted.refusal(path, "has no header; say how it is read by shape and bits")
+    needed, size = math.prod(raw.shape) * raw.kind.itemsize, path.stat().st_size
+    if size != needed:
+        raise wanted.refusal(
+            path,
+            f"has {size} bytes, but {raw.shape[0]}x{raw.shape[1]} numbers of {raw.bits} bits take {needed}; "
+            "correct shape or bits",
+        )
+
+    def read() -> Iterator[Numbers]:
+        """Its one page."""
+        values = np.fromfile(path, raw.kind, math.prod(raw.shape)).reshape(raw.shape)
+        if values.max() >= 2**raw.bits:
+            most = values.max()
+            raise wanted.refusal(path, f"has the number {most}, beyond {raw.bits} bits; correct bits or byte_order")
+        yield values
+
+    return _Found(1, raw.shape, read)
+
+
+_READERS: dict[str, Callable[[Path, Wanted], _Found]] = {
+    **dict(zip(FORMATS, (_png, _tiff, _tiff, _npy, _exr), strict=True)),
+    **dict.fromkeys(BARE, _bare),
+}
+"""What looks into a file, by the end of its name in small letters."""
+
+
+def _allowed(kind: str, bits: Any, wanted: Wanted) -> str:
+    numbers = [str(count) for count in bits]
+    colours = ", nor of red, green and blue of 8 bits" if wanted.colour else ""
+    zero = " whose zero is black" if kind == "TIFF" else ""
+    return f"grey {kind} of {', '.join(numbers[:-1])} or {numbers[-1]} bits{zero}{colours}; save one number a pixel"
+
+
+@contextmanager
+def _opened(path: Path, kind: str, whole: bool = False) -> Iterator[Image]:
+    """A picture file of that ``kind``, its pixels not yet read; ``whole``: from a copy in memory, as the library for
+    packed TIFF would map the file, or read all of it for each page."""
+    from PIL import Image, UnidentifiedImageError  # most work reads no picture
+
+    logs = logging.getLogger("PIL")
+    if not logs.handlers:  # where nobody listens, Python writes errors in a log to stderr
+        logs.addHandler(logging.NullHandler())
+    with open(path, "rb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # on metadata that is damaged; where pixels are, reading them raises
+        warnings.simplefilter("error", Image.DecompressionBombWarning)
+        source = io.BytesIO(file.read()) if whole else cast("IO[bytes]", _Copied(file))
+        try:
+            opened = Image.open(source, formats=(kind,))
+        except UnidentifiedImageError:
+            raise ValueError(f"its header is none of a {kind}") from None
+        with opened as picture:
+            yield picture
+
+
+class _Copied:
+    """A file that Pillow can read, but not map: it has no name and no descriptor."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.read, self.seek, self.tell = file.read, file.seek, file.tell
+
+
+@contextmanager
+def _told(path: Path, wanted: Wanted) -> Iterator[None]:
+    """Whatever readers raise, as one line that names the file."""
+    try:
+        yield
+    except MitsimError:
+        raise
+    # Readers of damaged files raise whatever they stumble over.
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise wanted.refusal(
+            path, f"cannot be read: damaged, or of another kind than its name says ({reason}); write or copy it again"
+        ) from error

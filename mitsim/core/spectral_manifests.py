@@ -1,0 +1,261 @@
+"""Coloured folders: which spectral lines a run, calibration or image has; each line lies in a folder of its own.
+
+`colour.json` names the lines; `FOLDER/638nm/` is an ordinary RUN, CAL or image folder of that line alone. Of a camera
+under a mosaic of colour filters, whose frames show all lines at once, a run is one RUN folder for all, and the lines'
+folders hold what a perfect image of each would show.
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from mitsim.core.configuration import validated
+from mitsim.core.errors import ArgumentError, MitsimError, cut
+from mitsim.core.files import read_json, write_json
+
+COLOUR = "colour.json"
+RUN, CALIBRATION, IMAGE, MOSAIC = KINDS = ("colour-run", "colour-calibration", "colour-image", "mosaic-run")
+_COMMANDS = {
+    RUN: "capture --colour lines",
+    CALIBRATION: "calibrate --colour lines",
+    IMAGE: "reconstruct",
+    MOSAIC: "capture --colour mosaic",
+}
+"""What makes a folder of each kind."""
+MONO, LINES, BANDS = "mono", "lines", "bands"
+"""Ways to simulate a projector's light: not told apart by wavelength, each line, or ``bands:K`` of lines."""
+MOST_LINES = 4
+"""Lines that light is traced at together: wavelengths that a path carries in Mitsuba's spectral variants."""
+JOINT, HALF, DEMOSAIC = WAYS = ("joint", "half", "demosaic")
+"""Ways to images of lines from frames behind colour filters, that of most PSNR first
+(:mod:`mitsim.report.colour.ways`)."""
+Weight = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+
+
+def bands_of(name: str) -> int:
+    """K of ``bands:K``, 1 to :data:`MOST_LINES`; ArgumentError for another ``name``."""
+    word, _, count = name.partition(":")
+    if word != BANDS or count not in map(str, range(1, MOST_LINES + 1)):
+        raise ArgumentError("colour", f"{name!r}: give {BANDS}:1 to {BANDS}:{MOST_LINES}")
+    return int(count)
+
+
+def spectral_of(variant: str) -> str:
+    """The variant that knows wavelengths, of the same backend as ``variant``."""
+    return f"{variant.rpartition('_')[0]}_spectral"
+
+
+def check_undecided(variant: str) -> None:
+    """ArgumentError for a ``variant`` that colours cannot be weighed from."""
+    if variant.endswith("_spectral"):
+        raise ArgumentError("variant", f"{variant}: open the bench with a mono variant; colours are looked at too")
+
+
+class Line(BaseModel):
+    """One spectral line and the folder that holds it."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="ignore")
+
+    name: Annotated[str, Field(pattern=r"^[\w.+-]+$", max_length=255)] = Field(
+        description="of the line, and of its folder"
+    )
+    wavelength_nm: float = Field(ge=1, le=1e6, allow_inf_nan=False, description="of the line's light [nm]")
+    radiant_share: float | None = Field(
+        None, ge=0, le=1, allow_inf_nan=False, description="part of the projector's power; none: not known"
+    )
+
+    @field_validator("name")
+    @classmethod
+    def _a_folder_inside(cls, name: str) -> str:
+        if not name.strip("."):
+            raise ValueError(f"{name!r} is no folder of its own; give a name such as 638nm")
+        return name
+
+
+class ColourManifest(BaseModel):
+    """What colour.json says: the kind of folder, and its lines."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="ignore")
+
+    kind: Literal["colour-run", "colour-calibration", "colour-image", "mosaic-run"] = Field(
+        description="what the folder is"
+    )
+    channels: Annotated[tuple[Line, ...], Field(strict=False, min_length=1, max_length=256)] = Field(
+        description="spectral lines, each in a folder of its name"
+    )
+
+    @field_validator("channels")
+    @classmethod
+    def _each_once(cls, channels: tuple[Line, ...]) -> tuple[Line, ...]:
+        names = [line.name for line in channels]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise ValueError(f"{twice!r} is there twice; give each line a name of its own")
+        return channels
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the lines."""
+        return tuple(line.name for line in self.channels)
+
+    @property
+    def wavelengths_nm(self) -> tuple[float, ...]:
+        """Of the lines [nm]."""
+        return tuple(line.wavelength_nm for line in self.channels)
+
+
+class MosaicManifest(ColourManifest):
+    """What colour.json says of a run behind colour filters, beside its lines."""
+
+    mosaic: Literal["RGGB", "BGGR", "GRBG", "GBRG"] = Field(
+        description="filters of 2 x 2 pixels, row by row from the frame's first pixel"
+    )
+    weights: Annotated[
+        tuple[Annotated[tuple[Weight, ...], Field(strict=False)], ...], Field(strict=False, min_length=4, max_length=4)
+    ] = Field(description="of each of these four pixels, electrons per photon of each line")
+
+    @model_validator(mode="after")
+    def _a_weight_for_each_line(self) -> MosaicManifest:
+        if any(len(row) != len(self.channels) for row in self.weights):
+            raise ValueError(
+                f"weights have {', '.join(str(len(row)) for row in self.weights)} numbers; give each of the four "
+                f"pixels one for each of {len(self.channels)} lines"
+            )
+        return self
+
+
+Manifest = TypeVar("Manifest", bound=ColourManifest)
+
+
+def is_coloured(folder: Path | str) -> bool:
+    """Whether ``folder`` has a colour.json."""
+    return (Path(folder) / COLOUR).is_file()
+
+
+def is_mosaic(folder: Path | str) -> bool:
+    """Whether ``folder`` has the colour.json of a run behind colour filters. MitsimError when it is no JSON."""
+    return is_coloured(folder) and _kind(read_json(Path(folder) / COLOUR)) == MOSAIC
+
+
+def read_colours(folder: Path | str, kind: str) -> ColourManifest:
+    """The lines of a coloured ``folder`` of a ``kind``, one of :data:`KINDS`.
+
+    MitsimError when it has no colour.json, or one of another kind or that breaks a rule.
+    """
+    return _read(Path(folder), kind, ColourManifest)
+
+
+def read_mosaic(folder: Path | str) -> MosaicManifest:
+    """What colour.json says of a run behind colour filters in ``folder``. MitsimError as :func:`read_colours`."""
+    return _read(Path(folder), MOSAIC, MosaicManifest)
+
+
+def check_lines(lines: ColourManifest, run: str, calibration: Path) -> None:
+    """Whether a calibration is of a run's lines.
+
+    Parameters
+    ----------
+    lines, run
+        of the run, and what messages call it.
+    calibration
+        coloured folder.
+
+    Raises
+    ------
+    MitsimError
+        where its lines are others, or it is not coloured.
+    """
+    calibrated = read_colours(calibration, CALIBRATION)
+    ours, theirs = (dict(zip(each.names, each.wavelengths_nm, strict=True)) for each in (lines, calibrated))
+    if ours != theirs:
+        raise MitsimError(
+            f"calibration {calibration}: its lines are {', '.join(theirs)}, but {run} has {', '.join(ours)}; "
+            "calibrate each line of this projector"
+        )
+
+
+def checked_colours(data: Any, kind: str, place: Path) -> ColourManifest:
+    """The lines of a coloured folder.
+
+    Parameters
+    ----------
+    data
+        as its colour.json holds it.
+    kind
+        of folder that it is to be, one of :data:`KINDS`.
+    place
+        where it was found, for messages.
+
+    Raises
+    ------
+    MitsimError
+        when it is of another kind or breaks a rule.
+    """
+    return _checked(data, kind, place, ColourManifest)
+
+
+def checked_mosaic(data: Any, place: Path) -> MosaicManifest:
+    """What the ``data`` of a colour.json, found in ``place``, say of a run behind colour filters. MitsimError as
+    :func:`checked_colours`."""
+    return _checked(data, MOSAIC, place, MosaicManifest)
+
+
+def same_lines(run: Path, calibration: Path) -> ColourManifest:
+    """The lines of a coloured ``run``; MitsimError where its ``calibration`` has others, or either is not coloured."""
+    lines = read_colours(run, RUN)
+    check_lines(lines, str(run), calibration)
+    return lines
+
+
+def _read(folder: Path, kind: str, model: type[Manifest]) -> Manifest:
+    if not is_coloured(folder):
+        raise MitsimError(f"{folder}: holds no {COLOUR}; give a coloured folder, of `mitsim {_COMMANDS[kind]}`")
+    return _checked(read_json(folder / COLOUR), kind, folder, model)
+
+
+def _checked(data: Any, kind: str, place: Path, model: type[Manifest]) -> Manifest:
+    if _kind(data) != kind:
+        raise MitsimError(f"{place}: holds a {cut(_kind(data))}, not a {kind}; give the right folder")
+    return validated(model, data, f"{place}/{COLOUR}")
+
+
+def _kind(data: Any) -> str:
+    """What a colour.json of this ``data`` says that the folder is."""
+    return str(data.get("kind") if isinstance(data, dict) else type(data).__name__)
+
+
+def installed_ways() -> tuple[str, ...]:
+    """Those of :data:`WAYS` that are installed: demosaicing is an extra."""
+    return WAYS if find_spec("colour_demosaicing") else WAYS[:-1]
+
+
+def check_way(way: str) -> str:
+    """The ``way``, one of :data:`WAYS`; ArgumentError for another, and one that is not installed."""
+    if way not in WAYS:
+        raise ArgumentError("mosaic", f"{way!r}: use {', '.join(WAYS[:-1])} or {WAYS[-1]}")
+    if way not in installed_ways():
+        raise ArgumentError(
+            "mosaic",
+            f"{way}: colour-demosaicing is not installed; pip install 'mitsim[mosaic]' (Python 3.11 or newer), or use "
+            f"{' or '.join(installed_ways())}",
+        )
+    return way
+
+
+def write_colours(folder: Path, colours: ColourManifest, **more: Any) -> None:
+    """Write colour.json, all or nothing. MitsimError when it cannot be written.
+
+    Parameters
+    ----------
+    folder
+        that it is of.
+    colours
+        the folder's kind and lines.
+    **more
+        entries beside these.
+    """
+    write_json(folder / COLOUR, {**colours.model_dump(), **more})

@@ -1,0 +1,306 @@
+"""A camera file's table ``[mask]``: a mask's numbers in, the camera's geometry with that mask out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, cast, get_args
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.configuration import read_toml, validated
+from mitsim.core.errors import MitsimError
+from mitsim.core.imagelist import Wanted
+from mitsim.core.images import image_size, read_image
+from mitsim.core.resources import Cost, Limits
+from mitsim.core.seeds import stream
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.mask import MaskKind, mls_mask
+from mitsim.devices.mask_flaws import Dust, Flaws, etched
+from mitsim.devices.plate import LARGEST, Plate, read_drawing, squared
+
+_OWN = {
+    **dict.fromkeys(get_args(MaskKind), ("order",)),
+    "mura": ("features",),
+    "random": ("features", "open_part", "seed"),
+    "drawing": ("file",),
+    "psf": ("file", "psf_distance_mm", "aperture_mm2", "psf_reduce"),
+}
+"""The fields that each kind has beside its name and the feature size."""
+_NEEDED = {
+    "mura": ("features",),
+    "random": ("features",),
+    "drawing": ("file",),
+    "psf": ("file", "psf_distance_mm", "aperture_mm2"),
+}
+"""Those that it cannot do without."""
+_FLAWS = {
+    "over_etch_um", "edge_blur_um", "opaque_transmission", "clear_transmission", "rotation_deg", "tilt_row_mrad",
+    "tilt_column_mrad", "dust_per_mm2", "dust_radius_um", "dust_opacity", "dust_seed",
+}  # fmt: skip
+"""The fields that every kind has."""
+_DUST = {"dust_per_mm2", "dust_radius_um", "dust_opacity", "dust_seed"}
+"""Those that say nothing where there is no dust."""
+_QUARTER = 90
+"""Degrees of a turn that takes features to features."""
+_MOST_ETCHED = LARGEST // 2
+"""Features a side of a mask that is etched: each has two lines then."""
+_MOST_GROWTH = 8
+"""Features by which openings grow or shrink at most: beyond it nothing of a code is left."""
+
+
+class MaskProfile(BaseModel):
+    """What a mask is made of; the scene states where it stands."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    kind: Literal["separable", "flatcam", "open", "mura", "random", "drawing", "psf"] = Field(description="see below")
+    feature_mm: float = Field(ge=1e-6, le=1e3, description="side of a feature, or of a picture's pixel [mm]")
+    """As a scene's ``mask_feature``."""
+    order: int = Field(9, ge=2, le=16, description="separable, flatcam, open: order of the maximum length sequence")
+    features: int | None = Field(None, ge=1, le=LARGEST, description="mura (an odd prime), random: features a side")
+    open_part: float = Field(0.5, gt=0, le=1, description="random: probability that a feature is open")
+    seed: int = Field(0, ge=0, le=2**63 - 1, description="random: which of all such masks")
+    file: str | None = Field(
+        None, min_length=1, max_length=4096, description="drawing, psf: PNG, TIFF, NPY or OpenEXR file"
+    )
+    psf_distance_mm: float | None = Field(
+        None, gt=0, le=1e10, description="psf: from the sensor to the point that the picture shows the light of [mm]"
+    )
+    aperture_mm2: float | None = Field(None, gt=0, le=1e8, description="psf: area of the mask that lets light through")
+    psf_reduce: int = Field(1, ge=1, le=1024, description="psf: pixels a side of the picture that become one")
+    over_etch_um: float = Field(
+        0.0, ge=-1000, le=1000, description="how far every opening has grown on each side [um]; below 0 shrunk"
+    )
+    edge_blur_um: float = Field(
+        0.0, ge=0, le=1000, description="standard deviation of a Gaussian blur of the transmission [um]"
+    )
+    opaque_transmission: float = Field(
+        0.0, ge=0, le=1, description="part of the light that a closed feature lets through"
+    )
+    clear_transmission: float = Field(
+        1.0, ge=0, le=1, description="part of the light that an open feature lets through"
+    )
+    rotation_deg: float = Field(
+        0.0, ge=-180, le=180, description="turn in its plane, from the rows' direction to the columns' [degrees]"
+    )
+    tilt_row_mrad: float = Field(0.0, ge=-300, le=300, description="how its distance grows down the rows [mrad]")
+    tilt_column_mrad: float = Field(0.0, ge=-300, le=300, description="the same along the columns [mrad]")
+    dust_per_mm2: float = Field(0.0, ge=0, le=1e4, description="discs of dust, mean number on a square millimetre")
+    dust_radius_um: float = Field(10.0, gt=0, le=1e5, description="their radius [um]")
+    dust_opacity: float = Field(1.0, gt=0, le=1, description="part of the light that a disc takes")
+    dust_seed: int = Field(0, ge=0, le=2**63 - 1, description="which of all such dusts")
+
+    @model_validator(mode="after")
+    def _fields_of_its_kind(self) -> MaskProfile:
+        flaws = set() if self.kind == "psf" else _FLAWS
+        foreign = self.model_fields_set - {"kind", "feature_mm", *_OWN[self.kind], *flaws}
+        if foreign:
+            raise ValueError(f"{min(foreign)} says nothing of a mask {self.kind}; remove it")
+        missing = [name for name in _NEEDED.get(self.kind, ()) if getattr(self, name) is None]
+        if missing:
+            raise ValueError(f"a mask {self.kind} needs {missing[0]}; add it")
+        if self.kind == "mura" and not _is_odd_prime(self.features or 0):
+            raise ValueError(f"features: got {self.features}; a MURA has an odd prime, as 101 or 251")
+        if self.opaque_transmission >= self.clear_transmission:
+            raise ValueError(
+                f"opaque_transmission: got {self.opaque_transmission:g}; give less than clear_transmission, "
+                f"{self.clear_transmission:g}"
+            )
+        if abs(self.over_etch_um) * 1e-3 >= _MOST_GROWTH * self.feature_mm:
+            raise ValueError(f"over_etch_um: got {self.over_etch_um:g}; give less than {_MOST_GROWTH} features")
+        return self
+
+    @property
+    def flawless(self) -> bool:
+        """Whether it is made and mounted as it is drawn."""
+        return not self._stated
+
+    def plate(self, folder: Path) -> Plate:
+        """The plate as it is made; files count from ``folder``. MitsimError for one too large."""
+        drawn = self.drawn(folder)
+        if self.flawless:
+            return drawn
+        values, lines, feature = drawn.values, None, drawn.feature_mm
+        if self.over_etch_um:
+            if len(values) > _MOST_ETCHED:
+                raise MitsimError(
+                    f"{drawn.words}: has {len(values)} features a side, and over_etch_um is worked out for at most "
+                    f"{_MOST_ETCHED}; draw the part that the sensor sees"
+                )
+            lines, values = etched(values, feature, self.over_etch_um * 1e-3)
+        values = self.opaque_transmission + (self.clear_transmission - self.opaque_transmission) * values
+        extent = drawn.extent_mm + 2 * max(self.over_etch_um, 0.0) * 1e-3
+        dust = (
+            Dust.scattered(self.dust_per_mm2, self.dust_radius_um * 1e-3, self.dust_opacity, extent, self.dust_seed)
+            if self.dust_per_mm2
+            else None
+        )
+        turn = self.rotation_deg
+        if turn % _QUARTER == 0:
+            quarters = int(turn // _QUARTER)
+            values, turn = np.rot90(values, quarters), 0.0
+            dust = dust and dust.turned(quarters)
+        flaws = Flaws(self.edge_blur_um * 1e-3, turn, (self.tilt_row_mrad, self.tilt_column_mrad), dust)
+        told = [f"{name} {getattr(self, name):g}" for name in type(self).model_fields if name in self._stated]
+        return Plate(feature, values, ", ".join([drawn.words, *told]), lines, flaws)
+
+    def pictured(self, folder: Path, mask_distance_mm: float) -> Plate:
+        """The light behind a phase mask as a plate: how much brighter each place is than without a mask.
+
+        A point at depth z0 lights a picture's pixel of side p as one of side p (1 - d/z0) on the mask. Of its light the
+        aperture's area goes through, and the picture says where.
+
+        Parameters
+        ----------
+        folder
+            that the file counts from.
+        mask_distance_mm
+            d.
+
+        Raises
+        ------
+        MitsimError
+            for a picture that cannot be read or is too large, and a point that is not beyond the mask.
+        """
+        path, distance = folder / str(self.file), self.psf_distance_mm or 0.0
+        if distance <= mask_distance_mm:
+            raise MitsimError(
+                f"mask psf: psf_distance_mm is {distance:g}; the point must lie beyond the mask, at "
+                f"{mask_distance_mm:g} mm"
+            )
+        light = load_psf(path, self.psf_reduce, LARGEST // 2)
+        feature, values = squared(light, self.feature_mm * self.psf_reduce * (1 - mask_distance_mm / distance))
+        values *= float(self.aperture_mm2 or 0.0) / (values.sum() * feature**2)
+        words = f"point spread function {path.name} of {distance:g} mm, aperture {self.aperture_mm2:g} mm2"
+        return Plate(feature, values, words, irradiance=True)
+
+    @property
+    def _stated(self) -> set[str]:
+        """The flaws that differ from none."""
+        named = {name for name in _FLAWS - _DUST if getattr(self, name) != type(self).model_fields[name].default}
+        return named | (_DUST if self.dust_per_mm2 else set())
+
+    def drawn(self, folder: Path) -> Plate:
+        """The plate as it is drawn; files count from ``folder``."""
+        if self.kind in get_args(MaskKind):
+            if 2**self.order - 1 > LARGEST:
+                raise MitsimError(
+                    f"mask {self.kind} of order {self.order}: what is wrong with it is worked out for at most "
+                    f"{LARGEST} features a side; give an order up to 12"
+                )
+            mask = mls_mask(cast("MaskKind", self.kind), self.feature_mm, self.order)
+            values = sum(weight * np.outer(rows, columns) for weight, rows, columns in mask.terms)
+            return Plate(self.feature_mm, np.asarray(values), f"{self.kind}, order {self.order}")
+        if self.kind == "drawing":
+            path = folder / str(self.file)
+            return Plate(*squared(read_drawing(path), self.feature_mm), words=f"drawing {path.name}")
+        side = self.features or 0
+        if self.kind == "mura":
+            return Plate(self.feature_mm, mura(side), f"MURA of {side} features")
+        draws = stream(self.seed, "mask").random((side, side))
+        words = f"random mask of {side} features, open part {self.open_part:g}, seed {self.seed}"
+        return Plate(self.feature_mm, (draws < self.open_part).astype(np.float64), words)
+
+    def worn(self, camera: CameraGeometry, folder: Path) -> CameraGeometry:
+        """The ``camera`` with this mask; a drawing's file counts from ``folder``. MitsimError as for a plate."""
+        mask: dict[str, object] = {"mask_feature": self.feature_mm, "mask_plate": None}
+        if self.kind == "psf":
+            picture = self.pictured(folder, camera.mask_distance)
+            mask |= {"mask": "plate", "mask_plate": picture, "mask_feature": picture.feature_mm}
+        elif self.kind in get_args(MaskKind) and self.flawless:
+            mask |= {"mask": self.kind, "mask_order": self.order}
+        else:
+            mask |= {"mask": "plate", "mask_plate": self.plate(folder)}
+        return CameraGeometry.checked("camera file: [mask]", **{**dict(camera), **mask})
+
+
+def mura(features: int) -> FloatArray:
+    """(p, p) modified uniformly redundant array of an odd prime p ``features``, 0 and 1: one period of it.
+
+    Gottesman and Fenimore, Applied Optics 28, 4344 (1989), equation 11: row 0 is closed, else column 0 is open, else
+    what C_i C_j = 1 makes so, with C_k = 1 for squares modulo p and -1 for others.
+    """
+    signs = np.full(features, -1)
+    signs[np.arange(1, features) ** 2 % features] = 1
+    array: FloatArray = (np.outer(signs, signs) == 1).astype(np.float64)
+    array[:, 0], array[0] = 1, 0
+    return array
+
+
+def load_mask(path: Path | str) -> MaskProfile | None:
+    """The table ``[mask]`` of the camera file ``path``, None without one. MitsimError naming field, value and rule."""
+    table = read_toml(path).get("mask")
+    if table is None:
+        return None
+    if not isinstance(table, dict):
+        raise MitsimError(f"file {path}: mask: got {table!r}; give a table [mask]")
+    return validated(MaskProfile, table, f"file {path}: [mask]")
+
+
+def _is_odd_prime(number: int) -> bool:
+    return number > 2 and all(number % divisor for divisor in range(2, int(number**0.5) + 1))
+
+
+# -------- A picture of a point spread function in
+
+_PICTURE = Wanted("point spread function", colour=True)
+_PIXEL_BYTES = 64
+"""Of memory for a pixel: four colours of double precision, and as many arrays of their mean."""
+_BORDER = 16
+"""Width [pixels] of the frame along the picture's edges that shows the background, where the light of a point that
+is centred does not reach."""
+
+
+def load_psf(path: Path | str, reduce: int = 4, most: int | None = None) -> FloatArray:
+    """The point spread function in a picture (PNG, TIFF, NPY, OpenEXR).
+
+    Colours are averaged, the median of a frame along the edges is taken off as background, ``reduce`` x ``reduce``
+    pixels are averaged, what is left below zero (noise around the background) is zero, and the sum is made 1.
+
+    Parameters
+    ----------
+    path
+        of the picture; rows first, any depth of grey, or colours of 8 bits.
+    reduce
+        pixels a side that become one; rows and columns that remain at the far edges are left out.
+    most
+        pixels a side that there may be then; None: any number.
+
+    Raises
+    ------
+    MitsimError
+        for a file that is no picture, has a palette or is too large, a ``reduce`` that does not fit, no light above the
+        background.
+    """
+    path = Path(path)
+    size = image_size(path, _PICTURE)
+    rows, columns = (side // reduce for side in size) if reduce >= 1 else (0, 0)
+    if min(rows, columns) < 1 or min(size) <= 2 * _BORDER:
+        raise _PICTURE.refusal(
+            path,
+            f"{size[0]} x {size[1]} pixels, reduce {reduce}; it needs "
+            f"more than {2 * _BORDER} pixels a side, and reduce from 1 to its shorter side",
+        )
+    if most is not None and max(rows, columns) > most:
+        raise _PICTURE.refusal(
+            path, f"{rows} x {columns} pixels; at most {most} a side make a mask, so set a larger psf_reduce"
+        )
+    values = _grey(path, size)
+    inside = np.zeros(values.shape, dtype=bool)
+    inside[_BORDER:-_BORDER, _BORDER:-_BORDER] = True
+    above = values - np.median(values[~inside])
+    means = above[: rows * reduce, : columns * reduce].reshape(rows, reduce, columns, reduce).mean(axis=(1, 3))
+    light = np.maximum(means, 0)
+    total = float(light.sum())
+    if total <= 0:
+        raise _PICTURE.refusal(path, "nothing is brighter than its edges; give another picture")
+    return np.asarray(light / total)
+
+
+def _grey(path: Path, size: tuple[int, int]) -> FloatArray:
+    rows, columns = size
+    Cost(memory_bytes=rows * columns * _PIXEL_BYTES).check(f"point spread function {path}", Limits())
+    values = np.asarray(read_image(path, _PICTURE), dtype=np.float64)
+    return values if values.ndim == 2 else np.asarray(values[..., :3].mean(axis=2))

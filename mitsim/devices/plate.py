@@ -1,0 +1,367 @@
+"""A mask given feature by feature: its transmission in, the separable terms that make it up out, and what they leave.
+
+What is separable, as the product of two maximum length sequences is, has one term, FlatCam's and a MURA two, and these
+are exact: crosses of the matrix (Bebendorf, Numerische Mathematik 86, 565, 2000), 0 and 1 where the mask's are. Any
+other mask is the sum of its singular vectors. Coordinates are those of :mod:`mitsim.devices.mask`. What goes wrong when it
+is made and mounted is in :mod:`mitsim.devices.mask_flaws`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.arrays import ByValue, FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.core.imagelist import Wanted
+from mitsim.core.images import image_size, own_end, read_image
+from mitsim.devices.mask import BoolArray, Term, mean_opening
+from mitsim.devices.mask_flaws import NO_FLAWS, Flaws, dusted
+
+LEFT_OUT = 1e-7
+"""Part of a transmission, rms, that singular vectors may leave: a tenth of the finest accuracy that a plan takes."""
+RASTER_LEFT_OUT = 1e-4
+"""The same of light on a raster, which is no more exact itself."""
+FEW = 2
+"""Terms that are looked for as exact crosses: FlatCam's, of whose fields diffraction makes four terms."""
+LARGEST = 4096
+"""Features a side: a transmission takes 128 MiB."""
+_MOST_LINES = 2 * LARGEST
+"""Lines between features that are not equal, as over-etching leaves them: twice as many."""
+_ROUNDING = 1e-12
+"""Rest of a matrix of numbers up to 1 that is rounding after two crosses."""
+_GRIDS = 4
+"""Grids of openings that the reference draws from; with more it draws over the whole mask."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plate(ByValue):
+    """A square plate of square features, each of a transmission of its own; MitsimError for values out of range.
+
+    Attributes
+    ----------
+    feature_mm
+        side of one feature [mm].
+    values
+        (N, N) transmission of light's power, 0 to 1, read-only.
+    words
+        what it is, for messages and manifests.
+    lines_mm
+        (N + 1,) coordinates of the lines between its rows, and between its columns, where features are not equal.
+    flaws
+        what else is wrong with it.
+    irradiance
+        whether values are the light behind it, of any finite size, instead: waves are in them already.
+    """
+
+    feature_mm: float
+    values: FloatArray = field(repr=False)
+    words: str
+    lines_mm: FloatArray | None = field(default=None, repr=False)
+    flaws: Flaws = NO_FLAWS
+    irradiance: bool = False
+
+    def __post_init__(self) -> None:
+        values = np.array(self.values, dtype=np.float64)
+        most = LARGEST if self.lines_mm is None and not self.irradiance else _MOST_LINES
+        if values.ndim != 2 or values.shape[0] != values.shape[1] or not 1 <= len(values) <= most:
+            raise MitsimError(f"{self.words}: has shape {values.shape}; give a square of 1 to {most} features a side")
+        if not (np.isfinite(self.feature_mm) and self.feature_mm > 0):
+            raise MitsimError(f"{self.words}: feature size is {self.feature_mm} mm; give a finite number above 0")
+        if not (np.isfinite(values).all() if self.irradiance else values.min() >= 0 and values.max() <= 1):
+            raise MitsimError(f"{self.words}: transmissions are {values.min():g} to {values.max():g}; give 0 to 1")
+        if not values.max() > (0 if self.irradiance else _ROUNDING):
+            raise MitsimError(f"{self.words}: no feature lets light through; open some")
+        self._hold(values=values)
+        if self.lines_mm is not None:
+            self._hold(lines_mm=np.array(self.lines_mm, dtype=np.float64))
+
+    def _values(self) -> tuple[object, ...]:
+        return self.feature_mm, self.words, self.digest, self.flaws, self.irradiance
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of the transmissions, and of the lines where they are not even, 64 hexadecimal digits."""
+        digest = hashlib.sha256(np.ascontiguousarray(self.values).tobytes())
+        if self.lines_mm is not None:
+            digest.update(self.lines_mm.tobytes())
+        return digest.hexdigest()
+
+    @property
+    def identity(self) -> str:
+        """What manifests say of it: equal for equal plates alone."""
+        return f"{self.words}, features of {self.feature_mm:g} mm, sha256 {self.digest}"
+
+    @property
+    def extent_mm(self) -> float:
+        """Side of the square [mm]; it spans -extent/2 .. +extent/2."""
+        return len(self.values) * self.feature_mm if self.lines_mm is None else float(np.ptp(self.lines_mm))
+
+    @cached_property
+    def lines(self) -> FloatArray:
+        """(N + 1,) coordinates of the lines between rows, and between columns [mm]."""
+        if self.lines_mm is not None:
+            return self.lines_mm
+        return np.asarray((np.arange(len(self.values) + 1) - len(self.values) / 2) * self.feature_mm)
+
+    @property
+    def blur_mm(self) -> float:
+        """Standard deviation of the Gaussian that its profiles are blurred by [mm]."""
+        return self.flaws.blur_mm
+
+    @property
+    def even(self) -> bool:
+        """Whether its features are squares of one size with sharp edges."""
+        return self.lines_mm is None and not self.blur_mm
+
+    @property
+    def plain(self) -> bool:
+        """Whether it has square features, and no flaws."""
+        return self.lines_mm is None and self.flaws == NO_FLAWS
+
+    @property
+    def open_part(self) -> float:
+        """Mean transmission of the square, without dust."""
+        width = np.diff(self.lines) / self.extent_mm
+        return float(width @ self.values @ width)
+
+    @cached_property
+    def opening_mm(self) -> float:
+        """Mean width of its openings along rows, or along columns if that is less [mm]: of what lets half as much light
+        through as its clearest feature. Of a drawing it is that of what is drawn, however fine its pixels are."""
+        is_open, widths = self.values >= self.values.max() / 2, np.diff(self.lines)
+        return min(mean_opening(is_open, widths), mean_opening(is_open.T, widths))
+
+    @cached_property
+    def crosses(self) -> tuple[Term, ...] | None:
+        """The transmission as at most two exact terms (weight, row profile (N,), column profile (N,)), or None."""
+        rest = self.values.copy()
+        terms: list[Term] = []
+        while True:
+            row, column = np.unravel_index(np.argmax(np.abs(rest)), rest.shape)
+            pivot = rest[row, column]
+            if abs(pivot) <= _ROUNDING:
+                return tuple(terms)
+            if len(terms) == FEW:
+                return None
+            terms.append((1.0, rest[:, column].copy(), rest[row] / pivot))
+            rest -= np.outer(terms[-1][1], terms[-1][2])
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """The transmission as terms (weight, row profile (N,), column profile (N,)), but for :attr:`left_out`."""
+        return self._terms_and_rest[0]
+
+    @property
+    def left_out(self) -> float:
+        """What the terms leave of the transmission, root mean square, as a part of all; 0 where they are exact."""
+        return self._terms_and_rest[1]
+
+    @cached_property
+    def _terms_and_rest(self) -> tuple[tuple[Term, ...], float]:
+        if self.crosses is not None:
+            return self.crosses, 0.0
+        if self.irradiance:
+            return _large_terms(self.values)
+        rows, columns, left, singular, right = _factors(self.values, self.lines_mm)
+        beyond = np.sqrt(np.cumsum(np.square(singular[::-1]))[::-1])  # what the terms from each on hold
+        count = int(np.count_nonzero(beyond > LEFT_OUT * beyond[0]))
+        terms = tuple((float(singular[k]), left[rows, k], right[k, columns]) for k in range(count))
+        return terms, float(beyond[count] / beyond[0]) if count < len(beyond) else 0.0
+
+    @cached_property
+    def residuals(self) -> tuple[float, float]:
+        """What the best single term leaves of the transmission, rms, as a part of it: as it is, and of what is left
+        when the means of rows and columns are taken off, as a part of that."""
+        width = None if self.lines_mm is None else np.diff(self.lines_mm)
+        centred = self.values - np.average(self.values, axis=0, weights=width)
+        centred -= np.average(centred, axis=1, weights=width)[:, None]
+        return _beyond_one(self.values, self.lines_mm), _beyond_one(centred, self.lines_mm)
+
+    @property
+    def centred(self) -> bool:
+        """Whether a separable solver does better without the means of rows and columns, as for a FlatCam mask."""
+        plain, without = self.residuals
+        return without < plain
+
+    @property
+    def residual(self) -> float:
+        """What the best separable mask leaves of what a solver uses of this one, rms, as a part of it."""
+        return min(self.residuals)
+
+    @cached_property
+    def amplitude(self) -> Plate:
+        """The plate whose values are the factors of a field: roots of the transmissions, without phase."""
+        return self if self.binary else replace(self, values=np.sqrt(self.values))
+
+    @cached_property
+    def binary(self) -> bool:
+        """Whether every feature is open or closed."""
+        return bool(np.isin(self.values, (0, 1)).all())
+
+    @property
+    def diffracts(self) -> bool:
+        """Whether its diffraction is worked out: not of light that has gone through it, nor behind blurred edges of
+        more than one separable term."""
+        sharp = not self.blur_mm or (self.crosses is not None and len(self.crosses) == 1 and not self.flaws.turn_deg)
+        return not self.irradiance and sharp
+
+    @property
+    def may_be_thick(self) -> bool:
+        """Whether the shadow of two such faces is worked out."""
+        return self.crosses is not None and self.flaws == NO_FLAWS
+
+    @cached_property
+    def grids(self) -> tuple[tuple[BoolArray, BoolArray], ...] | None:
+        """What is open as grids that do not overlap, as :attr:`mitsim.devices.mask.Mask.openings`; None where over 4, and
+        for a mask that has no even features."""
+        if not self.binary or not self.plain:
+            return None
+        patterns, which = np.unique(self.values[self.values.any(axis=1)], axis=0, return_inverse=True)
+        if len(patterns) > _GRIDS:
+            return None
+        row_of = np.full(len(self.values), -1)
+        row_of[self.values.any(axis=1)] = which.ravel()
+        return tuple((row_of == k, pattern.astype(bool)) for k, pattern in enumerate(patterns))
+
+    @property
+    def openings(self) -> tuple[tuple[BoolArray, BoolArray], ...]:
+        """Grids that hold all that is open: exactly that with :attr:`grids`, else all rows and columns that let light
+        through anywhere; where features are not even, or turned, a square of :attr:`cover` features a side."""
+        if self.grids is not None:
+            return self.grids
+        if not self.plain:
+            every = np.ones(self.cover, dtype=bool)
+            return ((every, every),)
+        return ((np.asarray(self.values.any(axis=1)), np.asarray(self.values.any(axis=0))),)
+
+    @property
+    def cover(self) -> int:
+        """Features of a side of a square, its centre the mask's, that holds the mask as it is mounted."""
+        return int(np.ceil(self.flaws.reach(self.extent_mm) / self.feature_mm))
+
+    def transmission(self, s_row: npt.ArrayLike, s_col: npt.ArrayLike) -> FloatArray:
+        """Transmission (0..1) at points (``s_row``, ``s_col``) of the mask plane [mm], blur and dust apart; the arrays
+        broadcast."""
+        count = len(self.values)
+        s_row, s_col = self.flaws.turned_back(np.asarray(s_row), np.asarray(s_col))
+        if self.lines_mm is None:
+            row, column = (np.floor(np.asarray(s) / self.feature_mm + count / 2) for s in (s_row, s_col))
+        else:
+            row, column = (np.searchsorted(self.lines_mm, s, side="right") - 1.0 for s in (s_row, s_col))
+        inside = (row >= 0) & (row < count) & (column >= 0) & (column < count)
+        place = (np.where(inside, at, 0).astype(np.intp) for at in np.broadcast_arrays(row, column))
+        return np.asarray(np.where(inside, self.values[tuple(place)], 0.0))
+
+
+@lru_cache(maxsize=8)
+def within(plate: Plate, reach_mm: float) -> Plate:
+    """The ``plate`` with its dust, and without what lies beyond ``reach_mm`` of its centre where that saves terms."""
+    flaws = plate.flaws
+    if flaws.turn_deg:
+        reach_mm *= 2**0.5
+    seen = reach_mm + flaws.margin_mm
+    if flaws.dust is not None:
+        lines, values = dusted(plate.lines, plate.values, flaws.dust, seen)
+        return within(replace(plate, lines_mm=lines, values=values, flaws=flaws.clean), reach_mm)
+    if plate.lines_mm is not None:
+        inside = (plate.lines_mm[1:] > -seen) & (plate.lines_mm[:-1] < seen)
+        part, lines = (
+            plate.values[np.ix_(inside, inside)],
+            plate.lines_mm[np.append(inside, False) | np.append(False, inside)],
+        )
+        few = plate.crosses is not None or inside.all() or not part.any()
+        return plate if few else replace(plate, values=part, lines_mm=lines)
+    beyond = int((plate.extent_mm / 2 - seen) / plate.feature_mm)
+    if beyond <= 0 or plate.crosses is not None:
+        return plate
+    more = 1
+    while beyond > 0:
+        part = plate.values[beyond:-beyond, beyond:-beyond]
+        if part.any():
+            return replace(plate, values=part)
+        # Closed all over, which no plate is: out to the next open feature.
+        beyond, more = beyond - more, 2 * more
+    return plate
+
+
+def _factors(
+    values: FloatArray, lines: FloatArray | None = None
+) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], FloatArray, FloatArray, FloatArray]:
+    """Singular value decomposition of ``values`` by their distinct rows and columns, of which drawings have few.
+
+    Rows and columns count by their widths between ``lines``, where these are not even.
+
+    Returns
+    -------
+    (N,) which distinct row and which distinct column each is, their factors (rows, k) and (k, columns), and (k,)
+    singular values between them.
+    """
+    widths = np.ones(len(values)) if lines is None else np.diff(lines) * (len(lines) / np.ptp(lines))
+    rows, row = np.unique(values, axis=0, return_inverse=True)
+    columns, column = np.unique(rows, axis=1, return_inverse=True)
+    weights = np.sqrt(np.bincount(row.ravel(), widths))[:, None], np.sqrt(np.bincount(column.ravel(), widths))
+    left, singular, right = np.linalg.svd(weights[0] * columns * weights[1], full_matrices=False)
+    return row.ravel(), column.ravel(), left / weights[0], singular, right / weights[1]
+
+
+def _large_terms(values: FloatArray) -> tuple[tuple[Term, ...], float]:
+    """Terms of large ``values`` by their Gram matrix, in a fifth of the time; what they leave is told to 1e-8."""
+    squared, turn = np.linalg.eigh(values.T @ values)
+    within = np.cumsum(np.maximum(squared, 0))  # what smaller ones hold
+    kept = np.flatnonzero(within > RASTER_LEFT_OUT**2 * within[-1])[::-1]
+    left = values @ turn[:, kept]
+    rest = float(np.sqrt(within[kept[-1] - 1] / within[-1])) if kept[-1] else 0.0
+    return tuple((1.0, left[:, k], turn[:, place]) for k, place in enumerate(kept)), rest
+
+
+def _beyond_one(values: FloatArray, lines: FloatArray | None) -> float:
+    """What the best separable product leaves of ``values`` between ``lines``, root mean square, as a part of them."""
+    singular = _factors(values, lines)[3]
+    total = np.square(singular).sum()
+    rest = float(np.sqrt(np.square(singular[1:]).sum() / total)) if total else 0.0
+    return rest if rest > _ROUNDING * len(values) else 0.0
+
+
+# -------- A drawing or scan of a mask
+
+_DRAWING = Wanted("mask drawing", most=LARGEST, bits=(1, 2, 4, 8, 16, 32))
+"""2 and 4 bits are read as 8, in which white is the same."""
+_PICTURES = ".png", ".tif", ".tiff"
+"""Files whose whole numbers are parts of white; other files hold transmissions."""
+
+
+def read_drawing(path: Path) -> FloatArray:
+    """(rows, columns) transmissions, 0 to 1, of the drawing ``path``; a picture's values are linear in transmission.
+
+    Row 0 is at the top and column 0 at the left of who looks from the sensor toward the scene. MitsimError for a file
+    that is no PNG, TIFF, NPY or OpenEXR, has colours, transparency or several pages, or numbers outside 0 to 1.
+    """
+    rows, columns = image_size(path, _DRAWING)
+    if (rows - columns) % 2 and 2 * max(rows, columns) > LARGEST:
+        raise _DRAWING.refusal(
+            path,
+            f"{rows} x {columns} pixels: about its centre the shorter side needs half a pixel, so features become half "
+            f"as large, of which {LARGEST} a side are allowed; make its sides differ by an even number",
+        )
+    values = read_image(path, _DRAWING)
+    white = own_end(values) if path.suffix.lower() in _PICTURES else None
+    transmissions = np.asarray(values, dtype=np.float64) / (white or 1.0)
+    if transmissions.min() < 0 or transmissions.max() > 1:
+        raise _DRAWING.refusal(path, "has values outside 0 to 1; give transmissions")
+    return transmissions
+
+
+def squared(values: FloatArray, feature_mm: float) -> tuple[float, FloatArray]:
+    """A drawing ``values`` (rows, columns) of pixels of ``feature_mm`` with opaque margins that make it square about
+    its centre, and before it the side of its pixels: half of that where the margins need half a pixel."""
+    if (values.shape[0] - values.shape[1]) % 2:
+        values, feature_mm = values.repeat(2, axis=0).repeat(2, axis=1), feature_mm / 2
+    side = max(values.shape)
+    margins = [((side - own) // 2,) * 2 for own in values.shape]
+    return feature_mm, np.pad(values, margins)

@@ -1,0 +1,296 @@
+"""A projector's light: a TOML file in, a checked and frozen model with the spectrum of its photons out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from mitsim.core.arrays import ByValue, FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.core.spectral_manifests import MOST_LINES
+
+_ROUNDING = 1e-6
+"""How far the weights of a spectrum may sum from 1: six written digits."""
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum(ByValue):
+    """Wavelengths and the share of the photons at each; MitsimError for arrays that are none.
+
+    Attributes
+    ----------
+    wavelengths_nm
+        (w,) wavelengths [nm], above 0; read-only.
+    weights
+        (w,) shares, not negative, that sum to 1; read-only.
+    """
+
+    wavelengths_nm: FloatArray
+    weights: FloatArray
+
+    def __post_init__(self) -> None:
+        wavelengths, weights = (np.array(v, dtype=np.float64) for v in (self.wavelengths_nm, self.weights))
+        if wavelengths.ndim != 1 or wavelengths.size == 0 or wavelengths.shape != weights.shape:
+            raise MitsimError(
+                f"spectrum of {wavelengths.shape} wavelengths and {weights.shape} weights; give one weight a wavelength"
+            )
+        if not (np.isfinite(wavelengths).all() and (wavelengths > 0).all()):
+            raise MitsimError(f"spectrum has a wavelength of {wavelengths.min()} nm; give finite numbers above 0")
+        if not ((weights >= 0).all() and abs(weights.sum() - 1) < _ROUNDING):
+            raise MitsimError(
+                f"spectrum weights are at least {weights.min()} and sum to {weights.sum()}; "
+                "give shares of 0 or more that sum to 1"
+            )
+        self._hold(wavelengths_nm=wavelengths, weights=weights)
+
+    @property
+    def mean(self) -> Spectrum:
+        """All photons at their mean wavelength."""
+        return Spectrum(np.array([np.sum(self.wavelengths_nm * self.weights)]), np.ones(1))
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Spectral lines that light is traced at, all of them along one path.
+
+    Attributes
+    ----------
+    wavelengths_nm
+        of the lines [nm].
+    shares
+        part of the power that a scene states in each of them; 1 in all, unless some lines are left out.
+    """
+
+    wavelengths_nm: tuple[float, ...]
+    shares: tuple[float, ...]
+
+    @property
+    def several(self) -> bool:
+        """Whether light is told apart by line."""
+        return len(self.wavelengths_nm) > 1
+
+    @property
+    def single(self) -> tuple[Lines, ...]:
+        """Each of them alone."""
+        pairs = zip(self.wavelengths_nm, self.shares, strict=True)
+        return tuple(Lines((wavelength,), (share,)) for wavelength, share in pairs)
+
+    @property
+    def apart(self) -> tuple[Lines, ...]:
+        """Each of them at its own place among all: a path carries the one, and the others are that wavelength without
+        power."""
+        size = len(self.shares)
+        return tuple(
+            Lines((wavelength,) * size, tuple(share if at == place else 0.0 for at in range(size)))
+            for place, (wavelength, share) in enumerate(zip(self.wavelengths_nm, self.shares, strict=True))
+        )
+
+    @property
+    def mean_nm(self) -> float:
+        """The one wavelength that carries as many photons per watt [nm], to a picometre."""
+        if not self.several:
+            return self.wavelengths_nm[0]
+        return round(float(np.average(self.wavelengths_nm, weights=self.shares)), 3)
+
+    @property
+    def shining(self) -> Lines:
+        """Those that have power, shortest first."""
+        power: dict[float, float] = {}
+        for wavelength, share in sorted(zip(self.wavelengths_nm, self.shares, strict=True)):
+            if share > 0:
+                power[wavelength] = power.get(wavelength, 0.0) + share
+        return Lines(tuple(power), tuple(power.values()))
+
+    def bands(self, count: int) -> tuple[Lines, ...]:
+        """The lines of each of ``count`` bands, shortest first: neighbours, cut where the power's mean squared distance
+        from its band's :attr:`mean_nm` is least. By each band's mean and power, a sum over lines is a Gauss rule of
+        one node for it.
+
+        MitsimError for fewer than one band, or more than lines with power.
+        """
+        lines = self.shining
+        size = len(lines.shares)
+        if not 1 <= count <= size:
+            raise MitsimError(f"{count} bands of {size} lines of light: give 1 to {size}")
+        shares, waves = np.array(lines.shares), np.array(lines.wavelengths_nm)
+        power, first, second = (np.append(0, np.cumsum(shares * waves**k)) for k in range(3))
+        start, end = np.meshgrid(np.arange(size + 1), np.arange(size + 1), indexing="ij")
+        own, mean, square = (part[end] - part[start] for part in (power, first, second))
+        spread = np.where(end > start, square - mean**2 / np.where(end > start, own, 1), np.inf)
+        least, cuts = spread[0], []
+        for _ in range(count - 1):
+            through = least[:, None] + spread
+            cuts.append(through.argmin(axis=0))
+            least = through.min(axis=0)
+        edges = [size]
+        for cut in reversed(cuts):
+            edges.insert(0, int(cut[edges[0]]))
+        edges.insert(0, 0)
+        return tuple(Lines(lines.wavelengths_nm[a:b], lines.shares[a:b]) for a, b in pairwise(edges))
+
+
+Nanometres = Annotated[float, Field(ge=1, le=1e6)]
+"""Wavelength [nm]: from soft X-rays to a millimetre."""
+Share = Annotated[float, Field(ge=0, le=1e6)]
+"""Power beside the other lines' power: a millionth is none."""
+
+
+class Coherence(BaseModel):
+    """What decides the contrast of a laser projector's speckle (:func:`mitsim.optics.speckle.contrast_of`)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    beam_radius_mm: float | None = Field(
+        default=None,
+        ge=1e-3,
+        le=1e3,
+        description="1/e^2 radius of a scanned beam's spot [mm]; none: all is lit at once",
+    )
+    """A micrometre, less than any grain, to a metre, which is all at once."""
+    polarisation: float = Field(
+        default=0.0, ge=0, le=1, description="degree of polarisation of the scattered light; 0: paper, paint; 1: metal"
+    )
+    roughness_um: float | None = Field(
+        default=None, ge=0, le=1e6, description="surface's height, standard deviation [um]; none: lines speckle apart"
+    )
+    linewidth_nm: float = Field(
+        default=0.0, ge=0, le=1e3, description="standard deviation of each line [nm]; needs roughness_um"
+    )
+    """Laser diodes have some 1."""
+
+    @model_validator(mode="after")
+    def _a_linewidth_needs_a_roughness(self) -> Coherence:
+        if self.linewidth_nm and self.roughness_um is None:
+            raise ValueError(f"linewidth_nm: got {self.linewidth_nm:g} without roughness_um; give both")
+        return self
+
+
+class ProjectorModel(BaseModel):
+    """A projector's light and lens, and where their numbers come from.
+
+    Ranges hold every device known, with room. The fields from ``luminous_flux_lm`` on are not simulated: from them
+    follows the power that scenes state, irradiance = flux / efficacy / area of the picture.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    name: str = Field(description="what the projector is called in reports")
+    effective_wavelength_nm: Nanometres = Field(description="one wavelength that carries as many photons per watt [nm]")
+    wavelengths_nm: tuple[Nanometres, ...] = Field(
+        (), strict=False, max_length=256, description="spectral lines [nm]; none: the effective wavelength"
+    )
+    """A lamp's visible spectrum in steps of 2 nm has 200; each costs a shadow of its own."""
+    radiant_shares: tuple[Share, ...] = Field(
+        (), strict=False, description="part of the power in each line, relative to their sum"
+    )
+    contrast_ratio: float = Field(
+        math.inf, gt=1, allow_inf_nan=True, description="light of a white pixel over that of a black one"
+    )
+    """Without an upper end: inf is a black that is black."""
+    aperture_radius_mm: float = Field(0.0, ge=0, le=1000, description="radius of the lens [mm]; 0: pinhole")
+    """Lenses for the largest screens have some 100."""
+    focus_mm: float | None = Field(
+        None, ge=1, le=1e7, description="distance of the sharp plane [mm]; none: scene_distance"
+    )
+    """A millimetre, for microscopes, to 10 km."""
+    speckle_contrast: float = Field(0.0, ge=0, le=1, description="of one sensor pixel's light; see docs/physics.md")
+    """1 is speckle fully developed; more needs light that is not laser light."""
+    speckle: Coherence | None = Field(
+        None, description="table, in place of a number: what the contrast is computed from"
+    )
+    blur_pixels: float = Field(0.0, ge=0, le=16, description="spot's standard deviation [pixels]")
+    """16 leaves 0.7 % of the contrast of stripes of 16 pixels: a projector with fewer pixels than it says."""
+    luminous_flux_lm: float | None = Field(None, ge=1e-3, le=1e6, description="light of a white picture [lm]")
+    """The largest cinemas have 75 000."""
+    luminous_efficacy_lm_per_w: float | None = Field(None, ge=0, le=684, description="lumens per watt of light")
+    """683 at most, at 555 nm."""
+    radiant_flux_w: float | None = Field(None, ge=1e-9, le=1e5, description="power of a white picture's light [W]")
+    """The largest cinemas have some 300."""
+    throw_ratio: float | None = Field(None, ge=0.01, le=100, description="distance over width of the picture")
+    """0.2 beside the screen, 15 across a hall."""
+    columns: int | None = Field(None, ge=1, le=65536, description="pixels a row of the device's own raster")
+    rows: int | None = Field(None, ge=1, le=65536, description="rows of the device's own raster")
+    pixel_aspect: float = Field(
+        1.0, ge=0.1, le=10, description="width of a pixel of this raster on the scene, over its height; 1: square"
+    )
+    """0.1 to 10: a picture of 16:9 in a raster ten times too wide or too high."""
+    laser_class: Literal["1", "1C", "1M", "2", "2M", "3R", "3B", "4"] | None = Field(
+        None, description="class printed on the device (IEC 60825-1)"
+    )
+    assumed: tuple[str, ...] = Field((), strict=False, description="fields without a public measurement")
+    derived: tuple[str, ...] = Field((), strict=False, description="fields computed from others")
+    source: str = Field("", description="where the numbers come from")
+
+    @model_validator(mode="after")
+    def _lines_have_shares(self) -> ProjectorModel:
+        if len(self.wavelengths_nm) != len(self.radiant_shares):
+            raise ValueError(
+                f"{len(self.wavelengths_nm)} wavelengths_nm and {len(self.radiant_shares)} radiant_shares; "
+                "give one share a line"
+            )
+        if self.radiant_shares and not sum(self.radiant_shares) > 0:
+            raise ValueError("radiant_shares are all 0; at least one line must have power")
+        return self
+
+    @model_validator(mode="after")
+    def _one_contrast(self) -> ProjectorModel:
+        if self.speckle is not None and "speckle_contrast" in self.model_fields_set:
+            raise ValueError(f"got speckle_contrast {self.speckle_contrast:g} and the table speckle; give one of them")
+        return self
+
+    @model_validator(mode="after")
+    def _listed_fields_exist(self) -> ProjectorModel:
+        unknown = [name for name in (*self.assumed, *self.derived) if name not in type(self).model_fields]
+        if unknown:
+            raise ValueError(f"assumed and derived list fields of this file, and {unknown[0]!r} is none")
+        return self
+
+    @property
+    def black_level(self) -> float:
+        """Light of a black pixel, as a part of a white one's."""
+        return 1 / self.contrast_ratio
+
+    @property
+    def lines(self) -> Lines:
+        """Lines of the light, the effective wavelength where none are known, and the part of the power in each."""
+        shares = self.radiant_shares or (1.0,)
+        total = sum(shares)
+        return Lines(self.wavelengths_nm or (self.effective_wavelength_nm,), tuple(share / total for share in shares))
+
+    def at(self, wavelength_nm: float) -> ProjectorModel:
+        """The same projector that shows one line of ``wavelength_nm`` alone."""
+        alone = {"wavelengths_nm": (wavelength_nm,), "radiant_shares": (1.0,), "effective_wavelength_nm": wavelength_nm}
+        return self.model_copy(update=alone)
+
+    @property
+    def traced_lines(self) -> Lines:
+        """Its lines, which paths carry together; MitsimError for more than they can."""
+        lines = self.lines
+        if len(lines.shares) > MOST_LINES:
+            raise MitsimError(
+                f"colour: projector {self.name} has {len(lines.shares)} lines, and a path carries {MOST_LINES}; give "
+                f"bands, bands:{MOST_LINES} at most, or leave colour out"
+            )
+        return lines
+
+    def in_bands(self, count: int) -> ProjectorModel:
+        """The same projector whose lines are ``count`` bands of its own, each at its mean wavelength, as
+        :meth:`Lines.bands` cuts them. MitsimError as there."""
+        bands = self.lines.bands(count)
+        merged = {
+            "wavelengths_nm": tuple(band.mean_nm for band in bands),
+            "radiant_shares": tuple(sum(band.shares) for band in bands),
+        }
+        return self.model_copy(update=merged)
+
+    @property
+    def spectrum(self) -> Spectrum:
+        """Photons at each line: power times wavelength."""
+        wavelengths = np.array(self.wavelengths_nm or (self.effective_wavelength_nm,))
+        photons = np.array(self.radiant_shares or (1.0,)) * wavelengths
+        return Spectrum(wavelengths, photons / photons.sum())

@@ -1,0 +1,508 @@
+"""The numbers that describe an image sensor: a TOML file in, a checked and frozen model out."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from mitsim.core.configuration import read_toml, validated
+from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.manifests import Digital
+
+EXPOSURE_S = 1e-12, 1e6
+"""Shortest and longest exposure [s]: gated avalanche diodes open for 1e-10 s; cooled CCDs collect for some 1e4 s."""
+EXPOSURE_FRACTION = 1e-6, 1.0
+"""Mean of the brightest pixel as a part of the full well; a millionth is less than an electron of most wells."""
+ExposureFraction = Annotated[
+    float, Field(strict=True, ge=EXPOSURE_FRACTION[0], le=EXPOSURE_FRACTION[1], allow_inf_nan=False)
+]
+_LARGEST_CODE = 2**32 - 1
+"""What a frame's uint32 holds."""
+_ALWAYS = {"binning", "dark_current_e_per_s", "black_level_dn", "bits"}
+"""Fields that manifests hold whatever they are: calibrations of 0.4 do."""
+_LEVELS = 256
+"""Parts of the full well at which the linearity polynomial must rise: its terms end at the fifth power."""
+
+
+class SensorModel(BaseModel):
+    """A camera after EMVA 1288 release 4.0: per-pixel electronics and how pixels are binned.
+
+    The fields describe one **pixel**; a frame's element is a **superpixel** of `binning` x `binning` = b^2
+    pixels whose values are summed. The `superpixel_` properties follow: area, full well and dark current
+    times b^2, gain unchanged, read noise times b (b^2 independent readings), black level and largest code
+    times b^2 (the sum of b^2 codes needs more bits than one). The sum is rounded once where a camera rounds
+    each pixel, which leaves out (b^2 - 1)/12 DN^2 of variance. With `binning_on_chip` charge is summed and read
+    once: read noise, row noise, offsets, black level and largest code are those of one reading.
+
+    Every field that is left out is an effect that the camera does not have: nothing is computed for it.
+
+    Ranges hold every device known, with room: what lies outside is a slip of the unit or of the keyboard.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
+
+    name: str = Field(description="what the sensor is called in reports")
+    pixel_pitch_um: float = Field(ge=1e-3, le=1e4, description="distance between centres of pixels in a row, um")
+    """Pixels of telephones have 0.5 um, those of X-ray panels some 100 um."""
+    row_pitch_um: float | None = Field(
+        default=None,
+        ge=1e-3,
+        le=1e4,
+        description="distance between rows of pixels that are not square, um; none: as above",
+    )
+    binning: int = Field(default=1, ge=1, le=64, description="pixels summed along each side of a superpixel")
+    """Cameras bin up to 16 x 16."""
+    full_well_e: float = Field(ge=0.1, allow_inf_nan=True, description="electrons a pixel holds; inf = no limit")
+    """An avalanche diode counts one; read-outs of infrared arrays integrate 1e8, so 1e12 is the most, or inf."""
+    read_noise_e: float = Field(ge=0, le=1e6, description="standard deviation of one pixel's reading, electrons")
+    """0.2 in the quietest cameras, some 1e4 in photodiode arrays."""
+    dark_current_e_per_s: float = Field(default=0.0, ge=0, le=1e10, description="electrons a second and pixel")
+    """Warm infrared arrays have 1e8."""
+    dark_current_temperature_c: float | None = Field(
+        default=None, ge=-273.15, le=200, description="temperature that the dark current is stated at, degrees Celsius"
+    )
+    dark_doubling_c: float | None = Field(
+        default=None, ge=1, le=100, description="rise of the temperature that doubles the dark current, kelvin"
+    )
+    """5 to 10 in silicon."""
+    temperature_c: float | None = Field(
+        default=None, ge=-273.15, le=200, description="temperature of the sensor, degrees Celsius; none: as stated"
+    )
+    dark_current_spread_e_per_s: float = Field(
+        default=0.0, ge=0, le=1e10, description="its standard deviation over the pixels, electrons a second"
+    )
+    dsnu_pixel_e: float = Field(
+        default=0.0, ge=0, le=1e6, description="standard deviation of pixels' offsets, electrons"
+    )
+    dsnu_row_e: float = Field(default=0.0, ge=0, le=1e6, description="the same of offsets that a row shares")
+    dsnu_column_e: float = Field(default=0.0, ge=0, le=1e6, description="the same of offsets that a column shares")
+    """As read noise."""
+    prnu_pixel: float = Field(default=0.0, ge=0, le=0.1, description="relative standard deviation of pixels' response")
+    prnu_row: float = Field(default=0.0, ge=0, le=0.1, description="the same of what a row shares")
+    prnu_column: float = Field(default=0.0, ge=0, le=0.1, description="the same of what a column shares")
+    """Cameras have some 1e-2; beyond 0.1 the normal law of the response would reach zero."""
+    row_noise_e: float = Field(
+        default=0.0, ge=0, le=1e6, description="standard deviation of a noise that a row's pixels share, electrons"
+    )
+    hot_pixels: float = Field(default=0.0, ge=0, le=0.5, description="part of the pixels that are hot")
+    hot_dark_current_e_per_s: float = Field(
+        default=0.0, ge=0, le=1e10, description="what a hot pixel has of dark current beyond others, electrons a second"
+    )
+    dead_pixels: float = Field(default=0.0, ge=0, le=0.5, description="part of the pixels that do not respond to light")
+    pattern_seed: int = Field(
+        default=0, ge=0, lt=2**64, description="which specimen: root of all that is fixed in space, apart from a run's"
+    )
+    linearity: Annotated[tuple[float, ...], Field(strict=False, max_length=4)] = Field(
+        default=(), description="c_k of N (1 + sum c_k (N/F)^k), k = 1, 2, ..: what N of F electrons are read as"
+    )
+    crosstalk: float = Field(
+        default=0.0, ge=0, le=0.5, description="part of a pixel's light that its four neighbours get, a quarter each"
+    )
+    binning_on_chip: bool = Field(default=False, description="charge is summed and read once, in place of readings")
+    binned_full_well_e: float | None = Field(
+        default=None, ge=0.1, le=1e14, description="electrons a superpixel holds on chip; none: binning^2 full wells"
+    )
+    shutter: Literal["global", "rolling"] = Field(
+        default="global", description="whether all rows are exposed at once, or each some time after the one before"
+    )
+    line_time_us: float | None = Field(
+        default=None,
+        ge=1e-3,
+        le=1e6,
+        description="from the begin of a row's exposure to that of the next one, us; needed where light ripples",
+    )
+    """Some 1 to 100 in cameras; long exposures of a telephone's sensor stretch it to 1e4."""
+    quantum_efficiency: float | None = Field(
+        default=None,
+        ge=1e-6,
+        le=1,
+        description="electrons per photon, at source's wavelength; none: no source gives it",
+    )
+    """One electron a photon at most; photocathodes and silicon at their red end fall to 1e-4."""
+    quantum_efficiency_curve: EfficiencyCurve | None = Field(
+        default=None, description="table: electrons per photon over wavelength, in place of quantum_efficiency"
+    )
+    mosaic: Mosaic | None = Field(
+        default=None, description="colour filters of 2 x 2 pixels, row by row; none: a monochrome sensor"
+    )
+    mosaic_curves: MosaicCurves | None = Field(
+        default=None, description="tables R, G, B: curves of the pixels under each filter, in place of both"
+    )
+    gain_dn_per_e: float = Field(ge=1e-12, le=1e6, description="digital numbers per electron")
+    """1e-12 spreads the largest full well over one number; electron multiplication brings some 1e3."""
+    black_level_dn: float = Field(default=0.0, ge=0, lt=2**24, description="digital number of a pixel without charge")
+    """Below the largest ADC's last number."""
+    bits: int | None = Field(default=None, ge=1, le=24, description="bits of the ADC; None = real output")
+    """Cameras have up to 16, laboratory converters 24."""
+    source: str = Field(description="where the numbers come from")
+
+    @field_validator("full_well_e")
+    @classmethod
+    def _a_known_well_or_none(cls, electrons: float) -> float:
+        if 1e12 < electrons < math.inf:
+            raise ValueError(f"got {electrons:g}; a full well is 0.1 to 1e+12 electrons, or inf for none")
+        return electrons
+
+    @model_validator(mode="after")
+    def _room_above_black(self) -> SensorModel:
+        if self.bits is not None and self.black_level_dn >= 2**self.bits - 1:
+            raise ValueError(f"black_level_dn {self.black_level_dn} leaves no room below 2^{self.bits} - 1")
+        return self
+
+    @model_validator(mode="after")
+    def _fits_a_frame(self) -> SensorModel:
+        if self.largest_dn is not None and self.largest_dn > _LARGEST_CODE:
+            raise ValueError(
+                f"bits {self.bits} with binning {self.binning} has codes up to {self.largest_dn}; "
+                f"frames hold at most {_LARGEST_CODE}, so bin less or take fewer bits"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _effects_are_whole(self) -> SensorModel:
+        if self.temperature_c is not None and None in (self.dark_current_temperature_c, self.dark_doubling_c):
+            raise ValueError(
+                f"temperature_c {self.temperature_c:g} moves the dark current only with dark_current_temperature_c "
+                "and dark_doubling_c; give both, or leave it out"
+            )
+        if self.dark_current_spread_e_per_s and not self.dark_current_e_per_s:
+            raise ValueError(
+                f"dark_current_spread_e_per_s {self.dark_current_spread_e_per_s:g} is of a dark current of 0; "
+                "give dark_current_e_per_s"
+            )
+        if self.line_time_us is not None and self.shutter == "global":
+            raise ValueError(f"line_time_us {self.line_time_us:g} is of a rolling shutter; set shutter 'rolling'")
+        if bool(self.hot_pixels) != bool(self.hot_dark_current_e_per_s):
+            raise ValueError("hot_pixels and hot_dark_current_e_per_s go together; give both, or none")
+        if self.binned_full_well_e is not None and not self.binning_on_chip:
+            raise ValueError(
+                f"binned_full_well_e {self.binned_full_well_e:g} is of charge summed on chip; set binning_on_chip"
+            )
+        if self.linearity and not math.isfinite(self.full_well_e):
+            raise ValueError("linearity is relative to the full well; give a finite full_well_e")
+        if self.linearity:
+            parts = [level / _LEVELS for level in range(_LEVELS + 1)]
+            rises = [1 + sum((k + 1) * c * part**k for k, c in enumerate(self.linearity, 1)) for part in parts]
+            if not all(0 < rise < math.inf for rise in rises):
+                raise ValueError(f"linearity {self.linearity} falls below the full well; more light must read as more")
+        return self
+
+    @model_validator(mode="after")
+    def _one_efficiency(self) -> SensorModel:
+        names = "quantum_efficiency", "quantum_efficiency_curve", "mosaic_curves"
+        given = [name for name in names if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ValueError(f"got {' and '.join(given)}; give one of them")
+        if (self.mosaic is None) != (self.mosaic_curves is None):
+            raise ValueError("mosaic and mosaic_curves go together; give both, or none")
+        if self.mosaic is not None and self.binning > 1:
+            raise ValueError(f"mosaic {self.mosaic}: binning {self.binning} would sum its colours; set binning 1")
+        return self
+
+    def efficiency(self, wavelength_nm: float, plane: Plane | None = None) -> float:
+        """Electrons per photon.
+
+        Parameters
+        ----------
+        wavelength_nm
+            of the light; a camera whose file states one number has it at all wavelengths.
+        plane
+            whose pixels, of a camera with a mosaic; None for one without.
+
+        Raises
+        ------
+        MitsimError
+            outside the curve, for a camera whose file states no efficiency, or a plane that it has not.
+        """
+        if (self.mosaic is None) != (plane is None):
+            filters = f"a mosaic {self.mosaic}" if self.mosaic else "no mosaic"
+            asked = f"plane {plane} was" if plane else "monochrome frames were"
+            remedy = "use a monochrome camera, or --colour mosaic" if self.mosaic else "leave the plane out"
+            raise MitsimError(f"sensor {self.name!r}: has {filters}, and {asked} asked for; {remedy}")
+        curve = getattr(self.mosaic_curves, plane) if plane else self.quantum_efficiency_curve
+        try:
+            found = self.quantum_efficiency if curve is None else curve.at(wavelength_nm)
+        except MitsimError as error:
+            raise MitsimError(f"sensor {self.name!r}: {error}") from None
+        if found is None:
+            raise MitsimError(
+                f"sensor {self.name!r}: its file states no quantum_efficiency, so light makes no known number of "
+                "electrons; put one, with its source, into a copy of the file (characterise works without)"
+            )
+        return float(found)
+
+    def planes(self, wavelengths_nm: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+        """Electrons per photon of the mosaic's four pixels, row by row, each at these ``wavelengths_nm``.
+
+        MitsimError for a camera without a mosaic, and outside its curves.
+        """
+        if self.mosaic is None:
+            raise MitsimError(f"sensor {self.name!r}: has no mosaic of colour filters; use a camera that has one")
+        filters: dict[str, Plane] = {"R": "R", "G": "G", "B": "B"}
+        return tuple(tuple(self.efficiency(nm, filters[name]) for nm in wavelengths_nm) for name in self.mosaic)
+
+    @property
+    def states_efficiency(self) -> bool:
+        """Whether light makes a known number of electrons in a pixel without colour filters."""
+        return self.quantum_efficiency is not None or self.quantum_efficiency_curve is not None
+
+    @property
+    def identity(self) -> dict[str, object]:
+        """What manifests say of it: all fields but the source, and but effects that it does not name."""
+        fields = type(self).model_fields
+        return {
+            name: value
+            for name, value in self.model_dump(exclude={"source"}).items()
+            if name in _ALWAYS or value != fields[name].default
+        }
+
+    @property
+    def has_fixed_pattern(self) -> bool:
+        """Whether its pixels differ: in offset, response, dark current, or by defects."""
+        return any((*self.offset_parts, *self.response_parts, self.dark_current_spread_e_per_s, self.has_defects))
+
+    @property
+    def has_defects(self) -> bool:
+        """Whether some pixels are hot or dead."""
+        return self.hot_pixels > 0 or self.dead_pixels > 0
+
+    @property
+    def offset_parts(self) -> tuple[float, float, float]:
+        """Standard deviations of a superpixel's offset by pixel, row and column [electrons].
+
+        Of b^2 readings b share a row's offset, in each of b rows: (b^2, b^3, b^3)^(1/2) of one pixel's; on chip it is
+        one reading.
+        """
+        pixel, line = self._readings
+        return self.dsnu_pixel_e * pixel, self.dsnu_row_e * line, self.dsnu_column_e * line
+
+    @property
+    def response_parts(self) -> tuple[float, float, float]:
+        """Relative standard deviations of a superpixel's response by pixel, row and column: of means of b^2, b, b."""
+        line = math.sqrt(self.binning)
+        return self.prnu_pixel / self.binning, self.prnu_row / line, self.prnu_column / line
+
+    @property
+    def _readings(self) -> tuple[float, float]:
+        """How many times a pixel's own noise, and one that a row shares, a superpixel has."""
+        return (1.0, 1.0) if self.binning_on_chip else (float(self.binning), self.binning**1.5)
+
+    @property
+    def codes(self) -> int:
+        """Codes that are summed in a superpixel."""
+        return 1 if self.binning_on_chip else self.binning**2
+
+    @property
+    def dark_factor(self) -> float:
+        """Dark current over the stated one, 2^((T - T_stated) / T_doubling) (EMVA 1288 4.0, dark current)."""
+        if self.temperature_c is None or self.dark_current_temperature_c is None or self.dark_doubling_c is None:
+            return 1.0
+        return float(2 ** ((self.temperature_c - self.dark_current_temperature_c) / self.dark_doubling_c))
+
+    def known_line_time_s(self) -> float:
+        """From the begin of a row's exposure to that of the next one [s]: 0 of a global shutter.
+
+        MitsimError for a rolling one whose file does not state it.
+        """
+        if self.shutter == "global":
+            return 0.0
+        if self.line_time_us is None:
+            raise MitsimError(
+                f"sensor {self.name!r}: its shutter is rolling and its file states no line_time_us, so a ripple of the "
+                "light falls on no known rows; give line_time_us, with its source, or leave ripples out"
+            )
+        return self.line_time_us * 1e-6
+
+    @property
+    def superpixel_crosstalk(self) -> float:
+        """Part of a superpixel's light that its neighbours get: of even light, that of the pixels at its sides."""
+        return self.crosstalk / self.binning
+
+    @property
+    def superpixel_row_noise_e(self) -> float:
+        """Standard deviation of the noise that a row of superpixels shares [electrons]."""
+        return self.row_noise_e * self._readings[1]
+
+    @property
+    def superpixel_reading_noise_e(self) -> float:
+        """Standard deviation of all noise of a superpixel's reading, its own and its row's [electrons]."""
+        own = self.superpixel_read_noise_e
+        return math.hypot(own, self.superpixel_row_noise_e) if self.row_noise_e else own
+
+    @property
+    def full_well_dn(self) -> float:
+        """Digital number, not yet rounded, of a superpixel whose full well is full; inf without one."""
+        full = self.superpixel_full_well_e
+        bent = full * (1 + sum(self.linearity)) if self.linearity else full
+        return bent * self.gain_dn_per_e + self.superpixel_black_level_dn
+
+    @property
+    def superpixel_pitch_um(self) -> float:
+        """Distance between superpixel centres in a row, um."""
+        return self.pixel_pitch_um * self.binning
+
+    @property
+    def superpixel_area_m2(self) -> float:
+        """Light-collecting area, m^2 (the fill factor is part of the quantum efficiency)."""
+        if self.row_pitch_um is None:
+            return (self.superpixel_pitch_um * 1e-6) ** 2
+        return self.superpixel_pitch_um * self.row_pitch_um * self.binning * 1e-12
+
+    @property
+    def superpixel_full_well_e(self) -> float:
+        """Electrons a superpixel holds: b^2 full wells, or what the node on chip does."""
+        full = self.full_well_e * self.binning**2
+        return full if self.binned_full_well_e is None else min(full, self.binned_full_well_e)
+
+    @property
+    def superpixel_read_noise_e(self) -> float:
+        """Standard deviation of a superpixel's reading, electrons: b^2 independent readings add in
+        variance; on chip it is one.
+        """
+        return self.read_noise_e * self._readings[0]
+
+    @property
+    def superpixel_dark_current_e_per_s(self) -> float:
+        """Dark electrons a second and superpixel at the sensor's temperature, without those of hot pixels."""
+        return self.dark_current_e_per_s * self.binning**2 * self.dark_factor
+
+    @property
+    def superpixel_black_level_dn(self) -> float:
+        """Digital number of a superpixel without charge."""
+        return self.black_level_dn * self.codes
+
+    @property
+    def largest_dn(self) -> int | None:
+        """The largest code of a superpixel, b^2 (2^bits - 1), on chip 2^bits - 1; None for real-valued output."""
+        return None if self.bits is None else (2**self.bits - 1) * self.codes
+
+
+def check_exposure(seconds: float) -> float:
+    """Exposure of every frame of a camera, ``seconds``; ArgumentError where no camera has it."""
+    shortest, longest = EXPOSURE_S
+    if not shortest <= seconds <= longest:
+        raise ArgumentError("exposure", f"{seconds:g}: give the seconds of every frame, {shortest:g} to {longest:g}")
+    return seconds
+
+
+def load_sensor(path: Path | str) -> SensorModel:
+    """The sensor in the TOML file at ``path``, whose table ``[mask]`` is another's
+    (:func:`mitsim.devices.mask_profile.load_mask`). MitsimError names the file, field, value and rule."""
+    table = read_toml(path)
+    table.pop("mask", None)
+    return validated(SensorModel, table, f"file {path}")
+
+
+def paper_sensor(full_well_e: float, gain: float, dynamic_range_db: float) -> SensorModel:
+    """The noise model of Zheng & Asif (arXiv 2111.12862, simulation setup) as a preset of the same chain.
+
+    Y_n = G/F (Poisson(F/G Y) + N(0, s^2)) with s = F 10^(-R/20): a measurement Y (0 to G) is F/G Y
+    electrons, and the output is in the unit of Y. It neither clips at the full well nor quantises, so
+    `full_well_e` is infinite here and F sets only gain and noise; expected electrons are `measurement /
+    model.gain_dn_per_e`. The pitch is the binned one of the paper's camera and plays no part in the noise.
+
+    Parameters
+    ----------
+    full_well_e
+        F, electrons of the largest measurement.
+    gain
+        G, the largest measurement.
+    dynamic_range_db
+        R, of F over the read noise.
+    """
+    return SensorModel(
+        name="paper noise model",
+        pixel_pitch_um=11.72,
+        full_well_e=math.inf,
+        read_noise_e=full_well_e * 10 ** (-dynamic_range_db / 20),
+        quantum_efficiency=1.0,
+        gain_dn_per_e=gain / full_well_e,
+        source=f"arXiv 2111.12862, noise model with F={full_well_e}, G={gain}, R={dynamic_range_db} dB",
+    )
+
+
+# -------- How digital numbers become electrons a second
+
+
+def digital_of(sensor: SensorModel, exposure_s: float) -> Digital:
+    """What frames of the binned ``sensor`` mean at an exposure of ``exposure_s``."""
+    full = sensor.full_well_dn
+    largest = math.inf if sensor.largest_dn is None else float(sensor.largest_dn)
+    end = min(full if math.isinf(full) else float(math.floor(full)), largest)
+    return Digital(
+        exposure_s=exposure_s,
+        black_level_dn=sensor.superpixel_black_level_dn,
+        gain_dn_per_e=sensor.gain_dn_per_e,
+        dark_current_e_per_s=sensor.superpixel_dark_current_e_per_s,
+        read_noise_e=sensor.superpixel_reading_noise_e,
+        step_dn=0.0 if sensor.largest_dn is None else 1.0,
+        saturation_dn=None if math.isinf(end) else end,
+    )
+
+
+# -------- Quantum efficiency by wavelength
+
+Plane = Literal["R", "G", "B"]
+"""Colour of a filter over a pixel."""
+Mosaic = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
+"""Filters of 2 x 2 pixels, row by row from the frame's first pixel (Bayer, US patent 3 971 065)."""
+_MOST_POINTS = 1024
+"""The visible and near infrared in steps of a nanometre have 800."""
+
+
+class EfficiencyCurve(BaseModel):
+    """Electrons per photon over wavelength, linear between its points and unknown outside them."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    wavelengths_nm: tuple[Annotated[float, Field(ge=1, le=1e6)], ...] = Field(
+        strict=False, min_length=2, max_length=_MOST_POINTS, description="wavelengths of its points, rising [nm]"
+    )
+    """As a projector's."""
+    efficiency: tuple[Annotated[float, Field(ge=0, le=1)], ...] = Field(
+        strict=False, min_length=2, max_length=_MOST_POINTS, description="electrons per photon at each"
+    )
+
+    @model_validator(mode="after")
+    def _a_curve(self) -> EfficiencyCurve:
+        if len(self.wavelengths_nm) != len(self.efficiency):
+            raise ValueError(
+                f"got {len(self.wavelengths_nm)} wavelengths_nm and {len(self.efficiency)} of efficiency; "
+                "give one efficiency a wavelength"
+            )
+        for low, high in zip(self.wavelengths_nm, self.wavelengths_nm[1:], strict=False):
+            if high <= low:
+                raise ValueError(f"wavelengths_nm: got {high:g} after {low:g}; give rising wavelengths")
+        if not any(self.efficiency):
+            raise ValueError("efficiency: all are 0; give electrons per photon above 0 somewhere")
+        return self
+
+    def at(self, wavelength_nm: float) -> float:
+        """Electrons per photon of ``wavelength_nm``; MitsimError outside the curve."""
+        first, last = self.wavelengths_nm[0], self.wavelengths_nm[-1]
+        if not first <= wavelength_nm <= last:
+            raise MitsimError(
+                f"got {wavelength_nm:g} nm; the curve of quantum efficiency is of {first:g} to {last:g} nm; "
+                "use light of these"
+            )
+        # Without numpy, which would be half the time of a refusal.
+        above = max(1, bisect_left(self.wavelengths_nm, wavelength_nm))
+        part = (wavelength_nm - self.wavelengths_nm[above - 1]) / (
+            self.wavelengths_nm[above] - self.wavelengths_nm[above - 1]
+        )
+        return self.efficiency[above - 1] * (1 - part) + self.efficiency[above] * part
+
+
+class MosaicCurves(BaseModel):
+    """Curves of the pixels under each colour of a filter array, filters included."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    R: EfficiencyCurve = Field(description="of pixels under red filters")
+    G: EfficiencyCurve = Field(description="of pixels under green filters")
+    B: EfficiencyCurve = Field(description="of pixels under blue filters")

@@ -1,0 +1,741 @@
+"""Light of a scene: from a bench and an accuracy to sampled light, its frames and their error."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial, reduce
+from itertools import product
+from operator import add
+from typing import Any
+
+import numpy as np
+
+from mitsim.bench.bench import Apparatus
+from mitsim.bench.board import before_board
+from mitsim.core.arguments import checked
+from mitsim.core.arrays import FloatArray, Labels
+from mitsim.core.job import Progress, silent
+from mitsim.core.parallel import Behind, single_threaded_blas
+from mitsim.core.seeds import integer
+from mitsim.devices.patterns import Lighting, PatternFamily
+from mitsim.light.cost_model import CHECKED_SHOTS, FIXED, MOST_CHECKED, SHARED_COST, tells_all
+from mitsim.light.passes import AT_ANCHORS, TRAYS, FiledLight, Simulation, Stage, expected_of
+from mitsim.light.plan import Plan
+from mitsim.light.settings import EVEN, GROUPS, LANES_AT_ONCE, MOST_PATHS, Estimate, Settings, even, whole
+from mitsim.light.truth import Truth, trace_truth
+from mitsim.optics.frames import ExpectedFrames, bound_of, shares_of_bound
+from mitsim.transport.accumulator import Ledger, LitSums, fetched
+from mitsim.transport.path_reuse import NeighbourTracer
+from mitsim.transport.records import Deposits
+
+Target = Callable[[ExpectedFrames], float]
+"""The relative Monte Carlo error to stop at, from the frames seen so far."""
+_TOLD, _OF_HEAVY = 1.2, 0.55
+"""Bound over error beyond which a few heavy paths make most of either, so that both tell little of the light: four
+groups of many paths have 1.04 to 1.3, 1.15 in the middle. A heavy path counts for less among more of them, so the bound
+then falls with their number to the power 0.8 to 0.93 in place of 0.5 (cookie_bag, seeds 2 and 4): less than its power
+of 0.55 is missing."""
+_VIEW_SAMPLES = 64
+"""Samples a cell of a picture to look at: below the step of eight bits."""
+_LOST = 0.1
+"""Part of the accuracy that light beyond all cells may have: it falls on one edge of the sensor, so a hundredth of the
+pixels may have it, and their frames are then off by ten times as much."""
+_BY_CHANCE = 1.5
+"""Ratio of the variance over 49 shots to that over 16 of them which four groups of equal shots exceed by chance in one
+of fifty (20000 trials: 1.37 in one of twenty, 1.57 in one of a hundred)."""
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How light is sampled.
+
+    Attributes
+    ----------
+    purpose
+        names the random streams: light for two purposes shares none.
+    by_pixel
+        keep the light of every projector pixel apart, for any family; else by the lighting's classes, which is faster.
+    target
+        error to stop at, where the plan's own is not wanted.
+    excess
+        from lights of all lines, by how much the error of frames that are made of them together exceeds theirs, as a
+        ratio; None: they are frames of their own.
+    """
+
+    purpose: str = "scene"
+    by_pixel: bool = True
+    target: Target | None = None
+    excess: Callable[[Sequence[SampledLight]], float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Looked:
+    """What a look at the error of frames found, for who forms them.
+
+    Attributes
+    ----------
+    groups, simulation
+        that it was a look at.
+    rows
+        class of each row of theirs.
+    probed
+        of its :class:`ExpectedFrames`.
+    """
+
+    groups: tuple[FiledLight, ...]
+    simulation: Simulation
+    rows: Labels
+    probed: FloatArray
+
+    def at(self, light: SampledLight, rows: Labels, classes: int) -> FloatArray | None:
+        """``probed`` where it is of a ``light`` whose rows belong to these of so many classes; else None.
+
+        Parameters
+        ----------
+        light
+            whose frames are to be formed.
+        rows, classes
+            class of each of its rows, and their number.
+        """
+        same = light.groups is self.groups and light.simulation is self.simulation and len(self.probed) == classes
+        return self.probed if same and np.array_equal(rows, self.rows) else None
+
+
+@dataclass(frozen=True, eq=False)
+class SampledLight:
+    """Sampled light of one scene.
+
+    Attributes
+    ----------
+    groups
+        independent estimates.
+    simulation
+        what was simulated; it turns light into frames.
+    plan, seed
+        what it was traced for, and the root of its random streams.
+    labels
+        (n^2,) row of each projector pixel: its class, or the pixel itself when any family is to be formed.
+    flux
+        (n^2,) irradiance that each pixel's direct light casts on the sensor without the mask, mean over the sensor.
+    flux_error
+        (n^2,) its standard error, from the spread of the groups.
+    paths
+        connections and paths traced.
+    sampling_error
+        relative Monte Carlo error of the frames that were checked; ``reached`` tells whether it met the target.
+    samples
+        of each group, by the name of what was traced; empty where nobody kept them.
+    looked
+        what the last look at its error found.
+    known_truth
+        :attr:`apparent`, where it was traced with that of other lines.
+    """
+
+    groups: tuple[FiledLight, ...]
+    simulation: Simulation
+    plan: Plan
+    seed: int
+    labels: Labels
+    flux: FloatArray
+    flux_error: FloatArray
+    paths: int
+    sampling_error: float
+    reached: bool
+    samples: Mapping[str, int] = field(default_factory=dict)
+    looked: Looked | None = None
+    known_truth: Truth | None = None
+
+    def __repr__(self) -> str:
+        return f"SampledLight({self.paths:.2g} paths, relative error {self.sampling_error:.1e}, of {self.bench!r})"
+
+    @property
+    def lost(self) -> float:
+        """Part of the light that came from beyond all cells and is in no frame."""
+        outside = sum(group.outside for group in self.groups)
+        return outside / sum(group.received for group in self.groups) if outside else 0.0
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Why what is made of it is flagged: by its plan, and for light that is known to be missing."""
+        if self.lost <= _LOST * self.plan.accuracy:
+            return self.plan.warnings
+        return (
+            *self.plan.warnings,
+            f"{self.lost:.1e} of the light comes from beyond the directions that the plan holds, and is in no frame: "
+            "surfaces nearer than its pilot saw, at the edge of the view; widen the projector's window or move them",
+        )
+
+    @property
+    def unreached(self) -> tuple[str, ...]:
+        """That sampling stopped before the accuracy was reached, if it did."""
+        if self.reached:
+            return ()
+        return (f"sampling stopped at {self.sampling_error:.1e}; the accuracy {self.plan.accuracy:g} was not reached",)
+
+    @property
+    def error_bound(self) -> float:
+        """What the relative error of the frames that the light was traced for is below at 95 %: by sampling, and by
+        all that its plan left out or made coarse."""
+        target = self.plan.sampling_target
+        sampling = max(self.sampling_error, target) if self.reached else self.sampling_error
+        return self.plan.total(Estimate(self.sampling_error, sampling)).bound
+
+    @property
+    def bench(self) -> Apparatus:
+        """Where it shines."""
+        return self.simulation.bench
+
+    def frames(self, lighting: Lighting, seed: int, leaking: bool = True) -> ExpectedFrames:
+        """Expected frames of some shots.
+
+        SampledLight by pixel serves every family; light by class only families that never split one of its classes.
+
+        Parameters
+        ----------
+        lighting
+            the shots.
+        seed
+            of the probes that tell their error.
+        leaking
+            whether black pixels leak, as :meth:`Simulation.expected` takes it.
+
+        Raises
+        ------
+        ValueError
+            for shots that split a class of the light.
+        """
+        rows = self.rows_of(lighting)
+        probed = self.looked.at(self, rows, lighting.weights.shape[1]) if self.looked and seed == self.seed else None
+        return self.simulation.expected(self.groups, rows, lighting, seed, leaking, probed)
+
+    @checked
+    def rows_of(self, lighting: Lighting) -> Labels:
+        """(rows,) class of ``lighting`` that each row of the light belongs to; ValueError as :meth:`frames`."""
+        rows = np.zeros(int(self.labels.max()) + 1, dtype=np.int64)
+        rows[self.labels] = lighting.labels
+        if not np.array_equal(rows[self.labels], lighting.labels):
+            raise ValueError("the light was traced for another family of patterns")
+        return rows
+
+    def summary(self) -> dict[str, Any]:
+        """What the command line reports, but for the file's name."""
+        return {
+            "n": self.bench.n,
+            "shape": list(self.bench.geometry.frame_shape),
+            "entries": sum(getattr(group, tray).nnz for group in self.groups for tray in TRAYS),
+            "accuracy": self.plan.accuracy,
+            "mc_error": self.sampling_error,
+            "total_error_bound": self.error_bound,
+            "lost_light": self.lost,
+            "paths": self.paths,
+            "seed": self.seed,
+            "variant": self.bench.variant,
+            "warnings": [*self.warnings, *self.unreached],
+        }
+
+    @checked
+    def behind(self, bench: Apparatus) -> SampledLight:
+        """The same light before the camera of another ``bench``, of which only the mask may differ: light is traced up
+        to it."""
+        return replace(self, simulation=Simulation(bench, self.simulation.settings))
+
+    def speckle(self, family: PatternFamily | None = None) -> float:
+        """Contrast of speckle in frames of a ``family`` (None: of a white picture); 0 where it is left out."""
+        return self.bench.speckle(family) if self.simulation.physics.speckle else 0.0
+
+    def merged(self) -> SampledLight:
+        """The same light as one group: frames come without a variance, and faster."""
+        return replace(self, groups=(reduce(add, self.groups) / len(self.groups),))
+
+    @cached_property
+    def apparent(self) -> Truth:
+        """What a perfect image of this light would show, with its standard error; traced on its own."""
+        return self.known_truth or trace_truth(self.bench, self.plan.settings, self.seed, self.flux_error)
+
+    @property
+    def truth(self) -> FloatArray:
+        """(n, n) apparent reflectance: each projector pixel's flux toward the camera over that of the board.
+
+        The board is the session's: one of reflectance 0.99 counts as 1.
+        """
+        return self.apparent.reflectance
+
+
+def trace_light(
+    bench: Apparatus,
+    plan: Plan,
+    lighting: Lighting,
+    seed: int,
+    sampling: Sampling | None = None,
+    progress: Progress = silent,
+) -> SampledLight:
+    """Trace until the Monte Carlo error of the frames meets its target, or the limit of 2^32 paths.
+
+    Each group gets the same number of samples; after each round a look at all shots, or a few, tells the error.
+
+    Parameters
+    ----------
+    bench, plan
+        what is traced.
+    lighting
+        whose frames are to meet the target.
+    seed
+        root of the random streams.
+    sampling
+        target, filing and streams.
+    progress
+        told how near the target is.
+    """
+    (light,) = trace_lines(bench, (bench,), plan, lighting, seed, sampling, progress)
+    return light
+
+
+@single_threaded_blas()
+def trace_lines(
+    bench: Apparatus,
+    benches: Sequence[Apparatus],
+    plan: Plan,
+    lighting: Lighting,
+    seed: int,
+    sampling: Sampling | None = None,
+    progress: Progress = silent,
+) -> list[SampledLight]:
+    """Light of each line of a projector, from paths that all lines share; as :func:`trace_light`, until the frames of
+    every line meet the target.
+
+    Parameters
+    ----------
+    bench
+        what is traced: its lines, or light that is not told apart.
+    benches
+        the same with each of its lines alone; ``bench`` itself where light is not told apart.
+    plan, lighting, seed, sampling, progress
+        as for :func:`trace_light`.
+    """
+    sampling = sampling or Sampling()
+    simulation = Simulation(bench, plan.settings)
+    own = [simulation if each is bench else Simulation(each, plan.settings) for each in benches]
+    for each in own[1:]:
+        each.by_band = own[0].by_band  # lamps' light diffracts beside each line alike: its optics are prepared once
+    labels = np.arange(bench.n**2) if sampling.by_pixel else lighting.labels
+    followed = bool(simulation.indirect or simulation.from_camera)
+    streams = [integer(seed, "transport", sampling.purpose, group) for group in range(GROUPS)]
+    groups = [_Group(simulation, labels, stream, len(benches)) for stream in streams]
+    samples = first_samples(simulation)
+    while True:
+        _trace(groups, samples)
+        lines = [_line_of(groups, line, each, plan, seed) for line, each in enumerate(own)]
+        last = lines[0].paths >= MOST_PATHS
+        enough = math.inf if last or sampling.excess or sampling.target else plan.sampling_target
+        looks = _looks(lines, partial(_parts, groups), lighting, followed, enough)
+        lights, near, worst, excess = dict[int, SampledLight](), 1.0, 0, 0.0
+        more = sampling.excess([looks[line].light for line in sorted(looks)]) if sampling.excess else 1.0
+        for line, look in looks.items():
+            light, error = look.light, look.light.sampling_error
+            # The plan's budget is for what the error may be; a user's own target for what it is expected to be.
+            if sampling.target:
+                target = sampling.target(light.frames(_some(lighting, CHECKED_SHOTS), seed, leaking=False))
+            else:
+                target = plan.sampling_target
+            seen = more * (error if sampling.target else look.bound)
+            lights[line] = replace(light, reached=seen <= target)
+            if seen > target and (beyond := _excess(seen, more * error, target)) > excess:
+                worst, excess = line, beyond
+            near = min(near, (target / seen) ** 2 if seen > 0 else 1.0)
+        progress("transport", near)
+        if last or all(light.reached for light in lights.values()):
+            return [lights[line] for line in range(len(own))]
+        samples = next_samples(simulation, samples, looks[worst].variances, excess)
+        # What the next round replaces is not held beside it: new memory is dear.
+        del lines, looks, look, lights, light
+
+
+@single_threaded_blas()
+def traced_again(light: SampledLight, simulation: Simulation, purpose: str = "scene") -> SampledLight:
+    """The same paths of a light, as far as another simulation has their tracers, filed as that does.
+
+    Parameters
+    ----------
+    light
+        with its samples.
+    simulation
+        of the same scene.
+    purpose
+        of the light, which names its random streams.
+    """
+    streams = [integer(light.seed, "transport", purpose, group) for group in range(GROUPS)]
+    groups = [_Group(simulation, light.labels, stream) for stream in streams]
+    _trace(groups, light.samples)
+    flux = np.mean([group.flux() for group in groups], axis=0)
+    return replace(light, groups=tuple(group.light() for group in groups), simulation=simulation, flux=flux)
+
+
+def _line_of(groups: Sequence[_Group], line: int, simulation: Simulation, plan: Plan, seed: int) -> SampledLight:
+    """What groups know of the light of a ``line``, whose frames a ``simulation`` forms; its error is not known yet."""
+    flux = [group.flux(line) for group in groups]
+    return SampledLight(
+        groups=tuple(group.light(line) for group in groups),
+        simulation=simulation,
+        plan=plan,
+        seed=seed,
+        labels=groups[0].labels,
+        flux=np.mean(flux, axis=0),
+        flux_error=np.std(flux, axis=0, ddof=1) / GROUPS**0.5,
+        paths=sum(group.paths for group in groups),
+        sampling_error=math.inf,
+        reached=False,
+        samples=dict(groups[0].done),
+    )
+
+
+@dataclass(frozen=True)
+class _Look:
+    """A ``light`` with the Monte Carlo error of the frames, what that is below at 95 %, and what each part of the light
+    brings to the square of the latter, by the name of what was traced, up to one factor."""
+
+    light: SampledLight
+    bound: float
+    variances: Mapping[str, float]
+
+
+Parts = Mapping[str, Sequence[FiledLight]]
+"""Groups of each part of a light, by the name of what was traced."""
+
+
+def _parts(groups: Sequence[_Group], line: int) -> Parts:
+    """Those of a ``line`` in ``groups``."""
+    return {name: [group.part(name, line) for group in groups] for name in groups[0].done}
+
+
+def _looks(
+    lines: Sequence[SampledLight], parts: Callable[[int], Parts], lighting: Lighting, followed: bool, enough: float
+) -> dict[int, _Look]:
+    """What :func:`_looked` finds of the light of each line and its ``parts``, by its number: of the noisiest first, and
+    of the others when its bound is ``enough``, as long as theirs are; else all are traced on whatever theirs is."""
+    noise = [float(np.square(light.flux_error).sum() / (np.square(light.flux).sum() or 1.0)) for light in lines]
+    looks = {}
+    for line in sorted(range(len(lines)), key=lambda line: -noise[line]):
+        looks[line] = _looked(lines[line], parts(line), lighting, followed)
+        if looks[line].bound > enough:
+            break
+    return looks
+
+
+def _looked(light: SampledLight, parts: Parts, lighting: Lighting, followed: bool) -> _Look:
+    """A look at the frames of a light.
+
+    Parameters
+    ----------
+    light, parts, lighting
+        whose frames of which shots.
+    followed
+        whether it is light over several surfaces.
+    """
+    shots, classes = lighting.weights.shape
+    whole = tells_all(classes, shots, light.bench.geometry.frame_side)
+    seen = lighting if whole else _some(lighting, MOST_CHECKED if followed else CHECKED_SHOTS)
+    # What black pixels leak moves the error as little as the frames, and would make every shot a sum of all light.
+    each = [(light.simulation, groups) for groups in parts.values()]
+    expected = expected_of(each, light.rows_of(seen), seen, light.seed, leaking=False)
+    more = _unchecked(light, lighting, seen)
+    error, bound = (ratio * of_seen for ratio, of_seen in zip(more, expected.sampling_error(), strict=True))
+    light = replace(light, sampling_error=error)
+    if whole and expected.probed is not None:
+        found = Looked(light.groups, light.simulation, light.rows_of(lighting), expected.probed)
+        light = replace(light, looked=found)
+    by_part = np.concatenate([noise.reshape(len(parts), -1, len(light.groups)) for noise in expected.noise], axis=1)
+    variances = dict(zip(parts, shares_of_bound(by_part.sum(axis=1)).tolist(), strict=True))
+    if not whole:
+        for name, groups in parts.items():
+            _, more_of_part = _unchecked(replace(light, groups=tuple(groups)), lighting, seen)
+            variances[name] *= more_of_part**2
+    return _Look(light, bound, variances)
+
+
+def _excess(seen: float, error: float, target: float) -> float:
+    """By how much the next round is to lower what is ``seen`` of an ``error`` to come to the ``target``, as a ratio."""
+    return min(seen / target, max(_TOLD * error / target, math.pow(seen / target, _OF_HEAVY)))
+
+
+def _some(lighting: Lighting, count: int) -> Lighting:
+    """So many shots of a ``lighting``, evenly spread."""
+    shots = len(lighting.weights)
+    return lighting.shots(np.unique(np.linspace(0, shots - 1, min(shots, count)).astype(int)))
+
+
+def _unchecked(light: SampledLight, lighting: Lighting, checked: Lighting) -> tuple[float, float]:
+    """How much larger the error of all shots of a ``lighting``, and its bound, are than those of the shots ``checked``.
+
+    By what the groups of the ``light`` differ in the total light of each shot: a heavy path that no checked shot sees
+    shows there, without forming a frame. What may be chance counts as 1.
+    """
+    rows = np.zeros(int(light.labels.max()) + 1, dtype=np.int64)
+    rows[light.labels] = lighting.labels
+    totals = np.array(
+        [np.bincount(rows, group.totals[: len(rows)], lighting.weights.shape[1]) for group in light.groups]
+    )
+    totals -= totals.mean(axis=0)
+    every, some = (np.square(totals @ shots.weights.T).mean(axis=1) for shots in (lighting, checked))
+    if not some.any():
+        return 1.0, 1.0
+    ratios = every.sum() / some.sum(), (bound_of(every, 1.0) / bound_of(some, 1.0)) ** 2
+    error, bound = (math.sqrt(max(ratio / _BY_CHANCE, 1.0)) for ratio in ratios)
+    return error, bound
+
+
+Filing = Callable[[], None]
+"""Adds light of one line to what a group has."""
+
+
+def _trace(groups: Sequence[_Group], wanted: Mapping[str, int]) -> None:
+    """Trace until every group has so many samples as are ``wanted`` of each stage by its name, and file all of it."""
+    with Behind[Filing](lambda file: file()) as filing:
+        for group in groups:
+            group.trace(wanted, filing)
+        filing.wait()
+
+
+class _Group:
+    """One independent estimate of the light, by line and stage: the mean over its samples so far."""
+
+    def __init__(self, simulation: Simulation, labels: Labels, seed: int, lines: int = 1) -> None:
+        self.simulation, self.labels = simulation, labels
+        self.seed, self._lines = seed, lines
+        self.done: dict[str, int] = {}
+        self.paths = 0
+        self._means: list[dict[str, FiledLight]] = [{} for _ in range(lines)]
+        self._flux = [{name: np.zeros(simulation.bench.n**2) for name in ("direct", "sharp")} for _ in range(lines)]
+
+    def trace(self, wanted: Mapping[str, int], filing: Behind[Filing]) -> None:
+        """Trace until so many samples as are ``wanted`` of each stage by its name are done.
+
+        Parameters
+        ----------
+        wanted
+            samples.
+        filing
+            what light is filed by while the next is traced: filing takes one processor, and a tracer waits for its last
+            paths. All is there when it has been waited for.
+        """
+        at_once = min(LANES_AT_ONCE, self.simulation.paths_at_once)
+        for name, stage in self.simulation.tracers().items():
+            samples = wanted.get(name, 0)
+            if self.done.get(name, 0) >= samples:
+                continue
+            seed, ledgers = integer(self.seed, stage.stream), stage.ledgers(self.labels, self._lines)
+            if name in self.done:
+                filing.wait()
+                self._spread(name, samples / self.done[name])
+            while (done := self.done.get(name, 0)) < samples:
+                count = min(max(1, at_once // stage.tracer.lanes), samples - done)
+                deposits = stage.trace(seed, done, count, ledgers)
+                lights = enumerate(deposits.by_line(self._lines))
+                filing.give([partial(self._file, name, stage, light, line, samples) for line, light in lights])
+                self.done[name] = done + count
+                self.paths += count * stage.tracer.lanes
+            if ledgers:
+                held = [(*each, samples) for each in zip(ledgers, fetched(ledgers), strict=True)]
+                filing.give([partial(self._file_ledger, name, stage, each, line) for line, each in enumerate(held)])
+
+    def _spread(self, name: str, growth: float) -> None:
+        """Make the light of a stage the mean over so many times the samples, of which no others are filed yet."""
+        for means, fluxes in zip(self._means, self._flux, strict=True):
+            means[name] /= growth
+            if name in fluxes:
+                fluxes[name] /= growth
+
+    def _file(self, name: str, stage: Stage, deposits: Deposits, line: int, samples: int) -> None:
+        """Add light of a stage and a line, and the flux of each pixel where it is direct light."""
+        if name in self._flux[line]:
+            self._flux[line][name] += self.simulation.flux(deposits, samples)
+        self._add(name, stage.file(deposits, self.labels, samples), line)
+
+    def _file_ledger(self, name: str, stage: Stage, held: tuple[Ledger, LitSums, int], line: int) -> None:
+        """Add light of a stage and a line that its ledger ``held``, of so many samples."""
+        assert stage.file_ledger is not None
+        ledger, counted, samples = held
+        if name in self._flux[line]:
+            self._flux[line][name] += self.simulation.sharp_flux(ledger, counted, samples)
+        self._add(name, stage.file_ledger(ledger, counted, self.labels, samples), line)
+
+    def _add(self, name: str, light: FiledLight, line: int) -> None:
+        means = self._means[line]
+        means[name] = means[name] + light if name in means else light
+
+    def light(self, line: int = 0) -> FiledLight:
+        """Mean over the samples, of a ``line``."""
+        return reduce(add, self._means[line].values())
+
+    def part(self, name: str, line: int = 0) -> FiledLight:
+        """The same of one stage by its ``name``."""
+        return self._means[line][name]
+
+    def flux(self, line: int = 0) -> FloatArray:
+        """(n^2,) mean over the samples, of a ``line``."""
+        return np.asarray(sum(self._flux[line].values()))
+
+
+def pinhole_view(bench: Apparatus, board_reflectance: float, seed: int) -> FloatArray:
+    """(rows, columns) apparent reflectance seen from the sensor's centre under uniform light, for people to look at.
+
+    Direct light, two cells a side of a projector pixel; 0 where the projector does not light the board.
+
+    Parameters
+    ----------
+    bench, seed
+        what is looked at, and the root of the random streams.
+    board_reflectance
+        of the board that counts as 1.
+    """
+    settings = Settings(depth=bench.geometry.scene_distance)
+
+    def view(which: Apparatus) -> FloatArray:
+        simulation = Simulation(which, settings, pixels=2 * bench.n)
+        deposits = simulation.direct.trace(integer(seed, "view"), 0, _VIEW_SAMPLES)
+        light = simulation.file_direct(deposits, np.zeros(bench.n**2, dtype=np.int64), 1).fine[[0]].toarray()
+        return np.asarray(light).reshape(simulation.fine.bundle.cells)
+
+    scene, board = view(bench), view(before_board(bench, board_reflectance))
+    return np.asarray(np.divide(scene, board, out=np.zeros(scene.shape), where=board > 0))
+
+
+# -------- Rounds of sampling
+
+_LARGEST_GROWTH = 8
+"""Most that samples of even numbers grow by in one round."""
+_LEAST_LESS, _MOST_LESS = 1.1, 6.0
+"""By how much a round lowers the variance, as a ratio: least, as each costs a look; and most, because the first rounds
+know their error badly."""
+_BEYOND = 1.05
+"""Variance that the error asks for over what is aimed at, so that another round is rare."""
+_DIRECT_RATE, _UNEVEN = 1.5, 1.2
+"""Power of the samples that the variance of direct light falls with, and variance of 3 * 2^k of them over what that of
+2^k says: 24 to 32 samples left 0.49 to 0.58, 32 to 48 0.64 to 0.70, 32 to 64 0.36 (cookie_bag, metal_blade)."""
+_FIRST = 0.8
+"""Part of the samples that the plan predicts with which sampling begins where most paths are of followed light: the
+prediction is safe. At 0.7 the corner needed a second round for the last tenth, by each of three seeds, which costs a
+look more: 4 to 17 % of its processor seconds and of the cookie bag's."""
+_PACES = dict(zip(AT_ANCHORS, ("followed", "followed_from_camera"), strict=True))
+"""What prices call the light of a stage, where it is not the stage's name."""
+
+
+def first_samples(simulation: Simulation) -> dict[str, int]:
+    """Samples of a group with which sampling begins in a ``simulation``, by the name of what is traced."""
+    part = _FIRST if _mostly_followed(simulation) else 1.0
+    return {name: int(whole(name, part * stage.predicted)) for name, stage in simulation.tracers().items()}
+
+
+def next_samples(
+    simulation: Simulation, done: Mapping[str, int], variances: Mapping[str, float], excess: float
+) -> dict[str, int]:
+    """Samples of a group after the next round, by the name of what is traced.
+
+    Parameters
+    ----------
+    simulation
+        whose light is traced.
+    done
+        samples so far.
+    variances
+        of the frames by each light, or what it brings to their bound, up to one factor.
+    excess
+        by how much the error is to be lowered, as a ratio.
+    """
+    work = _work(simulation)
+    lights = [_Sampled(name, count, variances[name], work[name]) for name, count in done.items()]
+    # A target that was set very low would overflow the square.
+    less = max(_BEYOND * min(excess, _MOST_LESS) ** 2, _LEAST_LESS)
+    return cheapest_samples(lights, sum(variances.values()) / min(less, _MOST_LESS))
+
+
+@dataclass(frozen=True)
+class _Sampled:
+    """A light by ``name``: samples ``done``, the variance that they leave, and the work of one."""
+
+    name: str
+    done: int
+    variance: float
+    work: float
+
+    def left(self, samples: int) -> float:
+        """Variance of so many ``samples``."""
+        if self.name != "direct":
+            return self.variance * self.done / samples
+        return self.variance * _of_direct(samples) / _of_direct(self.done)
+
+    @property
+    def gain(self) -> float:
+        """By how much a sample more lowers the variance, for its work."""
+        return self.variance / (self.done * self.work)
+
+    @property
+    def steps(self) -> list[int]:
+        """Even numbers of samples from those done to as many as a round may come to."""
+        found = [self.done]
+        while (following := int(even(found[-1] + 1.0))) <= _LARGEST_GROWTH * self.done:
+            found.append(following)
+        return found
+
+
+def cheapest_samples(lights: Sequence[_Sampled], allowed: float) -> dict[str, int]:
+    """Samples of ``lights`` by name that leave the ``allowed`` variance together with the least work, none fewer than
+    are done; all that a round may take where nothing leaves so little."""
+    stepped = [light for light in lights if light.name in EVEN]
+    others = [light for light in lights if light.name not in EVEN]
+    best, least = {light.name: light.steps[-1] for light in stepped}, math.inf
+    best |= {light.name: _LARGEST_GROWTH * light.done for light in others}
+    for counts in product(*(light.steps for light in stepped)):
+        left = allowed - sum(light.left(count) for light, count in zip(stepped, counts, strict=True))
+        shared = _shared_out(others, left)
+        if shared is None:
+            continue
+        found = {light.name: count for light, count in zip(stepped, counts, strict=True)} | shared
+        work = sum(light.work * (found[light.name] - light.done) for light in lights)
+        if work < least:
+            best, least = found, work
+    return {light.name: best[light.name] for light in lights}
+
+
+def _shared_out(lights: Sequence[_Sampled], allowed: float) -> dict[str, int] | None:
+    """As :func:`cheapest_samples`, where any number of samples serves; None where nothing leaves so little.
+
+    Samples of those that grow go with sqrt(variance of one / work of one), by Lagrange; a light whose next sample gains
+    less for its work than theirs rests.
+    """
+    found = {light.name: light.done for light in lights}
+    if sum(light.variance for light in lights) <= allowed:
+        return found
+    resting, growing = sorted(lights, key=lambda light: light.gain), list[_Sampled]()
+    while resting:
+        growing.append(resting.pop())
+        left = allowed - sum(light.variance for light in resting)
+        if left <= 0:
+            continue
+        scale = sum(math.sqrt(light.variance * light.done * light.work) for light in growing) / left
+        if not resting or scale**2 * resting[-1].gain <= 1:
+            return found | {light.name: math.ceil(scale * math.sqrt(light.gain) * light.done) for light in growing}
+    return None
+
+
+def _of_direct(samples: int) -> float:
+    """Variance of direct light of so many ``samples``, to any scale."""
+    return float(samples**-_DIRECT_RATE) * (1.0 if samples & (samples - 1) == 0 else _UNEVEN)
+
+
+def _work(simulation: Simulation) -> dict[str, float]:
+    """Seconds at fixed paces of a sample of each light."""
+    return {
+        name: getattr(FIXED, _PACES.get(name, name))
+        * stage.tracer.lanes
+        * (SHARED_COST if isinstance(stage.tracer, NeighbourTracer) else 1)
+        for name, stage in simulation.tracers().items()
+    }
+
+
+def _mostly_followed(simulation: Simulation) -> bool:
+    """Whether most paths that a plan predicts are of light over several surfaces."""
+    tracers = simulation.tracers()
+    paths = {name: int(whole(name, stage.predicted)) * stage.tracer.lanes for name, stage in tracers.items()}
+    return sum(count for name, count in paths.items() if name not in EVEN) > sum(paths.values()) / 2

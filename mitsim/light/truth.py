@@ -1,0 +1,214 @@
+"""What a perfect image would show: from a bench and how well frames know its light to apparent reflectance and error.
+
+Apparent reflectance is each projector pixel's flux of direct light toward the sensor over that of the calibration
+board. Both fluxes have random streams of their own, so an error of the frames is never one of the truth as well; but
+where the frames' light is noisy tells where the truth is to be sampled.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mitsim.bench.bench import Apparatus
+from mitsim.bench.board import before_board
+from mitsim.bench.effects import Physics, names
+from mitsim.core.arrays import FloatArray, mean_of_neighbours
+from mitsim.core.seeds import integer
+from mitsim.devices.session import load_recipe
+from mitsim.light.cost_model import BOARD_SAMPLES, MOST_RAYS, MOST_SAMPLES, TRUTH_GROUPS, TRUTH_PART, TRUTH_SAMPLES
+from mitsim.light.settings import Settings
+from mitsim.transport.flux import FluxTracer, IntArray
+
+_FINEST = 1e-4
+"""Standard error below which the truth is not refined: 80 dB, where no image of a sensor with a full well comes."""
+_BOARD_PART = 0.5
+"""Of the truth's error, what the board may bring: a quarter of its square, for a surface that converges quickly."""
+_RATE = 2.0
+"""Power of its samples that a pixel's variance falls with: 1 of random points, 2 of stratified ones about an edge, 3
+over smooth light. Too high a guess costs another round, too low a one some rays."""
+_ANYWHERE = 0.01
+"""Part of the mean variance that is expected of any pixel, as those that foretell it may have missed what it shows."""
+_AIM = 0.98
+"""Part of the error to aim at: half of those just at it would take another round."""
+_DOUBLINGS, _AT_ONCE = 8, 4
+"""Doublings of a pixel's samples that are weighed, and those made in one round, as the first rounds know little.
+Numbers of samples are powers of 2, at which points are even."""
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Apparent reflectance of every projector pixel, 1 = the calibration board.
+
+    Attributes
+    ----------
+    reflectance, standard_error
+        (n, n) and what sampling may have moved it by.
+    board_flux
+        (n^2,) direct light of each projector pixel on the sensor, over the board [W m^-2].
+    rays
+        that were traced for both fluxes.
+    """
+
+    reflectance: FloatArray
+    standard_error: FloatArray
+    board_flux: FloatArray
+    rays: int
+
+    @property
+    def error(self) -> float:
+        """Standard error, root mean square over the image."""
+        return float(np.sqrt(np.square(self.standard_error).mean()))
+
+    def error_of(self, flux_error: FloatArray) -> float:
+        """What sampling leaves in any image, rms over it: the standard error ``flux_error`` (n^2,) [W m^-2] of the
+        frames' own light, over the board's."""
+        return float(_rms(_over(flux_error, self.board_flux)))
+
+
+def trace_truth(bench: Apparatus, settings: Settings, seed: int, flux_error: FloatArray) -> Truth:
+    """Trace until the truth's standard error, rms over the image, is a sixth of the frames', or 1e-4.
+
+    Parameters
+    ----------
+    bench, settings
+        the scene, and what of lens and pixels is simulated.
+    seed
+        root of the random streams.
+    flux_error
+        (n^2,) standard error of each projector pixel's direct light in the frames [W m^-2]: what sampling alone leaves
+        in any image of them.
+    """
+    (truth,) = trace_truths(bench, settings, seed, flux_error[None])
+    return truth
+
+
+def trace_truths(bench: Apparatus, settings: Settings, seed: int, flux_errors: FloatArray) -> list[Truth]:
+    """The truth of each line of a projector, from paths that all lines share.
+
+    Parameters
+    ----------
+    bench
+        with its lines; or light that is not told apart, as one line.
+    settings, seed
+        as for :func:`trace_truth`.
+    flux_errors
+        (lines, n^2) ``flux_error`` there.
+    """
+    effects = names(lambda effect: effect.in_truth) & settings.effects
+    board = _Flux(before_board(bench, load_recipe().board_reflectance), effects, seed, "board", BOARD_SAMPLES)
+    unit = board.mean
+    target = np.maximum(TRUTH_PART * _rms(_over(flux_errors, unit)), _FINEST)
+    board.refine(unit, _BOARD_PART * target, np.ones(unit.shape[1]))
+    scene = _Flux(bench, effects, seed, "scene", TRUTH_SAMPLES)
+    likely = np.square(_over(flux_errors, unit)).sum(axis=0)
+    scene.refine(unit, float(np.sqrt(1 - _BOARD_PART**2)) * target, likely)
+    reflectance = _over(scene.mean, board.mean)
+    error = np.hypot(_over(scene.standard_error, board.mean), reflectance * _over(board.standard_error, board.mean))
+    shape, rays = (bench.n, bench.n), scene.rays + board.rays
+    lines = zip(reflectance, error, board.mean, strict=True)
+    return [Truth(own.reshape(shape), its.reshape(shape), flux, rays) for own, its, flux in lines]
+
+
+class _Flux:
+    """Direct light of every projector pixel on the sensor by line, in independent groups; sampled where that helps
+    most."""
+
+    def __init__(self, bench: Apparatus, effects: frozenset[str], seed: int, name: str, samples: int) -> None:
+        physics, loaded, pixels = Physics.simulated(bench, effects), bench.loaded, bench.n**2
+        self._tracer = FluxTracer(loaded.scene, loaded.camera, physics.projector, physics.geometry, loaded.glossy)
+        self._seed = integer(seed, "truth", name)
+        lines = len(bench.lines.shares) if physics.projector.by_line and bench.lines else 1
+        self._sums, self._samples = np.zeros((lines, TRUTH_GROUPS, pixels)), np.zeros(pixels, np.int64)
+        self._shape, self._first = (bench.n, bench.n), samples
+        self._sample(np.full(pixels, samples))
+
+    @property
+    def rays(self) -> int:
+        """All that were traced."""
+        return int(TRUTH_GROUPS * self._samples.sum())
+
+    @property
+    def mean(self) -> FloatArray:
+        """(lines, n^2) [W m^-2]."""
+        return np.asarray(self._sums.mean(axis=1) / self._samples)
+
+    @property
+    def standard_error(self) -> FloatArray:
+        """(lines, n^2) of the mean, from the spread of the groups [W m^-2]."""
+        return np.asarray(self._sums.std(axis=1, ddof=1) / self._samples / np.sqrt(TRUTH_GROUPS))
+
+    def refine(self, unit: FloatArray, target: FloatArray, likely: FloatArray) -> None:
+        """Trace more where that brings most, until the standard error of every line meets its target, or too many rays
+        would be needed.
+
+        Parameters
+        ----------
+        unit
+            (lines, n^2) of the error [W m^-2].
+        target
+            (lines,) its rms over the image, in these units.
+        likely
+            (n^2,) variances at equal samples, in any unit, by what others know. The pixels' own spread does not tell:
+            a pixel whose samples happen to agree would get no more of them, and be further off than it says.
+        """
+        # An edge goes on in the next pixel, where all samples so far may have missed it.
+        likely = likely + mean_of_neighbours(likely.reshape(self._shape)).ravel()
+        likely += _ANYWHERE * likely.mean() or 1.0
+        most = max(MOST_RAYS, MOST_SAMPLES * len(unit)) // TRUTH_GROUPS
+        while ((error := _rms(_over(self.standard_error, unit))) > target).any():
+            part = float(np.square(_AIM * target / np.maximum(error, np.finfo(float).tiny)).min())
+            wanted = _allotted(likely, self._samples, self._first, part, most)
+            if (wanted == self._samples).all():
+                return
+            self._sample(wanted)
+
+    def _sample(self, wanted: IntArray) -> None:
+        """Trace until every pixel has so many samples as are ``wanted`` (n^2,): no less than it has."""
+        pixels = np.flatnonzero(wanted > self._samples)
+        done, more = self._samples[pixels], (wanted - self._samples)[pixels]
+        block = int(np.gcd.reduce(more))
+        blocks = more // block
+        place = np.repeat(np.arange(len(pixels)), blocks)
+        within = np.arange(len(place)) - np.repeat(np.cumsum(blocks) - blocks, blocks)
+        starts = done[place] + block * within
+        light = self._tracer.sums(self._seed, TRUTH_GROUPS, pixels[place], starts, block)
+        for groups, parts in zip(self._sums, light, strict=True):
+            for sums, part in zip(groups, parts, strict=True):
+                sums += np.bincount(pixels[place], part, len(sums))
+        self._samples = wanted
+
+
+def _allotted(likely: FloatArray, samples: IntArray, first: int, part: float, most: int) -> IntArray:
+    """(n^2,) samples that leave a part of the variance, doubled where a sample takes off most of it.
+
+    Parameters
+    ----------
+    likely
+        (n^2,) variances of the pixels at ``first`` samples, in any unit.
+    samples, first
+        (n^2,) that they have, powers of 2 times what they began with.
+    part
+        of today's variance that may be left.
+    most
+        samples in all.
+    """
+    doublings = np.arange(_DOUBLINGS)
+    left = (likely * (samples / first) ** -_RATE)[:, None] * 2.0 ** (-_RATE * doublings)
+    gain, cost = (1 - 2.0**-_RATE) * left, samples[:, None] * 2.0**doublings
+    best = np.argsort(-(gain / cost), axis=None, kind="stable")
+    enough = int(np.searchsorted(np.cumsum(gain.ravel()[best]), (1 - part) * left[:, 0].sum())) + 1
+    affordable = int(np.searchsorted(np.cumsum(cost.ravel()[best]), most - samples.sum(), side="right"))
+    made = np.bincount(best[: min(enough, affordable)] // _DOUBLINGS, minlength=len(likely))
+    return np.asarray(samples << np.minimum(made, _AT_ONCE))
+
+
+def _over(flux: FloatArray, unit: FloatArray) -> FloatArray:
+    """``flux`` (..., n^2) in units ``unit``, of its shape; 0 where there is none, as the board has no light there."""
+    return np.divide(flux, unit, out=np.zeros_like(flux), where=unit > 0)
+
+
+def _rms(values: FloatArray) -> FloatArray:
+    """Along the last axis."""
+    return np.asarray(np.sqrt(np.square(values).mean(axis=-1)))

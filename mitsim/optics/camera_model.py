@@ -1,0 +1,170 @@
+"""A camera's numbers, and how far its mask and projector are off them, in; the factors that its model has, out.
+
+Column p of a factor is the mask's shadow of light from projector pixel p, geometric or wave-optical, in closed form
+(:mod:`mitsim.optics.terms`), less what a flat diffuse board and a flat sensor take of slanted rays: both cosines and
+the square of the distance, z^2 / r^4 with r^2 = z^2 (1 + t_row^2 + t_column^2), t = tau - u / z seen from the sensor's
+pixel at u. As a product of the two axes, (1 + t_row^2)^-2 (1 + t_column^2)^-2, it is off by 2 t_row^2 t_column^2 at
+most. All projector pixels are taken to be equally bright.
+
+A mask that is turned by a small angle phi from rows toward columns lets through r(s + phi t) c(t - phi s): no separable
+operator any more. To first order it is L (x) R + phi (dL/ds (x) T o R - S o L (x) dR/dt), with S and T the mask
+coordinates at which rays from pixels to directions pass.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.projector import Spectrum
+from mitsim.optics.separable import best_term, centred
+from mitsim.optics.shadow import Directions, SeparableTerms
+from mitsim.optics.terms import shadow_terms
+
+_ANGLE = 2.0
+"""Half the power of a cosine that light of a flat board to a flat sensor falls with: four."""
+_DERIVED_MM = 5e-4
+"""Shift of the mask for derivatives: a twentieth of a pixel, over which shadows are averaged."""
+_KEPT = 12
+"""Factors that are held: of a point, and of a step of each number from it."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where mask and projector are, and how bright the board is.
+
+    Attributes
+    ----------
+    mask_distance
+        sensor to mask [mm].
+    mask_shift_row, mask_shift_column
+        of the mask's centre beyond the camera's own offset [mm], index coordinates.
+    mask_rotation
+        from rows toward columns, about its centre [rad].
+    magnification
+        of the projector's window about its centre.
+    projector_row, projector_column
+        shift of the window [tangent of the angle].
+    gain
+        electrons a second that a projector pixel of the board makes on a sensor pixel without the mask.
+    """
+
+    mask_distance: float
+    mask_shift_row: float = 0.0
+    mask_shift_column: float = 0.0
+    mask_rotation: float = 0.0
+    magnification: float = 1.0
+    projector_row: float = 0.0
+    projector_column: float = 0.0
+    gain: float = 1.0
+
+    def moved(self, steps: Mapping[str, float]) -> Placement:
+        """The same with ``steps`` added to some of its numbers, by name."""
+        return replace(self, **{name: getattr(self, name) + step for name, step in steps.items()})
+
+
+@dataclass(frozen=True, eq=False)
+class ModelledCamera:
+    """The model of a camera that was to be built so.
+
+    Attributes
+    ----------
+    geometry
+        the camera.
+    windows
+        row and column tan-angles of the projector's window on the aligned plane.
+    n
+        projector pixels a side.
+    spectrum
+        lines of a wave-optical shadow; None: geometric.
+    """
+
+    geometry: CameraGeometry
+    windows: tuple[tuple[float, float], tuple[float, float]]
+    n: int
+    spectrum: Spectrum | None = None
+
+    @property
+    def built(self) -> Placement:
+        """As it was to be."""
+        return Placement(self.geometry.mask_distance)
+
+    def factors(self, placement: Placement) -> tuple[FloatArray, FloatArray]:
+        """(m, n) left and (m', n) right factor [sqrt(electrons / s)] of the mask at a ``placement``, but not turned."""
+        left, right = self._kept(
+            placement.moved({"gain": 1 - placement.gain, "mask_rotation": -placement.mask_rotation})
+        )
+        root = np.sqrt(placement.gain)
+        return left * root, right * root
+
+    @cached_property
+    def _kept(self) -> Callable[[Placement], tuple[FloatArray, FloatArray]]:
+        """The last factors: a fit asks for the same again, with other numbers that scale or turn them."""
+        return lru_cache(maxsize=_KEPT)(self._formed)
+
+    @cached_property
+    def _kept_axis(self) -> Callable[[float, float, Directions], SeparableTerms]:
+        """The last shadows of an axis: most of what is fitted changes one of the two."""
+        return lru_cache(maxsize=_KEPT)(self._axis)
+
+    def _formed(self, placement: Placement) -> tuple[FloatArray, FloatArray]:
+        shifts = placement.mask_shift_row, placement.mask_shift_column
+        by_row, by_column = (
+            self._kept_axis(placement.mask_distance, own + shift, directions)
+            for own, shift, directions in zip(
+                self.geometry.mask_offset, shifts, self._directions(placement), strict=True
+            )
+        )
+        terms = [(left, right) for (left, _), (_, right) in zip(by_row, by_column, strict=True)]
+        best = best_term(centred(terms) if self.geometry.centred else terms)
+        return best.left, best.right
+
+    def _axis(self, distance: float, offset: float, directions: Directions) -> SeparableTerms:
+        """The shadow of one axis, as its left and as its right factors."""
+        update = {"mask_distance": distance, "mask_offset_row": offset, "mask_offset_column": offset}
+        camera = self.geometry.model_copy(update=update)
+        of_rows, of_columns = (self._falloff(directions, axis) for axis in (0, 1))
+        terms = shadow_terms(camera, directions, directions, camera.scene_distance, self.spectrum)
+        return [(left * of_rows, right * of_columns) for left, right in terms]
+
+    def turned(self, placement: Placement) -> SeparableTerms:
+        """What a rotation of the mask at a ``placement`` adds to the product of its factors, for each radian."""
+        step = {"mask_shift_row": _DERIVED_MM, "mask_shift_column": _DERIVED_MM}
+        ahead = self.factors(placement.moved(step))
+        behind = self.factors(placement.moved({name: -value for name, value in step.items()}))
+        # A mask that moves on by o is seen at s - o.
+        slopes = [(back - on) / (2 * _DERIVED_MM) for on, back in zip(ahead, behind, strict=True)]
+        left, right = self.factors(placement)
+        across, along = self._crossings(placement)
+        return [(slopes[0], along * right), (-across * left, slopes[1])]
+
+    def _directions(self, placement: Placement) -> tuple[Directions, Directions]:
+        edges = []
+        for (first, last), shift in zip(
+            self.windows, (placement.projector_row, placement.projector_column), strict=True
+        ):
+            middle, half = (first + last) / 2 + shift, (last - first) / 2 * placement.magnification
+            edges.append(np.linspace(middle - half, middle + half, self.n + 1))
+        return Directions.cells(edges[0]), Directions.cells(edges[1])
+
+    def _falloff(self, directions: Directions, axis: int) -> FloatArray:
+        """(m, n) part of the light that is left of ``directions`` at a pixel, along an ``axis``."""
+        depth, pixels = self.geometry.scene_distance, self.geometry.centres(axis)
+        squared = np.square(directions.centres - pixels[:, None] / depth)
+        return np.asarray((1 + squared) ** -_ANGLE * self.geometry.angular_response(squared))
+
+    def _crossings(self, placement: Placement) -> tuple[FloatArray, FloatArray]:
+        """(m, n) and (m', n) mask coordinates, from its centre, of rays from pixels to directions, along both axes."""
+        depth, distance = self.geometry.scene_distance, placement.mask_distance
+        shifts = placement.mask_shift_row, placement.mask_shift_column
+        return tuple(  # type: ignore[return-value]
+            (1 - distance / depth) * self.geometry.centres(axis)[:, None] + distance * each.centres - own - shift
+            for axis, (each, own, shift) in enumerate(
+                zip(self._directions(placement), self.geometry.mask_offset, shifts, strict=True)
+            )
+        )

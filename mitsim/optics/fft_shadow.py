@@ -1,0 +1,459 @@
+"""A mask that no few separable terms make up, and its light: the shadow of a point on a raster, at one depth, out.
+
+A turned mask, the light that waves leave behind a mask of many terms, and a picture of a point spread function have no
+short closed form; the geometric shadow of a mask of many terms has a long one. Each is drawn on square cells, a whole
+number of which is a sensor pixel seen on the mask, as :mod:`mitsim.optics.fft_shadow` needs them; a cell's value is
+its mean. A point at depth z and tan-angle tau then shades sensor point u by what the raster has at s = u (1 - d/z) + d
+tau, as every mask does.
+
+Means over cells smear an edge by their own box and by that of the raster, h^2 / 6 of variance; a twelfth of the second
+difference along each axis is taken off, which takes half of it back where the raster is read within cells alone.
+
+**Waves.** Behind a mask whose amplitude is a sum of K terms, the field of a point source is that sum of the products of
+1-D fields of :mod:`mitsim.optics.diffraction`; |U|^2 is averaged over points in each cell, and over the light's lines.
+Behind a turned mask there is the same light, turned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from typing import cast
+
+import numpy as np
+import numpy.typing as npt
+from scipy import fft
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.mask import Mask
+from mitsim.devices.mask_flaws import NO_FLAWS, Flaws
+from mitsim.devices.plate import Plate
+from mitsim.devices.projector import Spectrum
+from mitsim.optics.diffraction import EdgeWaves, grid_step, wave_profiles
+from mitsim.optics.edge_profile import Steps, blurred_step
+from mitsim.optics.shadow import Directions, ShadowGeometry
+
+_CELLS_PER_PIXEL = 6
+"""Raster cells along a pixel: at 4 a raster leaves twice as much (tests/physics/test_raster.py), for which a plan at an
+accuracy of 1e-3 has no room. Features far below a pixel need no more: of a frame in pixels of 12 um random masks of 1
+and of 4 um leave 2e-4 and 1e-3 in waves at 6 (against 48), 2e-4 and 6e-5 turned."""
+_LEFT_BEYOND = 1e-3
+"""Bound of the part of the light that waves may carry beyond a raster's edge. A third of it is found there, as much as
+the points at which waves are squared leave (3.6e-4, a random mask of 31 features of 60 um)."""
+_LARGEST = 8192
+"""Cells a side: a raster takes 512 MiB."""
+_POINTS, _LATTICE = 16, 7
+"""Points of a cell at which a turned mask is asked for its transmission, and columns from one to the next, of as
+many."""
+_POINTS_PER_FRESNEL_LENGTH = 80
+"""Points in sqrt(lambda D) at which waves are squared: at 80 uniform light behind separable masks of order 6 and 9 is
+3.2e-4 and 2.2e-4 off its closed form, at 60 5.8e-4 and 6.8e-4, evenly (tests/physics/test_raster.py)."""
+_MOST_WAVE_POINTS = 1 << 16
+"""Points a side at most: 4e9 of them take a minute for each line, and some seconds more for each term."""
+_LEAST_WAVE_POINTS = 2
+"""Points along a cell at least."""
+_GRID_CELLS = 3
+"""Cells of the field's grid from point to point at least."""
+_AROUND = 8
+"""Cells that a raster is wider than its turned one, for the splines' ends."""
+_AT_ONCE = 2**20
+"""Points asked for at a time, 8 MiB of each of some ten arrays."""
+
+
+@lru_cache(maxsize=2)
+def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = None) -> Plate:
+    """The shadow of a point at one depth, as a plate of square cells about the mask's centre.
+
+    Parameters
+    ----------
+    geometry
+        the camera.
+    depth
+        of the point [mm].
+    spectrum
+        lines of its light; None: geometric.
+
+    Raises
+    ------
+    MitsimError
+        for a raster of too many cells, or a mask whose waves are not worked out.
+    """
+    mask, shadow = geometry.build_mask(), ShadowGeometry.of(geometry, depth)
+    if not isinstance(mask, Plate):
+        raise MitsimError(f"{geometry.mask_words}: its shadow has a closed form; take that")
+    pixel = geometry.pixel_pitch * shadow.shrink
+    step = pixel / cells_per_pixel(geometry)
+    count = _cells(geometry, mask, step, spectrum)
+    if count > _LARGEST:
+        raise MitsimError(
+            f"{mask.words}: its shadow needs a raster of {count} cells a side, more than {_LARGEST}; take fewer "
+            "pixels, larger features, or a mask of one or two separable terms"
+        )
+    if mask.irradiance:
+        values = _resampled(mask, step, count)
+    elif spectrum is None:
+        means = _turned if mask.flaws.turn_deg else _resampled
+        values = sharpened(means(mask, step, count))
+    else:
+        values = sharpened(_waves(replace(shadow, mask=mask.amplitude), spectrum, step, count))
+    return Plate(step, values, mask.words, flaws=Flaws(mask.blur_mm if spectrum is None else 0.0), irradiance=True)
+
+
+def cells_a_side(geometry: CameraGeometry, spectrum: Spectrum | None) -> int:
+    """Raster cells a side of far points' shadow; of nearer ones it has some more.
+
+    Parameters
+    ----------
+    geometry
+        the camera, with a plate.
+    spectrum
+        lines of the light; None: geometric.
+    """
+    mask = geometry.build_mask()
+    assert isinstance(mask, Plate)
+    return _cells(geometry, mask, geometry.pixel_pitch / cells_per_pixel(geometry), spectrum)
+
+
+def _cells(geometry: CameraGeometry, mask: Plate, step: float, spectrum: Spectrum | None) -> int:
+    """Cells of a ``step`` [mm] a side of what can be seen of a ``mask``, and of the light that waves carry beyond it.
+
+    An edge sends lambda D / (4 pi^2 x) of light, as a length, beyond x of it; a mean opening has two along each axis.
+    """
+    half = mask.flaws.reach(mask.extent_mm) / 2
+    if spectrum is not None and not mask.irradiance:
+        product = float(spectrum.wavelengths_nm.max()) * 1e-6 * geometry.mask_distance
+        half += product / (np.pi**2 * mask.opening_mm * _LEFT_BEYOND)
+    return 2 * int(np.ceil(min(geometry.mask_reach, half) / step))
+
+
+def points_per_cell(wavelength_nm: float, distance_mm: float, step_mm: float) -> int:
+    """Points along a raster cell at which waves are squared.
+
+    Parameters
+    ----------
+    wavelength_nm, distance_mm
+        of the waves, and how far behind the mask plane waves would have the same fringes.
+    step_mm
+        the cell's side.
+    """
+    apart = (wavelength_nm * 1e-6 * distance_mm) ** 0.5 / _POINTS_PER_FRESNEL_LENGTH
+    return max(int(np.ceil(step_mm / apart)), _LEAST_WAVE_POINTS)
+
+
+def cells_per_pixel(geometry: CameraGeometry) -> int:
+    """Raster cells along a pixel of ``geometry``: as many as were chosen, else the fewest."""
+    return geometry.mask_cells or _CELLS_PER_PIXEL
+
+
+def sharpened(values: FloatArray) -> FloatArray:
+    """(n, n) means over cells, whose blur by the cells is taken back to second order along both axes of ``values``."""
+    for _ in ("rows", "columns"):
+        padded = np.pad(values, ((1, 1), (0, 0)))
+        values = (values - (padded[2:] - 2 * values + padded[:-2]) / 12).T
+    return values
+
+
+def _turned(mask: Plate, step: float, count: int) -> FloatArray:
+    """(count, count) mean transmissions of cells of a ``step`` [mm], at points of a lattice in each: no two of them lie
+    in one row or column, and an edge that is turned by little is told to a part in so many."""
+    corners = (np.arange(count) - count / 2) * step
+    down = (np.arange(_POINTS) + 0.5) / _POINTS * step
+    across = (np.arange(_POINTS) * _LATTICE % _POINTS + 0.5) / _POINTS * step
+    means = np.zeros((count, count))
+    rows = max(1, _AT_ONCE // count)
+    for start in range(0, count, rows):
+        some = slice(start, start + rows)
+        for row, column in zip(down, across, strict=True):
+            means[some] += mask.transmission(corners[some, None] + row, corners[None] + column)
+    means /= _POINTS
+    return means
+
+
+def _resampled(mask: Plate, step: float, count: int) -> FloatArray:
+    """(count, count) mean values of a mask that is not turned over cells of a ``step`` [mm]."""
+    start = -count * step / 2
+    along = np.stack(
+        [Steps(mask.lines[k : k + 2], np.ones(1)).cell_means(start, step, count) for k in range(len(mask.values))],
+        axis=1,
+    )
+    return np.asarray(along @ mask.values @ along.T)
+
+
+def _waves(shadow: ShadowGeometry, spectrum: Spectrum, step: float, count: int) -> FloatArray:
+    """(count, count) mean |U|^2 of cells behind the amplitude that the ``shadow``'s mask is."""
+    mask = cast("Plate", shadow.mask)
+    if mask.blur_mm:
+        raise MitsimError(
+            f"{mask.words}: the waves behind a blurred mask of more than one separable term are not worked out; use "
+            "--effects=-diffraction for its geometric shadow"
+        )
+    if mask.flaws.turn_deg:
+        # Waves turn with the mask.
+        even = replace(shadow, mask=replace(mask, flaws=NO_FLAWS))
+        whole = 2 * int(np.ceil(count / 2**0.5)) + _AROUND
+        return _turned_light(_waves(even, spectrum, step, whole), count, mask.flaws)
+    total = np.zeros((count, count))
+    for wavelength, share in zip(spectrum.wavelengths_nm, spectrum.weights, strict=True):
+        total += share * _intensity(*_fields(shadow, float(wavelength), step, count))
+    return total
+
+
+def _turned_light(values: FloatArray, count: int, flaws: Flaws) -> FloatArray:
+    """(count, count) cells of light (n, n) that is turned about its centre, between its cells by cubic splines."""
+    # Imported here: most masks are not turned.
+    from scipy import ndimage
+
+    middles = np.asarray(np.arange(count) + 0.5 - count / 2)
+    row, column = flaws.turned_back(middles[:, None], middles)
+    places = np.stack([row, column]) + (len(values) - 1) / 2
+    return np.asarray(ndimage.map_coordinates(values, places, order=3, mode="nearest"))
+
+
+def _fields(
+    shadow: ShadowGeometry, wavelength_nm: float, step: float, count: int
+) -> tuple[npt.NDArray[np.complex64], npt.NDArray[np.complex64], int]:
+    """(points, K) and (K, points) fields of the mask's terms along rows and columns, weights in the first; and points a
+    cell."""
+    distance = shadow.distance_mm * shadow.shrink
+    points = points_per_cell(wavelength_nm, distance, step)
+    if count * points > _MOST_WAVE_POINTS:
+        raise MitsimError(
+            f"mask of {len(shadow.mask.terms)} terms, {shadow.distance_mm:g} mm from the sensor: its waves are squared "
+            f"at {count * points} points a side there, more than {_MOST_WAVE_POINTS}; move it off the sensor, or take "
+            "fewer pixels"
+        )
+    between = max(int(np.ceil(step / points / grid_step(shadow, wavelength_nm))), _GRID_CELLS)
+    half = count * step / 2
+    span = half + shadow.mask.extent_mm / 2 + step
+    waves = EdgeWaves(wavelength_nm, distance, step / points / between, count * points * between, span)
+    terms, lines = shadow.mask.terms, shadow.mask.lines
+
+    def field(profile: FloatArray) -> npt.NDArray[np.complex64]:
+        return _at_points(waves.field(Steps.between(profile, lines), -half), between).astype(np.complex64)
+
+    rows = np.stack([np.complex64(weight) * field(row) for weight, row, _ in terms], axis=1)
+    return rows, np.stack([field(column) for *_, column in terms]), points
+
+
+def _at_points(field: npt.NDArray[np.complex128], between: int) -> npt.NDArray[np.complex128]:
+    """(n,) of a ``field`` (n * between,): its means from point to point, their blur taken back to second order.
+
+    Fringes of far edges are finer than points are apart. Met at points, they add up wherever the code's lattice meets
+    that of the points; their means are none, and the light in them is given back evenly.
+    """
+    means = field.reshape(-1, between).mean(axis=1)
+    means[1:-1] -= np.diff(means, 2) / 24
+    power = float(np.square(np.abs(means)).mean())
+    return np.asarray(means * (np.square(np.abs(field)).mean() / power) ** 0.5) if power else means
+
+
+def _intensity(rows: npt.NDArray[np.complex64], columns: npt.NDArray[np.complex64], points: int) -> FloatArray:
+    """(cells, cells) mean |U|^2 of U = ``rows`` ``columns`` at ``points`` x ``points`` points of each cell."""
+    count = len(rows) // points
+    means = np.empty((count, count))
+    at_once = max(1, _AT_ONCE // len(rows) // points)
+    for start in range(0, count, at_once):
+        stop = min(start + at_once, count)
+        field = rows[start * points : stop * points] @ columns
+        means[start:stop] = _blocks(np.square(field.real) + np.square(field.imag), points)
+    return means
+
+
+def _blocks(values: npt.NDArray[np.floating], side: int) -> FloatArray:
+    """Means of ``values`` over squares of so many a ``side``."""
+    rows, columns = (size // side for size in values.shape)
+    return np.asarray(values.reshape(rows, side, columns, side).mean(axis=(1, 3), dtype=np.float64))
+
+
+# -------- Frames behind a mask drawn on a raster
+
+_WHOLE = 1e-6
+"""Part of a raster cell by which a pixel may miss a whole number of them: rounding, of a frame 4096 pixels wide too."""
+
+
+class Correlation:
+    """A raster's shadow of one depth, prepared once; MitsimError for a raster of which a pixel is no whole number.
+
+    Parameters
+    ----------
+    shadow
+        of a camera whose mask is the raster.
+    rows, columns
+        directions of the cells.
+    fill_factor
+        active part of a pixel, which frames are scaled by.
+    """
+
+    def __init__(self, shadow: ShadowGeometry, rows: Directions, columns: Directions, fill_factor: float = 1.0) -> None:
+        sides = [_Side.of(*shadow.from_mask(directions, axis)) for axis, directions in enumerate((rows, columns))]
+        self.shape = sides[0].pixels, sides[1].pixels
+        self._phases = sides[0].phases, sides[1].phases
+        self._spread = [side.weights for side in sides]
+        reach = max(len(side.weights) // side.phases for side in sides)
+        self._size = [fft.next_fast_len(side.pixels + reach - 1, real=True) for side in sides]
+        along = [size * phases for size, phases in zip(self._size, self._phases, strict=True)]
+        seen = _part(_part(_mask_values(shadow), sides[0].first, along[0]).T, sides[1].first, along[1]).T
+        self._spectra = fft.rfft2(fill_factor * self._by_phase(seen))
+
+    def image(self, light: FloatArray, rows: npt.ArrayLike, columns: npt.ArrayLike) -> FloatArray:
+        """(m, m') irradiance.
+
+        Parameters
+        ----------
+        light
+            (r, c) of some cells.
+        rows, columns
+            (r,) and (c,) which cells of the directions these are.
+        """
+        left, right = self._spread[0][:, np.asarray(rows)], self._spread[1][:, np.asarray(columns)]
+        by_phase = self._by_phase(left @ light @ right.T)
+        seen = fft.fft(fft.rfft(by_phase, self._size[1]), self._size[0], axis=-2)
+        total = np.einsum("ijkl,ijkl->kl", self._spectra, np.conjugate(seen, out=seen))
+        return np.asarray(fft.irfft2(total, self._size)[: self.shape[0], : self.shape[1]])
+
+    def _by_phase(self, cells: FloatArray) -> FloatArray:
+        """(q, q', m, m') every q-th and q'-th of raster ``cells`` (q m, q' m')."""
+        rows, columns = self._phases
+        return cells.reshape(len(cells) // rows, rows, -1, columns).transpose(1, 3, 0, 2)
+
+
+class _Side:
+    """One axis: its pixels, raster cells in each of them, the first cell that pixel 0 sees, and how it weighs them
+    (cells, c) for each direction."""
+
+    def __init__(self, pixels: int, phases: int, first: int, weights: FloatArray) -> None:
+        self.pixels, self.phases, self.first, self.weights = pixels, phases, first, weights
+
+    @classmethod
+    def of(cls, shadow: ShadowGeometry, directions: Directions) -> _Side:
+        pixels = len(shadow.pixel_centres_mm)
+        length = shadow.pixel_centres_mm[-1] - shadow.pixel_centres_mm[0]
+        step = length * shadow.shrink / max(pixels - 1, 1) / shadow.mask.feature_mm
+        phases = max(round(step), 1)
+        if pixels > 1 and abs(step - phases) > _WHOLE:
+            raise MitsimError(f"a pixel is {step:g} cells of the mask's raster; draw one of a whole number")
+        cell, blur = shadow.mask.feature_mm, shadow.mask.blur_mm
+        halves = shadow.half_pixel / cell, shadow.half_cell(directions) / cell
+        crossings = (shadow.shrink * shadow.pixel_centres_mm[0] + shadow.distance_mm * directions.centres) / cell
+        crossings = crossings + len(_mask_values(shadow)) / 2
+        reach = sum(halves) + 8.3 * blur / cell
+        first = int(np.floor(crossings.min() - reach))
+        count = -(-(int(np.ceil(crossings.max() + reach)) - first) // phases) * phases
+        edges = first + np.arange(count + 1)
+        below = blurred_step(edges[:, None] - crossings, halves[0], halves[1], blur / cell)
+        return cls(pixels, phases, first, np.diff(below, axis=0))
+
+
+def _mask_values(shadow: ShadowGeometry) -> FloatArray:
+    return np.asarray(shadow.mask.values)  # type: ignore[union-attr]
+
+
+def _part(values: FloatArray, first: int, count: int) -> FloatArray:
+    """(count, m) rows of ``values`` from ``first`` on, 0 beyond them."""
+    result = np.zeros((count, values.shape[1]))
+    low, high = max(first, 0), min(first + count, len(values))
+    result[low - first : max(high, low) - first] = values[low : max(high, low)]
+    return result
+
+
+# -------- A mask as functions that can be asked for means
+
+Sampler = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
+SeparableTerm = tuple[float, Sampler, Sampler]
+
+
+class ProfileSampler:
+    """Exact means of a piecewise constant mask profile, zero outside its features.
+
+    Parameters
+    ----------
+    profile
+        (N,) transmission of each feature.
+    feature_mm
+        their size.
+    start_mm
+        where the first begins; None: centred on ``centre_mm``.
+    centre_mm
+        of the mask, which ``start_mm`` is counted from.
+    """
+
+    def __init__(
+        self, profile: npt.ArrayLike, feature_mm: float, start_mm: float | None = None, centre_mm: float = 0.0
+    ) -> None:
+        values = np.asarray(profile, dtype=np.float64)
+        self._values = np.concatenate(([0.0], values, [0.0]))
+        self._sums = np.cumsum(self._values)
+        self._feature, self._count = feature_mm, len(values)
+        self._start = (-len(values) / 2 if start_mm is None else start_mm / feature_mm) + centre_mm / feature_mm
+
+    def __call__(self, s: FloatArray, width: FloatArray, tangent: FloatArray) -> FloatArray:
+        """Mean over [s - width/2, s + width/2] for arrays that broadcast; at width 0 the value itself."""
+        centre, half = s / self._feature - self._start, np.abs(width) / self._feature / 2
+        low, high = centre - half, centre + half
+        first, last = self._index(low), self._index(high)
+        # Two features that are cut and what lies between: with nothing between, no large sums are subtracted.
+        parts = self._values[first] * (first - low) + self._values[last] * (high - last + 1)
+        parts += self._sums[np.maximum(last - 1, first)] - self._sums[first]
+        return np.asarray(np.where(first == last, self._values[first], parts / np.where(half > 0, 2 * half, 1)))
+
+    def _index(self, x: FloatArray) -> npt.NDArray[np.intp]:
+        """Place in the padded values of what lies at x (features from the first edge); feature k is number k + 1."""
+        return np.clip(np.floor(x), -1, self._count).astype(np.intp) + 1
+
+
+def wave_samplers(
+    geometry: CameraGeometry, spectrum: Spectrum, depth: float, tau: tuple[float, float]
+) -> list[SeparableTerm]:
+    """A mask's wave-optical shadow of a (virtual) source, as samplers.
+
+    Parameters
+    ----------
+    geometry, spectrum
+        the camera and the light.
+    depth, tau
+        of the source [mm], and its tan-angles along rows and columns.
+    """
+    if geometry.drawn(spectrum is not None):
+        return _of_plate(raster(geometry, depth, spectrum), geometry.mask_offset)
+    shadow = ShadowGeometry.of(geometry, depth)
+    reach = geometry.half_width + geometry.mask_distance * geometry.tan_half_fov + max(geometry.pitches)
+    terms: list[SeparableTerm] = []
+    for wavelength, share in zip(spectrum.wavelengths_nm, spectrum.weights, strict=True):
+
+        def axis(of: int, wavelength: float = float(wavelength)) -> list[tuple[float, ProfileSampler]]:
+            centre = geometry.mask_offset[of]
+            low, high = -reach - centre, reach - centre
+            profiles, start, step = wave_profiles(shadow, wavelength, low, high, tau[of] - centre / depth)
+            return [(weight, ProfileSampler(profile, step, start, centre)) for weight, profile in profiles]
+
+        terms += [
+            (float(share) * weight, row, column) for (weight, row), (_, column) in zip(axis(0), axis(1), strict=True)
+        ]
+    return terms
+
+
+def _steps_sampler(profile: Steps) -> Sampler:
+    """That of a ``profile`` whose features are not even, or blurred."""
+    return lambda s, width, tangent: profile.over(s, np.abs(width) / 2)
+
+
+def geometric_samplers(geometry: CameraGeometry) -> list[SeparableTerm]:
+    """The geometric shadow of the mask of ``geometry``, as samplers."""
+    if geometry.drawn(waves=False):
+        return _of_plate(raster(geometry, geometry.scene_distance), geometry.mask_offset)
+    return _of_plate(geometry.build_mask(), geometry.mask_offset)
+
+
+def _of_plate(mask: Mask | Plate, centre: tuple[float, float]) -> list[SeparableTerm]:
+    """The samplers of a ``mask`` with its ``centre`` off the axis [mm]."""
+
+    def sampler(profile: FloatArray, at: float) -> Sampler:
+        if mask.even:
+            return ProfileSampler(profile, mask.feature_mm, centre_mm=at)
+        return _steps_sampler(Steps.between(profile, mask.lines + at, mask.blur_mm))
+
+    row, column = centre
+    return [(weight, sampler(rows, row), sampler(columns, column)) for weight, rows, columns in mask.terms]

@@ -1,0 +1,416 @@
+"""The closed form: light per (layer, anchor, tan-angle cell) in, irradiance on every sensor pixel out.
+
+A cell's shadow on the sensor is separable, so is the interpolation between anchors, and the frame of one light
+distribution T is ``sum over layers and mask terms of L T R^T`` with T's rows running over (anchor row, cell row) and
+its columns over (anchor column, cell column); each wavelength has mask terms of its own. Only rows and columns that
+hold light enter the product: for k x k shifting dots that is one in k of each. Behind a mask that is drawn on a raster
+(:mod:`mitsim.optics.fft_shadow`) the frame of each pair of anchors is a correlation instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import pairwise, starmap
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.plate import FEW
+from mitsim.devices.projector import Spectrum
+from mitsim.optics.fft_shadow import Correlation, cells_per_pixel, raster
+from mitsim.optics.shadow import Directions, Places, SeparableTerms, ShadowGeometry
+from mitsim.optics.terms import shadow_terms
+
+IntArray = npt.NDArray[np.integer]
+Entries = tuple[IntArray, FloatArray]
+"""Increasing indices into (layers, rows, columns), and the light [W m^-2] at each."""
+_FILLED = 1 / 8
+"""Part of all places from which light is laid out whole: of places at random, an eighth lights every row and column."""
+_HELD = 8
+"""Anchors whose stacked factors are held: those of 48 and a mask's three wavelengths would be gigabytes."""
+_kept_shadow = lru_cache(maxsize=24)(shadow_terms)
+"""The last shadows, a few MiB each: a plan asks for some ten of them again and again."""
+_KEPT_RASTERS = 8
+"""The last shadows on rasters, some 40 MiB each at 512 pixels: layers of a scene, with one line and with all."""
+
+_JUDGED = 64
+"""Pixels a side on which a raster is judged: one of half the cells is drawn in a second."""
+_FINER = 2
+"""Times as many cells a side of the raster that judges."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """Light of one layer in the rows and columns that any of several estimates lights, seen by separable terms.
+
+    Attributes
+    ----------
+    factors
+        by term, (r, m) and (c, m') on frames (m, m'): the shadow's factors of the lit rows and columns.
+    lights
+        (estimates, r, c) light of each.
+    """
+
+    factors: Sequence[tuple[FloatArray, FloatArray]]
+    lights: FloatArray
+
+    def frame(self, out: FloatArray | None = None) -> FloatArray:
+        """(m, m') irradiance of the estimates' mean, in ``out`` where that is given.
+
+        One product over the rows, or columns, of all terms: those of single terms would go over the frame once each.
+        """
+        mean = self.lights[0] if len(self.lights) == 1 else self.lights.mean(axis=0)
+        lefts, rights = zip(*self.factors, strict=True)
+        # The cheaper order of the two products: fewer lit rows or fewer lit columns next to the sensor's side.
+        if len(lefts[0]) < len(rights[0]):
+            return np.matmul(_stacked(lefts).T, _stacked([mean @ right for right in rights]), out=out)
+        return np.matmul(_stacked([mean.T @ left for left in lefts]).T, _stacked(rights), out=out)
+
+    def probe(self, vectors: FloatArray | None) -> FloatArray:
+        """(m, estimates * probes) products of each estimate's frame with ``vectors`` (m', probes); without them the
+        frames themselves, side by side."""
+        count, rows, columns = self.lights.shape
+        flat, total = self.lights.reshape(count * rows, columns), np.zeros(())
+        for left, right in self.factors:
+            seen = (flat @ (right if vectors is None else right @ vectors)).reshape(count, rows, -1)
+            total = total + left.T @ np.moveaxis(seen, 0, 1).reshape(rows, -1)
+        return total
+
+
+@dataclass(frozen=True, eq=False)
+class _RasterBlock:
+    """The same, seen by a raster.
+
+    Attributes
+    ----------
+    layer
+        the raster, and what pixels it is for.
+    rows, columns
+        (r,) and (c,) places in (anchor, cell) of the lights' rows and columns.
+    lights
+        (estimates, r, c) light of each.
+    """
+
+    layer: _RasterLayer
+    rows: IntArray
+    columns: IntArray
+    lights: FloatArray
+
+    def frame(self, out: FloatArray | None = None) -> FloatArray:
+        """As :meth:`_Block.frame`."""
+        seen = self.layer.image(self.lights.mean(axis=0), self.rows, self.columns)
+        if out is None:
+            return seen
+        out[...] = seen
+        return out
+
+    def probe(self, vectors: FloatArray | None) -> FloatArray:
+        """As :meth:`_Block.probe`."""
+        seen = [self.layer.image(light, self.rows, self.columns) for light in self.lights]
+        return np.concatenate([frame if vectors is None else frame @ vectors for frame in seen], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _RasterLayer:
+    """One layer behind a mask on a raster: its correlation, the anchors' weights (m, anchors) and (m', anchors), and
+    rows and columns of a frame, None for all."""
+
+    correlation: Correlation
+    weights: tuple[FloatArray, FloatArray]
+    places: Places | None
+    cells: tuple[int, int]
+
+    def block(self, rows: IntArray, columns: IntArray, lights: FloatArray) -> _RasterBlock:
+        """The layer with ``lights`` (estimates, r, c) in these ``rows`` and ``columns``."""
+        return _RasterBlock(self, rows, columns, lights)
+
+    def image(self, light: FloatArray, rows: IntArray, columns: IntArray) -> FloatArray:
+        """(m, m') irradiance of a ``light`` (r, c) in these ``rows`` and ``columns``."""
+        (row_anchor, row), (column_anchor, column) = (
+            np.divmod(places, cells) for places, cells in zip((rows, columns), self.cells, strict=True)
+        )
+        by_row, by_column = self.weights
+        total = np.zeros((len(by_row), len(by_column)))
+        for first in np.unique(row_anchor):
+            for second in np.unique(column_anchor):
+                inside = row_anchor == first, column_anchor == second
+                part = light[np.ix_(*inside)]
+                if not part.any():
+                    continue
+                seen = self.correlation.image(part, row[inside[0]], column[inside[1]])
+                if self.places is not None:
+                    seen = seen[np.ix_(*self.places)]
+                total += by_row[:, first, None] * seen * by_column[:, second]
+        return total
+
+
+@dataclass(frozen=True, eq=False)
+class _TermsLayer:
+    """One layer behind a mask of separable terms: by term, (anchors * cells, m) factors of rows and of columns."""
+
+    terms: Sequence[tuple[Any, Any]]
+
+    def block(self, rows: IntArray, columns: IntArray, lights: FloatArray) -> _Block:
+        """The layer with ``lights`` (estimates, r, c) in these ``rows`` and ``columns``."""
+        return _Block([(_picked(left, rows), _picked(right, columns)) for left, right in self.terms], lights)
+
+
+class FrameOptics:
+    """The closed form, prepared once; applying it changes nothing.
+
+    Parameters
+    ----------
+    geometry
+        the camera.
+    rows, columns
+        directions of the cells along the two axes.
+    depths
+        [mm], one a layer.
+    anchors
+        points a side of the sensor from which light is seen.
+    spectrum
+        lines of a wave-optical shadow; None: geometric.
+    places
+        rows and columns of a frame, increasing, of which it then consists; None: all.
+    """
+
+    def __init__(
+        self,
+        geometry: CameraGeometry,
+        rows: Directions,
+        columns: Directions,
+        depths: Sequence[float],
+        anchors: int,
+        spectrum: Spectrum | None = None,
+        places: Places | None = None,
+    ) -> None:
+        positions = anchor_positions(anchors, geometry.half_width)
+        centres = [geometry.centres(axis) for axis in (0, 1)]
+        if places is not None:
+            centres = [own[np.asarray(chosen)] for own, chosen in zip(centres, places, strict=True)]
+        by_row, by_column = (anchor_weights(positions, own) for own in centres)
+        self.anchors = anchors
+        self.frame_shape = len(centres[0]), len(centres[1])
+        self.cells = (len(rows.centres), len(columns.centres))
+        self.shape = (anchors * self.cells[0], anchors * self.cells[1])
+        if geometry.correlated(spectrum is not None):
+            seen = [_correlation(geometry, rows, columns, depth, spectrum) for depth in depths]
+            self._layers: Sequence[_RasterLayer | _TermsLayer] = [
+                _RasterLayer(correlation, (by_row, by_column), places, self.cells) for correlation in seen
+            ]
+            return
+        # Stored with the light's index first, so that picking lit rows copies contiguous memory.
+        stack = _Stack if anchors > _HELD else _stack
+        self._layers = [
+            _TermsLayer(
+                [
+                    (stack(left, by_row), stack(right, by_column))
+                    for left, right in _shadow(geometry, rows, columns, depth, spectrum, places)
+                ]
+            )
+            for depth in depths
+        ]
+
+    def frame(self, flat: IntArray, light: FloatArray) -> FloatArray:
+        """(m, m') irradiance of ``light`` [W m^-2] at increasing indices ``flat`` into (layers, *shape)."""
+        return self.seen([(flat, light)], None)[0]
+
+    def probe(self, estimates: Sequence[Entries], vectors: FloatArray | None = None) -> FloatArray:
+        """Frames of several ``estimates`` times ``vectors`` (m', probes): (m, estimates * probes).
+
+        The frames, which would cost far more, are never formed; but without ``vectors`` they are, side by side.
+        """
+        rows, columns = self.frame_shape
+        total = np.zeros((rows, len(estimates) * (columns if vectors is None else vectors.shape[1])))
+        for block in self._blocks(estimates):
+            total += block.probe(vectors)
+        return total
+
+    def seen(
+        self, estimates: Sequence[Entries], vectors: FloatArray | None, out: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """The frame of the mean of several estimates, and the product of each one's frame with some vectors.
+
+        Parameters
+        ----------
+        estimates
+            of one light.
+        vectors
+            (m', probes), or None for no products.
+        out
+            (m, m') zeros, in which the frame is returned; a new array where not given.
+
+        Returns
+        -------
+        (m, m') and (m, estimates * probes).
+        """
+        probes = 0 if vectors is None else vectors.shape[1]
+        frame, probed = None, np.zeros((self.frame_shape[0], len(estimates) * probes))
+        for block in self._blocks(estimates, together=vectors is None):
+            frame = block.frame(out) if frame is None else np.add(frame, block.frame(), out=frame)
+            if vectors is not None:
+                probed += block.probe(vectors)
+        if frame is None:
+            frame = np.zeros(self.frame_shape) if out is None else out
+        return frame, probed
+
+    def _blocks(self, estimates: Sequence[Entries], together: bool = False) -> Iterator[_Block | _RasterBlock]:
+        """The light of each layer that holds any, of each estimate or of their mean ``together``."""
+        split = [self._split(*entries) for entries in estimates]
+        for of_depth, of_layer in zip(self._layers, zip(*split, strict=True), strict=True):
+            parts = list(of_layer)
+            most = max(len(place) for place, _ in parts)
+            if not most:
+                continue
+            if most < _FILLED * self.shape[0] * self.shape[1]:
+                rows, columns, parts = self._lit(parts)
+            else:
+                rows, columns = (np.arange(count) for count in self.shape)
+            lights = np.zeros((1 if together else len(parts), len(rows) * len(columns)))
+            for number, (place, values) in enumerate(parts):
+                if together:
+                    lights[0, place] += values
+                else:
+                    lights[number][place] = values
+            if together:
+                lights /= len(parts)
+            yield of_depth.block(rows, columns, lights.reshape(-1, len(rows), len(columns)))
+
+    def _lit(self, parts: Sequence[Entries]) -> tuple[IntArray, IntArray, list[Entries]]:
+        """Rows and columns that any of some ``parts`` lights, and the parts by places among these alone."""
+        places = [np.divmod(place, self.shape[1]) for place, _ in parts]
+        lit_row, lit_column = np.zeros(self.shape[0], bool), np.zeros(self.shape[1], bool)
+        for row, column in places:
+            lit_row[row], lit_column[column] = True, True
+        rows, columns = np.flatnonzero(lit_row), np.flatnonzero(lit_column)
+        row_of, column_of = (np.cumsum(lit_row) - 1) * len(columns), np.cumsum(lit_column) - 1
+        return (
+            rows,
+            columns,
+            [
+                (row_of[row] + column_of[column], values)
+                for (row, column), (_, values) in zip(places, parts, strict=True)
+            ],
+        )
+
+    def _split(self, flat: IntArray, light: FloatArray) -> list[Entries]:
+        """What lies in each layer: places in (rows, columns), and light."""
+        if len(self._layers) == 1:
+            return [(flat, light)]
+        starts = np.arange(len(self._layers) + 1, dtype=flat.dtype) * flat.dtype.type(self.shape[0] * self.shape[1])
+        parts = starmap(slice, pairwise(np.searchsorted(flat, starts)))
+        return [(flat[part] - start, light[part]) for start, part in zip(starts, parts, strict=False)]
+
+
+def _shadow(geometry: CameraGeometry, *directions: Any) -> SeparableTerms:
+    """The shadow of ``geometry`` toward ``directions``; of masks of many terms, 100 MiB each, none is kept."""
+    many = geometry.mask_terms > FEW or geometry.mask_motion is not None
+    return (shadow_terms if many else _kept_shadow)(geometry, *directions)
+
+
+def raster_error(
+    geometry: CameraGeometry,
+    rows: Directions,
+    columns: Directions,
+    depth: float,
+    spectrum: Spectrum | None,
+    light: FloatArray,
+) -> tuple[float, bool]:
+    """What a shadow on a raster leaves of the frame of a ``light``, relative rms, on a few pixels about the axis; and
+    whether it is told from the sum of the mask's terms, else from a raster of half the cells.
+
+    Parameters
+    ----------
+    geometry, depth, spectrum
+        the camera, and depth and lines of the light.
+    rows, columns
+        r and c directions.
+    light
+        (r, c).
+    """
+    side = min(*geometry.shape, _JUDGED)
+    few = geometry.model_copy(update={"pixels": side, "rows": None, "columns": None, "roi": None})
+    row, column = (np.arange(len(each.centres)) for each in (rows, columns))
+
+    def frame(finer: int) -> FloatArray:
+        drawn = few.model_copy(update={"mask_cells": finer * cells_per_pixel(few)})
+        shadow = replace(ShadowGeometry.of(drawn, depth), mask=raster(drawn, depth, spectrum))
+        return Correlation(shadow, rows, columns, drawn.pixel_fill_factor).image(light, row, column)
+
+    known = not few.drawn(spectrum is not None)
+    coarse = frame(1)
+    if known:
+        terms = shadow_terms(few, rows, columns, depth, spectrum)
+        judge = np.asarray(sum(left @ light @ right.T for left, right in terms))
+    else:
+        judge = frame(_FINER)
+    energy = float(np.square(judge).sum())
+    error = float(np.sqrt(np.square(coarse - judge).sum() / energy)) if energy else 0.0
+    return error, known
+
+
+@lru_cache(maxsize=_KEPT_RASTERS)
+def _correlation(
+    geometry: CameraGeometry, rows: Directions, columns: Directions, depth: float, spectrum: Spectrum | None
+) -> Correlation:
+    """The shadow of a mask that is drawn on a raster, prepared once."""
+    shadow = replace(ShadowGeometry.of(geometry, depth), mask=raster(geometry, depth, spectrum))
+    return Correlation(shadow, rows, columns, geometry.pixel_fill_factor)
+
+
+def _stacked(parts: Sequence[FloatArray]) -> FloatArray:
+    """Matrices one above the other; one alone is not copied."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
+def _picked(factor: FloatArray | _Stack, rows: IntArray) -> FloatArray:
+    """The ``rows`` of a factor; the factor itself where they are all."""
+    whole = isinstance(factor, np.ndarray) and len(rows) == len(factor)
+    return factor if whole else factor[rows]  # type: ignore[return-value]
+
+
+class _Stack:
+    """The same as :func:`_stack`, whose rows are made when they are asked for."""
+
+    def __init__(self, factor: FloatArray, weights: FloatArray) -> None:
+        self._factor, self._weights = np.ascontiguousarray(factor.T), np.ascontiguousarray(weights.T)
+
+    def __getitem__(self, rows: IntArray) -> FloatArray:
+        anchor, cell = np.divmod(rows, len(self._factor))
+        return np.asarray(self._weights[anchor] * self._factor[cell])
+
+
+def _stack(factor: FloatArray, weights: FloatArray) -> FloatArray:
+    """(anchors * cells, pixels): the factor (pixels, cells) once for each anchor, scaled by the anchor's weight."""
+    scaled = weights.T[:, None, :] * factor.T[None, :, :]
+    return np.ascontiguousarray(scaled.reshape(-1, factor.shape[0]))
+
+
+# -------- Points of the sensor from which radiance is evaluated, and the weights that interpolate between them
+
+
+def anchor_positions(count: int, half_width: float) -> FloatArray:
+    """(``count``,) coordinates of anchors on a sensor of ``half_width``, in its unit.
+
+    Chebyshev nodes, the near-best points for interpolation. MitsimError for less than one.
+    """
+    if count < 1:
+        raise MitsimError(f"number of anchors a side is {count}; give at least 1")
+    k = np.arange(count)
+    return -half_width * np.cos(np.pi * (2 * k + 1) / (2 * count))
+
+
+def anchor_weights(anchors: Sequence[float] | FloatArray, at: FloatArray) -> FloatArray:
+    """(len(at), len(anchors)) Lagrange weights that interpolate values known at ``anchors`` to the points ``at``."""
+    nodes = np.asarray(anchors, dtype=np.float64)
+    weights = np.ones((len(at), len(nodes)))
+    for j, node in enumerate(nodes):
+        for zero in np.delete(nodes, j):
+            weights[:, j] *= (at - zero) / (node - zero)
+    return weights

@@ -1,0 +1,325 @@
+"""Light that mirrors carry to the sensor: from beams that cross the sensor plane to irradiance on every sensor pixel.
+
+A beam is a thin bundle of rays from a pinhole projector, a quadrilateral of one projector pixel's window. Its flux is
+known, its four corner rays say where it lands, and between them all is bilinear; so a beam is cut into small boxes of
+at most half a sensor pixel, and each box gives every pixel that it overlaps its part of the flux times the mask's mean
+over the part. Boxes tile what the beam lights, and flux is conserved whatever their shape.
+
+The mask enters as separable terms of samplers (:mod:`mitsim.optics.fft_shadow`); a wave-optical one needs the distance of
+the virtual source, :attr:`Beams.inverse_depth`. Coordinates are index coordinates (s_row = -y, s_col = -x), centred, in
+mm.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.devices.camera import CameraGeometry
+from mitsim.optics.fft_shadow import SeparableTerm
+from mitsim.optics.frames import ClassFrames
+from mitsim.optics.image_formation import IntArray
+
+_BOXES_AT_ONCE = 2**18
+"""Boxes held at a time, some tens of MiB."""
+_POINT = 1e-9
+"""Part of a length that counts as none; chosen far above rounding, 1e-16, and far below what a pixel shows."""
+_ASKEW_BOXES = 2
+"""Further boxes a side, in those of an even beam, that an askew one gets; without them a moire of 1 % (measured)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Beams:
+    """Bundles of rays that reach the sensor plane, the last index of each pair being (row, column).
+
+    Attributes
+    ----------
+    pixel
+        (q,) projector pixel (row * n + column) that each beam leaves.
+    flux
+        (q,) flux that the projector puts into each beam at full power [W m^-2 mm^2].
+    sensor
+        (q, 2, 2, 2) where the corner rays cross the sensor plane [mm].
+    tangent
+        (q, 2, 2, 2) their tan-angles (x/z, y/z, in index coordinates) seen from there.
+    throughput
+        (q, 2, 2) part of the light left at each corner.
+    unresolved
+        flux on the sensor that is in no beam, because where it lands was not found out.
+    error
+        standard error of the flux on the sensor, from beams that an edge cuts and that were not divided further: these
+        are points.
+    """
+
+    pixel: IntArray
+    flux: FloatArray
+    sensor: FloatArray
+    tangent: FloatArray
+    throughput: FloatArray
+    unresolved: float
+    error: float = 0.0
+
+    def __len__(self) -> int:
+        return len(self.pixel)
+
+    @property
+    def delivered(self) -> FloatArray:
+        """(q,) flux that arrives at the sensor plane, on the sensor or beside it [W m^-2 mm^2]."""
+        return np.asarray(self.flux * self.throughput.mean(axis=(1, 2)))
+
+    @property
+    def wide(self) -> npt.NDArray[np.bool_]:
+        """(q,) whether beams are more than points."""
+        return np.asarray((np.ptp(self.sensor.reshape(len(self), 4, 2), axis=1) > 0).any(axis=1))
+
+    @property
+    def inverse_depth(self) -> FloatArray:
+        """(q, 2) 1/z [1/mm] of the virtual source along rows and columns, from dt/du = -1/z at each beam's centre."""
+        return -_slope(self.sensor, self.tangent)
+
+
+@dataclass(frozen=True, eq=False)
+class GlintFrames(ClassFrames):
+    """Irradiance by mirrors, one frame for each class of projector pixels that reaches the sensor.
+
+    Attributes
+    ----------
+    lit_pixels
+        (p,) projector pixels whose light meets the sensor, behind the mask or not.
+    flux
+        flux on the sensor without the mask, all classes at full power [W m^-2 mm^2].
+    unresolved, error
+        flux that is left out, and the standard error of what is not, from what edges cut; same unit.
+    """
+
+    lit_pixels: IntArray
+    flux: float
+    unresolved: float
+    error: float
+
+
+def glint_frames(
+    beams: Beams,
+    geometry: CameraGeometry,
+    terms: Sequence[SeparableTerm],
+    labels: IntArray,
+    boxes_per_pixel: int = 2,
+) -> GlintFrames:
+    """Frames of the classes that mirrors bring to the sensor; memory is one frame for each of them.
+
+    Parameters
+    ----------
+    beams
+        from ``mitsim.transport.specular.trace_glint``.
+    geometry
+        the camera; irradiance is the mean over a pixel's active square, times the fill factor and the response.
+    terms
+        the mask, see the module; ``[]`` gives no light.
+    labels
+        (n * n,) class of each projector pixel.
+    boxes_per_pixel
+        boxes a sensor pixel's side, at least 2: a box turned by 45 degrees must not reach into a third
+        pixel. Any number is exact where beams are aligned with the pixels' rows and columns.
+
+    Raises
+    ------
+    MitsimError
+        for ``labels`` that do not cover the beams' projector pixels, or fewer than two boxes.
+    """
+    labels = np.asarray(labels)
+    _check(beams, labels, boxes_per_pixel)
+    active_part = math.sqrt(geometry.pixel_fill_factor)
+    reached = _on_sensor(beams, geometry)
+    classes = np.unique(labels[beams.pixel[reached]])
+    frames = np.zeros((len(classes), *geometry.frame_shape))
+    total, lit = 0.0, np.zeros(len(labels), dtype=bool)
+    for cut in _cuts(beams, reached, min(geometry.pitches) / boxes_per_pixel):
+        boxes = _boxes(beams, cut, geometry)
+        pixels = beams.pixel[boxes.beam]
+        total += _deposit(frames, np.searchsorted(classes, labels[pixels]), boxes, geometry, terms, active_part)
+        lit[pixels] = True
+    used = np.isin(classes, labels[lit])
+    area = math.prod(geometry.active_sides)
+    return GlintFrames(
+        classes[used].astype(np.int64), frames[used] / area, np.flatnonzero(lit), total, beams.unresolved, beams.error
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Cut:
+    """Beams cut alike: centres a, b (0..1) of some boxes along the two sides, and the sizes of a box in a and b."""
+
+    beams: IntArray
+    a: FloatArray
+    b: FloatArray
+    size: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class _Boxes:
+    """Boxes on the sensor: the beam (k,) and flux (k,) of each; place and extent on the sensor, tan-angle, and the
+    magnification ds/du of the mask's shadow, all (k, 2) for (row, column)."""
+
+    beam: IntArray
+    flux: FloatArray
+    place: FloatArray
+    extent: FloatArray
+    tangent: FloatArray
+    magnification: FloatArray
+
+
+def _check(beams: Beams, labels: IntArray, boxes_per_pixel: int) -> None:
+    if boxes_per_pixel < 2:
+        raise MitsimError(f"boxes_per_pixel is {boxes_per_pixel}; give at least 2")
+    if len(beams) and int(beams.pixel.max()) >= len(labels):
+        raise MitsimError(
+            f"labels has {len(labels)} entries, but light leaves projector pixel {int(beams.pixel.max())}; "
+            "give one class for each of the n * n pixels"
+        )
+
+
+def _on_sensor(beams: Beams, geometry: CameraGeometry) -> IntArray:
+    """Beams whose bounding box meets the sensor."""
+    corners = beams.sensor.reshape(len(beams), 4, 2)
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    return np.flatnonzero(((high > -geometry.half_width) & (low < geometry.half_width)).all(axis=1))
+
+
+def _cuts(beams: Beams, reached: IntArray, box: float) -> Iterator[_Cut]:
+    """All boxes of the beams ``reached``, no side longer than ``box`` [mm], in portions that memory holds.
+
+    Numbers of boxes a side are rounded up to three leading bits, so that many beams share one. Askew beams get up to
+    three times as many: boxes then overlap and leave gaps, which shows as a moire with the pixels (1 % at two a pixel).
+    """
+    corners = beams.sensor[reached]
+    sides = [np.diff(corners, axis=axis).reshape(len(reached), 2, 2) for axis in (1, 2)]
+    length = np.stack([np.linalg.norm(side, axis=-1).max(axis=1) for side in sides], axis=1)
+    longest = length.max(axis=1)
+    askew = np.max([np.abs(side).min(axis=-1).max(axis=1) for side in sides], axis=0)
+    askew /= np.where(longest > 0, longest, 1)
+    need = np.maximum(length / box * (1 + _ASKEW_BOXES * np.minimum(4 * askew, 1))[:, None], 1)
+    quarter = 2 ** np.maximum(np.floor(np.log2(need)) - 2, 0)
+    counts = (np.ceil(need / quarter) * quarter).astype(np.int64)
+    for rows, columns in np.unique(counts, axis=0).tolist():
+        alike = reached[(counts == (rows, columns)).all(axis=1)]
+        b = (np.arange(columns) + 0.5) / columns
+        strip = max(1, min(rows, _BOXES_AT_ONCE // columns))
+        step = max(1, _BOXES_AT_ONCE // (strip * columns))
+        for first in range(0, rows, strip):
+            a = (np.arange(first, min(first + strip, rows)) + 0.5) / rows
+            for start in range(0, len(alike), step):
+                yield _Cut(alike[start : start + step], a, b, (1 / rows, 1 / columns))
+
+
+def _boxes(beams: Beams, cut: _Cut, geometry: CameraGeometry) -> _Boxes:
+    """The boxes of one cut that lie on the sensor and inside the field stop."""
+    corners = beams.sensor[cut.beams]
+    place, tangent = _bilinear(corners, cut.a, cut.b), _bilinear(beams.tangent[cut.beams], cut.a, cut.b)
+    along, across = _gradients(corners, cut.a, cut.b)
+    extent = np.hypot(along * cut.size[0], across * cut.size[1])
+    extent = np.maximum(extent, _POINT * min(geometry.pitches))
+    seen = (np.abs(place) < geometry.half_width + extent / 2).all(axis=-1)
+    seen &= (np.abs(tangent) <= geometry.tan_half_fov).all(axis=-1)
+    throughput = _bilinear(beams.throughput[cut.beams][..., None], cut.a, cut.b)[..., 0]
+    flux = (beams.flux[cut.beams, None, None] * throughput)[seen] * (cut.size[0] * cut.size[1])
+    owner = np.broadcast_to(np.arange(len(cut.beams))[:, None, None], seen.shape)[seen]
+    place, extent, tangent = place[seen], extent[seen], tangent[seen]
+    response = geometry.pixel_fill_factor * geometry.angular_response(
+        np.square(tangent[:, 0]) + np.square(tangent[:, 1])
+    )
+    magnification = 1 + geometry.mask_distance * _slope(corners, beams.tangent[cut.beams])
+    return _Boxes(cut.beams[owner], flux * response, place, extent, tangent, magnification[owner])
+
+
+def _deposit(
+    frames: FloatArray,
+    slot: IntArray,
+    boxes: _Boxes,
+    geometry: CameraGeometry,
+    terms: Sequence[SeparableTerm],
+    active_part: float,
+) -> float:
+    """Add the boxes' flux behind the mask to ``frames`` [.. mm^2]; the sum of their flux on the sensor without it.
+
+    A box is at most one pixel wide, so it meets two pixels of each axis at most.
+    """
+    count, total = geometry.frame_shape, 0.0
+    rows, columns = ([_pieces(boxes, axis, step, geometry, active_part) for step in (0, 1)] for axis in (0, 1))
+    shadows = [
+        ([row(*piece[2:]) for piece in rows], [column(*piece[2:]) for piece in columns]) for _, row, column in terms
+    ]
+    for i, (row, row_share, *_) in enumerate(rows):
+        for j, (column, column_share, *_) in enumerate(columns):
+            flux = boxes.flux * row_share * column_share
+            total += float(flux.sum())
+            met = np.flatnonzero(flux)
+            passed = sum(
+                (
+                    weight * left[i][met] * right[j][met]
+                    for (weight, _, _), (left, right) in zip(terms, shadows, strict=True)
+                ),
+                np.zeros(len(met)),
+            )
+            flat = (slot[met] * count[0] + row[met]) * count[1] + column[met]
+            np.add.at(frames.reshape(-1), flat, flux[met] * passed)
+    return total
+
+
+def _pieces(
+    boxes: _Boxes, axis: int, step: int, geometry: CameraGeometry, active_part: float
+) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The part of each box in its first (step 0) or second pixel along an axis.
+
+    Pixel index, share of the box (0 outside the sensor), then what a sampler takes: centre and width of the part's
+    shadow in the mask plane [mm], tan-angle.
+    """
+    pitch, first = geometry.pitches[axis], 0 if geometry.roi is None else geometry.roi[axis]
+    place = boxes.place[:, axis] / pitch + geometry.shape[axis] / 2 - first
+    extent = boxes.extent[:, axis] / pitch
+    low, high = place - extent / 2, place + extent / 2
+    pixel = np.floor(low).astype(np.int64) + step
+    low = np.maximum(low, pixel + (1 - active_part) / 2)
+    high = np.minimum(high, pixel + (1 + active_part) / 2)
+    share = np.maximum(high - low, 0) / extent
+    share[(pixel < 0) | (pixel >= geometry.frame_shape[axis])] = 0
+    magnification, tangent = boxes.magnification[:, axis], boxes.tangent[:, axis]
+    offset = ((low + high) / 2 - place) * pitch
+    shadow = boxes.place[:, axis] + geometry.mask_distance * tangent + magnification * offset
+    return pixel, share, shadow, np.abs(magnification) * share * extent * pitch, tangent
+
+
+def _bilinear(corners: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
+    """(q, A, B, 2) values between corners (q, 2, 2, 2) at all pairs of a (A,) and b (B,)."""
+    sides = corners[:, None, 0] + (corners[:, None, 1] - corners[:, None, 0]) * a[:, None, None]
+    return np.asarray(sides[:, :, None, 0] + (sides[:, :, None, 1] - sides[:, :, None, 0]) * b[:, None])
+
+
+def _gradients(corners: FloatArray, a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Derivatives of :func:`_bilinear` by a (q, 1, B, 2) and by b (q, A, 1, 2)."""
+    along = (corners[:, 1] - corners[:, 0])[:, None]
+    across = (corners[:, :, 1] - corners[:, :, 0])[:, :, None]
+    return (
+        along[:, :, None, 0] + (along[:, :, None, 1] - along[:, :, None, 0]) * b[:, None],
+        across[:, None, 0] + (across[:, None, 1] - across[:, None, 0]) * a[:, None, None],
+    )
+
+
+def _slope(sensor: FloatArray, tangent: FloatArray) -> FloatArray:
+    """(q, 2) dt/du along rows and along columns at the beams' centres; 0 where a beam is folded to a line.
+
+    What a curved mirror adds across (dt_row/du_column) is left out: it matters only over less than a box.
+    """
+    middle = np.array([0.5])
+    (ua, ub), (ta, tb) = ([g[:, 0, 0] for g in _gradients(c, middle, middle)] for c in (sensor, tangent))
+    determinant = ua[:, 0] * ub[:, 1] - ua[:, 1] * ub[:, 0]
+    flat = np.abs(determinant) < _POINT * np.linalg.norm(ua, axis=1) * np.linalg.norm(ub, axis=1)
+    row = ta[:, 0] * ub[:, 1] - tb[:, 0] * ua[:, 1]
+    column = tb[:, 1] * ua[:, 0] - ta[:, 1] * ub[:, 0]
+    safe = np.where(flat | (determinant == 0), np.inf, determinant)
+    return np.asarray(np.stack([row, column], axis=1) / safe[:, None])

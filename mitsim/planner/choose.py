@@ -1,0 +1,604 @@
+"""The cheapest settings that keep an accuracy: from what the pilot measured to settings, their error and their work.
+
+Every combination of effects, anchors, layers, cells and coarse cells is predicted: the error that all it leaves out or
+makes coarse adds up to, with its signs; the samples that keep the rest of the budget; and the work of both, at fixed
+paces. The cheapest that fits is taken.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from itertools import chain, combinations, product
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.bench.effects import EFFECTS, names
+from mitsim.bench.request import HIGHEST_ACCURACY
+from mitsim.core.arrays import FloatArray
+from mitsim.light.cost_model import (
+    ANCHORS_OF,
+    FIXED,
+    MIXING,
+    Numbers,
+    checking_seconds,
+    connections,
+    efforts,
+    entries,
+    filing_seconds,
+    optics_seconds,
+    priced,
+    tells_all,
+    traced_for,
+    truth_seconds,
+)
+from mitsim.light.settings import COUNTED, GROUPS, SURE, Effort, Estimate, Evidence, Number, Part, Settings, whole
+from mitsim.optics.frames import bound_over_error
+
+_MARGIN = 0.95
+"""Part of the accuracy that is planned for: frames that the pilot looks at differ from all by a few percent, and so do
+shots whose error is seen, where it is not that of all."""
+_MOST_ENTRIES = 2.0**25
+"""Entries of one group's filed light beyond which settings are not chosen: 12 GB in all (`mitsim.planner.memory`)."""
+_LUCKY = -1.0
+"""Standard errors below an estimate at which what keeps no accuracy for certain may still keep it: one case in six."""
+_AS_GOOD = 1.1
+"""Where nothing fits, settings whose error is larger than the least by this count as good as it."""
+_ONE_HIT = 0.25
+"""Part of the Monte Carlo error that one hit in a group may be of a small target's light."""
+_OFF_BY_HITS = Estimate(0.75, 1.5)
+"""Hits in a group that a small target's light is off by: groups that meet it equally often show no spread. Root mean
+square of 40 runs of cards of 3 to 10 mm and a rod of 1 x 60 mm in pixels of 55 mm, 400 to 1600 hits; twice that."""
+_COARSE_CELLS = (1, 2, 4, 8)
+"""As for fine light."""
+_BOUND_OVER_ERROR = 1.1
+"""Sampling stops by the 95 % bound on its error, which lies so far above its estimate where four groups of many paths
+tell it at best (1.04 to 1.3 in photograph, gift card, corner, metal blade, compact disc, colour checker); predicting
+1.17 saves no time (processor seconds of gift card, compact disc, metal blade, photograph, five seeds: within 3 %)."""
+
+_SETTLED = 8
+"""Times that samples and their bound are worked out from each other: to a percent, as each step leaves a third."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Settings, and what they are predicted to leave and to take.
+
+    Attributes
+    ----------
+    settings
+        effects, numbers, and samples.
+    systematic
+        error that all that is left out or made coarse adds up to.
+    lacking
+        light that is known to be missing, by where it is; it is added as it is.
+    target, noise
+        Monte Carlo error at which sampling may stop, and which the samples are predicted to leave.
+    fits
+        whether the total is within the accuracy, but for what nothing could make up for.
+    work
+        seconds at fixed paces.
+    """
+
+    settings: Settings
+    systematic: Estimate
+    lacking: Mapping[str, float]
+    target: float
+    noise: float
+    fits: bool
+    work: float
+
+    @property
+    def total(self) -> Estimate:
+        """Predicted error of the frames, all in all."""
+        return Estimate(*(math.hypot(error, self.noise) for error in self.systematic))
+
+
+def parts_of(evidence: Evidence, settings: Settings) -> frozenset[Part]:
+    """What ``settings`` leave out or make coarse, of all that the ``evidence`` knows."""
+    counts = zip(COUNTED, counted(settings), strict=True)
+    off = (Part(name) for name in evidence.effects if name not in settings.effects)
+    return frozenset(chain((Part(*count) for count in counts), off))
+
+
+def cheapest(accuracy: float, evidence: Evidence, switches: Mapping[str, bool], sure: float = SURE) -> Choice:
+    """The choice of least work whose predicted total error is below ``accuracy``; failing that, of least error.
+
+    What the user switched off, and light that is known to be missing, does not count for that: nothing could make up
+    for it.
+
+    Parameters
+    ----------
+    accuracy
+        relative rms error of the expected frames.
+    evidence
+        what the pilot measured.
+    switches
+        effects that the user switches on or off, by name.
+    sure
+        standard errors that are added to an estimate.
+    """
+    table, index = Candidates(evidence, switches, sure).best(accuracy)
+    return table.choice(index)
+
+
+class Candidates:
+    """All combinations that the evidence lets choose from, at any accuracy: what they leave is added up once.
+
+    Parameters
+    ----------
+    evidence, switches, sure
+        as for :func:`cheapest`.
+    """
+
+    def __init__(self, evidence: Evidence, switches: Mapping[str, bool], sure: float = SURE) -> None:
+        self.evidence = evidence
+        counts = [_allowed(evidence, name, switches) for name in COUNTED]
+        rows = np.array(list(product(*counts, _COARSE_CELLS, (0, 1))), dtype=np.float64)
+        rows = rows[(rows[:, 3] > 1) | (rows[:, 5] == 1)]  # width is that of what several anchors see
+        if evidence.occluded:
+            # Light of one anchor is what the sensor's centre sees, of several what all of it does: all pixels, or none.
+            rows = rows[(rows[:, 0] > 1) == (rows[:, 4] > 1)]
+        given = _given(switches)
+        self._tables = [
+            _Table(math.nan, evidence, (effects, cells), rows, given, sure)
+            for effects in _subsets(evidence, switches)
+            for cells in evidence.forms(_in_waves(effects))
+        ]
+
+    def best(self, accuracy: float) -> tuple[_Table, int]:
+        """The table and row of the choice that :func:`cheapest` makes at an ``accuracy``."""
+        found = [(table, table.best) for table in (each.at(accuracy) for each in self._tables)]
+        return min(found, key=lambda each: each[0].rank(each[1]))
+
+    def seconds(self, accuracy: float) -> tuple[float, bool]:
+        """Seconds at fixed paces of that choice and of its truth, and whether it keeps the ``accuracy``."""
+        table, index = self.best(accuracy)
+        truth = truth_seconds(self.evidence, table.settings(index), FIXED)
+        return float(table.work[index]) + truth, bool(table.fits[index])
+
+
+def predicted(
+    accuracy: float, evidence: Evidence, settings: Settings, switches: Mapping[str, bool], sure: float = SURE
+) -> Choice:
+    """What ``settings`` leave and take with samples of their own for the rest of the budget.
+
+    Parameters
+    ----------
+    accuracy, evidence, switches, sure
+        as for :func:`cheapest`.
+    settings
+        effects and numbers.
+    """
+    return _table_of(accuracy, evidence, settings, switches, sure).choice(0)
+
+
+def _table_of(
+    accuracy: float, evidence: Evidence, settings: Settings, switches: Mapping[str, bool], sure: float
+) -> _Table:
+    """Predictions of ``settings`` alone; all else as for :func:`cheapest`."""
+    row = np.array([[*counted(settings), settings.coarse_cells, settings.coarse_layers]], dtype=np.float64)
+    drawn = evidence.raster[_in_waves(settings.effects)]
+    cells = (settings.raster_cells or drawn.cells[0]) if settings.raster or drawn.needed else 0
+    return _Table(accuracy, evidence, (settings.effects, cells), row, _given(switches), sure)
+
+
+def doubt(accuracy: float, evidence: Evidence, switches: Mapping[str, bool]) -> tuple[float, Part]:
+    """Work that knowing the evidence for certain could save, and the part that is known worst.
+
+    Parameters
+    ----------
+    accuracy, evidence, switches
+        as for :func:`cheapest`.
+    """
+    careful, hopeful = (cheapest(accuracy, evidence, switches, sure) for sure in (SURE, 0.0))
+    unsure = _table_of(accuracy, evidence, hopeful.settings, switches, 0.0).unsure
+    worst = max(sorted(unsure), key=lambda part: unsure[part], default=Part("cells", 1))
+    if careful.fits:
+        return careful.work - hopeful.work, worst
+    lucky = cheapest(accuracy, evidence, switches, _LUCKY)
+    return lucky.work if lucky.fits else 0.0, worst
+
+
+class _Table:
+    """Predictions of many choices with the same effects.
+
+    Parameters
+    ----------
+    accuracy, evidence, sure
+        as for :func:`cheapest`.
+    form
+        effects that are on, and cells along a pixel of the raster that frames are formed of; 0: a sum of terms.
+    rows
+        (m, 8) anchors, layers, cells, anchors of followed light and of occluded pixels, width of cells of the former,
+        coarse cells, and whether coarse light has all layers.
+    given
+        parts that are left out whatever is chosen.
+    """
+
+    def __init__(
+        self,
+        accuracy: float,
+        evidence: Evidence,
+        form: tuple[frozenset[str], int],
+        rows: FloatArray,
+        given: frozenset[Part],
+        sure: float,
+    ) -> None:
+        effects, self.raster_cells = form
+        self.effects = effects
+        self.accuracy, self.evidence, self.rows = accuracy, evidence, rows
+        self.given, self.sure = given, sure
+        self.anchors, self.layers, self.cells, self.followed_anchors, self.occluded_anchors = rows.T[:5]
+        self.followed_width, self.coarse, self._all_layers = rows.T[5:]
+        indirect = float("interreflection" in effects)
+        waves = float(_in_waves(effects))
+        layered = np.where(self._all_layers > 0, self.layers, 1.0)
+        self.numbers = Numbers(
+            anchors=self.anchors,
+            layers=self.layers,
+            cells=self.cells,
+            coarse_cells=self.coarse,
+            coarse_layers=layered,
+            followed_anchors=self.followed_anchors,
+            followed_width=self.followed_width,
+            waves=waves,
+            indirect=indirect,
+            mixed=float(MIXING in effects),
+            occluded=float(len(evidence.occluded)),
+            occluded_anchors=self.occluded_anchors,
+            raster_cells=float(self.raster_cells),
+        )
+        self._follows = bool(effects & names(lambda effect: effect.followed))
+
+    def at(self, accuracy: float) -> _Table:
+        """The same combinations at an ``accuracy``: what does not depend on it is shared.
+
+        To be called before anything else is asked of the table.
+        """
+        self._avoidable  # noqa: B018 - found once, and copied
+        again = copy.copy(self)
+        again.accuracy = accuracy
+        return again
+
+    def rank(self, index: int) -> tuple[bool, float, float]:
+        """What makes one choice better than another: that it fits, less work, less error."""
+        if not self.fits[index]:
+            return True, float(self._avoidable[index]), 0.0
+        return False, float(self.work[index]), float(self._avoidable[index])
+
+    @cached_property
+    def best(self) -> int:
+        """The best row."""
+        if self.fits.any():
+            chosen = self.fits
+        else:
+            error = np.where(self._entries <= max(_MOST_ENTRIES, self._entries.min()), self._avoidable, math.inf)
+            chosen = error <= _AS_GOOD * error.min()
+        return int(np.lexsort((self._avoidable, self.work, ~chosen))[0])
+
+    def settings(self, index: int) -> Settings:
+        """The settings of a row."""
+        numbers = (int(number) for number in self.rows[index])
+        anchors, layers, cells, followed, occluded, width, coarse, all_layers = numbers
+        settings = Settings(
+            depth=self.evidence.depth,
+            anchors=anchors,
+            layers=self.evidence.layers[layers] if layers > 1 else (),
+            subdivision=cells,
+            effects=self.effects,
+            followed_anchors=followed,
+            followed_width=width,
+            coarse_cells=coarse,
+            coarse_layers=bool(all_layers),
+            shared=self.evidence.shared,
+            repeats=self.evidence.repeats,
+            reach=self.evidence.reach,
+            sharp=self.evidence.sharp,
+            occluded=self.evidence.occluded,
+            occluded_anchors=occluded,
+            raster=self.raster_cells > 0,
+            raster_cells=self.raster_cells,
+        )
+        samples: dict[str, Any] = {f"{name}_samples": float(count[index]) for name, count in self.needed.items()}
+        return replace(settings, **samples)
+
+    def choice(self, index: int) -> Choice:
+        """The choice of a row."""
+        lacking = {
+            "light over sharp lobes": self.evidence.unresolved,
+            "light over mirrors or curved glass both ways, or once and a sharp lobe (left out)": self.evidence.left_out,
+            "light over small mirrors alone (not resolved)": self.evidence.glint,
+        }
+        missing = min(sum(lacking.values()), 1.0)
+        # Errors of the light that is there count for its part of all.
+        rest = [float(self._systematic(sure, frozenset())[index]) for sure in (0.0, SURE)]
+        if not math.isinf(self.evidence.hits):
+            one_hit = 1 / (self.evidence.hits * float(self.samples["direct"][index]))
+            rest = [math.hypot(error, hits * one_hit) for error, hits in zip(rest, _OFF_BY_HITS, strict=True)]
+        value, bound = (missing + (1 - missing) * error for error in rest)
+        return Choice(
+            settings=self.settings(index),
+            systematic=Estimate(value, bound),
+            lacking=lacking,
+            target=float(self.target[index]),
+            noise=float(self.noise[index]),
+            fits=bool(self.fits[index]),
+            work=float(self.work[index]),
+        )
+
+    # ---- errors
+
+    @cached_property
+    def _avoidable(self) -> FloatArray:
+        """(m,) systematic error without what is given."""
+        return self._systematic(self.sure, self.given)
+
+    @property
+    def unsure(self) -> dict[Part, float]:
+        """By part that the only row leaves, what chance may add to the square of its error."""
+        weights = {part: float(self._weight(part)[0]) for part in self.evidence.changes.parts}
+        errors = {part: self.evidence.error(part) for part, weight in weights.items() if weight}
+        return {part: weights[part] ** 2 * (each.bound**2 - each.value**2) for part, each in errors.items()}
+
+    def _systematic(self, sure: float, ignored: frozenset[Part]) -> FloatArray:
+        """(m,) what all that is left out or made coarse adds up to, but for parts that are ``ignored``."""
+        changes, apart = self.evidence.changes, self.evidence.apart
+        chosen = np.stack([self._weight(part) * (part not in ignored) for part in changes.parts], axis=1)
+        drawn = [size**2 for name, size in apart.items() if name not in self.effects and Part(name) not in ignored]
+        drawn += [self.evidence.sharp.left**2] if self.evidence.sharp else []
+        cells = self.raster_cells
+        of_raster = self.evidence.raster[_in_waves(self.effects)].left(cells) if cells else None
+        drawn += [of_raster[sure > 0] ** 2] if of_raster else []
+        squared, spread = changes.squared(chosen)
+        return np.asarray(np.sqrt(np.maximum(np.maximum(squared, 0) + sure * spread, 0) + sum(drawn)))
+
+    def _weight(self, part: Part) -> FloatArray:
+        """(m,) how much of a part's change each row leaves."""
+        light, _, what = part.name.rpartition(" ")
+        if not part.count:
+            return np.full(len(self.rows), float(part.name not in self.effects))
+        if not light:
+            left = float(self._follows or not part.name.startswith("followed"))
+            if part.name == "followed_width":
+                left = left * (self.followed_anchors > 1) * (np.square(1 / self.coarse) if part.count == 1 else 1.0)
+            return np.asarray((getattr(self, part.name) == part.count) * left, dtype=np.float64)
+        filed = self.numbers.indirect > 0 if light == "indirect" else getattr(self, ANCHORS_OF[light]) > 1
+        # Even cells are of second order; several layers leave as much of one layer's error as they do of direct light.
+        return np.asarray(filed * (np.square(1 / self.coarse) if what == "cells" else self._left_by_layers))
+
+    @cached_property
+    def _left_by_layers(self) -> FloatArray:
+        """(m,) part of one layer's error that the layers of coarse light leave."""
+        ladder = self.evidence.ladders["layers"]
+        parts = np.zeros(max(ladder) + 1)
+        for count, error in ladder.items():
+            parts[count] = min(error.bound / ladder[1].bound, 1.0) if ladder[1].bound else 0.0
+        return np.where(self._all_layers > 0, parts[self.layers.astype(int)], 1.0)
+
+    # ---- samples and work
+
+    @cached_property
+    def fits(self) -> npt.NDArray[np.bool_]:
+        """(m,) whether anything is left for sampling, and the light can be held."""
+        return (self._avoidable < _MARGIN * self.accuracy) & (self._entries <= _MOST_ENTRIES)
+
+    @cached_property
+    def target(self) -> FloatArray:
+        """(m,) Monte Carlo error at which sampling may stop.
+
+        Where looks see the error of all shots, it needs no margin; what the pilot saw of a few frames does.
+        """
+        forming, left = self.evidence.forming, np.square(_MARGIN * self.accuracy) - np.square(self._avoidable)
+        margin = _MARGIN if tells_all(forming.classes, forming.shots, forming.pixels) else 1.0
+        target = np.where(left > 0, np.sqrt(np.maximum(left, 0)) / margin, _MARGIN * self.accuracy)
+        return (
+            target if math.isinf(self.evidence.hits) else target * math.sqrt(1 - (_ONE_HIT * _OFF_BY_HITS.bound) ** 2)
+        )
+
+    @cached_property
+    def _prices(self) -> dict[str, FloatArray]:
+        """(m,) work of one sample in every group, by kind of light."""
+        lines = traced_for(self.evidence.forming.lines, self.evidence.forming.parted)
+        return {
+            name: lines * GROUPS * getattr(FIXED, name) * effort.paths * connections(name, self.numbers)
+            for name, effort in efforts(self.evidence, self.effects).items()
+        }
+
+    @cached_property
+    def samples(self) -> dict[str, FloatArray]:
+        """(m,) samples of a group by kind of light, as they are traced."""
+        return {name: np.asarray(whole(name, count)) for name, count in self.needed.items()}
+
+    @cached_property
+    def needed(self) -> dict[str, FloatArray]:
+        """(m,) samples of a group by kind of light, or the part of one: the least work for a sum of variances."""
+        parts = {name: np.sqrt(self._by_row(name, _variance) * price) for name, price in self._prices.items()}
+        every = sum(parts.values()) + np.zeros(len(self.rows))
+        single = self.target * math.sqrt(GROUPS) / _BOUND_OVER_ERROR
+        found = {}
+        for name, part in parts.items():
+            # SampledLight without noise takes no share; a share of one keeps the division defined.
+            share = np.sqrt(np.divide(part, every, out=np.ones(len(every)), where=part > 0))
+            needed = self._by_row(name, partial(_needed, target=single * share))
+            if name == "direct":
+                needed = np.maximum(needed, 1 / (self.evidence.hits * _ONE_HIT * self.target))
+            # What needs no whole sample does not take two when all others grow.
+            found[name] = np.where(needed < 1, needed, whole(name, needed))
+        return found
+
+    @cached_property
+    def noise(self) -> FloatArray:
+        """(m,) Monte Carlo error that these samples leave."""
+        total = np.zeros(len(self.rows))
+        for name, count in self.samples.items():
+            left = self._by_row(name, partial(_left, samples=count))
+            total = total + (connections(name, self.numbers) > 0) * np.square(left) / GROUPS
+        return np.sqrt(total)
+
+    def _by_row(self, name: str, of: Callable[[Effort], Number]) -> FloatArray:
+        """(m,) something ``of`` the light ``name``: where there are several anchors, direct light goes to random points
+        of the sensor."""
+        found = of(efforts(self.evidence, self.effects)[name]) + np.zeros(len(self.rows))
+        if name == "direct":
+            found = np.where(self.anchors > 1, of(self.evidence.spread), found)
+        return np.asarray(found)
+
+    @cached_property
+    def _entries(self) -> FloatArray:
+        """(m,) of one group's filed light."""
+        evidence, samples = self.evidence, {**self.samples}
+        for name in ("indirect", "followed", "followed_from_camera", "occluded"):
+            samples.setdefault(name, np.ones(len(self.rows)))
+        found = entries(evidence.direct.paths, evidence.forming.classes, self.numbers, samples)
+        return np.asarray(found) + np.zeros(len(self.rows))
+
+    @cached_property
+    def work(self) -> FloatArray:
+        """(m,) seconds at fixed paces."""
+        tracing = sum(self.samples[name] * price for name, price in self._prices.items())
+        forming = self.evidence.forming
+        filing = filing_seconds(forming, self.numbers, self._entries, FIXED)
+        shown = optics_seconds(forming, self.numbers, FIXED) + checking_seconds(forming, self.numbers, FIXED)
+        return np.asarray(tracing + filing + shown)
+
+
+def _variance(kind: Effort) -> Number:
+    return kind.variance
+
+
+def _needed(kind: Effort, target: Number) -> Number:
+    """Samples at which sampling may stop at a ``target``: by a bound, which lies the further above the error the fewer
+    paths make it."""
+    noise = kind.noise
+    light = needed = noise.samples_for(target)
+    if noise.spread:
+        for _ in range(_SETTLED):
+            above = 1 + np.sqrt(noise.spread * noise.samples / needed) * (bound_over_error(1.0, GROUPS) ** 2 - 1)
+            needed = light * np.maximum(above / _BOUND_OVER_ERROR**2, 1.0)
+    return needed
+
+
+def _left(kind: Effort, samples: Number) -> Number:
+    return kind.noise.left(samples)
+
+
+def _in_waves(effects: frozenset[str]) -> bool:
+    """Whether the shadow is wave-optical."""
+    return bool(effects & names(lambda effect: effect.in_shadow))
+
+
+def counted(settings: Settings) -> tuple[int, int, int, int, int, int]:
+    """The numbers in ``settings`` that :data:`COUNTED` names."""
+    apart = settings.followed_anchors, settings.occluded_anchors, settings.followed_width
+    return settings.anchors, len(settings.depths), settings.subdivision, *apart
+
+
+def _counts(evidence: Evidence, name: str) -> list[int]:
+    return list(evidence.ladders[name])
+
+
+def _allowed(evidence: Evidence, name: str, switches: Mapping[str, bool]) -> list[int]:
+    """Numbers of ``name`` that the user leaves to choose from."""
+    counts = _counts(evidence, name)
+    if name not in switches or len(counts) == 1:
+        return counts
+    return [count for count in counts if (count > 1) == switches[name]]
+
+
+def _given(switches: Mapping[str, bool]) -> frozenset[Part]:
+    """What is left out by the user's choice."""
+    off = {name for name, on in switches.items() if not on}
+    if "anchors" in off:
+        off.add("occluded_anchors")
+    return frozenset(Part(name, int(name in COUNTED)) for name in off)
+
+
+def _subsets(evidence: Evidence, switches: Mapping[str, bool]) -> Iterator[frozenset[str]]:
+    """Effects that may be on together: those that take no time always are, unless the user switches them off."""
+    takes_time, present = priced(), frozenset(evidence.effects)
+    free = [name for name in EFFECTS if name in takes_time & present and name not in switches]
+    always = {name for name in EFFECTS if switches.get(name, name in present - takes_time)}
+    for several in chain.from_iterable(combinations(free, count) for count in range(len(free) + 1)):
+        yield frozenset(always | set(several))
+
+
+# -------- The finest accuracy that a time buys
+
+FIRST_LOOK = 1e-3
+"""Accuracy of the look that tells what accuracies cost: a looser one takes as long."""
+_STEPS, _DECADES = 10, 5
+"""Accuracies a decade: neighbours differ by a quarter, as predictions of time are good to. The finest, 1e-5, is
+a thirtieth of what sensors tell, and ladders of anchors and cells end near it."""
+
+
+@dataclass(frozen=True)
+class Affordable:
+    """An ``accuracy``, the ``seconds`` that its run is predicted to take at fixed paces, and whether that ``fits``."""
+
+    accuracy: float
+    seconds: float
+    fits: bool
+
+
+def accuracies(finest: float) -> list[float]:
+    """Those that are tried, from the loosest down to ``finest``."""
+    steps = (float(f"{10 ** (-step / _STEPS):.3g}") for step in range(_DECADES * _STEPS + 1))
+    return [HIGHEST_ACCURACY, *(each for each in steps if finest <= each < HIGHEST_ACCURACY)]
+
+
+def affordable(candidates: Candidates, seconds: float, finest: float, kept: bool = True) -> Affordable:
+    """The finest accuracy whose light, frames and truth take at most so many seconds; the loosest where none does.
+
+    Parameters
+    ----------
+    candidates
+        choices.
+    seconds
+        for light, frames and truth.
+    finest
+        accuracy that the evidence is good for.
+    kept
+        whether the choice must be predicted to keep the accuracy; else only its price counts.
+    """
+
+    def tried(accuracy: float) -> Affordable:
+        taken, keeps = candidates.seconds(accuracy)
+        return Affordable(accuracy, taken, taken <= seconds and (keeps or not kept))
+
+    grid = accuracies(finest)
+    best, too_fine = tried(grid[0]), len(grid)
+    if not best.fits:
+        # What keeps no accuracy at all is for the plan to say; here only time counts.
+        return Affordable(best.accuracy, best.seconds, best.seconds <= seconds)
+    coarse = 0
+    while too_fine - coarse > 1:
+        middle = (coarse + too_fine) // 2
+        found = tried(grid[middle])
+        if found.fits:
+            best, coarse = found, middle
+        else:
+            too_fine = middle
+    return best
+
+
+def told(found: Affordable, seconds: float, around: float) -> Iterator[str]:
+    """Why a plan is flagged: more time was needed than was given.
+
+    Parameters
+    ----------
+    found
+        what was chosen.
+    seconds, around
+        that were asked for, and that all but light, frames and truth takes.
+    """
+    if not found.fits:
+        yield (
+            f"{seconds:g} seconds are too few: even accuracy {found.accuracy:g}, which was taken, is predicted to take "
+            f"{found.seconds + around:.1f} s from start to finish; give more"
+        )

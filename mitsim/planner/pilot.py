@@ -1,0 +1,442 @@
+"""A short look at a scene before the real work: a bench and a lighting in, numbers that the plan decides by out.
+
+Every error is relative, ``||a - b|| / ||b||``, over up to four shots of the family.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+
+from mitsim.bench import effects
+from mitsim.bench.bench import Apparatus
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.core.seeds import integer
+from mitsim.devices.patterns import Lighting
+from mitsim.light.cost_model import FIXED, Numbers, forming_seconds
+from mitsim.light.passes import Simulation
+from mitsim.light.settings import LOOKS, Changes, Drawn, Effort, Evidence, Forming, Part, Settings
+from mitsim.planner.pilot_direct import SMOOTH, AnchoredLight, FineLight, OccludedLight, occluded_pixels, sharp_pixels
+from mitsim.planner.pilot_indirect import FollowedLight, SwitchedEffects
+from mitsim.planner.pilot_samples import GOOD_ENOUGH, Sample
+from mitsim.scene.darkness import why_dark
+from mitsim.transport.highlights import highlights
+from mitsim.transport.missed import LeftOut, left_out_light
+from mitsim.transport.sharp_lobes import SharpLight, sharp_light, with_neighbours
+
+STAGES = ("cells", "effects", "anchors", "followed", "occluded")
+"""What is looked at apart: cells and layers of direct light, effects switched off, anchors, those of followed light,
+and of occluded pixels."""
+_STAGE_OF = {
+    "cells": "cells",
+    "layers": "cells",
+    "anchors": "anchors",
+    "anchored cells": "anchors",
+    "anchored layers": "anchors",
+    "followed_anchors": "followed",
+    "followed_width": "followed",
+    "occluded_anchors": "occluded",
+    "occluded cells": "occluded",
+    "occluded layers": "occluded",
+}
+FINER = 4
+"""Samples of a stage over those of the look before: standard errors are halved at least."""
+_ROUGH = 0.5
+"""Part of the accuracy that a few anchors may leave at most before it is asked which pixels are to blame."""
+_OF_FOLLOWED = 0.5
+"""The same for followed light: every further step takes twice as many connections, and its own noise is as large as
+what it tells."""
+_FRAMES_AS_MANY = 20.0
+"""Frames whose forming takes as long as one more change does: four shots seen by four looks, and finer cells."""
+_OF_EFFECTS = 3
+"""Changes that each effect's look takes as long as: it forms all light with and without, and coarse cells besides."""
+_OVER_PRICES, _LESS_S = 4.2, 0.6
+"""Seconds of a look over the price of its samples, and less what flat scenes have less: kernels, searches for lobes and
+edges, chains of changes (processor seconds in a new process: photograph 1.0, gift_card 2, corner 3, cookie_bag 7.5; six
+tenths of them by the clock on two cores)."""
+_LOBE_RAYS = 2**22
+"""Rays that look for sharp lobes, some 0.5 s: a lobe of 1e-4 of the hemisphere is met 400 times, a metal ball of 20 mm
+at 370 twelve times on a sensor of 6.4 mm; a quarter of them overlooked it in one plan of twenty."""
+_CAUSTIC_PATHS = 2**20
+"""Paths that look for light that is left out: a thousandth of the light that all curved glass sends is met 30 times."""
+_FEWEST_HITS = 30.0
+"""Below so many hits the pilot's connections do not tell how much light a lobe sends, nor how noisy it is."""
+_FEWEST_MET = 3.0
+"""Below so many meetings of the projector's own lens the pilot may see none, one time in twenty: where it sees one, the
+run samples until it knows the light; else neither may."""
+_FAINT = 1e-3
+"""Part of the mean light on the sensor below which its centre sees nothing but rounding."""
+_MOST_RAYS = 2**26
+"""Rays that look for what a scene shows while few have met it, some 0.5 s: they meet 2e-4 of the window's width."""
+_MORE = 4
+"""Times as many rays as before: a power of two keeps the places of each pixel's rays even."""
+_LOOSELY = 0.3
+"""Part of the light of highlights that the search for lobes may lack where it has found them: some 30 hits tell it to a
+fifth."""
+_FEWEST_IN_LOOK = 8.0
+"""Hits that a look at a small target must count on: the looks then tell its light to a fifth."""
+_ALIGNED = 1e-6
+"""Relative distance from the aligned plane that is rounding: the plane keeps its exact cells."""
+
+
+class Look:
+    """A look at a scene, as short as it can be at first; each of its stages is repeated with more samples.
+
+    Parameters
+    ----------
+    bench
+        what is looked at.
+    lighting
+        of the family that will be captured.
+    accuracy
+        where the search for enough anchors, layers and cells may stop.
+    seed
+        root of the random streams.
+    lines
+        that share the paths, of which the bench shows one.
+
+    Raises
+    ------
+    MitsimError
+        when no light of the projector reaches the camera.
+    """
+
+    def __init__(self, bench: Apparatus, lighting: Lighting, accuracy: float, seed: int, lines: int = 1) -> None:
+        self.bench, self.lighting, self.accuracy, self.seed, self._lines = bench, lighting, accuracy, seed, lines
+        self.present = effects.present(bench)
+        first_look = frozenset(self.present) & effects.names(lambda effect: effect.first_look)
+        first = Simulation(bench, Settings(depth=bench.geometry.scene_distance, effects=first_look))
+        self._sharp = _sharp(first, seed)
+        depth, centre, hits = _first_light(first, seed, self._sharp)
+        # A connection that meets a sharp lobe by chance may be all that the centre sees.
+        self._light = self._sharp.rest if self._sharp.irradiance else centre
+        self._seen = seen = Simulation(bench, Settings(depth=depth, effects=first_look))
+        reach = light_reach(seen, integer(seed, "pilot", "reach"))
+        own = integer(seed, "pilot", "sharp")
+        apart = sharp_pixels(seen, self._sharp, self._light, accuracy, own)
+        self._base = Settings(depth=depth, effects=first_look, reach=reach, sharp=apart)
+        sample, self._hits = Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors), math.inf
+        if not bench.loaded.mirrors and not self._sharp.irradiance:
+            sample = _enough(sample, hits, bench)
+            self._hits = hits if hits < _FEWEST_HITS else math.inf
+        self.samples = dict.fromkeys(STAGES, sample)
+        self.occluded: OccludedLight | None = None
+        for stage in STAGES:
+            self._measure(stage)
+        if self._rough:
+            self._look_for_occluded()
+
+    def _look_for_occluded(self) -> None:
+        """Give pixels that are hidden from part of the sensor anchors of their own."""
+        own = integer(self.seed, "pilot", "occluded")
+        occluded = occluded_pixels(Simulation(self.bench, self._base), self.accuracy, own)
+        shown = np.isin(self.samples["occluded"].shown, occluded)
+        # Unless the sample's shots show some of either kind, nobody knows how many anchors each takes.
+        if shown.any() and not shown.all():
+            self._base = replace(self._base, occluded=occluded)
+            for stage in ("anchors", "occluded"):
+                self._measure(stage)
+
+    def refine(self, stage: str) -> None:
+        """Repeat a ``stage`` with so many more samples that its standard errors are halved."""
+        self.samples[stage] = self._finer(stage)
+        self._measure(stage)
+        vars(self).pop("evidence", None)
+
+    def price(self, stage: str) -> float:
+        """Work of repeating a ``stage``, in seconds at fixed paces; infinite where it has all the samples it may."""
+        now, finer = self.samples[stage], self._finer(stage)
+        if (finer.fine, finer.direct) == (now.fine, now.direct):
+            return math.inf
+        one, changes = forming_seconds(self.forming, Numbers.coarsest(), _FRAMES_AS_MANY, FIXED), 0
+        pixels, shown = self.bench.n**2, len(finer.shown)
+        if stage == "cells":
+            paths, changes = FIXED.direct * shown * finer.fine, len(self.fine.changes)
+        elif stage == "anchors":
+            connections = sum(part.count**2 for part in self.anchored.changes if part.name == stage)
+            paths, changes = FIXED.anchored * shown * finer.anchored * connections, len(self.anchored.changes)
+        elif stage == "occluded":
+            count = len(self.occluded.pixels) if self.occluded else 0
+            if self.occluded is None or finer.occluded(count) == now.occluded(count):
+                return math.inf
+            connections = sum(part.count**2 for part in self.occluded.changes if " " not in part.name)
+            paths = FIXED.occluded * FINER * self.occluded.paths / LOOKS * connections
+            changes = len(self.occluded.changes)
+        elif stage == "followed":
+            connections = sum(part.count**2 for part in self.followed.changes if part.name == "followed_anchors")
+            lanes = sum(self.switched.lanes.values())
+            paths, changes = FIXED.followed * lanes * finer.followed * connections, len(self.followed.changes)
+        else:
+            followed = sum(getattr(FIXED, name) * lanes for name, lanes in self.switched.lanes.items())
+            paths, changes = (
+                FIXED.direct * pixels * finer.direct + followed * finer.followed,
+                _OF_EFFECTS * len(self.present),
+            )
+        return LOOKS * paths + changes * float(one)
+
+    @property
+    def seconds(self) -> float:
+        """What the look took, about, at fixed paces."""
+        prices = [price / FINER for price in map(self.price, STAGES) if math.isfinite(price)]
+        return max(_OVER_PRICES * sum(prices) - _LESS_S, 0.0)
+
+    @property
+    def _rough(self) -> bool:
+        """Whether a few anchors may leave too much: light that is hidden from part of the sensor, or sharp gloss."""
+        few = Changes.between(self.anchored.few, self.switched.light**2).estimate([Part("anchors", SMOOTH)])
+        return few.bound > _ROUGH * self.accuracy
+
+    def heavy(self, samples: int) -> dict[str, Effort]:
+        """What is followed from the camera takes, by its name in the evidence, as looks of more ``samples`` see it: a
+        lobe that is met in one of a million paths, and brings most of the noise, is in none of the short ones."""
+        found = {
+            "from_camera": self.switched.with_more(samples),
+            "followed_from_camera": self.followed.with_more(self.switched.light, samples),
+        }
+        return {name: effort for name, effort in found.items() if effort.noise.error}
+
+    def _finer(self, stage: str) -> Sample:
+        sample = self.samples[stage]
+        return replace(sample, effort=FINER * sample.effort)
+
+    def _measure(self, stage: str) -> None:
+        bench, base, sample, seed = self.bench, self._base, self.samples[stage], self.seed
+        if stage == "cells":
+            self.fine = FineLight(bench, base, sample, self.accuracy, seed)
+        elif stage == "effects":
+            looked = bench, self._everything, sample, seed, self.fine.judging, self.accuracy
+            self.switched = SwitchedEffects(*looked)
+        elif stage == "followed":
+            tolerance, lit = self._tolerance(_OF_FOLLOWED), self.switched.received > 0
+            self.followed = FollowedLight(bench, self._everything, sample, tolerance, seed, self.fine.judging, lit=lit)
+        elif stage == "occluded":
+            if base.occluded:
+                self.occluded = OccludedLight(bench, base, sample, self._tolerance(), seed, self.fine.judging)
+        else:
+            self.anchored = AnchoredLight(bench, base, sample, self._tolerance(), seed, self.fine.judging)
+
+    def _tolerance(self, part: float = GOOD_ENOUGH) -> float:
+        """Norm of that ``part`` of all light that the capture may leave out."""
+        return part * self.accuracy * self.switched.light
+
+    @property
+    def _everything(self) -> Settings:
+        return replace(self._base, effects=frozenset(self.present), subdivision=2)
+
+    @cached_property
+    def forming(self) -> Forming:
+        """How frames are formed."""
+        return self.fine.forming(self.lighting)
+
+    @cached_property
+    def _raster(self) -> tuple[Drawn, Drawn]:
+        return self.fine.raster()
+
+    @cached_property
+    def _left_out(self) -> LeftOut:
+        return _left_out(self.switched.simulation, self.seed)
+
+    def _rows_and_columns(self, pixels: tuple[int, ...]) -> tuple[float, float]:
+        """Parts of the projector's rows and of its columns that ``pixels`` lie in."""
+        rows, columns = (np.unique(each).size / self.bench.n for each in np.divmod(pixels, self.bench.n))
+        return rows, columns
+
+    @property
+    def _unmet(self) -> float:
+        """Irradiance of glossy balls' highlights that neither the search for lobes nor the looks' rays meet."""
+        loaded, geometry = self.bench.loaded, self.bench.geometry
+        if not loaded.glossy:
+            return 0.0
+        every = highlights(loaded.scene, loaded.camera, self._seen.physics.projector, geometry)
+        unmet = every.unmet(self.samples["cells"].fine * LOOKS)
+        if not len(unmet.pixels):
+            return 0.0
+        near = with_neighbours(np.isin(np.arange(self.bench.n**2), unmet.pixels), self.bench.n)
+        missing = float(unmet.irradiance.sum() - self._sharp.by_pixel[near].sum())
+        return missing if missing > _LOOSELY * float(unmet.irradiance.sum()) else 0.0
+
+    def _unsure_glint(self, other: float) -> float:
+        """Part of all light that comes over mirrors alone and is in no frame, or may be in the wrong pixels.
+
+        ``other``: irradiance of all other light [W m^-2].
+        """
+        if not self.bench.loaded.mirrors:
+            return 0.0
+        found, unsure = self.bench.glint.irradiance(self.bench.geometry)
+        return unsure / (other + found + unsure) if unsure else 0.0
+
+    @cached_property
+    def evidence(self) -> Evidence:
+        """What has been found."""
+        fine, switched, anchored = self.fine, self.switched, self.anchored
+        seen = {**anchored.changes, **fine.changes, **switched.changes, **self.followed.changes}
+        if self.occluded:
+            seen |= self.occluded.changes
+        light, sharp, apart = switched.light, self._sharp, self._base.sharp
+        samples = self.samples["effects"].followed * LOOKS
+        indirect, shared, repeats = switched.indirect_effort()
+        followed, from_camera = self.followed.efforts(light)
+        left_out, mirror = self._left_out.unseen(_FEWEST_HITS / samples, _FEWEST_MET / samples)
+        found = self._light + sharp.irradiance + switched.received
+        few = not apart and sharp.hits * self.samples["cells"].fine * LOOKS < _FEWEST_HITS
+        unmet = self._unmet
+        unresolved = unmet + (sharp.irradiance if few else 0.0)
+        return Evidence(
+            depth=self._base.depth,
+            layers=fine.layers,
+            changes=Changes.between(seen, light**2),
+            direct=fine.effort(light),
+            spread=fine.spread(light),
+            anchored=anchored.effort(light),
+            indirect=indirect,
+            shared=shared,
+            repeats=repeats,
+            from_camera=switched.effort("from_camera"),
+            forming=replace(self.forming, lines=self._lines, occluded=self._rows_and_columns(self._base.occluded)),
+            apart=switched.apart,
+            unresolved=unresolved / (self._light + sharp.irradiance + unmet) if unresolved else 0.0,
+            left_out=left_out / (left_out + found) if left_out else 0.0,
+            glint=self._unsure_glint(found),
+            mirror=mirror,
+            reach=self._base.reach,
+            sharp=apart,
+            sharp_light=switched.sharp_effort(),
+            followed=followed,
+            followed_from_camera=from_camera,
+            occluded=self._base.occluded,
+            occluded_light=self.occluded.effort(light) if self.occluded else Effort.none(),
+            raster=self._raster,
+            hits=self._hits,
+        )
+
+
+def measure(bench: Apparatus, lighting: Lighting, accuracy: float, seed: int) -> Evidence:
+    """What the shortest :class:`Look` of these arguments finds.
+
+    Parameters
+    ----------
+    bench, lighting, accuracy, seed
+        as there.
+    """
+    return Look(bench, lighting, accuracy, seed).evidence
+
+
+def stage_of(part: Part) -> str:
+    """The stage that tells the error of a ``part``."""
+    return _STAGE_OF.get(part.name, "effects")
+
+
+def _enough(sample: Sample, hits: float, bench: Apparatus) -> Sample:
+    """The ``sample`` with so many rays that some meet what the camera sees, where one of each pixel has few ``hits``.
+
+    MitsimError where that takes more than a look may trace.
+    """
+    effort = math.ceil(_FEWEST_IN_LOOK / (hits * sample.direct)) if hits else 1
+    more = replace(sample, effort=effort * sample.effort)
+    if effort > 1 and hits * more.direct < _FEWEST_IN_LOOK:
+        n, side = bench.n, math.sqrt(hits)
+        raise MitsimError(
+            f"what the camera sees is too small for the projector's light: all that it lights fills {hits:.1e} of a "
+            f"projector pixel ({side:.1e} of one a side), of {n} x {n}, and would be met by too few rays; give the "
+            "projector a narrower fov, or a larger target"
+        )
+    return more
+
+
+def _sharp(simulation: Simulation, seed: int) -> SharpLight:
+    """Direct light over lobes that are too sharp to be met by connections."""
+    loaded = simulation.bench.loaded
+    if not loaded.glossy:
+        return SharpLight.none(simulation.bench.n**2)
+    parts = loaded.scene, loaded.camera, simulation.physics.projector, simulation.physics.geometry
+    return sharp_light(*parts, integer(seed, "pilot", "lobes"), max(1, _LOBE_RAYS // simulation.bench.n**2))
+
+
+def _left_out(simulation: Simulation, seed: int) -> LeftOut:
+    """Light that no tracer finds, or connections may not meet."""
+    loaded, physics = simulation.bench.loaded, simulation.physics
+    if not loaded.mirrors:
+        return LeftOut.none()
+    samples = max(1, _CAUSTIC_PATHS // (simulation.aim.shape[0] * simulation.aim.shape[1]))
+    own = integer(seed, "pilot", "caustics")
+    parts = loaded.scene, loaded.camera, physics.projector, simulation.aim
+    return left_out_light(*parts, physics.geometry, own, samples)
+
+
+def _first_light(simulation: Simulation, seed: int, sharp: SharpLight) -> tuple[float, float, float]:
+    """Where light is seen, 1 / mean(1/z) [mm], how much of it, and how many rays bring it if each pixel sends one.
+
+    From one ray of each projector pixel, or, where hardly one meets what the camera sees, from more. Rays count by
+    their light, as so many equal ones.
+    """
+    bench, own = simulation.bench, integer(seed, "pilot", "depth")
+    enough = min(_FEWEST_HITS, simulation.bench.n**2 / 4)
+    first, samples = 0, 1
+    deposits = simulation.direct.trace(own)
+    while _equal(deposits.value) < enough and not bench.loaded.mirrors and not sharp.irradiance:
+        if _MORE * (first + samples) * bench.n**2 > _MOST_RAYS:
+            break
+        first, samples = first + samples, (_MORE - 1) * (first + samples)
+        deposits = simulation.direct.trace(own, first, samples)
+    total = float(deposits.value.sum()) / samples
+    if not bench.loaded.mirrors and not sharp.irradiance:
+        everywhere = Simulation(bench, replace(simulation.settings, anchors=2)).direct.trace(own, first, samples)
+        if total < _FAINT * float(everywhere.value.sum()) / samples:
+            raise MitsimError(
+                "the sensor's centre sees no light of the projector, though other parts of the sensor do: "
+                + why_dark(bench.loaded)
+            )
+    if not total and not bench.loaded.mirrors:
+        raise MitsimError(f"no light of the projector reaches the camera: {why_dark(bench.loaded)}")
+    # Sums by numpy, here and elsewhere: those of BLAS depend on the number of its threads in the last bits.
+    mean = float((deposits.inverse_depth * deposits.value).sum()) / (samples * total) if total else 0.0
+    # A plane is met at its own depth but for rounding; the aligned plane keeps its exact cells.
+    flat = abs(mean * bench.geometry.scene_distance - 1) < _ALIGNED
+    depth = bench.geometry.scene_distance if flat or mean <= 0 else 1 / mean
+    return depth, total, _equal(deposits.value) / samples
+
+
+def _equal(values: FloatArray) -> float:
+    """How many equal ``values`` would scatter as much about their sum as these."""
+    squares = float(np.square(values, dtype=np.float64).sum())
+    return float(values.sum(dtype=np.float64)) ** 2 / squares if squares else 0.0
+
+
+# -------- How far from the axis light comes
+
+_CONNECTIONS = 2**16
+"""Connections that look for near surfaces, some 10 ms; what they overlook is counted when the light is filed."""
+_FLAT = 1e-4
+"""Relative distance of the nearest light from the mean below which the scene is flat: single precision is 1e-7."""
+
+
+def light_reach(simulation: Simulation, seed: int) -> float | None:
+    """Largest tan-angle of direct light at any point of the sensor, seen from its centre; None: that of its depth.
+
+    At the field stop's edge the sensor sees surfaces nearer than the mean depth beyond the cells of a flat scene.
+    Found by connections to random points of the sensor, plus a projector pixel for what they did not meet; never more
+    than the nearest light can have.
+
+    Parameters
+    ----------
+    simulation
+        with the depth that the cells are made for.
+    seed
+        of the connections.
+    """
+    bench, depth = simulation.bench, simulation.settings.depth
+    tracer = simulation.spread
+    deposits = tracer.trace(seed, 0, max(1, _CONNECTIONS // tracer.lanes))
+    if not deposits.value.size:
+        return None
+    nearest = 1 / float(deposits.inverse_depth.max())
+    if nearest > depth * (1 - _FLAT):
+        return None
+    farthest = max(float(abs(angle).max()) for angle in (deposits.row, deposits.column))
+    pixel = max((last - first) / bench.n for first, last in bench.windows_at(depth))
+    reach = min(farthest + pixel, simulation.physics.geometry.reach(nearest))
+    return reach if reach > simulation.reach else None

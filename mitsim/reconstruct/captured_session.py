@@ -1,0 +1,602 @@
+"""A folder with the frames of a real calibration session in; the camera's factors, and what nobody knows of them, out.
+
+Numbers are those of a simulated session: frames of one, written to such a folder, give its factors bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.arguments import checked
+from mitsim.core.arrays import FloatArray
+from mitsim.core.configuration import locate
+from mitsim.core.environment import versions
+from mitsim.core.errors import MitsimError
+from mitsim.core.exr import checksum, verify
+from mitsim.core.files import output_folder
+from mitsim.core.images import image_size, own_end, read_image
+from mitsim.core.job import Job
+from mitsim.core.manifests import CalibrationManifest, Digital
+from mitsim.core.parallel import in_threads, single_threaded_blas
+from mitsim.core.resources import workers
+from mitsim.devices.framelist import DarkFile, SessionFrames, StripeFile, load_frames
+from mitsim.devices.patterns import stripe_signs
+from mitsim.devices.sensor import digital_of, load_sensor
+from mitsim.devices.session import SIDES, UNIFORM, Half, Merge, Side
+from mitsim.reconstruct.estimate_factors import Estimate, Seen, StripeSums, stripe_sums
+from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.session_faults import Checked, Circumstances, check_session
+
+_FILLED = ("read_noise_e", "step_dn", "saturation_dn")
+"""Of a list's `digital`, what a camera's file states where the list does not."""
+_COMPARED = {"gain_dn_per_e": (0.05, 0.0), "black_level_dn": (0.02, 1.0), "saturation_dn": (0.02, 1.0)}
+"""What both state, and from which relative and absolute difference they contradict: published gains are good to a few
+percent, level and end are settings, true to a digital number."""
+_UNLIKE, _MATTERS = 4.0, 0.02
+"""Squared difference of two frames that should be alike, in the session's median one, and its root as a part of their
+light, from which one is wrong: light that is twice the usual doubles the first, less than the second costs less than
+most sessions' noise."""
+_LIT = 0.01
+"""Light of a dark frame beyond the others', as a part of the uniform frame's, from which it is wrong."""
+_CLIPPED, _FEW = 2e-3, 10
+"""Part of a frame's pixels, and how many, at its largest number that are no chance: of noisy ones a few are."""
+
+
+@checked
+def calibrate_frames(
+    folder: Path | str | SessionFrames,
+    output: Path | str | None = None,
+    job: Job | None = None,
+    camera: Path | str | None = None,
+) -> Factors:
+    """The camera's two factors, from the frames of a real session.
+
+    Parameters
+    ----------
+    folder
+        with the frames and their list, as docs/formats.md describes it; or what :func:`load_frames` says of it.
+    output
+        CAL folder that is written; None keeps the factors in memory.
+    job
+        clock and progress.
+    camera
+        name of a shipped camera, or its TOML file: what the list does not state of noise and saturation is the
+        camera's, and what it states is compared.
+
+    Returns
+    -------
+    Factors
+        flagged where they cannot be trusted: for saturated frames, responses that are not separable, and a list that
+        contradicts the camera.
+
+    Raises
+    ------
+    MitsimError
+        for frames that are missing, there twice, of different sizes or cannot be read, for a list that breaks a rule,
+        and an output that cannot be written.
+    """
+    job = job or Job()
+    session = folder if isinstance(folder, SessionFrames) else load_frames(folder)
+    doubts: tuple[str, ...] = ()
+    if camera is not None:
+        session, doubts = _with_camera(session, camera)
+    _check_sizes(session)
+    if output is None:
+        return _calibrated(session, job, doubts)
+    with output_folder(output) as place:
+        factors = _calibrated(session, job, doubts)
+        factors.write(place)
+    return factors
+
+
+def _with_camera(session: SessionFrames, camera: Path | str) -> tuple[SessionFrames, tuple[str, ...]]:
+    """The ``session`` with what its list does not state taken from the ``camera``, and where both contradict."""
+    sensor = load_sensor(locate(camera, "calibration", ".toml"))
+    stated, own = session.listed.digital, digital_of(sensor, session.listed.digital.exposure_s)
+    absent = {name: getattr(own, name) for name in _FILLED if getattr(stated, name) is None}
+    doubts = []
+    for name, (part, least) in _COMPARED.items():
+        ours, theirs = getattr(stated, name), getattr(own, name)
+        if ours is not None and theirs is not None and abs(ours - theirs) > max(part * theirs, least):
+            doubts.append(
+                f"camera {sensor.name}: digital.{name} is {ours:g} in the list, and {theirs:g} by the camera's file; "
+                "correct the wrong one, or leave --camera out"
+            )
+    listed = session.listed.model_copy(update={"digital": stated.model_copy(update=absent)})
+    return replace(session, listed=listed), tuple(doubts)
+
+
+def chosen_responses(session: SessionFrames, chosen: Iterable[tuple[Side, int]]) -> Iterator[tuple[FloatArray, float]]:
+    """Response (rows, columns) to each of the ``chosen`` +-1 patterns, side and number, of a real ``session``, and the
+    standard deviation of its noise [electrons/s]; where the list does not state the sensor's, that of its light alone.
+
+    MitsimError for a frame with pixels at the full well or the ADC's end, where a model's fit would be misled.
+    """
+    _check_sizes(session)
+    readings = _Readings(session)
+    for side, index in chosen:
+        rate, variance, _ = readings.response(side, index)
+        if readings.saturated:
+            raise MitsimError(
+                f"frames {session.folder}: {min(readings.saturated)} has pixels at the full well or the ADC's end; "
+                "expose for less"
+            )
+        yield rate, float(np.sqrt(variance))
+
+
+def _calibrated(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -> Factors:
+    listed = session.listed
+    readings = _Readings(session)
+    estimate, noise, found = _estimate(readings, job)
+    warnings: tuple[str, ...] = doubts if estimate.ok else (*doubts, str(estimate.status))
+    warnings += (*found.warnings(session.frame_name), *readings.odd.values())
+    if readings.saturated:
+        warnings += (
+            f"saturation: {len(readings.saturated)} of {len(session.files)} frames have pixels at the full well or the "
+            f"ADC's end, first {min(readings.saturated)}, so responses are not linear; expose for less",
+        )
+    error = float(np.hypot(*estimate.predicted_error))
+    result = {
+        "n": listed.n,
+        "frames": len(session.files),
+        "separability_residual": estimate.separability_residual,
+        "unexplained_residual": estimate.unexplained,
+        "noise_free_residual": None,
+        "phi_error": None,
+        "predicted_phi_error": error,
+        "response_noise": noise,
+        "faults": found.listed(session.frame_name),
+        "lamp": found.lamp.listed(),
+        "condition": estimate.condition,
+        "exposure_s": listed.digital.exposure_s,
+        "saturated_frames": len(readings.saturated),
+        "dark_frames": len(session.dark),
+        "not_known": [*_not_known(session)],
+        "seconds": job.clock.seconds(),
+        "warnings": warnings,
+    }
+    with job.clock.stage("checksums"):
+        sums = in_threads(lambda name: checksum(session.folder / name), session.files)
+    manifest = CalibrationManifest(
+        configuration={
+            "frames": str(session.folder),
+            "list": listed.model_dump(mode="json"),
+            "frames_sha256": dict(zip(session.files, sums, strict=True)),
+        },
+        camera=listed.camera,
+        centre=listed.centre,
+        board_reflectance=listed.board_reflectance,
+        digital=listed.digital,
+        parallax=listed.parallax,
+        result=result,
+        warnings=warnings,
+        versions=versions(),
+    )
+    return Factors.of(estimate, manifest)
+
+
+def _not_known(session: SessionFrames) -> Iterator[str]:
+    """What neither frames nor list tell, and what follows."""
+    listed = session.listed
+    yield "phi_error, noise_free_residual: nobody has exact factors of a real camera; predicted_phi_error is by noise"
+    if not listed.digital.noise_is_stated:
+        yield "digital.read_noise_e: what noise leaves and what no separable camera explains are not told apart"
+    if listed.digital.saturation_dn is None:
+        yield "digital.saturation_dn: frames count as saturated at the largest number of their file, if at all"
+    if listed.board_reflectance is None:
+        yield "board_reflectance: 1 in an image is this board, whatever it reflects"
+    if listed.parallax is None:
+        yield "parallax: `reconstruct --focus` has no other depth than the board's"
+    if session.dark and session.pairs:
+        yield "dark: the difference of a pair's halves has no dark signal, and dark frames are not used"
+
+
+def _check_sizes(session: SessionFrames) -> None:
+    """MitsimError for a frame that cannot be read, or is of another size than the first."""
+    first, *others = session.files
+    size = image_size(session.folder / first, session.wanted)
+    for name in session.files:
+        verify(session.folder, name, {}, "")  # no link out of it
+    for name in others:
+        own = image_size(session.folder / name, session.wanted)
+        if own != size:
+            raise MitsimError(
+                f"frames {session.folder}: {name} is {own[0]} x {own[1]} pixels, but {first} is {size[0]} x {size[1]}; "
+                "take all with one camera setting"
+            )
+
+
+def _check_levels(session: SessionFrames, uniform: FloatArray) -> None:
+    """MitsimError where frames have no light by the levels that the list states.
+
+    Parameters
+    ----------
+    session
+        whose list it is.
+    uniform
+        (rows, columns) the brighter of both uniform responses [electrons/s].
+    """
+    first = session.repeated((SIDES[0], 0, 1 if session.pairs else UNIFORM))[0]
+    values, digital = read_image(session.folder / first.file, session.wanted), session.listed.digital
+    if digital.rate(values).max() <= 0 or not uniform.any():
+        raise MitsimError(
+            f"frames {session.folder}: no number of {first.file}, a uniform frame, is above {values.max():g}, and its "
+            f"list states digital.black_level_dn {digital.black_level_dn:g} and dark_current_e_per_s "
+            f"{digital.dark_current_e_per_s:g}, which leave no light; state levels in the numbers of the files"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Reading:
+    """Mean of ``shots`` frames of each exposure: electrons a second, and how they were read."""
+
+    rate: FloatArray
+    ladder: Ladder
+    shots: int
+
+    @property
+    def exposure_s(self) -> float:
+        """The shortest exposure [s]."""
+        return self.ladder.digitals[0].exposure_s
+
+    @property
+    def variance(self) -> float:
+        """Mean noise variance, of all shots [(electrons/s)^2]."""
+        return max(self.ladder.variance(self.rate), 0.0) / self.shots
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """Two frames that should be alike: names, mean ``squared`` difference over mean squared light, that light, and how
+    much of the light of the second the first has. ``kind`` are those that noise makes differ alike."""
+
+    names: tuple[str, str]
+    kind: int
+    squared: float
+    light: float
+    part: float
+
+    @classmethod
+    def of(cls, names: tuple[str, str], kind: int, one: FloatArray, other: FloatArray) -> _Compared:
+        """Of rates (pixels,)."""
+        light = max(float(np.square(other).mean()), float(np.square(one).mean()))
+        product = float(np.dot(one.ravel(), other.ravel())) / other.size
+        size = float(np.square(other).mean())
+        return cls(names, kind, float(np.square(one - other).mean()), light, product / size if size else 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Readings:
+    """Frames of a ``session`` as electrons a second; names of those that are ``saturated`` are noted as they are read,
+    how frames ``compared`` that should be alike, and which dark ones are ``odd``, in words.
+
+    Measurements of all patterns are as in a simulated session: :meth:`mitsim.calibrate.session.LitSession.noisy`.
+    """
+
+    session: SessionFrames
+    saturated: set[str] = field(default_factory=set)
+    compared: dict[Half, list[_Compared]] = field(default_factory=dict)
+    odd: dict[str, str] = field(default_factory=dict)
+
+    def wrong(self) -> dict[Half, str]:
+        """Which halves of patterns have repeats or exposures that differ, in words."""
+        kinds: dict[int, list[float]] = {}
+        for each in self.compared.values():
+            for one in each:
+                kinds.setdefault(one.kind, []).append(one.squared)
+        usual = {kind: float(np.median(values)) for kind, values in kinds.items()}
+        found = {}
+        for half, each in self.compared.items():
+            far = [
+                one
+                for one in each
+                if one.squared > max(_UNLIKE * usual[one.kind], _MATTERS**2 * max(one.light, 1e-300))
+            ]
+            if not far:
+                continue
+            first = far[0]
+            # A frame that differs from two that are alike is the wrong one.
+            counts = Counter(name for one in far for name in one.names)
+            near = {name for one in each if one not in far for name in one.names}
+            name = max(first.names, key=lambda name: (counts[name], name not in near))
+            other = first.names[1 - first.names.index(name)]
+            part = first.part if name == first.names[0] else 1 / (first.part or np.inf)
+            which = "should be alike" if len(each) == 1 else "is the one that differs"
+            found[half] = (
+                f"{name} has {part:.3g} of the light of {other}, and {'both' if len(each) == 1 else 'it'} {which}"
+            )
+        return found
+
+    def response(self, side: Side, index: int) -> tuple[FloatArray, float, FloatArray | None]:
+        """Response (rows, columns) to a +-1 pattern [electrons/s], its mean noise variance, and the sum of its two
+        frames (rows, columns); None where it is not their difference.
+
+        Parameters
+        ----------
+        side, index
+            of the pattern.
+        """
+        positive = self._merged((side, index, 1))
+        if self.session.pairs:
+            negative = self._merged((side, index, -1))
+            light = positive.rate + negative.rate
+            return positive.rate - negative.rate, positive.ladder.variance(light, 2) / positive.shots, light
+        uniform = self._uniform[side]
+        response = 2 * positive.rate - uniform.rate
+        variance = 4 * positive.variance + uniform.variance
+        if self.session.dark:
+            # 2 (Y - D) - (U - D), where both are exposed alike.
+            both = (positive.exposure_s, 2), (uniform.exposure_s, -1)
+            parts: dict[float, int] = {}
+            for exposure, weight in both:
+                parts[exposure] = parts.get(exposure, 0) + weight
+            for exposure, weight in parts.items():
+                dark = self._dark_of[side][exposure]
+                response -= weight * dark.rate
+                variance += weight**2 * dark.variance
+        return response, variance, None
+
+    @cached_property
+    def _uniform(self) -> dict[Side, _Reading]:
+        return {side: self._merged((side, 0, UNIFORM)) for side in SIDES}
+
+    @cached_property
+    def _ladders(self) -> dict[Side, Ladder] | None:
+        """How several exposures of a side's frames are merged, by a uniform frame of the other; None for one."""
+        listed = self.session.listed
+        if len(listed.exposure_ladder) == 1:
+            return None
+        digitals = [
+            listed.digital.model_copy(update={"exposure_s": listed.digital.exposure_s * factor})
+            for factor in listed.exposure_ladder
+        ]
+        found = {}
+        for side, other in zip(SIDES, reversed(SIDES), strict=True):
+            frames = self.session.repeated((other, 0, 1 if self.session.pairs else UNIFORM))
+            uniform = self._read(frames, True)
+            found[side] = Ladder.of(digitals, uniform.rate, uniform.shots, listed.ladder_merge)
+        return found
+
+    @cached_property
+    def _dark_of(self) -> dict[Side, dict[float, _Reading]]:
+        """Mean dark frame of a side by exposure; of several, by the shortest, merged."""
+        found = {}
+        for exposure in {self.session.exposure_s(frame) for frame in self.session.dark}:
+            frames = [frame for frame in self.session.dark if self.session.exposure_s(frame) == exposure]
+            found[exposure] = self._read(self._alike(frames), True)
+        if self._ladders is None:
+            return dict.fromkeys(SIDES, found)
+        each = [found[digital.exposure_s] for digital in self._ladders[SIDES[0]].digitals]
+        return {
+            side: {each[0].exposure_s: _Reading(ladder.merged(own.rate for own in each), ladder, each[0].shots)}
+            for side, ladder in self._ladders.items()
+        }
+
+    def _alike(self, frames: list[DarkFile]) -> list[DarkFile]:
+        """Dark ``frames`` of one exposure without one that has light which the others have not; it is noted in
+        ``odd``."""
+        levels = np.array([float(self._read([frame], True).rate.mean()) for frame in frames])
+        uniform = self._read(self.session.repeated((SIDES[0], 0, UNIFORM)), True).rate.mean()
+        parts = (levels - np.median(levels)) / uniform
+        lit = np.abs(parts) > _LIT
+        if not lit.any():
+            return frames
+        few = len(frames) < 3
+        remedy = "one of them is wrong: take more" if few else "it is left out"
+        for frame, part in zip(np.asarray(frames)[lit], parts[lit], strict=True):
+            self.odd[frame.file] = (
+                f"frames: {frame.file}, with the projector off, has {part:+.1%} of a uniform frame's light more than "
+                f"the median of {len(frames)} such frames; {remedy}"
+            )
+        return frames if few else [frame for frame, one in zip(frames, lit, strict=True) if not one]
+
+    def clipped(self, half: Half) -> bool:
+        """Whether many pixels of a frame share its largest number."""
+        for exposure in range(len(self.session.listed.exposure_ladder)):
+            for frame in self.session.repeated(half, exposure):
+                values = read_image(self.session.folder / frame.file, self.session.wanted)
+                if np.count_nonzero(values == values.max()) > max(_CLIPPED * values.size, _FEW):
+                    return True
+        return False
+
+    def _merged(self, half: Half) -> _Reading:
+        """What shows a ``half`` of a pattern, of all exposures and repeats."""
+        if self._ladders is None:
+            return self._read(self.session.repeated(half), True)
+        ladder = self._ladders[half[0]]
+        rates = []
+        for number in range(len(ladder.digitals)):
+            frames, used = self.session.repeated(half, number), ladder.used(number)
+            rates.append(self._read(frames, used).rate)
+            both = np.asarray(used & ladder.used(0))
+            if number and both.any():
+                names = frames[0].file, self.session.repeated(half)[0].file
+                self._compare(half, _Compared.of(names, -number, rates[-1][both], rates[0][both]))
+        return _Reading(ladder.merged(rates), ladder, self.session.listed.repeats)
+
+    def _compare(self, half: Half, compared: _Compared) -> None:
+        """Note it, once."""
+        known = self.compared.setdefault(half, [])
+        if compared not in known:
+            known.append(compared)
+
+    def _read(self, frames: Sequence[StripeFile | DarkFile], used: Chosen) -> _Reading:
+        """The mean of ``frames`` of one exposure; ``used`` are the pixels that may not be saturated."""
+        digital = self.session.listed.digital.model_copy(update={"exposure_s": self.session.exposure_s(frames[0])})
+        total: FloatArray | None = None
+        before: FloatArray | None = None
+        for place, frame in enumerate(frames):
+            values = read_image(self.session.folder / frame.file, self.session.wanted)
+            end = own_end(values) if digital.saturation_dn is None else digital.saturation_dn
+            if end is not None and ((values >= end) & used).any():
+                self.saturated.add(frame.file)
+            total = values.astype(np.float64) if total is None else total + values
+            if len(frames) > 1 and isinstance(frame, StripeFile):
+                rate = digital.rate(values)
+                if before is not None:
+                    names = frame.file, frames[place - 1].file
+                    half = frame.side, frame.index, frame.sign
+                    self._compare(half, _Compared.of(names, frame.exposure, rate, before))
+                before = rate
+        assert total is not None
+        return _Reading(digital.rate(total / len(frames)), Ladder((digital,)), len(frames))
+
+
+@single_threaded_blas()
+def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Checked]:
+    """Factors, the rms noise of the responses [electrons/s] where the list states the sensor's, and which frames are
+    wrong."""
+    session = readings.session
+    signs = stripe_signs(session.listed.n).astype(np.float64)
+    sums, variances = _sums(readings, signs.shape[1], job)
+    digital = session.listed.digital
+    taken = Circumstances(
+        session.order,
+        session.frame_name,
+        readings.clipped,
+        bool(readings.saturated),
+        step=(digital.step_dn or 0.0) / digital.gain_dn_per_e / digital.exposure_s,
+        wrong=readings.wrong(),
+    )
+    found = check_session(sums, signs, taken)
+    if wrong := found.wrong_uniform():
+        sums, variances = _sums(readings, signs.shape[1], job, found.other_uniform(wrong))
+        found = check_session(sums, signs, taken, uniform_given=True)
+    noise = float(np.sqrt(max(float(np.mean(variances)), 0.0))) if session.listed.digital.noise_is_stated else None
+    with job.clock.stage("estimate"):
+        return found.estimate(signs, noise), noise, found
+
+
+def _sums(
+    readings: _Readings, count: int, job: Job, uniform: Side | None = None
+) -> tuple[tuple[StripeSums, StripeSums], list[float]]:
+    """Sums over all responses, and the noise variance of each.
+
+    Parameters
+    ----------
+    readings, job
+        as for :func:`_estimate`.
+    count
+        patterns of a side.
+    uniform
+        the side whose first response is the uniform one; None: the mean of both.
+    """
+    with job.clock.stage("frames"):
+        first = [readings.response(side, 0) for side in SIDES]
+    (left, *_), (right, *_) = first
+    _check_levels(readings.session, max((left, right), key=lambda response: float(response.mean())))
+    alone = None if uniform is None else (left, right)[SIDES.index(uniform)]
+    lights = [light for *_, light in first]
+    sums = stripe_sums(left, right, count, readings.session.listed.centre, alone, lights)
+    variances = [variance for _, variance, _ in first]
+    step = 4 * workers()
+    for side, own in zip(SIDES, sums, strict=True):
+
+        def looked(index: int, side: Side = side, own: StripeSums = own) -> tuple[Seen, float]:
+            response, variance, light = readings.response(side, index)
+            return own.seen(response, index, light), variance
+
+        for start in range(1, count, step):
+            with job.clock.stage("frames"):
+                chunk = in_threads(looked, range(start, min(start + step, count)))
+            for seen, variance in chunk:
+                own.put(seen)
+                variances.append(variance)
+            job.progress(f"{side} stripes", own.done / count)
+    return sums, variances
+
+
+# -------- One frame taken at several exposure times in
+
+Chosen = npt.NDArray[np.bool_] | bool
+"""Pixels (rows, columns) that are chosen, or all or none."""
+_ROOM = 5.0
+"""Deviations of its noise that a uniform frame's pixel must stay below saturation: one of 3 million goes beyond."""
+_ladder_LIT = 0.5
+"""Light of stripes over that of the uniform frame, whose noise decides on the weights."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ladder:
+    """Exposures of every frame, and how their rates are merged.
+
+    Attributes
+    ----------
+    digitals
+        how numbers of each exposure become rates, the shortest first.
+    weights
+        (exposures, rows, columns), 1 in sum; None where there is one exposure.
+    """
+
+    digitals: tuple[Digital, ...]
+    weights: FloatArray | None = None
+
+    @classmethod
+    def of(cls, digitals: Sequence[Digital], uniform: FloatArray, shots: int, merge: Merge) -> Ladder:
+        """Weights of several exposures.
+
+        Parameters
+        ----------
+        digitals
+            of each, the shortest first.
+        uniform
+            (rows, columns) rate of the uniform frame at the shortest [electrons/s].
+        shots
+            that it is the mean of.
+        merge
+            ``weighted``: by variance; ``longest``: the longest exposure that does not saturate a pixel, alone.
+        """
+        first = digitals[0]
+        light = np.maximum(uniform, 0.0)
+        error = first.variance(light) / shots
+        usable = np.ones((len(digitals), *uniform.shape), dtype=bool)
+        variance = np.empty(usable.shape)
+        for rung, digital in enumerate(digitals):
+            variance[rung] = digital.variance(_ladder_LIT * light)
+            if rung and digital.saturation_dn is not None:
+                unit = digital.gain_dn_per_e * digital.exposure_s
+                brightest = uniform + digital.dark_current_e_per_s + _ROOM * np.sqrt(error + digital.variance(light))
+                usable[rung] = brightest * unit + digital.black_level_dn < digital.saturation_dn
+        if merge == "longest":
+            longest = len(digitals) - 1 - np.argmax(usable[::-1], axis=0)
+            weights = (np.arange(len(digitals))[:, None, None] == longest).astype(np.float64)
+        else:
+            weights = usable / variance
+            weights /= weights.sum(axis=0)
+        return cls(tuple(digitals), weights)
+
+    def merged(self, rates: Iterable[FloatArray], rows: slice = slice(None)) -> FloatArray:
+        """``rates`` (rows, columns) of one frame at each exposure as one; ``rows`` are those that they are of."""
+        each = iter(rates)
+        if self.weights is None:
+            return next(each)
+        total = self.weights[0, rows] * next(each)
+        for weight, rate in zip(self.weights[1:, rows], each, strict=True):
+            total += weight * rate
+        return total
+
+    def used(self, exposure: int) -> Chosen:
+        """(rows, columns) whether pixels are read at an ``exposure``."""
+        return True if self.weights is None else np.asarray(self.weights[exposure] > 0)
+
+    def variance(self, light: FloatArray | float, shots: int = 1) -> float:
+        """Mean noise variance [(electrons/s)^2] of a merged sum or difference of frames.
+
+        Parameters
+        ----------
+        light
+            (rows, columns) sum of their rates [electrons/s]; one number will do where there is one exposure.
+        shots
+            their number.
+        """
+        if self.weights is None:
+            return float(self.digitals[0].variance(float(np.mean(light)), shots))
+        parts = zip(self.weights, self.digitals, strict=True)
+        return float(sum((np.square(weight) * digital.variance(light, shots)).mean() for weight, digital in parts))

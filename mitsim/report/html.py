@@ -1,0 +1,173 @@
+"""What every page is made by: a template and what it shows in, one self-contained HTML file out."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from matplotlib.figure import Figure
+
+from mitsim.core.files import whole_file
+from mitsim.core.pictures import data_uri
+
+_DPI, _SHOWN_DPI = 220, 110
+"""Figures are 8.6 inches wide at most: 946 pixels of the page, in two dots each."""
+
+
+def rendered(template: str, filters: Mapping[str, Callable[..., str]] | None = None, **shown: Any) -> str:
+    """A page as text.
+
+    Parameters
+    ----------
+    template
+        file of ``mitsim/report/templates``.
+    filters
+        of its own, by name, beside ``sci`` of a number, ``typeset`` of a text and ``sentence`` of a warning.
+    **shown
+        what it shows, by the names that it has there; one that is missing is an error.
+    """
+    loader = PackageLoader("mitsim.report")
+    environment = Environment(
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    own = {"sci": scientific, "typeset": typeset, "sentence": sentence}
+    environment.filters.update({**own, **(filters or {})})
+    return environment.get_template(template).render(**shown)
+
+
+def write_html(path: Path, text: str) -> Path:
+    """Write a page, all or nothing.
+
+    Parameters
+    ----------
+    path
+        the file.
+    text
+        of the page.
+
+    Returns
+    -------
+    Path
+        of the file.
+
+    Raises
+    ------
+    MitsimError
+        when it cannot be written.
+    """
+    with whole_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+    return path
+
+
+def shown_figure(figure: Figure) -> tuple[str, int]:
+    """A figure for a page.
+
+    Parameters
+    ----------
+    figure
+        drawn.
+
+    Returns
+    -------
+    tuple of str and int
+        its data URI, and how wide it is shown [pixels].
+    """
+    return figure_uri(figure, _DPI), round(float(figure.get_figwidth()) * _SHOWN_DPI)
+
+
+def figure_uri(figure: Figure, dots_per_inch: int) -> str:
+    """A figure as a data URI.
+
+    Parameters
+    ----------
+    figure
+        drawn.
+    dots_per_inch
+        of its picture.
+    """
+    figure.savefig(buffer := BytesIO(), format="png", dpi=dots_per_inch)
+    return data_uri(buffer.getvalue())
+
+
+# -------- Numbers and plain text in, the same as a page or a figure prints them out
+
+DASH = "\N{EN DASH}"
+"""Where there is no number."""
+_SUPERSCRIPT = str.maketrans("+-0123456789", "⁺⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_TIMES = "\N{MULTIPLICATION SIGN}"
+_POWER = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?)e([+-]?\d+)(?![\w.]\w)")
+"""A number such as 4.9e-03, and neither a part of a name nor of a longer number."""
+_SIZE = re.compile(r"(?<![\w:.])(\d+(?:\.\d+)?)( ?)x\2(?=\d+(?:\.\d+)?(?![\w:]))")
+"""512 x 512 and 3x3, but not dots:7x16."""
+
+
+def scientific(value: float | None) -> str:
+    """A number of three digits, a ``value`` below 0.01 or from 10,000 on of two with a power of ten; None as a dash."""
+    if value is None or value == 0.0:
+        return DASH if value is None else "0"
+    if 1e-2 <= abs(value) < 1e4:
+        return f"{value:.0f}" if abs(value) >= 99.95 else f"{value:#.3g}"
+    return typeset(f"{value:.1e}")
+
+
+def rounded(value: float, error: float) -> str:
+    """A number to the second digit of its standard error.
+
+    Parameters
+    ----------
+    value, error
+        in one unit; an error of 0, or none that is finite, leaves five digits.
+    """
+    if not (error > 0 and math.isfinite(error) and math.isfinite(value)):
+        return f"{value:.5g}"
+    places = 1 - math.floor(math.log10(error))
+    return f"{round(value, places) + 0.0:.{max(places, 0)}f}"
+
+
+def reflectance(value: float) -> str:
+    """An error in reflectance, its ``value``: four places, as all are below 1 and few below 0.001."""
+    return f"{value:.4f}" if value >= 1e-3 else scientific(value)
+
+
+def with_error(value: float, error: float, unit: str = "") -> str:
+    """A number and its standard error, neither finer than 0.01: to the second digit of the error, without one that
+    rounds to nothing.
+
+    Parameters
+    ----------
+    value, error, unit
+        in one unit, which stands behind both.
+    """
+    places = min(max(1 - math.floor(math.log10(error)), 0), 2) if error > 0 else 2
+    told = f" \N{PLUS-MINUS SIGN} {error:.{places}f}" if round(error, 2) else ""
+    # Zero has no sign.
+    return f"{value:z.{places}f}".replace("-", "\N{MINUS SIGN}") + told + unit
+
+
+def sentence(text: str) -> str:
+    """A warning ``text`` of the command line as a sentence: a capital first, a full stop last."""
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
+
+
+def typeset(text: str) -> str:
+    """A ``text`` for people: 4.9e-03 as a power of ten and 4.9e-02 without one, +- as one sign, 512 x 512 with a times
+    sign, um with a Greek letter."""
+    text = _POWER.sub(_power, text).replace("+-", "\N{PLUS-MINUS SIGN}")
+    text = _SIZE.sub(rf"\1\2{_TIMES}\2", text)
+    return re.sub(r"(?<=[\d\[(] )um\b|(?<=[\[(/])um\b", "\N{GREEK SMALL LETTER MU}m", text)
+
+
+def _power(found: re.Match[str]) -> str:
+    mantissa, exponent = found[1], int(found[2])
+    if not float(mantissa):
+        return "0"
+    if mantissa != "1" and 1e-2 <= float(found[0]) < 1e4:  # as ``scientific`` prints it, with the digits that it has
+        return f"{float(found[0]):.{max(len(mantissa.partition('.')[2]) - exponent, 0)}f}"
+    power = f"10{str(exponent).translate(_SUPERSCRIPT)}"
+    return power if float(mantissa) == 1 and "." not in mantissa else f"{mantissa}{_TIMES}{power}"

@@ -1,0 +1,1 @@
+"""The accuracy study: what each part of the light costs and brings."""

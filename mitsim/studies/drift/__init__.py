@@ -1,0 +1,1 @@
+"""What moves between calibration and capture, and what it costs an image."""

@@ -1,0 +1,1 @@
+"""How studies of many points run: experiment, workers, table, verdicts, page."""

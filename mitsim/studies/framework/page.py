@@ -1,0 +1,188 @@
+"""Finished studies in, one self-contained HTML page out: claims, figures, and the commands that repeat them."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from mitsim.core.environment import versions
+from mitsim.report.html import rendered, shown_figure, write_html
+from mitsim.studies.framework.experiment import HEADS, KNOBS, Claim, Experiment, PageTable, Results, Scope
+from mitsim.studies.framework.pictures import TEST_IMAGES
+from mitsim.studies.framework.setup import Setup
+
+_NUMBER = re.compile(r"[+-]?\d|nothing$")
+"""How a cell of a column of numbers begins."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """One study on a page; ``pictures`` are figures by file name: what holds each, and its width [pixels]; ``about``,
+    ``heads`` and ``note`` are the experiment's; ``quick``: of a few points alone; ``warnings`` are on what was
+    measured; ``prints``: over how many test images means are."""
+
+    name: str
+    title: str
+    question: str
+    claims: tuple[Claim, ...]
+    pictures: Mapping[str, tuple[str, int]]
+    count: str
+    command: str
+    about: str = ""
+    heads: tuple[str, str, str] = HEADS
+    tables: tuple[PageTable, ...] = ()
+    quick: bool = False
+    note: str = ""
+    warnings: tuple[str, ...] = ()
+    prints: int = 1
+
+    @classmethod
+    def of(
+        cls,
+        experiment: Experiment,
+        study: str,
+        scope: Scope,
+        claims: Sequence[Claim],
+        figures: Mapping[str, Figure],
+        results: Results,
+    ) -> Section:
+        """The section of an experiment.
+
+        Parameters
+        ----------
+        experiment, study, scope
+            what was studied, and what the command line calls it.
+        claims, figures, results
+            what it came to.
+        """
+        prints = sorted(set(results.table.distinct("picture")) & set(TEST_IMAGES))
+        of = f" of the test image{'s' if len(prints) > 1 else ''} {', '.join(prints)} of scikit-image" if prints else ""
+        setup = scope.setup
+        command = ["mitsim study", study, *([] if any(scope.pictures) else [setup.scene]), *_options(scope)]
+        accuracies = sorted({point.setup.accuracy for point in experiment.points(scope)} if experiment.traced else ())
+        asked = " or ".join(f"{each:g}" for each in accuracies)
+        good = f"; frames before noise asked to be good to {asked} (relative rms)" if accuracies else ""
+        return cls(
+            name=experiment.name,
+            title=experiment.title.replace(KNOBS, " and ".join(name for name, _ in scope.sweep)),
+            question=experiment.question,
+            claims=tuple(claims),
+            pictures={name: shown_figure(figure) for name, figure in figures.items()},
+            count=f"{len(results.table)} measurements{of}{good}",
+            command=" ".join(command),
+            about=experiment.about,
+            heads=experiment.heads,
+            tables=tuple(experiment.tables(results)),
+            quick=scope.quick,
+            note=experiment.note,
+            warnings=flagged(experiment.name, results),
+            prints=len(prints),
+        )
+
+
+@dataclass(frozen=True)
+class Part:
+    """Of a page of one study: a table of ``rows`` under ``head``, in words, ``figures`` by file name, and ``notes``
+    that say how these are to be read."""
+
+    title: str
+    lead: str
+    head: tuple[str, ...] = ()
+    rows: tuple[tuple[str, ...], ...] = ()
+    figures: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def numeric(self) -> tuple[bool, ...]:
+        """Of which columns all cells begin with a number: these stand to the right."""
+        columns = zip(*self.rows, strict=True)
+        return tuple(any(cells) and all(not cell or _NUMBER.match(cell) for cell in cells) for cells in columns)
+
+
+def flagged(name: str, results: Results) -> tuple[str, ...]:
+    """That images of the study ``name`` are flagged in its ``results``, how many and what for; empty where none is."""
+    # An image may have many rows, such as a transfer function's.
+    rows = {
+        (row.get("point"), row.get("exposure"), row.get("psnr_db")): row
+        for row in results.table.rows
+        if row.get("flagged") is not None
+    }
+    found = [str(row.get("reason") or "") for row in rows.values() if row["flagged"]]
+    if not found:
+        return ()
+    reasons = Counter(reason for each in found for reason in each.split("; ") if reason)
+    told = "; ".join(f"{count} \N{MULTIPLICATION SIGN} {reason}" for reason, count in reasons.most_common())
+    return (
+        f"{len(found)} of {len(rows)} images are flagged by the solver, their calibration or their capture, and "
+        f"count all the same (column flagged of {name}.csv){': ' if told else ''}{told}.",
+    )
+
+
+def build_findings(
+    name: str,
+    title: str,
+    where: str,
+    parts: Sequence[Part],
+    figures: Mapping[str, Figure],
+    warnings: Sequence[str] = (),
+) -> str:
+    """The page of a study of one bench, as HTML.
+
+    Parameters
+    ----------
+    name, title
+        of the study, and the page's head.
+    where
+        of which scene and patterns it is.
+    parts
+        of the page, in order.
+    figures
+        by file name.
+    warnings
+        why its findings may not be trusted, for its head.
+    """
+    pictures = {file: shown_figure(figure) for file, figure in figures.items()}
+    return rendered(
+        "findings.html",
+        name=name,
+        title=title,
+        where=where,
+        parts=parts,
+        pictures=pictures,
+        warnings=warnings,
+        versions=versions(),
+    )
+
+
+def build_page(sections: Sequence[Section], path: Path, title: str) -> Path:
+    """Write a page, all or nothing, and return its path.
+
+    MitsimError when it cannot be written.
+
+    Parameters
+    ----------
+    sections, title
+        what it shows, and its head.
+    path
+        where.
+    """
+    return write_html(path, rendered("study.html", title=title, sections=sections, versions=versions()))
+
+
+def _options(scope: Scope) -> list[str]:
+    setup = scope.setup
+    named = {"--camera": setup.camera, "--projector": setup.projector}
+    given = [f"{option} {value}" for option, value in named.items() if value]
+    given += [f"-D {name}={value}" for name, value in setup.parameters]
+    given += [f"--over {name}={','.join(values)}" for name, values in scope.sweep]
+    given += [f"--measure {','.join(scope.measures)}"] if scope.measures else []
+    given += [f"--patterns {scope.patterns}"] if scope.patterns != Scope.patterns else []
+    given += [f"--recipe {scope.recipe}"] if scope.recipe else []
+    given += [f"--seed {scope.seeds[0]}"] if scope.seeds[0] != Scope.seeds[0] else []
+    given += [f"--variant {setup.variant}"] if setup.variant != Setup.variant else []
+    return [*given, *(["--allow-outside-files"] if setup.outside else []), *(["--quick"] if scope.quick else [])]

@@ -1,0 +1,242 @@
+"""What all studies share: a bench and what to measure in; findings, and the folder that holds them, out."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+from mitsim.api.bench import Bench
+from mitsim.bench.request import Request
+from mitsim.core.environment import versions
+from mitsim.core.errors import MitsimError
+from mitsim.core.files import check_plain, sweep, whole_file, write_json
+from mitsim.core.job import Job
+from mitsim.studies.framework.experiment import Found, Results
+from mitsim.studies.framework.folder import study_folder
+from mitsim.studies.framework.setup import Point
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from mitsim.report.table import Table
+    from mitsim.studies.framework.page import Part
+
+
+DPI = 150
+"""Figures are 8.6 inches wide: 1290 pixels, the width of a page of text on a common screen."""
+
+
+def write_figures(folder: Path, figures: Mapping[str, Figure]) -> None:
+    """Write ``figures``, by file name, to a ``folder``; MitsimError when one cannot be written."""
+    for file, figure in figures.items():
+        with whole_file(folder / file) as part:
+            figure.savefig(part, dpi=DPI, format="png")
+
+
+class Findings(Protocol):
+    """What a study measured."""
+
+    def payload(self) -> dict[str, Any]:
+        """As JSON holds it."""
+
+    def lines(self) -> list[str]:
+        """For people."""
+
+    def figures(self) -> Mapping[str, Figure]:
+        """By file name."""
+
+
+@runtime_checkable
+class Tabled(Protocol):
+    """Findings with tables."""
+
+    def tables(self) -> Mapping[str, Table]:
+        """By file name."""
+
+
+@runtime_checkable
+class Warned(Protocol):
+    """Findings that may not be trusted."""
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """What is wrong, and what to do; empty where nothing is."""
+
+
+@runtime_checkable
+class Paged(Protocol):
+    """Findings with a page."""
+
+    title: str
+
+    def parts(self) -> Sequence[Part]:
+        """Of the page."""
+
+
+@dataclass(frozen=True)
+class StudyResult:
+    """Findings, of which scene and patterns they are (None: of none), and the folder ``output`` that holds them."""
+
+    findings: Findings
+    scene: str | None
+    patterns: str | None
+    output: str
+
+    def payload(self) -> dict[str, Any]:
+        """What the command line reports."""
+        where = {"scene": self.scene, "patterns": self.patterns, "output": self.output}
+        return {**self.findings.payload(), **where}
+
+    def lines(self) -> list[str]:
+        """For people."""
+        return [*self.findings.lines(), f"JSON and plots: {self.output}"]
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """Of the findings."""
+        return self.findings.warnings if isinstance(self.findings, Warned) else ()
+
+
+Measure = Callable[[Any, Request, Job], Findings]
+Study = Callable[[Bench | None, Path | str, Request | None, Job | None], StudyResult]
+
+
+def run_study(
+    name: str,
+    measure: Measure,
+    bench: Bench | None,
+    output: Path | str,
+    request: Request | None = None,
+    job: Job | None = None,
+) -> StudyResult:
+    """Measure, and write NAME.json, figures, tables and a page, where there are such, to a folder.
+
+    MitsimError for an output that cannot be written or holds something else, and for what the study itself refuses.
+
+    Parameters
+    ----------
+    name, measure
+        of the study.
+    bench, request, job
+        what is studied: the scene, patterns and seed; clock, progress and limits. None for a study of no scene.
+    output
+        new or empty folder, or one with an earlier study of that name, which is replaced.
+    """
+    request = request or Request.of()
+    with study_folder(output, name) as folder:
+        findings = measure(bench, request, job or Job())
+        scene, patterns = (str(bench.loaded.path), request.patterns) if bench else (None, None)
+        result = StudyResult(findings, scene, patterns, str(folder))
+        provenance = {"kind": name, "seed": request.seed, "versions": versions()}
+        write_json(folder / f"{name}.json", {**result.payload(), **provenance})
+        figures = findings.figures()
+        write_figures(folder, figures)
+        if isinstance(findings, Paged):
+            from mitsim.studies.framework.page import build_findings
+
+            where = f"Scene {bench.loaded.path.parent.name}, " if bench else ""
+            where += f"patterns {patterns}, seed {request.seed}."
+            page = build_findings(name, findings.title, where, findings.parts(), figures, result.warnings)
+            with whole_file(folder / f"{name}.html") as part:
+                part.write_text(page, encoding="utf-8")
+        for file, table in findings.tables().items() if isinstance(findings, Tabled) else ():
+            table.write(folder / file)
+        return result
+
+
+# -------- Findings of points on disk
+
+_ROWS = "rows"
+
+
+@dataclass(frozen=True)
+class Store:
+    """The findings in a ``folder``, which exists."""
+
+    folder: Path
+
+    def has(self, point: Point) -> bool:
+        """Whether a ``point`` is measured."""
+        return self._file(point).is_file()
+
+    def save(self, point: Point, found: Found) -> None:
+        """Keep what was ``found`` at a ``point``; MitsimError when it cannot be written."""
+        import numpy as np
+
+        rows = np.frombuffer(json.dumps([dict(row) for row in found.rows]).encode(), dtype=np.uint8)
+        with whole_file(self._file(point)) as part, part.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **{_ROWS: rows, **found.arrays})  # type: ignore[arg-type]
+
+    def load(self, point: Point) -> Found:
+        """What was found at a ``point``; MitsimError when the file is damaged."""
+        from mitsim.core.arrayfile import read_npz
+
+        path = self._file(point)
+        try:
+            if not check_plain(path).st_size:
+                raise ValueError("it is empty: the disk was full, or the machine stopped")
+            with path.open("rb") as file:
+                arrays = read_npz(file, path)
+            rows = json.loads(arrays.pop(_ROWS).tobytes())
+            if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+                raise ValueError("its rows are none")
+            return Found(tuple(rows), arrays)
+        except (OSError, ValueError, KeyError, RecursionError) as error:
+            raise MitsimError(
+                f"file {path}: cannot be read as a point of a study ({error}); remove it and run again"
+            ) from error
+
+    def take(self, other: Store) -> None:
+        """Copy what an ``other`` store has and this one has not."""
+        for file in sorted(other.folder.glob("*.npz")):
+            if not (self.folder / file.name).exists():
+                check_plain(file)
+                with whole_file(self.folder / file.name) as part:
+                    shutil.copyfile(file, part)
+
+    def results(self, points: Iterable[Point]) -> Results:
+        """Everything found at ``points``, in their order."""
+        from mitsim.report.table import Table
+
+        found = {point.key: self.load(point) for point in points}
+        rows = tuple({**row, "point": key} for key, each in found.items() for row in each.rows)
+        arrays = {(key, name): array for key, each in found.items() for name, array in each.arrays.items()}
+        return Results(Table(rows), arrays)
+
+    def tidy(self) -> None:
+        """Remove what killed processes left half-written."""
+        sweep(self.folder)
+
+    def _file(self, point: Point) -> Path:
+        return self.folder / f"{point.key}.npz"
+
+
+def batches(points: Sequence[Point]) -> list[tuple[Point, ...]]:
+    """The ``points`` in their order, those of one setup together: they share its light."""
+    return [tuple(group) for _, group in groupby(points, key=lambda point: point.setup)]
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Part ``number`` of ``count``, from 1 on, of a study that several jobs of a cluster share."""
+
+    number: int = 1
+    count: int = 1
+
+    @classmethod
+    def of(cls, text: str) -> Shard:
+        """From a ``text`` such as 2/8; MitsimError for anything else."""
+        number, slash, count = text.partition("/")
+        if not (slash and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+            raise MitsimError(f"--shard {text!r}: give I/N with I from 1 to N, such as 1/4")
+        return cls(int(number), int(count))
+
+    def part(self, points: Sequence[Point]) -> list[Point]:
+        """The ``points`` of this part: every ``count``-th batch, as a batch's light is traced once."""
+        own = batches(points)[self.number - 1 :: self.count]
+        return [point for batch in own for point in batch]

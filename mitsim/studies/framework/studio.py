@@ -1,0 +1,271 @@
+"""Where points of a study are measured: setups in; light, factors and images out, kept while neighbours share them."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from filelock import FileLock
+from skimage import io
+
+from mitsim.acquire.capture import expose
+from mitsim.api.bench import Bench, open_bench
+from mitsim.core.arrays import FloatArray
+from mitsim.core.configuration import locate
+from mitsim.core.errors import MitsimError
+from mitsim.devices.patterns import PatternFamily
+from mitsim.metrics import Quality
+from mitsim.reconstruct.factors import Factors, load_calibration
+from mitsim.reconstruct.misfit import Misfit
+from mitsim.reconstruct.reconstruct import reconstruct
+from mitsim.reconstruct.status import Status
+from mitsim.report.exposures import EQUAL_PEAK, RENDERED, LitScene, Unexposed
+from mitsim.report.table import Value
+from mitsim.studies.framework.pictures import picture
+from mitsim.studies.framework.setup import Point, Setup
+from mitsim.studies.sweepcam import Places, calibrated_places
+
+Kept = TypeVar("Kept")
+_PRINT = "reflectance.png"
+"""What a scene with a print of its own has beside it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """One reconstruction and how good it is.
+
+    Attributes
+    ----------
+    image, quality, lam
+        (n, n) reflectance, against the truth, and lambda.
+    shots, exposure_s
+        frames, and seconds of each.
+    flagged
+        whether its run or the solver warned.
+    trust
+        where it is known: the unexplained part of the measurements, their chi-square, the image's standard uncertainty.
+    reason
+        of a flagged image: what it is flagged for.
+    """
+
+    image: FloatArray
+    quality: Quality
+    lam: float
+    shots: int
+    exposure_s: float
+    flagged: bool
+    trust: Mapping[str, float | None] = field(default_factory=dict)
+    reason: str = ""
+
+    @classmethod
+    def of(
+        cls, frames: Unexposed, seconds: float, lam: float | Literal["auto", "best"] = "auto", binning: int = 1
+    ) -> Image:
+        """That of one exposure.
+
+        Parameters
+        ----------
+        frames
+            what is exposed.
+        seconds, lam, binning
+            as for :meth:`mitsim.report.exposures.Unexposed.solve`.
+        """
+        solution = frames.solve(seconds, lam, binning)
+        quality, reason = frames.lit.quality(solution.image), reason_of(solution.status)
+        shots = len(frames.family.shots)
+        return cls(solution.image, quality, solution.lam, shots, seconds, bool(reason), reason=reason)
+
+    def row(self) -> dict[str, Value]:
+        """As a table has it."""
+        return {
+            "psnr_db": self.quality.psnr_db,
+            "ssim": self.quality.ssim,
+            "lambda": self.lam,
+            "shots": self.shots,
+            "exposure_s": self.exposure_s,
+            "flagged": self.flagged,
+            "reason": self.reason,
+            **self.trust,
+        }
+
+
+def reason_of(status: Status, misfit: Misfit | None = None) -> str:
+    """What an image of this ``status`` and ``misfit`` is flagged for, reasons apart by "; "; empty where it is not."""
+    cause = f", likely cause: {misfit.reason}" if misfit and misfit.flagged and misfit.cause else ""
+    own = () if status.verdict.good else (f"{status.verdict.value}{cause}",)
+    return "; ".join((*own, *(text.partition(". ")[0].rstrip(".").replace("; ", ", ") for text in status.flags)))
+
+
+class Studio:
+    """Benches, their light and their factors, the last few of each; a temporary folder holds scenes with other prints.
+
+    To be used as a context, which removes that folder.
+
+    Parameters
+    ----------
+    shared
+        folder of calibrations that several studios share; None: this one's are its own.
+    """
+
+    def __init__(self, shared: str | None = None) -> None:
+        self._shared = None if shared is None else Path(shared) / "calibrations"
+        self._folder = tempfile.TemporaryDirectory(prefix="mitsim-study-")
+        self._kept: dict[str, OrderedDict[Hashable, Any]] = {}
+
+    def __enter__(self) -> Studio:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._kept.clear()
+        self._folder.cleanup()
+
+    def folder(self, name: str) -> Path:
+        """A new folder of this studio's own, which ends with it; what was in one of that ``name`` is removed."""
+        place = Path(self._folder.name) / "own" / name
+        shutil.rmtree(place, ignore_errors=True)
+        place.mkdir(parents=True)
+        return place
+
+    def bench(self, setup: Setup) -> Bench:
+        """The bench of a ``setup``.
+
+        MitsimError as :func:`mitsim.open_bench`, and for another print on a scene that has none.
+        """
+        return self.once("bench", 3, setup, lambda: self._opened(setup))
+
+    def lit(self, setup: Setup) -> LitScene:
+        """The scene of a ``setup`` in its light."""
+        return self.once("light", 1, setup, lambda: LitScene(self.bench(setup).light(accuracy=setup.accuracy)))
+
+    def factors(self, setup: Setup, seed: int) -> Factors:
+        """What a session with the camera of a ``setup`` estimates, its noise from ``seed``; whatever is printed."""
+        blank = setup.printed(None)
+        return self.once("factors", 4, (blank, seed), lambda: self._calibrated(blank, seed))
+
+    def places(self, setup: Setup, places_mm: tuple[float, ...], seed: int) -> Places:
+        """Factors of the same camera with its mask moved.
+
+        Parameters
+        ----------
+        setup, seed
+            as for :meth:`factors`.
+        places_mm
+            how far it is moved along both axes.
+        """
+        blank = setup.printed(None)
+        key = blank, places_mm, seed
+        return self.once("places", 1, key, lambda: calibrated_places(self.bench(blank), places_mm, seed))
+
+    def frames(self, setup: Setup, model: str, patterns: str | PatternFamily, seed: int = 0) -> Unexposed:
+        """Frames of a family before any exposure.
+
+        Parameters
+        ----------
+        setup, model, seed
+            as for :meth:`image`.
+        patterns
+            the family, or its name.
+        """
+        lit = self.lit(setup)
+        family = lit.bench.family(patterns, seed) if isinstance(patterns, str) else patterns
+        return (
+            lit.rendered(self.factors(setup, seed), family, seed) if model == RENDERED else lit.idealised(family, seed)
+        )
+
+    def image(
+        self,
+        setup: Setup,
+        model: str,
+        patterns: str,
+        seed: int = 0,
+        exposure: str = EQUAL_PEAK,
+        focus: Literal["auto", "map"] | None = None,
+    ) -> Image:
+        """A scene as it comes out: rendered, as a user's own frames are exposed and reconstructed.
+
+        Parameters
+        ----------
+        setup
+            the scene.
+        model
+            one of :data:`mitsim.report.exposures.MODELS`.
+        patterns
+            the family.
+        seed
+            of the frames' noise, and of the calibration's.
+        exposure
+            one of :data:`mitsim.report.exposures.CONVENTIONS`, or ``DIM``.
+        focus
+            of rendered frames, as for :func:`mitsim.reconstruct`.
+        """
+        frames = self.frames(setup, model, patterns, seed)
+        if model != RENDERED:
+            return Image.of(frames, frames.seconds(exposure))
+        seconds = "auto" if exposure == EQUAL_PEAK else frames.seconds(exposure)
+        shots = expose(frames.lit.light, patterns, seed=seed, exposure=seconds)
+        found = reconstruct(shots, self.factors(setup, seed), focus=focus)
+        misfit, told = found.misfit, found.uncertainty
+        trust = {
+            "misfit": misfit.unexplained if misfit else None,
+            "chi_square": misfit.chi_square if misfit else None,
+            "uncertainty": None if told is None else float(np.sqrt(np.square(told).mean())),
+        }
+        count, quality = len(frames.family.shots), frames.lit.quality(found.image)
+        reason = reason_of(found.status, misfit)
+        return Image(found.image, quality, found.lam, count, shots.exposure_s, not found.ok, trust, reason)
+
+    def _calibrated(self, blank: Setup, seed: int) -> Factors:
+        """By this studio, or by another that was first: factors in memory are as a file has them."""
+        if self._shared is None:
+            return self.bench(blank).calibrate(seed)
+        place = self._shared / Point.of(blank, seed=seed).key
+        place.parent.mkdir(exist_ok=True)
+        with FileLock(place.with_suffix(".lock")):
+            if not place.exists():
+                part = place.with_suffix(".part")  # whole or not at all: this process may be ended
+                shutil.rmtree(part, ignore_errors=True)
+                self.bench(blank).calibrate(seed).save(part).rename(place)
+            return load_calibration(place)
+
+    def _opened(self, setup: Setup) -> Bench:
+        path = setup.scene if setup.picture is None else self._printed(setup.scene, setup.picture)
+        parameters: dict[str, Any] = dict(setup.parameters)
+        return open_bench(path, setup.variant, setup.camera, setup.projector, setup.outside, **parameters)
+
+    def _printed(self, scene: str, name: str) -> Path:
+        """A copy of a ``scene`` with the picture ``name`` for its print."""
+        own = locate(scene, "scenes", "scene.xml")
+        if not (own.parent / _PRINT).is_file():
+            raise MitsimError(
+                f"scene {scene}: has no {_PRINT} beside it, so there is no print to replace; keep its own"
+            )
+        place = Path(self._folder.name) / own.parent.name / name
+        if not place.exists():
+            shutil.copytree(own.parent, place)
+            io.imsave(place / _PRINT, picture(name), check_contrast=False)
+        return place / own.name
+
+    def once(self, kind: str, most: int, key: Hashable, make: Callable[[], Kept]) -> Kept:
+        """What is made once while neighbours share it.
+
+        Parameters
+        ----------
+        kind, most, key
+            what it is, how many of its kind are kept, and which of them it is.
+        make
+            makes it.
+        """
+        kept = self._kept.setdefault(kind, OrderedDict())
+        if key not in kept:
+            while len(kept) >= most:
+                kept.popitem(last=False)  # before the new one is made: two lights need not fit
+            kept[key] = make()
+        kept.move_to_end(key)
+        found: Kept = kept[key]
+        return found

@@ -1,0 +1,331 @@
+"""Light filed where it is traced: connections on the device in, a sparse matrix of light per row and place out.
+
+Light is added up in whole numbers of a small unit, so that the sums do not hang on the order in which threads add, and
+nothing but the sums is ever fetched. Where :class:`mitsim.transport.records.Bundle` splits light between two layers,
+the ledger does so too, or draws one of them: the same in the mean.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from copy import copy
+from dataclasses import dataclass
+from functools import cached_property, reduce
+from itertools import pairwise, product
+from operator import or_
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from mitsim.core.arrays import FloatArray, Labels
+from mitsim.core.errors import MitsimError
+from mitsim.transport.records import Bundle, CellAxis, Sightings
+
+MOST_PLACES = 2**26
+"""Places of all rows and lines that are held: 0.5 GB."""
+_UNIT_BITS = 30
+"""Power of two of units in the light that is passed as one: rounding moves a path's by 5e-10 of it at most, either way,
+and a place holds 2^34 times as much."""
+_PAYS = 4
+"""Places for each part of a path below which a ledger pays: a place takes 0.03 us, to be fetched from the machine and
+looked through, and each part of a path on the host 0.1 us or more (balls of the highlight)."""
+_MOST_BITS = 52
+"""Power of two of units that one path may bring, four million times the light that is passed as one: more is no light.
+A place would hold 4096 such paths."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lit:
+    """Sums that hold light in any of some ledgers of one kind, and how they lie in a matrix, which is found once.
+
+    Attributes
+    ----------
+    numbers
+        of the sums, increasing.
+    rows, size, lamps
+        of the matrix: rows of the projector's light, places, and rows of lamps after them.
+    """
+
+    numbers: npt.NDArray[np.uint32]
+    rows: int
+    size: int
+    lamps: int
+
+    @property
+    def inside(self) -> int:
+        """How many of the sums, the first, have a place: what lay outside has the last ones."""
+        return int(np.searchsorted(self.numbers, np.uint32(self.size * self.rows)))
+
+    @cached_property
+    def layout(self) -> sparse.csr_array:
+        """(rows + lamps, size) which of the sums lies where."""
+        # All places fit 32 bits, in which matrices take half the time.
+        numbers = self.numbers[: self.inside]
+        places = (numbers // np.uint32(self.rows)).astype(np.int32)
+        row = numbers.astype(np.int32) - places * np.int32(self.rows)
+        starts = np.append(0, np.cumsum(np.bincount(places, minlength=self.size))).astype(np.int32)
+        which = np.arange(len(numbers), dtype=np.int32)
+        found = sparse.csc_array((which, row, starts), shape=(self.rows + self.lamps, self.size)).tocsr()
+        for shared in (found.indices, found.indptr):
+            shared.flags.writeable = False
+        return found
+
+    def matrix(self, light: FloatArray) -> sparse.csr_array:
+        """(rows + lamps, size) the ``light`` of the sums, where they have a place."""
+        layout = self.layout
+        return sparse.csr_array((light[layout.data], layout.indices, layout.indptr), shape=layout.shape)
+
+
+LitSums = tuple[Lit, npt.NDArray[np.uint64]]
+"""Which sums of a ledger hold light, and these: of corner, a tenth of its ledger's memory."""
+
+
+class _Held:
+    """Sums on the device of so many ``lines``, those of an entry side by side: a path brings light of every line to one
+    entry, and memory that is not at hand is fetched once for all of them."""
+
+    def __init__(self, entries: int, lines: int) -> None:
+        self._entries, self.lines = entries, lines
+        self.empty()
+
+    def empty(self) -> None:
+        """Hold no light."""
+        self.sums = dr.zeros(mi.UInt64, self._entries * self.lines)
+
+    def of_line(self, line: int, entries: mi.UInt32 | None = None) -> mi.UInt64:
+        """Sums of a ``line``, of some ``entries`` or of all."""
+        if entries is None and self.lines == 1:
+            return self.sums
+        if entries is None:
+            entries = dr.arange(mi.UInt32, self._entries)
+        if not len(entries):  # of which there are no multiples
+            return mi.UInt64()
+        return dr.gather(mi.UInt64, self.sums, entries * self.lines + line)
+
+
+class Ledger:
+    """Sums of light by row and place.
+
+    Parameters
+    ----------
+    bundle
+        how light is filed.
+    labels
+        (n^2,) row of each projector pixel.
+    one
+        irradiance [W m^-2] of about a bright path's.
+
+    Attributes
+    ----------
+    sums
+        (places * rows + 1,) on the device, in units, or of all lines that it was made with, side by side. A place's
+        rows lie side by side: neighbouring pixels, which are of different rows, bring light to one place at a time.
+    """
+
+    def __init__(self, bundle: Bundle, labels: Labels, one: float) -> None:
+        self._bundle, self._rows = bundle, int(labels.max()) + 1
+        self._width = self._places(bundle)
+        self._unit = 2.0 ** (math.floor(math.log2(one)) - _UNIT_BITS)
+        self._labels = mi.UInt32(labels.astype(np.uint32))
+        # A last one that counts what is no light.
+        self._line, self._held = 0, _Held(self._rows * self._width + 1, 1)
+
+    @classmethod
+    def of_lines(cls, lines: int, bundle: Bundle, labels: Labels, one: float) -> tuple[Ledger, ...]:
+        """One for each of so many ``lines``, which are :func:`fetched` together.
+
+        Parameters
+        ----------
+        lines
+            their number.
+        bundle, labels, one
+            as for one alone.
+        """
+        first = cls(bundle, labels, one)
+        first._held = _Held(first._rows * first._width + 1, lines)
+        ledgers = first, *(copy(first) for _ in range(1, lines))
+        for line, ledger in enumerate(ledgers):
+            ledger._line = line
+        return ledgers
+
+    @property
+    def sums(self) -> mi.UInt64:
+        return self._held.sums
+
+    @staticmethod
+    def _places(bundle: Bundle) -> int:
+        """Places of a row: those of a ``bundle``, and one for each anchor, of light from beyond all cells."""
+        return bundle.size + bundle.anchors**2
+
+    @staticmethod
+    def holds(bundle: Bundle, labels: Labels, ledgers: int = 1, paths: float = math.inf) -> bool:
+        """Whether so many ledgers have room, and take less time than the host.
+
+        Parameters
+        ----------
+        bundle, labels
+            of each.
+        ledgers
+            their number.
+        paths
+            that they file.
+        """
+        entries = (int(labels.max()) + 1) * Ledger._places(bundle)
+        parts = (4 if bundle.between else 1) * min(len(bundle.depths), 2)
+        return ledgers * entries < MOST_PLACES and entries < _PAYS * parts * paths
+
+    def place(self, seen: Sightings, chosen: mi.Float, anchor: tuple[mi.UInt32, mi.UInt32] | None = None) -> mi.UInt32:
+        """Where light is filed, all of it in one place.
+
+        Parameters
+        ----------
+        seen
+            the light.
+        chosen
+            random numbers in [0, 1) that choose its layer.
+        anchor
+            row and column of its anchor; the first without them.
+        """
+        layer = mi.UInt32(0)
+        for part in self._passed(seen):
+            layer += dr.select(chosen < part, mi.UInt32(1), mi.UInt32(0))
+        cells = [self._cell(axis, tau) for axis, tau in self._axes(seen)]
+        return self._placed(seen, layer, cells, anchor)
+
+    def shares(self, seen: Sightings, anchor: tuple[mi.UInt32, mi.UInt32]) -> Iterator[tuple[mi.UInt32, mi.Float]]:
+        """Where light is filed, each place with its part of it, as :meth:`Bundle.file` splits it.
+
+        Parameters
+        ----------
+        seen, anchor
+            as for :meth:`place`.
+        """
+        passed = [dr.clip(part, 0, 1) for part in self._passed(seen)]
+        layers = [(mi.UInt32(k), a - b) for k, (a, b) in enumerate(pairwise([mi.Float(1), *passed, mi.Float(0)]))]
+        rows, columns = (self._cells(axis, tau) for axis, tau in self._axes(seen))
+        for (layer, part), (row, row_part), (column, column_part) in product(layers, rows, columns):
+            yield self._placed(seen, layer, [row, column], anchor), part * row_part * column_part
+
+    def _axes(self, seen: Sightings) -> tuple[tuple[CellAxis, mi.Float], tuple[CellAxis, mi.Float]]:
+        return (self._bundle.grid.rows, seen.row), (self._bundle.grid.columns, seen.column)
+
+    def _passed(self, seen: Sightings) -> Iterator[mi.Float]:
+        """How far between each layer and the next nearer one light is; below 0 before it, and above 1 beyond."""
+        for low, high in pairwise(1 / depth for depth in self._bundle.depths):
+            yield (seen.inverse_depth - dr.opaque(mi.Float, low)) / dr.opaque(mi.Float, high - low)
+
+    @staticmethod
+    def _position(axis: CellAxis, tau: mi.Float) -> mi.Float:
+        """Cells from the first one's edge."""
+        return (tau - dr.opaque(mi.Float, axis.start)) * dr.opaque(mi.Float, 1 / axis.size)
+
+    def _cell(self, axis: CellAxis, tau: mi.Float) -> mi.UInt32:
+        return mi.UInt32(dr.maximum(dr.floor(self._position(axis, tau)), 0))
+
+    def _cells(self, axis: CellAxis, tau: mi.Float) -> list[tuple[mi.UInt32, mi.Float]]:
+        """Cells along an axis that share the light, each with its part."""
+        if not self._bundle.between or axis.count == 1:
+            return [(self._cell(axis, tau), mi.Float(1))]
+        position = dr.clip(self._position(axis, tau) - 0.5, 0, dr.opaque(mi.Float, axis.count - 1))
+        first = dr.minimum(mi.UInt32(position), dr.opaque(mi.UInt32, axis.count - 2))
+        beyond = position - mi.Float(first)
+        return [(first, 1 - beyond), (first + 1, beyond)]
+
+    def _placed(
+        self,
+        seen: Sightings,
+        layer: mi.UInt32,
+        cells: Sequence[mi.UInt32],
+        anchor: tuple[mi.UInt32, mi.UInt32] | None,
+    ) -> mi.UInt32:
+        """Where light of a ``layer`` and of ``cells`` along rows and columns is filed, or its anchor's place for what
+        lies beyond all cells."""
+        inside = mi.Bool(True)
+        for axis, tau in self._axes(seen):
+            position = self._position(axis, tau)
+            inside &= (position >= 0) & (position < dr.opaque(mi.Float, axis.count))
+        grid = self._bundle.grid
+        rows, columns, anchors = (dr.opaque(mi.UInt32, count) for count in (*grid.shape, self._bundle.anchors))
+        line, column = anchor or (mi.UInt32(0), mi.UInt32(0))
+        place = ((layer * anchors + line) * rows + cells[0]) * (anchors * columns) + column * columns + cells[1]
+        return dr.select(inside, place, dr.opaque(mi.UInt32, self._bundle.size) + line * anchors + column)
+
+    def add(self, light: mi.Float, pixel: mi.UInt32, place: mi.UInt32, active: mi.Bool) -> None:
+        """File light.
+
+        Parameters
+        ----------
+        light
+            [W m^-2].
+        pixel
+            projector pixels that it is of.
+        place
+            of :meth:`place`.
+        active
+            lanes that count.
+        """
+        units = light * dr.opaque(mi.Float, 1 / self._unit)
+        fits = (units >= 0) & (units < 2.0**_MOST_BITS)
+        row = dr.gather(mi.UInt32, self._labels, pixel, active)
+        entry = dr.select(fits, place * dr.opaque(mi.UInt32, self._rows) + row, self._rows * self._width)
+        index = entry * self._held.lines + self._line
+        amount = dr.select(fits, mi.UInt64(dr.round(units)), mi.UInt64(1))
+        dr.scatter_reduce(dr.ReduceOp.Add, self.sums, amount, index, active, mode=dr.ReduceMode.Direct)
+
+    def filed(self, counted: LitSums | None = None, samples: int = 1) -> tuple[sparse.csr_array, float, float]:
+        """(rows + lamps, places) light per sample, the last rows empty; all that was received, and what lay outside
+        [W m^-2].
+
+        Parameters
+        ----------
+        counted
+            sums that were :func:`fetched`; None: those that are there, which are fetched.
+        samples
+            that they are of.
+
+        Raises
+        ------
+        MitsimError
+            where light is NaN, infinite, or four million times ``one``.
+        """
+        lit, units = counted or fetched((self,))[0]
+        if len(lit.numbers) and lit.numbers[-1] == self._rows * self._width and units[-1]:
+            raise MitsimError(
+                "the scene reflects NaN, infinite or boundless light toward the camera; check its materials"
+            )
+        light = units.astype(np.float64) * (self._unit / samples)
+        return lit.matrix(light), float(light.sum()), float(light[lit.inside :].sum())
+
+    def beyond(self, counted: LitSums, samples: int = 1) -> FloatArray:
+        """(rows, anchors, anchors) light from beyond all cells per sample [W m^-2].
+
+        Parameters
+        ----------
+        counted, samples
+            as for :meth:`filed`.
+        """
+        (lit, units), anchors = counted, self._bundle.anchors
+        # Its last one counts what is no light.
+        found = np.zeros(self._rows * anchors**2 + 1)
+        found[lit.numbers[lit.inside :] - np.uint32(self._rows * self._bundle.size)] = units[lit.inside :]
+        by_row = np.moveaxis(found[:-1].reshape(anchors, anchors, self._rows), 2, 0)
+        return np.asarray(by_row * (self._unit / samples))
+
+
+def fetched(ledgers: Sequence[Ledger]) -> list[LitSums]:
+    """The sums of ``ledgers`` of one kind, one for each line, on the host; they are empty then.
+
+    Which sums hold light is told of all together, as it is nearly the same of each.
+    """
+    first = ledgers[0]
+    lit = dr.compress(reduce(or_, (ledger._held.of_line(ledger._line) != 0 for ledger in ledgers)))
+    units = [ledger._held.of_line(ledger._line, lit) for ledger in ledgers]
+    dr.eval(lit, units)
+    for ledger in ledgers:
+        ledger._held.empty()
+    found = Lit(np.array(lit), first._rows, first._bundle.size, first._bundle.lamps)
+    return [(found, np.array(each)) for each in units]

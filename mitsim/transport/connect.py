@@ -1,0 +1,315 @@
+"""The bare sensor as a receiver: from a lit surface point to the irradiance that it casts on a point of the sensor.
+
+A surface point P that receives the flux phi irradiates the sensor point with::
+
+    E = f(P) cos_s / cos_g  phi  cos_P cos_a / r^2  r(t)        [W m^-2]
+
+f is the BSDF, cos_s and cos_g the arriving light's cosines to the shading and the geometric normal at P, cos_P and
+cos_a those of the connection at P and at the sensor, and r(t) the pixel's angular response. Without a lens, every
+surface point that is not in the shadow of another sees the sensor: light can be followed from the projector's side,
+where every path counts for a pixel that is known from the start. Behind flat glass r and cos_a are those of the point
+that the sensor seems to see (:mod:`mitsim.transport.transmission`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.projector import Lines
+from mitsim.optics.image_formation import anchor_positions
+from mitsim.transport.coordinates import rows_columns, x_y
+from mitsim.transport.projector import ProjectorRays, line_wavelengths
+from mitsim.transport.records import Sightings
+from mitsim.transport.sampler import generator, panchromatic
+from mitsim.transport.transmission import Passage, refracted_way
+
+
+@dataclass(frozen=True)
+class SensorPoints:
+    """Where on the sensor light is followed to: its centre, several anchors, or random points that are filed as one.
+
+    Attributes
+    ----------
+    half_width
+        of the sensor [mm].
+    anchors
+        a side; one is the centre.
+    spread
+        whether random points stand in for the one anchor: their light is the mean over the sensor.
+    distance
+        [mm] at which paths that start there are aimed at the same cells.
+    """
+
+    half_width: float
+    anchors: int = 1
+    spread: bool = False
+    distance: float = math.inf
+
+    @property
+    def count(self) -> int:
+        """Connections of a path in all."""
+        return self.anchors**2
+
+    @property
+    def positions(self) -> FloatArray:
+        """(anchors,) along an axis [mm]."""
+        return anchor_positions(self.anchors, self.half_width)
+
+    def of(self, lane: mi.UInt32, paths: int) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+        """Path of each ``lane``, of so many ``paths`` to each anchor, and row and column of the anchor."""
+        count, anchors = dr.opaque(mi.UInt32, paths), dr.opaque(mi.UInt32, self.anchors)
+        anchor = lane // count
+        return lane % count, anchor // anchors, anchor % anchors
+
+    def at(self, row: mi.UInt32, column: mi.UInt32, rng: mi.PCG32) -> mi.Point3f:
+        """Anchors in the camera's frame, or random points.
+
+        Parameters
+        ----------
+        row, column
+            of the anchor.
+        rng
+            draws the random points.
+        """
+        if self.spread:
+            return self.inside(mi.Point2f(rng.next_float32(), rng.next_float32()))
+        if self.anchors == 1:
+            return mi.Point3f(0)
+        positions = mi.Float(self.positions.astype(np.float32))
+        return mi.Point3f(*x_y(dr.gather(mi.Float, positions, row), dr.gather(mi.Float, positions, column)), 0)
+
+    def inside(self, point: mi.Point2f) -> mi.Point3f:
+        """Each ``point`` of the unit square on the sensor, in the camera's frame."""
+        side = 2 * dr.opaque(mi.Float, self.half_width)
+        return mi.Point3f((point.x - 0.5) * side, (point.y - 0.5) * side, 0)
+
+
+@dataclass
+class Way:
+    """The way from a surface point P to a point of the sensor, whatever light comes to P.
+
+    ``open`` tells whether it is, ``direction`` is the unit one in which light leaves P, ``passed`` the part of it that
+    comes through, ``geometric`` all factors [mm^-2] of the irradiance but for the BSDF and the arriving light's cosine
+    to the surface; ``row``, ``column`` and ``inverse_depth`` as in :class:`mitsim.transport.records.Deposits`.
+    """
+
+    open: mi.Bool
+    direction: mi.Vector3f
+    passed: mi.Spectrum
+    geometric: mi.Float
+    row: mi.Float
+    column: mi.Float
+    inverse_depth: mi.Float
+
+
+@dataclass
+class Reception:
+    """Irradiance for each unit of flux [mm^-2], where it is seen from the sensor's centre, and the turn's pdf [1/sr].
+
+    ``row``, ``column`` and ``inverse_depth`` as in :class:`mitsim.transport.records.Deposits`; ``pdf`` is that of
+    sampling the turn at P from the sensor's side, ``direction`` the unit one in which the light leaves P.
+    """
+
+    irradiance: mi.Spectrum
+    row: mi.Float
+    column: mi.Float
+    inverse_depth: mi.Float
+    pdf: mi.Float
+    direction: mi.Vector3f
+
+    def solid_angle(self, local: mi.Point3f) -> mi.Float:
+        """Solid angle at P for each area of the sensor at ``local`` [sr/mm^2]: cos^3 / z^2 of the apparent point."""
+        row, column = rows_columns(local.x, local.y)
+        inverse = self.inverse_depth
+        squared = 1 + dr.square(self.row - row * inverse) + dr.square(self.column - column * inverse)
+        return dr.square(inverse) / (squared * dr.sqrt(squared))
+
+    def sightings(self, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32, by_line: bool = False) -> Sightings:
+        """Light seen from here.
+
+        Parameters
+        ----------
+        light
+            [W m^-2] at the path's wavelengths.
+        pixel
+            of the projector.
+        by_line
+            whether it is told apart by line.
+        """
+        return Sightings.of(light, by_line, pixel, self.row, self.column, self.inverse_depth)
+
+
+class Receiver:
+    """Prepared once for a scene and a camera.
+
+    Parameters
+    ----------
+    scene, camera
+        as loaded.
+    geometry
+        stands in for the camera's own.
+    """
+
+    def __init__(self, scene: mi.Scene, camera: mi.Sensor, geometry: CameraGeometry | None = None) -> None:
+        self.scene, self.camera, self.passage = scene, camera, Passage(scene)
+        self.geometry: CameraGeometry = geometry or camera.geometry
+
+    def of_board(self, rays: ProjectorRays) -> float:
+        """Irradiance [W m^-2] by the light of a projector pixel, from a white board at the rig's distance; ``rays`` are
+        the projector's."""
+        pixel = dr.arange(mi.UInt32, rays.projector.n**2)
+        wavelengths, spectral = sampled_wavelengths(self.camera, generator(mi.UInt32(0), pixel), rays.projector.lines)
+        flux = np.array(panchromatic(rays.flux(pixel, wavelengths) * spectral))
+        return float(flux.mean(dtype=np.float64)) / (math.pi * self.geometry.scene_distance**2)
+
+    def receive(
+        self, si: mi.SurfaceInteraction3f, toward: mi.Vector3f, local: mi.Point3f, active: mi.Bool
+    ) -> Reception:
+        """Connect lit surface points to sensor points.
+
+        Parameters
+        ----------
+        si
+            the surface points.
+        toward
+            unit directions that they are lit from, in the world.
+        local
+            sensor points in the camera's frame [mm].
+        active
+            lanes that count.
+        """
+        return self.received(si, toward, self.way(si, local, active))
+
+    def way(self, si: mi.SurfaceInteraction3f, local: mi.Point3f, active: mi.Bool) -> Way:
+        """Connect surface points to sensor points.
+
+        Parameters
+        ----------
+        si, local, active
+            as for :meth:`receive`.
+        """
+        to_world = self.camera.world_transform()
+        point = to_world.inverse() @ si.p
+        sensor = to_world @ local
+        apparent, bent = si.p, None
+        if self.passage.panes:
+            bent = refracted_way(self.passage, si, sensor, active)
+            apparent, active = bent.apparent, active & bent.open
+            point = to_world.inverse() @ apparent
+        offset = sensor - apparent
+        squared = dr.squared_norm(offset)
+        direction = offset * dr.rsqrt(squared) if bent is None else bent.direction
+        t = mi.Vector2f(point.x - local.x, point.y - local.y) / point.z
+        stop = dr.opaque(mi.Float, self.geometry.tan_half_fov)
+        active = active & (point.z > dr.opaque(mi.Float, self.geometry.mask_distance))
+        active &= (dr.abs(t.x) <= stop) & (dr.abs(t.y) <= stop)
+        if bent is None:
+            seen, passed = self.passage.between(si, sensor, active)
+            active &= seen
+        else:
+            passed = bent.part
+        cosine = dr.rsqrt(1 + dr.squared_norm(t))
+        geometric = dr.abs(dr.dot(si.n, direction)) * cosine / squared
+        if self.geometry.angular_exponent > 0:
+            geometric *= dr.power(cosine, dr.opaque(mi.Float, self.geometry.angular_exponent))
+        inverse_depth = dr.rcp(point.z)
+        row, column = rows_columns(point.x, point.y)
+        return Way(active, direction, passed, geometric, row * inverse_depth, column * inverse_depth, inverse_depth)
+
+    @staticmethod
+    def received(si: mi.SurfaceInteraction3f, toward: mi.Vector3f, way: Way) -> Reception:
+        """What comes to the sensor by a way.
+
+        Parameters
+        ----------
+        si, toward
+            as for :meth:`receive`.
+        way
+            from these points.
+        """
+        si.wi = si.to_local(way.direction)
+        reflected, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(toward), way.open)
+        geometric = way.geometric / dr.abs(dr.dot(si.n, toward))
+        irradiance = dr.select(way.open, mi.unpolarized_spectrum(reflected) * way.passed * geometric, 0)
+        return Reception(irradiance, way.row, way.column, way.inverse_depth, pdf, way.direction)
+
+
+def sampled_wavelengths(camera: mi.Sensor, rng: mi.PCG32, lines: Lines | None = None) -> tuple[mi.Color0f, mi.Spectrum]:
+    """Wavelengths of a path, and their weights; but in spectral variants, none and 1.
+
+    Light by the weights has a mean over the wavelengths that is the mean over 360-830 nm, where a flat spectrum of 1
+    counts as 1; or the sum over given lines, each with its share.
+
+    Parameters
+    ----------
+    camera
+        that the path comes to.
+    rng
+        draws the wavelengths; it draws as many numbers where ``lines`` are given.
+    lines
+        wavelengths that are taken instead, four at most, in spectral variants.
+    """
+    wavelengths, weight = camera.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), rng.next_float32(), True)
+    if not mi.is_spectral:
+        return wavelengths, weight
+    if lines is None:
+        return wavelengths, weight / (mi.MI_CIE_MAX - mi.MI_CIE_MIN)
+    wavelengths, weights = line_wavelengths(lines)
+    return wavelengths, mi.Spectrum(*(dr.opaque(mi.Float, float(weight)) for weight in weights))
+
+
+# -------- Where light lands that leaves surfaces in known directions
+
+
+@dataclass
+class Landing:
+    """Points (x, y) of the camera's frame [mm], the cosine there, the way's length [mm], and whether light arrives."""
+
+    x: mi.Float
+    y: mi.Float
+    cosine: mi.Float
+    length: mi.Float
+    arrives: mi.Bool
+
+
+def landing(receiver: Receiver, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> Landing:
+    """Where light crosses the plane of the sensor from the front; whether something opaque hides it is not asked.
+
+    Parameters
+    ----------
+    receiver
+        the sensor, and the scene with its panes.
+    si
+        points of surfaces.
+    direction
+        unit, in which light leaves them.
+    active
+        lanes that count.
+    """
+    inverse, passage = receiver.camera.world_transform().inverse(), receiver.passage
+    ray, length = mi.Ray3f(si.p, direction, si.time, si.wavelengths), mi.Float(0)
+
+    def further(active: mi.Bool, ray: mi.Ray3f, length: mi.Float) -> tuple[object, ...]:
+        met = passage.next_surface(ray, active)
+        before = inverse @ met.p
+        active &= met.is_valid() & (before.z > 0)
+        passed = passage.through(met, ray.d, active)
+        active &= dr.max(passed.part) > 0
+        beyond = passage.onward(met, passed.direction)
+        ray.o, ray.d = dr.select(active, beyond.o, ray.o), dr.select(active, beyond.d, ray.d)
+        return active, ray, dr.select(active, length + met.t, length)
+
+    if passage.panes:
+        start = passage.onward(si, direction), length
+        _, ray, length = dr.while_loop((mi.Bool(active), *start), lambda active, *_: active, further)
+    place, onward = inverse @ ray.o, inverse @ ray.d
+    reach = -place.z / onward.z
+    arrives = active & (onward.z < 0) & (reach > 0)
+    return Landing(place.x + onward.x * reach, place.y + onward.y * reach, -onward.z, length + reach, arrives)

@@ -1,0 +1,428 @@
+"""Indirect light with shared second surfaces: neighbouring projector pixels light each other's second points.
+
+Light of projector pixel i comes to x1_i, is turned there toward x2_i, and goes on to the sensor or further. Where pixel
+k of the same block of ``SIDE`` x ``SIDE`` pixels found x2_k, x1_i sees it as well (or does not, which a ray tells): the
+balance heuristic over the block's N directions, each pixel's drawn by its own BSDF, gives the estimate::
+
+    L_i = sum_k  f_i(x2_k) V(x1_i, x2_k) / sum_j p_j(x2_k)  x  (what x2_k hands on of light from x1_i)
+
+f_i is what x1_i sends per area at x2_k, p_j the density per area with which x1_j would have found it, 0 where x1_j
+sends it nothing. It is unbiased (Veach and Guibas 1995; Bekaert, Sbert, Halton 2002, "Accelerating path tracing by
+re-using paths"), and bounded near edges where f_i grows. Shifting dots never light neighbours together, so that common
+points correlate their frames, but make none of them noisier.
+
+x2 hands on: to the sensor, by its BSDF, of each x1_i; and to further surfaces, where it is diffuse, as the path goes on
+that pixel k follows. Such a path leaves x2 on the side that x1_k lights, by the shading normal; it stands for light of
+those x1_i that light the same side, and in its density count only x1_j that do. A glossy x2 is followed further for its
+own pixel alone. Where paths carry the projector's lines, pairs bring light of each, by the same weights: these are of
+geometry alone. Deltas at x1 (mirrors), wavelengths that every path draws for itself, and scenes that light passes
+straight are not shared.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cached_property, reduce
+from itertools import cycle
+from operator import or_
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsim.transport.accumulator import Ledger
+from mitsim.transport.connect import Way
+from mitsim.transport.indirect import MEMBERS, SIDE, IndirectTracer, IndirectWalk, blocks_of
+from mitsim.transport.integrator import KINDS, camera_part
+from mitsim.transport.records import INDIRECT, Deposits, Sightings, check_finite
+from mitsim.transport.sampler import generator, seed_of, stratified, told_apart
+
+if TYPE_CHECKING:
+    ByLine = list[mi.Float]
+    Store = Callable[[mi.UInt32, mi.UInt32, tuple[ByLine, ByLine], mi.Bool], None]
+    Sender = Callable[[mi.Vector3f, mi.Bool], tuple[ByLine, mi.Float]]
+    Turner = Callable[[mi.UInt32, mi.Bool], tuple[ByLine, ByLine]]
+
+_STEP, _TURN = 5, 16
+"""Members of a block take the points of their common sequence in turn; each sample begins five members on, and sixteen
+samples one more, so that each pixel's own points are spread over the sequence."""
+_LANES_PER_LAUNCH = 2**20
+"""Paths of one kernel: their pairs take 256 bytes a path."""
+_MOST_COMPARED = 32
+"""Shapes that each second point is compared with: every comparison is an instruction of the kernel."""
+_REFLECTANCE = re.compile(r"(brdf_\d\.)?reflectance\.")
+"""Parameters of a diffuse material, one-sided or two-sided, and of no other."""
+
+
+class NeighbourTracer(IndirectTracer):
+    """The same light as :class:`IndirectTracer`'s, to one point of the sensor or random ones."""
+
+    lanes_per_launch = _LANES_PER_LAUNCH
+
+    @property
+    def lanes(self) -> int:
+        """Paths of one sample: one for each pixel of whole blocks, or as often as these are repeated."""
+        return MEMBERS * (len(self.turns) if self.turns else blocks_of(self.projector.n) ** 2)
+
+    def repeating(self, repeats: Sequence[int]) -> IndirectTracer:
+        """The same, as :meth:`IndirectTracer.repeating`; ``repeats`` (blocks^2,)."""
+        return self._taking(np.asarray(repeats, dtype=np.int64))
+
+    def trace_looks(self, seeds: Sequence[int], samples: int = 1) -> list[Deposits]:
+        """``samples`` of each of some ``seeds``, one after the other: pairs of paths have no lane of their own."""
+        return [self.trace(seed, 0, samples) for seed in seeds]
+
+    def shares(self) -> bool:
+        """Whether what is to be followed can be shared: as the module says."""
+        lines = mi.is_monochromatic or (mi.is_spectral and self.projector.lines is not None)
+        several = self.points.count > 1 or not lines or mi.is_polarized
+        return self.interreflection and not several and not self.receiver.passage.open
+
+    @property
+    def lines(self) -> int:
+        """Lines that light is told apart by; 1 where it is not."""
+        lines = self.projector.lines
+        return len(lines.shares) if lines is not None and mi.is_spectral else 1
+
+    @cached_property
+    def diffuse(self) -> frozenset[int]:
+        """Places among the scene's shapes of those whose material is diffuse and nothing else: no bumps, no coat."""
+        shapes = enumerate(self.scene.shapes())
+        return frozenset(place for place, shape in shapes if _is_diffuse(shape.bsdf()))
+
+    @property
+    def all_diffuse(self) -> bool:
+        """Whether all surfaces are: pairs then take no look at a material."""
+        return len(self.diffuse) == len(self.scene.shapes())
+
+    def _walk(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> _Block:
+        return (_DiffuseBlock if self.all_diffuse else _Block)(self, seed, sample, lane)
+
+
+def _is_diffuse(bsdf: mi.BSDF | None) -> bool:
+    """Whether a material reflects like Lambert's, on one side or on either."""
+    if bsdf is None or bsdf.class_name() not in ("SmoothDiffuse", "TwoSidedBRDF"):
+        return False
+    return all(_REFLECTANCE.match(name) for name in mi.traverse(bsdf).keys())  # noqa: SIM118 - no dictionary
+
+
+class _Block(IndirectWalk):
+    """Paths of whole blocks of pixels, the members of each one after the other."""
+
+    tracer: NeighbourTracer
+
+    def _place(self, sample: mi.UInt32, lane: mi.UInt32) -> mi.Float | float:
+        tracer, weight = self.tracer, 1.0
+        self.block, self.member, self.sample = lane // MEMBERS, lane % MEMBERS, sample
+        if tracer.turns:
+            self.block, self.sample, weight = tracer.turns.at(self.block, sample)
+        n, blocks = (dr.opaque(mi.UInt32, count) for count in (tracer.projector.n, blocks_of(tracer.projector.n)))
+        row = (self.block // blocks) * SIDE + self.member // SIDE
+        column = (self.block % blocks) * SIDE + self.member % SIDE
+        inside = (row < n) & (column < n)
+        self.pixel = dr.minimum(row, n - 1) * n + dr.minimum(column, n - 1)
+        self.anchor = dr.zeros(mi.UInt32, dr.width(lane)), dr.zeros(mi.UInt32, dr.width(lane))
+        return dr.select(inside, mi.Float(weight), 0)
+
+    def _begin(self, seed: int | mi.UInt32) -> None:
+        shared, sample = seed_of(seed), self.sample
+        self.rng = generator(shared ^ (sample * 0x9E3779B9 + 1), self.pixel)
+        place = (self.member + sample * _STEP + sample // _TURN) % MEMBERS
+        self.first_turn = stratified(sample * MEMBERS + place, generator(shared, self.block))
+
+    def deposits(self, further: bool) -> list[Deposits]:
+        """Light on the host: of each pixel's own paths, and of all pairs of pixels and second points."""
+        own, count = self._own(), dr.width(self.lit) * MEMBERS
+        values = [[dr.zeros(mi.Float, count) for _ in range(self.tracer.lines)] for _ in range(2)]
+
+        def store(place: mi.UInt32, at: mi.UInt32, light: tuple[ByLine, ByLine], active: mi.Bool) -> None:
+            for kept, by_line in zip(values, light, strict=True):
+                for each, value in zip(kept, by_line, strict=True):
+                    dr.scatter(each, value, place, active)
+
+        self._hand_on(*self._weights(), store)
+        dr.eval(values)
+        return [*own, self._paired(values[0], self.way), self._paired(values[1], self.further)]
+
+    def file(self, ledgers: Sequence[Ledger]) -> list[Deposits]:
+        """Light of each pixel's own paths on the host; that of pairs in ``ledgers``, one for each line."""
+        own = self._own()
+        seen = Sightings(self.way.geometric, self.pixel, self.way.row, self.way.column, self.way.inverse_depth)
+        places = [ledgers[0].place(each, self.rng.next_float32()) for each in (seen, self.further)]
+        dr.eval(places)
+
+        def store(place: mi.UInt32, at: mi.UInt32, light: tuple[ByLine, ByLine], active: mi.Bool) -> None:
+            for each, by_line in zip(places, light, strict=True):
+                for ledger, value in zip(ledgers, by_line, strict=True):
+                    lit = active & ~(value == 0)  # not a number is light to be refused
+                    ledger.add(value, self.pixel, dr.gather(mi.UInt32, each, at, lit), lit)
+
+        self._hand_on(*self._weights(), store)
+        return own
+
+    def _own(self) -> list[Deposits]:
+        """Follow all paths; on the host the light that is not shared."""
+        self._first()
+        self._second()
+        self._follow_on()
+        kept = self.kept["indirect"]
+        place = kept.pixel, kept.row, kept.column, kept.inverse_depth
+        self.further = Sightings(dr.select(self.follows, kept.value, 0), *place)
+        # Of unit light, whose mean over wavelengths the sightings hold.
+        self.beyond = [self.further.value]
+        if kept.lines is not None:
+            unit = dr.select(self.follows, kept.lines * len(kept.lines), 0)
+            self.beyond = [unit[line] for line in range(self.tracer.lines)]
+        kept.value = dr.select(self.follows, 0, kept.value)
+        dr.eval(vars(self))
+        return [Deposits.fetched(seen, KINDS[kind], self.anchor) for kind, seen in self.kept.items()]
+
+    def _first(self) -> None:
+        """The first surface, and each path's turn there."""
+        self.lit_by, self.power = mi.Ray3f(self.ray), told_apart(self.flux, self.tracer.lines)
+        self.lit_at = self.scene.ray_intersect_preliminary(self.ray, True, active=self.active)
+        si = self.lit_at.compute_surface_interaction(self.ray, active=self.active)
+        self.active &= si.is_valid()
+        self.lit = mi.Bool(self.active)
+        self._leave(si, True)
+
+    def _second(self) -> None:
+        """The second surface, its way to the sensor, and each path's turn there: of unit light where it is shared."""
+        self.arrived_by = mi.Ray3f(self.ray)
+        self.arrived_at = self.scene.ray_intersect_preliminary(self.ray, active=self.active)
+        si = self.arrived_at.compute_surface_interaction(self.ray, active=self.active)
+        self.active &= si.is_valid()
+        self.shared = self.active & (self.scattered == 1)
+        self.point, self.normal = mi.Point3f(si.p), mi.Normal3f(si.n)
+        self.way = self._way(si)
+        self._take(si, replace(self.way, open=self.way.open & ~self.shared))
+        self.follows = self.shared & self._diffuse(si)
+        self.shading = mi.Normal3f(si.sh_frame.n)
+        self.side = dr.sign(dr.dot(self.shading, -self.arrived_by.d))
+        self.strength = dr.select(self.follows, 1, self.strength)
+        self.flux = dr.select(self.follows, 1, self.flux)
+        self._leave(si, False)
+        self.turned = self._turn(si, -self.arrived_by.d, self.ray.d, self.active & self.follows)
+        self.onward = mi.Vector3f(self.ray.d)
+
+    def _diffuse(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
+        """Whether the surfaces at ``si`` are diffuse; of very many materials none counts as such."""
+        shapes, diffuse = self.scene.shapes(), self.tracer.diffuse
+        others = frozenset(range(len(shapes))) - diffuse
+        few = min(diffuse, others, key=len)
+        if len(few) > _MOST_COMPARED:
+            return mi.Bool(False)
+        found = mi.Bool(False)
+        for place in few:
+            found |= si.shape == mi.ShapePtr(shapes[place])
+        return found if few is diffuse else ~found
+
+    def _factors(self, spectrum: mi.UnpolarizedSpectrum) -> ByLine:
+        """What a ``spectrum`` makes of light by line: where no lines are told apart, all its numbers are the same."""
+        return [spectrum[line] for line in range(self.tracer.lines)]
+
+    def _turn(self, si: mi.SurfaceInteraction3f, toward: mi.Vector3f, onward: mi.Vector3f, active: mi.Bool) -> ByLine:
+        """Light that a surface turns from ``toward`` to ``onward``, but for a factor of the latter."""
+        si.wi = si.to_local(toward)
+        context = mi.BSDFContext(mi.TransportMode.Importance)
+        value = mi.unpolarized_spectrum(si.bsdf().eval(context, si, si.to_local(onward), active))
+        value *= dr.abs(mi.Frame3f.cos_theta(si.wi) / dr.dot(si.n, toward))
+        return self._factors(dr.select(active & dr.isfinite(value), value, 0))
+
+    def _weights(self) -> tuple[ByLine, mi.Float, mi.Float]:
+        """(lanes * members,) what each pixel sends to each second point of its block, negative to its other side, by
+        line or the same for all; (lanes,) the points' densities, and those with which their own side is lit."""
+        width = dr.width(self.lit)
+        density = dr.zeros(mi.Float, width * MEMBERS)
+        index, si = dr.arange(mi.UInt32, width), self._first_points()
+        first = index - self.member
+
+        send = self._sender(si)
+        sent = [dr.zeros(mi.Float, width * MEMBERS) for _ in range(self.sends)]
+
+        def pair(other: mi.UInt32) -> tuple[mi.UInt32]:
+            known = self.point, self.normal, self.shading, self.side
+            point, normal, shading, side = (dr.gather(type(each), each, first + other) for each in known)
+            active = self.lit & dr.gather(mi.Bool, self.shared, first + other)
+            offset = point - si.p
+            squared = dr.squared_norm(offset)
+            direction = offset * dr.rsqrt(squared)
+            by_line, pdf = send(direction, active)
+            to_area = dr.abs(dr.dot(normal, direction)) / squared
+            values = [value * to_area for value in by_line]
+            some = reduce(dr.maximum, values)
+            active &= (some > 0) & (some < dr.inf) & (pdf > 0)
+            another = active & (other != self.member)
+            active &= ~self.scene.ray_test(si.spawn_ray_to(point), another) | ~another
+            place, sign = index * MEMBERS + other, dr.select(dr.dot(shading, direction) * side < 0, mi.Float(1), -1)
+            for each, value in zip(sent, values, strict=True):
+                dr.scatter(each, value * sign, place, active)
+            dr.scatter(density, pdf * to_area * sign, place, active)
+            return (other + 1,)
+
+        dr.while_loop((mi.UInt32(0),), lambda other: other < MEMBERS, pair)
+        dr.eval(sent, density)
+        # Gathered in one order: sums of floating-point numbers that are scattered hang on the threads.
+        whole, same_side = mi.Float(0), mi.Float(0)
+        for member in range(MEMBERS):
+            each = dr.gather(mi.Float, density, (first + member) * MEMBERS + self.member)
+            whole, same_side = whole + dr.abs(each), same_side + dr.maximum(each, 0)
+        return sent, whole, same_side
+
+    def _hand_on(self, sent: ByLine, whole: mi.Float, same_side: mi.Float, store: Store) -> None:
+        """Light of each pixel by each second point of its block, straight to the sensor and further on.
+
+        Parameters
+        ----------
+        sent, whole, same_side
+            as :meth:`_weights` has them.
+        store
+            takes the light of pairs: their place among all, the lane of the second point, the two lights, and which
+            lanes count.
+        """
+        index, si = dr.arange(mi.UInt32, dr.width(self.lit)), self._first_points()
+        first = index - self.member
+        dr.eval(whole, same_side)
+        turn = self._turner(si)
+
+        def pair(other: mi.UInt32) -> tuple[mi.UInt32]:
+            place, at = index * MEMBERS + other, first + other
+            given = [dr.gather(mi.Float, each, place) for each in sent]
+            active = self.lit & reduce(or_, (each != 0 for each in given))
+            connected, further = turn(at, active)
+            all_ways, same_way = (1 / dr.gather(mi.Float, density, at) for density in (whole, same_side))
+            light = [power * each for power, each in zip(self.power, cycle(given))]
+            straight = [value * dr.abs(each) * all_ways for value, each in zip(connected, light, strict=True)]
+            onward = [value * each * same_way for value, each in zip(further, light, strict=True)]
+            store(place, at, (straight, [dr.select(each > 0, each, 0) for each in onward]), active)
+            return (other + 1,)
+
+        dr.while_loop((mi.UInt32(0),), lambda other: other < MEMBERS, pair)
+
+    @property
+    def sends(self) -> int:
+        """Numbers that tell what a pixel sends to a second point: one for each line, or for all."""
+        return self.tracer.lines
+
+    def _sender(self, si: mi.SurfaceInteraction3f) -> Sender:
+        """What first surfaces at ``si`` send in a direction [1/sr], and the density [1/sr] of sampling that."""
+        context, toward = mi.BSDFContext(mi.TransportMode.Importance), -self.lit_by.d
+
+        def send(direction: mi.Vector3f, active: mi.Bool) -> tuple[ByLine, mi.Float]:
+            local = si.to_local(direction)
+            reflected, pdf = si.bsdf().eval_pdf(context, si, local, active)
+            turned = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, direction)
+            turned /= mi.Frame3f.cos_theta(local) * dr.dot(si.n, toward)
+            return self._factors(mi.unpolarized_spectrum(reflected) * dr.abs(turned)), pdf
+
+        return send
+
+    def _turner(self, si: mi.SurfaceInteraction3f) -> Turner:
+        """What second points of lanes turn of light from first points at ``si``: to the sensor, and on the ways that
+        are followed further."""
+
+        def turn(at: mi.UInt32, active: mi.Bool) -> tuple[ByLine, ByLine]:
+            met, ray = (dr.gather(type(each), each, at, active) for each in (self.arrived_at, self.arrived_by))
+            second = met.compute_surface_interaction(ray, active=active)
+            toward = dr.normalize(si.p - second.p)
+            way = dr.gather(Way, self.way, at, active)
+            reception = self.tracer.receiver.received(second, toward, replace(way, open=way.open & active))
+            connected = self._factors(reception.irradiance * (1 - camera_part(reception.pdf)))
+            beyond, turned = (
+                [dr.gather(mi.Float, each, at, active) for each in lines] for lines in (self.beyond, self.turned)
+            )
+            handed = [active & (light > 0) & (own > 0) for light, own in zip(beyond, turned, strict=True)]
+            onward = dr.gather(mi.Vector3f, self.onward, at, active)
+            others = self._turn(second, toward, onward, reduce(or_, handed))
+            further = [light * other / own for light, other, own in zip(beyond, others, turned, strict=True)]
+            return connected, [dr.select(some, light, 0) for some, light in zip(handed, further, strict=True)]
+
+        return turn
+
+    def _first_points(self) -> mi.SurfaceInteraction3f:
+        return self.lit_at.compute_surface_interaction(self.lit_by, active=self.lit)
+
+    def _paired(self, values: ByLine, seen: Way | Sightings) -> Deposits:
+        """Light on the host of pairs of pixels and second points."""
+        by_line = np.array(values)
+        light = by_line.sum(axis=0)
+        check_finite(light)
+        pairs = np.flatnonzero(light)
+        lines = np.zeros((len(mi.Spectrum()), len(pairs)), np.float32)
+        lines[: len(by_line)] = by_line[:, pairs]
+        lane, other = np.divmod(pairs, MEMBERS)
+        at = lane - lane % MEMBERS + other
+        none = np.zeros(len(pairs), np.int64)
+        row, column, inverse = (np.array(part)[at] for part in (seen.row, seen.column, seen.inverse_depth))
+        return Deposits(
+            pixel=np.array(self.pixel)[lane].astype(np.int64),
+            anchor_row=none,
+            anchor_column=none,
+            row=row.astype(np.float64),
+            column=column.astype(np.float64),
+            inverse_depth=inverse.astype(np.float64),
+            value=light[pairs].astype(np.float64),
+            kind=np.full(len(pairs), INDIRECT, dtype=np.int16),
+            lines=lines if self.by_line else None,
+        )
+
+
+class _DiffuseBlock(_Block):
+    """The same where all surfaces are diffuse: what they turn hangs on two cosines, and on no material.
+
+    A diffuse surface of shading normal s and geometric normal n turns light from w by rho / pi |s w| / |n w|, whatever
+    it goes on to, on the side that s w tells.
+    """
+
+    sends = 1
+
+    def _first(self) -> None:
+        super()._first()
+        si = self._first_points()
+        self.facing = dr.sign(mi.Frame3f.cos_theta(si.wi))
+        turned = self._turn(si, -self.lit_by.d, si.sh_frame.n * self.facing, self.lit)
+        self.lit &= reduce(dr.maximum, turned) > 0
+        self.power = [power * own for power, own in zip(self.power, turned, strict=True)]
+
+    def _second(self) -> None:
+        super()._second()
+        second = self.arrived_at.compute_surface_interaction(self.arrived_by, active=self.shared)
+        self.sensor_side = dr.sign(dr.dot(self.shading, self.way.direction))
+        facing = self.shading * self.sensor_side
+        way = replace(self.way, open=self.way.open & self.shared)
+        reception = self.tracer.receiver.received(second, facing, way)
+        self.to_sensor = self._factors(reception.irradiance * dr.abs(dr.dot(self.normal, facing)))
+
+    def _sender(self, si: mi.SurfaceInteraction3f) -> Sender:
+        def send(direction: mi.Vector3f, active: mi.Bool) -> tuple[ByLine, mi.Float]:
+            cosine = dr.dot(si.sh_frame.n, direction) * self.facing
+            value = dr.abs(dr.dot(si.n, direction))
+            return [dr.select(active & (cosine > 0), value, 0)], cosine * dr.inv_pi
+
+        return send
+
+    def _turner(self, si: mi.SurfaceInteraction3f) -> Turner:
+        own = self._cosines(self.shading, self.normal, -self.arrived_by.d)
+        further = [dr.select(own > 0, light / own, 0) for light in self.beyond]
+        dr.eval(further)
+
+        def turn(at: mi.UInt32, active: mi.Bool) -> tuple[ByLine, ByLine]:
+            known = self.point, self.normal, self.shading, self.sensor_side
+            point, normal, shading, side = (dr.gather(type(each), each, at, active) for each in known)
+            to_sensor, beyond = (
+                [dr.gather(mi.Float, each, at, active) for each in lines] for lines in (self.to_sensor, further)
+            )
+            toward = dr.normalize(si.p - point)
+            cosines = self._cosines(shading, normal, toward)
+            seen = dr.select(dr.dot(shading, toward) * side > 0, cosines, 0)
+            return [light * seen for light in to_sensor], [light * cosines for light in beyond]
+
+        return turn
+
+    @staticmethod
+    def _cosines(shading: mi.Normal3f, normal: mi.Normal3f, toward: mi.Vector3f) -> mi.Float:
+        """Cosine of a direction to the shading normal over that to the geometric one."""
+        return dr.abs(dr.dot(shading, toward)) / dr.abs(dr.dot(normal, toward))

@@ -1,0 +1,73 @@
+"""Plugins of our own and Mitsuba's variants: registration once for each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+
+_REGISTERED: set[tuple[str, str]] = set()
+
+
+def register_once(kind: str, plugin: str, build: Callable[[], type]) -> None:
+    """Make a plugin known to the current variant, unless it is.
+
+    Parameters
+    ----------
+    kind
+        "sensor", "emitter" or "bsdf".
+    plugin
+        name in scene files.
+    build
+        makes the class: Mitsuba's base classes exist per variant.
+
+    Raises
+    ------
+    MitsimError
+        when no variant is selected.
+    """
+    variant = mi.variant()
+    if variant is None:
+        raise MitsimError("no Mitsuba variant is selected; call mitsim.core.environment.load_variant first")
+    if (variant, plugin) not in _REGISTERED:
+        getattr(mi, f"register_{kind}")(plugin, build())
+        _REGISTERED.add((variant, plugin))
+
+
+# -------- Between Dr.Jit and NumPy
+
+
+def per_lane(values: mi.Float, count: int) -> npt.NDArray[Any]:
+    """(count,) of a Dr.Jit array ``values`` of ``count`` numbers or one; real numbers in double precision."""
+    array = np.array(values)
+    array = array.astype(np.float64) if array.dtype.kind == "f" else array
+    return np.broadcast_to(array.reshape(-1), (count,))
+
+
+def vectors(values: mi.Vector3f, count: int) -> FloatArray:
+    """(``count``, 3) of a Dr.Jit vector ``values``."""
+    return np.stack([per_lane(part, count) for part in (values.x, values.y, values.z)], axis=1)
+
+
+def channels(spectrum: mi.UnpolarizedSpectrum, count: int) -> FloatArray:
+    """(``count``, channels) of a ``spectrum``."""
+    return np.stack([per_lane(spectrum[i], count) for i in range(len(spectrum))], axis=1)
+
+
+def lanes_of(vectors: FloatArray) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """Components of ``vectors`` (k, 3) on the device, in single precision.
+
+    Gathered of one array: Dr.Jit takes arrays over as they lie in memory, and compiles kernels that read them anew for
+    each alignment, which is another for nearly every k (50 ms each).
+    """
+    flat = mi.Float(np.ascontiguousarray(vectors, dtype=np.float32).ravel())
+    first = 3 * dr.arange(mi.UInt32, len(vectors))
+    x, y, z = (dr.gather(mi.Float, flat, first + part) for part in range(3))
+    return x, y, z

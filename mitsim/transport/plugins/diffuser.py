@@ -1,0 +1,212 @@
+"""A refractive diffuser before a bare sensor, lit by a distant point, in; the pattern of light on the sensor out.
+
+A sheet of glass (polycarbonate, as DiffuserCam's) whose face towards the sensor is a random, smooth relief. A distant
+point's parallel rays meet the flat face, then the relief, are refracted by Mitsuba's smooth dielectric, and land on the
+sensor, where they are counted. For small slopes a ray at x lands at x + d (n - 1) grad h(x), with h the thickness, so
+that the irradiance is 1 / |det(1 + d (n - 1) Hess h)|, summed over all x that land there: the caustics of a diffuser.
+Axes as in docs/physics.md: the sensor at z = 0 looks along +z, row 0 is at +y, column 0 at +x.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import mitsuba as mi
+import numpy as np
+from scipy import fft
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.core.seeds import integer, stream
+from mitsim.transport.plugins.base import per_lane, vectors
+
+_THICKNESS_MM = 1.0
+"""Of the sheet; it moves tilted light only, by its thickness times the tangent in glass."""
+_CLEAR_MM = 0.05
+"""How far along its line a refracted ray starts, beyond the face that it leaves and before the next one."""
+_RAYS_AT_ONCE = 2**22
+"""0.3 GiB of rays and their surface interactions."""
+_VERTICES = 12
+"""Vertices for each correlation length: normals between them, taken linearly, are then off by 0.3 % of the slope."""
+
+
+@dataclass(frozen=True, eq=False)
+class Relief:
+    """A face over a square that is centred on the axis.
+
+    Attributes
+    ----------
+    side_mm
+        of the square.
+    height_mm
+        (g, g) how far the glass stands out towards the sensor [mm], at x = y = -side/2 to side/2; first index x.
+    slope_x, slope_y
+        (g, g) its derivatives, which say how rays are refracted.
+    """
+
+    side_mm: float
+    height_mm: FloatArray
+    slope_x: FloatArray
+    slope_y: FloatArray
+
+
+def random_relief(side_mm: float, correlation_mm: float, slope: float, seed: int) -> Relief:
+    """A normal random surface with the autocorrelation exp(-r^2 / (2 correlation^2)).
+
+    Parameters
+    ----------
+    side_mm, correlation_mm
+        of the square, and of the relief; [mm].
+    slope
+        root mean square derivative along x and along y.
+    seed
+        of the surface.
+
+    Raises
+    ------
+    MitsimError
+        for lengths that do not fit, or a slope that is no small positive number.
+    """
+    if not (0 < correlation_mm < side_mm / 4 and 0 < slope <= 0.5):
+        raise MitsimError(
+            f"diffuser of {side_mm:g} mm with correlation {correlation_mm:g} mm and slope {slope:g}: give a "
+            "correlation above 0 and below a quarter of the side, and a slope above 0 and up to 0.5"
+        )
+    # Twice as wide as it is used, so that it does not repeat.
+    cells = fft.next_fast_len(int(np.ceil(2 * side_mm / correlation_mm * _VERTICES)))
+    step = 2 * side_mm / cells
+    wave = 2 * np.pi * np.fft.fftfreq(cells, step)
+    wave_x, wave_y = wave[:, None], wave[None, :]
+    noise = fft.fft2(stream(seed, "diffuser").standard_normal((cells, cells)))
+    spectrum = noise * np.exp(-(correlation_mm**2) * (wave_x**2 + wave_y**2) / 4)
+    used = slice(0, cells // 2 + 1)
+    height, slope_x, slope_y = (
+        np.asarray(fft.ifft2(spectrum * factor).real[used, used]) for factor in (1, 1j * wave_x, 1j * wave_y)
+    )
+    gain = slope / float(np.sqrt((np.square(slope_x).mean() + np.square(slope_y).mean()) / 2))
+    return Relief((cells // 2) * step, height * gain, slope_x * gain, slope_y * gain)
+
+
+@dataclass(frozen=True, eq=False)
+class Diffuser:
+    """A sheet before a sensor.
+
+    Attributes
+    ----------
+    relief
+        its face towards the sensor; by default chosen so that, in pixels of 23.4 um, its caustics fill as much of 300 x
+        400 pixels as the public point spread function of DiffuserCam, in cells about as wide.
+    index
+        of refraction.
+    distance_mm
+        from the relief's zero to the sensor.
+    """
+
+    relief: Relief = field(default_factory=lambda: random_relief(6.0, 0.35, 0.05, 0))
+    index: float = 1.5
+    distance_mm: float = 8.0
+
+    def scene(self) -> mi.Scene:
+        """Flat face and relief, with Mitsuba's smooth dielectric; glass between them."""
+        glass = {"type": "dielectric", "int_ior": self.index, "ext_ior": 1.0}
+        side, top = self.relief.side_mm, self.distance_mm + _THICKNESS_MM
+        # Wider than the relief by what tilted light needs.
+        flat = mi.ScalarTransform4f().translate([0, 0, top]).scale([2 * side, 2 * side, 1])
+        return mi.load_dict(
+            {
+                "type": "scene",
+                "flat": {"type": "rectangle", "to_world": flat, "bsdf": glass},
+                "relief": self._mesh(mi.load_dict(glass)),
+            }
+        )
+
+    def _mesh(self, glass: mi.BSDF) -> mi.Mesh:
+        relief, count = self.relief, len(self.relief.height_mm)
+        across = np.linspace(-relief.side_mm / 2, relief.side_mm / 2, count)
+        x, y = np.meshgrid(across, across, indexing="ij")
+        places = np.stack([x, y, self.distance_mm - relief.height_mm], axis=-1)
+        # Out of the glass, towards the sensor.
+        normals = np.stack([-relief.slope_x, -relief.slope_y, -np.ones_like(x)], axis=-1)
+        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+        corner = (np.arange(count - 1)[:, None] * count + np.arange(count - 1)).ravel()
+        beside, above = corner + count, corner + 1
+        faces = np.concatenate(
+            [np.stack([corner, above, beside], axis=1), np.stack([beside, above, beside + 1], axis=1)]
+        )
+        properties = mi.Properties()
+        properties["bsdf"] = glass
+        mesh = mi.Mesh("relief", count * count, len(faces), has_vertex_normals=True, props=properties)
+        held = mi.traverse(mesh)
+        held["vertex_positions"] = mi.Float(places.astype(np.float32).ravel())
+        held["vertex_normals"] = mi.Float(normals.astype(np.float32).ravel())
+        held["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
+        held.update()
+        return mesh
+
+
+def point_spread(
+    diffuser: Diffuser,
+    shape: tuple[int, int],
+    pitch_mm: float,
+    tilt: tuple[float, float] = (0.0, 0.0),
+    rays: int = 4096,
+    seed: int = 0,
+) -> FloatArray:
+    """(rows, columns) irradiance of a distant point's light behind a diffuser, over that before it.
+
+    Only light that meets the relief is traced: what surrounds it is opaque.
+
+    Parameters
+    ----------
+    diffuser
+        what stands before the sensor; a Mitsuba variant is selected.
+    shape, pitch_mm
+        rows and columns of the sensor, and the distance of its pixels.
+    tilt
+        tangents along x and y of the direction that light travels in.
+    rays
+        a side of the square of rays, one at random in each cell: a pixel of area a gets a / side^2 of them.
+    seed
+        of their places.
+    """
+    scene, side = diffuser.scene(), diffuser.relief.side_mm
+    rows, columns = shape
+    inner = np.array(tilt) / np.sqrt(diffuser.index**2 * (1 + np.dot(tilt, tilt)) - np.dot(tilt, tilt))
+    above = _THICKNESS_MM + 1.0
+    # Where light must meet the flat face to reach the relief's middle, and a millimetre before that.
+    start = -inner * _THICKNESS_MM - np.array(tilt)
+    light = np.zeros(rows * columns)
+    band = max(1, _RAYS_AT_ONCE // rays)
+    for first in range(0, rays, band):
+        count = min(band, rays - first)
+        jitter = stream(integer(seed, "diffuser rays"), first).random((2, count, rays))
+        x = ((np.arange(first, first + count)[:, None] + jitter[0]) / rays - 0.5) * side
+        y = ((np.arange(rays)[None, :] + jitter[1]) / rays - 0.5) * side
+        places = np.stack([x.ravel() + start[0], y.ravel() + start[1], np.full(x.size, diffuser.distance_mm + above)])
+        place, part = _landed(scene, places, np.array([*tilt, -1.0]))
+        row = np.floor(rows / 2 - place[:, 1] / pitch_mm)
+        column = np.floor(columns / 2 - place[:, 0] / pitch_mm)
+        seen = (row >= 0) & (row < rows) & (column >= 0) & (column < columns) & (part > 0)
+        index = (row[seen] * columns + column[seen]).astype(np.int64)
+        light += np.bincount(index, part[seen], minlength=rows * columns)
+    return np.asarray(light.reshape(shape) * (side / rays / pitch_mm) ** 2)
+
+
+def _landed(scene: mi.Scene, places: FloatArray, along: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(k, 3) where rays from ``places`` (3, k) ``along`` a direction cross z = 0, and (k,) the part of their light."""
+    unit = along / np.linalg.norm(along)
+    ray = mi.Ray3f(mi.Point3f(places.astype(np.float32)), mi.Vector3f(*unit.tolist()))
+    part, active = mi.Float(1), mi.Bool(True)
+    # Light, not radiance, and only what is refracted.
+    context = mi.BSDFContext(mi.TransportMode.Importance, mi.BSDFFlags.DeltaTransmission)
+    for _ in range(2):
+        crossing = scene.ray_intersect(ray, active)
+        active &= crossing.is_valid()
+        turned, weight = crossing.bsdf().sample(context, crossing, 0.5, mi.Point2f(0.5), active)
+        part *= weight[0]  # glass without colour
+        # Not Mitsuba's own start, which leaves the ray's line and loses light at the relief's edge.
+        along_ray = crossing.to_world(turned.wo)
+        ray = mi.Ray3f(crossing.p + along_ray * _CLEAR_MM, along_ray)
+    active &= ray.d.z < 0
+    landed = ray(-ray.o.z / ray.d.z)
+    return vectors(landed, places.shape[1]), per_lane(mi.Float(mi.UInt32(active)) * part, places.shape[1])

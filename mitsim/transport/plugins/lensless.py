@@ -1,0 +1,376 @@
+"""The reference estimator: a Mitsuba sensor, from rays leaving a bare sensor to irradiance behind a coded mask.
+
+Plugin ``mitsim_lensless``
+--------------------------
+Irradiance at sensor point u, in the units of the scene's radiance times steradian (W m^-2 for W m^-2 sr^-1)::
+
+    E(u) = integral of  L(u, t) M(u + d t) M(u + (d + h) t) cos^n(theta) (1 + |t|^2)^-2  dt
+
+over t = (x/z, y/z) inside the field stop; M is the mask's transmission, d its distance, h its thickness (both
+faces count, a thin mask has one), cos^n a pixel's angular response, and the last factor is
+cos(theta) d omega written in t. A sample draws u inside its pixel's active square and a place where the mask's near
+face is open, evenly among all that the field stop shows from u (:mod:`mitsim.transport.plugins.lensless`), which makes t. It
+traces the ray from u and returns weight p M(u + (d + h) t) cos^n (1 + |t|^2)^-2 (2 T)^2 times the fill factor, with T =
+tan(fov / 2) and p the part of the field stop that is open: irradiance is per pixel area. With t drawn over the whole
+field stop three of four rays would end at a separable mask. Where a plate is not open in a few grids, the place is
+drawn from a rectangle that holds all that is open, and M(u + d t) is one more factor of the weight; a tilted mask is
+met where the ray crosses its plane, a blurred one at a place moved at random by a normal deviate. The mask is a
+factor, not geometry: thin geometry suffers from Mitsuba's ray epsilon and blocks connections to delta lights.
+Diffraction is the factored estimator's: here light travels along rays.
+
+The local frame is Mitsuba's: origin at the sensor's centre, +z to the scene, +y up, +x to the left of one who looks
+along +z. Image row 0 is at +y and column 0 at +x, so a frame shows the scene as one sees it looking along +z.
+
+======================  ========  ==========  =================================================================
+parameter               unit      default     meaning
+======================  ========  ==========  =================================================================
+``pixel_pitch``         mm        0.01172     pixel pitch; the film's size gives the number of pixels,
+                                              and its crop window a region of interest
+``row_pitch``           mm        -           distance between rows, where pixels are not square
+``mask``                -         separable   ``separable``, ``flatcam`` or ``open``; a camera file may give others
+``mask_order``          -         9           order of the maximum length sequence (2^order - 1 features a side)
+``mask_feature``        mm        0.06        feature size
+``mask_distance``       mm        2           sensor to mask (the face next to the sensor)
+``mask_thickness``      mm        0           mask thickness; 0 is a thin mask
+``mask_offset_row``     mm        0           the mask's centre off the axis, down the rows (toward -y)
+``mask_offset_column``  mm        0           the same along the columns (toward -x)
+``scene_distance``      mm        400         plane to which the rig is aligned (calibration board, cell grid)
+``fov``                 degrees   20          full angle of the square field stop, a baffle: no light beyond it
+``pixel_fill_factor``   -         1           active part of a pixel, a centred square
+``angular_exponent``    -         0           a pixel responds as cos(theta) to this power; 0 is no angular response
+``to_world``            -         identity    rigid transform of the camera
+======================  ========  ==========  =================================================================
+
+XML::
+
+    <sensor type="mitsim_lensless">
+        <float name="mask_distance" value="2"/>
+        <film type="hdrfilm">
+            <integer name="width" value="512"/> <integer name="height" value="512"/>
+            <rfilter type="box"/> <string name="pixel_format" value="luminance"/>
+        </film>
+    </sensor>
+
+Python: ``register(); mi.load_dict({"type": "scene", "camera": {"type": "mitsim_lensless", "mask": "open"}, ...})``.
+
+Nothing else is sampled by importance: the reference is the judge, and simple enough to check by eye.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsim.core.errors import MitsimError
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.mask import BoolArray, Mask
+from mitsim.devices.mask_flaws import Flaws
+from mitsim.devices.plate import Plate
+from mitsim.transport.coordinates import RIGID, rigidity_error, rows_columns, turn_and_origin, x_y
+from mitsim.transport.plugins.base import register_once
+from mitsim.transport.sampler import generator, shuffled, stratified
+
+PLUGIN = "mitsim_lensless"
+_BOX_RADIUS = 0.5 + 1e-4
+"""Radius [pixels] of a filter that keeps light in its pixel; Mitsuba's box says 0.5 in float32."""
+
+
+def register() -> None:
+    """Make ``mitsim_lensless`` known to the current variant; calling it again does nothing."""
+    register_once("sensor", PLUGIN, _sensor_class)
+
+
+def _geometry(props: mi.Properties, film: mi.Film) -> CameraGeometry:
+    of_film = ("pixels", "rows", "columns", "roi")
+    values = {name: props[name] for name in CameraGeometry.model_fields if name not in of_film and name in props}
+    (columns, rows), first, shown = ([*map(int, part)] for part in (film.size(), film.crop_offset(), film.crop_size()))
+    if rows != columns:
+        values |= {"rows": rows, "columns": columns}
+    if shown != [columns, rows]:
+        values["roi"] = first[1], first[0], shown[1], shown[0]
+    return CameraGeometry.checked(PLUGIN, pixels=max(rows, columns), **values)
+
+
+def _check_rigid(transform: mi.AffineTransform4f) -> None:
+    turn, origin = turn_and_origin(transform)
+    error = rigidity_error(turn)
+    if not (np.isfinite(turn).all() and np.isfinite(origin).all() and error < RIGID and np.linalg.det(turn) > 0):
+        raise MitsimError(
+            f"{PLUGIN}: to_world is no rotation and translation (it scales, shears or mirrors: R^T R is {error:.2g} "
+            "from 1); lengths are mm everywhere, so move and turn the camera only"
+        )
+
+
+def _sensor_class() -> type:
+    """The plugin for the variant in use: Mitsuba's base classes exist per variant."""
+
+    class Lensless(mi.Sensor):  # type: ignore[misc]
+        def __init__(self, props: mi.Properties) -> None:
+            super().__init__(props)
+            self.m_needs_sample_3 = True
+            if self.film().rfilter().radius() > _BOX_RADIUS:
+                raise MitsimError(
+                    f"{PLUGIN}: the film's filter spreads light between pixels; use <rfilter type='box'/>"
+                )
+            _check_rigid(self.world_transform())
+            self._points: tuple[int, int] | None = None
+            self.wear(_geometry(props, self.film()))
+
+        def wear(self, geometry: CameraGeometry) -> None:
+            """Take the camera of a ``geometry``, which has the mask of a camera file."""
+            self.geometry = geometry
+            mask = geometry.build_mask()
+            self._openings, self._feature = Openings(mask), mask.feature_mm
+            self._features = self._cover = round(mask.extent_mm / mask.feature_mm)
+            self._weights, self._rows, self._columns, self._values = [], [], [], None
+            self._whole = isinstance(mask, Plate) and mask.grids is None
+            self._lines, self._flaws = None, Flaws()
+            if isinstance(mask, Plate):
+                self._values, self._flaws = mi.Float(mask.values.astype(np.float32).ravel()), mask.flaws
+                if not mask.plain:
+                    self._features, self._cover = len(mask.values), mask.cover
+                    self._lines = mi.Float(mask.lines.astype(np.float32))
+                return
+            for weight, rows, columns in mask.terms:
+                self._weights.append(weight)
+                self._rows.append(mi.Float(rows.astype(np.float32)))
+                self._columns.append(mi.Float(columns.astype(np.float32)))
+
+        def stratify(self, points: tuple[int, int] | None) -> None:
+            """Draw u and t of a pixel's paths from Sobol points that are scrambled by (seed, paths a pixel) ``points``.
+
+            Each pixel has points of its own, and so has each seed. None: random numbers again.
+            """
+            self._points = points
+
+        def sample_ray(
+            self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
+        ) -> tuple[mi.Ray3f, mi.Spectrum]:
+            geometry = self.geometry
+            wavelengths, spectral_weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
+            if self._points:
+                sample2, sample3 = self._stratified(sample2, *self._points)
+            height, width = geometry.half_sides
+            u = (1 - 2 * self._active(self._on_sensor(sample2))) * mi.Point2f(width, height)
+            t, weight = self._direction(u, sample3)
+            squared = 1 + dr.squared_norm(t)
+            if self._whole:
+                weight *= self._transmission(self._crossing(u, t, sample3), active)
+            if geometry.mask_thickness:
+                weight *= self._transmission(u + (geometry.mask_distance + geometry.mask_thickness) * t, active)
+            if geometry.angular_exponent:
+                weight *= squared ** (-geometry.angular_exponent / 2)
+            weight *= geometry.pixel_fill_factor * (2 * geometry.tan_half_fov) ** 2 / dr.square(squared)
+            to_world = self.world_transform()
+            ray = mi.Ray3f(
+                to_world @ mi.Point3f(u.x, u.y, 0),
+                to_world @ (mi.Vector3f(t.x, t.y, 1) * dr.rsqrt(squared)),
+                time,
+                wavelengths,
+            )
+            return ray, spectral_weight * weight
+
+        def sample_ray_differential(
+            self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
+        ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
+            ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
+            return mi.RayDifferential3f(ray), weight
+
+        def _stratified(self, film: mi.Point2f, seed: int, paths: int) -> tuple[mi.Point2f, mi.Point2f]:
+            """Even points in the pixels of ``film`` points (0..1), and of the unit square; in the order of lanes."""
+            rows, columns = self.geometry.frame_shape
+            count = mi.Point2f(columns, rows)
+            place = dr.minimum(dr.floor(film * count), count - 1)
+            pixel = mi.UInt32(place.y) * columns + mi.UInt32(place.x)
+            rng = generator(dr.opaque(mi.UInt32, seed), pixel)
+            index = dr.arange(mi.UInt32, dr.width(film)) % dr.opaque(mi.UInt32, paths)
+            film = (place + stratified(index, rng)) / count
+            return film, stratified(shuffled(index, rng), rng)
+
+        def _on_sensor(self, film: mi.Point2f) -> mi.Point2f:
+            """Points (0..1) of the region of interest, which the film shows, on the whole sensor (0..1)."""
+            geometry, roi = self.geometry, self.geometry.roi
+            if roi is None:
+                return film
+            first, shown, whole = (mi.Point2f(part[1], part[0]) for part in (roi[:2], roi[2:], geometry.shape))
+            return (first + film * shown) / whole
+
+        def _active(self, sample: mi.Point2f) -> mi.Point2f:
+            """Film points (0..1) drawn together into the active square of their pixels."""
+            geometry = self.geometry
+            if geometry.pixel_fill_factor == 1:
+                return sample
+            count = mi.Point2f(geometry.shape[1], geometry.shape[0])
+            middle = (dr.floor(sample * count) + 0.5) / count
+            return middle + (sample - middle) * (geometry.active_sides[1] / geometry.pixel_pitch)
+
+        def _direction(self, u: mi.Point2f, sample: mi.Point2f) -> tuple[mi.Vector2f, mi.Float]:
+            """Tan-angles t from sensor points u [mm] to open places of the mask, and the part of all that is open."""
+            geometry = self.geometry
+            stop, side = geometry.tan_half_fov, self._feature
+            # What the field stop shows of the mask, in features from the mask's first corner.
+            first = [
+                (start - stop * geometry.mask_distance - centre) / side + 0.5 * self._cover
+                for start, centre in zip(rows_columns(u.x, u.y), geometry.mask_offset, strict=True)
+            ]
+            width = 2 * stop * geometry.mask_distance / side
+            row, column, part = self._openings.drawn(mi.Point2f(*first), width, sample)
+            t = mi.Vector2f(*x_y(*(place * (2 * stop / width) - stop for place in (row, column))))
+            return t, part
+
+        def _crossing(self, u: mi.Point2f, t: mi.Vector2f, sample: mi.Point2f) -> mi.Point2f:
+            """Where rays of tan-angles t from sensor points u cross the mask, tilted; then moved as its blur says.
+
+            A Gaussian blur is the mean over places that are moved at random: the bits of a ``sample`` tell how far.
+            """
+            distance, flaws = self.geometry.mask_distance, self._flaws
+            if any(flaws.tilt_mrad):
+                tilt = mi.Vector2f(*x_y(*(float(np.tan(angle * 1e-3)) for angle in flaws.tilt_mrad)))
+                centre = mi.Point2f(*x_y(*self.geometry.mask_offset))
+                along = (distance + dr.dot(tilt, u - centre)) / (1 - dr.dot(tilt, t))
+                # A length along the tilted plane is longer than what it covers of the even one.
+                point = (u + along * t - centre) * dr.sqrt(1 + dr.square(tilt)) + centre
+            else:
+                point = u + distance * t
+            if flaws.blur_mm:
+                bits = [dr.reinterpret_array(mi.UInt32, mi.Float32(number)) for number in (sample.x, sample.y)]
+                rng = generator(*bits)
+                moved = mi.Point2f(rng.next_float32(), rng.next_float32())
+                point += flaws.blur_mm * mi.warp.square_to_std_normal(moved)
+            return point
+
+        def _place(self, row: mi.Float, column: mi.Float) -> tuple[mi.Float, mi.Float]:
+            """Row and column of the mask, as whole numbers, at places [mm] about its centre."""
+            if self._lines is None:
+                return tuple(dr.floor(s / self._feature + 0.5 * self._features) for s in (row, column))
+            angle = np.radians(self._flaws.turn_deg)
+            if angle:
+                cosine, sine = float(np.cos(angle)), float(np.sin(angle))
+                row, column = cosine * row + sine * column, cosine * column - sine * row
+            lines, count = self._lines, self._features + 1
+            return tuple(
+                mi.Float(dr.binary_search(0, count, lambda k, s=s: dr.gather(mi.Float, lines, k) <= s)) - 1
+                for s in (row, column)
+            )
+
+        def _transmission(self, point: mi.Point2f, active: mi.Bool) -> mi.Float:
+            """Mask transmission at mask-plane points (x, y) [mm]; opaque outside its features."""
+            row, column = rows_columns(point.x, point.y)
+            row_centre, column_centre = self.geometry.mask_offset
+            row, column = self._place(row - row_centre, column - column_centre)
+            inside = (row >= 0) & (row < self._features) & (column >= 0) & (column < self._features)
+            inside &= active
+            row, column = mi.UInt32(dr.maximum(row, 0)), mi.UInt32(dr.maximum(column, 0))
+            if self._values is not None:
+                return dr.gather(mi.Float, self._values, row * self._features + column, inside)
+            total = mi.Float(0)
+            for weight, rows, columns in zip(self._weights, self._rows, self._columns, strict=True):
+                left = dr.gather(mi.Float, rows, row, inside)
+                total += weight * left * dr.gather(mi.Float, columns, column, inside)
+            return total
+
+        def bbox(self) -> mi.ScalarBoundingBox3f:
+            return mi.ScalarBoundingBox3f()
+
+        def to_string(self) -> str:
+            return f"{PLUGIN}[{self.geometry}]"
+
+    return Lensless
+
+
+# -------- Where a mask is open
+
+
+class OpenAxis:
+    """The open rows of a grid, or its columns; coordinates count features from the first one's edge.
+
+    ``bits`` (N,) tell which are open.
+    """
+
+    def __init__(self, bits: BoolArray) -> None:
+        self._size = len(bits)
+        # Once more at the end, and a place that is not there after the last one: nothing is open beyond the mask.
+        before = np.cumsum(np.concatenate([[0], bits, [0]]))
+        self._before = mi.UInt32(before.astype(np.uint32))
+        self._places = mi.UInt32(np.append(np.flatnonzero(bits), len(bits)).astype(np.uint32))
+
+    def seen(self, low: mi.Float, width: float) -> _Seen:
+        """What is open from ``low`` on over a ``width``."""
+        # From the feature that holds its start: the width of a narrow view keeps its digits.
+        start = mi.UInt32(dr.clip(low, 0, self._size))
+        within = low - mi.Float(start)
+        last = dr.clip(within + width, 0, self._size - mi.Float(start))
+        end = mi.UInt32(last)
+        before, first = self._open(start)
+        after, tail = self._open(start + end)
+        skipped = first * dr.maximum(within, 0)
+        length = mi.Float(after - before) + tail * (last - mi.Float(end)) - skipped
+        return _Seen(self._places, start, within, before, skipped, dr.maximum(length, 0))
+
+    def _open(self, index: mi.UInt32) -> tuple[mi.UInt32, mi.Float]:
+        """How many features are open before the one of an ``index``, and whether it is itself: 1 or 0."""
+        before = dr.gather(mi.UInt32, self._before, index)
+        return before, mi.Float(dr.gather(mi.UInt32, self._before, index + 1) - before)
+
+
+@dataclass
+class _Seen:
+    """An axis from the range's start: the feature that holds it, how far inside, what is open before, and within."""
+
+    places: mi.UInt32
+    start: mi.UInt32
+    within: mi.Float
+    before: mi.UInt32
+    skipped: mi.Float
+    length: mi.Float
+
+    def drawn(self, number: mi.Float) -> mi.Float:
+        """Distance from the range's start, in features, of the open place that a ``number`` in [0, 1) means."""
+        place = self.skipped + number * self.length
+        whole = mi.UInt32(place)
+        feature = dr.gather(mi.UInt32, self.places, dr.minimum(self.before + whole, dr.width(self.places) - 1))
+        return (mi.Float(feature) - mi.Float(self.start)) + (place - mi.Float(whole)) - self.within
+
+
+class Openings:
+    """The open places of a ``mask``; of a plate without grids of them, a rectangle that holds them."""
+
+    def __init__(self, mask: Mask | Plate) -> None:
+        self._grids = [(OpenAxis(rows), OpenAxis(columns)) for rows, columns in mask.openings]
+
+    def drawn(self, corner: mi.Point2f, width: float, number: mi.Point2f) -> tuple[mi.Float, mi.Float, mi.Float]:
+        """An open place of a square window, each as likely as any other.
+
+        Parameters
+        ----------
+        corner
+            the window's first (row, column), in features from the mask's first corner.
+        width
+            its side, in features.
+        number
+            of the unit square: the same for the same place.
+
+        Returns
+        -------
+        row and column from the window's first corner, in features, and the part of the window that is open: where it is
+        0 the place means nothing.
+        """
+        grids = [(rows.seen(corner.x, width), columns.seen(corner.y, width)) for rows, columns in self._grids]
+        areas = [rows.length * columns.length for rows, columns in grids]
+        total = sum(areas[1:], areas[0])
+        left, (rows, columns) = number.y * total, grids[0]
+        chosen = [rows.drawn(number.x), columns.drawn(_part(left, areas[0]))]
+        for (rows, columns), area, before in zip(grids[1:], areas[1:], areas, strict=False):
+            further, left = left >= before, left - before
+            place = rows.drawn(number.x), columns.drawn(_part(left, area))
+            chosen = [dr.select(further, new, old) for new, old in zip(place, chosen, strict=True)]
+        row, column = (dr.clip(place, 0, width) for place in chosen)
+        return row, column, total / width**2
+
+
+def _part(amount: mi.Float, whole: mi.Float) -> mi.Float:
+    """An ``amount`` in units of the ``whole``; 0 of nothing."""
+    return dr.select(whole > 0, amount / whole, 0)

@@ -1,0 +1,332 @@
+"""Direct light over sharp lobes, found from the surface: how much of it there is, and whether connections can see it.
+
+Direct light is found by connecting lit points to the sensor. A connection rarely meets a lobe that is far narrower
+than the projector's window: then no estimate holds its light, no spread of estimates tells of it, and the frames would
+lack it in silence. Sampled from the surface instead, such a lobe meets the sensor easily. With I the irradiance that a
+ray's connection to a sensor point stands for, uniform over the sensor's area A, and q the density [1/mm^2] of meeting
+that point by sampling the surface, a met point estimates the mean irradiance by x = I / (A q), and the second moment of
+a connection by x I. So N connections see the light L of the lobes as ``N L^2 / E[x I]`` equal hits would.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.arrays import FloatArray, Labels, mean_of_neighbours
+from mitsim.devices.camera import CameraGeometry
+from mitsim.transport.connect import Receiver, Reception, landing, sampled_wavelengths
+from mitsim.transport.direct import DirectTracer
+from mitsim.transport.integrator import launches
+from mitsim.transport.projector import ProjectorOptics, ProjectorRays
+from mitsim.transport.records import check_finite
+from mitsim.transport.sampler import panchromatic, streams
+
+_SHARP, _LEAST_SHARP = 100.0, 10.0
+"""Density [1/sr] of a turn above which its lobe counts as sharp where all turns of a pixel are, as a GGX lobe of
+roughness 0.03 does; where a part of them is, that part of it, but no less than the second: as a lobe of roughness 0.02
+does that takes a twentieth of the light.
+
+Such a lobe fills 0.01 sr, a tenth of the shipped projector's window: connections from all of it meet broader ones.
+"""
+_PLENTY = 2**12
+"""Rays met on the sensor that tell the light of a few pixels to a few percent; fewer are followed by a second look."""
+_CONNECTIONS = 2**18
+"""Connections that tell all other light, some 0.1 s: it is bounded, so a percent of it or less is left open."""
+_SEARCHING = 2**20
+"""Connections that look for lobes which take little of the light, and are therefore seldom sampled, some 0.1 s: varnish
+of roughness 0.005 that reflects a twentieth, on a ball of 100 mm at 390, is met eleven times, and sampled twice."""
+_FEWER, _WIDER = 16, 16.0
+"""A look at a sensor so many times as wide takes so many times fewer rays, and meets 16 times as much: where it meets
+nothing, the full look, which is far longer, is spared."""
+_SHARPEST = 0.1
+"""Part of the light over sharper lobes than the width that is reported: the peak of a GGX lobe is met that often."""
+
+
+@dataclass(frozen=True, eq=False)
+class SharpLight:
+    """Light over sharp lobes, without the mask.
+
+    Attributes
+    ----------
+    irradiance, error
+        mean over the sensor [W m^-2], and its Monte Carlo error.
+    hits
+        of one connection of every projector pixel, those that would meet a lobe, as far as noise goes.
+    by_pixel, moments
+        (n^2,) ``irradiance`` of each projector pixel, and the second moment of its connection [W^2 m^-4].
+    width
+        radius of the lobes on the sensor [mm], sqrt(P / (pi q)) of all but the sharpest tenth of the light: with P the
+        part of a pixel's turns that are sharp, q / P is the density of a lobe by itself.
+    rest
+        all other direct light, mean over the sensor [W m^-2].
+    """
+
+    irradiance: float
+    error: float
+    hits: float
+    by_pixel: FloatArray
+    moments: FloatArray
+    width: float
+    rest: float = 0.0
+
+    @classmethod
+    def none(cls, pixels: int) -> SharpLight:
+        """Of a projector of so many ``pixels`` that lights no sharp lobe."""
+        return cls(0.0, 0.0, math.inf, np.zeros(pixels), np.zeros(pixels), math.inf)
+
+
+def sharp_light(
+    scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, geometry: CameraGeometry, seed: int, samples: int
+) -> SharpLight:
+    """Direct light over lobes too sharp for connections.
+
+    Where a shorter look at a wider sensor meets none, there is none. What few rays find comes from small parts of a few
+    pixels, as off curved surfaces: these pixels, those that connections find, and their neighbours are looked at once
+    more, with as many rays.
+
+    Parameters
+    ----------
+    scene, camera, projector
+        what light meets, the sensor it is received on, and where it comes from.
+    geometry
+        of the camera.
+    seed, samples
+        of the random numbers, and rays of every projector pixel.
+
+    Raises
+    ------
+    MitsimError
+        when the scene sends NaN or infinite light to the camera.
+    """
+    lanes = projector.n**2
+    lobes = _Lobes(scene, camera, projector, geometry)
+    first = lobes.look(np.arange(lanes), seed, 0, -(-samples // _FEWER), _WIDER)
+    if not len(first.widths):
+        return SharpLight.none(lanes)
+    lobes.least = least = mi.Float(np.clip(_SHARP * first.sharp, _LEAST_SHARP, _SHARP).astype(np.float32))
+    found = lobes.look(np.arange(lanes), seed, 0, samples)
+    if len(found.widths) < _PLENTY:
+        search = _Connections(scene, camera, projector, 1, geometry, spread=True).over(least, sharp=True)
+        lit = np.bincount(search.trace(seed, 0, max(1, _SEARCHING // lanes)).pixel, minlength=lanes)
+        pixels = with_neighbours((found.by_pixel > 0) | (lit > 0), projector.n)
+        if len(pixels):
+            found = lobes.look(pixels, seed, samples, samples * lanes // len(pixels))
+    total, moment = float(found.by_pixel.sum()), float(found.moments.sum())
+    hits = total**2 / moment if moment else 0.0
+    rest = 0.0
+    if total:
+        others = _Connections(scene, camera, projector, 1, geometry, spread=True).over(least, sharp=False)
+        count = max(1, _CONNECTIONS // lanes)
+        rest = float(others.trace(seed, 0, count).value.sum()) / count
+    width = _quantile(found.widths, found.weights, _SHARPEST)
+    return SharpLight(total, found.error, hits, found.by_pixel, found.moments, width, rest)
+
+
+def _quantile(values: FloatArray, weights: FloatArray, part: float) -> float:
+    """Value below which ``part`` of the ``weights`` lie; inf for none."""
+    order = np.argsort(values)
+    sums = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(sums, part * sums[-1])]) if values.size else math.inf
+
+
+def with_neighbours(chosen: npt.NDArray[np.bool_], side: int) -> Labels:
+    """Numbers of the pixels that are chosen, and of all that touch one of them.
+
+    Parameters
+    ----------
+    chosen
+        (side^2,) of a square of pixels, row by row.
+    side
+        of the square.
+    """
+    return np.flatnonzero(mean_of_neighbours(chosen.reshape(side, side).astype(np.float64)) > 0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """Irradiance and second moment of every projector pixel, the part of its turns that are sharp, the irradiance's
+    error, and width and weight of each lobe."""
+
+    by_pixel: FloatArray
+    moments: FloatArray
+    sharp: FloatArray
+    error: float
+    widths: FloatArray
+    weights: FloatArray
+
+
+@dataclass
+class _Met:
+    """Of points met on the sensor: estimates x of the mean irradiance, x I, and density q of one, drawn by x; and sharp
+    turns, wherever they went."""
+
+    mean: mi.Float
+    moment: mi.Float
+    density: mi.Float
+    turns: mi.Float
+
+    def joined_by(self, more: _Met, rng: mi.PCG32) -> _Met:
+        """These and ``more``; in x I, points that are met over one surface are no points of another."""
+        mean = self.mean + more.mean
+        new = rng.next_float32() * mean < more.mean
+        density = dr.select(new, more.density, self.density)
+        return _Met(mean, self.moment + more.moment, density, self.turns + more.turns)
+
+
+class _Connections(DirectTracer):
+    """Direct light over sharp lobes alone, or all other."""
+
+    _over_sharp: bool
+    _least: mi.Float
+    _of_lane: mi.Float
+
+    def over(self, least: mi.Float, sharp: bool) -> _Connections:
+        """The same over ``sharp`` lobes, of at ``least`` such a density [1/sr] by pixel, or over all others."""
+        self._least, self._over_sharp = least, sharp
+        return self
+
+    def _place(
+        self, number: mi.UInt32, row: mi.UInt32, column: mi.UInt32, jitter: mi.Point2f
+    ) -> tuple[mi.Point2f, mi.Float]:
+        self._of_lane = dr.gather(mi.Float, self._least, number)
+        return super()._place(number, row, column, jitter)
+
+    def _connected(
+        self,
+        si: mi.SurfaceInteraction3f,
+        direction: mi.Vector3f,
+        light: mi.Spectrum,
+        sensor: mi.Point3f,
+        active: mi.Bool,
+    ) -> tuple[Reception, mi.UnpolarizedSpectrum]:
+        reception, received = super()._connected(si, direction, light, sensor, active)
+        sharp = reception.pdf > self._of_lane
+        return reception, dr.select(sharp == self._over_sharp, received, 0)
+
+
+class _Lobes:
+    """Rays of the projector that sharp lobes of the surfaces that they light send to the sensor.
+
+    Attributes
+    ----------
+    least
+        (n^2,) density [1/sr] above which a lobe counts as sharp, by projector pixel.
+    """
+
+    def __init__(
+        self, scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, geometry: CameraGeometry
+    ) -> None:
+        self.camera, self.geometry = camera, geometry
+        self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
+        self.least = dr.full(mi.Float, _LEAST_SHARP, projector.n**2)
+
+    def look(self, pixels: Labels, seed: int, first: int, samples: int, wider: float = 1.0) -> _Found:
+        """What rays of the projector meet on the sensor.
+
+        Parameters
+        ----------
+        pixels
+            of the projector.
+        seed
+            of the random numbers.
+        first, samples
+            rays ``first`` to ``first + samples`` - 1 of each pixel are followed.
+        wider
+            times the sensor's width that is looked at.
+        """
+        squares, met, weights = 0.0, [], []
+        by_pixel, moments = np.zeros((2, self.rays.projector.n**2))
+        turned = dr.zeros(mi.Float, len(by_pixel))
+        for sample, place in launches(len(pixels), first, samples):
+            pixel = dr.gather(mi.UInt32, mi.UInt32(pixels), place)
+            number, mean, product, density = self.meet(seed, sample, pixel, wider, turned)
+            by_pixel += np.bincount(number, mean, minlength=len(by_pixel)) / samples
+            moments += np.bincount(number, product, minlength=len(by_pixel)) / samples
+            squares += float(np.square(mean).sum())
+            met.append((number, density))
+            weights.append(mean)
+        sharp = np.array(turned, dtype=np.float64) / samples
+        variance = max(squares / samples - float(by_pixel.sum()) ** 2 / len(pixels), 0.0)
+        pixel_of, densities = (np.concatenate(parts) for parts in zip(*met, strict=True))
+        widths = np.sqrt(sharp[pixel_of] / (np.pi * densities))
+        return _Found(by_pixel, moments, sharp, math.sqrt(variance / samples), widths, np.concatenate(weights))
+
+    def meet(
+        self, seed: int, sample: mi.UInt32, pixel: mi.UInt32, wider: float, turned: mi.Float
+    ) -> tuple[Labels, FloatArray, FloatArray, FloatArray]:
+        """Pixels of the rays that meet the sensor, and for each x, x I, and density q of one of the points met.
+
+        Parameters
+        ----------
+        seed, sample, pixel
+            of the rays.
+        wider
+            as for :meth:`look`.
+        turned
+            (n^2,) sharp turns of each pixel's rays, to which these add theirs.
+
+        Raises
+        ------
+        MitsimError
+            when the scene sends NaN or infinite light to the camera.
+        """
+        half = dr.opaque(mi.Float, wider * self.geometry.half_width)
+        _, rng = streams(seed, pixel, sample)
+        jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
+        wavelengths, spectral = sampled_wavelengths(self.camera, rng, self.rays.projector.lines)
+        ray = self.rays.sample(pixel, jitter, rng, wavelengths)
+        flux = self.rays.flux(pixel, wavelengths) * spectral
+        none = _Met(mi.Float(0), mi.Float(0), mi.Float(1), mi.Float(0))
+        met, _ = self.receiver.passage.along(
+            ray, flux, (none, rng), partial(self._at, half, dr.gather(mi.Float, self.least, pixel))
+        )
+        # Whole numbers, whose sums in any order are the same.
+        dr.scatter_reduce(dr.ReduceOp.Add, turned, met.turns, pixel, met.turns > 0)
+        dr.eval(met, turned)
+        # Few rays meet the sensor: of the others nothing is fetched. What is not a number is no zero either.
+        lit = dr.compress(~(met.mean == 0))
+        number = np.array(dr.gather(mi.UInt32, pixel, lit), dtype=np.int64)
+        mean, product, density = (
+            np.array(dr.gather(mi.Float, values, lit), dtype=np.float64)
+            for values in (met.mean, met.moment, met.density)
+        )
+        check_finite(mean)
+        check_finite(product)
+        return number, mean, product, density
+
+    def _at(
+        self,
+        half: mi.Float,
+        least: mi.Float,
+        si: mi.SurfaceInteraction3f,
+        direction: mi.Vector3f,
+        light: mi.Spectrum,
+        active: mi.Bool,
+        state: tuple[_Met, mi.PCG32],
+    ) -> tuple[_Met, mi.PCG32]:
+        """What a turn that is sampled at the surface meets on a sensor of a ``half`` width, over lobes of ``least``
+        density."""
+        met, rng = state
+        si.wi = si.to_local(-direction)
+        context = mi.BSDFContext(mi.TransportMode.Importance)
+        number, point = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+        turn, _ = si.bsdf().sample(context, si, number, point, active)
+        density = si.bsdf().pdf(context, si, turn.wo, active)
+        active = active & (turn.pdf > 0) & (density > 0) & ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
+        turns = dr.select(active & (density > least), mi.Float(1), 0)
+        place = landing(self.receiver, si, si.to_world(turn.wo), active)
+        active &= place.arrives & (dr.abs(place.x) <= half) & (dr.abs(place.y) <= half)
+        sensor = mi.Point3f(place.x, place.y, 0)
+        reception = self.receiver.receive(si, -direction, sensor, active)
+        active &= reception.pdf > least
+        per_area = density * reception.solid_angle(sensor)
+        connected = dr.select(active, panchromatic(reception.irradiance * light), 0)
+        mean = dr.select(active, connected / (4 * dr.square(half) * per_area), 0)
+        return met.joined_by(_Met(mean, mean * connected, per_area, turns), rng), rng

@@ -1,0 +1,387 @@
+"""Glint: from a scene and a pinhole projector to beams of rays that reach the sensor over perfect mirrors alone.
+
+A path projector - mirror - sensor has a delta at both ends, so no path from the camera finds it: it is traced from the
+projector instead (:mod:`mitsim.transport.specular_rays`). Rays go through a grid of points of each projector pixel. Four
+neighbours that met the same surfaces in the same way (the same *chain*) bound a beam; beams near the sensor are divided
+until the map from the projector's window to the sensor is bilinear over each. :mod:`mitsim.optics.mirror_frames` turns beams
+into frames.
+
+Flux: the stock projector's irradiance on the plane at unit distance is pi x scale x texture, the same everywhere on it,
+so a beam holds that times its area on this plane.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.devices.camera import CameraGeometry
+from mitsim.optics.mirror_frames import Beams
+from mitsim.transport.projector import ProjectorOptics
+from mitsim.transport.specular_rays import Chains, Crossings, GlintRays, IntArray, Mask, delta_bsdfs
+from mitsim.transport.specular_search import first_squares, grazing
+
+_UNIT = 2**24
+"""Lattice points a projector pixel's side: what a ball of 10 um sends to a sensor leaves a projector pixel of 2 mm
+through 0.1 um."""
+_DIVISIONS = 2**14
+"""Parts a side that squares of the first grid are divided into at most: a rim in a projector pixel of 300 sensor
+pixels is found to a 20th of one."""
+_DEEPER = 2**4
+"""How much finer that is than squares whose light may land anywhere are divided: those are left out, and counted."""
+_MOST = 2**16
+"""Squares of one size beyond which none is divided further: a wire of 0.15 mm reaches it, in 5 processor seconds."""
+_AT_ONCE = 2**18
+"""Squares that are looked at together, some hundreds of MB."""
+_COARSE = 128
+"""Least number of coarse beams along the window's side: a mirror of a hundredth of the window is seen."""
+_TOLERANCE = 0.02
+"""Largest departure from a bilinear map, in sensor pixels: twice what float32 leaves of a place at the sensor."""
+_SHADES = 0.01
+"""The same for the light left, relative: of a painted mirror, whose paint is seldom known better."""
+_SMALL = 2.0
+"""Whole beams below this many sensor pixels are not divided further: what varies inside is finer than frames show."""
+_PAINT = 0.5
+"""The same for beams that an edge of paint cuts, which are kept whole: half a pixel, which a frame does not resolve."""
+_RIM = 1 / 16
+"""The same for beams that a rim cuts, of which points stand for the part inside: along a straight rim that part is out
+by the same in all of them, 1.5 % of a pixel; each halving doubles the beams along every rim."""
+_THIN, _MANY = 0.25, 8.0
+"""Sensor pixels across, and how many times that the light of a square is longer, of squares that are thinned out: what
+they stand for then is half a pixel wide at most, which a frame does not resolve."""
+_STRAIGHT = 0.1
+"""Departure from a bilinear map over the light's extent, below which corners tell how wide it is."""
+_SHARES = np.outer([0.25, 0.5, 0.25], [0.25, 0.5, 0.25])
+"""Part of a square that each of its 3 x 3 nodes stands for (trapezoidal rule)."""
+_MARGIN = 0.02
+"""Sine by which the field stop is widened when squares are left out: 1 degree, more than a square's rays curve."""
+
+
+def has_mirrors(scene: mi.Scene) -> bool:
+    """Whether some surface of the ``scene`` reflects or refracts like a perfect mirror or lens."""
+    return bool(delta_bsdfs(scene, int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)))
+
+
+def trace_glint(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, max_depth: int = 16) -> Beams:
+    """All beams that leave the projector, meet perfect mirrors or lenses alone, and reach the sensor.
+
+    A mirror that no ray of the coarse grid meets (one point a projector pixel, at least 128 a side) is not seen.
+
+    Parameters
+    ----------
+    scene, camera
+        what light meets, and the sensor with its ``geometry``.
+    projector
+        where it comes from; taken as a pinhole.
+    max_depth
+        mirrors that a beam may meet, at least 1.
+
+    Raises
+    ------
+    MitsimError
+        for a depth below 1.
+    """
+    if max_depth < 1:
+        raise MitsimError(f"max_depth of glints is {max_depth}; give at least 1")
+    if not has_mirrors(scene):
+        return _joined([], np.zeros(2))
+    parts, left = [], np.zeros(2)
+    for each in projector.apart:
+        beams, lost = _of(GlintRays(scene, camera, each, max_depth), projector.n, camera.geometry)
+        parts += beams
+        left += lost
+    return _joined(parts, left)
+
+
+def _of(tracer: GlintRays, n: int, geometry: CameraGeometry) -> tuple[list[Beams], FloatArray]:
+    """Beams of the pixels of a window of ``n`` a side, and (2,) the flux that none has and their variance."""
+    step = _UNIT // min(_UNIT, 2 ** max(0, int(np.ceil(np.log2(_COARSE / n)))))
+    arcs, close = grazing(tracer, geometry.half_width, _UNIT)
+    parts, left = [], np.array([close, 0.0])
+    for size, row, column in first_squares(tracer.mirrors, tracer.rays, n, _UNIT, step, _DIVISIONS, arcs):
+        for first in range(0, len(row), _AT_ONCE):
+            chosen = slice(first, first + _AT_ONCE)
+            beams, lost = _search(tracer, row[chosen], column[chosen], size, n, geometry)
+            parts += beams
+            left += lost
+    return parts, left
+
+
+def _search(
+    tracer: GlintRays, row: IntArray, column: IntArray, size: int, n: int, geometry: CameraGeometry
+) -> tuple[list[Beams], FloatArray]:
+    """The same of all chains in squares of the lattice (first row and column, ``size``)."""
+    crossings, place = _traced(tracer, row, column, np.array([0, size]))
+    # Squares that a chain has a corner of, one for each chain; corners (row, column) by the ray that they are.
+    chains, number = np.unique(crossings.chain, return_inverse=True)
+    order = np.argsort(place.ravel(), kind="stable")
+    corner_of = place.ravel()[order]
+    first, last = (np.searchsorted(corner_of, crossings.ray, side=side) for side in ("left", "right"))
+    touched = order[_ranges(first, last)] // 4
+    pairs = np.unique(np.repeat(number, last - first) * len(row) + touched)
+    chain, square = np.divmod(pairs, len(row))
+    nodes = _nodes(crossings, chains[chain], place[square])
+    spread = _spread(nodes, np.full((len(square), 2), np.inf))
+    chosen = _near(nodes, spread, geometry)
+    square, chain = square[chosen], chain[chosen]
+    return _refine(tracer, (chains[chain], row[square], column[square], spread[chosen]), size, n, geometry)
+
+
+def _ranges(first: IntArray, last: IntArray) -> IntArray:
+    """All whole numbers from each ``first`` to before its ``last``, one range behind another."""
+    counts = last - first
+    return np.asarray(np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts - first, counts))
+
+
+@dataclass(frozen=True, eq=False)
+class _Nodes:
+    """What is known at lattice points of one chain, any shape: whether a ray arrived, and where, how, how bright."""
+
+    valid: Mask
+    sensor: FloatArray
+    tangent: FloatArray
+    throughput: FloatArray
+
+    def take(self, index: Any) -> _Nodes:
+        return _Nodes(self.valid[index], self.sensor[index], self.tangent[index], self.throughput[index])
+
+    def quarter(self, i: int, j: int) -> _Nodes:
+        """The corners (q, 2, 2) of a quarter of squares that are known at (q, 3, 3) nodes."""
+        return self.take((slice(None), slice(i, i + 2), slice(j, j + 2)))
+
+
+def _traced(tracer: GlintRays, row: IntArray, column: IntArray, steps: IntArray) -> tuple[Crossings, IntArray]:
+    """Rays through the points of squares at ``steps`` from their first corner, shared ones traced once; and which ray
+    (q, k, k) each point is."""
+    rows, columns = np.broadcast_arrays(row[:, None, None] + steps[:, None], column[:, None, None] + steps)
+    line, number = np.unique(columns, return_inverse=True)
+    key, place = np.unique(rows.ravel() * len(line) + number.ravel(), return_inverse=True)
+    row, number = np.divmod(key, max(1, len(line)))
+    return tracer.follow(np.stack([row, line[number]], axis=1) / _UNIT), place.reshape(rows.shape)
+
+
+def _nodes(crossings: Crossings, chain: Chains, place: IntArray) -> _Nodes:
+    """What is known at rays ``place`` (q, ., .) of squares of one ``chain`` (q,) each."""
+    chains, number = np.unique(crossings.chain, return_inverse=True)
+    rays = int(max(place.max(initial=0), crossings.ray.max(initial=0))) + 1
+    key = number * rays + crossings.ray
+    order = np.argsort(key, kind="stable")
+    mine = np.searchsorted(chains, chain)
+    known = mine < len(chains)
+    known[known] = chains[mine[known]] == chain[known]
+    wanted = np.where(known, mine, len(chains))[:, None, None] * rays + place
+    if not len(order):
+        nothing = np.full((*wanted.shape, 2), np.nan)
+        return _Nodes(np.zeros(wanted.shape, bool), nothing, nothing, np.zeros(wanted.shape))
+    # The last of equal ones.
+    at = order[np.maximum(np.searchsorted(key[order], wanted, side="right") - 1, 0)]
+    valid = key[at] == wanted
+    sensor, tangent = (np.where(valid[..., None], v[at], np.nan) for v in (crossings.sensor, crossings.tangent))
+    return _Nodes(valid, sensor, tangent, np.where(valid, crossings.throughput[at], 0))
+
+
+def _refine(
+    tracer: GlintRays,
+    squares: tuple[Chains, IntArray, IntArray, FloatArray],
+    size: int,
+    n: int,
+    geometry: CameraGeometry,
+) -> tuple[list[Beams], FloatArray]:
+    """The same inside ``squares``: chain, first row and column (q,), and :func:`_spread` (q, 2) of each."""
+    chain, row, column, spread = squares
+    parts: list[Beams] = []
+    unresolved = variance = 0.0
+    finest = max(1, size // _DIVISIONS)
+    pitch, stands_for, turn = min(geometry.pitches), np.ones(len(row), np.int64), 0
+    while len(row):
+        half = size // 2
+        nodes = _nodes_of(tracer, chain, row, column, half)
+        extent = _extent(nodes)
+        whole = nodes.valid.all(axis=(1, 2))
+        smooth = (_departure(nodes.sensor) < _TOLERANCE * pitch) & (extent < geometry.half_width)
+        even = _departure(nodes.throughput[..., None]) <= _SHADES * nodes.throughput.max(axis=(1, 2))
+        done = whole & (smooth | (extent < _SMALL * pitch)) & (even | (extent < _PAINT * pitch))
+        spread = _spread(nodes, spread)
+        edge = ~whole & (spread[:, 0] < _RIM * pitch)
+        # Light that small balls send to each other is faint, and its place is known too late.
+        unknown = (half <= finest * _DEEPER) & (spread[:, 0] > pitch)
+        lost = ~done & (edge | unknown | (half == finest) | (len(row) > _MOST))
+        flux, pixel = stands_for * _fluxes(tracer, row, column, size, n), _pixel(row, column, n)
+        points = _points(nodes.take(lost), flux[lost], pixel[lost], geometry)
+        if len(row) <= _MOST:
+            kept = ~unknown[lost][points.number]
+            unresolved += float(points.beams.flux[~kept].sum())
+            points = points.take(kept)
+        parts.append(points.beams)
+        variance += points.variance
+        thin, way = _thinness(nodes)
+        for i, j in np.ndindex(2, 2):
+            corners = _stretched(nodes.quarter(i, j).take(done), way[done], stands_for[done])
+            at = row[done] + i * half, column[done] + j * half
+            quarter = stands_for[done] * _fluxes(tracer, *at, half, n)
+            parts.append(Beams(_pixel(*at, n), quarter, corners.sensor, corners.tangent, corners.throughput, 0.0))
+        # Of thin squares every second row or column stands for its neighbour, too.
+        straight = _departure(nodes.sensor) < _STRAIGHT * extent
+        halved = whole & ~done & straight & (stands_for * thin < _THIN * pitch)
+        by_row = np.abs(way[:, 0]) >= np.abs(way[:, 1])
+        following = []
+        for i, j in np.ndindex(2, 2):
+            kept = ~halved | np.equal(np.where(by_row, i, j), turn)
+            goes_on = ~done & ~lost & kept & _near(nodes.quarter(i, j), spread, geometry)
+            more = stands_for[goes_on] * np.where(halved[goes_on], 2, 1)
+            at = row[goes_on] + i * half, column[goes_on] + j * half
+            following.append((chain[goes_on], *at, more, spread[goes_on]))
+        chain, row, column, stands_for, spread = (np.concatenate(part) for part in zip(*following, strict=True))
+        size, turn = half, 1 - turn
+    return parts, np.array([unresolved, variance])
+
+
+def _thinness(nodes: _Nodes) -> tuple[FloatArray, FloatArray]:
+    """How wide (q,) [mm] the light of squares is across their longer side, inf unless that is many times longer; and
+    the direction (q, 2) in the window that it is so little moved by, of unit length.
+
+    A wire spreads light across itself a thousand times more than along.
+    """
+    corners = nodes.sensor[:, ::2, ::2]
+    # What the sensor's place moves by over the square, for a step down and a step across.
+    down, across = ((c[:, 1] - c[:, 0]).mean(axis=1) for c in (corners, corners.transpose(0, 2, 1, 3)))
+    a, b, c = (np.square(down).sum(axis=1), (down * across).sum(axis=1), np.square(across).sum(axis=1))
+    # Eigenvectors of [[a, b], [b, c]], the smaller value's by half the angle.
+    angle = np.arctan2(2 * b, a - c) / 2 + np.pi / 2
+    way = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    least, most = (np.linalg.norm(down * v[:, :1] + across * v[:, 1:], axis=1) for v in (way, way[:, ::-1] * [-1, 1]))
+    with np.errstate(invalid="ignore"):
+        return np.where(most > _MANY * least, least, np.inf), way
+
+
+def _stretched(corners: _Nodes, way: FloatArray, factor: IntArray) -> _Nodes:
+    """``corners`` (q, 2, 2) of squares that stand for a ``factor`` (q,) of them along a ``way`` (q, 2)."""
+    wide = np.flatnonzero(factor > 1)
+    if not len(wide):
+        return corners
+    # A corner lies at -1/2 or 1/2 of the square; the part of that along the way grows.
+    place = np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], indexing="ij"), axis=-1)
+    along = np.einsum("ijk,qk->qij", place, way[wide]) * (factor[wide] - 1)[:, None, None]
+    for values in (corners.sensor, corners.tangent):
+        v = values[wide]
+        down, across = ((c[:, 1] - c[:, 0]).mean(axis=1) for c in (v, v.transpose(0, 2, 1, 3)))
+        slope = down * way[wide, :1] + across * way[wide, 1:]
+        values[wide] = v + along[..., None] * slope[:, None, None]
+    return corners
+
+
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """Beams without extent, and the ``number`` (k,) of the square that each is of."""
+
+    beams: Beams
+    number: IntArray
+
+    @property
+    def variance(self) -> float:
+        """Of the sum of their flux, as if each square were all or nothing."""
+        return float(np.square(np.bincount(self.number, self.beams.flux)).sum()) if len(self.number) else 0.0
+
+    def take(self, chosen: Mask) -> _Points:
+        names = ("pixel", "flux", "sensor", "tangent", "throughput")
+        arrays = {name: getattr(self.beams, name)[chosen] for name in names}
+        return _Points(replace(self.beams, **arrays), self.number[chosen])
+
+
+def _points(nodes: _Nodes, flux: FloatArray, pixel: IntArray, geometry: CameraGeometry) -> _Points:
+    """Squares that are not divided further as beams without extent, one at each node (q, 3, 3) that meets the sensor.
+
+    A node stands for its part of the square's ``flux`` (q,): of an edge's squares that is right in the mean.
+    """
+    seen = nodes.valid & (np.abs(nodes.sensor) < geometry.half_width).all(axis=-1)
+    seen &= (np.abs(nodes.tangent) <= geometry.tan_half_fov).all(axis=-1)
+    light = _SHARES * nodes.throughput * flux[:, None, None]
+    square, i, j = np.nonzero(seen)
+    sensor, tangent = (
+        np.broadcast_to(v[square, i, j][:, None, None], (len(square), 2, 2, 2)) for v in (nodes.sensor, nodes.tangent)
+    )
+    whole = np.ones((len(square), 2, 2))
+    return _Points(Beams(pixel[square], light[square, i, j], sensor, tangent, whole, 0.0), square)
+
+
+def _nodes_of(tracer: GlintRays, chain: Chains, row: IntArray, column: IntArray, half: int) -> _Nodes:
+    """Nodes (q, 3, 3) at corners, edge middles and centre of squares."""
+    crossings, place = _traced(tracer, row, column, half * np.arange(3))
+    return _nodes(crossings, chain, place)
+
+
+def _box(valid: Mask, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(q, 2) least and greatest values (q, ., ., 2) at valid nodes, inf and -inf where there are none."""
+    low, high = (np.where(valid[..., None], values, limit) for limit in (np.inf, -np.inf))
+    return low.min(axis=(1, 2)), high.max(axis=(1, 2))
+
+
+def _size(low: FloatArray, high: FloatArray) -> FloatArray:
+    """(q,) larger side of boxes, 0 where nothing or one ray arrived."""
+    return np.asarray(np.where(np.isfinite(low), high - low, 0).max(axis=-1))
+
+
+def _extent(nodes: _Nodes) -> FloatArray:
+    """(q,) larger side of the bounding box of what arrived [mm]."""
+    return _size(*_box(nodes.valid, nodes.sensor))
+
+
+def _spread(nodes: _Nodes, before: FloatArray) -> FloatArray:
+    """(q, 2) how far apart the rays of squares arrive, by place [mm] and by sine; that ``before`` where one ray did."""
+    sizes = np.stack([_size(*_box(nodes.valid, values)) for values in (nodes.sensor, _sines(nodes))], axis=1)
+    return np.asarray(np.where(sizes > 0, sizes, before))
+
+
+def _near(nodes: _Nodes, spread: FloatArray, geometry: CameraGeometry) -> Mask:
+    """(q,) whether a square may light the sensor within the field stop: its corners' box, grown by what may be hidden.
+
+    A whole square bulges by its curvature; one that a rim cuts may be as large as the ``spread`` (q, 2) of the square
+    that it is part of. Directions are compared by sines, which stay finite.
+    """
+    sine = geometry.tan_half_fov / np.hypot(1, geometry.tan_half_fov)
+    whole = nodes.valid.all(axis=(1, 2))
+    near = nodes.valid.any(axis=(1, 2))
+    of_places = nodes.sensor, spread[:, 0], geometry.half_width + max(geometry.pitches)
+    for values, above, reach in (of_places, (_sines(nodes), spread[:, 1], sine + _MARGIN)):
+        low, high = _box(nodes.valid, values)
+        margin = np.where(whole, _size(low, high) / 2, above)[:, None]
+        with np.errstate(invalid="ignore"):
+            near &= ((low - margin < reach) & (high + margin > -reach)).all(axis=1)
+    return np.asarray(near)
+
+
+def _sines(nodes: _Nodes) -> FloatArray:
+    """Sines of the rays' angles to the axis, along rows and columns."""
+    return np.asarray(nodes.tangent / np.sqrt(1 + np.square(nodes.tangent).sum(axis=-1, keepdims=True)))
+
+
+def _departure(values: FloatArray) -> FloatArray:
+    """(q,) largest distance of values (q, 3, 3, k) from the bilinear map of their corners; NaN if one lacks."""
+    blend = np.array([[1, 0], [0.5, 0.5], [0, 1]])
+    flat = np.einsum("ia,jb,qabk->qijk", blend, blend, values[:, ::2, ::2])
+    return np.asarray(np.linalg.norm(values - flat, axis=-1).max(axis=(1, 2)))
+
+
+def _fluxes(tracer: GlintRays, row: IntArray, column: IntArray, size: int, n: int) -> FloatArray:
+    """(q,) flux into squares of the lattice [W m^-2 mm^2]."""
+    power = tracer.rays.power.mean(axis=1)[_pixel(row, column, n)]
+    return np.asarray(power * tracer.rays.area * (size / _UNIT) ** 2)
+
+
+def _pixel(row: IntArray, column: IntArray, n: int) -> IntArray:
+    """(q,) projector pixel of points of the lattice."""
+    return (row // _UNIT) * n + column // _UNIT
+
+
+def _joined(parts: list[Beams], left: FloatArray) -> Beams:
+    pair = np.zeros((0, 2, 2, 2))
+    none = Beams(np.zeros(0, np.int64), np.zeros(0), pair, pair, np.zeros((0, 2, 2)), 0.0)
+    names = ("pixel", "flux", "sensor", "tangent", "throughput")
+    arrays = {name: np.concatenate([getattr(part, name) for part in (none, *parts)]) for name in names}
+    return Beams(**arrays, unresolved=float(left[0]), error=math.sqrt(left[1]))

@@ -1,0 +1,313 @@
+"""Rays that follow perfect mirrors: from points of a pinhole projector's window to where they cross the sensor plane.
+
+Rays are traced in Mitsuba's float32, which is good to about 1e-4 mm at the sensor: 1 % of a pixel, and as much error
+in a masked frame. So each hit is polished in float64: the ray is met with the tangent plane of the surface that was
+hit, and reflection or refraction is worked out again there. What is left is the surface's own place and normal in
+float32: nothing for a mirror that faces the axis squarely; round ones and smooth meshes are met in float64
+(:mod:`mitsim.transport.exact_hits`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.arrays import FloatArray
+from mitsim.transport.coordinates import rows_columns, turn_and_origin
+from mitsim.transport.exact_hits import ExactHits, Hits
+from mitsim.transport.plugins.base import channels, lanes_of, per_lane, vectors
+from mitsim.transport.projector import PinholeRays, ProjectorOptics, wavelength_sets
+from mitsim.transport.transmission import CLEAR, Passage, transmits
+
+IntArray = npt.NDArray[np.int64]
+Chains = npt.NDArray[np.uint64]
+Mask = npt.NDArray[np.bool_]
+_FAINTEST = 1e-5
+"""Part of its light below which a ray ends, after three or four reflections of glass: a hundredth of accuracy 1e-3."""
+_AGREEMENT = 1e-4
+"""Largest distance of our direction to Mitsuba's: float32 agrees to some 1e-6, another law of bending is far beyond."""
+_OFFSET = 1e-4
+"""How far a ray starts off its surface, for each mm of its coordinates: Mitsuba's own ray epsilon, 1500 roundings."""
+_GRAZING = 0.02
+"""Least cosine that this distance is divided by, so that a grazing ray does not start centimetres away."""
+_CHAIN = np.uint64(0x9E3779B97F4A7C15)
+"""Multiplier of a chain's number, 2^64 over the golden ratio: it scatters neighbouring sequences (Knuth)."""
+
+
+def delta_bsdfs(scene: mi.Scene, kinds: int) -> list[mi.BSDF]:
+    """Materials of a ``scene`` with a part of one of the ``kinds``, ``mi.BSDFFlags`` added up."""
+    materials: list[mi.BSDF] = []
+    for shape in scene.shapes():
+        bsdf = shape.bsdf()
+        if bsdf is not None and bsdf.flags() & kinds and bsdf not in materials:
+            materials.append(bsdf)
+    return materials
+
+
+@dataclass(frozen=True, eq=False)
+class Crossings:
+    """Rays that crossed the sensor plane from the front after at least one mirror; one ray may arrive several times.
+
+    Attributes
+    ----------
+    ray
+        (k,) number of the ray that was sent.
+    chain
+        (k,) a number for the sequence of surfaces that turned it, and whether each reflected or transmitted it.
+    sensor, tangent
+        (k, 2) where it crosses [mm] and its tan-angles from there, (row, column) in index coordinates.
+    throughput
+        (k,) part of the light left.
+    """
+
+    ray: IntArray
+    chain: Chains
+    sensor: FloatArray
+    tangent: FloatArray
+    throughput: FloatArray
+
+    @classmethod
+    def joined(cls, parts: Sequence[Crossings]) -> Crossings:
+        """All ``parts`` in one."""
+        pair = np.zeros((0, 2))
+        none = cls(np.zeros(0, np.int64), np.zeros(0, np.uint64), pair, pair, np.zeros(0))
+        return cls(*(np.concatenate([getattr(part, name) for part in (none, *parts)]) for name in vars(none)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Rays:
+    """Rays under way. ``start`` lies on the ray a little beyond ``origin``, clear of the surface that it leaves."""
+
+    index: IntArray
+    origin: FloatArray
+    direction: FloatArray
+    start: FloatArray
+    chain: Chains
+    spectrum: FloatArray
+
+    @classmethod
+    def joined(cls, parts: Sequence[_Rays]) -> _Rays:
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
+
+
+class GlintRays:
+    """Follows rays of a projector over delta reflections, refractions and straight transmissions to the sensor plane.
+
+    At a surface that both reflects and transmits, a ray goes both ways. A ray that meets anything that scatters ends
+    there: that light is found from the camera.
+    """
+
+    def __init__(self, scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, max_depth: int) -> None:
+        """What is followed.
+
+        Parameters
+        ----------
+        scene, camera, projector
+            as loaded.
+        max_depth
+            surfaces that a ray may meet between the two.
+        """
+        self._scene, self._max_depth = scene, max_depth
+        self._clear = CLEAR if transmits(scene) else _OFFSET
+        self._wavelengths = wavelength_sets(projector.lines)
+        self.rays = PinholeRays(projector, self._wavelengths)
+        mean = self.rays.power.mean(axis=0)
+        self._colour = mean / mean.sum() if mean.sum() > 0 else np.full(len(mean), 1 / len(mean))
+        self._lobes = _by_choice(lobe for bsdf in delta_bsdfs(scene, int(mi.BSDFFlags.Delta)) for lobe in _lobes(bsdf))
+        polished = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
+        self.mirrors = [s for s in scene.shapes() if s.bsdf() is not None and s.bsdf().flags() & polished]
+        self._exact = ExactHits(self.mirrors)
+        self._camera_turn, self.camera_place = turn_and_origin(camera.world_transform())
+
+    def follow(self, points: FloatArray) -> Crossings:
+        """Send rays through window ``points`` (row, column) (k, 2), in projector pixels."""
+        count = len(points)
+        origin = np.broadcast_to(self.rays.origin, (count, 3))
+        rays = _Rays(
+            np.arange(count),
+            origin,
+            self.rays.directions(points),
+            origin,
+            np.zeros(count, dtype=np.uint64),
+            np.ones((count, len(self._colour))),
+        )
+        crossings = []
+        for _ in range(self._max_depth + 1):
+            si = self._intersect(rays)
+            distance = np.where(per_lane(si.is_valid(), len(rays.index)), per_lane(si.t, len(rays.index)), np.inf)
+            distance = distance + np.linalg.norm(rays.start - rays.origin, axis=1)
+            crossing, arrived = self._cross(rays, distance)
+            crossings.append(crossing)
+            onward = self._bounce(rays, si, ~arrived & np.isfinite(distance))
+            if not onward:
+                break
+            rays = _Rays.joined(onward)
+        return Crossings.joined(crossings)
+
+    def _intersect(self, rays: _Rays) -> mi.SurfaceInteraction3f:
+        ray = mi.Ray3f(mi.Point3f(*lanes_of(rays.start)), mi.Vector3f(*lanes_of(rays.direction)))
+        si = self._scene.ray_intersect(ray, mi.RayFlags.All, True)
+        dr.eval(si)
+        return si
+
+    def _cross(self, rays: _Rays, distance: FloatArray) -> tuple[Crossings, Mask]:
+        """Rays that cross the sensor plane from the front before they meet anything."""
+        origin = (rays.origin - self.camera_place) @ self._camera_turn
+        direction = rays.direction @ self._camera_turn
+        ahead = (origin[:, 2] > 0) & (direction[:, 2] < 0)
+        reach = np.full(len(ahead), np.inf)
+        np.divide(-origin[:, 2], direction[:, 2], out=reach, where=ahead)
+        arrived = ahead & (reach < distance)
+        turned = arrived & (rays.chain != 0)
+        o, d, r = origin[turned], direction[turned], reach[turned, None]
+        crossing = Crossings(
+            rays.index[turned],
+            rays.chain[turned],
+            _rows_columns(o + d * r),
+            _rows_columns(d / d[:, 2:]),
+            rays.spectrum[turned] @ self._colour,
+        )
+        return crossing, arrived
+
+    def _bounce(self, rays: _Rays, si: mi.SurfaceInteraction3f, active: Mask) -> list[_Rays]:
+        """The rays that go on, polished, by lobe; see the module."""
+        count = len(active)
+        hits = _polished(rays, si)
+        shaded = hits.normal.copy()
+        shapes = per_lane(dr.reinterpret_array(mi.UInt32, si.shape), count).astype(np.uint64)
+        numbers = shapes.astype(np.int64), per_lane(si.prim_index, count).astype(np.int64)
+        self._exact.refine(rays.origin, rays.direction, hits, *numbers)
+        point, geometric, normal = hits.point, hits.geometric, hits.normal
+        onward: list[_Rays] = []
+        materials = per_lane(dr.reinterpret_array(mi.UInt32, si.bsdf()), count)
+        for lobe, own in self._lobes:
+            met = active & np.isin(materials, own)
+            if not met.any():
+                continue
+            here = mi.Bool(met)
+            sample, weight = self._sampled(lobe, si, here)
+            kind, eta = per_lane(sample.sampled_type, count), per_lane(sample.eta, count)
+            single = (kind & int(mi.BSDFFlags.Delta)) != 0
+            spectrum = rays.spectrum * np.nan_to_num(weight)
+            chosen = np.flatnonzero(met & single & ((spectrum @ self._colour) > _FAINTEST))
+            traced = vectors(si.to_world(sample.wo), count)[chosen]
+            turn = kind[chosen], eta[chosen], rays.direction[chosen]
+            # What Mitsuba did with its own normal tells which law it is; the better normal is for where light goes.
+            lawful = np.linalg.norm(_redirected(shaded[chosen], *turn) - traced, axis=1) < _AGREEMENT
+            direction = np.where(lawful[:, None], _redirected(normal[chosen], *turn), traced)
+            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+            slope = np.abs((direction * geometric[chosen]).sum(axis=1))
+            clear = self._clear * (1 + np.abs(point[chosen]).max(axis=1, initial=0)) / np.maximum(slope, _GRAZING)
+            reflected = (kind[chosen] & int(mi.BSDFFlags.DeltaReflection)) != 0
+            code = shapes[chosen] * np.uint64(2) + reflected.astype(np.uint64) + np.uint64(1)
+            straight = lobe.kind == int(mi.BSDFFlags.Null)
+            chain = rays.chain[chosen] if straight else rays.chain[chosen] * _CHAIN + code
+            start = point[chosen] + direction * clear[:, None]
+            if len(chosen):
+                onward.append(_Rays(rays.index[chosen], point[chosen], direction, start, chain, spectrum[chosen]))
+        return onward
+
+    def _sampled(self, lobe: _Lobe, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.BSDFSample3f, FloatArray]:
+        """Direction sample, and weights (k, channels) over all wavelength sets."""
+        weights = []
+        choice = lobe.choice * (1 - dr.max(Passage.straight(si, active))) if lobe.by_chance else lobe.choice
+        for wavelengths in self._wavelengths:
+            if wavelengths is not None:
+                si.wavelengths = wavelengths
+            sample, weight = si.bsdf().sample(lobe.context, si, choice, mi.Point2f(0.5), active)
+            weight = weight * sample.pdf if lobe.by_chance else weight
+            if lobe.kind == int(mi.BSDFFlags.Null):
+                # Whatever was sampled, light that passes keeps its direction.
+                weight, sample.wo = si.bsdf().eval_null_transmission(si, active), -si.wi
+                sample.sampled_type, sample.eta = mi.UInt32(lobe.kind), mi.Float(1)
+            weight = dr.select((sample.sampled_type & lobe.kind) != 0, weight, 0)
+            weights.append(channels(mi.unpolarized_spectrum(weight), dr.width(si.t)))
+        return sample, np.concatenate(weights, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Lobe:
+    """One way on at a material, of a ``kind``: the context and random number that choose it, and whether of several.
+
+    If so, Mitsuba has divided the weight by the probability of the choice, which is the sample's ``pdf``.
+    """
+
+    bsdf: mi.BSDF
+    context: mi.BSDFContext
+    kind: int
+    choice: float = 0.5
+    by_chance: bool = False
+
+
+def _by_choice(lobes: Iterable[_Lobe]) -> list[tuple[_Lobe, list[int]]]:
+    """One of all ``lobes`` that are chosen alike, and the numbers of their materials in Dr.Jit's registry."""
+    found: dict[tuple[object, ...], tuple[_Lobe, list[int]]] = {}
+    for lobe in lobes:
+        key = lobe.kind, lobe.choice, lobe.by_chance, lobe.context.type_mask, lobe.context.component
+        number = int(np.array(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(lobe.bsdf))).ravel()[0])
+        found.setdefault(key, (lobe, []))[1].append(number)
+    return list(found.values())
+
+
+def _lobes(bsdf: mi.BSDF) -> list[_Lobe]:
+    """Every delta part of a material, so that nothing is left to chance.
+
+    Parts are chosen by type, because components of a ``twosided`` are not numbered alike on both sides; those of a
+    blend can be told by component only, and a ``mask`` obeys neither: its first and last outcome short of the hole are
+    taken (a mirror, or the reflection of glass and its transmission). What passes is the same for all materials.
+    """
+    flags = mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.Null
+    reflected, refracted, straight = (int(flag) for flag in flags)
+    name, delta = str(bsdf), reflected | refracted
+    lobes = [_Lobe(bsdf, _context(), straight)] if bsdf.flags() & straight else []
+    if name.startswith("Mask"):
+        outcomes = (reflected, 0.0), (refracted, 1 - 2**-23)
+        return lobes + [_Lobe(bsdf, _context(), kind, choice, True) for kind, choice in outcomes if bsdf.flags() & kind]
+    if "BlendBSDF" in name:
+        for component in range(bsdf.component_count()):
+            if bsdf.flags(component) & delta:
+                lobes.append(_Lobe(bsdf, _context(), delta))
+                lobes[-1].context.component = component
+        return lobes
+    for kind in (reflected, refracted):
+        if bsdf.flags() & kind:
+            lobes.append(_Lobe(bsdf, _context(), kind))
+            lobes[-1].context.type_mask = kind
+    return lobes
+
+
+def _context() -> mi.BSDFContext:
+    return mi.BSDFContext(mi.TransportMode.Importance)
+
+
+def _polished(rays: _Rays, si: mi.SurfaceInteraction3f) -> Hits:
+    """Where rays met surfaces, in float64 with the tangent plane of each."""
+    count = len(rays.index)
+    hit, geometric, normal = (vectors(v, count) for v in (si.p, si.n, si.sh_frame.n))
+    with np.errstate(all="ignore"):
+        geometric /= np.linalg.norm(geometric, axis=1, keepdims=True)
+        along = ((hit - rays.origin) * geometric).sum(axis=1) / (rays.direction * geometric).sum(axis=1)
+        point = rays.origin + rays.direction * along[:, None]
+        good = np.linalg.norm(point - hit, axis=1) < 10 * _OFFSET * (1 + np.abs(hit).max(axis=1))
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return Hits(np.where(good[:, None], point, hit), geometric, normal)
+
+
+def _redirected(normal: FloatArray, kind: IntArray, eta: FloatArray, direction: FloatArray) -> FloatArray:
+    """(k, 3) directions after a surface in float64: reflected, refracted by ``eta`` (Snell) or straight on."""
+    cosine = (direction * normal).sum(axis=1, keepdims=True)
+    reflected = direction - 2 * cosine * normal
+    inside = 1 - (1 - cosine**2) / eta[:, None] ** 2
+    refracted = (direction - cosine * normal) / eta[:, None] + np.sign(cosine) * np.sqrt(np.maximum(inside, 0)) * normal
+    polished = np.where((kind & int(mi.BSDFFlags.DeltaTransmission))[:, None] != 0, refracted, direction)
+    return np.asarray(np.where((kind & int(mi.BSDFFlags.DeltaReflection))[:, None] != 0, reflected, polished))
+
+
+def _rows_columns(points: FloatArray) -> FloatArray:
+    """(k, 2) index coordinates of points (k, 3) of the camera's frame."""
+    return np.stack(rows_columns(points[:, 0], points[:, 1]), axis=1)

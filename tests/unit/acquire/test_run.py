@@ -1,0 +1,502 @@
+"""`capture`: a folder with every frame and all that is needed to use them; the same seed gives the same folder."""
+
+import hashlib
+import json
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.acquire import capture
+from mitsim.acquire.exposure import Exposer
+from mitsim.api.bench import Bench, open_bench
+from mitsim.bench.request import Exposure, Request
+from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.exr import checksum, read_frame
+from mitsim.core.job import Job
+from mitsim.core.resources import Limits
+from mitsim.core.runs import Capture
+from mitsim.devices.patterns import parse_patterns
+from mitsim.devices.session import load_recipe
+from mitsim.light.light import trace_light
+from mitsim.light.settings import GROUPS
+from mitsim.planner.planner import make_plan
+from mitsim.sensor.moments import frame_moments
+from tests.unit.planner.invented_evidence import plan as invented_plan
+
+pytestmark = pytest.mark.usefixtures("kept_plans")
+N, ACCURACY = 16, 1e-2
+FILES = [f"frame_{index:05d}.exr" for index in range(9)]
+
+
+@pytest.fixture(scope="module")
+def printed() -> np.ndarray:
+    """8-bit print, texels of 4 mm on the 128 mm sheet; its middle 120 mm are lit."""
+    return np.random.default_rng(6).integers(90, 250, (32, 32))
+
+
+@pytest.fixture(scope="module")
+def bench(shared_scene: Callable[..., Path], variant: str, printed: np.ndarray) -> Bench:
+    return open_bench(shared_scene("capture", reflectance=printed), variant)
+
+
+@pytest.fixture(scope="module")
+def captured(bench: Bench, tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    return bench.capture("dots:3", tmp_path_factory.mktemp("capture") / "run", accuracy=ACCURACY, seed=5)
+
+
+def test_a_plan_that_takes_too_long_is_refused(bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its own seconds count, and nothing is left of the run."""
+    monkeypatch.setattr(capture, "make_plan", lambda *_: time.sleep(60))
+    job = Job(limits=Limits(seconds=1.0))
+    with pytest.raises(MitsimError, match=r"dots:3: was not planned within the 1 s that are allowed"):
+        bench.capture("dots:3", tmp_path / "run", job=job)
+    assert job.clock.seconds()["total"] < 30
+    assert not (tmp_path / "run").exists()
+
+
+def pixels(folder: Path) -> dict[str, str]:
+    """SHA-256 of every frame's channels."""
+    found = {}
+    for path in sorted(folder.glob("*.exr")):
+        channels, _ = read_frame(path)
+        digest = hashlib.sha256()
+        for name in sorted(channels):
+            digest.update(name.encode() + channels[name].tobytes())
+        found[path.name] = digest.hexdigest()
+    return found
+
+
+def test_the_folder_holds_every_frame_and_nothing_else(captured: Capture) -> None:
+    folder = captured.folder
+    assert sorted(path.name for path in folder.iterdir()) == sorted([*FILES, "manifest.json", "truth.exr"])
+    summary = captured.summary()
+    assert summary["frames"] == 9 and summary["shape"] == (64, 64) and summary["seed"] == 5
+    seconds = summary["seconds"]
+    assert set(seconds) >= {"imports", "transport", "optics", "sensor", "write", "total"}
+    assert seconds["total"] >= max(seconds.values())
+    assert summary["variant"] == "llvm_ad_mono"
+
+
+def test_the_manifest_says_what_was_done(captured: Capture, bench: Bench) -> None:
+    folder = captured.folder
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert manifest["kind"] == "capture" and manifest["status"] == "complete"
+    configuration = manifest["configuration"]
+    assert configuration["patterns"] == "dots:3" and configuration["seed"] == 5
+    assert configuration["accuracy"] == ACCURACY and configuration["variant"] == "llvm_ad_mono"
+    assert configuration["scene_sha256"] == checksum(bench.loaded.path)
+    assert manifest["camera"]["geometry"]["mask_distance"] == 2.0 and manifest["camera"]["projector"]["n"] == N
+    assert manifest["digital"]["exposure_s"] == captured.exposure_s
+    assert manifest["mc_error"] == captured.manifest.mc_error
+    assert {"mitsim", "mitsuba", "drjit", "numpy", "python"} <= set(manifest["versions"])
+    assert {"effects", "accuracy", "predicted_seconds", "settings"} <= set(manifest["plan"])
+    assert {"anchors", "layers", "subdivision", "effects"} <= set(manifest["plan"]["settings"])
+
+
+def test_the_manifests_patterns_are_the_family(captured: Capture) -> None:
+    block = json.loads((captured.folder / "manifest.json").read_text())["patterns"]
+    family = parse_patterns("dots:3", N)
+    assert block["family"] == "dots:3" and block["n"] == N
+    assert np.array_equal(block["P_L"], family.left) and np.array_equal(block["P_R"], family.right)
+    assert [entry["file"] for entry in block["captures"]] == FILES
+    for entry, shown in zip(block["captures"], family.shots, strict=True):
+        assert (entry["row"], entry["column"], entry["sign"]) == (shown.row, shown.column, 0)
+        _, metadata = read_frame(captured.folder / entry["file"])
+        assert (metadata["row"], metadata["column"], metadata["sign"]) == (shown.row, shown.column, 0)
+        assert metadata["exposure_s"] == captured.exposure_s and metadata["seed"] == 5
+
+
+def test_checksums_are_those_of_the_files(captured: Capture) -> None:
+    folder = captured.folder
+    checksums = json.loads((folder / "manifest.json").read_text())["checksums"]
+    assert set(checksums) == {*FILES, "truth.exr"}
+    for name, value in checksums.items():
+        assert value == hashlib.sha256((folder / name).read_bytes()).hexdigest()
+
+
+def test_the_monte_carlo_error_is_within_the_accuracy(captured: Capture, bench: Bench) -> None:
+    """Stated, and true: against light of another seed at a third of the error."""
+    assert 0 < captured.manifest.mc_error <= ACCURACY and not captured.warnings
+    lighting = parse_patterns("dots:3", N).lighting
+    plan = make_plan(bench, lighting, ACCURACY, 5)
+    assert json.loads(json.dumps(plan.block()["settings"])) == json.loads(json.dumps(captured.plan["settings"]))
+    light = trace_light(bench, replace(plan, sampling_target=captured.manifest.mc_error / 3), lighting, seed=99)
+    exposer = Exposer(bench.rig, captured.exposure_s, 0)
+    judge = np.stack([exposer.electrons(frame) for frame in light.frames(lighting, 0)])
+    found = np.stack([read_frame(captured.folder / name)[0]["electrons"] for name in FILES])
+    error = np.linalg.norm(found - judge) / np.linalg.norm(judge)
+    # The error has few degrees of freedom (how bright each dot pattern is as a whole), and so has its estimate.
+    assert error < 2 * captured.manifest.mc_error * np.hypot(1, 1 / 3)
+    assert error > captured.manifest.mc_error / 3
+
+
+def test_the_brightest_pixel_has_its_part_of_the_full_well(captured: Capture, bench: Bench) -> None:
+    peak = max(read_frame(captured.folder / name)[0]["electrons"].max() for name in FILES)
+    dark = bench.sensor.superpixel_dark_current_e_per_s * captured.exposure_s
+    assert peak + dark == pytest.approx(0.8 * bench.sensor.superpixel_full_well_e, rel=1e-5)
+
+
+def test_digital_numbers_follow_the_expected_electrons(captured: Capture, bench: Bench) -> None:
+    """Mean residual of 9 x 4096 pixels in units of its closed-form deviation is normal: five of it."""
+    scores = []
+    for name in FILES:
+        channels, _ = read_frame(captured.folder / name)
+        assert channels["DN"].dtype == np.uint32
+        mean, variance = frame_moments(channels["electrons"], captured.exposure_s, bench.sensor)
+        scores.append((channels["DN"] - mean) / np.sqrt(variance))
+    scores = np.stack(scores)
+    assert abs(scores.mean()) < 5 / np.sqrt(scores.size)
+    assert abs(scores.std() - 1) < 5 / np.sqrt(2 * scores.size)
+    # Frames, and neighbours, have noise of their own.
+    frames = scores.reshape(9, -1)
+    correlation = np.corrcoef(frames)[np.triu_indices(9, 1)]
+    assert np.abs(correlation).max() < 6 / np.sqrt(4096)
+
+
+def test_truth_is_the_prints_reflectance_over_the_boards(captured: Capture, printed: np.ndarray) -> None:
+    truth = read_frame(captured.folder / "truth.exr")[0]["reflectance"]
+    fine = np.kron(printed / 255, np.ones((8, 8)))  # 0.5 mm
+    expected = fine[8:-8, 8:-8].reshape(N, 15, N, 15).mean(axis=(1, 3)) / load_recipe().board_reflectance
+    # A projector pixel's light comes from hundreds of paths, jittered in cells; texels are as large as half a pixel.
+    assert np.abs(truth - expected).max() < 0.1
+    assert np.linalg.norm(truth - expected) < 0.03 * np.linalg.norm(expected)
+    assert np.linalg.norm(truth - expected.T) > 0.1 * np.linalg.norm(expected)
+
+
+def test_the_same_seed_is_bit_equal_and_another_differs(bench: Bench, tmp_path: Path, captured: Capture) -> None:
+    again = bench.capture("dots:3", tmp_path / "again", accuracy=ACCURACY, seed=5)
+    other = bench.capture("dots:3", tmp_path / "other", accuracy=ACCURACY, seed=6)
+    same, different = pixels(again.folder), pixels(other.folder)
+    assert same == pixels(captured.folder)
+    assert all(different[name] != same[name] for name in same)
+
+
+def copied(captured: Capture, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(captured.folder, tmp_path / "run"))
+
+
+def test_resume_makes_the_missing_frames_and_keeps_the_rest(bench: Bench, captured: Capture, tmp_path: Path) -> None:
+    folder = copied(captured, tmp_path)
+    whole = pixels(folder)
+    for name in FILES[2:7]:
+        (folder / name).unlink()
+    (folder / FILES[0]).write_bytes((folder / FILES[0]).read_bytes()[:2000])  # cut short by a full disk
+    manifest = json.loads((folder / "manifest.json").read_text())
+    keys = ("kind", "configuration", "configuration_sha256")
+    (folder / "manifest.json").write_text(json.dumps({**{k: manifest[k] for k in keys}, "status": "incomplete"}))
+    kept = (folder / FILES[8]).stat().st_mtime_ns
+    resumed = bench.capture("dots:3", folder, accuracy=ACCURACY, seed=5, resume=True)
+    assert pixels(folder) == whole
+    assert (folder / FILES[8]).stat().st_mtime_ns == kept
+    assert resumed.manifest.mc_error == captured.manifest.mc_error and resumed.exposure_s == captured.exposure_s
+    checksums = json.loads((folder / "manifest.json").read_text())["checksums"]
+    assert all(checksum(folder / name) == value for name, value in checksums.items())
+
+
+def test_seconds_buy_an_accuracy_that_the_manifest_states(
+    bench: Bench, captured: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The choice knows no clock: made again by a machine that looks far slower, it is the same."""
+    shots = bench.capture("dots:3", tmp_path / "run", seconds=3.0, seed=5)
+    manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
+    assert manifest["configuration"]["seconds"] == 3.0 and "accuracy" not in manifest["configuration"]
+    summary = shots.summary()
+    assert summary["asked_seconds"] == manifest["plan"]["asked_seconds"] == 3.0
+    assert summary["accuracy"] == manifest["plan"]["accuracy"] < 0.3 and summary["predicted_seconds"] > 0
+    assert summary["total_error_bound"] <= summary["accuracy"] and not shots.warnings
+    assert captured.summary()["asked_seconds"] is None and captured.summary()["accuracy"] == ACCURACY
+
+    monkeypatch.setattr("mitsim.planner.planner._seconds", lambda *_: 100.0)
+    whole = pixels(tmp_path / "run")
+    for name in FILES[3:]:
+        (tmp_path / "run" / name).unlink()
+    with pytest.raises(MitsimError, match="other"):
+        bench.capture("dots:3", tmp_path / "run", seconds=4.0, seed=5, resume=True)
+    resumed = bench.capture("dots:3", tmp_path / "run", seconds=3.0, seed=5, resume=True)
+    assert pixels(tmp_path / "run") == whole and resumed.summary()["accuracy"] == summary["accuracy"]
+
+
+def test_too_few_seconds_flag_the_loosest_plan(bench: Bench) -> None:
+    plan = bench.plan("dots:3", seconds=0.01, seed=5)
+    assert plan.accuracy == 0.3 and any("0.01 seconds are too few" in line for line in plan.warnings)
+    assert plan.payload()["asked_seconds"] == 0.01
+    for other, said in (({"seconds": 20.0}, "0.01; plan anew"), ({"accuracy": 1e-3}, "not both")):
+        with pytest.raises(MitsimError, match=said):
+            bench.capture(plan, **other)
+
+
+@pytest.mark.parametrize(
+    ("asked", "maker", "handed"),
+    [
+        ({"seconds": 3.0}, "plan_within", (3.0, 5, {"blur": False})),
+        ({"accuracy": 2e-2}, "make_plan", (2e-2, 5, {"blur": False}, 1)),
+        ({}, "make_plan", (1e-3, 5, {"blur": False}, 1)),
+    ],
+)
+def test_a_plan_is_made_of_what_is_asked(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, asked: dict[str, object], maker: str, handed: tuple[object, ...]
+) -> None:
+    """By the one way or the other. (Planted: no seed, or no effects, for a plan within seconds.)"""
+
+    def planned(seen: Bench, lighting: object, *rest: object) -> None:
+        raise MitsimError(repr((seen is bench, *rest)))
+
+    monkeypatch.setattr(capture, maker, planned)
+    for begin in (bench.plan, bench.light, bench.capture):
+        with pytest.raises(MitsimError) as caught:
+            begin("dots:3", seed=5, effects="-blur", **asked)
+        assert str(caught.value) == repr((True, *handed))
+
+
+def test_what_a_plan_was_made_for_is_not_changed() -> None:
+    """What would need another plan is refused by name; what the plan does not hang on may change. (Planted: each of the
+    four left out.)"""
+    made = replace(invented_plan(), request=Request.of(patterns="dots:3", accuracy=2e-2, effects="-blur", seed=3))
+    timed = replace(made, request=Request.of(seconds=3.0))
+    for own, changes in (
+        (made, {"patterns": "dots:2"}),
+        (made, {"accuracy": 1e-2}),
+        (made, {"effects": {}}),
+        (timed, {"seconds": 4.0}),
+    ):
+        (name,) = changes
+        with pytest.raises(ArgumentError, match="plan anew") as caught:
+            capture.request_of(own, changes)
+        assert caught.value.argument == name
+    assert capture.request_of(made, {"exposure": 0.01, "accuracy": 2e-2}) == made.request.changed(exposure=0.01)
+    assert capture.request_of(timed, {"exposure": 0.01}) == Request.of(seconds=3.0, exposure=0.01)
+
+
+def test_frames_of_another_run_are_not_kept(bench: Bench, captured: Capture, tmp_path: Path) -> None:
+    folder = copied(captured, tmp_path)
+    whole = pixels(folder)
+    shutil.copyfile(folder / FILES[1], folder / FILES[2])
+    bench.capture("dots:3", folder, accuracy=ACCURACY, seed=5, resume=True)
+    assert pixels(folder) == whole
+
+
+@pytest.mark.parametrize(
+    ("changed", "word"),
+    [
+        ({"seed": 6}, "seed"),
+        ({"patterns": "dots:4"}, "patterns"),
+        ({"accuracy": 2e-2}, "accuracy"),
+        ({"exposure": 0.01}, "exposure"),
+    ],
+)
+def test_resume_with_other_options_is_refused(
+    bench: Bench, captured: Capture, tmp_path: Path, changed: dict[str, object], word: str
+) -> None:
+    folder = copied(captured, tmp_path)
+    before = pixels(folder)
+    options = {"patterns": "dots:3", "accuracy": ACCURACY, "seed": 5, **changed}
+    with pytest.raises(MitsimError, match=word) as caught:
+        bench.capture(options.pop("patterns"), folder, resume=True, **options)
+    assert str(folder) in str(caught.value) and "\n" not in str(caught.value)
+    assert pixels(folder) == before
+
+
+def test_resume_of_a_changed_scene_is_refused(small_scene: Callable[..., Path], tmp_path: Path) -> None:
+    path = small_scene()
+    open_bench(path).capture("uniform", tmp_path / "run", accuracy=2e-2)
+    with pytest.raises(MitsimError, match="defines"):
+        open_bench(path, albedo="0.4").capture("uniform", tmp_path / "run", accuracy=2e-2, resume=True)
+    path.write_text(path.read_text() + "<!-- edited -->")
+    with pytest.raises(MitsimError, match="scene_sha256"):
+        open_bench(path).capture("uniform", tmp_path / "run", accuracy=2e-2, resume=True)
+
+
+def test_a_folder_in_use_is_refused(bench: Bench, captured: Capture, tmp_path: Path) -> None:
+    with pytest.raises(MitsimError, match="holds files already"):
+        bench.capture("dots:3", captured.folder, accuracy=ACCURACY, seed=5)
+    (tmp_path / "note.txt").write_text("mine")
+    for resume in (False, True):
+        with pytest.raises(MitsimError, match="holds files already"):
+            bench.capture("dots:3", tmp_path, accuracy=ACCURACY, resume=resume)
+    assert [path.name for path in tmp_path.iterdir()] == ["note.txt"]
+    with pytest.raises(MitsimError, match="does not exist"):
+        bench.capture("dots:3", tmp_path / "no" / "run", accuracy=ACCURACY)
+
+
+def test_a_folder_in_use_is_refused_before_any_work(
+    bench: Bench, captured: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def work(*_: object) -> None:
+        raise AssertionError("work was done first")
+
+    monkeypatch.setattr(capture, "make_plan", work)
+    with pytest.raises(MitsimError, match="holds files already"):
+        bench.capture("dots:3", captured.folder, accuracy=ACCURACY, seed=5)
+
+
+@pytest.mark.parametrize("changed", [{"patterns": "dots:17"}, {"accuracy": 0.0}, {"seed": -1}])
+def test_what_is_refused_leaves_nothing_behind(bench: Bench, tmp_path: Path, changed: dict[str, object]) -> None:
+    options = {"patterns": "dots:3", "accuracy": ACCURACY, "seed": 0, **changed}
+    with pytest.raises(MitsimError):
+        bench.capture(options.pop("patterns"), tmp_path / "run", **options)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_signed_family_is_captured_in_halves(bench: Bench, tmp_path: Path) -> None:
+    black = {"black-level": False}
+    done = bench.capture("hadamard:2", tmp_path / "run", accuracy=2e-2, seed=1, exposure=0.02, effects=black)
+    assert len(done.manifest.patterns.captures) == 8 and done.exposure_s == 0.02
+    block = json.loads((tmp_path / "run" / "manifest.json").read_text())["patterns"]["captures"]
+    assert [entry["sign"] for entry in block] == [1, -1] * 4
+    halves = {
+        (entry["row"], entry["column"], entry["sign"]): read_frame(tmp_path / "run" / entry["file"])[0]["electrons"]
+        for entry in block
+    }
+    uniform = halves[0, 0, 1]
+    assert not halves[0, 0, -1].any()
+    for i, j in ((0, 1), (1, 0), (1, 1)):
+        assert np.allclose(halves[i, j, 1] + halves[i, j, -1], uniform, rtol=1e-5)
+        assert not np.allclose(halves[i, j, 1], halves[i, j, -1], rtol=1e-3)
+
+
+def test_measurements_are_the_noisy_response_to_each_pattern(bench: Bench) -> None:
+    """Difference of halves in electrons a second; its mean is the expected response within its noise."""
+    family = parse_patterns("hadamard:2", N)
+    plan = make_plan(bench, family.lighting, 2e-2, 0)
+    expected = trace_light(bench, plan, family.lighting, 0).frames(family.lighting, 0)
+    exposer = Exposer(bench.rig, 0.01, seed=3)
+    measured = {(i, j): y for y, i, j in exposer.measurements(family, expected)}
+    assert set(measured) == {(0, 0), (0, 1), (1, 0), (1, 1)}
+    frames = dict(zip(((c.row, c.column, c.sign) for c in family.shots), expected, strict=True))
+    for (i, j), rate in measured.items():
+        halves = [exposer.electrons(frames[i, j, sign]) for sign in (1, -1)]
+        noise = np.hypot(*(exposer.sensor_noise(half) for half in halves)) / 0.01
+        residual = rate - (halves[0] - halves[1]) / 0.01
+        assert abs(residual.mean()) < 5 * noise / 64
+        assert residual.std() == pytest.approx(noise, rel=0.06)
+    # To the last bit: a half that weighs 0.999 is less than the noise. (Planted.)
+    noisy = {
+        (shot.row, shot.column, shot.sign): exposer.rate(exposer.digital(exposer.lit(frame, *shot.names), *shot.names))
+        for shot, frame in zip(family.shots, expected, strict=True)
+    }
+    assert all(np.array_equal(rate, noisy[i, j, 1] - noisy[i, j, -1]) for (i, j), rate in measured.items())
+
+
+def test_dark_current_is_taken_off(bench: Bench) -> None:
+    """1e5 dark electrons a second in 0.1 s on a frame without light: 1e4 electrons, a rate of 0 +- 1000 a pixel."""
+    noisy = replace(
+        bench, rig=replace(bench.rig, sensor=bench.sensor.model_copy(update={"dark_current_e_per_s": 25e3}))
+    )
+    exposer = Exposer(noisy.rig, 0.1, seed=1)
+    rate = exposer.rate(exposer.digital(np.zeros((64, 64)), "dark"))
+    assert abs(rate.mean()) < 5 * 1000 / 64
+    assert rate.std() == pytest.approx(1000, rel=0.06)
+
+
+def test_saturation_is_flagged(bench: Bench, tmp_path: Path) -> None:
+    done = bench.capture("uniform", tmp_path / "run", accuracy=2e-2, exposure=10.0)
+    assert any("full well" in warning for warning in done.warnings)
+
+
+@pytest.mark.parametrize(
+    "settings", [{"seconds": s} for s in (0.0, 1e-13, 1e7, np.inf)] + [{"fraction": f} for f in (0.0, 1e-7, 1.1)]
+)
+def test_exposures_that_make_no_sense(settings: dict[str, float]) -> None:
+    with pytest.raises(MitsimError, match="exposure"):
+        Exposure(**settings)
+
+
+def test_sampling_stops_at_its_target(bench: Bench) -> None:
+    lighting = parse_patterns("dots:3", N).lighting
+    plan = make_plan(bench, lighting, 1e-2, 0)
+    targets = (1e-2, 1.5e-3)
+    loose, tight = (trace_light(bench, replace(plan, sampling_target=t), lighting, 0) for t in targets)
+    for light, target in zip((loose, tight), targets, strict=True):
+        assert light.reached and len(light.groups) == GROUPS
+        assert target / 4 < light.sampling_error <= target
+        assert all((a.fine != b.fine).nnz for a, b in combinations(light.groups, 2)), "groups have to be independent"
+    # The error falls at least with the square root of the paths, and not faster than with the paths themselves.
+    gain, cost = loose.sampling_error / tight.sampling_error, tight.paths / loose.paths
+    assert 0.7 * gain < cost < 1.5 * gain**2
+
+
+# ---- the user's own choices
+
+
+def test_effects_are_switched_by_the_user(bench: Bench, captured: Capture, tmp_path: Path) -> None:
+    """Without diffraction the frames are the geometric ones: 20 % and more away; the plan and the manifest say so."""
+    done = bench.capture("dots:3", tmp_path / "run", accuracy=ACCURACY, seed=5, effects={"diffraction": False})
+    assert "diffraction" in captured.plan["settings"]["effects"]
+    assert "diffraction" not in done.plan["settings"]["effects"]
+    manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
+    assert manifest["configuration"]["effects"] == {"diffraction": False}
+    row = next(effect for effect in manifest["plan"]["effects"] if effect["name"] == "diffraction")
+    assert row["state"] == "off" and "by the user" in row["reason"]
+    assert any("largest: diffraction (off)" in warning for warning in done.warnings)
+    first, second = (
+        np.stack([read_frame(one.folder / name)[0]["electrons"] for name in FILES]) / one.exposure_s
+        for one in (captured, done)
+    )
+    change = np.linalg.norm(first - second) / np.linalg.norm(first)
+    assert change > 0.1
+    # The pilot looks with cells of a whole projector pixel, half a mask feature here: too coarse for the fringes.
+    assert 0.6 < row["error_if_off"] / change < 2
+
+
+@pytest.mark.parametrize(
+    "changed", [{"effects": {"diffraction": False}}, {"effects": {"blur": True}}, {"noise_fraction": 0.5}]
+)
+def test_resume_with_other_effects_is_refused(
+    bench: Bench, captured: Capture, tmp_path: Path, changed: dict[str, object]
+) -> None:
+    folder = copied(captured, tmp_path)
+    before = pixels(folder)
+    with pytest.raises(MitsimError, match=next(iter(changed))):
+        bench.capture("dots:3", folder, accuracy=ACCURACY, seed=5, resume=True, **changed)
+    assert pixels(folder) == before
+
+
+def test_sampling_stops_at_a_part_of_the_sensors_noise(bench: Bench, tmp_path: Path) -> None:
+    """Exposures of 0.8 of full well have a noise of about a percent: 0.05 of it needs more paths than all of it."""
+    paths = {}
+    for fraction in (1.0, 0.05):
+        folder = tmp_path / str(fraction)
+        done = bench.capture("dots:3", folder, accuracy=ACCURACY, noise_fraction=fraction)
+        # Stopped by eight of the nine frames, and by an estimate that is good to some percent.
+        assert 0 < done.manifest.mc_error < 1.1 * fraction * done.manifest.sensor_noise
+        manifest = json.loads((folder / "manifest.json").read_text())
+        assert manifest["configuration"]["noise_fraction"] == fraction
+        paths[fraction] = manifest["paths"]
+    assert paths[0.05] > 1.5 * paths[1.0]
+
+
+@pytest.mark.parametrize("fraction", [0.0, -0.1, 1.5, np.nan])
+def test_noise_fractions_that_make_no_sense(bench: Bench, tmp_path: Path, fraction: float) -> None:
+    with pytest.raises(MitsimError, match="noise_fraction"):
+        bench.capture("dots:3", tmp_path / "run", accuracy=ACCURACY, noise_fraction=fraction)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    "limits", [Limits(seconds=1e-3), Limits(memory_bytes=1e8), Limits(seconds=1e-9, memory_bytes=1e3)]
+)
+def test_what_frames_alone_take_is_looked_at_before_the_plan(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limits: Limits
+) -> None:
+    monkeypatch.setattr(capture, "make_plan", lambda *_: pytest.fail("work was begun"))
+    with pytest.raises(MitsimError, match="dots:3: would take about"):
+        bench.capture("dots:3", tmp_path / "run", accuracy=ACCURACY, job=Job(limits=limits))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_resumed_run_needs_room_for_its_missing_frames_only(
+    captured: Capture, bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nine frames take 0.3 MB; with all of them there, 0.06 MB are enough."""
+    monkeypatch.setattr("mitsim.core.resources.free_disk", lambda _: 6e4)
+    with pytest.raises(MitsimError, match="would write about"):
+        bench.capture("dots:3", tmp_path / "new", accuracy=ACCURACY, seed=5)
+    folder = Path(shutil.copytree(captured.folder, tmp_path / "run"))
+    bench.capture("dots:3", folder, accuracy=ACCURACY, seed=5, resume=True)
+    assert pixels(folder) == pixels(captured.folder)

@@ -1,0 +1,153 @@
+"""`mitsim sense`: an image of irradiance or radiance behind a camera's sensor."""
+
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mitsim.acquire.sense import check_ending, irradiance_behind_lens, read_image, sense
+from mitsim.bench.request import Exposure
+from mitsim.core.configuration import shipped
+from mitsim.core.errors import MitsimError
+from mitsim.core.exr import read_frame, write_frame
+from mitsim.devices.sensor import load_sensor
+from mitsim.sensor import chain, moments
+from tests.invented import sensor
+
+CAMERA = sensor(
+    full_well_e=8000.0, read_noise_e=3.0, gain_dn_per_e=0.47, black_level_dn=200.0, bits=12, quantum_efficiency=0.5
+)
+IMAGE = np.linspace(0, 2e-6, 60 * 80).reshape(60, 80)
+
+
+def test_an_image_is_exposed_and_read_as_a_capture_s_frame() -> None:
+    """Auto exposure fills 0.8 of the well at the brightest pixel; squared z-scores of all 4800 pixels, 5 deviations."""
+    frame = sense(IMAGE, CAMERA, seed=3)
+    assert frame.exposure_s == chain.exposure_for_peak(2e-6, 0.8, CAMERA, 550.0)
+    assert frame.electrons.max() == pytest.approx(6400, rel=1e-12)
+    mean, variance = moments.frame_moments(frame.electrons, frame.exposure_s, CAMERA)
+    squares = float((np.square(frame.digital - mean) / variance).sum())
+    assert abs(squares - IMAGE.size) < 5 * math.sqrt(2 * IMAGE.size)
+    assert np.array_equal(frame.digital, sense(IMAGE, CAMERA, seed=3).digital)
+    assert not np.array_equal(frame.digital, sense(IMAGE, CAMERA, seed=4).digital)
+    assert not frame.warnings and frame.summary()["shape"] == [60, 80]
+
+
+def test_seconds_by_hand_and_saturation_are_as_a_capture_has_them() -> None:
+    auto = sense(IMAGE, CAMERA)
+    longer = sense(IMAGE, CAMERA, Exposure(2 * auto.exposure_s))
+    np.testing.assert_allclose(longer.electrons, 2 * auto.electrons)
+    # Beyond 8000 of 12 800 electrons: the upper 3/8 of the pixels, half of those at the well itself by read noise.
+    assert 0.17 < longer.saturated / IMAGE.size < 0.39
+    assert "saturation" in longer.warnings[0]
+
+
+def test_a_reading_at_the_well_that_light_cannot_have_filled_is_read_noise_as_in_a_capture() -> None:
+    """Light of 0.9 of the well, 9 deviations below it; of 4800 readings with 400 electrons of noise some lie above.
+
+    (Planted: the well in place of the chance that light fills it.) One pixel at twice the light is saturated, and then
+    all readings at the well count.
+    """
+    noisy = CAMERA.model_copy(update={"read_noise_e": 400.0, "bits": 14})
+    even = np.full((60, 80), 1e-6)
+    frame = sense(even, noisy, Exposure(fraction=0.9))
+    assert frame.digital.max() >= math.floor(noisy.full_well_dn) and frame.saturated == 0 and not frame.warnings
+    even[3, 4] = 2e-6
+    bright = sense(even, noisy, Exposure(frame.exposure_s))
+    assert bright.saturated == np.count_nonzero(bright.digital >= math.floor(noisy.full_well_dn)) > 10
+
+
+def test_a_lens_of_f_number_n_images_radiance_l_as_pi_l_over_4_n_squared() -> None:
+    assert irradiance_behind_lens(np.array([[4.0]]), 2.0)[0, 0] == pytest.approx(math.pi / 4)
+    with pytest.raises(MitsimError, match="f_number"):
+        irradiance_behind_lens(IMAGE, 0.1)
+
+
+@pytest.mark.parametrize("ending", [".png", ".exr", ".npy"])
+def test_numbers_are_written_whole_in_every_format(tmp_path: Path, ending: str) -> None:
+    frame = sense(IMAGE, CAMERA)
+    path = frame.save(tmp_path / f"frame{ending}")
+    if ending == ".exr":
+        channels, facts = read_frame(path)
+        numbers = channels["DN"]
+        assert facts["exposure_s"] == frame.exposure_s and set(channels) == {"DN", "electrons"}
+    else:
+        numbers = np.load(path) if ending == ".npy" else np.asarray(Image.open(path))
+    assert np.array_equal(numbers, frame.digital)
+
+
+def test_images_of_other_renderers_are_read(tmp_path: Path) -> None:
+    parts = {name: np.full((2, 3), value, np.float32) for name, value in (("R", 1.0), ("G", 2.0), ("B", 4.0))}
+    write_frame(tmp_path / "rgb.exr", parts, {})
+    light, notes = read_image(tmp_path / "rgb.exr")
+    np.testing.assert_allclose(light, 0.2126 + 2 * 0.7152 + 4 * 0.0722, rtol=1e-6)
+    assert "luminance" in notes[0] and read_image(tmp_path / "rgb.exr", "G")[0][0, 0] == 2
+    write_frame(tmp_path / "render.exr", {"Y": parts["R"], "error.Y": parts["B"]}, {})
+    assert read_image(tmp_path / "render.exr")[0].max() == 1 and not read_image(tmp_path / "render.exr")[1]
+    np.save(tmp_path / "image.npy", IMAGE)
+    assert np.array_equal(read_image(tmp_path / "image.npy")[0], IMAGE)
+
+
+def test_what_is_no_image_is_refused_in_a_line(tmp_path: Path) -> None:
+    write_frame(tmp_path / "two.exr", {name: np.ones((2, 2), np.float32) for name in "ab"}, {})
+    for name, channel, message in (
+        ("two.exr", None, "a, b"),
+        ("two.exr", "c", "no channel 'c'"),
+        ("x.jpg", None, "OpenEXR"),
+    ):
+        with pytest.raises(MitsimError, match=message):
+            read_image(tmp_path / name, channel)
+    (tmp_path / "bad.npy").write_text("no array")
+    with pytest.raises(MitsimError, match="not an array"):
+        read_image(tmp_path / "bad.npy")
+    for values in (np.full((2, 2), 1 + 1j), np.full((2, 2), "1")):  # (planted: imaginary parts dropped)
+        np.save(tmp_path / "bad.npy", values)
+        with pytest.raises(MitsimError, match=r"not an array .* no real numbers"):
+            read_image(tmp_path / "bad.npy")
+    with pytest.raises(MitsimError, match="an array has no channel 'R'"):
+        read_image(tmp_path / "bad.npy", "R")
+    for image in (np.array([[1.0, -1.0]]), np.array([[math.nan]]), np.ones(3), np.ones((0, 2))):
+        with pytest.raises(MitsimError, match="image"):
+            sense(image, CAMERA)
+    for scale in (1e300, 1e-30):  # (planted: exposures of 1e-303 s taken)
+        with pytest.raises(MitsimError, match=r"exposures are 1e-12 to .*; check the image's unit"):
+            sense(np.full((2, 2), scale), CAMERA)
+    with pytest.raises(MitsimError, match="quantum_efficiency"):
+        sense(IMAGE, sensor(quantum_efficiency=None))
+    with pytest.raises(MitsimError, match="wavelength"):
+        sense(IMAGE, CAMERA, wavelength_nm=0.0)
+    with pytest.raises(MitsimError, match="mosaic BGGR of colour filters, which an image of one channel"):
+        sense(IMAGE, load_sensor(shipped("calibration", "ov5647.toml")))
+
+
+def test_a_png_holds_16_bits(tmp_path: Path) -> None:
+    for model in (sensor(bits=None), sensor(bits=16, binning=2)):
+        with pytest.raises(MitsimError, match="16 bits end"):
+            check_ending(tmp_path / "x.png", model)
+    with pytest.raises(MitsimError, match="ends in"):
+        check_ending(tmp_path / "x.jpg", sensor())
+
+
+def test_an_array_that_claims_is_held_against_its_file(tmp_path: Path) -> None:
+    """Sparse, cut in its header, or of more pixels than a sensor has. (Planted: numpy's reader, which raises a
+    TokenError for the second.)"""
+    np.save(tmp_path / "image.npy", IMAGE)
+    whole = (tmp_path / "image.npy").read_bytes()
+    for content, size, words in (
+        (whole, 1 << 40, "and 1099511627648 follow"),
+        (whole.replace(b"'shape': (", b"'shape'  (("), len(whole), "not an array of numbers"),
+        (whole.replace(b"}", b"{"), len(whole), "header is damaged|not an array"),
+        (whole[:-1], len(whole) - 1, "its header claims"),
+    ):
+        (tmp_path / "bad.npy").write_bytes(content)
+        os.truncate(tmp_path / "bad.npy", size)
+        with pytest.raises(MitsimError, match=words):
+            read_image(tmp_path / "bad.npy")
+    np.lib.format.open_memmap(tmp_path / "wide.npy", "w+", np.float64, (1, 20000)).flush()
+    np.lib.format.open_memmap(tmp_path / "large.npy", "w+", np.uint8, (8193, 8192)).flush()
+    for name in ("wide", "large"):
+        with pytest.raises(MitsimError, match="at most 16384 pixels a side and 67108864 in all"):
+            read_image(tmp_path / f"{name}.npy")

@@ -1,0 +1,99 @@
+"""Shots that are exposed in chunks while files of the chunk before are written, on a rig of plain numbers."""
+
+from __future__ import annotations
+
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from mitsim.acquire import exposure as exposing
+from mitsim.acquire.capture import Shooting, Totals
+from mitsim.core.errors import MitsimError
+from mitsim.core.job import Job
+from mitsim.core.runs import RunMemory
+from mitsim.devices.patterns import parse_patterns
+from mitsim.light.settings import GROUPS
+from mitsim.optics import frames as forming
+from mitsim.planner.memory import frames_at_once, frames_bytes
+from tests.unit.acquire.test_exposer import PIXELS, exposer, frame
+from tests.unit.optics.small_camera import LABELS, SPLIT, expected_frames, random_groups, small_optics
+
+FAMILY = parse_patterns("dots:5", 10)
+FRAMES = [frame(1e-6 * (2 + index)) for index in range(25)]
+
+
+def shot(recorder: RunMemory) -> Shooting:
+    shooting = Shooting(FAMILY, recorder, exposer(), None, np.zeros((PIXELS, PIXELS)))
+    shooting.shoot(FRAMES, Job())
+    return shooting
+
+
+def test_a_large_sensor_s_frames_are_exposed_a_few_at_a_time() -> None:
+    assert [frames_at_once(pixels**2) for pixels in (8, 512, 1024, 2048, 8192)] == [16, 16, 16, 4, 1]
+
+
+@pytest.mark.parametrize("together", [1, 7, 100])
+def test_shots_are_the_same_however_many_are_exposed_at_a_time(together: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bit by bit, and with them what is told of all. (Planted: noise named by the place in the chunk; the last chunk's
+    files not waited for; its sums left out.)"""
+    one, other = RunMemory(), RunMemory()
+    first = shot(one)
+    monkeypatch.setattr(exposing, "FRAMES_AT_ONCE", together)
+    second = shot(other)
+    assert one.files.keys() == other.files.keys() and len(one.files) == 25
+    for name, (channels, metadata) in one.files.items():
+        assert metadata == other.files[name][1]
+        assert all(np.array_equal(values, other.files[name][0][channel]) for channel, values in channels.items())
+    for told in ("sensor_noise", "saturated", "noise_ratio", "dilution", "ambient_part", "noise_to_signal"):
+        assert getattr(first, told) == getattr(second, told)
+    electrons = np.array([channels["electrons"] for channels, _ in one.files.values()], dtype=np.float64)
+    assert first.sensor_noise**2 * np.square(electrons).sum() == pytest.approx((electrons + 9).sum(), rel=1e-6)
+
+
+def test_a_file_that_cannot_be_written_ends_the_shooting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In one line, whichever of the chunks it is in; frames that are not begun are not written either."""
+    monkeypatch.setattr(exposing, "FRAMES_AT_ONCE", 4)
+    for bad in ("frame_00000.exr", "frame_00024.exr"):
+
+        class Full(RunMemory):
+            def _write(self, name, channels, metadata, bad=bad) -> None:
+                if name == bad:
+                    raise MitsimError(f"file {name}: cannot be written (No space left on device)")
+                super()._write(name, channels, metadata)
+
+        recorder = Full()
+        with pytest.raises(MitsimError, match=f"^file {bad}: cannot be written"):
+            shot(recorder)
+        assert bad not in recorder.files and len(recorder.files) <= (24 if bad.endswith("24.exr") else 8)
+
+
+@pytest.mark.parametrize("mixed", [True, False])
+def test_frames_take_as_much_memory_as_is_predicted(mixed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Thirty-six shots of 200 x 200 pixels, mixed from classes that are held or formed one by one: half to all of it.
+
+    (Planted: chunks that are kept until all is written; frames formed 36 at a time, where 5 are predicted.)
+    """
+    pixels, shots = 200, 36
+    for room, count in ((forming, 5), (exposing, 4)):
+        monkeypatch.setattr(room, "_BYTES_AT_ONCE", count * 8 * pixels**2)
+    classes, labels = (4, LABELS) if mixed else (12, SPLIT)
+    if not mixed:
+        monkeypatch.setattr(forming, "_BASIS_BYTES", 1)
+    weights = np.random.default_rng(3).random((shots, classes))
+
+    class Nowhere(RunMemory):
+        def _write(self, name, channels, metadata) -> None:
+            """Kept by nobody."""
+
+    expected = expected_frames(small_optics(pixels), random_groups(GROUPS, 7), labels, weights, 0)
+    shooting = Shooting(parse_patterns("dots:6", 12), Nowhere(), exposer(), None, np.zeros((pixels, pixels)))
+    tracemalloc.start()
+    try:
+        totals = Totals.of(expected)
+        shooting.shoot(expected, Job())
+        taken = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert totals.peak > 0 and shooting.sensor_noise > 0
+    assert 0.4 < taken / frames_bytes(classes, shots, pixels) < 1

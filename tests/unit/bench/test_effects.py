@@ -1,0 +1,214 @@
+"""The registry of effects: each has a neutral value that passes light through, and adding one touches little."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mitsim
+from mitsim.api.bench import Bench, open_bench
+from mitsim.bench import effects
+from mitsim.bench.effects import EFFECTS, Effect, Physics, _registry, _value
+from mitsim.core.errors import ArgumentError
+from mitsim.devices.patterns import Lighting
+from mitsim.light.passes import Simulation
+from mitsim.light.settings import Settings
+
+pytestmark = pytest.mark.usefixtures("variant")
+N, Z = 16, 400.0
+IDEAL = 'name = "pinhole"\neffective_wavelength_nm = 562.0\n'
+REAL = f"{IDEAL}contrast_ratio = 100.0\naperture_radius_mm = 3.0\nblur_pixels = 0.6\nspeckle_contrast = 0.02\n"
+NUMBERS = (
+    '<float name="mask_thickness" value="0.05"/><float name="pixel_fill_factor" value="0.6"/>'
+    '<float name="angular_exponent" value="3"/>'
+)
+LAMP_AND_MIRROR = """<emitter type="constant"><spectrum name="radiance" value="0.2"/></emitter>
+    <shape type="rectangle"><transform name="to_world"><scale x="5" y="5"/><rotate y="1" angle="170"/>
+    <translate x="-90" z="300"/></transform><bsdf type="conductor"/></shape>"""
+ALWAYS = ("interreflection", "diffraction")
+"""Light turns at several surfaces and bends at masks wherever there are any."""
+TOY = Path(__file__).with_name("toy_effect.patch")
+
+
+def device(tmp_path_factory: pytest.TempPathFactory, text: str) -> Path:
+    path = tmp_path_factory.mktemp("projector") / "projector.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.fixture(scope="module")
+def everything(shared_scene: Callable[..., Path], variant: str, tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    """A bench that has every effect."""
+    path = shared_scene("everything", extra=LAMP_AND_MIRROR)
+    fov = '<float name="fov" value="20"/>'
+    path.write_text(path.read_text().replace(fov, fov + NUMBERS))
+    return open_bench(path, variant, projector=device(tmp_path_factory, REAL))
+
+
+@pytest.fixture(scope="module")
+def nothing(shared_scene: Callable[..., Path], variant: str, tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    """A flat sheet, a thin mask, whole pixels and a pinhole that is black where it shows black."""
+    return open_bench(shared_scene("nothing"), variant, projector=device(tmp_path_factory, IDEAL))
+
+
+def frame(bench: Bench, *names: str) -> np.ndarray:
+    """A half-bright shot of direct and followed light, by the same paths whatever effects are on."""
+    simulation = Simulation(bench, Settings(depth=Z, effects=frozenset(names)))
+    labels = np.zeros(N * N, dtype=np.int64)
+    light = simulation.file_direct(simulation.direct.trace(3, 0, 8), labels, 8)
+    light = light + simulation.file_followed(simulation.follow(3, 4), labels, 4)
+    (shot,) = simulation.expected([light], np.zeros(1, dtype=np.int64), Lighting(labels, np.array([[0.5]])), 0)
+    return shot.irradiance
+
+
+def test_a_bench_has_what_its_devices_and_scene_have(everything: Bench, nothing: Bench) -> None:
+    assert effects.present(everything) == tuple(EFFECTS)
+    assert effects.present(nothing) == ALWAYS
+    for name, effect in EFFECTS.items():
+        assert effect.name == name and effect.present(everything) and effect.present(nothing) == (name in ALWAYS)
+        assert effect.absent or name in ALWAYS, "a plan says why it is left off"
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_neutral_values(everything: Bench, name: str) -> None:
+    """Taken off, an effect has its neutral values, and no other effect has lost any."""
+    physics = Physics.of(everything)
+    without = EFFECTS[name].without(physics)
+    changed = {
+        field
+        for effect in EFFECTS.values()
+        for field in effect.neutral
+        if _value(without, field) != _value(physics, field)
+    }
+    assert changed == set(EFFECTS[name].neutral)
+    assert all(_value(without, field) == value for field, value in EFFECTS[name].neutral.items())
+
+
+def test_a_simulation_has_what_is_on(everything: Bench) -> None:
+    for name in EFFECTS:
+        physics = Physics.simulated(everything, {name})
+        on = {
+            other
+            for other, effect in EFFECTS.items()
+            if any(_value(physics, f) != v for f, v in effect.neutral.items())
+        }
+        assert on == {name}
+
+
+@pytest.mark.parametrize("name", [name for name in EFFECTS if name != "diffraction"])
+def test_neutral_values_pass_light_through(nothing: Bench, name: str) -> None:
+    """Switched on where a bench has no such thing, an effect changes no pixel, but for the order of sums (1e-12).
+
+    Light over several surfaces is none before one flat sheet. A geometric shadow is its own closed form
+    (tests/unit/light/test_simulation.py), so diffraction is left out.
+    """
+    off, on = frame(nothing), frame(nothing, name)
+    assert off.any() and np.abs(on - off).max() <= 1e-12 * off.max()
+
+
+def test_the_registry_refuses_duplicates_and_changes() -> None:
+    blur = EFFECTS["blur"]
+    assert list(_registry(blur, EFFECTS["aperture"])) == ["blur", "aperture"]
+    with pytest.raises(ValueError, match="'blur' is registered twice"):
+        _registry(blur, EFFECTS["aperture"], Effect("blur", {"mirrors": False}))
+    with pytest.raises(TypeError):
+        EFFECTS["fog"] = blur  # type: ignore[index]
+
+
+def test_switches() -> None:
+    assert effects.parse_switches("") == {}
+    assert effects.parse_switches(" +ambient, -anchors,+ambient") == {"ambient": True, "anchors": False}
+    for text in ("fog", "+fog", "ambient", "+ambient,-ambient", "+", "+-ambient"):
+        with pytest.raises(ArgumentError) as caught:
+            effects.parse_switches(text)
+        assert caught.value.argument == "effects" and repr(text) in str(caught.value)
+    assert effects.check_switches({"blur": False}) == {"blur": False}
+    with pytest.raises(ArgumentError, match="fog"):
+        effects.check_switches({"fog": True})
+
+
+# ---- a new effect ----------------------------------------------------------------------------------------------------
+
+PROGRAM = """
+import json, pathlib, sys
+import mitsim
+from mitsim import cli
+assert pathlib.Path(mitsim.__file__).parents[1] == pathlib.Path.cwd(), mitsim.__file__
+for arguments in json.loads(sys.argv[1]):
+    sys.argv = ["mitsim", *arguments]
+    try:
+        cli.run()
+    except SystemExit as stop:
+        assert stop.code in (0, 1), stop.code
+"""
+
+
+def test_a_new_effect_is_an_entry_and_its_physics(small_scene: Callable[..., Path], tmp_path: Path) -> None:
+    """`dimming`: a lamp at 90 % where the projector's name says so, added to a copy of the package by a patch.
+
+    Plan, pilot, command line and capture follow without a change. Leaving it out makes frames 1/0.9 as bright.
+    """
+    patch = TOY.read_text()
+    assert re.findall(r"^\+\+\+ b/(.*)$", patch, re.MULTILINE) == [
+        "mitsim/bench/effects.py",
+        "mitsim/light/passes.py",
+    ]
+    assert len(re.findall(r"^\+(?!\+)", patch, re.MULTILINE)) <= 8, "lines that a new effect takes"
+    package = Path(mitsim.__file__).parent
+    copy = tmp_path / "copy"
+    shutil.copytree(package, copy / "mitsim")  # with its byte code: modules that stay as they are load at once
+    for shelf in ("scenes", "calibration"):
+        (copy / shelf).symlink_to(package.parent / shelf)
+    subprocess.run(["git", "apply", str(TOY)], cwd=copy, check=True)
+    dimmed, full = tmp_path / "dimmed.toml", tmp_path / "full.toml"
+    dimmed.write_text('name = "dimmed"\neffective_wavelength_nm = 562.0\n')
+    full.write_text('name = "full"\neffective_wavelength_nm = 562.0\n')
+    rig = [str(small_scene()), "--patterns", "uniform", "--accuracy", "0.02", "--json"]
+    shot = ["--exposure", "0.01", "-o"]
+    off, changed = "--effects=-dimming", ["--projector", str(dimmed)]
+    calls = [
+        ["plan", *rig, "--projector", str(full)],
+        ["capture", *rig, *changed, *shot, str(tmp_path / "on")],
+        ["capture", *rig, *changed, off, *shot, str(tmp_path / "off")],
+    ]
+    command = [sys.executable, "-c", PROGRAM, json.dumps(calls)]
+    done = subprocess.run(command, cwd=copy, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    plans = [
+        json.loads(done.stdout.splitlines()[0]),
+        *(json.loads((tmp_path / name / "manifest.json").read_text())["plan"] for name in ("on", "off")),
+    ]
+    absent, on, left_out = (next(row for row in plan["effects"] if row["name"] == "dimming") for plan in plans)
+    assert on["state"] == "exact" and on["error_if_off"] == pytest.approx(1 / 0.9 - 1, rel=1e-6)
+    assert left_out["state"] == "off" and "switched by the user" in left_out["reason"]
+    assert any("dimming (off)" in warning for warning in plans[2]["warnings"])
+    assert (absent["state"], absent["error_if_off"]) == ("off", 0.0) and "gives all" in absent["reason"]
+    bright, dim = (electrons(tmp_path / name) for name in ("off", "on"))
+    # The same paths: what is left is single precision.
+    assert np.abs(dim - 0.9 * bright).max() < 1e-6 * bright.max()
+
+
+def electrons(run: Path) -> Any:
+    return mitsim.load_run(run).electrons
+
+
+def test_computed_speckle_is_that_of_the_shots(small_scene: Callable[..., Path], tmp_path: Path, variant: str) -> None:
+    """A scanned beam averages over fewer places under dots; frames have the family's contrast, and none without it."""
+    projector = tmp_path / "laser.toml"
+    projector.write_text(IDEAL + "[speckle]\nbeam_radius_mm = 0.5\n", encoding="utf-8")
+    bench = open_bench(small_scene(), variant, None, projector)
+    white, dots = bench.speckle(), bench.speckle(bench.family("dots:4"))
+    assert 0 < white < dots < 1 and Physics.of(bench).speckle == white and "speckle" in effects.present(bench)
+    assert bench.speckle(bench.family("uniform")) == pytest.approx(white)
+    light = bench.light("dots:4", accuracy=1e-2, effects={"speckle": True})
+    assert light.speckle(bench.family("dots:4")) == dots
+    assert bench.light("dots:4", accuracy=1e-2, effects={"speckle": False}).speckle(bench.family("dots:4")) == 0

@@ -1,0 +1,157 @@
+"""The search for the least light, and sessions that are found by it, against sessions that are run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mitsim as ms
+from mitsim.acquire.capture import digital_scale
+from mitsim.calibrate.calibrate import estimate
+from mitsim.calibrate.plan import least_dose
+from mitsim.calibrate.session import Session
+from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.job import Job
+from mitsim.core.manifests import CalibrationManifest
+from mitsim.devices.session import MOST_REPEATS, SessionRecipe, load_recipe, recipe_text
+from mitsim.reconstruct.factors import Factors
+
+SMALLEST = 1e-6
+
+
+def curve(ceiling_db: float, noise: float) -> tuple[Callable[[float], float], list[float]]:
+    """PSNR of a mean squared error a + b / dose, and the doses that it was asked for."""
+    asked: list[float] = []
+
+    @cache
+    def quality(dose: float) -> float:
+        asked.append(dose)
+        return -10 * math.log10(10 ** (-ceiling_db / 10) + noise / dose)
+
+    return quality, asked
+
+
+@pytest.mark.parametrize("wanted", [12.0, 25.0, 31.0, 38.5])
+def test_the_least_part_of_an_exposure_is_found_to_a_twentieth_of_a_decibel(wanted: float) -> None:
+    quality, asked = curve(40.0, 1e-5)
+    dose = least_dose(quality, wanted, SMALLEST)
+    exact = 1e-5 / (10 ** (-wanted / 10) - 1e-4)
+    assert exact <= dose <= 1 and 0 <= quality(dose) - wanted <= 0.051
+    assert len(asked) <= 12  # each is an image or several
+
+
+@pytest.mark.parametrize(("wanted", "noise"), [(30.0, 3e-3), (36.0, 3e-3), (39.0, 4e-4), (39.9, 1.5e-3)])
+def test_the_fewest_repeats_are_found_to_a_twentieth_of_a_decibel(wanted: float, noise: float) -> None:
+    quality, asked = curve(40.0, noise)
+    repeats = least_dose(quality, wanted, SMALLEST)
+    exact = noise / (10 ** (-wanted / 10) - 1e-4)
+    assert exact <= repeats < 1.01 * exact + 1 or quality(repeats) - wanted <= 0.05
+    assert quality(repeats) >= wanted and repeats == round(repeats) > 1
+    assert len(asked) <= 14
+
+
+def test_beyond_all_light_and_below_the_least_it_ends() -> None:
+    assert least_dose(curve(40.0, 1.0)[0], 39.0, SMALLEST) == MOST_REPEATS
+    assert least_dose(curve(40.0, 1e-12)[0], 20.0, SMALLEST) == SMALLEST
+    assert least_dose(lambda dose: 31.0 if dose >= 5 else 29.9, 30.0, SMALLEST) == 5
+
+
+def test_a_recipe_is_written_as_it_is_read(tmp_path: Path) -> None:
+    recipe = load_recipe().model_copy(
+        update={"exposure_fraction": 1.23e-5, "repeats": 7, "source": 'a "word", and \\ more'}
+    )
+    file = tmp_path / "recipe.toml"
+    file.write_text(recipe_text(recipe), encoding="utf-8")
+    assert load_recipe(file) == recipe
+    fields = {name: field.default for name, field in SessionRecipe.model_fields.items() if not field.is_required()}
+    file.write_text(recipe_text(recipe.model_copy(update=fields)), encoding="utf-8")
+    assert load_recipe(file) == recipe.model_copy(update=fields)
+
+
+@pytest.mark.parametrize("change", [{"exposure_ladder": (1.0, 4.0)}, {"dark_frames": 8}, {"depths": (350.0, 450.0)}])
+def test_a_recipe_that_a_plan_does_not_know_is_refused(bench: Any, change: dict[str, Any]) -> None:
+    recipe = load_recipe().model_copy(update={"signed_capture": "uniform", **change})
+    with pytest.raises(MitsimError, match=r"^recipe: has .*leave"):
+        ms.plan_calibration(bench, 30.0, recipe=recipe)
+
+
+def test_a_quality_that_no_image_has_is_refused(bench: Any) -> None:
+    for psnr in (0.0, 101.0, float("nan")):
+        with pytest.raises(ArgumentError, match="give 1 to 100 dB"):
+            ms.plan_calibration(bench, psnr)
+
+
+@pytest.fixture(scope="module")
+def bench(shared_scene: Callable[..., Path], variant: str) -> Any:
+    steps = np.kron(np.random.default_rng(3).integers(30, 220, (8, 8)), np.ones((2, 2)))
+    return ms.open_bench(shared_scene("planned", n=16, reflectance=steps), variant)
+
+
+@pytest.fixture(scope="module")
+def plan(bench: Any, kept_plans: None) -> ms.CalibrationPlan:
+    return ms.plan_calibration(bench, 30.0, "dots:2", accuracy=0.005)
+
+
+@pytest.mark.slow
+def test_a_session_by_the_plan_has_the_images_that_it_promised(bench: Any, plan: ms.CalibrationPlan) -> None:
+    """Four sessions, each with noise of its own; an image of 256 pixels scatters, as the plan says itself."""
+    assert plan.reached and not plan.warnings and plan.ceiling.psnr_db > plan.trial.psnr_db + 3
+    assert plan.recipe.exposure_fraction < 0.8 and plan.recipe.repeats == 1
+    found = []
+    for seed in range(1, 5):
+        shots = bench.capture("dots:2", seed=seed, accuracy=0.005)
+        factors = bench.calibrate(seed, 0.005, plan.recipe)
+        assert factors.manifest.result["frames"] == plan.frames
+        assert factors.manifest.result["exposure_s"] == pytest.approx(plan.exposure_s, rel=0.01)
+        found.append(ms.psnr(ms.reconstruct(shots, factors).image, shots.truth))
+    error = plan.trial.spread_db * math.sqrt(1 / 4 + 1 / 6)
+    assert np.mean(found) == pytest.approx(plan.trial.psnr_db, abs=0.3 + 3 * error)
+
+
+def test_its_light_is_that_of_the_session(bench: Any, plan: ms.CalibrationPlan) -> None:
+    """A quarter of the mask's shadow is open where both rows and columns are: the mean is less than the peak's half."""
+    said = plan.payload()
+    peak = plan.recipe.exposure_fraction * bench.sensor.superpixel_full_well_e
+    assert 0.05 * peak < plan.electrons < 0.5 * peak
+    assert plan.photons == pytest.approx(plan.electrons / bench.sensor.quantum_efficiency)
+    assert said["exposure_total_s"] == pytest.approx(plan.frames * plan.exposure_s)
+    assert said["electrons_a_pixel_total"] == pytest.approx(plan.frames * plan.electrons)
+    assert plan.simulation_s > 0 and "30 dB under dots:2" in plan.lines()[0]
+
+
+def test_more_than_the_capture_allows_is_said_in_one_line(bench: Any, kept_plans: None) -> None:
+    plan = ms.plan_calibration(bench, 75.0, "dots:2", accuracy=0.005)
+    assert not plan.reached and plan.recipe.repeats == 1
+    (line,) = plan.warnings
+    assert "75 dB cannot be reached under dots:2" in line and f"{plan.ceiling.psnr_db:.1f} dB" in line
+    assert "most of its error is" in line and "\n" not in line
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["photograph", "colour_chart", "resolution_target"])
+@pytest.mark.parametrize("wanted", [30.0, 35.0])
+def test_the_promise_is_kept_within_half_a_decibel(scene: str, wanted: float, variant: str, kept_plans: None) -> None:
+    """Mean PSNR of four sessions, every frame of them exposed, in other light than the plan's, against the plan's.
+
+    Single sessions scatter by 0.4 dB and the difference of the means by 0.25 dB, so that nineteen in twenty keep it;
+    these seeds do. docs/studies.md has six sessions of each.
+    """
+    bench = ms.open_bench(scene, variant)
+    patterns = "dots:5" if scene == "resolution_target" else "dots:7"
+    plan = ms.plan_calibration(bench, wanted, patterns)
+    assert plan.reached
+    shots, session = bench.capture(patterns, seed=11), Session(bench, plan.recipe, 11)
+    lit = session.lit(session.trace(session.plan(1e-3, Job()), Job()), Job())
+    manifest = CalibrationManifest(camera=bench.identity(), digital=digital_scale(bench, lit.exposure_s))
+    found = []
+    for seed in range(11, 15):
+        estimated, _ = estimate(replace(lit, session=replace(session, seed=seed)), Job())
+        found.append(ms.psnr(ms.reconstruct(shots, Factors.of(estimated, manifest)).image, shots.truth))
+    assert np.mean(found) == pytest.approx(plan.trial.psnr_db, abs=0.5)

@@ -1,0 +1,473 @@
+"""Calibration sessions: factors that are the camera's geometric shadow, with the error that their noise predicts.
+
+Few electrons (1 % of full well) make the sensor's noise the only error that counts.
+"""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mitsim.acquire.exposure import Exposer
+from mitsim.api.bench import Bench, open_bench
+from mitsim.bench.effects import EFFECTS
+from mitsim.calibrate.calibrate import Checkpoint, calibrate
+from mitsim.calibrate.session import Session, session_cost
+from mitsim.core.errors import MitsimError
+from mitsim.core.exr import checksum, read_frame
+from mitsim.core.job import Job
+from mitsim.devices.camera import CameraGeometry, centred_edges
+from mitsim.devices.framelist import FrameList
+from mitsim.devices.patterns import Lighting
+from mitsim.devices.session import SIDES, SessionRecipe, load_recipe
+from mitsim.light.plan import Plan
+from mitsim.light.settings import LANES_AT_ONCE, Settings
+from mitsim.optics.frames import mixes
+from mitsim.optics.shadow import scene_factor
+from mitsim.planner.memory import FRAMES_AT_ONCE, frame_seconds
+from mitsim.planner.planner import make_plan
+from mitsim.reconstruct.captured_session import calibrate_frames
+from mitsim.reconstruct.estimate_factors import Estimate
+from mitsim.reconstruct.factors import Factors, load_calibration
+
+pytestmark = pytest.mark.usefixtures("kept_plans")
+N = 16
+CASES = [("separable", "pair", 16), ("separable", "uniform", 16), ("flatcam", "pair", 16)]
+CASES += [pytest.param("separable", "pair", 13, marks=pytest.mark.slow)]
+Done = tuple[Bench, Factors, Estimate, Path]
+"""The bench, its factors, the estimate that they were made of, and their folder."""
+
+
+def geometric_plan(*arguments: object) -> Plan:
+    """Direct light through a geometric mask."""
+    return make_plan(*arguments, switches=dict.fromkeys(EFFECTS, False))
+
+
+def recipe(mode: str, fraction: float = 0.01) -> SessionRecipe:
+    return load_recipe().model_copy(update={"exposure_fraction": fraction, "signed_capture": mode})
+
+
+@pytest.fixture(scope="module")
+def session(
+    shared_scene: Callable[..., Path], variant: str, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[..., Done]:
+    made: dict[tuple[str, str, int], Done] = {}
+
+    def run(mask: str, mode: str, n: int) -> Done:
+        key = mask, mode, n
+        if key not in made:
+            bench = open_bench(shared_scene(f"{mask}{n}", mask=mask, n=n), variant)
+            folder = tmp_path_factory.mktemp("calibration") / "cal"
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr("mitsim.calibrate.session.make_plan", geometric_plan)
+                factors = bench.calibrate(2, recipe=recipe(mode), output=folder)
+            made[key] = bench, factors, factors.estimate, folder
+        return made[key]
+
+    return run
+
+
+def test_each_depth_has_factors_of_its_own(
+    shared_scene: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At each depth those of the geometric shadow there: rows from the axis, columns from 60 mm beside it, off
+    by their predicted error. In folders called by depth, which stay as they are when resumed; with the
+    parallax from there. (Planted: the board always on the aligned plane, one seed for all depths.)"""
+    monkeypatch.setattr("mitsim.calibrate.session.make_plan", geometric_plan)
+    bench = open_bench(shared_scene("depths16", n=16))
+    depths = recipe("pair").model_copy(update={"depths": (350.0, 450.0)})
+    found = bench.calibrate_depths(2, recipe=depths, output=tmp_path / "cal")
+    geometry = bench.geometry
+    code = geometry.build_mask().terms[-1][1]
+    for depth, factors in found.items():
+        assert factors.estimate is not None and factors.status.ok
+        half, centre = 60 * depth / 400, 60 * (1 - depth / 400)
+        errors = factors.estimate.predicted_error
+        for side, middle, error in zip((factors.left, factors.right), (0.0, centre), errors, strict=True):
+            # Columns run down -x, and the projector stands at +x.
+            edges = np.linspace(-half, half, N + 1) - middle
+            shadow = scene_factor(
+                code, geometry.mask_feature, geometry.pixel_edges, edges, geometry.mask_distance, depth
+            )
+            scale = (side * shadow).sum(axis=0) / np.square(shadow).sum(axis=0)
+            rest = np.linalg.norm(side - scale * shadow) / np.linalg.norm(side)
+            assert rest == pytest.approx(error, rel=0.3)
+        result, parallax = factors.manifest.result, factors.manifest.parallax
+        assert result["depth_mm"] == depth and parallax is not None and parallax.depth_mm == depth
+        assert parallax.column_tan == pytest.approx(np.array([-half - centre, half - centre]) / depth, abs=1e-5)
+        assert parallax.column_mm == pytest.approx((-60, -60), abs=1e-3)
+        folder = tmp_path / "cal" / f"{depth:g}"
+        assert np.array_equal(load_calibration(folder).left, factors.left)
+    assert len({factors.manifest.configuration["seed"] for factors in found.values()}) == 2
+    stamp = (tmp_path / "cal" / "350" / "manifest.json").stat().st_mtime_ns
+    again = bench.calibrate_depths(2, recipe=depths, output=tmp_path / "cal", resume=True)
+    assert np.array_equal(again[450.0].right, found[450.0].right)
+    assert (tmp_path / "cal" / "350" / "manifest.json").stat().st_mtime_ns == stamp
+    with pytest.raises(MitsimError, match="use calibrate_depths"):
+        bench.calibrate(recipe=depths)
+    with pytest.raises(MitsimError, match="has no depths"):
+        bench.calibrate_depths()
+    with pytest.raises(MitsimError, match="the mask ends 2 mm"):
+        bench.calibrate_depths(recipe=depths.model_copy(update={"depths": (1.5,)}))
+
+
+def geometric(bench: Bench) -> np.ndarray:
+    """(pixels, n) shadow of the mask's code by projector pixels of 120 mm / n at 400 mm; flatcam: centred."""
+    geometry = bench.geometry
+    code = geometry.build_mask().terms[-1][1]
+    scene = centred_edges(bench.n, 120.0 / bench.n)
+    factor = scene_factor(code, geometry.mask_feature, geometry.pixel_edges, scene, geometry.mask_distance, 400.0)
+    return factor - factor.mean(axis=0) if geometry.mask == "flatcam" else factor
+
+
+@pytest.mark.parametrize(("mask", "mode", "n"), CASES)
+def test_factors_are_the_geometric_shadow_within_their_noise(
+    session: Callable[..., Done], mask: str, mode: str, n: int
+) -> None:
+    """Each column up to its own scale (falloff makes them 1 % different): the rest is the predicted noise.
+
+    1008 numbers a side tell a noise to 2 %; the light's fall-off inside a projector pixel adds a per mille.
+    """
+    bench, _, calibration, _ = session(mask, mode, n)
+    truth = geometric(bench)
+    for factor, predicted in zip((calibration.left, calibration.right), calibration.predicted_error, strict=True):
+        scale = (factor * truth).sum(axis=0) / np.square(truth).sum(axis=0)
+        assert np.ptp(scale) < (0.1 if mask == "separable" else 1.0) * abs(scale.mean())
+        error = np.linalg.norm(factor - truth * scale) / np.linalg.norm(factor)
+        assert error == pytest.approx(predicted, rel=0.12)
+        assert np.linalg.norm(factor - truth[::-1] * scale) > 3 * error * np.linalg.norm(factor), "orientation"
+
+
+@pytest.mark.parametrize(("mask", "mode", "n"), CASES)
+def test_the_reported_error_is_the_predicted_one(session: Callable[..., Done], mask: str, mode: str, n: int) -> None:
+    _, factors, calibration, _ = session(mask, mode, n)
+    result = factors.manifest.result
+    assert result["phi_error"] == pytest.approx(np.hypot(*calibration.predicted_error), rel=0.3)
+    assert result["noise_free_residual"] < 2e-3 < result["separability_residual"]
+    assert result["condition"] == calibration.condition
+
+
+def test_the_scale_is_absolute(session: Callable[..., Done]) -> None:
+    """left x right reproduces the rate of a uniform frame: E A t eta / (h c / lambda), from the board's radiance."""
+    bench, _, calibration, _ = session("separable", "pair", 16)
+    rate = np.outer(calibration.left.sum(axis=1), calibration.right.sum(axis=1))
+    radiance = 0.99 * 111000 / 400**2
+    tau = (np.arange(N) - 7.5) * 0.3 / N
+    falloff = (1 + np.square(tau)[:, None] + np.square(tau)[None, :]) ** -2
+    shadow = geometric(bench)
+    irradiance = radiance * (0.3 / N) ** 2 * shadow @ falloff @ shadow.T
+    photon_j = 6.62607015e-34 * 299792458 / 562e-9
+    expected = irradiance * (11.72e-6) ** 2 * bench.sensor.quantum_efficiency / photon_j
+    # A cell's falloff is taken at its middle (2e-4); noise of the sum of 16 columns is below a percent a pixel.
+    assert rate.mean() == pytest.approx(expected.mean(), rel=3e-3)
+    assert np.linalg.norm(rate - expected) < 0.03 * np.linalg.norm(expected)
+
+
+def test_number_of_frames(session: Callable[..., Done]) -> None:
+    assert session("separable", "pair", 16)[1].manifest.result["frames"] == 2 * 2 * 16
+    assert session("separable", "uniform", 16)[1].manifest.result["frames"] == 2 * (16 + 1)
+    # 13 is no Hadamard order: the patterns are those of 16.
+    assert session("separable", "pair", 13)[1].manifest.result["frames"] == 2 * 2 * 16
+
+
+def test_the_folder(session: Callable[..., Done]) -> None:
+    bench, factors, calibration, folder = session("separable", "pair", 16)
+    assert sorted(path.name for path in folder.iterdir()) == ["left.exr", "manifest.json", "right.exr"]
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert manifest["kind"] == "calibration" and manifest["centre"] is False
+    assert manifest["camera"] == json.loads(json.dumps(bench.identity()))
+    assert manifest["estimate"] == str(calibration.status) and manifest["warnings"] == list(factors.warnings)
+    assert not any("full well" in warning for warning in factors.warnings)
+    for name, factor in (("left", calibration.left), ("right", calibration.right)):
+        channels, metadata = read_frame(folder / f"{name}.exr")
+        assert np.array_equal(channels["factor"], factor.astype(np.float32))
+        assert metadata["unit"] == "sqrt(e-/s)"
+        assert manifest["checksums"][f"{name}.exr"] == checksum(folder / f"{name}.exr")
+
+
+def test_what_a_session_takes_is_predicted(session: Callable[..., Done]) -> None:
+    """By stage, and in bytes; there is no truth to be traced, and frames of both sides count. (Planted: of one.)"""
+    bench, factors, _, _ = session("separable", "pair", 16)
+    result = factors.manifest.result
+    assert result["predicted_seconds"] == pytest.approx(sum(result["predicted"].values()))
+    assert result["predicted"].keys() >= {"start", "plan", "transport", "optics", "sensor"}
+    assert result["predicted"]["truth"] == 0
+    exposing = frame_seconds(bench, 2 * 2 * 16)["sensor"]
+    assert result["predicted"]["sensor"] == exposing > 0
+    assert 0 < result["predicted"]["optics"] < 10
+    assert 3e8 < result["predicted_memory_bytes"] < 2e9
+
+
+@pytest.mark.parametrize(("pixels", "mixed"), [(1024, True), (2048, False)])
+def test_memory_of_large_sensors_stays_below_four_gib(
+    monkeypatch: pytest.MonkeyPatch, pixels: int, mixed: bool
+) -> None:
+    """By prediction, with 128 and 512 stripes a side, whether frames of single lines are held or not.
+    (Planted: all shots of a side held.)"""
+    assert mixes(128, 128, pixels) == mixed
+    large = SimpleNamespace(n=128, geometry=CameraGeometry(pixels=pixels))
+    monkeypatch.setattr("mitsim.planner.memory.Simulation", lambda *_: SimpleNamespace(paths_at_once=LANES_AT_ONCE))
+    for n in (128, 512):
+        large.n = n
+        assert 5e8 < session_cost(large, n, Settings(400.0), 1.0).memory_bytes < 3.6 * 2**30
+
+
+def test_flatcam_is_centred(session: Callable[..., Done]) -> None:
+    _, _, calibration, folder = session("flatcam", "pair", 16)
+    assert json.loads((folder / "manifest.json").read_text())["centre"] is True
+    for factor in (calibration.left, calibration.right):
+        assert np.abs(factor.sum(axis=0)).max() < 1e-9 * np.abs(factor).sum()
+
+
+def test_seeds(shared_scene: Callable[..., Path]) -> None:
+    bench = open_bench(shared_scene("separable16", n=16))
+    one, again, other = (bench.calibrate(seed, 2e-2, recipe("uniform")).left for seed in (1, 1, 2))
+    assert np.array_equal(one, again) and not np.allclose(one, other, rtol=1e-6)
+
+
+def test_a_used_folder_is_refused_before_any_work(
+    session: Callable[..., Done], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench, *_, folder = session("separable", "pair", 16)
+    monkeypatch.setattr("mitsim.calibrate.session.make_plan", lambda *_: pytest.fail("work was done first"))
+    with pytest.raises(MitsimError, match="holds files already"):
+        bench.calibrate(output=folder)
+
+
+def test_a_session_is_planned_by_what_its_responses_need(shared_scene: Callable[..., Path]) -> None:
+    """Diffraction hardly changes a uniform frame, but single lines, and so the +-1 responses, by a tenth."""
+    board = open_bench(shared_scene("separable16", n=16)).with_board(0.99)
+    uniform = make_plan(board, Lighting.uniform(16), 2e-2, 0)
+    assert "diffraction" not in uniform.settings.effects
+    assert "diffraction" in Session(board, recipe("pair")).plan(2e-2, Job()).settings.effects
+
+
+# ---- frames of a session ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("geometric_sessions")
+@pytest.mark.parametrize(
+    ("more", "files", "ending"),
+    [
+        ({"signed_capture": "pair", "order": "interleaved"}, 64, ".tif"),
+        (
+            {
+                "signed_capture": "uniform",
+                "exposure_ladder": (1.0, 20.0),
+                "repeats": 2,
+                "dark_frames": 3,
+                "order": "random",
+            },
+            (34 * 2 + 3) * 2,
+            ".npy",
+        ),
+    ],
+)
+def test_frames_that_are_written_give_the_same_factors_bit_for_bit(
+    shared_scene: Callable[..., Path], tmp_path: Path, more: dict[str, object], files: int, ending: str
+) -> None:
+    """Codes as TIFF, real numbers as NPY, called by the order in which they are taken; and nothing that a camera's user
+    does not have. (Planted: numbers by the order of the list, repeats not told apart, half of the codes cut, the
+    parallax in the list.)"""
+    bench = open_bench(shared_scene("written16", n=16))
+    if ending == ".npy":
+        bench = replace(bench, rig=replace(bench.rig, sensor=bench.sensor.model_copy(update={"bits": None})))
+    own = recipe("pair").model_copy(update=more)
+    simulated = bench.write_session(tmp_path / "frames", tmp_path / "cal", 3, recipe=own)
+    found = calibrate_frames(tmp_path / "frames")
+    assert np.array_equal(found.left, simulated.left) and np.array_equal(found.right, simulated.right)
+    assert simulated.manifest.result["frames"] == files == len(list((tmp_path / "frames").glob(f"*{ending}")))
+    assert np.array_equal(load_calibration(tmp_path / "cal").left, found.left)
+    listed = json.loads((tmp_path / "frames" / "session.json").read_text())
+    assert not listed.keys() - FrameList.model_fields.keys() and not {"parallax", "seed"} & listed.keys()
+    taken = [frame["file"] for frame in listed["frames"]]
+    assert taken == sorted(taken)
+    with pytest.raises(MitsimError, match="holds files already"):
+        bench.write_session(tmp_path / "frames", recipe=own)
+
+
+# ---- interrupted and resumed -----------------------------------------------------------------------------------------
+
+SECONDS = {"seconds", "predicted", "predicted_seconds"}
+"""Of a result, what differs from session to session: time, taken and predicted with what was taken before."""
+PARTS = ["light.part.npz", "stripes.part.npz"]
+
+
+class Killed(BaseException):
+    """The end of a process that no code of ours takes notice of."""
+
+
+@pytest.fixture
+def geometric_sessions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sessions of geometric shadows whose plan is made once for each scene, accuracy and seed: plans take most of their
+    time, and that the same seed makes the same plan is held by test_pilot.py."""
+    plans: dict[tuple[object, ...], Plan] = {}
+
+    def planned(board: Bench, lighting: Lighting, *request: object) -> Plan:
+        key = board.loaded.path, *request
+        if key not in plans:
+            plans[key] = geometric_plan(board, lighting, *request)
+        return plans[key]
+
+    monkeypatch.setattr("mitsim.calibrate.session.make_plan", planned)
+
+
+@pytest.fixture(autouse=True)
+def every_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Checkpoints are kept however little time has passed."""
+    monkeypatch.setattr("mitsim.calibrate.calibrate._SAVED_AFTER_S", 0.0)
+
+
+@pytest.fixture
+def kill_after(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """The session ends right after so many checkpoints are written from now on."""
+    save = Checkpoint.save
+
+    def arm(count: int) -> None:
+        left = iter(range(count - 1, -1, -1))
+
+        def save_and_die(self: Checkpoint, *part: object) -> None:
+            save(self, *part)
+            if next(left) == 0:
+                raise Killed
+
+        monkeypatch.setattr(Checkpoint, "save", save_and_die)
+
+    return arm
+
+
+def assert_equal(ours: Factors, theirs: Factors) -> None:
+    """The same factors bit for bit, the same report but for seconds."""
+    for name in ("left", "right"):
+        assert np.array_equal(getattr(ours, name), getattr(theirs, name)), name
+    for name in ("predicted_error", "unexplained", "noise", "status"):
+        assert getattr(ours.estimate, name) == getattr(theirs.estimate, name), name
+    for name in ours.manifest.result.keys() - SECONDS:
+        assert ours.manifest.result[name] == theirs.manifest.result[name], name
+
+
+@pytest.mark.usefixtures("geometric_sessions")
+@pytest.mark.parametrize("mode", ["pair", pytest.param("uniform", marks=pytest.mark.slow)])
+def test_a_session_killed_at_every_checkpoint_gives_the_same_bits(
+    shared_scene: Callable[..., Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    kill_after: Callable[[int], None],
+    mode: str,
+) -> None:
+    """Each of the five processes but the last gets one checkpoint further; nothing that is kept is computed again."""
+    bench = open_bench(shared_scene("resumed16", n=16))
+    whole = calibrate(bench, recipe=recipe(mode), seed=3)
+    exposures: list[object] = []
+    digital = Exposer.digital
+
+    def counted(self: Exposer, *shot: object) -> object:
+        exposures.append(shot[1:])
+        return digital(self, *shot)
+
+    monkeypatch.setattr(Exposer, "digital", counted)
+    calibration = tmp_path / "cal"
+    for life in range(5):
+        kill_after(1)
+        with pytest.raises(Killed):
+            calibrate(bench, recipe=recipe(mode), seed=3, output=calibration, resume=True)
+        assert json.loads((calibration / "manifest.json").read_text())["status"] == "incomplete"
+        monkeypatch.setattr(Session, "trace", lambda *_: pytest.fail("light is traced again"))
+        assert [path.name for path in sorted(calibration.glob("*.npz"))] == [
+            name for name, since in zip(PARTS, (0, 1), strict=True) if life >= since
+        ]
+    kill_after(0)  # nothing is left to be saved
+    resumed = calibrate(bench, recipe=recipe(mode), seed=3, output=calibration, resume=True)
+    assert_equal(resumed, whole)
+    assert sorted(path.name for path in calibration.iterdir()) == ["left.exr", "manifest.json", "right.exr"]
+    # Shots that were exposed with those of a checkpoint are exposed again, at most one chunk of each side a life.
+    assert set(exposures) == {
+        ("calibration", side, index) for side in SIDES for index in range(whole.manifest.result["frames"] // 2)
+    }
+    assert len(exposures) < whole.manifest.result["frames"] + 5 * FRAMES_AT_ONCE
+
+
+@pytest.mark.usefixtures("geometric_sessions")
+def test_damaged_and_foreign_parts_are_computed_again(
+    shared_scene: Callable[..., Path],
+    tmp_path: Path,
+    kill_after: Callable[[int], None],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Cut, emptied, flipped at the start, in the middle and at the end, or of a session with another seed."""
+    bench = open_bench(shared_scene("damaged16", n=16))
+    save = Checkpoint.save
+    for name, seed in (("ours", 3), ("theirs", 4)):
+        kill_after(3)
+        with pytest.raises(Killed):
+            calibrate(bench, recipe=recipe("pair"), seed=seed, output=tmp_path / name)
+    monkeypatch.setattr(Checkpoint, "save", save)
+    whole = calibrate(bench, recipe=recipe("pair"), seed=3)
+
+    def flipped(spot: float) -> Callable[[bytes], bytes]:
+        def flip(data: bytes) -> bytes:
+            index = int(spot * (len(data) - 1))
+            return data[:index] + bytes([data[index] ^ 4]) + data[index + 1 :]
+
+        return flip
+
+    damages = [lambda data: data[:-7], lambda data: b"", flipped(0.0), flipped(0.5), flipped(1.0), None]
+    for index, damage in enumerate(damages):
+        folder = shutil.copytree(tmp_path / "ours", tmp_path / f"cal{index}")
+        part = folder / PARTS[index % len(PARTS)]
+        source = part if damage else tmp_path / "theirs" / part.name
+        part.write_bytes((damage or bytes)(source.read_bytes()))
+        assert_equal(calibrate(bench, recipe=recipe("pair"), seed=3, output=folder, resume=True), whole)
+
+
+@pytest.mark.usefixtures("geometric_sessions")
+def test_only_the_same_session_is_resumed(
+    shared_scene: Callable[..., Path], tmp_path: Path, kill_after: Callable[[int], None]
+) -> None:
+    bench = open_bench(shared_scene("other16", n=16))
+    kill_after(1)
+    with pytest.raises(Killed):
+        calibrate(bench, recipe=recipe("pair"), output=tmp_path / "cal")
+    for change, words in (
+        ({"seed": 5}, "seed differ"),
+        ({"accuracy": 1e-2, "recipe": recipe("uniform")}, "accuracy, recipe differ"),
+    ):
+        with pytest.raises(
+            MitsimError, match=rf"resume=True: .*cal holds a session of another configuration \({words}\)"
+        ):
+            calibrate(bench, **{"recipe": recipe("pair"), "output": tmp_path / "cal", "resume": True, **change})
+    with pytest.raises(MitsimError, match="holds files already"):
+        calibrate(bench, recipe=recipe("pair"), output=tmp_path / "cal")
+    (tmp_path / "cal" / "manifest.json").write_text('{"kind": "capture"}')
+    with pytest.raises(MitsimError, match=r"resume=True: .* is not that of a calibration"):
+        calibrate(bench, recipe=recipe("pair"), output=tmp_path / "cal", resume=True)
+
+
+@pytest.mark.usefixtures("geometric_sessions")
+def test_saving_from_memory_is_the_same_folder(shared_scene: Callable[..., Path], tmp_path: Path) -> None:
+    bench = open_bench(shared_scene("memory16", n=16))
+    calibrate(bench, recipe=recipe("pair"), output=tmp_path / "streamed")
+    calibrate(bench, recipe=recipe("pair")).save(tmp_path / "saved")
+    manifests = []
+    for name in ("streamed", "saved"):
+        manifest = json.loads((tmp_path / name / "manifest.json").read_text())
+        for key in SECONDS:
+            del manifest["result"][key]
+        manifests.append(manifest)
+    assert manifests[0] == manifests[1]
+    with pytest.raises(MitsimError, match="holds files already"):
+        calibrate(bench, recipe=recipe("pair")).save(tmp_path / "saved")
+
+
+def test_describing_a_session_traces_nothing(
+    shared_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("make_plan", "trace_lines"):
+        monkeypatch.setattr(f"mitsim.calibrate.session.{name}", lambda *_: pytest.fail("work was done"))
+    session = Session(open_bench(shared_scene("separable16", n=16)), recipe("pair"))
+    assert session.shots == 64 and session.signs.shape == (16, 16)

@@ -1,0 +1,71 @@
+"""The table [drift]: what it takes, what moves, and the recipe that ships with one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from mitsim.core.configuration import shipped
+from mitsim.core.errors import MitsimError
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.drift import STILL, UNITS, WORDS, Drift, MaskMotion
+from mitsim.devices.session import load_recipe
+
+
+def test_nothing_moves_where_nothing_is_said() -> None:
+    """(Planted: a rotation of 1 by default.)"""
+    none = Drift()
+    assert none.kinds == () and none.mask_mm == (0, 0, 0) and none.motion is None and load_recipe().drift == none
+    assert set(UNITS) == set(WORDS)
+    assert set(UNITS) == {*Drift.model_fields} - set(STILL)
+
+
+def test_one_kind_alone() -> None:
+    """Warmth widens the gap; other kinds stay behind. (Planted: the gap left out; all kinds kept.)"""
+    both = Drift(mask_rows_um=3.0, temperature_k=20.0, gap_um_per_k=0.05)
+    assert both.alone("temperature_k").mask_mm == pytest.approx((0, 0, 1e-3))
+    assert both.alone("mask_rows_um", 5).mask_mm == pytest.approx((5e-3, 0, 0))
+    assert both.kinds == ("mask_rows_um", "temperature_k")
+    assert Drift(mask_tilt_rows_mrad=2.0, mask_tilt_columns_mrad=-1.0).tilt_mrad == (2.0, -1.0)
+    assert Drift(mask_tilt_columns_mrad=-1.0).tilt_mrad == (0.0, -1.0) and both.tilt_mrad is None
+    assert Drift(vibration_um=2.0).motion == MaskMotion(vibration_um=2.0)
+
+
+def test_a_ripple_has_a_frequency_and_keeps_it() -> None:
+    """Each source its own. (Planted: the other's frequency; frequencies left behind.)"""
+    both = Drift(power_ripple=0.2, power_ripple_hz=60.0, lamp_ripple=0.5, lamp_ripple_hz=100.0)
+    assert both.ripples == {"power": (0.2, 60.0), "lamp": (0.5, 100.0)}
+    assert both.alone("lamp_ripple", 0.1).ripples == {"lamp": (0.1, 100.0)}
+    assert both.alone("power").ripples == {} and Drift(power_ripple_hz=60.0).kinds == ()
+    with pytest.raises(MitsimError, match=r"^drift[^\n]*lamp_ripple 0\.1 has no frequency; give lamp_ripple_hz[^\n]*$"):
+        Drift(power_ripple_hz=60.0).alone("lamp_ripple", 0.1)
+
+
+@pytest.mark.parametrize(
+    ("kind", "amount", "said"),
+    [("speed", 1, "no such kind"), ("power", -2, "power"), ("mask_tilt_rows_mrad", 51, "50")],
+)
+def test_what_cannot_be_is_one_line(kind: str, amount: float, said: str) -> None:
+    with pytest.raises(MitsimError, match=rf"^drift[^\n]*{said}[^\n]*$"):
+        Drift().alone(kind, amount)
+
+
+def test_the_shipped_drift_is_of_the_shipped_session(tmp_path: Path) -> None:
+    """All kinds move in it; its session is that of session.toml. (Planted: another exposure there.)"""
+    recipe = load_recipe(shipped("calibration", "drift.toml"))
+    assert recipe.drift.kinds == tuple(UNITS)
+    bare = {"drift": Drift(), "source": ""}
+    assert recipe.model_copy(update=bare) == load_recipe().model_copy(update=bare)
+    bad = tmp_path / "bad.toml"
+    bad.write_text(shipped("calibration", "drift.toml").read_text().replace("power = 0.005", 'power = "5 %"'))
+    with pytest.raises(MitsimError, match=r"drift\.power"):
+        load_recipe(bad)
+
+
+def test_a_camera_that_moves_is_another() -> None:
+    """(Planted: its motion left out of the identity.)"""
+    still = CameraGeometry()
+    turned = still.model_copy(update={"mask_motion": MaskMotion(rotation_mrad=1.0)})
+    assert turned.identity != still.identity and "mask_motion" not in still.identity
+    assert hash(turned) != hash(still)

@@ -1,0 +1,143 @@
+"""Projector files: what is in them is checked, what is unknown is refused, and the spectrum counts photons."""
+
+import math
+from collections.abc import Sequence
+from itertools import combinations, pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.core.configuration import load_model, shipped, validated
+from mitsim.core.errors import MitsimError
+from mitsim.devices.projector import Lines, ProjectorModel, Spectrum
+
+BASE = {"name": "test", "effective_wavelength_nm": 550.0}
+
+
+def test_the_shipped_file_is_a_projector_with_its_sources() -> None:
+    model = load_model(shipped("calibration", "mp_cl1.toml"), ProjectorModel)
+    assert (model.luminous_flux_lm, model.columns, model.rows, model.laser_class) == (32.0, 1920, 720, "3R")
+    assert "wavelengths_nm" in model.assumed and "radiant_shares" in model.derived and model.source
+    assert model.black_level == pytest.approx(1 / 80_000)
+
+
+def test_a_mistyped_field_is_refused_with_the_field_it_resembles(tmp_path: Path) -> None:
+    """`blur_pixel = 3` was ignored, and the projector was sharp."""
+    path = tmp_path / "mine.toml"
+    path.write_text('name = "mine"\neffective_wavelength_nm = 550\nblur_pixel = 3\n')
+    with pytest.raises(MitsimError, match=r"mine\.toml: blur_pixel: got 3, no such field; did you mean blur_pixels\?"):
+        load_model(path, ProjectorModel)
+    path.write_text('name = "mine"\neffective_wavelenght_nm = 550\n')
+    with pytest.raises(MitsimError, match=r"effective_wavelenght_nm: [^;]*; did you mean effective_wavelength_nm\?"):
+        load_model(path, ProjectorModel)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "rule"),
+    [
+        ("blur_pixels", 300.0, "range: 0 to 16"),
+        ("blur_pixels", True, "range: 0 to 16"),
+        ("aperture_radius_mm", 1e4, "range: 0 to 1000"),
+        ("focus_mm", 0.0, r"range: 1 to 1e\+07"),
+        ("focus_mm", math.inf, "finite"),
+        ("speckle_contrast", 1.5, "range: 0 to 1"),
+        ("effective_wavelength_nm", 0.0, r"range: 1 to 1e\+06"),
+        ("contrast_ratio", 1.0, "greater than 1"),
+        ("luminous_efficacy_lm_per_w", 900.0, "range: 0 to 684"),
+        ("columns", 1920.0, "integer"),
+        ("laser_class", "5", "'3R'"),
+        ("derived", ["blur"], "'blur' is none"),
+        ("wavelengths_nm", [550.0], "one share a line"),
+    ],
+)
+def test_a_value_beyond_any_device_is_refused_with_its_range(field: str, value: object, rule: str) -> None:
+    with pytest.raises(MitsimError, match=rf"^here: [^\n]*{field}[^\n]*{rule}[^\n]*$"):
+        validated(ProjectorModel, {**BASE, field: value}, "here")
+
+
+def test_a_spectrum_is_of_photons_and_some_line_has_power() -> None:
+    """Shares are relative to their sum; all 0 gave weights of nan."""
+    lines = {**BASE, "wavelengths_nm": [450.0, 600.0]}
+    with pytest.raises(MitsimError, match="radiant_shares are all 0; at least one line must have power"):
+        validated(ProjectorModel, {**lines, "radiant_shares": [0.0, 0.0]}, "here")
+    spectrum = validated(ProjectorModel, {**lines, "radiant_shares": [2.0, 3.0]}, "here").spectrum
+    assert spectrum.weights == pytest.approx([180 / 540, 360 / 540])
+    assert validated(ProjectorModel, BASE, "here").spectrum.wavelengths_nm.tolist() == [550.0]
+
+
+@pytest.mark.parametrize(
+    ("wavelengths", "weights"),
+    [
+        ([], []),
+        ([500.0], [0.5, 0.5]),
+        ([-1.0], [1.0]),
+        ([math.nan], [1.0]),
+        ([500.0], [0.9]),
+        ([1.0, 2.0], [2.0, -1.0]),
+    ],
+)
+def test_arrays_that_are_no_spectrum_are_refused(wavelengths: list[float], weights: list[float]) -> None:
+    with pytest.raises(MitsimError, match=r"^spectrum [^\n]+$"):
+        Spectrum(np.array(wavelengths), np.array(weights))
+
+
+def test_speckle_is_a_number_or_a_table(tmp_path: Path) -> None:
+    path = tmp_path / "laser.toml"
+    head = 'name = "laser"\neffective_wavelength_nm = 562.0\n'
+    path.write_text(head + "[speckle]\nroughness_um = 20.0\nlinewidth_nm = 1.0\n")
+    model = load_model(path, ProjectorModel)
+    assert model.speckle and model.speckle.linewidth_nm == 1.0
+    for text, words in (
+        ("speckle_contrast = 0.0\n[speckle]\n", "got speckle_contrast 0 and the table speckle; give one"),
+        ("[speckle]\nlinewidth_nm = 1.0\n", "got 1 without roughness_um; give both"),
+        ("[speckle]\npolarization = 1.0\n", "did you mean polarisation"),
+    ):
+        path.write_text(head + text)
+        with pytest.raises(MitsimError, match=words):
+            load_model(path, ProjectorModel)
+
+
+LED = Lines((630.0, 460.0, 450.0, 440.0, 620.0), (0.2, 0.1, 0.3, 0.1, 0.3))
+
+
+def test_bands_are_cut_between_lines_that_are_far_apart() -> None:
+    """Each keeps its lines' power at the wavelength of as many photons (planted: the plain mean, 450 and 625)."""
+    blue, red = LED.bands(2)
+    assert blue == Lines((440.0, 450.0, 460.0), (0.1, 0.3, 0.1)) and red == Lines((620.0, 630.0), (0.3, 0.2))
+    assert (blue.mean_nm, red.mean_nm) == (450.0, 624.0)
+    model = ProjectorModel(**BASE, wavelengths_nm=LED.wavelengths_nm, radiant_shares=LED.shares)
+    assert model.in_bands(2).wavelengths_nm == (450.0, 624.0)
+    assert model.in_bands(2).radiant_shares == pytest.approx((0.5, 0.5))
+    assert model.in_bands(2).lines.mean_nm == pytest.approx(model.lines.mean_nm)
+
+
+def spread(bands: Sequence[Lines]) -> float:
+    """Power times squared distance from the band's mean."""
+    return sum(
+        share * (wave - np.average(band.wavelengths_nm, weights=band.shares)) ** 2
+        for band in bands
+        for wave, share in zip(band.wavelengths_nm, band.shares, strict=True)
+    )
+
+
+def test_no_other_cuts_leave_less_of_the_power_off_its_bands_mean() -> None:
+    """Against all cuts of nine random lines (planted: cuts by the widest gap)."""
+    rng = np.random.default_rng(3)
+    for count in (1, 2, 3, 4):
+        lines = Lines(tuple(rng.uniform(400, 700, 9).tolist()), tuple(rng.uniform(0.1, 1, 9).tolist())).shining
+        waves, shares = lines.wavelengths_nm, lines.shares
+
+        every = combinations(range(1, 9), count - 1)
+        least = min(spread([Lines(waves[a:b], shares[a:b]) for a, b in pairwise((0, *at, 9))]) for at in every)
+        assert len(lines.bands(count)) == count and spread(lines.bands(count)) == pytest.approx(least)
+
+
+def test_bands_of_as_many_as_lines_are_the_lines() -> None:
+    """To the last bit, so that folders and calibrations are the same; lines without power are none, and two of one
+    wavelength one."""
+    assert [band.mean_nm for band in LED.bands(5)] == sorted(LED.wavelengths_nm)
+    assert Lines((600.0, 500.0, 600.0), (0.25, 0.0, 0.75)).bands(1) == (Lines((600.0,), (1.0,)),)
+    for count in (0, 6):
+        with pytest.raises(MitsimError, match=f"{count} bands of 5 lines of light: give 1 to 5"):
+            LED.bands(count)

@@ -1,0 +1,126 @@
+import math
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from mitsim.core.configuration import shipped
+from mitsim.core.errors import MitsimError
+from mitsim.devices.sensor import SensorModel, load_sensor, paper_sensor
+from tests.invented import sensor
+
+BASE = {
+    "name": "test",
+    "pixel_pitch_um": 5.0,
+    "full_well_e": 1000.0,
+    "read_noise_e": 3.0,
+    "quantum_efficiency": 0.5,
+    "gain_dn_per_e": 2.0,
+    "source": "invented for this test",
+}
+
+
+def test_a_superpixel_is_the_sum_of_its_pixels() -> None:
+    model = SensorModel(**BASE, binning=3, dark_current_e_per_s=2.0, black_level_dn=10.0, bits=12)
+    assert model.superpixel_pitch_um == 15.0
+    assert model.superpixel_area_m2 * 1e12 == pytest.approx(225.0, rel=1e-12)
+    assert model.superpixel_full_well_e == 9000.0
+    assert model.superpixel_read_noise_e == 9.0  # sqrt(9) x 3: nine independent readings
+    assert model.superpixel_dark_current_e_per_s == 18.0
+    assert model.superpixel_black_level_dn == 90.0
+    assert model.largest_dn == 9 * 4095
+
+
+def test_without_binning_a_superpixel_is_a_pixel() -> None:
+    model = SensorModel(**BASE)
+    assert (model.superpixel_full_well_e, model.superpixel_read_noise_e) == (1000.0, 3.0)
+    assert model.largest_dn is None
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("pixel_pitch_um", 0.0),
+        ("binning", 0),
+        ("full_well_e", -1.0),
+        ("full_well_e", math.nan),
+        ("read_noise_e", -0.1),
+        ("read_noise_e", math.nan),
+        ("quantum_efficiency", 1.01),
+        ("quantum_efficiency", 0.0),
+        ("quantum_efficiency", 1e-9),
+        ("pixel_pitch_um", 1e5),
+        ("full_well_e", 1e13),
+        ("full_well_e", True),
+        ("read_noise_e", 1e7),
+        ("dark_current_e_per_s", 1e11),
+        ("gain_dn_per_e", 1e7),
+        ("black_level_dn", 2.0**24),
+        ("binning", 2.0),
+        ("bits", True),
+        ("gain_dn_per_e", math.inf),
+        ("bits", 0),
+        ("colour", "red"),
+    ],
+)
+def test_a_value_out_of_range_is_refused(field: str, value: object) -> None:
+    with pytest.raises(ValidationError, match=field):
+        SensorModel(**{**BASE, field: value})
+
+
+def test_whole_numbers_are_numbers() -> None:
+    assert SensorModel(**{**BASE, "full_well_e": 1000, "read_noise_e": 3}) == SensorModel(**BASE)
+
+
+def test_a_black_level_at_the_ceiling_is_refused() -> None:
+    with pytest.raises(ValidationError, match="no room"):
+        SensorModel(**BASE, black_level_dn=255.0, bits=8)
+
+
+def test_a_model_does_not_change() -> None:
+    with pytest.raises(ValidationError, match="frozen"):
+        SensorModel(**BASE).read_noise_e = 0.0
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("read_noise_e = -6.7", r"read_noise_e: got -6\.7, .* \(range: 0 to 1e\+06\); correct this field$"),
+        ("read_noise = 6.7", r"read_noise: got 6\.7, no such field; did you mean read_noise_e\? known fields: name, "),
+    ],
+)
+def test_a_bad_file_is_one_line(tmp_path: Path, line: str, message: str) -> None:
+    text = shipped("calibration", "imx249.toml").read_text(encoding="utf-8")
+    (tmp_path / "a.toml").write_text(text.replace("read_noise_e = 6.7", line))
+    with pytest.raises(MitsimError, match=rf"^file [^\n]*a\.toml: {message}[^\n]*"):
+        load_sensor(tmp_path / "a.toml")
+
+
+def test_the_shipped_sensor_fills_its_adc_but_does_not_overflow_it() -> None:
+    model = load_sensor(shipped("calibration", "imx249.toml"))
+    assert model.superpixel_pitch_um == pytest.approx(11.72)  # the paper's binned pitch
+    assert model.largest_dn is not None
+    top = model.superpixel_full_well_e * model.gain_dn_per_e + model.superpixel_black_level_dn
+    assert 0.95 < top / model.largest_dn < 1
+    # Below about half a code of noise the rounding is not dithered and 1/12 DN^2 does not hold.
+    assert model.superpixel_read_noise_e * model.gain_dn_per_e > 0.5
+    # The two figures its full well and read noise are derived from (mvBlueFOX3 manual).
+    assert 10 * math.log10(model.full_well_e) == pytest.approx(45.1, abs=0.05)
+    assert 20 * math.log10(model.full_well_e / (model.read_noise_e + 0.5)) == pytest.approx(73, abs=0.5)
+
+
+def test_the_paper_s_model_has_the_paper_s_numbers() -> None:
+    model = paper_sensor(full_well_e=1e4, gain=2.0, dynamic_range_db=60.0)
+    assert model.gain_dn_per_e == pytest.approx(2e-4)  # G / F
+    assert model.read_noise_e == pytest.approx(10.0)  # F 10^(-R/20)
+    assert model.bits is None and model.black_level_dn == 0.0 and math.isinf(model.full_well_e)
+
+
+def test_a_camera_s_identity_has_the_effects_that_it_names_and_no_others() -> None:
+    """Calibrations of 0.4, which know no effects, fit the cameras that they were made of."""
+    plain = sensor().identity
+    assert set(plain) == {
+        "name", "pixel_pitch_um", "binning", "full_well_e", "read_noise_e", "dark_current_e_per_s",
+        "quantum_efficiency", "gain_dn_per_e", "black_level_dn", "bits",
+    }  # fmt: skip
+    assert sensor(prnu_row=0.01).identity == {**plain, "prnu_row": 0.01}

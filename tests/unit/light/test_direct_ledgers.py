@@ -1,0 +1,102 @@
+"""Direct light that is filed on the device: what the host files of the same paths, place by place."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsim.api.bench import Bench, open_bench
+from mitsim.light.passes import FiledLight, Simulation
+from mitsim.light.settings import Settings, SharpPixels
+from mitsim.transport.accumulator import fetched
+
+pytestmark = pytest.mark.usefixtures("variant")
+N, SAMPLES = 16, 96
+BALL = """<shape type="sphere"><point name="center" x="10" y="5" z="330"/><float name="radius" value="20"/>
+    <bsdf type="roughconductor"><string name="material" value="none"/>
+    <float name="alpha" value="0.05"/></bsdf></shape>"""
+SETTINGS = Settings(
+    depth=380.0,
+    anchors=3,
+    layers=(400.0, 350.0, 310.0),
+    coarse_layers=True,
+    subdivision=2,
+    anchored_samples=SAMPLES,
+    # A window that holds most of the light of these pixels, and not all.
+    sharp=SharpPixels(tuple(range(50, 200, 7)), 3, (-0.03, 0.05, -0.03, 0.05)),
+    sharp_samples=1000.0,
+)
+
+
+@pytest.fixture(scope="module")
+def bench(shared_scene: Callable[..., Path], variant: str) -> Bench:
+    """A ball before the sheet, seen by a sensor of 6.4 mm."""
+    return open_bench(shared_scene("ball", n=N, pitch=0.1, extra=BALL), variant, for_render=True)
+
+
+def both(simulation: Simulation, name: str, labels: np.ndarray) -> tuple[FiledLight, FiledLight, list[np.ndarray]]:
+    """Light of a stage by the host and by the device, and the flux of its pixels by both."""
+    stage = simulation.tracers()[name]
+    deposits = stage.trace(3, 0, SAMPLES)
+    (ledger,) = stage.ledgers(labels, 1)
+    rest = stage.trace(3, 0, SAMPLES, (ledger,))
+    assert not len(rest.value) and len(deposits.value) > 1000
+    (counted,) = fetched((ledger,))
+    assert stage.file_ledger is not None
+    device = stage.file_ledger(ledger, counted, labels, SAMPLES)
+    flux = [simulation.flux(deposits, SAMPLES)]
+    if name == "sharp":
+        flux.append(simulation.sharp_flux(ledger, counted, SAMPLES))
+    return stage.file(deposits, labels, SAMPLES), device, flux
+
+
+@pytest.mark.parametrize(("name", "tray"), [("anchored", "coarse"), ("sharp", "sharp")])
+def test_the_device_files_what_the_host_does(bench: Bench, name: str, tray: str) -> None:
+    """Light between layers and between cells is split, not drawn. (Planted: rows and columns of anchors exchanged; the
+    nearer layer's part for the farther; the first cell of two alone; what lies outside filed as the first anchor's;
+    pixels' rows for classes'.)"""
+    labels = np.random.default_rng(1).integers(0, 5, N * N)
+    host, device, flux = both(Simulation(bench, SETTINGS), name, labels)
+    expected, found = (getattr(light, tray).toarray() for light in (host, device))
+    assert found.shape == expected.shape and np.count_nonzero(expected) > 500
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=2e-5 * np.abs(expected).max())
+    assert np.abs(found - expected).sum() < 2e-5 * np.abs(expected).sum()
+    if name == "sharp":
+        assert 0 < host.outside < 0.5 * host.received
+        assert (device.received, device.outside) == pytest.approx((host.received, host.outside), rel=1e-5)
+        np.testing.assert_allclose(flux[1], flux[0], rtol=1e-5, atol=1e-7 * flux[0].max())
+
+
+def test_few_paths_for_many_cells_are_left_to_the_host(bench: Bench) -> None:
+    """A ledger would be mostly empty. (Planted: always a ledger.)"""
+    labels = np.arange(N * N) % 49
+    few = replace(SETTINGS, anchored_samples=1.0, sharp_samples=1.0)
+    stages = Simulation(bench, few).tracers()
+    assert stages["anchored"].ledgers(labels, 1) == () == stages["sharp"].ledgers(labels, 1)
+    many = replace(SETTINGS, anchored_samples=1000.0, sharp_samples=1000.0)
+    stages = Simulation(bench, many).tracers()
+    assert len(stages["anchored"].ledgers(labels, 3)) == 3 == len(stages["sharp"].ledgers(labels, 3))
+
+
+def test_the_middle_of_the_sharpest_lobe_is_light(bench: Bench, variant: str) -> None:
+    """Ledgers refuse what is no light; what the sharpest lobe of Mitsuba brings is, and what is dim is not rounded
+    away. (Planted: light compared to a board's own; `_LOBE` of 2^20.)"""
+    simulation = Simulation(bench, SETTINGS)
+    tracer = simulation.anchored
+    assert tracer is not None
+    lobe = mi.load_dict({"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": 1e-6})
+    square = dr.zeros(mi.SurfaceInteraction3f)
+    square.wi = mi.Vector3f(0, 0, 1)
+    brightest = math.pi * float(np.max(np.array(lobe.eval(mi.BSDFContext(), square, mi.Vector3f(0, 0, 1)))))
+    assert brightest > 2e7
+    board = tracer.receiver.of_board(tracer.rays)
+    (ledger,) = simulation.coarse_ledgers(np.zeros(N * N, dtype=np.int64), 1)
+    for place, light in enumerate([10 * brightest * board, 1e-5 * board]):
+        ledger.add(mi.Float(light), mi.UInt32(0), mi.UInt32(place), mi.Bool(True))
+    filed, *_ = ledger.filed()
+    np.testing.assert_allclose(filed.toarray()[0, :2] / board, [10 * brightest, 1e-5], rtol=0.02)

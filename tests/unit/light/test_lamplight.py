@@ -1,0 +1,324 @@
+"""Lamps of known spectra over a matt sheet, as a camera of known efficiency counts them, against integrals.
+
+The geometry is that of ``test_lamps``: a point lamp, a sheet at 400 mm, an open mask. What a line's run sees is
+
+    integral I(lambda) rho(lambda) eta(lambda) lambda dlambda / (470 nm eta_l lambda_l)
+
+times what it sees of a lamp of intensity 1 over a sheet of reflectance 1; I / 470 nm is the lamp's spectral intensity.
+"""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from mitsim.acquire import spectral as colour
+from mitsim.acquire.capture import _of_unknown_light
+from mitsim.acquire.mosaic import MosaicBench
+from mitsim.acquire.spectral import ColourBench
+from mitsim.api.bench import open_bench
+from mitsim.bench.request import Request
+from mitsim.core.spectral_manifests import MOSAIC, RUN
+from mitsim.devices.lamps import SPECTRA_NM, Lamplight, Response
+from mitsim.devices.patterns import Lighting
+from mitsim.devices.projector import Spectrum
+from mitsim.light.passes import Simulation, Tray
+from mitsim.light.settings import Settings
+from mitsim.transport.from_camera import FromCameraTracer, LampTracer, Paths, Together
+from mitsim.transport.records import Deposits
+from tests.conftest import write_small_scene
+from tests.system.conftest import CAMERA
+from tests.unit.bench.test_lamps import ALBEDO, POSITION, seen
+
+LAMPS = {
+    "flat": '<spectrum name="intensity" value="3e4"/>',
+    "coloured": '<spectrum name="intensity" value="400:1e4, 500:6e4, 505:2e5, 510:6e4, 650:2e4, 800:5e4"/>',
+    "cie_a": '<spectrum name="intensity" type="blackbody"><float name="temperature" value="2856"/></spectrum>',
+    "d65": '<spectrum name="intensity" type="d65"><float name="scale" value="3e4"/></spectrum>',
+}
+SHEETS = {"grey": "0.5", "coloured": "350:0.2, 550:0.8, 850:0.4"}
+CURVE = {420.0: 0.2, 530.0: 0.8, 700.0: 0.3}
+"""A camera's electrons per photon."""
+FILTERS = {
+    "G": {400.0: 0.02, 480.0: 0.1, 530.0: 0.6, 600.0: 0.1, 700.0: 0.05},
+    "B": {390.0: 0.1, 450.0: 0.5, 520.0: 0.1, 600.0: 0.0, 650.0: 0.0},
+    "R": {420.0: 0.0, 560.0: 0.02, 600.0: 0.5, 650.0: 0.4, 750.0: 0.2},
+}
+"""The same behind filters, GBRG."""
+LINES = [638.0, 520.0, 445.0]
+SHARES = [0.5, 0.3, 0.2]
+SEEDS, SAMPLES = 8, 64
+CASES = [("flat", "grey", False), ("coloured", "coloured", True), ("cie_a", "grey", False), ("d65", "coloured", True)]
+FILTERED = ["flat", "coloured", "cie_a", "d65"]
+"""Lamps over a grey sheet that are seen behind filters as well; d65's lights a coloured one."""
+
+
+def spectral(lamp: str, wavelengths: np.ndarray) -> np.ndarray:
+    """Intensity of a ``lamp``, as Mitsuba's plugins have it."""
+    if lamp == "flat":
+        return np.full(wavelengths.shape, 3e4)
+    if lamp == "coloured":
+        known = {400: 1e4, 500: 6e4, 505: 2e5, 510: 6e4, 650: 2e4, 800: 5e4}
+        return np.interp(wavelengths, list(known), list(known.values()), 0, 0)
+    if lamp == "cie_a":  # Planck's law [W m^-2 sr^-1 nm^-1]
+        metres, h, c, k = wavelengths * 1e-9, 6.62607015e-34, 299792458.0, 1.380649e-23
+        return 1e-9 * 2 * h * c**2 / metres**5 / np.expm1(h * c / (metres * k * 2856.0))
+    import colour
+
+    daylight = colour.SDS_ILLUMINANTS["D65"]
+    return 3e4 * np.interp(wavelengths, daylight.wavelengths, daylight.values) / D65_UNIT
+
+
+D65_UNIT = 98.99741751876255
+"""Mitsuba's D65 has a luminance of 1: MI_CIE_D65_NORMALIZATION."""
+
+
+def counted(
+    lamp: str,
+    sheet: str,
+    curve: bool | dict[float, float],
+    low: float = SPECTRA_NM[0],
+    high: float = SPECTRA_NM[1],
+) -> float:
+    """Integral from ``low`` to ``high`` [nm] of what the camera counts, or pixels of a ``curve``."""
+    known = curve if isinstance(curve, dict) else CURVE
+    at = np.linspace(low, high, 2 + int((high - low) * 20))
+    pairs = dict(map(float, pair.split(":")) for pair in SHEETS[sheet].split(", ")) if sheet == "coloured" else {}
+    albedo = np.interp(at, list(pairs), list(pairs.values())) if pairs else ALBEDO
+    efficiency = np.interp(at, list(known), list(known.values())) if curve else 0.75
+    return float(np.trapezoid(spectral(lamp, at) * albedo * efficiency * at, at) / (SPECTRA_NM[1] - SPECTRA_NM[0]))
+
+
+def traced(folder: str) -> list[dict[str, Any]]:
+    """Light of each case in this process, whose variant is spectral from then on."""
+    place, found = Path(folder), []
+    (place / "number.toml").write_text(CAMERA)
+    table = f"[quantum_efficiency_curve]\nwavelengths_nm = {list(CURVE)}\nefficiency = {list(CURVE.values())}\n"
+    (place / "curve.toml").write_text(CAMERA.replace("quantum_efficiency = 0.75\n", "") + table)
+    (place / "lines.toml").write_text(
+        f'name = "lines"\neffective_wavelength_nm = 550\nwavelengths_nm = {LINES}\nradiant_shares = {SHARES}\n'
+    )
+    single = CAMERA.replace("5.86", "11.72").replace("binning = 2\n", "").replace("quantum_efficiency = 0.75\n", "")
+    tables = "".join(
+        f"[mosaic_curves.{name}]\nwavelengths_nm = {list(curve)}\nefficiency = {list(curve.values())}\n"
+        for name, curve in FILTERS.items()
+    )
+    (place / "filters.toml").write_text(f'{single}mosaic = "GBRG"\n{tables}')
+    for lamp, sheet, curve in CASES:
+        emitter = f'<emitter type="point">{POSITION}{LAMPS[lamp]}</emitter>'
+        path = write_small_scene(place, lamp, mask="open", extra=emitter)
+        camera = place / ("curve.toml" if curve else "number.toml")
+        bench = open_bench(path, "llvm_ad_spectral", camera, place / "lines.toml", albedo=SHEETS[sheet])
+        whole = ColourBench.of(bench, RUN).lit_by_lamps({}, 0).whole
+        assert whole.lamplight is not None
+        simulation = Simulation(whole, Settings(depth=400.0, effects=frozenset({"ambient"})))
+        assert isinstance(simulation.from_camera, LampTracer)
+        looks = [simulation.from_camera.trace(seed, 0, SAMPLES) for seed in range(SEEDS)]
+        lines = [[light.value.sum() / SAMPLES for light in look.by_line(len(LINES))] for look in looks]
+        bands = [np.bincount(look.pixel - whole.n**2, look.value) / SAMPLES for look in looks]
+        parts = whole.loaded.scene, whole.loaded.camera, simulation.physics.projector, simulation.aim
+        mirrored = Together(FromCameraTracer(*parts, Paths(mirrors=True)), simulation.from_camera)
+        both = mirrored.trace(0, 0, SAMPLES).by_line(len(LINES)) if lamp == "flat" else []
+        labels = np.zeros(whole.n**2, dtype=np.int64)
+        filed = [simulation.file_followed(look.by_line(3)[2], labels, SAMPLES).fine for look in looks[:1]]
+        found.append(
+            {
+                "lines": np.array(lines).tolist(),
+                "bands": np.array(bands).tolist(),
+                "together": [float(light.value.sum()) / SAMPLES for light in both],
+                "filed": np.asarray(filed[0].sum(axis=1)).tolist(),
+                "shares": whole.lamplight.shares.tolist() if whole.lamplight.shares is not None else [],
+                "edges": list(whole.lamplight.bands),
+                "spectra": [list(each.wavelengths_nm) for each in whole.lamplight.spectra],
+                "weights": [list(each.weights) for each in whole.lamplight.spectra],
+                "unknown": whole.lamplight.unknown,
+                "filtered": through_filters(place, path, lamp) if lamp in FILTERED else {},
+            }
+        )
+    return found
+
+
+def through_filters(place: Path, scene: Path, lamp: str) -> dict[str, Any]:
+    """Light of a ``lamp`` behind filters: by band and line of all lines, and of the second line alone."""
+    sheet = SHEETS["coloured" if lamp == "d65" else "grey"]
+    bench = open_bench(scene, "llvm_ad_spectral", place / "filters.toml", place / "lines.toml", albedo=sheet)
+    colours = ColourBench.of(MosaicBench.of(bench), MOSAIC).lit_by_lamps({}, 0)
+    lamplight, found = colours.whole.lamplight, {}
+    assert lamplight is not None
+    for name, each in {"lines": colours.whole, "alone": colours.benches[1]}.items():
+        tracer = Simulation(each, Settings(depth=400.0, effects=frozenset({"ambient"}))).from_camera
+        assert isinstance(tracer, Together) and len(tracer.tracers) == 3
+        looks = [tracer.trace(seed, 0, SAMPLES) for seed in range(SEEDS if name == "lines" else 1)]
+        lines = [look.by_line(len(LINES) if name == "lines" else 1) for look in looks]
+        found[name] = [[np.bincount(one.pixel - bench.n**2, one.value, 12).tolist() for one in look] for look in lines]
+    assert lamplight.shares is not None
+    return {**found, "shares": lamplight.shares.tolist(), "unknown": lamplight.unknown, "range": lamplight.range_nm}
+
+
+@pytest.fixture(scope="module")
+def light(tmp_path_factory: pytest.TempPathFactory) -> Mapping[tuple[str, str, bool], dict[str, Any]]:
+    """Light of each case, from one child process: this one has another variant."""
+    program = (
+        "import json, sys; from tests.unit.light.test_lamplight import traced; print(json.dumps(traced(sys.argv[1])))"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path_factory.mktemp("lamps"))]
+    root = Path(__file__).parents[3]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=root, check=False)
+    assert done.returncode == 0, done.stderr
+    return dict(zip(CASES, json.loads(done.stdout.splitlines()[-1]), strict=True))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_every_line_sees_the_lamp_as_its_closed_form(light: Mapping[Any, dict[str, Any]], case: Any) -> None:
+    """Seven standard errors of eight seeds, 1 % at most, and 2e-4 of rounding and of the geometry's judge."""
+    *_, curve = case
+    ends = (min(CURVE), max(CURVE)) if curve else SPECTRA_NM
+    geometry = seen("point") / (ALBEDO * 3e4)
+    runs, found = np.array(light[case]["lines"]), light[case]
+    for line, wavelength in enumerate(LINES):
+        efficiency = np.interp(wavelength, list(CURVE), list(CURVE.values())) if curve else 0.75
+        expected = geometry * counted(*case, *ends) / (efficiency * wavelength)
+        error = runs[:, line].std(ddof=1) / np.sqrt(SEEDS)
+        assert 7 * error < 0.01 * expected
+        assert abs(runs[:, line].mean() - expected) < 7 * error + 2e-4 * expected, (case, wavelength)
+    assert found["together"] in ([], pytest.approx(runs[0], rel=1e-12)), "beside paths over mirrors, which see none"
+    assert sum(found["filed"]) == pytest.approx(runs[0, 2], rel=1e-6) and found["filed"][0] == 0
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_each_band_has_its_light(light: Mapping[Any, dict[str, Any]], case: Any) -> None:
+    """In rows of its own, and as the first look says to some percent; in the look, so many parts of a band."""
+    found = light[case]
+    expected = np.array([counted(*case, *edges) for edges in found["edges"]])
+    bands = np.array(found["bands"])
+    assert bands.mean(axis=0) / bands.mean() / 4 == pytest.approx(expected / expected.sum(), abs=2e-3)
+    assert found["shares"] == pytest.approx(expected / expected.sum(), abs=0.01)
+    for edges, spectrum, weights in zip(found["edges"], found["spectra"], found["weights"], strict=True):
+        assert edges[0] < min(spectrum) and max(spectrum) < edges[1]
+        mean = counted_mean(case, edges)
+        assert np.dot(spectrum, weights) == pytest.approx(mean, abs=3)
+
+
+@pytest.mark.parametrize("lamp", FILTERED)
+def test_pixels_count_the_lamp_each_through_its_filter(light: Mapping[Any, dict[str, Any]], lamp: str) -> None:
+    """And no filter counts for another; lines share a count as their power, each alone as all together.
+
+    (Planted: the red curve for all; red for blue; a line's part of the count as of its photons.)
+    """
+    (case,) = (each for each in CASES if each[0] == lamp)
+    sheet, found, geometry = "coloured" if lamp == "d65" else "grey", light[case]["filtered"], seen("point")
+    planes = {name: "GBRG".count(name) / 4 for name in FILTERS}
+    # Electrons that all lines make, of an even sheet, for one of their power.
+    power = sum(
+        share * part * at * np.interp(at, list(FILTERS[name]), list(FILTERS[name].values()))
+        for at, share in zip(LINES, SHARES, strict=True)
+        for name, part in planes.items()
+    )
+    looks = np.array(found["lines"]).reshape(SEEDS, len(LINES), len(FILTERS), 4) / SAMPLES
+    every = {name: counted(lamp, sheet, curve, min(curve), max(curve)) for name, curve in FILTERS.items()}
+    whole = sum(planes[name] * every[name] for name in FILTERS)
+    for number, (name, curve) in enumerate(FILTERS.items()):
+        edges = np.linspace(min(curve), max(curve), 5)
+        bands = [counted(lamp, sheet, curve, *ends) for ends in pairwise(edges)]
+        assert np.reshape(found["shares"], (3, 4))[number] == pytest.approx(
+            planes[name] * np.array(bands) / whole, abs=0.01
+        )
+        for line, share in enumerate(SHARES):
+            runs = looks[:, line, number].sum(axis=1) * power / share / planes[name]
+            expected, error = geometry / (ALBEDO * 3e4) * every[name], runs.std(ddof=1) / np.sqrt(SEEDS)
+            assert 7 * error < 0.01 * expected
+            assert abs(runs.mean() - expected) < 7 * error + 2e-4 * expected, (lamp, name, line)
+    assert np.array(found["alone"])[0, 0] == pytest.approx(np.array(found["lines"])[0, 1], rel=1e-6)
+    beyond = max(1 - every[name] / counted(lamp, sheet, curve) for name, curve in FILTERS.items())
+    assert found["unknown"] == pytest.approx(beyond, abs=0.01) and found["range"] == [420, 650]
+
+
+def counted_mean(case: tuple[str, str, bool], edges: tuple[float, float]) -> float:
+    """Mean wavelength [nm] of what is counted in a band, in steps of a nanometre."""
+    middles = np.arange(edges[0], edges[1], 1.0) + 0.5
+    light = np.array([counted(*case, at - 0.5, at + 0.5) for at in middles])
+    return float((middles * light).sum() / light.sum())
+
+
+def test_light_beyond_a_curve_is_known_to_be_missing(light: Mapping[Any, dict[str, Any]]) -> None:
+    """As if the efficiency stayed what it is at the curve's ends. (Planted: none told.)"""
+    for case in CASES:
+        *_, curve = case
+        if not curve:
+            assert light[case]["unknown"] == 0
+            continue
+        ends = min(CURVE), max(CURVE)
+        inside, whole = counted(*case, *ends), counted(*case)
+        assert light[case]["unknown"] == pytest.approx((whole - inside) / whole, abs=0.01)
+
+
+def test_the_mask_diffracts_each_band_by_its_own_wavelengths(small_scene: Callable[..., Path], variant: str) -> None:
+    """A spot of each band alone makes the frame of a spot of its spectrum, beside a projector that is not lit.
+
+    (Planted: rows of bands taken from the end.)
+    """
+    nm = [(420.0,), (500.0, 540.0), (600.0,), (760.0,)]
+    spectra = tuple(Spectrum(np.array(at), np.full(len(at), 1 / len(at))) for at in nm)
+    lamp = '<emitter type="constant"/>'
+    bench = open_bench(small_scene(extra=lamp), variant, None, "mp_cl1")
+    response = Response.of(bench.sensor)
+    bench = replace(bench, lamplight=Lamplight((response,), response.bands(4), spectra, np.full(4, 0.25)))
+    settings = Settings(depth=400.0, effects=frozenset({"ambient", "diffraction"}))
+    simulation, labels = Simulation(bench, settings), np.zeros(bench.n**2, dtype=np.int64)
+    frames = []
+    for band, spectrum in enumerate(spectra):
+        none, place = np.zeros(1, np.int64), np.full(1, 0.02)
+        spot = Deposits(
+            none + bench.n**2 + band, none, none, place, place, place / 8, np.ones(1), none.astype(np.int16)
+        )
+        light = simulation.file_followed(spot, labels, 1)
+        expected = simulation.expected([light], labels[:1], Lighting.uniform(bench.n).shots([0]), 0)
+        alone = Tray(simulation.fine.bundle, bench.geometry, spectrum).optics
+        found = expected.projector_off.irradiance
+        row = light.fine[[1 + band]].tocsr()
+        assert np.allclose(found, alone.frame(row.indices, row.data), rtol=1e-12, atol=1e-15 * found.max())
+        frames.append(found)
+    assert np.linalg.norm(frames[0] - frames[3]) > 0.05 * np.linalg.norm(frames[0])
+
+
+@pytest.mark.parametrize(("part", "flagged"), [(0.5, True), (0.02, False)])
+def test_lamps_light_that_is_not_counted_flags_a_run(part: float, flagged: bool) -> None:
+    """Where it is more of all light than the accuracy."""
+    lamplight = Lamplight((Response(np.ones(2), (400.0, 700.0)),), (), unknown=0.04)
+    light: Any = SimpleNamespace(bench=SimpleNamespace(lamplight=lamplight), plan=SimpleNamespace(accuracy=1e-3))
+    said = list(_of_unknown_light(light, cast("Any", SimpleNamespace(ambient_part=part))))
+    assert bool(said) is flagged and all("4.0% of the lamps' light is in no frame" in sentence for sentence in said)
+
+
+def test_lines_are_planned_with_their_lamps_lit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wherever they are planned: `mitsim plan` has not lit them before. (Planted: planned as they are.)"""
+    planned: list[Any] = []
+    alone, whole = (
+        SimpleNamespace(lamplight=object()),
+        SimpleNamespace(
+            family=lambda patterns, seed: SimpleNamespace(lighting=Lighting(np.zeros(4, int), np.ones((1, 1))))
+        ),
+    )
+    lit = SimpleNamespace(roughest=lambda seed, part: alone)
+    colours: Any = SimpleNamespace(
+        manifest=SimpleNamespace(channels=(1, 2, 3)),
+        whole=whole,
+        lit_by_lamps=lambda effects, seed: lit,
+        roughest=lambda seed, part: SimpleNamespace(lamplight=None),
+    )
+
+    def plan_request(bench: Any, request: Any, lines: int) -> Any:
+        planned.append((bench, dict(request.effects), lines))
+        return SimpleNamespace(settings=SimpleNamespace(effects=frozenset()))
+
+    monkeypatch.setattr(colour, "plan_request", plan_request)
+    colour.plan_lines(colours, Request.of(patterns="uniform"))
+    assert planned == [(alone, {}, 3), (alone, {"ambient": True}, 3)]

@@ -1,0 +1,387 @@
+"""SampledLight for a family: stopped at its target, by pixel or by class, and only for the families that it was meant for."""
+
+import math
+import warnings
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mitsim.api.bench import Bench, open_bench
+from mitsim.bench.effects import EFFECTS
+from mitsim.core.errors import MitsimError
+from mitsim.devices.patterns import Lighting, parse_patterns
+from mitsim.light import light as module
+from mitsim.light.light import SampledLight, Sampling, trace_light
+from mitsim.light.passes import Simulation
+from mitsim.light.plan import Plan
+from mitsim.light.settings import GROUPS, Evidence, Settings
+from mitsim.optics.frames import ExpectedFrames, monte_carlo_error
+from mitsim.planner import choose, memory, planner
+from mitsim.planner.choose import Choice
+from mitsim.planner.explain import SceneFacts
+from mitsim.planner.planner import make_plan
+from tests.unit.planner.invented_evidence import EVIDENCE
+
+pytestmark = pytest.mark.usefixtures("kept_plans")
+N = 16
+FAR = ("interreflection",)
+
+
+@pytest.fixture(scope="module")
+def bench(shared_scene: Callable[..., Path], variant: str) -> Bench:
+    print_ = np.random.default_rng(4).integers(20, 256, (48, 48))
+    return open_bench(shared_scene("light", reflectance=print_), variant)
+
+
+@pytest.fixture(scope="module")
+def family() -> Lighting:
+    return parse_patterns("dots:4", N).lighting
+
+
+@pytest.fixture(scope="module")
+def plan(bench: Bench, family: Lighting) -> Plan:
+    """Direct light only: quick, and enough to see how sampling is steered."""
+    return make_plan(bench, family, 1e-2, 0, dict.fromkeys(EFFECTS, False))
+
+
+def stacked(frames: ExpectedFrames) -> np.ndarray:
+    return np.stack([frame.irradiance for frame in frames])
+
+
+def test_by_pixel_and_by_class_are_the_same_light(bench: Bench, plan: Plan, family: Lighting) -> None:
+    pixel, group = (trace_light(bench, plan, family, 3, Sampling(by_pixel=by_pixel)) for by_pixel in (True, False))
+    assert pixel.groups[0].fine.shape[0] == N * N + 1 and group.groups[0].fine.shape[0] == 16 + 1
+    assert np.allclose(stacked(pixel.frames(family, 0)), stacked(group.frames(family, 0)), rtol=1e-9)
+    assert pixel.sampling_error == pytest.approx(group.sampling_error, rel=1e-6)
+    assert np.allclose(pixel.flux, group.flux) and pixel.paths == group.paths
+
+
+def test_light_by_class_serves_no_other_family(bench: Bench, plan: Plan, family: Lighting) -> None:
+    other, uniform = parse_patterns("dots:3", N).lighting, Lighting.uniform(N)
+    by_class, by_pixel = (
+        trace_light(bench, plan, family, 3, Sampling(by_pixel=by_pixel)) for by_pixel in (False, True)
+    )
+    with pytest.raises(ValueError, match="another family"):
+        by_class.frames(other, 0)
+    assert len(list(by_pixel.frames(other, 0))) == 9
+    # Uniform light never splits a class: it is the sum of all of them.
+    (white,) = stacked(by_class.frames(uniform, 0))
+    assert np.allclose(white, stacked(by_class.frames(family, 0)).sum(axis=0), rtol=1e-9)
+
+
+def test_a_target_stops_the_sampling(
+    bench: Bench, plan: Plan, family: Lighting, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is asked with the frames seen so far, here eight of the sixteen, and its answer is the error to stop at.
+
+    The error of all sixteen is told by random signs alone, the frames' energy too: 0.7 % off here.
+    """
+    monkeypatch.setattr("mitsim.light.light.CHECKED_SHOTS", 8)
+    asked: list[float] = []
+
+    def target(frames: ExpectedFrames) -> float:
+        assert len(frames) == 8
+        asked.append(monte_carlo_error(frames))
+        return math.inf if len(asked) == 1 else 0.0
+
+    found = trace_light(bench, replace(plan, sampling_target=1e-9), family, 3, Sampling(target=target))
+    assert found.reached and len(asked) == 1
+    assert found.sampling_error == pytest.approx(monte_carlo_error(found.frames(family, 3, leaking=False)), rel=0.03)
+    tighter = trace_light(bench, plan, family, 3, Sampling(target=lambda _: found.sampling_error / 3))
+    assert tighter.sampling_error <= found.sampling_error / 3 and tighter.paths > found.paths
+
+
+@pytest.mark.parametrize(("classes_tell", "effects", "looked_at"), [(True, (), 16), (False, (), 8), (False, FAR, 16)])
+def test_shots_that_are_looked_at(
+    bench: Bench,
+    plan: Plan,
+    family: Lighting,
+    monkeypatch: pytest.MonkeyPatch,
+    classes_tell: bool,
+    effects: tuple[str, ...],
+    looked_at: int,
+) -> None:
+    """All, where frames of few classes tell of them; else some, here eight, and more of followed light, as a heavy path
+    may strike another; again after each round. (Planted: eight always.)"""
+    target, asked = plan.sampling_target, []
+
+    def told(frames: ExpectedFrames) -> tuple[float, float]:
+        asked.append(len(frames))
+        return 0.5 * target, 2 * target if len(asked) == 1 else 0.5 * target
+
+    monkeypatch.setattr(ExpectedFrames, "sampling_error", told)
+    monkeypatch.setattr("mitsim.light.light.tells_all", lambda *_: classes_tell)
+    monkeypatch.setattr("mitsim.light.light.CHECKED_SHOTS", 8)
+    plan = replace(plan, settings=replace(plan.settings, effects=frozenset(effects)))
+    assert trace_light(bench, plan, family, 3).reached and asked == [looked_at] * 2
+
+
+@pytest.mark.parametrize(
+    ("error", "bound", "excess"), [(1.9, 2.0, 2.0), (1.9, 4.0, 1.2 * 1.9), (0.9, 2.0, 2.0**0.55), (1.0, 1.1, 1.1)]
+)
+def test_the_next_round_is_for_the_error_where_few_paths_make_the_bound(
+    bench: Bench,
+    plan: Plan,
+    family: Lighting,
+    monkeypatch: pytest.MonkeyPatch,
+    error: float,
+    bound: float,
+    excess: float,
+) -> None:
+    """Where many tell it, for the bound; never more than that. (Planted: for the bound always, for the error always,
+    no power of the bound.)"""
+    target, looks = plan.sampling_target, []
+
+    def told(frames: ExpectedFrames) -> tuple[float, float]:
+        looks.append(frames)
+        return (0.0, 0.0) if len(looks) > 1 else (error * target, bound * target)
+
+    monkeypatch.setattr(ExpectedFrames, "sampling_error", told)
+    monkeypatch.setattr(module, "tells_all", lambda *_: True)
+    asked = []
+
+    def following(_: Simulation, done: Mapping[str, int], variances: Mapping[str, float], by: float) -> dict[str, int]:
+        asked.append((set(variances), by))
+        return {name: count + 1 for name, count in done.items()}
+
+    monkeypatch.setattr(module, "next_samples", following)
+    assert trace_light(bench, plan, family, 3).reached and asked == [({"direct"}, pytest.approx(excess))]
+
+
+def test_light_that_needs_less_than_a_sample_takes_one_and_every_round_grows(
+    bench: Bench, plan: Plan, family: Lighting, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """(Planted: two samples for what needs less; rounds in which nothing grows.)"""
+    target, looks = plan.sampling_target, list[ExpectedFrames]()
+
+    def told(frames: ExpectedFrames) -> tuple[float, float]:
+        looks.append(frames)
+        return (1.1 * target, 1.2 * target) if len(looks) < 3 else (0.0, 0.0)
+
+    monkeypatch.setattr(ExpectedFrames, "sampling_error", told)
+    settings = replace(plan.settings, effects=frozenset(FAR), direct_samples=0.1, indirect_samples=3.0)
+    settings = replace(settings, followed_anchors=2, followed_samples=0.5, followed_from_camera_samples=0.02)
+    wanted, kept = [], module._trace
+    monkeypatch.setattr(module, "_trace", lambda groups, samples: wanted.append(samples) or kept(groups, samples))
+    assert trace_light(bench, replace(plan, settings=settings), family, 3).reached
+    assert wanted[0] == {"direct": 1, "indirect": 3, "indirect at anchors": 1}
+    for before, after in pairwise(wanted):
+        assert after != before and all(after[name] >= count for name, count in before.items())
+
+
+def test_what_a_look_finds_is_used_again(bench: Bench, plan: Plan, family: Lighting) -> None:
+    """Frames of looked-at light state the errors of frames that nobody looked at before; of other light, shots with
+    other classes, or other signs they do not. (Planted: the look's products, times two, and a look for any light.)"""
+    light = trace_light(bench, plan, family, 3)
+    looked = light.looked
+    assert looked is not None
+    pairs, other = Lighting(family.labels // 2, np.eye(8)), light.behind(bench)
+    unlit = Lighting(family.labels, np.hstack([family.weights, np.ones((16, 1))]))  # a class that no pixel has
+    cases = [(light, family, 3), (light, pairs, 3), (light, family, 4), (light.merged(), family, 3), (other, family, 3)]
+    cases.append((light, unlit, 3))
+    for which, shots, seed in cases:
+        plain = replace(which, looked=None).frames(shots, seed)
+        for found, known in zip(which.frames(shots, seed), plain, strict=True):
+            assert np.array_equal(found.irradiance, known.irradiance)
+            assert found.variance == pytest.approx(known.variance, rel=1e-9)
+    assert [
+        looked.at(which, which.rows_of(shots), shots.weights.shape[1]) is not None for which, shots, _ in cases
+    ] == [
+        True,
+        False,
+        True,
+        False,
+        False,
+        False,
+    ]
+
+
+def test_what_is_made_of_all_lines_meets_the_target(bench: Bench, plan: Plan, family: Lighting) -> None:
+    """Its error may exceed theirs: by so much less is theirs. (Planted: the excess not asked for.)"""
+    asked = []
+
+    def excess(lights: Sequence[SampledLight]) -> float:
+        asked.append(len(lights))
+        return 2.0
+
+    target = trace_light(bench, plan, family, 3).sampling_error
+    found = trace_light(bench, replace(plan, sampling_target=target), family, 3, Sampling(excess=excess))
+    assert set(asked) == {1} and found.reached and found.sampling_error <= target / 2
+
+
+def test_a_round_does_not_hold_the_light_of_the_one_before(
+    bench: Bench, plan: Plan, family: Lighting, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of corner in three lines that was 0.4 GB. (Planted: each of the names that are dropped, kept.)"""
+    made, held = list[Any](), list[int]()  # of arrays, which copies of a light share
+    line_of, trace = module._line_of, module._trace
+
+    def watched(*parts: Any) -> SampledLight:
+        light = line_of(*parts)
+        made.append(weakref.ref(light.flux))
+        return light
+
+    def counted(*parts: Any) -> None:
+        held.append(sum(each() is not None for each in made))
+        trace(*parts)
+
+    monkeypatch.setattr(module, "_line_of", watched)
+    monkeypatch.setattr(module, "_trace", counted)
+    target = trace_light(bench, plan, family, 3).sampling_error
+    trace_light(bench, replace(plan, sampling_target=target / 2), family, 3)
+    assert len(held) > 2 and not any(held)
+
+
+def test_light_that_is_divided_lies_where_it_lay(bench: Bench, plan: Plan) -> None:
+    """Bit for bit SciPy's own quotient. (Planted: copied places; light over the count, which is not SciPy's.)"""
+    simulation = Simulation(bench, plan.settings)
+    labels = np.arange(N * N) % 5
+    light = simulation.file_direct(simulation.direct.trace(3, 0, 16), labels, 16)
+    divided = light / 3
+    np.testing.assert_array_equal(divided.fine.toarray(), (light.fine / 3).toarray())
+    assert np.shares_memory(divided.fine.indices, light.fine.indices)
+    assert np.shares_memory(divided.fine.indptr, light.fine.indptr)
+    assert divided.received == light.received / 3
+
+
+@pytest.mark.parametrize(
+    ("bounds", "looked"), [([3, 1, 1, 0], [2, 0]), ([1, 2, 1, 0], [2, 0, 1, 3]), ([1, 1, 3, 0], [2])]
+)
+def test_lines_are_looked_at_from_the_noisiest_until_one_is_not_good_enough(
+    monkeypatch: pytest.MonkeyPatch, bounds: list[float], looked: list[int]
+) -> None:
+    """Noise of 2, 1 and 3 in 4 of their light, and a dark line; 2 is enough. (Planted: no end; the quietest first.)"""
+    lines: list[Any] = [SimpleNamespace(flux=np.full(3, 4.0), flux_error=np.full(3, noise)) for noise in (2, 1, 3)]
+    lines.append(SimpleNamespace(flux=np.zeros(3), flux_error=np.zeros(3)))
+    monkeypatch.setattr(module, "_looked", lambda light, line, *_: module._Look(light, bounds[line], {}))
+    seen = module._looks(lines, lambda line: line, Lighting.uniform(1), False, 2.0)
+    assert list(seen) == looked
+    assert all(seen[line].light is lines[line] and seen[line].bound == bounds[line] for line in looked)
+    assert len(module._looks(lines, lambda line: line, Lighting.uniform(1), False, math.inf)) == 4
+
+
+def test_a_plan_of_several_lines_is_priced_for_all(
+    bench: Bench, family: Lighting, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames are those of each line, light is held for all; what one line's frames take to form comes once.
+
+    (Planted: lines that the pilot forgets; disk, or light, of one.)
+    """
+    seen: list[int] = []
+
+    def cheapest(accuracy: float, evidence: Evidence, switches: Mapping[str, bool]) -> Choice:
+        seen.append(evidence.forming.lines)
+        return choose.cheapest(accuracy, evidence, switches)
+
+    monkeypatch.setattr(planner, "cheapest", cheapest)
+    plan = planner.make_plan(bench, family, 1e-2, 0, dict.fromkeys(EFFECTS, False), lines=3)
+    assert seen == [3]
+    monkeypatch.setattr(memory, "workers", lambda: 1)  # files one line at a time
+    one, three = (memory.frames_cost(bench, plan.settings, family, lines=count) for count in (1, 3))
+    assert three.disk_bytes == 3 * one.disk_bytes
+    assert one.memory_bytes < three.memory_bytes < 2 * one.memory_bytes
+
+
+def test_purposes_share_no_random_numbers(bench: Bench, plan: Plan, family: Lighting) -> None:
+    scene, again, board = (
+        trace_light(bench, plan, family, 3, Sampling(purpose=name)) for name in ("scene", "scene", "board")
+    )
+    assert np.array_equal(scene.flux, again.flux) and (scene.flux != board.flux).mean() > 0.95
+    assert len(scene.groups) == GROUPS
+
+
+def test_light_for_another_family_says_how_much_worse_its_frames_are(bench: Bench) -> None:
+    """A shot of 4 pixels has a 64th of uniform light's samples: beyond the accuracy the run is flagged with the cause
+    and what to do, within it one line says so. (Planted: the ratio turned, nothing said.)"""
+    light = bench.light("uniform", accuracy=1e-2)
+    (found,) = light.expose("dots:8").warnings
+    assert found.startswith("the total error is up to") and found.endswith("trace it for dots:8")
+    lax = replace(light, plan=replace(light.plan, accuracy=0.1))
+    with pytest.warns(UserWarning, match=r"traced for uniform, .* trace it for dots:8$") as said:
+        shots = lax.expose("dots:8")
+    assert len(said) == 1 and not shots.warnings
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not lax.expose("uniform").warnings
+
+
+def test_merged_light_has_the_same_frames(bench: Bench, plan: Plan, family: Lighting) -> None:
+    light = trace_light(bench, plan, family, 3)
+    merged = light.merged()
+    assert np.allclose(stacked(merged.frames(family, 0)), stacked(light.frames(family, 0)), rtol=1e-9)
+    assert monte_carlo_error(merged.frames(family, 0)) == 0 < monte_carlo_error(light.frames(family, 0))
+
+
+def test_flux_is_what_each_pixel_casts_on_the_sensor(bench: Bench, plan: Plan) -> None:
+    """Over a board: radiance 0.5 scale / z^2 times each pixel's part of the tan-angles, with the falloff."""
+    tau = (np.arange(N) - 7.5) * 0.3 / N
+    falloff = (1 + np.square(tau)[:, None] + np.square(tau)[None, :]) ** -2
+    expected = 0.99 * 111000 / 400**2 * (0.3 / N) ** 2 * falloff.ravel()
+    assert trace_light(bench.with_board(0.99), plan, Lighting.uniform(N), 3).flux == pytest.approx(expected, rel=3e-3)
+
+
+def test_facts_name_what_is_there(small_scene: Callable[..., Path], bench: Bench) -> None:
+    sky = '<emitter type="constant"><spectrum name="radiance" value="1"/></emitter>'
+    facts = SceneFacts.of(open_bench(small_scene(extra=sky, fov=12)))
+    assert "1 emitter beside" in facts.notes["ambient"] and "field stop" in facts.warnings[0]
+    assert not SceneFacts.of(bench).warnings
+
+
+def test_a_plan_follows_the_users_choice(plan: Plan, bench: Bench, family: Lighting) -> None:
+    assert not plan.settings.effects
+    assert make_plan(bench, family, 0.3, 0, {"interreflection": True}).settings.effects >= {"interreflection"}
+    with pytest.raises(MitsimError, match=r"^accuracy 0"):
+        make_plan(bench, family, 0.0, 0)
+
+
+def test_sampling_is_checked_without_what_black_pixels_leak(bench: Bench, plan: Plan, family: Lighting) -> None:
+    """Frames that do not leak are those of a projector whose black is black, to the last bit.
+
+    (Planted: ``leaking`` not heeded.)
+    """
+    grey = replace(bench, rig=replace(bench.rig, projector=bench.projector.model_copy(update={"contrast_ratio": 20.0})))
+    with_black = replace(plan, settings=replace(plan.settings, effects=plan.settings.effects | {"black-level"}))
+    light = trace_light(grey, with_black, family, 3)
+    ours = stacked(light.frames(family, 3, leaking=False))
+    sharp = replace(light, simulation=Simulation(bench, plan.settings))
+    assert np.array_equal(ours, stacked(sharp.frames(family, 3)))
+    assert stacked(light.frames(family, 3)).sum() > 1.05 * ours.sum()
+
+
+def test_a_heavy_path_in_a_shot_that_is_not_checked_is_seen() -> None:
+    """One group of eight has a path of 100 standard deviations in shot 5; shots 0, 7, 14 are checked. (Planted: 1, 1.)
+
+    The other shots have a variance of about 1, so that of all is 1 + 100^2 (1/8 - 1/64) / 16, and one group has it all.
+    """
+    rng, lighting = np.random.default_rng(1), Lighting(np.arange(16), np.eye(16))
+    totals = rng.normal(size=(8, 17))
+    heavy = totals.copy()
+    heavy[3, 5] += 100
+
+    def ratios(groups: np.ndarray, shots: list[int]) -> tuple[float, float]:
+        light = SimpleNamespace(labels=lighting.labels, groups=[SimpleNamespace(totals=group) for group in groups])
+        return module._unchecked(light, lighting, lighting.shots(np.array(shots)))
+
+    assert ratios(totals, [0, 7, 14]) == (1.0, 1.0)
+    error, bound = ratios(heavy, [0, 7, 14])
+    assert error == pytest.approx(np.sqrt((1 + 100**2 * (1 / 8 - 1 / 64) / 16) / module._BY_CHANCE), rel=0.3)
+    assert bound > 1.2 * error, "one group alone makes it, so it could be larger by chance"
+    assert max(ratios(heavy, [0, 5, 14])) == 1.0, "what is checked is in the error already"
+
+
+def test_paces_are_measured_of_what_was_chosen_alone(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Direct light and its anchors, of a machine that takes 0.1 us a path; other kinds keep what they had. (Planted:
+    seconds of a sample, not of a path.)"""
+    monkeypatch.setattr(planner, "_seconds", lambda stage, seed, labels, samples: 1e-7 * stage.tracer.lanes * samples)
+    simulation = Simulation(bench, Settings(depth=400.0, anchors=2))
+    timed = planner._timed(EVIDENCE, simulation, np.arange(bench.n**2), 0)
+    for name in ("direct", "anchored"):
+        assert getattr(timed, name).seconds == pytest.approx(1e-7)
+    assert timed.indirect == EVIDENCE.indirect and timed.followed == EVIDENCE.followed

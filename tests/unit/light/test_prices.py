@@ -1,0 +1,182 @@
+"""What simulating is predicted to take: multiplications counted by hand, and the pilot's own frame found again."""
+
+from dataclasses import fields, replace
+
+import pytest
+
+from mitsim.light.cost_model import (
+    FIXED,
+    Numbers,
+    Paces,
+    checking_seconds,
+    entries,
+    filing_seconds,
+    forming_seconds,
+    optics_seconds,
+    paces_of,
+    tracing_seconds,
+    truth_seconds,
+)
+from mitsim.light.settings import GROUPS, Effort, Forming, Noise, Settings
+from mitsim.optics.frames import PROBES
+from tests.unit.planner.invented_evidence import EVIDENCE, plan
+
+FORMING = Forming(pixels=50, cells=10, lit=0.5, terms=3.0, shots=4, classes=4)
+ONE = Numbers.coarsest()
+COUNTED = Paces(**{**{pace.name: 0.0 for pace in fields(Paces)}, "product": 1.0})
+"""Paces at which seconds are multiplications of forming frames."""
+
+
+def products(rows: float, terms: float = 1.0) -> float:
+    """Of left (50, rows) times light (rows, rows) times right (rows, 50), and of the groups' probes in the same way."""
+    probes = GROUPS * (PROBES + 1) * (min(rows, 50) + 50) * rows
+    return terms * (50 * rows * rows + 50 * 50 * rows + probes)
+
+
+def test_the_frame_that_the_pilot_measured_takes_what_it_took() -> None:
+    measured = replace(EVIDENCE, forming=replace(EVIDENCE.forming, seconds=0.125))
+    assert forming_seconds(measured.forming, ONE, 1.0, paces_of(measured)) == pytest.approx(0.125, rel=1e-12)
+    none = replace(
+        EVIDENCE, direct=replace(EVIDENCE.direct, seconds=0.0), forming=replace(EVIDENCE.forming, seconds=0.0)
+    )
+    assert paces_of(none).direct == FIXED.direct and paces_of(none).product == FIXED.product
+    slower = {name: getattr(paces_of(measured), name) / getattr(FIXED, name) for name in ("frame", "entry", "filed")}
+    assert slower == pytest.approx(dict.fromkeys(slower, paces_of(measured).product / FIXED.product))
+    timed = replace(measured, forming=replace(measured.forming, product=FIXED.product / 6))
+    assert forming_seconds(timed.forming, ONE, 1.0, paces_of(timed)) == pytest.approx(0.125, rel=1e-12)
+    assert paces_of(timed).product == FIXED.product / 6, "large products are not slower because small frames are"
+    assert paces_of(timed).entry == pytest.approx(FIXED.entry / 6)
+    other = replace(EVIDENCE, direct=replace(EVIDENCE.direct, seconds=5e-6))
+    assert paces_of(other).direct == 5e-6
+
+
+@pytest.mark.parametrize(
+    ("change", "multiplications"),
+    [
+        ({"waves": 0.0}, products(5)),
+        ({}, products(5, 3)),
+        ({"layers": 2.0}, 2 * products(5, 3)),
+        ({"cells": 4.0}, products(20, 3)),
+        ({"anchors": 2.0, "coarse_cells": 2.0}, products(5, 3) + products(20, 3)),
+        ({"anchors": 2.0, "layers": 3.0, "coarse_layers": 3.0}, 3 * products(5, 3) + 3 * products(10, 3)),
+        ({"indirect": 1.0, "coarse_cells": 2.0}, products(5, 3) + products(20, 3)),
+        ({"followed_anchors": 3.0, "coarse_cells": 2.0}, products(5, 3) + products(60, 3)),
+        ({"followed_anchors": 3.0, "followed_width": 2.0, "coarse_layers": 3.0}, products(5, 3) + products(15, 3)),
+        ({"occluded": 1.0, "occluded_anchors": 4.0}, products(5, 3) + products(2, 3)),
+        ({"occluded": 90.0, "occluded_anchors": 4.0, "coarse_cells": 2.0}, products(5, 3) + products(40, 3)),
+        ({"mixed": 1.0}, products(5, 3) + 4 * 50**2),
+    ],
+)
+def test_forming_a_frame_is_as_many_products_as_its_matrices_have(
+    change: dict[str, float], multiplications: float
+) -> None:
+    """Half of the ten rows of cells hold light; coarse light of several anchors and indirect light add frames.
+
+    A quarter of the pixels is lit: of one occluded pixel a quarter of two rows, of many no more than of all.
+    """
+    assert forming_seconds(FORMING, replace(ONE, **change), 7.0, COUNTED) == pytest.approx(7 * multiplications)
+
+
+def test_occluded_pixels_in_a_column_are_a_narrow_matrix() -> None:
+    """They lie in all rows and a tenth of the columns: two columns of light by 20 rows, or as many of rows. (Planted:
+    as many columns as rows.)"""
+    numbers = replace(ONE, occluded=90.0, occluded_anchors=4.0)
+    for parts, rows, columns in (((1.0, 0.1), 20, 2), ((0.1, 1.0), 2, 20)):
+        narrow = 3 * (50 * rows * columns + 50**2 * 2 + GROUPS * (PROBES + 1) * (columns + 50) * rows)
+        found = forming_seconds(replace(FORMING, occluded=parts), numbers, 1.0, COUNTED)
+        assert found == pytest.approx(products(5, 3) + narrow)
+
+
+def test_shots_that_are_no_mixtures_hold_their_own_light_alone() -> None:
+    """More classes than shots: frames are formed shot by shot, and what leaks in all of them once and for all."""
+    forming = replace(FORMING, classes=9)
+    assert forming_seconds(forming, ONE, 1.0, COUNTED) == pytest.approx(products(5, 3))
+    assert forming_seconds(forming, replace(ONE, mixed=1.0), 1.0, COUNTED) == pytest.approx(products(5, 3))
+
+
+def test_shadows_take_entries_of_waves_or_a_thirtieth_of_one_without() -> None:
+    """Two sides of pixels times cells, for fine light, and once more where light is coarse."""
+    entries = replace(COUNTED, product=0.0, entry=1.0)
+    one = 2 * 50 * 10
+    for change, count in (
+        ({}, 3 * one),
+        ({"waves": 0.0}, 0.03 * one),
+        ({"cells": 2.0, "layers": 2.0}, 4 * 3 * one),
+        ({"anchors": 2.0, "coarse_cells": 2.0}, (1 + 2) * 3 * one),
+        ({"anchors": 2.0, "indirect": 1.0}, (1 + 2) * 3 * one),
+        ({"followed_anchors": 2.0, "followed_width": 4.0, "coarse_layers": 3.0}, (1 + 0.25) * 3 * one),
+    ):
+        assert optics_seconds(FORMING, replace(ONE, **change), entries) == pytest.approx(count), change
+
+
+def test_tracing_takes_a_path_of_every_sample_in_every_group_and_connections_to_all_anchors() -> None:
+    """Samples are whole; differences between 3 x 3 anchors take nine connections each, and one anchor has none."""
+    settings = replace(plan().settings, direct_samples=2.5, anchored_samples=4.0)
+    paces, paths = replace(COUNTED, direct=1.0, anchored=1.0), EVIDENCE.direct.paths
+    several, one = (tracing_seconds(EVIDENCE, replace(settings, anchors=count), paces) for count in (3, 1))
+    assert several["direct"] == one["direct"] == GROUPS * 3 * paths
+    assert several["anchored"] == 9 * GROUPS * 4 * EVIDENCE.anchored.paths and one["anchored"] == 0
+    occluded = replace(EVIDENCE, occluded=(3, 4, 5), occluded_light=Effort(Noise(1e-3, 4, 0.5), 3))
+    own = replace(settings, occluded=(3, 4, 5), occluded_anchors=8, occluded_samples=2.0)
+    assert tracing_seconds(occluded, own, replace(COUNTED, occluded=1.0))["occluded"] == 64 * GROUPS * 2 * 3
+    assert tracing_seconds(occluded, settings, replace(COUNTED, occluded=1.0))["occluded"] == 0
+
+
+def test_light_lies_in_the_cells_that_its_samples_reach() -> None:
+    """100 pixels, 7 classes. Direct light: a pixel's own cells and as many beyond its edge, in two layers at most; what
+    several anchors see, and twice of it: of each and their mean; followed light: all cells of each class."""
+    settings = Settings(
+        depth=400.0, direct_samples=3.0, anchored_samples=50.0, indirect_samples=1e3, followed_samples=20.0
+    )
+    for numbers, found in (
+        (ONE, 2),
+        (replace(ONE, cells=2.0), 3),
+        (replace(ONE, cells=2.0, layers=4.0), 2 * 3),
+        (replace(ONE, anchors=2.0, coarse_cells=2.0), 2 + 2 * 2**2 * 2 * 4),
+        (replace(ONE, indirect=1.0, coarse_cells=2.0), 2 + 7 * 2**2),
+        (replace(ONE, followed_anchors=2.0, coarse_cells=4.0), 2 + 2 * 2**2 * 2 * 20),
+        (replace(ONE, followed_anchors=4.0, followed_width=2.0, coarse_layers=3.0), 2 + 2 * 4**2 * 7 / 2**2),
+    ):
+        assert entries(100, 7, numbers, settings) == 100 * found, numbers
+
+
+def test_every_shot_is_looked_through_once_more_than_it_is_formed() -> None:
+    """For its brightest pixel and its energy, at so much a pixel: shots of 50 x 50 pixels, mixed or not.
+
+    (Planted: a side of the sensor in place of its pixels.)
+    """
+    looked = replace(COUNTED, product=0.0, pixel=1.0)
+    for classes in (FORMING.classes, 9):
+        forming = replace(FORMING, classes=classes)
+        assert optics_seconds(forming, ONE, looked) == pytest.approx(FORMING.shots * 50**2)
+
+
+def test_lines_share_paths_and_form_and_file_each_its_own() -> None:
+    """Three lines: two fifths more tracing, and all else three times. (Planted: shadows of one line; filing of one.)"""
+    three = replace(EVIDENCE, forming=replace(EVIDENCE.forming, lines=3))
+    settings = plan(evidence=EVIDENCE).settings
+    numbers = Numbers.of(settings)
+    for seconds in (
+        lambda forming: forming_seconds(forming, numbers, 5.0, FIXED),
+        lambda forming: optics_seconds(forming, numbers, FIXED),
+        lambda forming: checking_seconds(forming, numbers, FIXED),
+        lambda forming: filing_seconds(forming, numbers, 1e6, FIXED),
+    ):
+        assert seconds(three.forming) == pytest.approx(3 * seconds(EVIDENCE.forming))  # type: ignore[no-untyped-call]
+    one, several = (tracing_seconds(evidence, settings, FIXED) for evidence in (EVIDENCE, three))
+    assert several == pytest.approx({name: 1.4 * each for name, each in one.items()})
+    assert truth_seconds(three, settings, FIXED) == pytest.approx(1.4 * truth_seconds(EVIDENCE, settings, FIXED))
+
+
+def test_a_ledger_is_emptied_and_looked_through_where_it_has_room() -> None:
+    """4 classes of 20 x 20 cells in two layers, where light is followed over several surfaces."""
+    numbers = replace(ONE, indirect=1.0, coarse_cells=2.0, coarse_layers=2.0)
+    places = 4 * 20**2 * 2
+    entry = GROUPS * FIXED.filed
+    assert filing_seconds(FORMING, numbers, 1000.0, FIXED) == pytest.approx(entry * (1000 + 0.4 * places))
+    assert filing_seconds(FORMING, replace(numbers, indirect=0.0), 1000.0, FIXED) == pytest.approx(entry * 1000)
+    most = 2**26 // 800
+    large = replace(FORMING, classes=most)
+    assert filing_seconds(large, numbers, 1000.0, FIXED) == pytest.approx(entry * (1000 + 0.4 * most * 800))
+    larger = replace(FORMING, classes=most + 1)
+    assert filing_seconds(larger, numbers, 1000.0, FIXED) == pytest.approx(entry * 1000)

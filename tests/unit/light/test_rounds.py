@@ -1,0 +1,121 @@
+"""How much of each light the next round of sampling traces: what buys the missing accuracy with the least work."""
+
+import math
+from itertools import product
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from mitsim.light.cost_model import FIXED, SHARED_COST
+from mitsim.light.light import _Sampled, cheapest_samples, first_samples, next_samples
+from mitsim.light.settings import EVEN, even
+from mitsim.transport.path_reuse import NeighbourTracer
+
+LIGHTS = (
+    _Sampled("direct", 24, 0.165, 3.0),
+    _Sampled("anchored", 1, 0.015, 8.0),
+    _Sampled("indirect", 59, 0.5, 2.0),
+    _Sampled("indirect at anchors", 3, 0.23, 15.0),
+)
+
+
+def left(light: _Sampled, samples: int) -> float:
+    """By hand: 1 / N, but for direct light, whose 2^k samples are better than 3 * 2^k."""
+    if light.name != "direct":
+        return light.variance * light.done / samples
+    found = light.variance * (light.done / samples) ** 1.5
+    return found / 1.2 if even(samples) == 2 ** round(math.log2(samples)) else found
+
+
+@pytest.mark.parametrize("allowed", [0.9, 0.7, 0.5, 0.3])
+def test_no_other_samples_take_less_work(allowed: float) -> None:
+    """Against all that there are, but for what is rounded up: half a sample of each light that takes any number.
+
+    (Planted: the last that is enough, direct light as if 3 * 2^k samples were as good.)
+    """
+    found = cheapest_samples(LIGHTS, allowed)
+    assert sum(left(light, found[light.name]) for light in LIGHTS) <= allowed
+    assert all(found[light.name] >= light.done for light in LIGHTS)
+    assert all(even(found[light.name]) == found[light.name] for light in LIGHTS if light.name in EVEN)
+
+    def work(samples: tuple[int, ...]) -> float:
+        return sum(light.work * count for light, count in zip(LIGHTS, samples, strict=True))
+
+    ladders = [(24, 32, 48, 64, 96), (1, 2, 3, 4, 6, 8), range(59, 400), range(3, 24)]
+    enough = (
+        work(counts)
+        for counts in product(*ladders)
+        if sum(left(light, count) for light, count in zip(LIGHTS, counts, strict=True)) <= allowed
+    )
+    assert work(tuple(found.values())) <= min(enough) + (2.0 + 15.0)
+
+
+def test_a_heavy_path_makes_its_own_light_grow() -> None:
+    """Indirect light with 0.95 of the variance: the others, of ten times its work, stay as they are.
+
+    (Planted: each given its part by Lagrange, though it has more.)
+    """
+    shares = ("direct", 32, 0.03, 20.0), ("indirect", 57, 0.95, 2.0), ("occluded", 6, 0.02, 20.0)
+    more = ("from_camera", 9, 0.0, 20.0), ("indirect at anchors", 9, 0.0001, 20.0)
+    lights = [_Sampled(*share) for share in (*shares, *more)]
+    found = cheapest_samples(lights, 1 / 6)
+    grown = math.ceil(57 * 0.95 / (1 / 6 - 0.0501))
+    assert found == {"direct": 32, "indirect": grown, "occluded": 6, "from_camera": 9, "indirect at anchors": 9}
+
+
+def test_where_nothing_is_enough_all_grow_as_far_as_they_may() -> None:
+    lights = [_Sampled("direct", 24, 0.5, 3.0), _Sampled("indirect", 10, 0.5, 2.0)]
+    assert cheapest_samples(lights, 0.0) == {"direct": 192, "indirect": 80}
+
+
+def simulated(**tracers: tuple[Any, float]) -> Any:
+    """A simulation of these tracers, with predicted samples."""
+    stages = {name: SimpleNamespace(tracer=tracer, predicted=count) for name, (tracer, count) in tracers.items()}
+    return SimpleNamespace(tracers=lambda: stages)
+
+
+def of_lanes(lanes: int) -> Any:
+    return SimpleNamespace(lanes=lanes)
+
+
+def test_sampling_begins_with_what_is_predicted_or_less_where_most_is_followed() -> None:
+    assert first_samples(simulated(direct=(of_lanes(10), 24.0), indirect=(of_lanes(10), 20.0))) == {
+        "direct": 24,
+        "indirect": 20,
+    }
+    assert first_samples(simulated(direct=(of_lanes(10), 24.0), indirect=(of_lanes(10), 40.0))) == {
+        "direct": 24,
+        "indirect": 32,
+    }
+
+
+def test_the_next_round_lowers_the_variance_by_what_is_missing_and_a_twentieth() -> None:
+    """At least by a tenth, at most to a sixth. (Planted: each of the three left out.)"""
+    simulation, done = simulated(indirect=(of_lanes(10), 100.0)), {"indirect": 1000}
+
+    def grown(excess: float) -> float:
+        return next_samples(simulation, done, {"indirect": 3.0}, excess)["indirect"]
+
+    assert grown(1.5) == math.ceil(1000 * 1.05 * 1.5**2)
+    assert grown(1.001) == 1100
+    assert grown(1e200) == 6000
+
+
+def test_work_is_that_of_paths_at_fixed_paces() -> None:
+    """Shared light counts for several, and light at anchors has a pace of its own: of two lights with the same variance
+    the one of less work grows. (Planted: one pace for all, shared light counted once.)"""
+    shared = NeighbourTracer.__new__(NeighbourTracer)
+    shared.turns, shared.projector = None, SimpleNamespace(n=8)  # type: ignore[assignment]
+    cheap, dear = shared.lanes * SHARED_COST * FIXED.indirect, 100 * FIXED.from_camera
+    simulation = simulated(indirect=(shared, 1.0), from_camera=(of_lanes(100), 1.0))
+    found = next_samples(
+        simulation, dict.fromkeys(("indirect", "from_camera"), 1000), {"indirect": 1, "from_camera": 1}, 1.5
+    )
+    assert found["indirect"] / found["from_camera"] == pytest.approx(math.sqrt(dear / cheap), rel=2e-3)
+    simulation = simulated(**{"from camera at anchors": (of_lanes(100), 1.0), "from_camera": (of_lanes(100), 1.0)})
+    found = next_samples(
+        simulation, dict.fromkeys(simulation.tracers(), 1000), dict.fromkeys(simulation.tracers(), 1), 1.5
+    )
+    ratio = math.sqrt(FIXED.from_camera / FIXED.followed_from_camera)
+    assert found["from camera at anchors"] / found["from_camera"] == pytest.approx(ratio, rel=2e-3)

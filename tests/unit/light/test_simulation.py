@@ -1,0 +1,206 @@
+"""With every effect off a simulation is the plain geometric model; each effect changes its own part and no other."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.api.bench import Bench, open_bench
+from mitsim.bench.effects import EFFECTS
+from mitsim.devices.patterns import Lighting
+from mitsim.light.passes import AT_ANCHORS, Simulation
+from mitsim.light.settings import Settings
+from mitsim.optics.image_formation import FrameOptics
+from mitsim.optics.shadow import Directions
+from mitsim.transport.records import AMBIENT, Deposits
+
+pytestmark = pytest.mark.usefixtures("variant")
+N, Z, BLACK = 16, 400.0, 0.01
+NON_IDEAL = """
+name = "lens, spot and grey black"
+effective_wavelength_nm = 562.0
+wavelengths_nm = [450.0, 640.0]
+radiant_shares = [0.5, 0.5]
+contrast_ratio = 100.0
+aperture_radius_mm = 3.0
+focus_mm = 300.0
+blur_pixels = 0.6
+"""
+NUMBERS = (
+    '<float name="mask_thickness" value="0.05"/><float name="pixel_fill_factor" value="0.6"/>'
+    '<float name="angular_exponent" value="3"/>'
+)
+LAMP = '<emitter type="constant"><spectrum name="radiance" value="0.2"/></emitter>'
+MIRROR = """<shape type="rectangle"><transform name="to_world"><scale x="5" y="5"/><rotate y="1" angle="170"/>
+    <translate x="-90" z="300"/></transform><bsdf type="conductor"/></shape>"""
+
+
+@pytest.fixture(scope="module")
+def bench(shared_scene: Callable[..., Path], variant: str, tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    """Everything that an effect could act on."""
+    path = shared_scene("everything", extra=LAMP + MIRROR)
+    path.write_text(
+        path.read_text().replace('<float name="fov" value="20"/>', f'<float name="fov" value="20"/>{NUMBERS}')
+    )
+    projector = tmp_path_factory.mktemp("projector") / "projector.toml"
+    projector.write_text(NON_IDEAL)
+    return open_bench(path, variant, projector=projector)
+
+
+def simulation(bench: Bench, *effects: str, **settings: object) -> Simulation:
+    return Simulation(bench, Settings(depth=Z, effects=frozenset(effects), **settings))
+
+
+def uniform(made: Simulation, samples: int = 8, weight: float = 1.0) -> np.ndarray:
+    """The frame of one capture with every pixel alike."""
+    labels = np.zeros(N * N, dtype=np.int64)
+    light = made.file_direct(made.direct.trace(3, 0, samples), labels, samples)
+    light = light + made.file_followed(made.follow(3, 4), labels, 4)
+    (frame,) = made.expected([light], np.zeros(1, dtype=np.int64), Lighting(labels, np.array([[weight]])), 0)
+    return frame.irradiance
+
+
+def test_every_effect_off_is_the_geometric_model(bench: Bench) -> None:
+    """The board's radiance L through the mask's shadow: integrals of (1 + t^2)^-2 over the projector's pixels.
+
+    Nothing of it comes from the simulation: no lens, no spot, a thin mask, whole pixels, no lamp and no bounce.
+    """
+    plain = bench.geometry.model_copy(update={"mask_thickness": 0.0, "pixel_fill_factor": 1.0, "angular_exponent": 0.0})
+    edges = np.linspace(-0.15, 0.15, N + 1)
+    cells = Directions.cells(edges)
+    node, weight = np.polynomial.legendre.leggauss(5)
+    tau = ((edges[:-1] + edges[1:])[:, None] / 2 + node * 0.15 / N).ravel()
+    weights = np.tile(weight * 0.15 / N, N)
+    light = np.outer(weights, weights) * (1 + np.square(tau)[:, None] + np.square(tau)[None, :]) ** -2
+    light = 0.5 * 111000 / Z**2 * light.reshape(N, 5, N, 5).sum(axis=(1, 3))
+    expected = FrameOptics(plain, cells, cells, (Z,), 1).frame(np.arange(N * N), light.ravel())
+    # One path in a thousand or so of the mirror's corner is missing: the board behind it (10 mm) is out of sight.
+    found = uniform(simulation(bench), 256)
+    assert np.linalg.norm(found - expected) < 2e-3 * np.linalg.norm(expected)
+    assert simulation(bench).physics.geometry == plain
+
+
+def test_neutral_parts(bench: Bench) -> None:
+    off = simulation(bench)
+    assert off.physics.projector.ideal and off.physics.black_level == 0
+    assert off.from_camera is off.indirect is off.anchored is None
+    assert (
+        not off.physics.lamps
+        and off.physics.spectrum is None
+        and off.glint_frames(np.zeros(N * N, dtype=np.int64)) is None
+    )
+    assert set(off.tracers()) == {"direct"}
+
+
+def test_a_plan_says_how_large_the_spots_of_a_lens_are(bench: Bench) -> None:
+    """A cone of radius 3 mm that ends at 300 mm has grown again by 400 mm to a third of it."""
+    assert EFFECTS["aperture"].note(bench) == "a lens of radius 3 mm, sharp at 300 mm: spots of 2 mm at 400 mm"
+
+
+@pytest.mark.parametrize("effect", [name for name in EFFECTS if name != "speckle"])
+def test_each_effect_changes_its_own_part(bench: Bench, effect: str) -> None:
+    on, off = simulation(bench, effect), simulation(bench)
+    changed = {
+        "mask-thickness": on.physics.geometry.mask_thickness == 0.05,
+        "pixel-response": (on.physics.geometry.pixel_fill_factor, on.physics.geometry.angular_exponent) == (0.6, 3.0),
+        "aperture": (on.physics.projector.aperture, on.physics.projector.focus) == (3.0, 300.0),
+        "blur": on.physics.projector.blur == 0.6,
+        "black-level": on.physics.black_level == pytest.approx(BLACK),
+        "diffraction": on.physics.spectrum is not None,
+        "ambient": bool(on.physics.lamps) and on.from_camera is not None and len(on.from_camera.paths.emitters) == 1,
+        "interreflection": on.indirect is not None and on.indirect.interreflection,
+        "mirrors": on.indirect is not None and on.indirect.mirrors and on.from_camera.paths.mirrors,
+    }
+    assert [name for name, holds in changed.items() if holds] == [effect]
+    if effect not in ("mask-thickness", "pixel-response"):
+        assert on.physics.geometry == off.physics.geometry
+    if effect not in ("aperture", "blur"):
+        assert on.physics.projector.ideal
+
+
+@pytest.mark.parametrize("effect", ["mask-thickness", "pixel-response", "diffraction", "black-level", "ambient"])
+def test_each_effect_changes_the_frame(bench: Bench, effect: str) -> None:
+    """A half-bright capture, so that black light shows; the same paths with and without the effect."""
+    off, on = uniform(simulation(bench), weight=0.5), uniform(simulation(bench, effect), weight=0.5)
+    assert np.linalg.norm(on - off) > 5e-3 * np.linalg.norm(off)
+
+
+def test_black_is_a_part_of_white(bench: Bench) -> None:
+    """A dark capture is the black level of a white one, and white is white."""
+    made = simulation(bench, "black-level")
+    white, dark, plain = uniform(made), uniform(made, weight=0.0), uniform(simulation(bench))
+    assert np.allclose(dark, BLACK * white, rtol=1e-9) and np.allclose(white, plain, rtol=1e-9)
+    assert not uniform(simulation(bench), weight=0.0).any()
+
+
+def test_ambient_light_is_in_a_dark_capture(bench: Bench) -> None:
+    made = simulation(bench, "ambient")
+    dark, white = uniform(made, weight=0.0), uniform(made)
+    assert dark.any() and np.allclose(white - dark, uniform(simulation(bench)), rtol=1e-9)
+
+
+def test_indirect_light_goes_to_its_own_cells(bench: Bench) -> None:
+    made = simulation(bench, "interreflection", "ambient", subdivision=2, coarse_cells=1)
+    assert made.fine.bundle.cells == (2 * made.smooth.bundle.cells[0], 2 * made.smooth.bundle.cells[1])
+    labels = np.zeros(N * N, dtype=np.int64)
+    found = made.follow(1, 64)
+    light = made.file_followed(found, labels, 64)
+    kinds = {kind: found.value[found.kind == kind].sum() / 64 for kind in (0, 2)}
+    assert light.fine[[1]].sum() == pytest.approx(kinds[0], rel=0.02) and not light.fine[[0]].nnz
+    assert light.smooth.sum() == pytest.approx(kinds[2], rel=0.02) and not light.coarse.nnz
+
+
+def test_anchors_file_only_what_differs_from_the_mean(bench: Bench) -> None:
+    """Weighed by the mean anchor weights, what is filed for single anchors adds up to nothing."""
+    made = simulation(bench, anchors=2)
+    light = made.file_anchored(made.anchored.trace(2, 0, 4), np.zeros(N * N, dtype=np.int64), 4).coarse
+    rows, columns = made.coarse.bundle.cells
+    found = light[[0]].toarray().reshape(2, rows, 2, columns)
+    weights = [0.5, 0.5]  # linear interpolation, over the sensor
+    assert np.abs(np.einsum("a,b,aybx->yx", weights, weights, found)).max() < 1e-12 and np.abs(found).max() > 1e-12
+
+
+def test_followed_lights_mean_and_its_anchors_make_one_frame(bench: Bench) -> None:
+    """With the same light at all anchors nothing is left beyond the mean; ambient light is seen from random points."""
+    made = simulation(bench, "interreflection", "mirrors", "ambient", followed_anchors=2)
+    stages = made.tracers()
+    assert set(stages) == {"direct", "indirect", "from_camera", *AT_ANCHORS}
+    labels = np.zeros(N * N, dtype=np.int64)
+    assert (stages[AT_ANCHORS[1]].tracer.trace(1, 0, 16).kind == AMBIENT).any()
+    rng = np.random.default_rng(1)
+    number, place = rng.integers(0, 2, (3, 200)), rng.uniform(-0.14, 0.14, (2, 200))
+    found = Deposits(0 * number[0], *number[:2], *place, np.full(200, 1 / Z), rng.random(200), 1 + number[2])
+    light = made.file_at_anchors(found, labels, 16).followed[[0]].toarray()
+    rows, columns = made.followed.bundle.cells
+    weights = [0.5, 0.5]
+    assert np.abs(np.einsum("a,b,aybx->yx", weights, weights, light.reshape(2, rows, 2, columns))).max() < 1e-12
+    one = found.where((found.anchor_row == 0) & (found.anchor_column == 0))
+    same = [
+        replace(one, anchor_row=one.anchor_row + a, anchor_column=one.anchor_column + b) for a, b in np.ndindex(2, 2)
+    ]
+    assert np.abs(made.file_at_anchors(Deposits.joined(same), labels, 16).followed.data).max(initial=0) < 1e-15
+    ambient = [made.from_camera.trace(seed, 0, 64) for seed in range(2)]
+    assert all((one.kind == AMBIENT).any() for one in ambient)
+
+
+def test_flux_counts_each_pixels_direct_light(bench: Bench) -> None:
+    made = simulation(bench)
+    found = made.direct.trace(1, 0, 2)
+    assert made.flux(found, 2) == pytest.approx(np.bincount(found.pixel, found.value, N * N) / 2)
+    ambient = replace(found, pixel=np.full_like(found.pixel, N * N), kind=0 * found.kind)
+    indirect = replace(found, kind=0 * found.kind + 2)
+    assert (
+        not made.flux(indirect, 2).any() and not made.flux(ambient, 2).any() and not made.flux(Deposits.none(), 1).any()
+    )
+
+
+def test_cells_are_aligned_with_the_pixels_where_the_light_is(bench: Bench) -> None:
+    """At half the distance the window is seen at other angles, and the cells go with it."""
+    near = Simulation(bench, Settings(depth=200.0))
+    low, high = (60 - np.array([60.0, 0.0]) - 0) / 200  # x from 0 to 60 mm, column tan-angles -0.3 to 0
+    edges = near.aim.columns.edges
+    assert np.abs(edges + high).min() < 1e-5 or np.abs(edges - -0.30).min() < 1e-5
+    assert near.aim.columns.size == pytest.approx(0.3 / N, rel=1e-4) and low == 0
+    assert np.abs(edges).min() < 1e-5

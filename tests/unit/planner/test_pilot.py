@@ -1,0 +1,370 @@
+"""The pilot's predictions come true: what it says that leaving something out changes is what careful runs find.
+
+The scene calls for everything at once: a sensor of 24 mm near a ball and a corner, under a sky. Each prediction is held
+against frames of many more samples; the pilot sees a few, so a factor of 1.5 either way is its promise here.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.api.bench import Bench, open_bench
+from mitsim.bench import effects
+from mitsim.bench.effects import EFFECTS
+from mitsim.core.errors import MitsimError
+from mitsim.core.seeds import integer
+from mitsim.devices.patterns import parse_patterns
+from mitsim.light.passes import AT_ANCHORS, Simulation
+from mitsim.light.settings import LOOKS, Changes, Evidence, Part, Settings
+from mitsim.optics.frames import monte_carlo_error
+from mitsim.planner import pilot, pilot_direct, pilot_indirect, pilot_samples
+from mitsim.planner.pilot_indirect import SwitchedEffects
+from mitsim.transport.records import Deposits
+
+pytestmark = pytest.mark.usefixtures("variant")
+N = 16
+SHOWN = list(range(16))  # of dots:4 on few pixels the pilot looks at all captures
+EXTRA = """<emitter type="constant"><spectrum name="radiance" value="0.02"/></emitter>
+    <shape type="sphere"><point name="center" x="-25" y="10" z="330"/> <float name="radius" value="30"/>
+        <bsdf type="twosided"><bsdf type="diffuse"><spectrum name="reflectance" value="0.8"/></bsdf></bsdf></shape>
+    <shape type="rectangle"><transform name="to_world"><scale x="60" y="60"/><rotate y="1" angle="90"/>
+        <translate x="-50" z="350"/></transform>
+        <bsdf type="twosided"><bsdf type="diffuse"><spectrum name="reflectance" value="0.8"/></bsdf></bsdf></shape>"""
+
+
+@pytest.fixture(scope="module")
+def bench(shared_scene: Callable[..., Path], variant: str) -> Bench:
+    print_ = np.random.default_rng(4).integers(20, 256, (48, 48))
+    return open_bench(
+        shared_scene("pilot", reflectance=print_, extra=EXTRA, pitch=0.375, mask_feature=0.3),
+        variant,
+        for_render=True,
+    )
+
+
+def measured(bench: Bench, seed: int, accuracy: float = 1e-2) -> Evidence:
+    return pilot.measure(bench, parse_patterns("dots:4", N).lighting, accuracy, seed)
+
+
+@pytest.fixture(scope="module")
+def evidence(bench: Bench) -> Evidence:
+    return measured(bench, seed=3)
+
+
+def frames(bench: Bench, settings: Settings, many: int = 64, other: int = 24) -> np.ndarray:
+    """(16, pixels, pixels) of the captures that the pilot looks at, from many samples."""
+    lighting = parse_patterns("dots:4", N).lighting.shots(SHOWN)
+    labels = lighting.labels
+    made, counts = (
+        Simulation(bench, settings),
+        {"direct": many, "anchored": many // 4, "indirect": 8 * other, "from_camera": other}
+        | dict.fromkeys(AT_ANCHORS, other),
+    )
+    parts = [
+        stage.file(stage.tracer.trace(integer(77, name), 0, counts[name]), labels, counts[name])
+        for name, stage in made.tracers().items()
+    ]
+    light = sum(parts[1:], parts[0])
+    expected = made.expected([light], np.arange(16), lighting, 0)
+    return np.stack([frame.irradiance for frame in expected])
+
+
+def change(one: np.ndarray, judge: np.ndarray) -> float:
+    return float(np.linalg.norm(one - judge) / np.linalg.norm(judge))
+
+
+def promised(found: float, actual: float) -> bool:
+    return 1 / 1.5 < found / actual < 1.5
+
+
+def test_what_is_measured(bench: Bench, evidence: Evidence) -> None:
+    assert set(evidence.effects) == {"interreflection", "ambient", "diffraction", "black-level", "speckle"} & set(
+        effects.present(bench)
+    )
+    assert set(evidence.effects) <= set(EFFECTS)
+    ladders = evidence.ladders
+    assert {1, 2, 3} <= set(ladders["anchors"]) <= set(pilot_direct.ANCHOR_LADDER)
+    assert {1, 2, 3} <= set(ladders["layers"]) <= set(pilot_direct.LAYER_LADDER)
+    assert {1, 2} <= set(ladders["cells"]) <= set(pilot_direct.CELL_LADDER)
+    for name, errors in ladders.items():
+        assert all(0 <= error.value <= error.bound for error in errors.values())
+        coarsest, finest = (max(errors), 1) if name == "followed_width" else (1, max(errors))
+        assert len(errors) == 1 or errors[coarsest].value > errors[finest].value
+    widths = ladders["followed_width"]
+    assert tuple(widths) == pilot_indirect.WIDTHS and widths[1].value < widths[2].value < widths[4].value
+    assert {1, 2} <= set(ladders["followed_anchors"]) <= set(pilot_indirect.FOLLOWED_LADDER)
+    assert 0 < evidence.forming.seconds < 1
+    assert evidence.direct.paths == evidence.indirect.paths == N * N < evidence.from_camera.paths
+    assert evidence.followed.paths == evidence.indirect.paths
+    assert evidence.followed_from_camera.paths == evidence.from_camera.paths
+    assert evidence.forming.terms == len(bench.spectrum.weights)
+
+
+def test_gloss_makes_noise_at_random_points_of_the_sensor(small_scene: Callable[..., Path], variant: str) -> None:
+    """A glossy sheet differs over a sensor of 24 mm: light to random points of it is noisier than from ray to ray of a
+    pixel. The pilot says how much: judged by eight groups of 16 samples. (Planted: the centre's noise for both.)"""
+    gloss = (
+        '<shape type="rectangle"><transform name="to_world"><rotate y="1" angle="180"/><scale x="60" y="60"/>'
+        '<translate z="390"/></transform><bsdf type="roughconductor"><float name="alpha" value="0.1"/></bsdf></shape>'
+    )
+    bench = open_bench(small_scene(extra=gloss, pitch=0.375), variant, for_render=True)
+    found, lighting = measured(bench, 1), parse_patterns("dots:4", N).lighting.shots(SHOWN)
+    made = Simulation(bench, Settings(depth=found.depth, anchors=2))
+    groups = [made.file_direct(made.direct.trace(seed, 0, 16), lighting.labels, 16) for seed in range(8)]
+    actual = monte_carlo_error(made.expected(groups, np.arange(16), lighting, 0)) * 8**0.5
+    assert promised(float(found.spread.noise.left(16)), actual)
+    assert found.spread.noise.left(16) > 10 * found.direct.noise.left(16)
+
+
+def test_depth_and_layers(bench: Bench, evidence: Evidence) -> None:
+    """The light is seen from the ball's top (300 mm) to the sheet (400 mm); layers are equidistant in 1/z."""
+    assert 330 < evidence.depth < 400
+    assert evidence.layers[1] == (evidence.depth,)
+    for count, depths in evidence.layers.items():
+        if count > 1:
+            assert len(depths) == count and depths[0] == pytest.approx(400, rel=1e-3)
+            assert 299 < depths[-1] < 320
+            assert np.diff(1 / np.array(depths), 2) == pytest.approx(np.zeros(count - 2), abs=1e-9)
+
+
+@pytest.mark.parametrize("effect", ["interreflection", "ambient", "diffraction"])
+def test_effects_come_true(bench: Bench, evidence: Evidence, effect: str) -> None:
+    names = frozenset(effects.present(bench)) - {"speckle"}
+    full = Settings(depth=evidence.depth, subdivision=2, effects=names)
+    judge = frames(bench, full)
+    actual = change(frames(bench, replace(full, effects=names - {effect})), judge)
+    assert actual > 1e-3, "the scene has to call for it"
+    assert promised(evidence.effects[effect].value, actual)
+
+
+def test_anchors_come_true(bench: Bench, evidence: Evidence) -> None:
+    base = Settings(depth=evidence.depth, coarse_cells=2, subdivision=2)
+    every = frozenset(effects.present(bench)) - {"speckle"}
+    light = np.linalg.norm(frames(bench, replace(base, effects=every)))
+    judge = frames(bench, replace(base, anchors=5), 256)
+    actual = np.linalg.norm(frames(bench, base, 256) - judge) / light
+    assert actual > 2e-3
+    assert promised(evidence.ladders["anchors"][1].value, actual)
+
+
+@pytest.mark.slow
+def test_anchors_of_followed_light_come_true(bench: Bench, evidence: Evidence) -> None:
+    """Light between the ball, the wall and the sheet differs over the sensor of 24 mm. (Planted: paths from the camera
+    that are filed as seen from their start.)"""
+    every = frozenset(effects.present(bench)) - {"speckle"}
+    base = Settings(depth=evidence.depth, subdivision=2, effects=every)
+    light = np.linalg.norm(frames(bench, base))
+    judge = frames(bench, replace(base, followed_anchors=5), 64, 96)
+    actual = np.linalg.norm(frames(bench, base, 64, 96) - judge) / light
+    found = evidence.ladders["followed_anchors"]
+    assert actual > 1e-3, "the scene has to call for it"
+    assert promised(found[1].value, actual)
+    few = np.linalg.norm(frames(bench, replace(base, followed_anchors=2), 64, 96) - judge) / light
+    assert few < actual / 2
+
+
+@pytest.mark.parametrize("width", [2, pytest.param(4, marks=pytest.mark.slow)])
+def test_wide_cells_of_followed_light_come_true(bench: Bench, evidence: Evidence, width: int) -> None:
+    """What anchors see beyond their mean, in cells of several pixels and one layer, against cells of half a pixel and
+    two layers. (Planted: the mean filed in the cells of indirect light; cells twice as wide.)"""
+    every = frozenset(effects.present(bench)) - {"speckle"}
+    base = Settings(depth=evidence.depth, subdivision=2, effects=every, followed_anchors=2, layers=evidence.layers[2])
+    judge = frames(bench, replace(base, coarse_cells=2, coarse_layers=True))
+    wide = replace(base, coarse_cells=2, coarse_layers=True, followed_width=width)
+    filed = Simulation(bench, wide)
+    assert filed.followed.bundle.grid.rows.size == pytest.approx(2 * width * filed.smooth.bundle.grid.rows.size)
+    actual = change(frames(bench, wide), judge)
+    assert actual > 1e-3, "the scene has to call for it"
+    assert promised(evidence.ladders["followed_width"][width].value, actual)
+
+
+@pytest.mark.slow
+def test_light_to_many_anchors_is_traced_in_parts(
+    bench: Bench, evidence: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All of it at once takes gigabytes. Parts of two samples make the same ladder but for the order of sums.
+    (Planted: every part from the first sample on.)"""
+    monkeypatch.setattr(pilot_indirect, "_AT_ONCE", 2 * 9 * (evidence.followed.paths + evidence.from_camera.paths))
+    again = measured(bench, seed=3).ladders["followed_anchors"]
+    for count, error in evidence.ladders["followed_anchors"].items():
+        assert again[count] == pytest.approx(error, rel=1e-6)
+
+
+@pytest.fixture(scope="module")
+def direct_part(bench: Bench, evidence: Evidence) -> float:
+    """Of all light."""
+    base = Settings(depth=evidence.depth, effects=frozenset({"diffraction"}))
+    every = replace(base, effects=frozenset(effects.present(bench)) - {"speckle"})
+    return float(np.linalg.norm(frames(bench, base)) / np.linalg.norm(frames(bench, every)))
+
+
+def test_cells_come_true(bench: Bench, evidence: Evidence, direct_part: float) -> None:
+    """Against cells twice as fine as the finest that the pilot tries; of direct light, told as a part of all."""
+    base = Settings(depth=evidence.depth, effects=frozenset({"diffraction"}))
+    judge = frames(bench, replace(base, subdivision=2 * max(pilot_direct.CELL_LADDER)), 1024)
+    for cells in (1, 2):
+        actual = change(frames(bench, replace(base, subdivision=cells), 1024), judge)
+        assert actual > 4e-4
+        assert promised(evidence.ladders["cells"][cells].value, actual * direct_part)
+
+
+def test_a_print_in_the_projectors_pixels_needs_no_finer_cells(small_scene: Callable[..., Path]) -> None:
+    found = measured(open_bench(small_scene()), 0, accuracy=1e-3).ladders["cells"]
+    assert max(found.values()).value < 6e-4, "falloff within a pixel of 7.5 mm"
+
+
+def test_layers_come_true(bench: Bench, evidence: Evidence, direct_part: float) -> None:
+    base = Settings(depth=evidence.depth, subdivision=2, effects=frozenset({"diffraction"}))
+    judge = frames(bench, replace(base, layers=evidence.layers[4]), 256)
+    actual = change(frames(bench, base, 256), judge)
+    assert actual > 2e-3
+    assert promised(evidence.ladders["layers"][1].value, actual * direct_part)
+
+
+def test_noise_comes_true(bench: Bench, evidence: Evidence) -> None:
+    """Spread of six estimates of direct light with sixteen samples; and of other light with two."""
+    every = frozenset(effects.present(bench)) - {"speckle"}
+    switched = {"direct": frozenset({"diffraction"}), "indirect": every, "from_camera": every}
+    lighting = parse_patterns("dots:4", N).lighting.shots(SHOWN)
+    labels = lighting.labels
+    everything = frames(bench, Settings(depth=evidence.depth, subdivision=2, effects=every))
+    for kind in switched:
+        made = Simulation(bench, Settings(depth=evidence.depth, subdivision=2, effects=switched[kind]))
+        stage, noise = made.tracers()[kind], getattr(evidence, kind).noise
+        samples = int(noise.samples)
+        traced = [stage.tracer.trace(integer(9, kind, index), 0, samples) for index in range(6)]
+        groups = [stage.file(found, labels, samples) for found in traced]
+        found = [
+            np.stack([frame.irradiance for frame in made.expected([light], np.arange(16), lighting, 0)])
+            for light in groups
+        ]
+        spread = np.sqrt(np.square(np.std(found, axis=0, ddof=1)).sum())
+        norm = np.linalg.norm(np.mean(found, axis=0) if kind == "direct" else everything)
+        # A few looks tell a spread with few degrees of freedom.
+        assert 0.4 < noise.error / (spread / norm) < 2.5
+        assert 0.5 <= noise.rate <= 1
+
+
+@pytest.mark.slow
+def test_frames_of_looks_are_those_that_a_capture_forms(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the sample's pixels, other rows than columns, from the same paths, with lamps and black pixels that leak.
+    (Planted: lamps' light lost, the least light of a shot left out, places of rows for columns.)"""
+    monkeypatch.setattr(pilot_samples, "_PLACES", 5)
+    lighting = parse_patterns("dots:4", N).lighting
+    sample = pilot_samples.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
+    rows, columns = sample.places
+    sample = replace(sample, places=(rows, tuple(place + 1 for place in columns[:-1])))
+    everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
+    found = SwitchedEffects(bench, everything, sample, 5)
+    made = Simulation(bench, everything)
+    filed = [
+        made.file_direct(pilot_direct, lighting.labels, sample.direct)
+        + made.file_followed(Deposits.joined(list(pilot_indirect)), lighting.labels, sample.followed)
+        for pilot_direct, *pilot_indirect in zip(found.direct, *found.followed.values(), strict=True)
+    ]
+    assert made.physics.lamps and made.physics.black_level and sample.shape == (5, 4) and bench.geometry.pixels > 5
+    formed = [made.expected([light], sample.rows, sample.lighting, 0) for light in filed]
+    expected = np.array([[frame.irradiance[np.ix_(*sample.places)] for frame in one] for one in formed])
+    np.testing.assert_allclose(found.frames, expected, rtol=1e-9)
+
+
+def test_followed_light_of_either_side_has_its_own_noise(bench: Bench) -> None:
+    """At anchors, as a tracer alone would make it; their squares add up. (Planted: one side's for the other's, all
+    light's for one of them.)"""
+    lighting = parse_patterns("dots:4", N).lighting
+    sample = pilot_samples.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
+    everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
+    found = pilot_indirect.FollowedLight(bench, everything, sample, 0.0, 5)
+    indirect, camera = found.efforts(1.0)
+    alone, nothing = pilot_indirect.FollowedLight(bench, everything, sample, 0.0, 5), [Deposits.none()] * LOOKS
+    vars(alone)["_few_by_tracer"] = [found._few_by_tracer[0], nothing]
+    assert indirect.noise.error == pytest.approx(pilot_samples.noise(alone._beyond_mean()), rel=1e-9)
+    both = pilot_samples.noise(found._beyond_mean())
+    assert math.hypot(indirect.noise.error, camera.noise.error) == pytest.approx(both, rel=0.3)
+    assert (indirect.paths, camera.paths) == tuple(tracer.lanes for tracer in found._simulation().at_anchors)
+
+
+def test_indirect_light_is_looked_at_closer_where_noise_hides_what_coarse_cells_change(bench: Bench) -> None:
+    """By looks of their own, whose light and noise are as large as told before. (Planted: samples of the first looks
+    for either, the first looks' seeds, no closer looks at all.)"""
+    lighting = parse_patterns("dots:4", N).lighting
+    sample = pilot_samples.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
+    everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
+    first, close = (SwitchedEffects(bench, everything, sample, 5, (450.0, 330.0), told) for told in (1.0, 1e-7))
+    seen = [Changes.between(found.changes, found.light**2) for found in (first, close)]
+    open_ = [bound**2 - value**2 for value, bound in (each.estimate([Part("indirect cells", 1)]) for each in seen)]
+    assert open_[1] < open_[0] / 4
+    one, two = (each.estimate([Part("indirect layers", 1)]).value for each in seen)
+    assert two == pytest.approx(one, rel=0.3)
+    noises = [found.effort("indirect").noise for found in (first, close)]
+    assert [noise.samples for noise in noises] == [sample.followed, 16 * sample.followed]
+    assert 0.5 < noises[1].error * math.sqrt(16) / noises[0].error < 2
+    one, two = (found._closer[0][0].value[:50] for found in (first, close))
+    assert not np.array_equal(one, two)
+
+
+def test_the_pilot_is_reproducible(bench: Bench) -> None:
+    """Of few shots and at a loose accuracy: all parts of the pilot have their turn."""
+    lighting = parse_patterns("dots:2", N).lighting
+    one, again = (pilot.measure(bench, lighting, 0.1, 3) for _ in range(2))
+    for name in ("depth", "layers", "effects", "ladders"):
+        assert getattr(again, name) == getattr(one, name)
+    assert np.array_equal(again.changes.products, one.changes.products)
+
+
+@pytest.mark.slow
+def test_the_pilot_of_a_flat_scene_is_reproducible(small_scene: Callable[..., Path]) -> None:
+    flat = open_bench(small_scene())
+    one, again, other = (measured(flat, seed) for seed in (3, 3, 4))
+    assert again.effects == one.effects and np.array_equal(again.changes.products, one.changes.products)
+    assert other.effects != one.effects and other.ladders["anchors"] != one.ladders["anchors"]
+
+
+def test_a_flat_scene_needs_no_layers(small_scene: Callable[..., Path]) -> None:
+    found = measured(open_bench(small_scene()), 0)
+    assert found.depth == 400.0 and found.ladders["layers"] == {1: (0.0, 0.0)} and found.layers == {1: (400.0,)}
+    assert found.effects["interreflection"] == (0, 0) and "ambient" not in found.effects
+
+
+def test_a_scene_without_light_is_refused(small_scene: Callable[..., Path]) -> None:
+    away = open_bench(small_scene(projector_turn='<rotate y="1" angle="180"/>'))
+    with pytest.raises(MitsimError, match="no light of the projector reaches the camera"):
+        measured(away, seed=0)
+    black = open_bench(small_scene("black"), albedo="0")
+    with pytest.raises(MitsimError, match="no light of the projector reaches the camera"):
+        measured(black, seed=0)
+
+
+def test_applicable(bench: Bench, small_scene: Callable[..., Path], tmp_path: Path) -> None:
+    assert "ambient" in effects.present(bench) and "mirrors" not in effects.present(bench)
+    projector = tmp_path / "projector.toml"
+    projector.write_text('name = "ideal"\neffective_wavelength_nm = 562.0\n')
+    assert effects.present(open_bench(small_scene(), projector=projector)) == ("interreflection", "diffraction")
+    projector.write_text(
+        'name = "all"\neffective_wavelength_nm = 562.0\ncontrast_ratio = 100.0\naperture_radius_mm = 1.0\n'
+        "blur_pixels = 0.5\nspeckle_contrast = 0.01\n"
+    )
+    found = effects.present(open_bench(small_scene(), projector=projector))
+    assert found == ("interreflection", "diffraction", "aperture", "blur", "black-level", "speckle")
+
+
+@pytest.mark.slow
+def test_a_mirror_shows_some_shots_only(shipped_bench: Callable[..., Bench]) -> None:
+    """A mirror brings the light of a few projector pixels to the sensor; shots that do not show them see black pixels
+    alone, and four of 49 have no such shot among them. What black pixels change, against the frames of all shots in
+    closed form, (1 - b) of a class and b of all. (Planted: four shots, as of a print: 6.0e-5 of 8.8e-5.)"""
+    bench = shipped_bench("mirror")
+    lighting = parse_patterns("dots:7", bench.n).lighting
+    found = pilot.measure(bench, lighting, 1e-3, 1).effects["black-level"]
+    made = Simulation(bench, Settings(depth=400.0, effects=frozenset(effects.present(bench))))
+    glint, black = made.glint_frames(lighting.labels), made.physics.black_level
+    assert glint is not None
+    seen = np.zeros((49, 512, 512))
+    seen[glint.classes] = glint.irradiance
+    everything = black * seen.sum(axis=0)
+    actual = np.linalg.norm(everything - black * seen) / np.linalg.norm(everything + (1 - black) * seen)
+    assert found.value == pytest.approx(actual, rel=0.1)

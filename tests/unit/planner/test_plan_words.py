@@ -1,0 +1,167 @@
+"""What a plan says: of devices that the model does not cover, of effects, and as JSON; benches are plain numbers."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mitsim.api.bench import Bench
+from mitsim.bench.effects import EFFECTS
+from mitsim.light.cost_model import paces_of
+from mitsim.light.settings import Evidence, Part, Settings
+from mitsim.planner.explain import SceneFacts, decide
+from mitsim.scene.guard.estimators import Unfit
+from mitsim.scene.guard.outline import Tag
+from tests.unit.planner.invented_evidence import EVIDENCE, SIZES, changes, plan, rows, stages, with_occluded
+
+
+def bench(cuts: bool = False, shift: float = 0.0, feature: float = 0.06) -> Bench:
+    geometry = SimpleNamespace(
+        wall_shift_features=shift, mask_thickness=0.5, mask_feature=feature, diffracts=True, mask_plate=None,
+        build_mask=lambda: SimpleNamespace(opening_mm=2 * feature),
+        tilt_shift_mm=0.0, tilt_left_out=lambda waves: False, mask_tilt=(0.0, 0.0),
+    )  # fmt: skip
+    return SimpleNamespace(  # type: ignore[return-value]
+        field_stop_cuts=cuts,
+        geometry=geometry,
+        spectrum=SimpleNamespace(wavelengths_nm=np.array([450.0, 620.0])),
+        loaded=SimpleNamespace(
+            pixels=SimpleNamespace(keystone=2.5),
+            unfit=Unfit(),
+            shapes=(),
+            mirrors=False,
+            small_lamps=(),
+            coloured=(),
+            parting=(),
+        ),
+        lines=None,
+        sensor=SimpleNamespace(quantum_efficiency_curve=None),
+    )
+
+
+@pytest.mark.parametrize(
+    ("device", "words"),
+    [
+        (bench(), []),
+        (bench(cuts=True), ["field stop (fov) cuts into the projector's window"]),
+        (bench(shift=0.99), []),
+        (bench(shift=1.0), ["0.5 mm shifts the far face by 1.0 features"]),
+        (bench(feature=6.2e-4), []),
+        (bench(feature=6.1e-4), ["less than 2 wavelengths of 620 nm"]),
+    ],
+)
+def test_devices_are_flagged_where_their_model_ends(
+    monkeypatch: pytest.MonkeyPatch, device: Bench, words: list[str]
+) -> None:
+    """At a wall's shift of one feature, and a feature of the longest wavelength."""
+    monkeypatch.setattr("mitsim.planner.explain.EFFECTS", {})
+    facts = SceneFacts.of(device)
+    assert facts.keystone == 2.5 and len(facts.warnings) == len(words)
+    for warning, part in zip(facts.warnings, words, strict=True):
+        assert part in warning
+
+
+def test_light_over_mirrors_that_is_not_resolved_is_told_with_their_kinds_and_the_first() -> None:
+    mirrors = tuple(Tag(Path("a.xml"), line, "shape", {"type": kind}) for line, kind in ((7, "disk"), (9, "sphere")))
+    facts = SceneFacts({}, 0.0, mirrors=(*mirrors, mirrors[1]))
+    (warning,) = decide(1e-2, replace(EVIDENCE, glint=0.2), facts).warnings
+    assert warning.startswith("a.xml:7: shape: got 'disk'")
+    assert "0.2 of the light" in warning and "2 sphere, 1 disk" in warning
+    assert not decide(1e-2, replace(EVIDENCE, glint=1e-4), facts).warnings
+
+
+def test_light_that_is_lost_over_a_mirror_is_told_with_its_place() -> None:
+    """Where it breaks the accuracy: by itself, as the largest part, beside sharp lobes; else it is a part of all."""
+    shapes = tuple(Tag(Path("a.xml"), line, "shape", {"type": "sphere"}) for line in (3, 7))
+    place = "a.xml:7: shape: got 'sphere' in <shape type='sphere'>; "
+
+    def said(shapes: tuple[Tag, ...] = shapes, **lacking: float) -> tuple[str, ...]:
+        facts = SceneFacts(dict.fromkeys(EFFECTS, ""), 0.0, shapes=shapes)
+        return decide(1e-2, replace(EVIDENCE, mirror=1, **lacking), facts).warnings
+
+    assert said(left_out=1e-4) == ()
+    for part in (9.9e-3, 0.1):
+        (warning,) = said(left_out=part)
+        assert warning.startswith(f"{place}{part:.2g} of the light") and "left out of the frames" in warning
+    lobes, mirror = said(left_out=0.1, unresolved=0.2)
+    assert "lobes too sharp" in lobes and mirror.startswith(place)
+    (lobes,) = said(left_out=5e-3, unresolved=0.2)
+    assert "lobes too sharp" in lobes
+    (unknown,) = said((), left_out=0.1)
+    assert "largest: light over mirrors or curved glass both ways" in unknown
+
+
+def test_a_plan_as_json_leaves_out_what_it_was_decided_without() -> None:
+    block = plan().block()
+    assert "request" not in block and "cost" not in block and None not in block.values()
+    assert block["accuracy"] == 1e-3 and block["settings"]["effects"] == sorted(plan().settings.effects)
+    assert set(block) >= {"effects", "predicted_seconds", "settings", "sampling_target", "warnings"}
+
+
+def test_only_effects_that_are_on_by_choice_say_what_would_be_without_them() -> None:
+    """Those that are off, or that the user switched, had no choice to explain; what takes no time has no seconds."""
+    found = rows(plan(effects="+ambient,-interreflection"))
+    for name, row in found.items():
+        explained = "without it the error would be" in row.reason or "it takes no time" in row.reason
+        assert not (explained and (row.state == "off" or name in ("ambient", "interreflection"))), name
+        assert row.seconds == 0 or row.state != "off", name
+        assert row.seconds == 0 or "it takes no time" not in row.reason, name
+    assert "without it the error would be" in found["diffraction"].reason and found["diffraction"].seconds > 0
+    assert "it takes no time" in found["blur"].reason and found["blur"].state == "exact"
+
+
+def test_where_nothing_fits_sampling_still_aims_below_the_accuracy() -> None:
+    """Every number of anchors leaves 5 %: the plan is flagged, and sampling is no finer than it need be."""
+    coarse = {**SIZES, **{Part("anchors", count): 0.05 for count in (1, 2, 3, 5)}}
+    found = plan(1e-2, replace(EVIDENCE, changes=changes(coarse)))
+    assert found.warnings and found.systematic_bound > 1e-2
+    assert 0.5e-2 < found.sampling_target < 1e-2
+
+
+FOLLOWS = replace(EVIDENCE, changes=changes(SIZES | {Part("ambient"): 5e-2}))
+"""Light of lamps that no budget can do without, seen from two points a side of the sensor."""
+
+
+def seconds(settings: Settings, evidence: Evidence = FOLLOWS) -> float:
+    return sum(stages(evidence, settings, paces_of(evidence)).values())
+
+
+def test_seconds_are_those_of_every_stage_once() -> None:
+    found = plan(evidence=FOLLOWS)
+    expected = stages(FOLLOWS, found.settings, paces_of(FOLLOWS))
+    assert found.predicted == pytest.approx(expected) and min(expected.values()) > 0
+    assert found.predicted_seconds == pytest.approx(seconds(found.settings))
+
+
+def test_a_row_tells_what_one_of_it_would_save_and_leave() -> None:
+    """Seconds with and without, samples as they are; the error of one anchor, layer and point, not of two."""
+    found = plan(evidence=FOLLOWS)
+    settings, told = found.settings, rows(found)
+    assert settings.anchors > 1 and settings.layers and settings.followed_anchors == 2
+    for name, less in (
+        ("anchors", replace(settings, anchors=1)),
+        ("layers", replace(settings, layers=())),
+        ("followed-anchors", replace(settings, followed_anchors=1)),
+        ("diffraction", replace(settings, effects=settings.effects - {"diffraction"})),
+    ):
+        assert told[name].seconds == pytest.approx(seconds(settings) - seconds(less)) and told[name].seconds > 0, name
+    assert told["followed-anchors"].error_if_off == pytest.approx(SIZES[Part("followed_anchors", 1)])
+
+
+def test_the_row_of_occluded_pixels_tells_their_number_and_what_they_leave() -> None:
+    """None: few anchors serve all. Some: one anchor's error, and what the chosen ones leave."""
+    none = rows(plan())["occluded-anchors"]
+    assert (none.state, none.error_if_off, none.seconds) == ("off", 0, 0) and "serve all" in none.reason
+    evidence = with_occluded({1: 6e-3, 2: 3e-3, 5: 7e-4, 16: 1e-4, 32: 3e-5})
+    found = plan(evidence=evidence)
+    several, count = rows(found)["occluded-anchors"], found.settings.occluded_anchors
+    assert count > 1 and several.state == "approximate" and several.seconds == 0
+    assert several.error_if_off == pytest.approx(6e-3)
+    left = evidence.ladders["occluded_anchors"][count].value
+    hidden = "150 projector pixels are hidden from part of the sensor"
+    assert several.reason == f"{hidden}: {count}x{count} anchors leave {left:.1e}, one 6.0e-03"
+    one = rows(plan(0.1, evidence, "-anchors"))["occluded-anchors"]
+    assert (one.state, one.seconds) == ("off", 0) and one.error_if_off == pytest.approx(6e-3)
+    assert one.reason == f"{hidden}: one anchor leaves 6.0e-03"

@@ -1,0 +1,275 @@
+"""Plans within a time: what is looked at, how finely, and what of the time is left for light, of invented prices; paces
+of invented launches, and samples for rare heavy paths."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mitsim.devices.patterns import Lighting
+from mitsim.light.cost_model import FIXED
+from mitsim.light.plan import Plan
+from mitsim.light.settings import GROUPS, LOOKS, MOST_PATHS, Effort, Noise
+from mitsim.optics.frames import bound_of
+from mitsim.planner import pilot, planner
+from mitsim.planner.choose import _BOUND_OVER_ERROR, FIRST_LOOK, Choice, _needed, cheapest
+from tests.unit.planner.invented_evidence import ONE_CLASS, plan
+
+LIGHTING, SEED, LOOKING, FRAMES = Lighting.uniform(4), 7, 0.5, {"sensor": 0.2, "write": 0.1}
+AROUND = planner.OPENING_S + sum(FRAMES.values()) + LOOKING
+"""Seconds of all but light, frames and truth, after one look; a finer one is taken for twice as long."""
+PRICE, KEPT = 1e-3, 1.5e-5
+"""Light of accuracy e takes PRICE / e seconds, and half of it without diffraction; it keeps no finer one than KEPT."""
+OWN = "the plan's own"
+
+
+@dataclass
+class Invented:
+    """Stands in for the choices of a look."""
+
+    evidence: Looks
+    switches: Mapping[str, bool]
+
+    def seconds(self, accuracy: float) -> tuple[float, bool]:
+        price = PRICE * (self.evidence.dearer if len(self.evidence.asked) > 1 else 1.0) / accuracy
+        kept = self.evidence.kept if len(self.evidence.asked) > 1 else KEPT
+        return price * (1.0 if self.switches.get("diffraction", True) else 0.5), accuracy >= kept
+
+
+@dataclass
+class Looks:
+    """Accuracies and seeds of looks, and what was decided at last; a finer one may find all dearer, or less kept."""
+
+    asked: list[tuple[float, int]] = field(default_factory=list)
+    decided: tuple[object, float, Mapping[str, bool]] | None = None
+    dearer: float = 1.0
+    kept: float = KEPT
+
+
+@pytest.fixture(scope="module")
+def made() -> Plan:
+    return plan()
+
+
+@pytest.fixture
+def looks(made: Plan, monkeypatch: pytest.MonkeyPatch) -> Looks:
+    seen = Looks()
+
+    class Look:
+        seconds = LOOKING
+
+        def __init__(self, bench: object, lighting: Lighting, accuracy: float, seed: int) -> None:
+            assert lighting is LIGHTING
+            seen.asked.append((accuracy, seed))
+            self.evidence = seen
+
+    def decided(look: Look, accuracy: float, switches: Mapping[str, bool]) -> Plan:
+        seen.decided = look.evidence, accuracy, switches
+        return replace(made, accuracy=accuracy, warnings=(OWN,))
+
+    monkeypatch.setattr(pilot, "Look", Look)
+    monkeypatch.setattr(planner, "Candidates", Invented)
+    monkeypatch.setattr(planner, "_refuse_unfit", lambda bench, switches: None)
+    monkeypatch.setattr(planner, "_decided", decided)
+    monkeypatch.setattr(planner, "frame_seconds", lambda bench, shots: FRAMES)
+    return seen
+
+
+def within(light: float, switches: Mapping[str, bool] | None = None) -> Plan:
+    """Of ``light`` seconds beyond one look and all that is around it."""
+    bench: Any = None
+    return planner.plan_within(bench, LIGHTING, AROUND + light, SEED, switches)
+
+
+@pytest.mark.parametrize(
+    ("light", "bought", "finer_look"),
+    [
+        (0.2, 5.01e-3, None),
+        (1.01, 1e-3, None),
+        (2.2, 1e-3, None),  # after another look 1.2 s are left, and the next finer accuracy takes 1.26
+        (2.3, 7.94e-4, 7.94e-4),
+        (11.01, 1e-4, 1e-4),
+        (math.inf, 1.58e-5, 1e-5),
+    ],
+)
+def test_what_looks_leave_is_for_the_light(looks: Looks, light: float, bought: float, finer_look: float | None) -> None:
+    """Opening, frames and looking come off; a finer look is taken where what it leaves buys a finer accuracy."""
+    found = within(light)
+    finer = [(finer_look, SEED)] if finer_look else []
+    assert looks.asked == [(FIRST_LOOK, SEED), *finer]
+    assert looks.decided == (looks, bought, {}) and found.accuracy == bought
+    assert found.asked_seconds == AROUND + light and found.warnings == (OWN,)
+
+
+def test_what_is_switched_off_is_not_paid_for(looks: Looks) -> None:
+    """In both looks: 0.2 s buy what 0.4 do else, and so do 1.3 after another look."""
+    off = {"diffraction": False}
+    assert within(0.2, off).accuracy == 2.51e-3
+    assert within(2.3, off).accuracy == 3.98e-4 and looks.asked[-1] == (3.98e-4, SEED)
+    assert looks.decided == (looks, 3.98e-4, off)
+
+
+def test_too_few_seconds_are_told_with_what_all_would_take(looks: Looks) -> None:
+    found = within(-AROUND + 0.01)
+    line, own = found.warnings
+    assert found.accuracy == 0.3 and found.asked_seconds == pytest.approx(0.01) and own == OWN
+    assert line.startswith("0.01 seconds are too few: even accuracy 0.3")
+    assert f"to take {PRICE / 0.3 + AROUND:.1f} s from start to finish" in line
+    assert looks.asked == [(FIRST_LOOK, SEED)], "no time for another look"
+
+
+@pytest.mark.parametrize(("dearer", "bought"), [(1.3, 1.58e-4), (1e5, 1e-3)])
+def test_a_finer_look_that_finds_all_dearer_buys_less_or_nothing(looks: Looks, dearer: float, bought: float) -> None:
+    looks.dearer = dearer
+    found = within(11.01)
+    assert len(looks.asked) == 2 and found.accuracy == bought and found.warnings == (OWN,)
+
+
+def test_a_finer_look_that_finds_no_accuracy_kept_takes_none_away(looks: Looks) -> None:
+    """What the first look bought stands. (Planted: the loosest of all, 0.3, which the finer look can pay.)"""
+    looks.kept = 1.0
+    found = within(11.01)
+    assert len(looks.asked) == 2 and found.accuracy == 1e-3 and found.warnings == (OWN,)
+
+
+LAUNCH_S, PATH_S = 0.02, 1e-7
+"""What an invented machine takes for each launch, and for each path of it."""
+
+
+@dataclass
+class Machine:
+    """Stands in for a stage's launches; one of them, by its number, takes ten times as long as it should."""
+
+    disturbed: int = -1
+    launches: list[int] = field(default_factory=list)
+
+    def seconds(self, stage: Any, seed: int, labels: object, samples: int) -> float:
+        self.launches.append(samples)
+        taken = LAUNCH_S + PATH_S * samples * stage.tracer.lanes
+        return 10 * taken if len(self.launches) - 1 == self.disturbed else taken
+
+
+@pytest.mark.parametrize("lanes", [4000, 25_280, 300_000])
+@pytest.mark.parametrize("planned", [3, 100, 5000])
+@pytest.mark.parametrize("disturbed", [-1, 0, 1, 2, 3, 4, 5, 6])
+def test_paces_are_those_of_launches_as_the_run_has_them(
+    monkeypatch: pytest.MonkeyPatch, lanes: int, planned: int, disturbed: int
+) -> None:
+    """Within 1.5 times of what all launches of the run take together, one slow moment or none, where that is more than
+    a second. (Planted: the pace of the first launch alone, 4 times too slow; the slower of two launches.)"""
+    at_once, machine = 2**21, Machine(disturbed)
+    monkeypatch.setattr(planner, "_seconds", machine.seconds)
+    stage: Any = SimpleNamespace(tracer=SimpleNamespace(lanes=lanes))
+    pace, longest = planner._pace(stage, at_once, planned, None, SEED)  # type: ignore[arg-type]
+    launches = math.ceil(planned / (at_once // lanes))
+    taken = GROUPS * (launches * LAUNCH_S + planned * lanes * PATH_S)
+    if disturbed < 0 or taken > 1.0:
+        assert GROUPS * planned * pace == pytest.approx(taken, rel=0.15 if disturbed < 0 and planned > 3 else 0.5)
+        assert longest == pytest.approx(PATH_S * lanes, rel=0.5) or planned * lanes < 1e6
+    assert sum(machine.launches[1:]) <= max(2 + 2**16 / lanes, 0.3 * GROUPS * planned)
+
+
+class Heavy:
+    """A look at evidence whose light from the camera turns out to have noise of such a variance in a sample."""
+
+    def __init__(self, variance: float, spread: float = 0.0, paths: float = 50.0) -> None:
+        self.evidence = replace(ONE_CLASS, followed_from_camera=replace(ONE_CLASS.followed, seconds=0.0))
+        self.variance, self.spread, self.paths, self.looked = variance, spread, paths, list[int]()
+
+    def heavy(self, samples: int) -> dict[str, Effort]:
+        self.looked.append(samples)
+        noise = Noise(math.sqrt(self.variance / samples), samples, 0.5, self.spread, self.paths)
+        return {"from_camera": Effort(noise, self.evidence.from_camera.paths)}
+
+
+def planned_with(look: Any, accuracy: float = 3e-3) -> tuple[Choice, Choice]:
+    """The choice by the look's evidence, and that with heavy paths."""
+    chosen = cheapest(accuracy, look.evidence, {})
+    assert "interreflection" in chosen.settings.effects
+    return chosen, planner._with_heavy_paths(look, accuracy, chosen, {})[1]
+
+
+def test_rare_heavy_paths_are_sampled_from_the_first() -> None:
+    """The run begins with the samples that looks at more paths ask for. (Planted: the settings stay as they were, and
+    a run that meets none of these paths ends without them.)"""
+    plain = ONE_CLASS.from_camera.variance
+    same, unchanged = planned_with(Heavy(1.01 * plain))
+    assert unchanged is same
+    look = Heavy(400 * plain)
+    before, after = planned_with(look)
+    target = after.target
+    left = math.sqrt(look.variance / after.settings.from_camera_samples / GROUPS)
+    assert after.settings.from_camera_samples > 20 * before.settings.from_camera_samples and left < target
+    assert look.looked == sorted(look.looked) and look.looked[-1] * LOOKS * look.evidence.from_camera.paths <= 2**23
+    _, more = planned_with(Heavy(400 * plain, spread=4.0))
+    assert more.settings.from_camera_samples > 1.02 * after.settings.from_camera_samples
+    _, most = planned_with(Heavy(1e9 * plain))
+    assert most.settings.from_camera_samples * GROUPS * ONE_CLASS.from_camera.paths == pytest.approx(MOST_PATHS)
+
+
+def test_looks_go_on_while_few_heavy_paths_are_met() -> None:
+    """To the most, whatever they say that the run takes: 5 equal paths tell little of that; 50 end them at a tenth of
+    it. (Planted: looks end at a tenth whatever they met.)"""
+    plain = ONE_CLASS.from_camera.variance
+    many, few = Heavy(3 * plain, paths=50.0), Heavy(3 * plain, paths=5.0)
+    planned_with(many)
+    planned_with(few)
+    assert many.looked == few.looked[: len(many.looked)] and len(few.looked) > len(many.looked)
+    assert few.looked[-1] * LOOKS * ONE_CLASS.from_camera.paths == pytest.approx(2**23, rel=0.01)
+
+
+def test_a_run_of_heavy_paths_has_a_range_of_seconds() -> None:
+    """None where many paths make the noise; of some, five times their work at most and 0.7 at least, as the rest takes
+    what it takes; of fewer than four, what sampling stops at. (Planted: the rest grows too; a stage that is added is
+    in none of the ends.)"""
+    evidence, settings = ONE_CLASS, plan(3e-3, ONE_CLASS).settings
+    settings = replace(settings, from_camera_samples=100.0)
+    planned = replace(plan(3e-3, ONE_CLASS), settings=settings)
+    assert planner._range(evidence, planned) is None and planned.range_words == ""
+    pace, total = evidence.from_camera.seconds or FIXED.from_camera, planned.predicted_seconds
+    work = GROUPS * 100 * evidence.from_camera.paths * pace
+
+    def ends(paths: float) -> tuple[float, float] | None:
+        light = evidence.from_camera
+        return planner._range(
+            replace(evidence, from_camera=replace(light, noise=replace(light.noise, heavy=paths))), planned
+        )
+
+    assert ends(20.0) == pytest.approx((total - 0.3 * work, total + 4 * work))
+    assert ends(3.0) == pytest.approx((total - 0.3 * work, total - work + MOST_PATHS * pace))
+    later = replace(planned, predicted_range=(10.0, 60.0)).taking(plan=4.0)
+    assert later.predicted_range == (14.0, 64.0) and "take 14 to 64 s" in later.range_words
+    assert later.payload()["predicted_range"] == (14.0, 64.0) and planned.payload()["predicted_range"] is None
+
+
+def test_bounds_of_few_heavy_paths_take_more_samples() -> None:
+    """Sampling stops where a bound meets the target: of groups that some equal heavy paths meet by chance, half of the
+    bounds do with so many samples. (Planted: samples for the error alone, 9 % of the bounds.)"""
+    rate, per_look = 2.0, 50  # heavy paths in a look of so many samples
+    # Each brings an energy of 1 in its own pixels: variance of a sample, and of a look's energy over its square.
+    noise, target = Noise(math.sqrt(rate) / per_look, per_look, 0.5, 1 / rate), 1e-2
+    samples = float(_needed(Effort(noise, 1), target * math.sqrt(GROUPS) / _BOUND_OVER_ERROR))
+    rng = np.random.default_rng(5)
+    met = rng.poisson(rate * samples / per_look, (4000, GROUPS)).astype(np.float64)
+    bounds = np.array([bound_of(each / (samples * GROUPS) ** 2, 1.0) for each in met])
+    assert 0.35 < float((bounds < target).mean()) < 0.75
+
+
+def test_noise_tells_how_unlike_looks_are() -> None:
+    """Four looks of which one has all the noise: a relative variance of 16/9 about; of even noise next to none. And as
+    how many equal ones paths are: one that brings ten times as much as a hundred others is as 3.9 would be."""
+    rng = np.random.default_rng(6)
+    even, one = rng.normal(size=(LOOKS, 4000)), np.zeros((LOOKS, 4000))
+    one[2] = even[2]
+    paths = np.append(np.ones(100), 10.0)
+    assert Noise.among(even, 2.0, 8, paths).spread < 0.01
+    assert Noise.among(even, 2.0, 8, paths).error == pytest.approx(math.sqrt(4000) / 2, rel=0.05)
+    assert Noise.among(one, 2.0, 8, paths).spread == pytest.approx(16 / 9, rel=0.01)
+    assert Noise.among(one, 2.0, 8, paths).heavy == pytest.approx(200**2 / 10100)
+    assert Noise.among(np.zeros((LOOKS, 3)), 2.0, 8, np.zeros(0)) == Noise(0.0, 8, 0.5, heavy=0.0)

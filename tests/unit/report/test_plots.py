@@ -1,0 +1,161 @@
+"""Figures say their units, show the numbers they were given, and leave matplotlib's global state alone."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from itertools import product
+
+import numpy as np
+
+from mitsim.report import plots
+from mitsim.report.html import typeset
+from mitsim.report.table import Mean
+from mitsim.studies.solver import LAMBDAS, LAYOUTS, METHODS, PRECISIONS, SolverRow
+
+SOLVER_ROWS = [
+    SolverRow(method, precision, layout, lam, seconds=0.02 * 1.2**index, error=1e-3 * 0.1**index, judge_error=0, seed=0)
+    for lam in LAMBDAS
+    for index, (method, precision, layout) in enumerate(product(METHODS, PRECISIONS, LAYOUTS))
+]
+
+
+def test_every_axis_has_a_unit() -> None:
+    figures = (
+        plots.frame(np.ones((4, 4))),
+        plots.singular_values({"a": np.ones(3)}),
+        plots.error_bars({"a": 1e-3}, 1e-2),
+        plots.quality_bars({"a": (Mean(20.0, 1.0, 8), Mean(10.0, float("nan"), 1))}),
+        plots.solver_costs(SOLVER_ROWS),
+    )
+    for figure in figures:
+        axes = figure.axes[0]
+        labels = [text for text in (axes.get_xlabel(), axes.get_ylabel()) if text]
+        assert labels and all("[" in text for text in labels)
+
+
+def test_frame_shows_row_zero_at_the_top_with_its_own_range() -> None:
+    values = np.arange(12.0).reshape(3, 4)
+    figure = plots.frame(values)
+    drawn = figure.axes[0].images[0]
+    assert np.array_equal(np.asarray(drawn.get_array()), values)
+    assert drawn.get_clim() == (0.0, 11.0)
+    low, high = figure.axes[0].get_ylim()
+    assert low > high, "rows grow downwards"
+    assert figure.axes[1].get_ylabel() == "signal [DN]"
+
+
+def test_stated_and_actual_errors_share_one_scale() -> None:
+    """(Planted: each panel with a range of its own.)"""
+    error = np.linspace(0.0, 0.01, 10_000).reshape(100, 100)
+    figure = plots.stated_and_actual(np.full((100, 100), 0.004), error)
+    stated, actual, bar = figure.axes
+    assert stated.images[0].get_clim() == actual.images[0].get_clim() == (0.0, np.percentile(error, 99))
+    assert np.array_equal(np.asarray(actual.images[0].get_array()), error)
+    assert "stated" in stated.get_title() and "0.0040" in stated.get_title() and "0.0058" in actual.get_title()
+    assert bar.get_ylabel() == "reflectance, 1 = board"
+
+
+def test_singular_values_are_sorted_and_relative_to_the_largest() -> None:
+    line = plots.singular_values({"a": [1.0, 4.0, 2.0, 0.0]}).axes[0].lines[0]
+    assert np.array_equal(np.asarray(line.get_ydata()), [1.0, 0.5, 0.25, 0.0])
+    assert np.array_equal(np.asarray(line.get_xdata()), [25.0, 50.0, 75.0, 100.0])
+
+
+def test_error_bars_put_the_largest_on_top_and_keep_the_limit_in_sight() -> None:
+    axes = plots.error_bars({"small": 1e-5, "large": 1e-2}, limit=0.5).axes[0]
+    assert [text.get_text() for text in axes.get_yticklabels()] == ["small", "large"]
+    low, high = axes.get_xlim()
+    assert low < 1e-5 and high > 0.5
+
+
+def test_values_of_error_bars_stand_beside_the_axes_where_no_line_crosses_them() -> None:
+    figure = plots.error_bars({"small": 1e-5, "close": 7.8e-4, "large": 1e-2}, limit=1e-3)
+    figure.canvas.draw()
+    axes = figure.axes[0]
+    right = axes.get_window_extent().x1
+    written = [text for text in axes.texts if "10" in text.get_text() and "asked" not in text.get_text()]
+    assert [text.get_text() for text in written] == ["1.0\u00d710⁻⁵", "7.8\u00d710⁻⁴", "0.0100"]
+    for text in written:
+        box = text.get_window_extent()
+        assert box.x0 > right and box.x1 < figure.bbox.x1
+
+
+def test_labels_of_a_frame_lie_inside_the_figure() -> None:
+    figure = plots.frame(np.arange(262144.0).reshape(512, 512))
+    figure.canvas.draw()
+    for text in (figure.axes[0].yaxis.label, figure.axes[0].xaxis.label, figure.axes[1].yaxis.label):
+        box = text.get_window_extent()
+        assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= figure.bbox.x1 and box.y1 <= figure.bbox.y1
+
+
+def test_seven_families_can_be_told_apart() -> None:
+    lines = plots.singular_values({str(k): np.ones(2) for k in range(7)}).axes[0].lines
+    assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == 7
+    assert len({line.get_color() for line in lines}) == 7
+
+
+def test_the_front_is_what_nothing_beats() -> None:
+    points = [(3.0, 0.1), (1.0, 1.0), (2.0, 0.5), (2.5, 0.5), (1.0, 2.0), (4.0, 0.2)]
+    assert plots.pareto_front(points) == [(1.0, 1.0), (2.0, 0.5), (3.0, 0.1)]
+
+
+def test_legends_cover_no_point_and_lie_inside_the_figure() -> None:
+    figure = plots.solver_costs(SOLVER_ROWS)
+    figure.canvas.draw()
+    box = figure.legends[0].get_window_extent()
+    assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= figure.bbox.x1 and box.y1 <= figure.bbox.y1
+    assert not any(box.overlaps(axes.get_window_extent()) for axes in figure.axes)
+
+
+def test_solver_costs_shows_every_row_in_the_panel_of_its_lambda() -> None:
+    figure = plots.solver_costs(SOLVER_ROWS)
+    for axes, lam in zip(figure.axes, LAMBDAS, strict=True):
+        assert axes.get_title().endswith(typeset(f"{lam:.0e}"))
+        shown = [(line.get_xdata()[0], line.get_ydata()[0]) for line in axes.lines[:-1]]
+        assert sorted(shown) == sorted((row.seconds, row.error) for row in SOLVER_ROWS if row.lambda_rel == lam)
+    looks = {(line.get_color(), line.get_marker()) for line in figure.axes[0].lines[:-1]}
+    assert len(looks) == len(METHODS) * len(LAYOUTS) * len(PRECISIONS)
+
+
+def test_an_error_of_nothing_has_no_dot() -> None:
+    errors = {"large": 0.4, "nothing": 0.0, "a long name of an effect, with its parts": 1e-5}
+    figure = plots.error_bars(errors, limit=1e-3)
+    figure.canvas.draw()
+    axes = figure.axes[0]
+    assert [text.get_text() for text in axes.get_yticklabels()] == [list(errors)[i] for i in (1, 2, 0)]
+    assert list(axes.lines[0].get_xdata()) == [1e-5, 0.4], "an error of 0 has no place on a logarithmic axis"
+    plots.error_bars({"only": 0.0}).canvas.draw()
+
+
+def test_no_pyplot_is_loaded() -> None:
+    program = (
+        "import sys, numpy; from mitsim.study import plots; plots.frame(numpy.ones((4, 4)));"
+        "sys.exit('matplotlib.pyplot' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+def test_quality_by_factors_shows_every_value_on_the_line_of_its_system() -> None:
+    rows = [("ray", "assumed", 40.0), ("wave", "assumed", 20.0), ("wave", "found", 41.0)]
+    figure = plots.quality_by_factors(rows, "a message")
+    axes = figure.axes[0]
+    assert [text.get_text() for text in axes.get_yticklabels()] == ["wave", "ray"], "the first stands on top"
+    marks = {line.get_label(): line.get_xydata().tolist() for line in axes.lines if line.get_marker() != "None"}
+    assert marks == {"assumed": [[40.0, 1.0], [20.0, 0.0]], "found": [[41.0, 0.0]]}
+    assert "dB" in axes.get_xlabel() and figure.get_suptitle() == "a message"
+
+
+def test_shadow_profiles_show_the_middle_of_the_sensor() -> None:
+    """Of a region of interest, its middle. (Planted: the axis, which need not be on it.)"""
+    for middle in (0.0, 4.0):
+        position = [middle + place for place in (-1.0, -0.5, 0.0, 0.5, 1.0)]
+        axes = plots.shadow_profiles(position, {"rays": [1, 2, 3, 4, 5]}, 0.5, "a message").axes[0]
+        shown = [[middle - 0.5, 2.0], [middle, 3.0], [middle + 0.5, 4.0]]
+        assert axes.lines[0].get_xydata().tolist() == shown
+    assert "mm" in axes.get_xlabel() and axes.get_title() == "a message"
+
+
+def test_maps_of_errors_say_of_which_factor() -> None:
+    axes, _ = plots.deviations([[1.0, -2.0]], 4.0, "left factor").axes
+    assert axes.get_title() == "left factor" and axes.images[0].get_clim() == (-4.0, 4.0)

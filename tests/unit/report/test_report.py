@@ -1,0 +1,361 @@
+"""The HTML report from invented data: complete, self-contained, deterministic, and written all or nothing."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from mitsim.core.errors import MitsimError
+from mitsim.light.plan import PlanRow
+from mitsim.metrics import Quality
+from mitsim.report import report as R
+from mitsim.report.report import Trust
+from mitsim.studies.demo import _no_image
+from mitsim.studies.framework.page import Part, build_findings
+
+pytestmark = pytest.mark.usefixtures("draft_figures")
+N = 32
+
+
+def example(n: int = N, frame_size: int = 48) -> R.ReportData:
+    """A complete report of invented numbers; `n` scene pixels a side."""
+    rng = np.random.default_rng(7)
+    y, x = np.mgrid[0:n, 0:n] / n
+    truth = 0.15 + 0.6 * ((x - 0.4) ** 2 + (y - 0.5) ** 2 < 0.08) + 0.15 * y + 0.1 * (x > 0.8)
+
+    def recovery(decibel: float) -> R.Recovery:
+        image = truth + 10 ** (-decibel / 20) * rng.standard_normal((n, n))
+        error = 10 ** (-decibel / 20)
+        trust = Trust(np.full((n, n), error), np.abs(image - truth), 1.02, "depth" if decibel < 20 else "")
+        return R.Recovery(image, Quality(decibel, 0.98 - 0.6 * error), 3e-6, trust=trust)
+
+    def dots(k: int) -> np.ndarray:
+        row = np.arange(n) % k == 0
+        return np.outer(row, row).astype(float)
+
+    sign = np.where(np.arange(n) // (n // 8) % 2 == 0, 1.0, -1.0)
+    rows = (
+        ("uniform", "Uniform", 1, np.ones((n, n)), 23.5, 18.7),
+        ("dots:4", "16 dots", 16, dots(4), 31.2, 27.9),
+        ("dots:5", "25 dots", 25, dots(5), 33.4, 29.6),
+        ("dots:7", "49 dots", 49, dots(7), 36.4, 31.8),
+        ("hadamard:8", "64 Hadamard", 128, np.outer(sign, sign), 36.1, 30.9),
+    )
+    families = tuple(
+        R.FamilyResult(
+            name,
+            label,
+            shots,
+            (pattern,),
+            10 ** (-np.linspace(0, 6 / shots**0.4, n)),
+            recovery(a),
+            recovery(b),
+            {"equal peak": b, "equal frame": 20.0 + k} | ({} if k == 2 else {"equal total": 19.0 + k}),
+        )
+        for k, (name, label, shots, pattern, a, b) in enumerate(rows)
+    )
+    frames = {
+        label: rng.poisson(level * (1 + np.outer(*2 * [np.sin(np.arange(frame_size) / 5)])))
+        for label, level in (
+            ("Uniform", 2400),
+            ("49 dots, frame 1 of 49", 2100),
+            ("64 Hadamard, frame 3 of 128", 2300),
+        )
+    }
+    headline, detail = R.verdict(families[3], families[0])
+    return R.ReportData(
+        title="mitsim demo: a printed photograph",
+        verdict=headline,
+        verdict_detail=detail,
+        truth=truth,
+        scene="A printed photograph, 400 mm from the camera; a projector beside it lights 120 x 120 mm.",
+        render=np.kron(truth, np.ones((2, 2))),
+        families=families,
+        main="dots:7",
+        frames=frames,
+        exposure="equal peak, 80 % of full well",
+        calibration={
+            "n": 128,
+            "frames": 512,
+            "separability_residual": 1.2e-3,
+            "phi_error": 4.1e-3,
+            "condition": 2.6e5,
+            "status": "Factors agree with the noise-free ones.",
+        },
+        budget=(
+            R.BudgetRow("Monte Carlo noise", 2.1e-4, "Reached; five times below the accuracy asked for."),
+            R.BudgetRow("Sensor noise", 6.3e-3, "Shot and read noise of one frame; limits the result."),
+            R.BudgetRow("Calibration", 4.1e-3, "Error of the calibrated factors."),
+            R.BudgetRow("Discretisation", 3.0e-4, "Cells and depth layers."),
+        ),
+        accuracy=1e-3,
+        effects=(
+            PlanRow("anchors", "exact", "Lambertian plane: falloff needs 3 a side", 6e-4, 0.1),
+            PlanRow("mask diffraction", "approximate", "Fresnel number 3.3 at 550 nm; three lines", 0.36, 0.8),
+            PlanRow("interreflection", "off", "one convex sheet: no second bounce", 0.0, 0.0),
+            PlanRow("ambient light", "off", "no emitter besides the projector", None, 0.0),
+        ),
+        seconds={
+            "plan": 0.21,
+            "calibrate": 9.4,
+            "transport": 3.1,
+            "optics": 1.4,
+            "sensor": 0.9,
+            "reconstruct": 0.6,
+        },
+        configuration={
+            "scene": "scenes/photograph/scene.xml",
+            "mask": "separable, 511 x 60 um",
+            "pitch": "11.72 um",
+        },
+        seeds={"root": 0, "render": 3735928559},
+        versions={"mitsim": "0.1.0", "mitsuba": "3.9.1", "drjit": "1.5.0"},
+    )
+
+
+class _Outside(HTMLParser):
+    """Collects every attribute value that would make a browser load something, and unbalanced tags."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sources: list[str] = []
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.sources += [value or "" for name, value in attrs if name in ("src", "href", "data", "srcset")]
+        if tag not in ("meta", "img", "br", "link", "input", "hr"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open and self.open.pop() == tag, f"</{tag}> closes nothing"
+
+
+@pytest.fixture(scope="module")
+def page(draft_figures: None) -> str:
+    return R.render_html(example())
+
+
+@pytest.fixture
+def unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of pages whose words alone count, plots are not drawn."""
+    monkeypatch.setattr(R, "_picture", lambda figure: R.data_uri(b"a plot"))
+
+
+def test_nothing_is_loaded_from_elsewhere(page: str) -> None:
+    parser = _Outside()
+    parser.feed(page)
+    assert parser.open == [], "every tag is closed"
+    assert parser.sources and all(source.startswith("data:image/png;base64,") for source in parser.sources)
+    assert "<script" not in page and "@import" not in page and "url(" not in page
+
+
+def test_every_number_that_was_given_is_shown(page: str) -> None:
+    text = re.sub(r"<style>.*?</style>|data:image/png;base64,[A-Za-z0-9+/=]+|<[^>]+>", " ", page, flags=re.S)
+    for wanted in (
+        "49 dots beat uniform by 13.1 dB",
+        "31.8 against 18.7 dB PSNR, rendered light and calibrated factors.",
+        "The idealised model says +12.9 dB.",
+        *("Uniform", "16 dots", "25 dots", "64 Hadamard", "23.5 dB", "36.4 dB", "31.8 dB", "SSIM 0.965"),
+        *("Equal peak", "Equal frame", "Equal total", "equal peak, 80 % of full well"),
+        *("512", "1.2\u00d710⁻³", "2.6\u00d710⁵", "Monte Carlo noise", "2.1\u00d710⁻⁴"),
+        *("mask diffraction", "approximate", "Fresnel number", "9.40 s", "15.6 s", "3735928559", "3.9.1"),
+    ):
+        assert wanted in text, wanted
+
+
+def test_each_image_stands_in_its_place(page: str) -> None:
+    # Truth: in the scene and in each row. Then 10 recoveries, 5 patterns, 3 frames, the scene, 4 plots.
+    assert page.count("<img ") == 3 + 10 + 5 + 3 + 1 + 4
+    assert page.count('class="picture result best"') == 2
+
+
+@pytest.mark.usefixtures("unpainted")
+def test_an_empty_report_has_no_empty_section() -> None:
+    page = R.render_html(R.ReportData("t", "v", np.ones((4, 4)), "s"))
+    assert re.findall(r"<h2>(.*?)</h2>", page) == ["The scene"]
+
+
+def test_best_of_each_exposure_convention_and_a_dash_where_there_is_none(page: str) -> None:
+    table = page.split("<h2>Exposure decides who wins</h2>")[1].split("</table>")[0]
+    best = re.findall(r'class="n best">(.*?)<', table)
+    assert best == ["31.8 dB", "24.0 dB", "23.0 dB"] and table.count("\N{EN DASH}") == 1
+
+
+def test_trust_is_a_row_a_family_and_one_picture_of_the_main_one(page: str) -> None:
+    """1024 draws of normal noise of the stated deviation: 95 % of them inside to 0.7 %, one deviation, and 3 of these.
+
+    (Planted: the error held against one uncertainty instead of 1.96.)
+    """
+    section = page.split("<h2>How far to trust the images</h2>")[1].split("<h2>")[0]
+    rows = [re.findall(r"<td[^>]*>(.*?)</td>", row, flags=re.S) for row in section.split("<tr>")[2:]]
+    assert [row[0] for row in rows] == ["Uniform", "16 dots", "25 dots", "49 dots", "64 Hadamard"]
+    for row, decibel in zip(rows, (18.7, 27.9, 29.6, 31.8, 30.9), strict=True):
+        stated = 10 ** (-decibel / 20)
+        assert row[1] == f"{decibel} dB" and row[2] == f"{stated:.4f}" and row[5] == "1.020"
+        assert float(row[3]) == pytest.approx(stated, rel=0.1)
+        assert float(row[4].removesuffix(" %")) == pytest.approx(95, abs=2.1)
+    assert [re.sub(r"<.*?>", "", row[6]) for row in rows] == ["depth", "fits", "fits", "fits", "fits"]
+    assert section.count("<img ") == 1 and 'alt="Stated uncertainty and actual error, 49 dots"' in section
+
+
+@pytest.mark.usefixtures("unpainted")
+def test_an_image_without_its_uncertainty_has_no_row() -> None:
+    family = example().families[3]
+    assert family.rendered is not None
+    unknown = replace(family, rendered=replace(family.rendered, trust=None))
+    assert "How far to trust" not in R.render_html(replace(example(), families=(unknown,)))
+
+
+@pytest.mark.usefixtures("unpainted")
+def test_an_image_too_small_for_ssim_is_shown_without(page: str) -> None:
+    family = example().families[0]
+    small = replace(family, rendered=R.Recovery(np.ones((4, 4)), Quality(20.0, None)))
+    text = R.render_html(replace(example(), families=(small,)))
+    assert text.count("SSIM") == 1 and page.count("SSIM") == 12, "10 recoveries and 2 tiles"
+
+
+@pytest.mark.usefixtures("unpainted")
+def test_text_cannot_become_markup() -> None:
+    one = example().families[:1]
+    page = R.render_html(replace(example(), families=one, verdict="<b>&", configuration={"<i>": "</table>"}))
+    assert "&lt;b&gt;&amp;" in page and "&lt;/table&gt;" in page and "<i>" not in page
+
+
+def test_the_same_data_give_the_same_bytes(page: str) -> None:
+    assert R.render_html(example()) == page
+
+
+@pytest.mark.usefixtures("unpainted")
+def test_only_a_solver_with_something_to_say_is_heard(page: str) -> None:
+    assert "Solved" not in page
+
+    said = (
+        "Solved: every direction of the image is measured.",
+        "Solved, but 3 of 9 directions are not measured above rounding.",
+        "Rank deficient: 3 of 9 directions are not measured.",
+    )
+    families = tuple(
+        replace(family, rendered=replace(family.rendered, status=text))
+        for family, text in zip(example().families, said, strict=False)
+        if family.rendered is not None
+    )
+    text = R.render_html(replace(example(), families=families))
+    assert len(families) == 3 and "Solved: every" not in text
+    assert "Solved, but 3 of 9" in text and "Rank deficient" in text
+
+
+@pytest.mark.usefixtures("unpainted")
+def test_plan_shows_costs_where_there_are_any_and_no_column_of_zeros(page: str) -> None:
+    table = page.split("<h2>The effect plan</h2>")[1].split("</table>")[0]
+    assert ">Cost<" in table and "0.80 s" in table and "0.00 s" not in table
+    assert '<td class="n">0</td>' in table, "an effect that changes nothing"
+    assert table.count('<td class="n"></td>') == 2, "no cost, no number"
+    free = tuple(replace(row, seconds=0.0) for row in example().effects)
+    assert ">Cost<" not in R.render_html(replace(example(), families=example().families[:1], effects=free))
+
+
+def test_time_outside_all_stages_is_not_hidden() -> None:
+    assert R._stages({"a": 1.0, "b": 2.0, "total": 5.0}) == {"a": 1.0, "b": 2.0, "all else": 2.0}
+    assert R._stages({"a": 1.0, "b": 0.006, "c": 0.009, "total": 1.015}) == {"a": 1.0, "all else": pytest.approx(0.015)}
+    assert R._stages({"a": 1.0, "b": 2.0, "total": 3.02}) == {"a": 1.0, "b": 2.0}
+    assert R._stages({"a": 1.0}) == {"a": 1.0} and R._stages({}) == {}
+
+
+def test_patterns_are_cut_to_a_corner_where_pixels_can_be_seen() -> None:
+    pattern = np.indices((128, 128)).sum(axis=0) % 7 == 0
+    corner = R._PATTERN_CORNER
+    assert R._pattern(pattern) == R._pattern(pattern[:corner, :corner])
+    assert R._pattern(pattern) != R._pattern(pattern[1 : corner + 1, :corner])
+
+
+def test_display_clips_but_the_numbers_do_not() -> None:
+    bright = np.full((8, 8), 7.0)
+    assert R._reflectance(bright) == R._reflectance(np.ones((8, 8)))
+    assert R._reflectance(bright) != R._reflectance(np.full((8, 8), 0.99))
+
+
+def test_signed_patterns_show_minus_one_black() -> None:
+    assert R._pattern(np.array([[1.0, 0.0, -1.0]])) == R._pattern(np.array([[1.0, 0.5, 0.0]]))
+
+
+def test_a_loss_is_called_a_loss() -> None:
+    families = example().families
+    assert R.verdict(families[0], families[3])[0] == "Uniform: 13.1 dB below 49 dots"
+    assert R.verdict(families[0], families[0])[0] == "Uniform: 18.7 dB", "nothing to compare with"
+
+
+@pytest.mark.parametrize(("decibel", "headline"), [(-42.0, "49 dots: no image, -42.0 dB"), (0.1, "49 dots beat b by")])
+def test_a_gain_over_nothing_is_no_gain(decibel: float, headline: str) -> None:
+    """A mirror's demo said that 9 dots beat uniform by 23.3 dB, of images at -42 and -65 dB."""
+    ours, theirs = (
+        R.FamilyResult(name, name, 1, rendered=R.Recovery(np.ones((4, 4)), Quality(value, None)))
+        for name, value in (("49 dots", decibel), ("B", -65.3))
+    )
+    assert R.verdict(ours, theirs)[0].startswith(headline)
+    assert bool(_no_image(ours)) == ("no image" in headline)
+
+
+def test_refuses_what_it_cannot_show() -> None:
+    broken = np.ones((4, 4))
+    broken[1, 2] = np.nan
+    with pytest.raises(MitsimError, match=r"truth of shape \(4, 4\)"):
+        R.render_html(R.ReportData("t", "v", broken, "s"))
+    with pytest.raises(MitsimError, match="no rendered result"):
+        R.verdict(R.FamilyResult("a", "A", 1), R.FamilyResult("b", "B", 1))
+
+
+@pytest.mark.usefixtures("unpainted")
+def test_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    small = R.ReportData("t", "v", np.ones((4, 4)), "s")
+    target = R.build_report(small, tmp_path / "report.html")
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+    before = target.read_text(encoding="utf-8")
+
+    def full_disk(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full_disk)
+    with pytest.raises(MitsimError, match="No space left"):
+        R.build_report(replace(small, title="other"), target)
+    assert target.read_text(encoding="utf-8") == before
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+    with pytest.raises(MitsimError, match="cannot be written"):
+        R.build_report(small, tmp_path / "missing" / "report.html")
+
+
+def test_numbers_of_findings_stand_to_the_right_and_words_to_the_left() -> None:
+    """A column of words after one of numbers does not go right."""
+    rows = (("shot noise", "+7.4 +- 0.1", "2.8e+12", "1"), ("read noise", "nothing", "", "one"))
+    part = Part("Title", "512 x 512 pixels", ("Source", "Lost", "Photons", "Runs"), rows, ("a.png",))
+    assert part.numeric == (False, True, True, False)
+    page = build_findings("toy", "A study", "Scene toy", [part], {"a.png": Figure(figsize=(3.0, 2.0))})
+    assert page.count('<th class="n">') == 2 and page.count('<td class="n">') == 4
+    assert "512 \u00d7 512 pixels" in page and "2.8\u00d710\u00b9\u00b2" in page and "wide small" in page
+
+
+def test_warnings_of_findings_stand_at_the_head_and_notes_below_the_figures() -> None:
+    """(Planted: warnings on the command line alone.)"""
+    part = Part("Title", "the lead", notes=("how to read it",))
+    page = build_findings("toy", "A study", "Scene toy", [part], {}, ["losses: a cause is missing"])
+    head, body = page.split("</header>")
+    assert "Losses: a cause is missing." in head and body.index("the lead") < body.index("how to read it")
+
+
+def test_a_gain_that_does_not_count_and_light_that_fits_no_image_are_in_the_headline() -> None:
+    """(Planted: "beat" by 0.3 dB, and nothing of a misfit.)"""
+    families = example().families
+    best, theirs = families[3], families[0]
+    assert best.rendered and theirs.rendered and best.rendered.trust
+    near = replace(best.rendered.quality, psnr_db=theirs.rendered.quality.psnr_db + 0.3)
+    trust = replace(best.rendered.trust, cause="")
+    small = replace(best, rendered=replace(best.rendered, quality=near, trust=trust))
+    assert R.verdict(small, theirs)[0] == "49 dots: 0.3 dB above uniform"
+    misfit = replace(best, rendered=replace(best.rendered, trust=replace(trust, cause="depth")))
+    assert R.verdict(misfit, theirs)[0].endswith("dB, but part of their light fits no image")

@@ -1,0 +1,66 @@
+"""Rows of the accuracy study by the number of surfaces: in a diffuse sphere each keeps the albedo of the one before."""
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from mitsim.api.bench import open_bench
+from mitsim.core.job import Job
+from mitsim.light.settings import Part
+from mitsim.studies.accuracy import findings
+from mitsim.studies.accuracy.findings import PartCost
+from mitsim.studies.accuracy.parts import Judge, Orders
+from mitsim.studies.accuracy.study import PARENT
+from mitsim.studies.framework.knobs import Stand, sampled
+from mitsim.studies.framework.spreads import Budget, Spread
+from tests.unit.transport.test_indirect import MATT, SPHERE
+
+pytestmark = pytest.mark.usefixtures("variant", "kept_plans", "draft_figures")
+RHO = 0.8
+
+
+def test_each_surface_keeps_the_albedo_of_the_light(shared_scene: Callable[..., Path]) -> None:
+    """Light of order k is even in a sphere, so its frames are rho times those of order k - 1, and all after them
+    rho / (1 - rho) times; together they are what the pilot says of the effect. What they take is never negative.
+
+    (Planted: a row's order one too high; the orders after the last row left out; half of the looks' mean.)
+    """
+    sphere = SPHERE.format(bsdf=MATT.replace("0.5", str(RHO)))
+    bench = open_bench(shared_scene("orders_of_study", extra=sphere, sheet_z=3000))
+    stand = Stand(bench, bench.family("dots:2"), 5, Job(), 1e-2)
+    plan = stand.plan(1e-2)
+    judge = Judge.trace(stand, plan, 0.0)
+    full = SimpleNamespace(settings=sampled(plan.settings, 1024))
+    orders = Orders(stand, judge, SimpleNamespace(full=full, seconds=0.0))
+    assert not orders.costs
+    orders.measure(Budget(600.0), 1.0)
+    second, third, fourth, rest = orders.costs
+    assert [each.label for each in (second, rest)] == [f"{PARENT}: 2 surfaces", f"{PARENT}: 5 or more"]
+    for one, other, ratio in ((second, third, RHO), (third, fourth, RHO), (fourth, rest, RHO / (1 - RHO))):
+        assert other.error_if_off / one.error_if_off == pytest.approx(ratio, rel=0.1)
+    whole = stand.evidence.error(Part(PARENT))
+    summed = sum(each.error_if_off for each in orders.costs)
+    assert summed == pytest.approx(whole.value, abs=2 * (whole.bound - whole.value) + 0.1 * summed)
+    for each in orders.costs:
+        assert each.error_if_off < each.error_bound < 1.5 * each.error_if_off
+        assert each.repeats == 1 and each.payload()["least_s"] >= 0 and each.payload()["of"] == PARENT
+    assert second.without is not None and second.without.most == 0, "nothing else is followed"
+    assert len(orders.timed) == 5
+
+
+def test_rows_of_one_part_stand_by_their_names_in_the_chart() -> None:
+    """And a bound is drawn beside each error."""
+    took = Spread.of([1.0, 1.1, 1.2])
+    rows = [PartCost("fog", 0.1, 0.2, took, took, True), PartCost("2 surfaces", 0.05, 0.06, took, None, True, of="fog")]
+    errors, _ = findings.parts(rows, 1e-3).axes
+    assert [label.get_text() for label in errors.get_yticklabels()] == ["fog", "fog: 2 surfaces"]
+    assert [0.1, 0.2] in [list(line.get_xdata()) for line in errors.lines]
+
+
+def test_a_chart_of_parts_that_were_not_timed_has_no_empty_panel() -> None:
+    """(Planted: both panels always.)"""
+    (errors,) = findings.parts([PartCost("fog", 0.1, 0.1, None, None, True)], 1e-3).axes
+    assert errors.figure.get_suptitle() == "What each part of the light buys"
+    assert not errors.figure.legends, "no bound and nothing left out"

@@ -1,0 +1,304 @@
+"""The report of a session: errors of factors beside their prediction, on drawn noise; losses of an image."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mitsim.api.bench import open_bench
+from mitsim.bench.request import Request
+from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimate, estimates
+from mitsim.core.arrays import FloatArray
+from mitsim.core.configuration import shipped
+from mitsim.core.errors import MitsimError
+from mitsim.core.job import Job
+from mitsim.devices.patterns import Lighting
+from mitsim.devices.session import load_recipe
+from mitsim.optics.frames import Frame
+from mitsim.studies.budget import LAMBDA, REST, SCENE, SOLVER, LossRow, _of_scene, gained, session_rendering
+from mitsim.studies.calibration import CalibrationFindings, _row, judged, measure, singular_rows, spent
+from mitsim.studies.drift.perturbation import Expected, Noise
+from mitsim.studies.framework.page import build_findings
+from tests.unit.calibrate.test_responses import CLIPPED, EXPOSURE_S, ToyLight, lit_session
+
+SEEDS = 40
+IMAGE = {"patterns": "dots:7", "psnr_db": 40.0, "predicted_psnr_db": 43.9794, "frames": 49,
+         "exposure_seconds": 4.0, "photoelectrons": 1e9, "photons": 2e9}  # fmt: skip
+SPENT = {"frames": 512.0, "exposure_seconds": 3.0, "photoelectrons": 1e10, "photons": 2e10}
+
+
+class SampledLight(ToyLight):
+    """A toy's light of which each projector pixel has ``parts`` (n, n)."""
+
+    def __init__(self, parts: FloatArray) -> None:
+        super().__init__(len(parts))
+        self.right[:, 0] *= 6  # so that columns of the left factor hang on one pixel more than those of the right
+        self.parts = parts
+
+    def frames(self, lighting: Lighting, _: int, leaking: bool = True) -> list[Frame]:
+        pictures = [weights[lighting.labels].reshape(self.parts.shape) * self.parts for weights in lighting.weights]
+        return [Frame(self.left @ picture @ self.right.T / self.unit, 0.0, 0.0, 0.0) for picture in pictures]
+
+
+@pytest.mark.parametrize("mode", ["pair", "uniform"])
+def test_errors_of_factors_are_those_that_are_predicted(mode: str) -> None:
+    """Over 40 sessions of their own noise: 168 and 189 entries of unit variance each, less what a common scale takes.
+    What the uniform shot brings to all responses is in one column alone, and there as much as predicted. (Planted: the
+    other side's common vector, N left out; shared noise over all columns, and left out.)"""
+    lit = lit_session(7, mode)
+    squares: dict[str, list[float]] = {"left": [], "right": []}
+    found_errors, stated_errors, columns = [], [], []
+    for seed in range(SEEDS):
+        own = replace(lit, session=replace(lit.session, seed=seed))
+        (noisy, clean), _ = estimates(own, Job(), (NOISY, NOISE_FREE))
+        report = judged(own, noisy, clean)
+        columns.append(np.square(report.maps["left"]).mean(axis=0))
+        for row in report.entries:
+            squares[row.factor].append(row.chi_square)
+            found_errors.append(row.error)
+            stated_errors.append(row.predicted_error)
+    for values in squares.values():
+        assert np.mean(values) == pytest.approx(1, abs=0.06)
+    # 40 x 24 squares of unit variance: 5 standard errors.
+    assert np.mean(columns, axis=0) == pytest.approx(1, abs=5 * np.sqrt(2 / (SEEDS * 24)))
+    assert np.sqrt(np.mean(np.square(found_errors))) == pytest.approx(np.mean(stated_errors), rel=0.03)
+
+
+def test_singular_values_and_vectors_move_as_their_perturbation_says() -> None:
+    """300 draws of noise on a factor of 40 x 4, whose rows, and one column, have different noise: mean and spread of
+    each value, and the angle of each right vector. (Planted: bias of the other sign, angles without the gaps, products
+    left out, the noise of the first column for all.)"""
+    rng = np.random.default_rng(5)
+    left, _ = np.linalg.qr(rng.standard_normal((40, 4)))
+    right, _ = np.linalg.qr(rng.standard_normal((4, 4)))
+    exact = left * [40.0, 25.0, 12.0, 6.0] @ right.T
+    deviation = np.outer(rng.uniform(0.3, 0.5, 40), [1.0, 1.0, 2.5, 1.0])
+    draws = [
+        list(singular_rows("left", exact, exact + deviation * rng.standard_normal(exact.shape), deviation))
+        for _ in range(300)
+    ]
+    for rows in zip(*draws, strict=True):
+        moved = np.array([row.noisy - row.value for row in rows])
+        assert moved.std() == pytest.approx(rows[0].standard_error, rel=0.2)
+        assert moved.mean() == pytest.approx(rows[0].bias, abs=5 * rows[0].standard_error / np.sqrt(300))
+        angles = np.array([row.angle for row in rows])
+        assert np.sqrt(np.mean(angles**2)) == pytest.approx(rows[0].predicted_angle, rel=0.2)
+
+
+def test_bias_and_angle_are_second_derivatives_by_every_entry() -> None:
+    """Of entries that differ in their noise without any order: the mean change of a value is half the sum of variance
+    times its second derivative, the mean square of a vector's turn the sum of variance times that of its slope.
+    (Planted: products left out of either, or of the other sign.)"""
+    rng = np.random.default_rng(6)
+    left, _ = np.linalg.qr(rng.standard_normal((6, 3)))
+    right, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+    exact, deviation, step = left * [9.0, 5.0, 2.0] @ right.T, rng.uniform(1e-3, 1e-2, (6, 3)), 1e-4
+    bias, turn = np.zeros(3), np.zeros(3)
+    _, values, vectors = np.linalg.svd(exact, full_matrices=False)
+    for place in np.ndindex(exact.shape):
+        moved = []
+        for sign in (1, -1):
+            other = exact.copy()
+            other[place] += sign * step
+            moved.append(np.linalg.svd(other, full_matrices=False)[1:])
+        (up, ahead), (down, behind) = moved
+        bias += deviation[place] ** 2 * (up + down - 2 * values) / (2 * step**2)
+        for number, vector in enumerate(vectors):
+            slope = ahead[number] * np.sign(ahead[number] @ vector) - behind[number] * np.sign(behind[number] @ vector)
+            turn[number] += deviation[place] ** 2 * float(np.square(slope / (2 * step)).sum())
+    rows = list(singular_rows("left", exact, exact, deviation))
+    assert [row.bias for row in rows] == pytest.approx(bias, rel=1e-4)
+    assert [row.predicted_angle for row in rows] == pytest.approx(np.sqrt(turn), rel=1e-4)
+
+
+def test_light_and_time_of_a_session_are_counted() -> None:
+    """8 patterns of either side, two halves, three repeats at 0.02 and 0.08 s; each pair is a uniform frame's light."""
+    lit = lit_session(7, rig=CLIPPED, repeats=3, exposure_ladder=(1.0, 4.0))
+    found = spent(lit)
+    assert found["frames"] == 2 * 16 * 3 * 2 and found["exposure_seconds"] == pytest.approx(2 * 16 * 3 * 0.1)
+    assert found["photoelectrons"] == pytest.approx(float(lit.uniform_rate.sum()) * 16 * 3 * 0.1)
+    assert found["photons"] == pytest.approx(2 * found["photoelectrons"])
+    dark = lit_session(7, "uniform", rig=CLIPPED, dark_frames=5)
+    assert spent(dark)["exposure_seconds"] == pytest.approx((18 + 5) * 0.02)
+    shown = 2 + 2 * float((1 + dark.session.signs).sum()) / 2 / 7
+    assert spent(dark)["photoelectrons"] == pytest.approx(float(dark.uniform_rate.sum()) * shown * 0.02)
+
+
+def test_a_part_of_the_error_gains_what_is_left_without_it() -> None:
+    """A quarter of an image's error is 1.25 dB; a model that has half of that error has it for half of its own, 3.01
+    dB. Where twice as much is predicted as there is, it is an eighth, and it may be that all of what is too much is
+    this part. (Planted: the sum over the part; uncertainty of the predicted image alone.)"""
+    assert gained(1.0, 4.0, 2.0) == pytest.approx((1.2494, 3.0103 - 1.2494), abs=1e-4)
+    assert gained(1.0, 4.0, 8.0) == pytest.approx((0.5799, 0.5799), abs=1e-4)
+    assert gained(3.0, 4.0, 5.0) == pytest.approx((3.9794, 3.9794 - 3.0103), abs=1e-4)
+    assert gained(0.0, 4.0, 0.0) == (0.0, 0.0) and gained(4.0, 4.0, 4.0)[0] == pytest.approx(90)
+
+
+def test_what_lambda_takes_of_a_scene_is_a_loss_of_the_solvers() -> None:
+    """Nine tenths of the scene are left without noise: a hundredth of its square is lambda's, and nothing the light's.
+    (Planted: lambda's part left out; all of it told as the rest of the light.)"""
+    scene = np.random.default_rng(9).random((7, 7))
+    solver = SimpleNamespace(expected=lambda light: Expected(0.9 * light), variance=lambda *_: 0.0)
+    scatter: Any = SimpleNamespace(solver=solver, scene=scene, common=lambda *_: 0.0, deviation=lambda *_: 0.0)
+    found = _of_scene(scatter, {"": 0.9 * scene}, Noise())
+    assert found[SOLVER, LAMBDA].square == pytest.approx(0.01 * float(np.square(scene).mean()))
+    assert found[SCENE, REST].square == pytest.approx(0, abs=1e-12)
+
+
+def test_noise_by_source_is_all_noise() -> None:
+    """Of a session whose exposures, dark frames and repeats are several, in both ways to take signed patterns: the
+    shares of shot, dark and read noise and of rounding, and that only a uniform shot is shared. (Planted: dark frames
+    in the shot noise; repeats left out of what is shared.)"""
+    fields = {"repeats": 2, "exposure_ladder": (1.0, 2.0)}
+    for mode, extra in (("pair", {}), ("uniform", {"dark_frames": 3})):
+        lit = lit_session(7, mode, rig=CLIPPED, **fields, **extra)
+        own, shared = lit.response_variances("horizontal")
+        assert set(own) == set(shared) == {"shot noise", "dark current", "read noise", "quantisation"}
+        whole = sum(part.mean() for parts in (own, shared) for part in parts.values())
+        assert whole == pytest.approx(lit.response_variance("horizontal").mean())
+        assert all(part.any() == (mode == "uniform") for part in shared.values())
+    sensor, time = CLIPPED.sensor, EXPOSURE_S
+    own, shared = lit_session(7, "uniform", rig=CLIPPED, repeats=2, dark_frames=3).response_variances("vertical")
+    dark, read = sensor.dark_current_e_per_s / time, sensor.read_noise_e**2 / time**2
+    assert own["dark current"] == pytest.approx(4 * dark / 2)
+    assert shared["dark current"] == pytest.approx(dark / 2 + dark / 3)
+    assert own["read noise"] == pytest.approx(4 * read / 2) and shared["read noise"] == pytest.approx(read * 5 / 6)
+    assert own["quantisation"] == pytest.approx(own["read noise"] / 12 / sensor.read_noise_e**2)
+
+
+def test_sampled_light_of_a_session_multiplies_columns_of_its_factors() -> None:
+    """30 sessions without noise, each pixel's light 1 % off on its own: squares of 7 and 7 columns, less their common
+    scale; sqrt(2 / 180) is 11 %, three times that. (Planted: spreads of the other side; the error not squared.)"""
+    lit, rng, squares, even = lit_session(7), np.random.default_rng(8), [], SampledLight(np.ones((7, 7)))
+    factors = even.left, even.right
+    for _ in range(30):
+        light = SampledLight(1 + 0.01 * rng.standard_normal((7, 7)))
+        white = light.frames(Lighting.uniform(7), 0)[0]
+        found, _ = estimate(replace(lit, light=light, white=white), Job(), noise_free=True)  # type: ignore[arg-type]
+        sides = zip((found.left, found.right), factors, strict=True)
+        columns = [(own * exact).sum(axis=0) / np.square(exact).sum(axis=0) for own, exact in sides]
+        squares.append([np.var(each / each.mean(), ddof=1) for each in columns])
+    flux = rng.random(49) + 0.5
+    told = session_rendering(flux, 0.01 * flux, factors)
+    assert np.mean(squares, axis=0) == pytest.approx([told.left_light, told.right_light], rel=0.33)
+    assert told.right_light == pytest.approx(1e-4 / 7, rel=0.5), "the mean over a row of pixels"
+    dark = session_rendering(np.zeros(49), flux, factors)
+    assert dark.left_light == dark.right_light == 0
+
+
+@pytest.mark.parametrize(
+    ("camera", "largest"),
+    [({"prnu_pixel": 0.08, "prnu_row": 0.02, "prnu_column": 0.02}, "response nonuniformity"),
+     pytest.param({"dsnu_pixel_e": 400.0, "dsnu_row_e": 100.0, "dark_current_spread_e_per_s": 5.0,
+                   "dark_current_e_per_s": 10.0}, "offset nonuniformity", marks=pytest.mark.slow)],
+)  # fmt: skip
+def test_all_sources_together_are_what_the_image_is_off(
+    camera: dict[str, float], largest: str, small_scene: Callable[..., Path], tmp_path: Path, variant: str
+) -> None:
+    """An even print, of which the model leaves nothing out: to 0.5 dB of a loss that the nonuniformity is most of, its
+    rows' and columns' part of the response nothing of it."""
+    own = tmp_path / "camera.toml"
+    stated = shipped("calibration", "imx249.toml").read_text().splitlines()
+    kept = [line for line in stated if line.partition(" =")[0] not in camera]
+    own.write_text("\n".join([*(f"{name} = {value}" for name, value in camera.items()), *kept]))
+    bench = open_bench(str(small_scene(name="even")), variant, camera=own)
+    found = measure(bench, Request.of(patterns="dots:4", accuracy=2e-3, seed=1), Job())
+    assert found.image["predicted_psnr_db"] == pytest.approx(found.image["psnr_db"], abs=0.5)
+    told = {(row.of, row.source): row.squared_error for row in found.losses}
+    left = told.pop(("unexplained", "not explained"))
+    assert told["capture", largest] > 0.7 * sum(told.values()) and told["session", "rendering"] > 0
+    assert found.image["predicted_psnr_db"] == pytest.approx(-10 * np.log10(sum(told.values())))
+    assert found.image["psnr_db"] == pytest.approx(-10 * np.log10(sum(told.values()) + left)) and not found.warnings
+
+
+def print_of_squares(pixels: float) -> FloatArray:
+    """(256, 256) print of squares of so many projector pixels a side."""
+    place = (np.arange(256) + 0.5) / 256 * 17.06 / pixels  # 128 mm of the sheet, pixels of 7.5 mm
+    return 25 + 200 * np.not_equal.outer(place.astype(int) % 2, place.astype(int) % 2)
+
+
+def losses_of(scene: Path, variant: str, seed: int = 1, **rig: Path) -> tuple[CalibrationFindings, dict[str, LossRow]]:
+    """Findings of a session of 16 patterns, and losses by name."""
+    found = measure(
+        open_bench(str(scene), variant, **rig), Request.of(patterns="dots:4", accuracy=2e-3, seed=seed), Job()
+    )
+    return found, {row.name: row for row in found.losses}
+
+
+def test_detail_inside_projector_pixels_is_told_from_all_else(small_scene: Callable[..., Path], variant: str) -> None:
+    """Squares of one and a half projector pixels take 16 dB, all but a hundredth of the squared error, and what is left
+    is within three of its standard errors; an even print loses a tenth of a decibel at most. (Planted: detail left in
+    the light.)"""
+    found, rows = losses_of(small_scene("squares", reflectance=print_of_squares(1.5)), variant)
+    whole = 10 ** (-found.image["psnr_db"] / 10)
+    detail, left = rows["scene: detail inside projector pixels"], rows["not explained"]
+    assert 0.95 < detail.squared_error / whole < 1 and detail.lost_db > 13
+    assert abs(left.squared_error) < 3 * left.deviation < 0.03 * whole and not found.warnings
+    assert found.image["predicted_psnr_db"] == pytest.approx(found.image["psnr_db"], abs=0.1)
+    assert abs(rows["scene: all else"].squared_error) < 0.01 * whole
+    even = losses_of(small_scene("even"), variant)[1]
+    assert abs(even["scene: detail inside projector pixels"].lost_db) < 0.1
+    assert abs(even["scene: all else"].squared_error) < 0.5 * even["capture: rendering"].squared_error
+
+
+def test_a_cause_without_a_row_is_said_to_be_missing(
+    small_scene: Callable[..., Path], tmp_path: Path, variant: str
+) -> None:
+    """A camera that is not linear, of which no row knows. (Planted: a warning for none.)"""
+    own = tmp_path / "camera.toml"
+    own.write_text(f"linearity = [0.03]\n{shipped('calibration', 'imx249.toml').read_text()}")
+    found, rows = losses_of(small_scene("even"), variant, camera=own)
+    assert rows["not explained"].squared_error > 10 * rows["not explained"].deviation
+    (warning,) = found.warnings
+    assert "a cause is missing" in warning and found.payload()["warnings"] == found.warnings
+    assert "a cause is missing" in found.lines()[-1]
+
+
+@pytest.mark.parametrize(("errors", "said"), [(0.9, "within its standard error"), (-2.0, "chance makes 4.6% of all")])
+def test_what_is_not_explained_is_said_by_its_standard_errors(errors: float, said: str) -> None:
+    row = LossRow("unexplained", "not explained", "", 0.0, 0.0, errors * 1e-6, 1e-6)
+    found = CalibrationFindings((), (), (), {}, (0.1, 0.2), SPENT, IMAGE, (row,))
+    assert said in found.lines()[-1] and said in found.parts()[0].lead.lower() and not found.warnings
+
+
+def test_the_page_has_every_loss_in_one_table() -> None:
+    """With its uncertainty, the largest first; losses of 0.00 are named in a sentence, and what could not be predicted.
+    (Planted: the order of the rows; parts of the error that is measured.)"""
+    rows = (
+        LossRow("capture", "shot noise", "", 2.0, 0.1, 3e-5, 2e-7),
+        LossRow("drift", "mask_rows_um", "0.4 um", 3.0, 0.2),
+        LossRow("session", "read noise", "", 0.0, 0.0, 1e-5),
+    )
+    found = CalibrationFindings((), (), (), {}, (0.1, 0.2), SPENT, IMAGE, rows, ("vibration_um: no",))
+    part = found.parts()[0]
+    assert [row[3] for row in part.rows] == ["3.00 \N{PLUS-MINUS SIGN} 0.20", "2.00 \N{PLUS-MINUS SIGN} 0.10"]
+    assert [row[4] for row in part.rows] == ["", "75.00 \N{PLUS-MINUS SIGN} 0.50 %"]
+    assert "together say 43.98 dB" in part.lead and "Below 0.005 dB each: session: read noise." in part.notes
+    assert (
+        part.rows[0][:3] == ("drift, not in this image", "mask down the rows", "0.4 um")
+        and "vibration_um: no" in part.lead
+    )
+    assert set(found.figures()) >= {"losses.png"} and len(found.tables()["losses.csv"]) == 3
+    text = " ".join(found.lines())
+    assert "mask down the rows, 0.4 um: 3.00 +- 0.20 dB" in text and "read noise" not in text
+    assert "mask down the rows" in build_findings("calibration", found.title, "toy", found.parts(), found.figures())
+    assert not CalibrationFindings((), (), (), {}, (0.1, 0.2), SPENT).parts()[0].figures
+
+
+def test_a_recipe_with_depths_is_refused_before_anything_is_traced() -> None:
+    """(Planted: let pass.)"""
+    recipe = load_recipe().model_copy(update={"depths": (350.0, 400.0)})
+    with pytest.raises(MitsimError, match="2 depths, and a report is of one session"):
+        measure(None, Request.of(), Job(), recipe)  # type: ignore[arg-type]
+
+
+def test_a_cause_has_the_part_by_which_the_squared_residual_falls_without_it() -> None:
+    assert _row("board", 0.05, 0.03).part == pytest.approx(0.04)
+    assert _row("board", 0.03, 0.05).part == pytest.approx(-0.04)
+    assert _row("board", 0.03, 0.03).part == 0

@@ -1,0 +1,76 @@
+"""Frames of a diffuser camera: exposure by its conventions, noise by the sensor's own closed form, the best lambda."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mitsim.core.configuration import shipped
+from mitsim.core.errors import MitsimError
+from mitsim.devices.patterns import parse_patterns
+from mitsim.devices.sensor import load_sensor
+from mitsim.metrics import psnr
+from mitsim.reconstruct.convolution import ConvolutionalCamera
+from mitsim.reconstruct.dots import Classes
+from mitsim.report.exposures import CONVENTIONS
+from mitsim.studies.diffusercam import best_image, race, take
+
+N = 12
+SENSOR = load_sensor(shipped("calibration", "imx249.toml"))
+BLUR = np.exp(-np.square(np.arange(-8, 9) / 1.5) / 2)
+CAMERA = ConvolutionalCamera(np.outer(BLUR, BLUR) / BLUR.sum() ** 2, N, (22, 25))
+TRUTH = np.random.default_rng(2).uniform(0.1, 0.9, (N, N))
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_exposure_follows_the_convention_and_noise_the_light(convention: str) -> None:
+    """Peak: 0.8 of the full well of 129 440 electrons, of the family's own frames or of uniform light's.
+
+    Residuals over their expected deviation sqrt(electrons + read noise^2 + 1/12 DN^2) of 9 x 550 numbers, seed 0: mean
+    0 to 5 / sqrt(4950), mean square 1 to 5 sqrt(2 / 4950). Dark current adds some electrons at most.
+    """
+    family = parse_patterns("dots:3", N)
+    shots = take(CAMERA, family, TRUTH, SENSOR, convention)
+    own = np.stack(list(CAMERA.frames(family, TRUTH)))
+    uniform = next(CAMERA.frames(parse_patterns("uniform", N), TRUTH))
+    peak = own.max() if convention == "equal peak" else uniform.max()
+    electrons = own * 0.8 * 4 * 32360 / peak / (9 if convention == "equal total" else 1)
+    unit = electrons.max() / own.max()
+    deviation = np.sqrt(electrons + (2 * 6.7) ** 2 + 1 / 12 / 0.125**2)
+    residual = (shots.frames * unit - electrons) / deviation
+    assert abs(residual.mean()) < 5 / np.sqrt(residual.size)
+    assert np.mean(residual**2) == pytest.approx(1, abs=5 * np.sqrt(2 / residual.size))
+    assert shots.saturated == 0
+
+
+def test_the_best_lambda_is_found_to_a_tenth_of_a_decibel() -> None:
+    classes = Classes(CAMERA, 1)
+    shots = take(CAMERA, parse_patterns("uniform", N), TRUTH, SENSOR)
+    solution, db = best_image(classes, shots, TRUTH)
+    projected = classes.projected(shots.frames)
+    fine = [
+        psnr(classes.factorise(classes.largest * 10**exponent).solve(projected).image, TRUTH)
+        for exponent in np.arange(-9, 0.01, 0.05)
+    ]
+    assert db == psnr(solution.image, TRUTH) and max(fine) - 0.1 < db <= max(fine) + 0.05
+    assert fine[0] < max(fine) - 0.5 and fine[-1] < max(fine) - 0.5
+
+
+@pytest.mark.parametrize("k", [1, 3])
+@pytest.mark.parametrize("sensor", [None, (22, 25)])
+def test_both_solvers_come_to_one_image(sensor: tuple[int, int] | None, k: int) -> None:
+    """On all light, where the direct solver iterates on small grids, and cropped, where it factorises; under uniform
+    light, where lambda matters, and dots. (Planted: lambda doubled for one of them.)"""
+    camera = ConvolutionalCamera(CAMERA.psf, N, sensor)
+    whole = ConvolutionalCamera(CAMERA.psf, N)
+    found = race(Classes(camera, k), Classes(whole, k), TRUTH, SENSOR, 0)
+    assert found["difference"] <= 1e-6
+    assert 0 < found["iterations"] <= found["iterations_exact"] < 1000
+    assert 0 < found["iterative_s"] <= found["iterative_exact_s"]
+    assert found["direct_s"] > 0 and found["psnr_db"] > (12 if k == 1 else 30)
+
+
+def test_iterations_that_do_not_arrive_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mitsim.studies.diffusercam._MOST_STEPS", 2)
+    with pytest.raises(MitsimError, match=r"^iterations did not come to the direct solution at lambda [^\n]+$"):
+        race(Classes(CAMERA, 3), Classes(CAMERA, 3), TRUTH, SENSOR, 0)

@@ -1,0 +1,249 @@
+"""The drift study: what it measures and predicts on a small scene, its points, and what it says of invented results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from copy import copy
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from mitsim.acquire.drift import drifted, projecting
+from mitsim.cli.options import recipe_for, swept
+from mitsim.core.configuration import shipped
+from mitsim.core.errors import MitsimError
+from mitsim.devices.drift import UNITS, Drift
+from mitsim.devices.session import load_recipe
+from mitsim.report.exposures import RENDERED, LitScene
+from mitsim.report.table import Table
+from mitsim.studies import find_experiment
+from mitsim.studies.drift.drift import SESSION, DriftStand, Outcome
+from mitsim.studies.framework.experiment import Results, Scope
+from mitsim.studies.framework.setup import Setup
+from mitsim.studies.framework.studio import Studio
+from mitsim.studies.paper.drift import _moved
+
+pytestmark = pytest.mark.usefixtures("kept_plans")
+
+SEED = 3
+RECIPE = load_recipe()
+
+
+Y, X = (np.mgrid[:64, :64] + 0.5) / 64
+PRINT = np.rint(125 + 100 * np.sin(7 * Y + 2 * X) * np.cos(9 * X)).astype(int)
+LAMP = """<emitter type="point">
+    <point name="position" x="-60" y="40" z="150"/> <spectrum name="intensity" value="1e4"/></emitter>"""
+
+
+@pytest.fixture(scope="module")
+def stand(shared_scene: Callable[..., Path], variant: str) -> Iterator[DriftStand]:
+    setup = Setup(str(shared_scene("drift", reflectance=PRINT)), variant=variant)
+    with Studio() as studio:
+        lit = studio.lit(setup)
+        yield DriftStand(lit, studio.factors(setup, SEED), RECIPE, lit.bench.family("dots:4"), SEED)
+
+
+@pytest.fixture(scope="module")
+def lamp_stand(stand: DriftStand, shared_scene: Callable[..., Path], variant: str) -> Iterator[DriftStand]:
+    """The same before a lamp, which the session that found its factors does not see."""
+    setup = Setup(str(shared_scene("drift_lamp", reflectance=PRINT, extra=LAMP)), variant=variant)
+    with Studio() as studio:
+        yield replace(stand, lit=studio.lit(setup))
+
+
+def test_without_drift_the_image_is_the_same_bit_for_bit(stand: DriftStand) -> None:
+    """(Planted: the exposure chosen anew; another seed.)"""
+    found = stand.outcome(Drift())
+    assert found.before_db == found.after_db == found.auto_db
+    assert found.lost_db == found.predicted_lost_db == found.predicted_error_db == 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "amount"),
+    [("mask_rows_um", 10), ("mask_columns_um", -10), ("mask_axis_um", 40), ("mask_rotation_mrad", 3),
+     ("mask_tilt_columns_mrad", -40),
+     ("exposure", 0.02), ("power", -0.02), ("power_ramp", 0.03), ("black_level_dn", 8)],
+)  # fmt: skip
+def test_closed_forms_say_what_a_drift_costs(stand: DriftStand, kind: str, amount: float) -> None:
+    """To 0.5 dB of 3 or more: what detail leaves in this image, 14 dB above the model's error, shares in the drift's.
+    (Planted: rows and columns swapped; both terms of the rotation with one sign; a gain twice; black level of one
+    pixel.)"""
+    found = stand.outcome(Drift().alone(kind, amount))
+    assert found.lost_db > 3
+    assert found.predicted_lost_db == pytest.approx(found.lost_db, abs=0.5)
+
+
+@pytest.mark.parametrize(("source", "waves"), [("power", 0.0), ("power", 2.5), ("lamp", 2.5)])
+def test_closed_forms_say_what_a_ripple_costs(request: pytest.FixtureRequest, source: str, waves: float) -> None:
+    """By a global shutter, and by a rolling one that sees two and a half waves down its frame: to 0.5 dB of 3 or more,
+    the mean over five captures, whose phases spread by half of that."""
+    still = request.getfixturevalue("stand" if source == "power" else "lamp_stand")
+    bench, hertz = still.lit.bench, 0.6 / still.exposure_s
+    line_us = 1e6 * waves / hertz / (bench.geometry.frame_shape[0] * bench.sensor.binning)
+    shutter = {"shutter": "rolling", "line_time_us": line_us} if waves else {}
+    lit = copy(still.lit)
+    lit.bench = replace(bench, rig=replace(bench.rig, sensor=bench.sensor.model_copy(update=shutter)))
+    drift = Drift.model_validate({f"{source}_ripple": 0.1, f"{source}_ripple_hz": hertz})
+    found = [replace(still, lit=lit, seed=seed).outcome(drift) for seed in range(5)]
+    lost = np.mean([outcome.lost_db for outcome in found])
+    assert lost > 3
+    assert np.mean([outcome.predicted_lost_db for outcome in found]) == pytest.approx(lost, abs=0.5)
+
+
+@pytest.mark.parametrize(
+    ("kind", "amount"),
+    [("mask_rows_um", 10), ("power", -0.02), ("power_ramp", 0.3), ("black_level_dn", 100)],
+)  # fmt: skip
+def test_closed_forms_say_what_a_drift_costs_patterns_of_two_frames(
+    stand: DriftStand, kind: str, amount: float
+) -> None:
+    """To 0.5 dB, as of others; what both frames have alike costs nothing."""
+    signed = replace(stand, family=stand.lit.bench.family("hadamard:4"))
+    found = signed.outcome(Drift().alone(kind, amount))
+    assert found.predicted_lost_db == pytest.approx(found.lost_db, abs=0.5)
+    assert (abs(found.lost_db) < 0.01) if kind == "black_level_dn" else found.lost_db > 1
+
+
+@pytest.mark.parametrize("drift", [Drift(mask_tilt_rows_mrad=40.0), Drift(mask_tilt_columns_mrad=-40.0)])
+def test_a_tilt_changes_the_image_as_it_is_predicted_to(stand: DriftStand, drift: Drift) -> None:
+    """To 15 % of the change, without noise: the model has neither detail inside projector pixels nor falloff. What a
+    tilt of the rows costs this print hangs on that detail: its change has -0.4 of the error from before."""
+    bench, images = stand.lit.bench, []
+    for each in (Drift(), drift):
+        sums = stand._model.accumulator()
+        expected = stand.lit.expected(RENDERED, stand.family, bench=drifted(bench, each))
+        for frame, shot in zip(expected, stand.family.shots, strict=True):
+            sums.add(stand._frames.exposer(1.0).electrons(frame), shot.row, shot.column)
+        images.append(stand._model.solve(sums, stand.linear.lam).image)
+    still, tilted = (stand.linear.expected(stand.lit.truth, stand._changed(each)).image for each in (Drift(), drift))
+    changed = images[1] - images[0]
+    assert np.linalg.norm(tilted - still - changed) < 0.15 * np.linalg.norm(changed)
+
+
+@pytest.mark.parametrize("signed", ["pair", "uniform"])
+def test_a_session_whose_power_drifts_gives_other_factors(stand: DriftStand, signed: str) -> None:
+    """Phi C on either side, to 2 % of what the drift changes: noise of other light is what is left. What that costs, to
+    0.5 dB. (Planted: pairs of the other sign in what is predicted, and in what is exposed; levels of the first side for
+    both.)"""
+    drift, recipe = Drift(session_ramp=0.2, session_flicker=0.02), RECIPE.model_copy(update={"signed_capture": signed})
+    calibrate = stand.lit.bench.calibrate
+    still, factors = (
+        calibrate(SEED, recipe=recipe.model_copy(update={"drift": moving})) for moving in (Drift(), drift)
+    )
+    own = replace(stand, factors=still, recipe=recipe)
+    for before, after, mix in zip(
+        (still.left, still.right), (factors.left, factors.right), own.session_mixes(drift), strict=True
+    ):
+        assert np.linalg.norm(after - before @ mix) < 0.02 * np.linalg.norm(after - before)
+    found = own.outcome(drift, factors)
+    assert found.lost_db > 1 and found.predicted_lost_db == pytest.approx(found.lost_db, abs=0.5)
+
+
+def test_a_mask_turned_over_a_region_shifts_that_part_of_its_shadow(stand: DriftStand) -> None:
+    """As many rows as columns, which lie elsewhere. (Planted: rows' places for the columns'.)"""
+    bench = stand.lit.bench
+    camera = bench.geometry.model_copy(update={"roi": (3, 20, 30, 30)})
+    part = replace(bench, rig=replace(bench.rig, camera=camera))
+    lit = cast(LitScene, SimpleNamespace(bench=part, light=stand.lit.light))
+    found, whole = (
+        np.asarray(sum(np.einsum("ir,jc->irjc", *pair) for pair in each._turned(1e-3)))
+        for each in (replace(stand, lit=lit), stand)
+    )
+    np.testing.assert_allclose(found, whole[3:33, :, 20:50], rtol=0, atol=1e-9 * np.abs(whole).max())
+
+
+def test_a_moved_picture_lights_other_places(stand: DriftStand) -> None:
+    """A quarter of a pixel down a smooth print, its pixels see what lies between two. (Planted: rows and columns
+    swapped.)"""
+    drift = Drift(projector_rows=0.25)
+    bench = projecting(stand.lit.bench, drift)
+    (top, bottom), columns = bench.windows
+    (before, after), same = stand.lit.bench.windows
+    shift = 0.25 * (after - before) / bench.n
+    assert (top, bottom) == pytest.approx((before + shift, after + shift), abs=1e-7) and columns == pytest.approx(same)
+    moved = LitScene(bench.light(accuracy=1e-2))
+    truth = stand.lit.truth
+    left = moved.truth[:-1] - 0.75 * truth[:-1] - 0.25 * truth[1:]
+    assert np.linalg.norm(left) < 0.2 * np.linalg.norm(moved.truth - truth)
+    assert projecting(stand.lit.bench, Drift(mask_rows_um=1.0)) is stand.lit.bench
+    # By the plan of the light before: another's errors pass for the drift's. (Planted: a plan of its own.)
+    own = _moved(stand.lit, drift).light
+    assert own.plan is stand.lit.light.plan and own.bench.loaded.pixels == bench.loaded.pixels
+
+
+def test_what_is_predicted_of_a_worse_image() -> None:
+    """A drift that adds as much squared error as the image has costs 3 dB; if the model has half of that image's error,
+    it alone would say 4.8. (Planted: decibels subtracted.)"""
+    found = Outcome(before_db=30.0, after_db=27.0, auto_db=27.5, predicted_before_db=33.0103, predicted_db=28.2391)
+    assert found.predicted_lost_db == pytest.approx(3.0103, abs=1e-3)
+    assert found.predicted_error_db == pytest.approx(4.7712 - 3.0103, abs=1e-3)
+    assert found.lost_db == 3.0 and found.lost_auto_db == 2.5
+
+
+def test_an_image_is_off_the_still_one_by_the_noise_that_is_predicted_of_its_capture(stand: DriftStand) -> None:
+    """Of noisy frames and of expected ones, by one lambda: 256 pixels, whose mean square scatters by 9 %, three times
+    that. (Planted: electrons for electrons a second; each datum counted twice.)"""
+    capture = [noise for name, noise in stand.noises.items() if name != SESSION]
+    told = sum(stand.linear.variance(stand.lit.truth, noise) for noise in capture) / stand.lit.truth.size
+    still = stand.clear(stand.factors, stand.lit.light)
+    assert np.mean(np.square(stand._before.image - still)) == pytest.approx(told, rel=0.27)
+
+
+def test_points_are_every_kind_alone() -> None:
+    """At the shipped amounts, lamps' before a lamp; a quick study is a start of the whole. (Planted: lamps at the
+    sheet.)"""
+    experiment = find_experiment("drift")
+    points, few = (experiment.points(Scope(Setup(), ("astronaut", "page"), quick=quick)) for quick in (False, True))
+    assert {point["kind"] for point in points} == set(UNITS) and len(points) == 4 * len(UNITS)
+    assert len({point.key for point in points}) == len(points) and {p.key for p in few} <= {p.key for p in points}
+    drift = load_recipe(shipped("calibration", "drift.toml")).drift
+    assert all(point["amount"] == getattr(drift, point["kind"]) for point in points)
+    assert {p.setup.scene for p in points if p["kind"].startswith("lamp")} == {"lamp_bench"}
+    asked = experiment.points(Scope(Setup(), (None,), sweep=(("power", ("0.1", "0.2")),), quick=True))
+    assert [(point["kind"], point["amount"]) for point in asked] == [("power", 0.1), ("power", 0.2)]
+    others = experiment.points(Scope(Setup(), (None,), patterns="hadamard:8", quick=True))
+    assert {point["patterns"] for point in points} == {"dots:7"} and others[0]["patterns"] == "hadamard:8"
+    with pytest.raises(MitsimError, match="patterns 'stripes:8'"):
+        experiment.points(Scope(Setup(), (None,), patterns="stripes:8"))
+
+
+def test_options_of_the_study() -> None:
+    """(Planted: a recipe for any study; a ripple without a frequency refused.)"""
+    scope = Scope(Setup(), (None,))
+    assert swept("drift", scope, "dots:7", ["power=0.1,0.2"], "psnr").sweep == (("power", ("0.1", "0.2")),)
+    assert swept("drift", scope, "hadamard:8", (), "psnr").patterns == "hadamard:8"
+    # Whose frequency the recipe states.
+    assert swept("drift", scope, "dots:7", ["lamp_ripple=0.3"], "psnr").sweep == (("lamp_ripple", ("0.3",)),)
+    with pytest.raises(MitsimError, match="--over and --patterns for drift and sweep"):
+        swept("patterns", scope, "dots:7", ["power=0.1"], "psnr")
+    with pytest.raises(MitsimError, match="--recipe is for calibration and drift"):
+        recipe_for("sweep", Path("any.toml"))
+    with pytest.raises(MitsimError, match="there is no such kind"):
+        find_experiment("drift").points(Scope(Setup(), (None,), sweep=(("sheet_z", ("390",)),)))
+    unknown = Scope(Setup(camera="mt9m034"), (None,), sweep=(("power", ("0.1",)),))
+    assert find_experiment("drift").points(unknown)
+    with pytest.raises(MitsimError, match=r"^sensor 'Aptina MT9M034': [^\n]*give line_time_us[^\n]*$"):
+        find_experiment("drift").points(replace(unknown, sweep=(("power_ripple", ("0.1",)),)))
+    with pytest.raises(MitsimError, match="moves nothing"):
+        find_experiment("drift").points(Scope(Setup(), (None,), recipe=str(shipped("calibration", "session.toml"))))
+
+
+def test_claims_hold_predictions_against_what_was_measured() -> None:
+    """At the first amount of each kind, mean over seeds. (Planted: all amounts together.)"""
+    rows = [
+        {"kind": "power", "unit": "1", "amount": amount, "seed": seed, "lost_db": amount + 0.1 * seed,
+         "predicted_lost_db": predicted + 0.1 * seed, "predicted_error_db": 0.3}
+        for amount, predicted in ((1.0, 1.4), (2.0, 9.0))
+        for seed in (0, 1)
+    ]  # fmt: skip
+    rows += [{**row, "kind": "exposure", "predicted_lost_db": 3.0} for row in rows[:2]]
+    experiment, results = find_experiment("drift"), Results(Table(tuple(rows)))
+    power, exposure = experiment.claims(results)
+    assert power.verdict == "confirmed" and exposure.verdict == "not confirmed"
+    assert power.idealised == "1.45 \N{PLUS-MINUS SIGN} 0.30 dB lost"
+    assert power.rendered == "1.05 \N{PLUS-MINUS SIGN} 0.05 dB lost"
+    assert set(experiment.figures(results)) == {"losses.png", "power.png"}
