@@ -13,11 +13,9 @@ from scipy import sparse
 from mitsim.bench.effects import Physics
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.devices.patterns import Lighting
-from mitsim.light.grids import GRIDS
-from mitsim.light.light_estimate import LightEstimate
-from mitsim.light.pass_table import PASSES, Pass
+from mitsim.light.grids import GRIDS, LightEstimate
+from mitsim.light.pass_table import PASSES, Pass, PassTracer, Tracers
 from mitsim.light.settings import LANES_AT_ONCE
-from mitsim.light.tracers import PassTracer, Tracers
 from mitsim.optics.frames import ClassFrames, ExpectedFrames, Filed
 from mitsim.transport.accumulator import DeviceSums, Ledger
 from mitsim.transport.direct import DirectTracer

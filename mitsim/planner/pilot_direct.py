@@ -19,7 +19,6 @@ from mitsim.core.resources import workers
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum
-from mitsim.light.drawing_cost import cells_to_choose, drawing_seconds
 from mitsim.light.grids import Grid
 from mitsim.light.pass_table import PASSES
 from mitsim.light.passes import Simulation, emitted
@@ -28,6 +27,7 @@ from mitsim.light.settings import GROUPS, Estimate, Settings, SharpPixels
 from mitsim.optics.fft_shadow import cells_per_pixel
 from mitsim.optics.frames import ExpectedFrames, Filed
 from mitsim.optics.image_formation import raster_error
+from mitsim.planner.memory import cells_to_choose, drawing_seconds
 from mitsim.planner.pilot_samples import EVEN_CELLS, GOOD_ENOUGH, Sample, coarsened, known, ladder, noise, norm
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.records import Deposits

@@ -37,8 +37,8 @@ from mitsim.bench.bench import Apparatus
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
+from mitsim.light.grids import LightEstimate
 from mitsim.light.light import SampledLight, traced_again
-from mitsim.light.light_estimate import LightEstimate
 from mitsim.light.pass_table import PASSES
 from mitsim.light.passes import Simulation, TracedPass, expected_of
 from mitsim.light.settings import Settings

@@ -29,7 +29,7 @@ import mitsim as ms
 from mitsim.light.cost_model import FIXED, tracing_seconds
 from mitsim.light.light import trace_light
 from mitsim.light.light_file import write_light
-from mitsim.light.rounds import next_samples
+from mitsim.light.sampling import next_samples
 from mitsim.planner import pilot
 assert pathlib.Path(ms.__file__).parents[1] == pathlib.Path.cwd(), ms.__file__
 scene, folder = pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2])
