@@ -27,6 +27,7 @@ from mitsim.light.cost_model import (
     truth_seconds,
     unit_costs_of,
 )
+from mitsim.light.pass_table import FOLLOWED
 from mitsim.light.pilot_result import Evidence
 from mitsim.light.plan import Plan, PlanRow, State
 from mitsim.light.settings import Estimate, Settings
@@ -78,47 +79,47 @@ class SceneFacts:
     @classmethod
     def of(cls, bench: Apparatus, switches: Mapping[str, bool] | None = None) -> SceneFacts:
         """The facts of ``bench``, without what effects that the user's ``switches`` put out would bring."""
-        geometry, warnings = bench.geometry, [*known_losses(bench.loaded, switches or {})]
-        if bench.field_stop_cuts:
-            warnings.append(
-                "the field stop (fov) cuts into the projector's window for part of the sensor; its edge is blurred "
-                "over the anchors, so open it or accept an error there"
-            )
-        if geometry.wall_shift_features >= 1:
-            warnings.append(
-                f"mask_thickness {geometry.mask_thickness} mm shifts the far face by "
-                f"{geometry.wall_shift_features:.1f} features at the field stop; the two-face model holds below 1"
-            )
-        plate = geometry.mask_plate
-        if (
-            not geometry.diffracts
-            and not (plate and plate.irradiance)
-            and (switches or {}).get("diffraction") is not False
-        ):
-            warnings.append(
-                "diffraction is left out: behind blurred edges it is worked out for masks of one separable term, and "
-                f"this one ({geometry.mask_words}) has more; --effects=-diffraction says that a geometric shadow is "
-                "meant"
-            )
-        waves = geometry.diffracts and (switches or {}).get("diffraction") is not False
-        if geometry.tilt_left_out(waves) or (any(geometry.mask_tilt) and bench.loaded.mirrors):
-            whose = "" if geometry.tilt_left_out(waves) else " of light over mirrors"
-            warnings.append(
-                f"the mask's tilt is left out{whose}: it moves shadows by up to {geometry.tilt_shift_mm * 1e3:.2g} um; "
-                "render --estimator reference has it, or set it to 0 in the camera's [mask]"
-            )
-        longest, opening = float(bench.spectrum.wavelengths_nm.max()), geometry.build_mask().opening_mm
-        if opening * 1e6 < _FEW_WAVELENGTHS * longest and not (plate and plate.irradiance):
-            warnings.append(
-                f"mask_feature {geometry.mask_feature:g} mm: the mask's openings are {opening:.3g} mm wide, less than "
-                f"{_FEW_WAVELENGTHS} wavelengths of {longest:.0f} nm; scalar theory of masks needs wider ones, so the "
-                "shadow is a guess"
-            )
+        loaded, off = bench.loaded, {name for name, on in (switches or {}).items() if not on}
+        warnings = (*known_losses(loaded, switches or {}), *_limits(bench, waves="diffraction" not in off))
         notes = {name: effect.note(bench) for name, effect in EFFECTS.items()}
-        loaded = bench.loaded
         polished = polished_shapes(loaded.scene) if loaded.mirrors and loaded.shapes else ()
         mirrors = tuple(loaded.shapes[number] for number in polished)
-        return cls(notes, loaded.pixels.keystone, tuple(warnings), loaded.shapes, mirrors, _spectrum(bench))
+        return cls(notes, loaded.pixels.keystone, warnings, loaded.shapes, mirrors, _spectrum(bench))
+
+
+def _limits(bench: Apparatus, waves: bool) -> Iterator[str]:
+    """What the model of a ``bench``'s devices does not cover, where diffraction is simulated or not."""
+    geometry = bench.geometry
+    if bench.field_stop_cuts:
+        yield (
+            "the field stop (fov) cuts into the projector's window for part of the sensor; its edge is blurred over "
+            "the anchors, so open it or accept an error there"
+        )
+    if geometry.wall_shift_features >= 1:
+        yield (
+            f"mask_thickness {geometry.mask_thickness} mm shifts the far face by {geometry.wall_shift_features:.1f} "
+            "features at the field stop; the two-face model holds below 1"
+        )
+    of_light = bool(geometry.mask_plate and geometry.mask_plate.irradiance)
+    if not geometry.diffracts and not of_light and waves:
+        yield (
+            "diffraction is left out: behind blurred edges it is worked out for masks of one separable term, and this "
+            f"one ({geometry.mask_words}) has more; --effects=-diffraction says that a geometric shadow is meant"
+        )
+    left_out = geometry.tilt_left_out(geometry.diffracts and waves)
+    if left_out or (any(geometry.mask_tilt) and bench.loaded.mirrors):
+        yield (
+            f"the mask's tilt is left out{'' if left_out else ' of light over mirrors'}: it moves shadows by up to "
+            f"{geometry.tilt_shift_mm * 1e3:.2g} um; render --estimator reference has it, or set it to 0 in the "
+            "camera's [mask]"
+        )
+    longest, opening = float(bench.spectrum.wavelengths_nm.max()), geometry.build_mask().opening_mm
+    if opening * 1e6 < _FEW_WAVELENGTHS * longest and not of_light:
+        yield (
+            f"mask_feature {geometry.mask_feature:g} mm: the mask's openings are {opening:.3g} mm wide, less than "
+            f"{_FEW_WAVELENGTHS} wavelengths of {longest:.0f} nm; scalar theory of masks needs wider ones, so the "
+            "shadow is a guess"
+        )
 
 
 def decide(
@@ -274,13 +275,10 @@ class _Words:
         return math.hypot(other.systematic.bound, self.chosen.noise)
 
     def _anchors(self) -> PlanRow:
-        anchors, one = self.chosen.settings.anchors, self._number("anchors", 1)
-        if anchors == 1:
-            reason = f"falloff, gloss and parallax over the sensor: one anchor leaves {_said(one)}"
-            return PlanRow("anchors", "off", reason, one.value, 0.0)
-        left = _said(self._number("anchors", anchors))
-        reason = f"falloff, gloss and parallax: {anchors}x{anchors} anchors leave {left}, one {_said(one)}"
-        return PlanRow("anchors", "approximate", reason, one.value, self._seconds(anchors=1, occluded_anchors=1))
+        side = self.chosen.settings.anchors
+        alone, several = "falloff, gloss and parallax over the sensor: one anchor", "falloff, gloss and parallax"
+        seconds = self._seconds(anchors=1, occluded_anchors=1)
+        return self._row_of_anchors("anchors", alone, f"{several}: {side}x{side} anchors", seconds)
 
     def _layers(self) -> PlanRow:
         depths, one = self.chosen.settings.depths, self._number("layers", 1)
@@ -297,37 +295,32 @@ class _Words:
         return PlanRow("cells", "approximate", reason, max(error.value for error in errors.values()), 0.0)
 
     def _followed_anchors(self) -> PlanRow:
-        name, anchors, one = (
-            "followed-anchors",
-            self.chosen.settings.followed_anchors,
-            self._number("followed_anchors", 1),
-        )
-        if not any(effect.followed and effect.name in self.chosen.settings.effects for effect in EFFECTS.values()):
-            return PlanRow(name, "off", "no light over several surfaces, in mirrors or of lamps is followed", 0.0, 0.0)
-        if anchors == 1:
-            reason = f"light over several surfaces, in mirrors and of lamps: one point leaves {_said(one)}"
-            return PlanRow(name, "off", reason, one.value, 0.0)
-        left, width = _said(self._number("followed_anchors", anchors)), self.chosen.settings.followed_width
-        cells = f" in cells of {width}x{width} pixels" if width > 1 else ""
-        reason = f"light over several surfaces, in mirrors and of lamps: {anchors}x{anchors}{cells} leave {left}, one "
-        return PlanRow(name, "approximate", reason + _said(one), one.value, self._seconds(followed_anchors=1))
+        settings, light = self.chosen.settings, "light over several surfaces, in mirrors and of lamps"
+        if not settings.effects & FOLLOWED:
+            reason = "no light over several surfaces, in mirrors or of lamps is followed"
+            return PlanRow("followed-anchors", "off", reason, 0.0, 0.0)
+        side, width = settings.followed_anchors, settings.followed_width
+        several = f"{light}: {side}x{side}{f' in cells of {width}x{width} pixels' if width > 1 else ''}"
+        seconds = self._seconds(followed_anchors=1)
+        return self._row_of_anchors("followed_anchors", f"{light}: one point", several, seconds)
 
     def _occluded_anchors(self) -> PlanRow:
-        name, anchors, pixels = (
-            "occluded-anchors",
-            self.chosen.settings.occluded_anchors,
-            len(self.evidence.occluded),
-        )
-        one = self._number("occluded_anchors", 1)
+        pixels, side = len(self.evidence.occluded), self.chosen.settings.occluded_anchors
         if not pixels:
-            return PlanRow(name, "off", "few anchors serve all projector pixels", 0.0, 0.0)
-        reason = f"{pixels} projector pixels are hidden from part of the sensor"
-        if anchors == 1:
-            return PlanRow(name, "off", f"{reason}: one anchor leaves {_said(one)}", one.value, 0.0)
-        left = _said(self._number("occluded_anchors", anchors))
-        reason = f"{reason}: {anchors}x{anchors} anchors leave {left}, one {_said(one)}"
+            return PlanRow("occluded-anchors", "off", "few anchors serve all projector pixels", 0.0, 0.0)
+        hidden = f"{pixels} projector pixels are hidden from part of the sensor"
         # To see them apart saves time: with as many anchors for all pixels, it would take far more.
-        return PlanRow(name, "approximate", reason, one.value, 0.0)
+        return self._row_of_anchors(
+            "occluded_anchors", f"{hidden}: one anchor", f"{hidden}: {side}x{side} anchors", 0.0
+        )
+
+    def _row_of_anchors(self, count: str, alone: str, several: str, seconds: float) -> PlanRow:
+        """Of the setting ``count``, in words for one and for ``several``."""
+        name, one = count.replace("_", "-"), self._number(count, 1)
+        if (chosen := getattr(self.chosen.settings, count)) == 1:
+            return PlanRow(name, "off", f"{alone} leaves {_said(one)}", one.value, 0.0)
+        reason = f"{several} leave {_said(self._number(count, chosen))}, one {_said(one)}"
+        return PlanRow(name, "approximate", reason, one.value, seconds)
 
     @property
     def _waves(self) -> bool:

@@ -22,8 +22,9 @@ from mitsim.light.pass_table import PASSES
 from mitsim.light.passes import Simulation
 from mitsim.light.pilot_result import LOOKS, Changes, Drawn, Effort, Evidence, Forming, Part
 from mitsim.light.settings import Settings
-from mitsim.planner.pilot_direct import SMOOTH, AnchoredLight, FineLight, OccludedLight, occluded_pixels, sharp_pixels
-from mitsim.planner.pilot_indirect import FollowedLight, SwitchedEffects
+from mitsim.planner.pilot_anchors import AnchoredLight, FollowedLight, OccludedLight
+from mitsim.planner.pilot_direct import SMOOTH, FineLight, occluded_pixels, sharp_pixels
+from mitsim.planner.pilot_effects import SwitchedEffects
 from mitsim.planner.pilot_samples import GOOD_ENOUGH, Sample
 from mitsim.scene.darkness import why_dark
 from mitsim.transport.highlights import highlights
@@ -185,7 +186,7 @@ class Look:
     @property
     def _rough(self) -> bool:
         """Whether a few anchors may leave too much: light that is hidden from part of the sensor, or sharp gloss."""
-        few = Changes.between(self.anchored.few, self.switched.light**2).estimate([Part("anchors", SMOOTH)])
+        few = Changes.between(self.anchored.of_few, self.switched.light**2).estimate([Part("anchors", SMOOTH)])
         return few.bound > _ROUGH * self.accuracy
 
     def heavy(self, samples: int) -> dict[str, Effort]:
@@ -280,12 +281,11 @@ class Look:
         efforts = {
             **switched.efforts,
             **self.followed.efforts(light),
+            **anchored.efforts(light),
+            **(self.occluded.efforts(light) if self.occluded else {}),
             "direct": fine.effort(light),
-            "anchor_residual": anchored.effort(light),
             "indirect": indirect,
         }
-        if self.occluded:
-            efforts["penumbra"] = self.occluded.effort(light)
         left_out, mirror = self._left_out.unseen(_FEWEST_HITS / samples, _FEWEST_MET / samples)
         found = self._light + sharp.irradiance + switched.received
         few = not apart and sharp.hits * self.samples["cells"].fine * LOOKS < _FEWEST_HITS

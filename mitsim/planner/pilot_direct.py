@@ -1,4 +1,4 @@
-"""Direct light, filed in different ways: what few anchors, layers or cells change, and noise."""
+"""Direct light, accumulated in different ways: what few layers or cells change, noise, and pixels of their own."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -19,8 +18,6 @@ from mitsim.core.resources import workers
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum
-from mitsim.light.grids import Grid
-from mitsim.light.pass_table import PASSES
 from mitsim.light.passes import Simulation, emitted
 from mitsim.light.pilot_result import LOOKS, Drawn, Effort, Forming, Noise, Part
 from mitsim.light.settings import GROUPS, Estimate, Settings, SharpPixels
@@ -28,20 +25,15 @@ from mitsim.optics.fft_shadow import cells_per_pixel
 from mitsim.optics.frames import ExpectedFrames, Filed
 from mitsim.optics.image_formation import raster_error
 from mitsim.planner.memory import cells_to_choose, drawing_seconds
-from mitsim.planner.pilot_samples import EVEN_CELLS, GOOD_ENOUGH, Sample, coarsened, known, ladder, noise, norm
+from mitsim.planner.pilot_samples import EVEN_CELLS, GOOD_ENOUGH, Sample, ladder, noise, norm
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.records import Deposits
 from mitsim.transport.sharp_lobes import SharpLight, with_neighbours
 
-ANCHOR_LADDER, LAYER_LADDER, CELL_LADDER = (1, 2, 3, 5, 8), (1, 2, 3, 4, 6, 8, 12), (1, 2, 4, 8)
+LAYER_LADDER, CELL_LADDER = (1, 2, 3, 4, 6, 8, 12), (1, 2, 4, 8)
 """Numbers that are tried, each step about half the error of the one before or less."""
-_FIRST_JUDGES = {"anchors": 2, "layers": 2, "cells": 1}
+_FIRST_JUDGES = {"layers": 2, "cells": 1}
 """Indices of the numbers that judge at first: two steps, or one where it is known how the error falls."""
-OCCLUDED_LADDER = (1, 2, 3, 5, 8, 16, 32)
-"""Numbers that are tried for occluded pixels. An edge's penumbra has kinks, at which interpolation between N anchors
-errs by about 1 / N^1.5; 32 leave a hundredth of what one does."""
-_FEW_ANCHORS, _FEW_OCCLUDED = 3, 5
-"""Anchors whose noise is measured: fewer leave a plan's choice to them unseen."""
 _JUDGING = 4
 """Layers that judge one layer for light in coarse cells: the error of one is told to a twentieth."""
 _FLAT = 1e-4
@@ -81,7 +73,7 @@ class FineLight:
         self.bench, self.base, self.sample, self.accuracy = bench, base, sample, accuracy
         self._seeds = [integer(seed, "pilot", "fine", look) for look in range(LOOKS)]
         self._simulation = simulation = sample.simulation(bench, base)
-        self._tracer = _tracer(simulation, _shown(base, sample), base.anchors)
+        self._tracer = tracer_of(simulation, shown_pixels(base, sample), base.anchors)
         self._deposits = self._tracer.trace_looks(self._seeds, sample.fine)
         apart, samples = simulation.sharp, sample.sharp(simulation)
         self._sharp = apart.trace_looks(self._seeds, samples) if apart else []
@@ -153,7 +145,7 @@ class FineLight:
 
     @cached_property
     def _spread_noise(self) -> tuple[float, float]:
-        tracer = _tracer(self._simulation, _shown(self.base, self.sample), 1, spread=True)
+        tracer = tracer_of(self._simulation, shown_pixels(self.base, self.sample), 1, spread=True)
         seen = tracer.trace_looks(self._seeds, self.sample.fine)
         return self._noise_of(tracer, self._formed(self._simulation, seen, self.sample.fine))
 
@@ -242,137 +234,12 @@ def _product_seconds() -> float:
     return min(taken) / (_TRIALS * _SIDE**3)
 
 
-class AnchoredLight:
-    """The frames with fewer anchors; every anchor is connected to the same points, so little noise is left.
-
-    Frames, not radiance: the falloff's error is odd in the scene's coordinates and mostly cancels in a frame. Of one
-    wavelength: anchors change the same with all (to 0.2 % in photograph, cards and corner), coarse cells at most a
-    quarter less.
-
-    Parameters
-    ----------
-    bench, base, sample, seed
-        as for :class:`FineLight`.
-    tolerance
-        norm of a change at which the search for enough may stop.
-    layers
-        depths [mm] that judge one layer; none for a flat scene.
-    """
-
-    _ladder: tuple[int, ...] = ANCHOR_LADDER
-    _pass, _few_anchors = PASSES["anchor_residual"], _FEW_ANCHORS
-
-    def __init__(
-        self,
-        bench: Apparatus,
-        base: Settings,
-        sample: Sample,
-        tolerance: float,
-        seed: int,
-        layers: tuple[float, ...] = (),
-    ) -> None:
-        self.bench, self.base, self.sample, self.tolerance = bench, base, sample, tolerance
-        self.layers = layers
-        self._seeds = [integer(seed, "pilot", "anchors", look) for look in range(LOOKS)]
-        self.pixels, self._samples = self._of(sample)
-
-    def _of(self, sample: Sample) -> tuple[Labels, int]:
-        """Pixels that are followed, and samples of each in a look."""
-        return np.setdiff1d(_shown(self.base, sample), self.base.occluded), sample.anchored
-
-    @property
-    def paths(self) -> int:
-        """Paths of all looks to one anchor."""
-        return LOOKS * len(self.pixels) * self._samples
-
-    @cached_property
-    def changes(self) -> dict[Part, FloatArray]:
-        """Change of the frames by every number of anchors that was tried, and by coarse cells for what they see."""
-        coarse = coarsened(self._pass.name, self._beyond, self.layers)
-        return {**self._until(self.tolerance), **coarse}
-
-    @property
-    def few(self) -> dict[Part, FloatArray]:
-        """Change of the frames by the numbers of anchors that are always tried, as far as they tell."""
-        return self._until(math.inf)
-
-    def _until(self, tolerance: float) -> dict[Part, FloatArray]:
-        found = ladder(self._ladder, self._frames, _FIRST_JUDGES["anchors"], tolerance)
-        return {Part(self._pass.anchors, count): change for count, change in found.items()}
-
-    def effort(self, light: float) -> Effort:
-        """Monte Carlo error of one estimate of what a few anchors see beyond their mean, relative to all ``light``."""
-        relative = self._noise / light if light else 0.0
-        return Effort(Noise(relative, self._samples, 0.5), self._lanes)
-
-    @property
-    def _lanes(self) -> int:
-        return self.bench.n**2 - len(self.base.occluded)
-
-    @cached_property
-    def _noise(self) -> float:
-        return noise(self._beyond(1, ()))
-
-    @known
-    def _beyond(self, cells: int, layers: tuple[float, ...]) -> FloatArray:
-        """Frames of what a few anchors see beyond their mean, in coarse cells and layers."""
-        coarse = replace(self.base, coarse_cells=cells, coarse_layers=bool(layers), layers=layers)
-        simulation = self._simulation(self._few_anchors, coarse)
-        grid, weights = self._grid(simulation), simulation.mean_weights(self._few_anchors)
-        mean = [look.averaged(weights) for look in self._few]
-        frames = self._frames(self._few_anchors) if coarse == self.base else self._formed(grid, self._few)
-        return frames - self._formed(grid.of_mean, mean)
-
-    @cached_property
-    def _few(self) -> list[Deposits]:
-        return self._traced(self._simulation(self._few_anchors, self.base))
-
-    @known
-    def _frames(self, anchors: int) -> FloatArray:
-        simulation = self._simulation(anchors, self.base)
-        traced = self._few if anchors == self._few_anchors else self._traced(simulation)
-        return self._formed(self._grid(simulation), traced)
-
-    def _simulation(self, anchors: int, settings: Settings) -> Simulation:
-        several: dict[str, Any] = {self._pass.anchors: anchors}
-        return self.sample.simulation(self.bench, replace(settings, **several), one_line=True)
-
-    def _grid(self, simulation: Simulation) -> Grid:
-        """Where light of these pixels is accumulated."""
-        return simulation.grids[self._pass.grid]
-
-    def _traced(self, simulation: Simulation) -> list[Deposits]:
-        """Light to every anchor, look by look."""
-        anchors = self._grid(simulation).bundle.anchors
-        tracer = _tracer(simulation, self.pixels, anchors)
-        return tracer.trace_looks(self._seeds, self._samples)
-
-    def _formed(self, grid: Grid, looks: list[Deposits]) -> FloatArray:
-        """(looks, shots, places, places) frames of light in a ``grid``."""
-        return self.sample.frames(grid, looks, self._samples)
-
-
-class OccludedLight(AnchoredLight):
-    """The same of occluded pixels, which many anchors see."""
-
-    _ladder = OCCLUDED_LADDER
-    _pass, _few_anchors = PASSES["penumbra"], _FEW_OCCLUDED
-
-    def _of(self, sample: Sample) -> tuple[Labels, int]:
-        pixels = np.intersect1d(_shown(self.base, sample), self.base.occluded)
-        return pixels, sample.occluded(len(pixels))
-
-    @property
-    def _lanes(self) -> int:
-        return len(self.base.occluded)
-
-
-def _shown(settings: Settings, sample: Sample) -> Labels:
+def shown_pixels(settings: Settings, sample: Sample) -> Labels:
     """Projector pixels that the shots of a ``sample`` show, but for those that are traced apart."""
     return np.setdiff1d(sample.shown, settings.sharp.pixels) if settings.sharp else sample.shown
 
 
-def _tracer(simulation: Simulation, pixels: Labels, anchors: int, spread: bool = False) -> DirectTracer:
+def tracer_of(simulation: Simulation, pixels: Labels, anchors: int, spread: bool = False) -> DirectTracer:
     """Direct light of some projector ``pixels`` to every anchor, or ``spread`` over the sensor."""
     loaded, physics = simulation.bench.loaded, simulation.physics
     parts = loaded.scene, loaded.camera, physics.projector, anchors, physics.geometry

@@ -22,8 +22,9 @@ from mitsim.light.passes import Simulation
 from mitsim.light.pilot_result import LOOKS, Changes, Evidence, Part
 from mitsim.light.settings import Settings
 from mitsim.optics.frames import monte_carlo_error
-from mitsim.planner import pilot, pilot_direct, pilot_indirect, pilot_samples
-from mitsim.planner.pilot_indirect import SwitchedEffects
+from mitsim.planner import pilot, pilot_anchors, pilot_direct, pilot_samples
+from mitsim.planner.pilot_anchors import AnchoredLight, FollowedLight
+from mitsim.planner.pilot_effects import SwitchedEffects
 from mitsim.transport.records import Deposits
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -88,7 +89,7 @@ def test_what_is_measured(bench: Bench, evidence: Evidence) -> None:
     )
     assert set(evidence.effects) <= set(EFFECTS)
     ladders = evidence.ladders
-    assert {1, 2, 3} <= set(ladders["anchors"]) <= set(pilot_direct.ANCHOR_LADDER)
+    assert {1, 2, 3} <= set(ladders["anchors"]) <= set(AnchoredLight.ladder)
     assert {1, 2, 3} <= set(ladders["layers"]) <= set(pilot_direct.LAYER_LADDER)
     assert {1, 2} <= set(ladders["cells"]) <= set(pilot_direct.CELL_LADDER)
     for name, errors in ladders.items():
@@ -96,8 +97,8 @@ def test_what_is_measured(bench: Bench, evidence: Evidence) -> None:
         coarsest, finest = (max(errors), 1) if name == "followed_width" else (1, max(errors))
         assert len(errors) == 1 or errors[coarsest].value > errors[finest].value
     widths = ladders["followed_width"]
-    assert tuple(widths) == pilot_indirect.WIDTHS and widths[1].value < widths[2].value < widths[4].value
-    assert {1, 2} <= set(ladders["followed_anchors"]) <= set(pilot_indirect.FOLLOWED_LADDER)
+    assert tuple(widths) == pilot_anchors.WIDTHS and widths[1].value < widths[2].value < widths[4].value
+    assert {1, 2} <= set(ladders["followed_anchors"]) <= set(FollowedLight.ladder)
     assert 0 < evidence.forming.seconds < 1
     assert (
         evidence.efforts["direct"].paths
@@ -197,7 +198,7 @@ def test_light_to_many_anchors_is_traced_in_parts(
     """All of it at once takes gigabytes. Parts of two samples make the same ladder but for the order of sums.
     (Planted: every part from the first sample on.)"""
     monkeypatch.setattr(
-        pilot_indirect,
+        pilot_anchors,
         "_AT_ONCE",
         2 * 9 * (evidence.efforts["indirect_residual"].paths + evidence.efforts["from_camera"].paths),
     )
@@ -290,9 +291,9 @@ def test_followed_light_of_either_side_has_its_own_noise(bench: Bench) -> None:
     lighting = parse_patterns("dots:4", N).lighting
     sample = pilot_samples.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
     everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
-    found = pilot_indirect.FollowedLight(bench, everything, sample, 0.0, 5)
+    found = FollowedLight(bench, everything, sample, 0.0, 5)
     indirect, camera = found.efforts(1.0).values()
-    alone, nothing = pilot_indirect.FollowedLight(bench, everything, sample, 0.0, 5), [Deposits.none()] * LOOKS
+    alone, nothing = FollowedLight(bench, everything, sample, 0.0, 5), [Deposits.none()] * LOOKS
     vars(alone)["_few_by_tracer"] = [found._few_by_tracer[0], nothing]
     assert indirect.noise.error == pytest.approx(pilot_samples.noise(alone._beyond_mean()), rel=1e-9)
     both = pilot_samples.noise(found._beyond_mean())
