@@ -402,7 +402,7 @@ class _Table:
         single = self.target * math.sqrt(GROUPS) / _BOUND_OVER_ERROR
         found = {}
         for name, part in parts.items():
-            # SampledLight without noise takes no share; a share of one keeps the division defined.
+            # Light without noise takes no share; a share of one keeps the division defined.
             share = np.sqrt(np.divide(part, every, out=np.ones(len(every)), where=part > 0))
             needed = self._by_row(name, partial(_needed, target=single * share))
             if name == "direct":

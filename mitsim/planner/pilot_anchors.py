@@ -1,4 +1,4 @@
-"""Light at anchors of the sensor: what fewer of them change in the frames, and noise of what they see beyond its mean."""
+"""Light at anchors of the sensor: what fewer of them change in the frames, and noise of what they see beyond."""
 
 from __future__ import annotations
 
