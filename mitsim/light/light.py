@@ -69,7 +69,7 @@ class Sampling:
 
 
 @dataclass(frozen=True, eq=False)
-class Looked:
+class FrameCheck:
     """What a look at the error of frames found, for who forms them.
 
     Attributes
@@ -125,7 +125,7 @@ class SampledLight:
         relative Monte Carlo error of the frames that were checked; ``reached`` tells whether it met the target.
     samples
         of each group, by the name of the pass; empty where nobody kept them.
-    looked
+    frame_check
         what the last look at its error found.
     known_truth
         :attr:`apparent`, where it was traced with that of other lines.
@@ -142,7 +142,7 @@ class SampledLight:
     sampling_error: float
     reached: bool
     samples: Mapping[str, int] = field(default_factory=dict)
-    looked: Looked | None = None
+    frame_check: FrameCheck | None = None
     known_truth: Truth | None = None
 
     def __repr__(self) -> str:
@@ -205,7 +205,11 @@ class SampledLight:
             for shots that split a class of the light.
         """
         rows = self.rows_of(lighting)
-        probed = self.looked.at(self, rows, lighting.weights.shape[1]) if self.looked and seed == self.seed else None
+        probed = (
+            self.frame_check.at(self, rows, lighting.weights.shape[1])
+            if self.frame_check and seed == self.seed
+            else None
+        )
         return self.simulation.expected(self.groups, rows, lighting, seed, leaking, probed)
 
     @checked
@@ -326,17 +330,17 @@ def trace_lines(
         lines = [_line_of(groups, line, each, plan, seed) for line, each in enumerate(own)]
         last = lines[0].paths >= MOST_PATHS
         enough = math.inf if last or sampling.excess or sampling.target else plan.sampling_target
-        looks = _looks(lines, partial(_parts, groups), lighting, followed, enough)
+        checks = _checks(lines, partial(_parts, groups), lighting, followed, enough)
         lights, near, worst, excess = dict[int, SampledLight](), 1.0, 0, 0.0
-        more = sampling.excess([looks[line].light for line in sorted(looks)]) if sampling.excess else 1.0
-        for line, look in looks.items():
-            light, error = look.light, look.light.sampling_error
+        more = sampling.excess([checks[line].light for line in sorted(checks)]) if sampling.excess else 1.0
+        for line, check in checks.items():
+            light, error = check.light, check.light.sampling_error
             # The plan's budget is for what the error may be; a user's own target for what it is expected to be.
             if sampling.target:
                 target = sampling.target(light.frames(_some(lighting, CHECKED_SHOTS), seed, leaking=False))
             else:
                 target = plan.sampling_target
-            seen = more * (error if sampling.target else look.bound)
+            seen = more * (error if sampling.target else check.bound)
             lights[line] = replace(light, reached=seen <= target)
             if seen > target and (beyond := _excess(seen, more * error, target)) > excess:
                 worst, excess = line, beyond
@@ -344,9 +348,9 @@ def trace_lines(
         progress("transport", near)
         if last or all(light.reached for light in lights.values()):
             return [lights[line] for line in range(len(own))]
-        samples = next_samples(simulation, samples, looks[worst].variances, excess)
+        samples = next_samples(simulation, samples, checks[worst].variances, excess)
         # What the next round replaces is not held beside it: new memory is dear.
-        del lines, looks, look, lights, light
+        del lines, checks, check, lights, light
 
 
 @single_threaded_blas()
@@ -393,7 +397,7 @@ def _flux(estimates: Sequence[LightEstimate], like: FloatArray) -> list[FloatArr
 
 
 @dataclass(frozen=True)
-class _Look:
+class _Check:
     """A ``light`` with the Monte Carlo error of the frames, what that is below at 95 %, and what each part of the light
     brings to the square of the latter, by the name of the pass, up to one factor."""
 
@@ -411,21 +415,21 @@ def _parts(groups: Sequence[Group], line: int) -> Parts:
     return {name: [group.part(name, line) for group in groups] for name in groups[0].done}
 
 
-def _looks(
+def _checks(
     lines: Sequence[SampledLight], parts: Callable[[int], Parts], lighting: Lighting, followed: bool, enough: float
-) -> dict[int, _Look]:
-    """What :func:`_looked` finds of the light of each line and its ``parts``, by its number: of the noisiest first, and
+) -> dict[int, _Check]:
+    """What :func:`_check` finds of the light of each line and its ``parts``, by its number: of the noisiest first, and
     of the others when its bound is ``enough``, as long as theirs are; else all are traced on whatever theirs is."""
     noise = [float(np.square(light.flux_error).sum() / (np.square(light.flux).sum() or 1.0)) for light in lines]
-    looks = {}
+    checks = {}
     for line in sorted(range(len(lines)), key=lambda line: -noise[line]):
-        looks[line] = _looked(lines[line], parts(line), lighting, followed)
-        if looks[line].bound > enough:
+        checks[line] = _check(lines[line], parts(line), lighting, followed)
+        if checks[line].bound > enough:
             break
-    return looks
+    return checks
 
 
-def _looked(light: SampledLight, parts: Parts, lighting: Lighting, followed: bool) -> _Look:
+def _check(light: SampledLight, parts: Parts, lighting: Lighting, followed: bool) -> _Check:
     """A look at the frames of a light.
 
     Parameters
@@ -445,15 +449,15 @@ def _looked(light: SampledLight, parts: Parts, lighting: Lighting, followed: boo
     error, bound = (ratio * of_seen for ratio, of_seen in zip(more, expected.sampling_error(), strict=True))
     light = replace(light, sampling_error=error)
     if whole and expected.probed is not None:
-        found = Looked(light.groups, light.simulation, light.rows_of(lighting), expected.probed)
-        light = replace(light, looked=found)
+        found = FrameCheck(light.groups, light.simulation, light.rows_of(lighting), expected.probed)
+        light = replace(light, frame_check=found)
     by_part = np.concatenate([noise.reshape(len(parts), -1, len(light.groups)) for noise in expected.noise], axis=1)
     variances = dict(zip(parts, shares_of_bound(by_part.sum(axis=1)).tolist(), strict=True))
     if not whole:
         for name, groups in parts.items():
             _, more_of_part = _unchecked(replace(light, groups=tuple(groups)), lighting, seen)
             variances[name] *= more_of_part**2
-    return _Look(light, bound, variances)
+    return _Check(light, bound, variances)
 
 
 def _excess(seen: float, error: float, target: float) -> float:

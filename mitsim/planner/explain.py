@@ -18,11 +18,11 @@ from mitsim.bench.request import check_accuracy
 from mitsim.light.cost_model import (
     Numbers,
     UnitCosts,
+    accumulation_seconds,
     checking_seconds,
+    costly_effects,
     entries,
-    filing_seconds,
     optics_seconds,
-    priced,
     tracing_seconds,
     truth_seconds,
     unit_costs_of,
@@ -31,7 +31,7 @@ from mitsim.light.pass_table import FOLLOWED
 from mitsim.light.pilot_result import Evidence
 from mitsim.light.plan import Plan, PlanRow, State
 from mitsim.light.settings import Estimate, Settings
-from mitsim.planner.choose import Choice, cheapest, predicted
+from mitsim.planner.choose import Candidate, cheapest, predicted
 from mitsim.transport.missed import polished_shapes
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ _GREY = "no surface differs by wavelength; the mask's shadow is the mean over al
 _FEW_WAVELENGTHS = 2
 """Mean width of a mask's openings below which scalar waves, and shadows, are a guess: half the openings of codes and of
 random masks are one feature, which is half the mean and a wavelength then."""
-_TOLD = 2.0
+_VAGUE = 2.0
 """An estimate whose bound is above this much of it is told as a bound."""
 
 
@@ -127,7 +127,7 @@ def decide(
     evidence: Evidence,
     facts: SceneFacts,
     switches: Mapping[str, bool] | None = None,
-    chosen: Choice | None = None,
+    chosen: Candidate | None = None,
 ) -> Plan:
     """Choose effects, anchors, layers, cells and samples.
 
@@ -166,10 +166,10 @@ def _stages(evidence: Evidence, settings: Settings, costs: UnitCosts) -> dict[st
     """Seconds of transport, truth and optics."""
     forming, numbers = evidence.forming, Numbers.of(settings)
     tracing = tracing_seconds(evidence, settings, costs)
-    filed = entries(evidence.efforts["direct"].paths, forming.classes, numbers, settings)
+    held = entries(evidence.sample_costs["direct"].paths, forming.classes, numbers, settings)
     return {
         "transport": sum(tracing.values())
-        + float(filing_seconds(forming, numbers, filed, costs))
+        + float(accumulation_seconds(forming, numbers, held, costs))
         + float(checking_seconds(forming, numbers, costs)),
         "truth": truth_seconds(evidence, settings, costs),
         "optics": float(optics_seconds(forming, numbers, costs)),
@@ -182,7 +182,7 @@ class _Words:
 
     accuracy: float
     evidence: Evidence
-    chosen: Choice
+    chosen: Candidate
     facts: SceneFacts
     switches: Mapping[str, bool]
 
@@ -283,15 +283,17 @@ class _Words:
     def _layers(self) -> PlanRow:
         depths, one = self.chosen.settings.depths, self._number("layers", 1)
         if len(depths) == 1:
-            reason = f"the light is seen at {self.evidence.depth:.1f} mm; one layer leaves {_said(one)}"
+            reason = f"the light is seen at {self.evidence.depth:.1f} mm; one layer leaves {_error_words(one)}"
             return PlanRow("layers", "off", reason, one.value, 0.0)
-        left = _said(self._number("layers", len(depths)))
+        left = _error_words(self._number("layers", len(depths)))
         reason = f"the light is seen from {depths[-1]:.0f} to {depths[0]:.0f} mm; {len(depths)} layers leave {left}"
-        return PlanRow("layers", "approximate", f"{reason}, one {_said(one)}", one.value, self._seconds(layers=()))
+        return PlanRow(
+            "layers", "approximate", f"{reason}, one {_error_words(one)}", one.value, self._seconds(layers=())
+        )
 
     def _cells(self) -> PlanRow:
         cells, errors = self.chosen.settings.subdivision, self.evidence.ladders["cells"]
-        reason = f"{cells}x{cells} cells of even light a projector pixel leave {_said(errors[cells])}"
+        reason = f"{cells}x{cells} cells of even light a projector pixel leave {_error_words(errors[cells])}"
         return PlanRow("cells", "approximate", reason, max(error.value for error in errors.values()), 0.0)
 
     def _followed_anchors(self) -> PlanRow:
@@ -318,8 +320,8 @@ class _Words:
         """Of the setting ``count``, in words for one and for ``several``."""
         name, one = count.replace("_", "-"), self._number(count, 1)
         if (chosen := getattr(self.chosen.settings, count)) == 1:
-            return PlanRow(name, "off", f"{alone} leaves {_said(one)}", one.value, 0.0)
-        reason = f"{several} leave {_said(self._number(count, chosen))}, one {_said(one)}"
+            return PlanRow(name, "off", f"{alone} leaves {_error_words(one)}", one.value, 0.0)
+        reason = f"{several} leave {_error_words(self._number(count, chosen))}, one {_error_words(one)}"
         return PlanRow(name, "approximate", reason, one.value, seconds)
 
     @property
@@ -343,23 +345,21 @@ class _Words:
             formed = replace(settings, raster=cells > 0, raster_cells=cells)
             return _stages(self.evidence, formed, costs)["optics"]
 
-        fewest = drawn.cells[0]
+        fewest, leaves = drawn.cells[0], _error_words(left)
         cells = settings.raster_cells or fewest
         on_raster, by_fft = f"on a raster of {cells} cells a pixel", seconds(cells)
         if drawn.needed:
-            reason = f"the mask's shadow is drawn {on_raster}, and frames are formed by FFT: that leaves {_said(left)}"
+            reason = f"the mask's shadow is drawn {on_raster}, and frames are formed by FFT: that leaves {leaves}"
             if cells == fewest or drawn.error is None:
                 return (PlanRow("mask-shadow", "approximate", reason, None, 0.0),)
-            reason += f", {fewest} {_said(drawn.error)}"
+            reason += f", {fewest} {_error_words(drawn.error)}"
             return (PlanRow("mask-shadow", "approximate", reason, None, max(by_fft - seconds(fewest), 0.0)),)
         sums = seconds(0)
         terms = f"{forming.geometric_terms:.0f} separable terms"
         if settings.raster:
-            reason = (
-                f"{terms}: by FFT {on_raster}, {by_fft:.2g} s, which leaves {_said(left)}; their sum takes {sums:.2g} s"
-            )
+            reason = f"{terms}: by FFT {on_raster}, {by_fft:.2g} s, which leaves {leaves}; their sum takes {sums:.2g} s"
             return (PlanRow("mask-shadow", "approximate", reason, 0.0, max(by_fft, 0.0)),)
-        reason = f"{terms} are summed, {sums:.2g} s; by FFT {on_raster}, {by_fft:.2g} s, {_said(left)} would be left"
+        reason = f"{terms} are summed, {sums:.2g} s; by FFT {on_raster}, {by_fft:.2g} s, {leaves} would be left"
         return (PlanRow("mask-shadow", "exact", reason, left.value, sums),)
 
     def _effect(self, effect: Effect) -> PlanRow:
@@ -370,8 +370,8 @@ class _Words:
         if error is None:
             return PlanRow(name, state, effect.absent or "nothing in the scene calls for it", 0.0, 0.0)
         said = [self.facts.notes.get(name, ""), "switched by the user" if name in self.switches else ""]
-        said.append(f"left out, the frames change by {_said(error)}")
-        takes_time = name in priced()
+        said.append(f"left out, the frames change by {_error_words(error)}")
+        takes_time = name in costly_effects()
         if on and name not in self.switches:
             less = replace(settings, effects=settings.effects - {name})
             said.append(self._without(less) if takes_time else "it takes no time")
@@ -379,11 +379,11 @@ class _Words:
         return PlanRow(name, state, "; ".join(filter(None, said)), error.value, seconds)
 
 
-def _said(error: Estimate) -> str:
+def _error_words(error: Estimate) -> str:
     """An error as people read it: below its bound where it cannot be told from none."""
     if error.bound == 0:
         return "0"
-    return f"{error.value:.1e}" if error.bound < _TOLD * error.value else f"less than {error.bound:.1e}"
+    return f"{error.value:.1e}" if error.bound < _VAGUE * error.value else f"less than {error.bound:.1e}"
 
 
 def _spectrum(bench: Apparatus) -> PlanRow:

@@ -16,7 +16,7 @@ from mitsim.core.seeds import integer
 from mitsim.light.grids import Grid
 from mitsim.light.pass_table import PASSES, PassTracer
 from mitsim.light.passes import Simulation
-from mitsim.light.pilot_result import LOOKS, Effort, Noise, Part
+from mitsim.light.pilot_result import LOOKS, Noise, Part, SampleCost
 from mitsim.light.settings import Settings
 from mitsim.planner.pilot_direct import shown_pixels, tracer_of
 from mitsim.planner.pilot_samples import EVEN_CELLS, Sample, coarsened, heavy_paths, known, ladder, noise, norm
@@ -33,7 +33,7 @@ _FOLLOWED_JUDGE = 1
 """Index of the number that judges at first, for light that is followed."""
 
 
-class AnchoredLight:
+class AnchorRuns:
     """The frames with fewer anchors; every anchor is connected to the same points, so little noise is left.
 
     Frames, not radiance: the falloff's error is odd in the scene's coordinates and mostly cancels in a frame. Of one
@@ -53,7 +53,7 @@ class AnchoredLight:
     layers
         depths [mm] that judge one layer; none for a flat scene.
     lit
-        whether other looks found any such light, where that is not certain.
+        whether other replicates found any such light, where that is not certain.
     """
 
     _pass = PASSES["anchor_residual"]
@@ -75,17 +75,17 @@ class AnchoredLight:
     ) -> None:
         self.bench, self.base, self.sample, self.tolerance = bench, base, sample, tolerance
         self.layers, self._lit = layers, lit
-        self._seeds = [integer(seed, "pilot", self._stream, look) for look in range(LOOKS)]
+        self._seeds = [integer(seed, "pilot", self._stream, replicate) for replicate in range(LOOKS)]
         self._choose(sample)
 
     def _choose(self, sample: Sample) -> None:
-        """Pixels that are followed, and samples of each in a look."""
+        """Pixels that are followed, and samples of each in a replicate."""
         self.pixels = np.setdiff1d(shown_pixels(self.base, sample), self.base.occluded)
         self._samples, self._lanes = sample.anchored, self.bench.n**2 - len(self.base.occluded)
 
     @property
     def paths(self) -> int:
-        """Paths of all looks to one anchor."""
+        """Paths of all replicates to one anchor."""
         return LOOKS * len(self.pixels) * self._samples
 
     @cached_property
@@ -102,11 +102,11 @@ class AnchoredLight:
         found = ladder(self.ladder, self._frames, judge, tolerance)
         return {Part(self._pass.anchors, count): change for count, change in found.items()}
 
-    def efforts(self, light: float) -> dict[str, Effort]:
+    def sample_costs(self, light: float) -> dict[str, SampleCost]:
         """Monte Carlo error of one estimate of what a few anchors see beyond their mean, relative to all ``light``, by
         pass."""
         relative = noise(self._beyond_mean()) / light if light else 0.0
-        return {self._pass.name: Effort(Noise(relative, self._samples, 0.5), self._lanes)}
+        return {self._pass.name: SampleCost(Noise(relative, self._samples, 0.5), self._lanes)}
 
     def _in_cells(self, cells: int, layers: tuple[float, ...]) -> FloatArray:
         coarse = {"coarse_cells": cells, "coarse_layers": bool(layers), "layers": layers}
@@ -120,19 +120,19 @@ class AnchoredLight:
     def _beyond(
         self,
         simulation: Simulation,
-        looks: Sequence[Deposits],
+        replicates: Sequence[Deposits],
         frames: FloatArray | None = None,
         samples: int | None = None,
     ) -> FloatArray:
         """Frames of light to a few anchors beyond its mean, in a ``simulation``; of all of it, where they are known."""
         weights, grids = simulation.mean_weights(self.few), self._grids(simulation)
-        mean = [look.averaged(weights) for look in looks]
-        frames = self._formed(grids, looks, samples) if frames is None else frames
+        mean = [replicate.averaged(weights) for replicate in replicates]
+        frames = self._formed(grids, replicates, samples) if frames is None else frames
         return frames - self._formed([grid.of_mean for grid in grids], mean, samples)
 
     @cached_property
     def _few(self) -> list[Deposits]:
-        """Light to a few anchors, look by look."""
+        """Light to a few anchors, replicate by replicate."""
         return self._traced(self._simulation(self.few))
 
     @known
@@ -152,19 +152,19 @@ class AnchoredLight:
         return [simulation.grids[name], *lamps]
 
     def _traced(self, simulation: Simulation) -> list[Deposits]:
-        """Light to every anchor, look by look."""
+        """Light to every anchor, replicate by replicate."""
         anchors = self._grids(simulation)[0].bundle.anchors
         return tracer_of(simulation, self.pixels, anchors).trace_looks(self._seeds, self._samples)
 
-    def _formed(self, grids: Sequence[Grid], looks: Sequence[Deposits], samples: int | None = None) -> FloatArray:
-        """(looks, shots, places, places) frames of light in ``grids``; of so many ``samples``, if not of as many as
-        others."""
+    def _formed(self, grids: Sequence[Grid], replicates: Sequence[Deposits], samples: int | None = None) -> FloatArray:
+        """(replicates, shots, places, places) frames of light in ``grids``; of so many ``samples``, if not of as many
+        as others."""
         samples = samples or self._samples
-        frames = self.sample.frames(grids[0], looks, samples)
-        return frames + self.sample.lamps(grids[1], looks, samples) if len(grids) > 1 else frames
+        frames = self.sample.frames(grids[0], replicates, samples)
+        return frames + self.sample.lamps(grids[1], replicates, samples) if len(grids) > 1 else frames
 
 
-class OccludedLight(AnchoredLight):
+class PenumbraRuns(AnchorRuns):
     """The same of occluded pixels, which many anchors see. An edge's penumbra has kinks, at which interpolation between
     N anchors errs by about 1 / N^1.5; 32 leave a hundredth of what one does."""
 
@@ -177,7 +177,7 @@ class OccludedLight(AnchoredLight):
         self._samples, self._lanes = sample.occluded(len(self.pixels)), len(self.base.occluded)
 
 
-class FollowedLight(AnchoredLight):
+class FollowedRuns(AnchorRuns):
     """The same of light that is followed, of settings with all effects on; to every anchor go the same paths."""
 
     _pass = PASSES["indirect_residual"]
@@ -199,10 +199,10 @@ class FollowedLight(AnchoredLight):
         # Where the judge was never judged, few anchors serve, and their light is held in any cells.
         return {**anchors, **self._widths} if len(anchors) > _FOLLOWED_JUDGE + 1 else anchors
 
-    def efforts(self, light: float) -> dict[str, Effort]:
+    def sample_costs(self, light: float) -> dict[str, SampleCost]:
         tracers = self._simulation().at_anchors
         if not self.changes:
-            return dict.fromkeys(self.passes, Effort.none())
+            return dict.fromkeys(self.passes, SampleCost.none())
         every = self._beyond_mean()
         if None in tracers:
             seen = every, every
@@ -211,21 +211,21 @@ class FollowedLight(AnchoredLight):
             seen = every - from_camera, from_camera
         errors = (noise(each) / light if light else 0.0 for each in seen)
         return {
-            name: Effort(Noise(error, self._samples, 0.5), tracer.lanes) if tracer else Effort.none()
+            name: SampleCost(Noise(error, self._samples, 0.5), tracer.lanes) if tracer else SampleCost.none()
             for name, error, tracer in zip(self.passes, errors, tracers, strict=True)
         }
 
-    def with_more(self, light: float, samples: int) -> Effort:
-        """That of what is followed from the camera, by looks of so many ``samples``; ``light`` as for those."""
+    def with_more(self, light: float, samples: int) -> SampleCost:
+        """That of what is followed from the camera, by replicates of so many ``samples``; ``light`` as for those."""
         simulation = self._simulation(self.few)
         tracer, one = simulation.at_anchors[1], self._simulation().at_anchors[1]
         if tracer is None or one is None or not self.changes or not light:
-            return Effort.none()
+            return SampleCost.none()
         seen = [heavy_paths(tracer, integer(seed, "heavy"), samples) for seed in self._seeds]
         frames = self._beyond(simulation, seen, samples=samples)
         # The heaviest paths come to one anchor of several: each connection counts.
-        found = Noise.among(frames, light, samples, np.concatenate([look.value for look in seen]))
-        return Effort(found, one.lanes)
+        found = Noise.among(frames, light, samples, np.concatenate([replicate.value for replicate in seen]))
+        return SampleCost(found, one.lanes)
 
     @property
     def _widths(self) -> dict[Part, FloatArray]:
@@ -271,5 +271,5 @@ def _tracers(simulation: Simulation) -> list[PassTracer]:
 
 
 def _joined(traced: Sequence[list[Deposits]]) -> list[Deposits]:
-    """Light of several tracers together, look by look."""
-    return [Deposits.joined(looks) for looks in zip(*traced, strict=True)]
+    """Light of several tracers together, replicate by replicate."""
+    return [Deposits.joined(replicates) for replicates in zip(*traced, strict=True)]

@@ -19,7 +19,7 @@ from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum
 from mitsim.light.passes import Simulation, emitted
-from mitsim.light.pilot_result import LOOKS, Drawn, Effort, Forming, Noise, Part
+from mitsim.light.pilot_result import LOOKS, Drawn, Forming, Noise, Part, SampleCost
 from mitsim.light.settings import GROUPS, Estimate, Settings, SharpPixels
 from mitsim.optics.fft_shadow import cells_per_pixel
 from mitsim.optics.frames import ExpectedFrames, Filed
@@ -54,7 +54,7 @@ _FARTHEST = 1e-4
 """Inverse depth, relative to the scene's, below which light counts as infinitely far."""
 
 
-class FineLight:
+class DirectRuns:
     """Direct light in many samples a cell, filed in different ways.
 
     Parameters
@@ -71,7 +71,7 @@ class FineLight:
 
     def __init__(self, bench: Apparatus, base: Settings, sample: Sample, accuracy: float, seed: int) -> None:
         self.bench, self.base, self.sample, self.accuracy = bench, base, sample, accuracy
-        self._seeds = [integer(seed, "pilot", "fine", look) for look in range(LOOKS)]
+        self._seeds = [integer(seed, "pilot", "fine", replicate) for replicate in range(LOOKS)]
         self._simulation = simulation = sample.simulation(bench, base)
         self._tracer = tracer_of(simulation, shown_pixels(base, sample), base.anchors)
         self._deposits = self._tracer.trace_looks(self._seeds, sample.fine)
@@ -113,22 +113,22 @@ class FineLight:
             found |= {Part("layers", count): change for count, change in layers.items()}
         return found
 
-    def effort(self, light: float) -> Effort:
+    def sample_cost(self, light: float) -> SampleCost:
         """Monte Carlo error of one estimate of what the sensor's centre sees, relative to all ``light``, how fast it
         falls, and its paths."""
-        return self._effort(self._noise, light)
+        return self._sample_cost(self._noise, light)
 
-    def spread(self, light: float) -> Effort:
+    def spread(self, light: float) -> SampleCost:
         """The same, as a part of ``light``, of what random points of the sensor see: gloss differs over the sensor, and
         makes noise there."""
-        return self._effort(self._spread_noise, light)
+        return self._sample_cost(self._spread_noise, light)
 
-    def _effort(self, noises: tuple[float, float], light: float) -> Effort:
+    def _sample_cost(self, noises: tuple[float, float], light: float) -> SampleCost:
         many, few = noises
         steep = many > 0 and few > 0 and self._fewer < self.sample.fine
         rate = math.log(few / many) / math.log(self.sample.fine / self._fewer) if steep else 0.5
         relative = many / light if light else 0.0
-        return Effort(Noise(relative, self.sample.fine, min(max(rate, 0.5), _STEEPEST)), self.bench.n**2)
+        return SampleCost(Noise(relative, self.sample.fine, min(max(rate, 0.5), _STEEPEST)), self.bench.n**2)
 
     @property
     def _fewer(self) -> int:
@@ -136,7 +136,7 @@ class FineLight:
 
     @cached_property
     def _whole(self) -> FloatArray:
-        """(looks, ...) frames of the light in the cells and layers of the base."""
+        """(replicates, ...) frames of the light in the cells and layers of the base."""
         return self._formed(self._simulation, self._deposits, self.sample.fine)
 
     @cached_property
@@ -150,7 +150,7 @@ class FineLight:
         return self._noise_of(tracer, self._formed(self._simulation, seen, self.sample.fine))
 
     def _noise_of(self, tracer: DirectTracer, many: FloatArray) -> tuple[float, float]:
-        """Error of a look of the ``tracer`` whose frames of all samples are ``many``, and of one with fewer."""
+        """Error of a replicate of the ``tracer`` whose frames of all samples are ``many``, and of one with fewer."""
         few = tracer.trace_looks(self._seeds, self._fewer)
         return noise(many), noise(self._formed(self._simulation, few, self._fewer))
 
@@ -280,13 +280,13 @@ def occluded_pixels(simulation: Simulation, accuracy: float, seed: int) -> tuple
     rough, whole = _roughness(simulation, pixels, _FIRST, seed)
     rest = (_LEFT * accuracy) ** 2 * whole
     found = pixels[_most(rough, rest)]
-    every, looked = np.zeros(n**2), np.zeros(n**2, dtype=bool)
+    every, frame_check = np.zeros(n**2), np.zeros(n**2, dtype=bool)
     # Few rays miss what is hidden by a little; it lies beside what is hidden by much.
-    while len(near := np.intersect1d(_beside(found, n), pixels[~looked[pixels]])):
-        if looked.sum() + len(near) > 9 * _MOST * n**2:
+    while len(near := np.intersect1d(_beside(found, n), pixels[~frame_check[pixels]])):
+        if frame_check.sum() + len(near) > 9 * _MOST * n**2:
             return ()
-        every[near], _ = _roughness(simulation, near, _NEAR, integer(seed, "near", int(looked.sum())))
-        looked[near] = True
+        every[near], _ = _roughness(simulation, near, _NEAR, integer(seed, "near", int(frame_check.sum())))
+        frame_check[near] = True
         found = _most(every, rest)
     return tuple(np.sort(found).tolist()) if len(found) <= _MOST * n**2 else ()
 
@@ -352,8 +352,8 @@ _WELL_MET = 30.0
 """Hits of one connection of each pixel from which even points meet lobes often enough, where few anchors do: in
 compact_disc (125 hits) tracing 600 pixels apart took 1.5 times the time for the same error."""
 _SEEN = 0.5
-"""Hits of one connection of each pixel from which the pilot's ordinary looks, 64 connections or more, tell how a lobe's
-light varies over the sensor: they meet it thirty times."""
+"""Hits of one connection of each pixel from which the pilot's ordinary replicates, 64 connections or more, tell how a
+lobe's light varies over the sensor: they meet it thirty times."""
 _TRIAL, _LARGEST_TRIAL = 16, 2**21
 """Samples that tell how noisy the light is, and connections of them, some 0.5 s."""
 _AFFORDABLE = 2.0**29
@@ -399,7 +399,7 @@ def sharp_pixels(
         order = np.argsort(-sharp.by_pixel, kind="stable")
         held = np.cumsum(sharp.by_pixel[order])[:lit]
         count = min(int(np.searchsorted(held, sharp.irradiance - _LEFT_SHARP * accuracy * whole)) + 1, lit)
-    # Beside a lobe's light is that of its tails, which ordinary looks meet as seldom where it is small.
+    # Beside a lobe's light is that of its tails, which ordinary replicates meet as seldom where it is small.
     pixels = with_neighbours(np.isin(np.arange(len(order)), order[:count]), simulation.bench.n)
     # One pixel at least stays with the others.
     if len(pixels) == len(order):
@@ -410,7 +410,8 @@ def sharp_pixels(
 
 
 def _unseen(sharp: SharpLight, order: Labels, negligible: float) -> int:
-    """Pixels, the first in ``order``, without which the others' light is ``negligible`` or seen by ordinary looks."""
+    """Pixels, the first in ``order``, without which the others' light is ``negligible`` or seen by ordinary
+    replicates."""
     held, moments = (np.cumsum(values[order][::-1])[::-1] for values in (sharp.by_pixel, sharp.moments))
     told = (held <= negligible) | (np.square(held) >= _SEEN * moments)
     return int(np.argmax(told)) if told.any() else len(order)

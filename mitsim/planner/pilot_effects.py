@@ -17,7 +17,7 @@ from mitsim.core.seeds import integer
 from mitsim.light.cost_model import SHARED_COST
 from mitsim.light.pass_table import PASSES
 from mitsim.light.passes import Simulation, emitted
-from mitsim.light.pilot_result import LOOKS, Changes, Effort, Noise, Part
+from mitsim.light.pilot_result import LOOKS, Changes, Noise, Part, SampleCost
 from mitsim.light.settings import Settings
 from mitsim.planner.pilot_direct import SHARP_RATE
 from mitsim.planner.pilot_samples import Known, Sample, coarsened, heavy_paths, noise, norm
@@ -30,15 +30,15 @@ from mitsim.transport.records import Deposits
 _FOLLOWED = tuple(name for name, row in PASSES.items() if not (row.even or row.anchors))
 """Passes of light that is followed to one point of the sensor."""
 _WORTH_REPEATING = 0.85
-"""Variance times paths, over that of even ones, below which blocks are followed unevenly: short looks tell it so
+"""Variance times paths, over that of even ones, below which blocks are followed unevenly: short replicates tell it so
 well."""
 _OPEN = 0.1
 """Part of the accuracy that noise may leave open of what coarse cells for indirect light change: a hundredth of the
-budget's square. Where more is, the capture follows ten times as many paths as the closer looks, or more (corner at
-5e-4, first looks: 1e-3 open, and 110 processor seconds in place of 33)."""
+budget's square. Where more is, the capture follows ten times as many paths as the closer replicates, or more (corner at
+5e-4, first replicates: 1e-3 open, and 110 processor seconds in place of 33)."""
 
 
-class SwitchedEffects:
+class EffectRuns:
     """A bench with all effects; direct and followed light are traced once and reused where they can be.
 
     Parameters
@@ -66,7 +66,7 @@ class SwitchedEffects:
     ) -> None:
         self.bench, self.everything, self.sample, self.layers = bench, everything, sample, layers
         self.accuracy = accuracy
-        self.seeds = [integer(seed, "pilot", "effects", look) for look in range(LOOKS)]
+        self.seeds = [integer(seed, "pilot", "effects", replicate) for replicate in range(LOOKS)]
         self.simulation = sample.simulation(bench, everything)
         self.direct = self._direct(self.simulation)
         self.followed = {name: self._follow(self.simulation, name) for name in _FOLLOWED}
@@ -99,9 +99,9 @@ class SwitchedEffects:
 
     @cached_property
     def _bounced(self) -> list[Deposits]:
-        """Indirect light from the projector's side in closer looks, look by look."""
-        looks, _ = self._closer
-        return self._first_bounced if looks is self.followed["indirect"] else _indirect_of(looks)
+        """Indirect light from the projector's side in closer replicates, replicate by replicate."""
+        replicates, _ = self._closer
+        return self._first_bounced if replicates is self.followed["indirect"] else _indirect_of(replicates)
 
     @cached_property
     def _first_bounced(self) -> list[Deposits]:
@@ -110,22 +110,22 @@ class SwitchedEffects:
     @cached_property
     def _closer(self) -> tuple[list[Deposits], int]:
         """Looks at the projector's side's light, and their samples: more where noise hides what coarse cells change."""
-        looks, samples, tracer = self.followed["indirect"], self.sample.followed, self.simulation.indirect
+        replicates, samples, tracer = self.followed["indirect"], self.sample.followed, self.simulation.indirect
         if tracer is None or not any(light.value.size for light in self._first_bounced):
-            return looks, samples
+            return replicates, samples
         seen = coarsened("indirect", partial(self._indirect, self._first_bounced, samples), ())
         value, bound = Changes.between(seen, self.light**2).estimate(seen)
         wanted = math.ceil(samples * (bound**2 - value**2) / (_OPEN * self.accuracy) ** 2)
         more = min(wanted, self.sample.closer(tracer.lanes))
         if more <= samples:
-            return looks, samples
-        # Seeds of their own: that the first looks are vague says nothing of these.
+            return replicates, samples
+        # Seeds of their own: that the first replicates are vague says nothing of these.
         return tracer.trace_looks([integer(seed, "closer") for seed in self.seeds], more), more
 
     @property
     def received(self) -> float:
         """Light that is followed, as irradiance at the sensor's centre [W m^-2]."""
-        light = sum(float(look.value.sum()) for looks in self.followed.values() for look in looks)
+        light = sum(float(replicate.value.sum()) for replicates in self.followed.values() for replicate in replicates)
         return light / (LOOKS * self.sample.followed)
 
     @property
@@ -139,57 +139,57 @@ class SwitchedEffects:
         """Paths in a sample of each tracer."""
         return {name: lanes for name, (_, _, lanes) in self._noise.items()}
 
-    def effort(self, name: str) -> Effort:
+    def sample_cost(self, name: str) -> SampleCost:
         """Monte Carlo error of one estimate by the pass ``name``, relative to all light, and its paths."""
         if name not in self._noise:
-            return Effort.none()
+            return SampleCost.none()
         error, samples, lanes = self._noise[name]
         relative = error / self.light if self.light else 0.0
-        return Effort(Noise(relative, samples, 0.5), lanes)
+        return SampleCost(Noise(relative, samples, 0.5), lanes)
 
-    def with_more(self, samples: int) -> Effort:
-        """The same of what is followed from the camera, by looks of so many ``samples`` of their own."""
+    def with_more(self, samples: int) -> SampleCost:
+        """The same of what is followed from the camera, by replicates of so many ``samples`` of their own."""
         tracer = self.simulation.from_camera
         if tracer is None or not self.light:
-            return Effort.none()
+            return SampleCost.none()
         seen = [heavy_paths(tracer, integer(seed, "heavy"), samples) for seed in self.seeds]
         frames = self._form(self.simulation, followed=self._by_kind({"from_camera": seen}), samples=samples)
-        paths = np.concatenate([look.value for look in seen])
-        return Effort(Noise.among(frames, self.light, samples, paths), tracer.lanes)
+        paths = np.concatenate([replicate.value for replicate in seen])
+        return SampleCost(Noise.among(frames, self.light, samples, paths), tracer.lanes)
 
-    def indirect_effort(self) -> tuple[Effort, bool, tuple[int, ...]]:
+    def indirect_cost(self) -> tuple[SampleCost, bool, tuple[int, ...]]:
         """What light over several surfaces takes, whether that is less where neighbouring pixels share it, and how
         often each block of pixels is followed in a sample."""
-        effort, shared = self._shared_or_not
+        sample_cost, shared = self._shared_or_not
         repeats, (variance, paths) = self._repeats
         if variance * paths > _WORTH_REPEATING:
-            return effort, shared, ()
-        noise_left = replace(effort.noise, error=effort.noise.error * math.sqrt(variance))
-        return replace(effort, noise=noise_left, paths=math.ceil(effort.paths * paths)), shared, repeats
+            return sample_cost, shared, ()
+        noise_left = replace(sample_cost.noise, error=sample_cost.noise.error * math.sqrt(variance))
+        return replace(sample_cost, noise=noise_left, paths=math.ceil(sample_cost.paths * paths)), shared, repeats
 
     @cached_property
     def _repeats(self) -> tuple[tuple[int, ...], tuple[float, float]]:
-        """Paths of each block of pixels in a sample, and what that makes of variance and paths, by other looks."""
+        """Paths of each block of pixels in a sample, and what that makes of variance and paths, by other replicates."""
         pixels = self.bench.n
-        moments = [block_moments(look.pixel, look.value, pixels) for look in self._bounced]
+        moments = [block_moments(replicate.pixel, replicate.value, pixels) for replicate in self._bounced]
         repeats = chosen_repeats(np.sum(moments, axis=0))
-        # Judged by looks that had no say, a half each: a single heavy path recommends only its own block.
+        # Judged by replicates that had no say, a half each: a single heavy path recommends only its own block.
         halves = np.sum(moments[::2], axis=0), np.sum(moments[1::2], axis=0)
         judged = [effect_of(chosen_repeats(one), other) for one, other in (halves, halves[::-1])]
         variance, paths = np.mean(judged, axis=0)
         return tuple(int(count) for count in repeats.ravel()), (float(variance), float(paths))
 
     @cached_property
-    def _shared_or_not(self) -> tuple[Effort, bool]:
+    def _shared_or_not(self) -> tuple[SampleCost, bool]:
         """What light over several surfaces takes, and whether it is shared."""
-        plain, tracer = self.effort("indirect"), self._sharing.indirect
+        plain, tracer = self.sample_cost("indirect"), self._sharing.indirect
         if not plain.noise.error or not isinstance(tracer, NeighbourTracer) or not tracer.shares():
             return plain, False
         samples = max(1, self._closer[1] // SHARED_COST)
         seen = [tracer.trace(integer(seed, "shared"), 0, samples) for seed in self.seeds]
         error = noise(self._form(self._sharing, followed=self._by_kind({"indirect": seen}), samples=samples))
         error /= self.light
-        shared = Effort(Noise(error, samples, 0.5), SHARED_COST * tracer.lanes)
+        shared = SampleCost(Noise(error, samples, 0.5), SHARED_COST * tracer.lanes)
         less = shared.variance * shared.paths < plain.variance * plain.paths
         return (shared, True) if less else (plain, False)
 
@@ -198,28 +198,28 @@ class SwitchedEffects:
         return self.sample.simulation(self.bench, replace(self.everything, shared=True))
 
     @property
-    def efforts(self) -> dict[str, Effort]:
+    def sample_costs(self) -> dict[str, SampleCost]:
         """That of every pass that is followed to one point of the sensor, and of sharp pixels where there are any."""
-        found = {name: self.effort(name) for name in _FOLLOWED}
+        found = {name: self.sample_cost(name) for name in _FOLLOWED}
         tracer = self.simulation.sharp
-        return {**found, "sharp": self._sharp_effort(tracer.lanes)} if tracer else found
+        return {**found, "sharp": self._sharp_cost(tracer.lanes)} if tracer else found
 
-    def _sharp_effort(self, lanes: int) -> Effort:
+    def _sharp_cost(self, lanes: int) -> SampleCost:
         """That of pixels that are traced apart, their rate being that of stratified rays."""
         samples = self.sample.sharp(self.simulation)
         error = noise(self._form(self.simulation, sharp=self.sharp))
         relative = error / self.light if self.light else 0.0
-        return Effort(Noise(relative, samples, SHARP_RATE), lanes)
+        return SampleCost(Noise(relative, samples, SHARP_RATE), lanes)
 
     @cached_property
     def _noise(self) -> dict[str, tuple[float, int, int]]:
-        """Error of a look by each tracer, the look's samples, and paths of one."""
+        """Error of a replicate by each tracer, the replicate's samples, and paths of one."""
         found = {}
         for name, each in self.simulation.passes.items():
             if name in _FOLLOWED:
                 first = self.followed[name], self.sample.followed
-                looks, samples = self._closer if name == "indirect" else first
-                frames = self._form(self.simulation, followed=self._by_kind({name: looks}), samples=samples)
+                replicates, samples = self._closer if name == "indirect" else first
+                frames = self._form(self.simulation, followed=self._by_kind({name: replicates}), samples=samples)
                 found[name] = noise(frames), samples, each.tracer.lanes
         return found
 
@@ -240,7 +240,7 @@ class SwitchedEffects:
         return simulation.direct.trace_looks(self.seeds, self.sample.direct)
 
     def _follow(self, simulation: Simulation, name: str) -> list[Deposits]:
-        """Light of the pass ``name``, look by look."""
+        """Light of the pass ``name``, replicate by replicate."""
         tracer = PASSES[name].tracer(simulation)
         if tracer is None:
             return [Deposits.none()] * LOOKS
@@ -248,12 +248,14 @@ class SwitchedEffects:
 
     @staticmethod
     def _by_kind(followed: dict[str, list[Deposits]]) -> dict[str, list[Deposits]]:
-        """Light of several tracers together by its kind, look by look."""
-        looks = [Deposits.joined(looks) for looks in zip(*followed.values(), strict=True)]
-        return {name: [look.where(look.kind == kind) for look in looks] for name, kind in KINDS.items()}
+        """Light of several tracers together by its kind, replicate by replicate."""
+        replicates = [Deposits.joined(replicates) for replicates in zip(*followed.values(), strict=True)]
+        return {
+            name: [replicate.where(replicate.kind == kind) for replicate in replicates] for name, kind in KINDS.items()
+        }
 
     def _sharp(self, simulation: Simulation) -> list[Deposits]:
-        """Light of pixels that are traced apart, look by look."""
+        """Light of pixels that are traced apart, replicate by replicate."""
         tracer, samples = simulation.sharp, self.sample.sharp(simulation)
         if tracer is None:
             return []
@@ -267,7 +269,8 @@ class SwitchedEffects:
         sharp: Sequence[Deposits] = (),
         samples: int | None = None,
     ) -> FloatArray:
-        """Frames of light look by look, where there is any; ``samples`` of followed light, if not as many as of all."""
+        """Frames of light replicate by replicate, where there is any; ``samples`` of followed light, if not as many as
+        of all."""
         sample, known, physics = self.sample, self._known, simulation.physics
         light, few = emitted(physics, sample.lighting), samples or sample.followed
         grids = simulation.grids
@@ -276,9 +279,9 @@ class SwitchedEffects:
         if physics.interreflection:
             parts.append((grids["indirect"], followed.get("indirect", ()), few))
         frames = np.zeros((LOOKS, len(light), *sample.shape))
-        for grid, looks, count in parts:
-            if any(look.value.size for look in looks):
-                frames += sample.frames(grid, looks, count, light, known)
+        for grid, replicates, count in parts:
+            if any(replicate.value.size for replicate in replicates):
+                frames += sample.frames(grid, replicates, count, light, known)
         lamps = followed.get("ambient", ())
         if physics.lamps and lamps:
             frames += sample.lamps(simulation.ambient["fine"], lamps, few, known)
@@ -286,6 +289,6 @@ class SwitchedEffects:
         return frames if glint is None else frames + np.tensordot(light[:, glint.classes], glint.irradiance, 1)
 
 
-def _indirect_of(looks: Sequence[Deposits]) -> list[Deposits]:
-    """Indirect light in ``looks``, look by look."""
-    return [light.where(light.kind == records.INDIRECT) for light in looks]
+def _indirect_of(replicates: Sequence[Deposits]) -> list[Deposits]:
+    """Indirect light in ``replicates``, replicate by replicate."""
+    return [light.where(light.kind == records.INDIRECT) for light in replicates]

@@ -42,13 +42,13 @@ for name in ("plain", "veiled"):
     light = trace_light(bench, plan, lighting, 0)
     write_light(folder / f"{name}.h5", light)
     grown = next_samples(light.simulation, light.samples, {each: float(each == "veil") for each in light.samples}, 2.0)
-    effort = result.efforts["veil"]
+    sample_cost = result.sample_costs["veil"]
     found[name] = {
         "plan": plan.payload(),
         "samples": dict(light.samples),
         "grown": grown,
-        "noise": effort.noise.error,
-        "paths": effort.paths,
+        "noise": sample_cost.noise.error,
+        "paths": sample_cost.paths,
         "seconds": tracing_seconds(result, plan.settings, FIXED)["veil"],
         "reached": light.reached,
     }
