@@ -188,7 +188,7 @@ class Simulation(Tracers):
 
     # ---- Frames
 
-    def filed(self, groups: Sequence[LightEstimate], first: int) -> tuple[list[Filed], list[Filed]]:
+    def with_optics(self, groups: Sequence[LightEstimate], first: int) -> tuple[list[Filed], list[Filed]]:
         """Light of the projector and ambient light, with the optics that form their frames.
 
         Parameters
@@ -209,7 +209,7 @@ class Simulation(Tracers):
         Parameters
         ----------
         groups, first
-            as for :meth:`filed`.
+            as for :meth:`with_optics`.
         bands
             of which it is, where not of all.
         """
@@ -280,7 +280,7 @@ def expected_of(
         as for :meth:`Simulation.expected`.
     """
     light = emitted(parts[0][0].physics, lighting, leaking)
-    filed = [simulation.filed(groups, len(rows)) for simulation, groups in parts]
+    filed = [simulation.with_optics(groups, len(rows)) for simulation, groups in parts]
     lights, ambient = ([each for part in filed for each in part[kind]] for kind in (0, 1))
     glint = parts[-1][0].glint_frames(lighting.labels)
     return ExpectedFrames(lights, Lighting(rows, light), seed, ambient, glint, probed)

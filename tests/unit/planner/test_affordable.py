@@ -15,7 +15,7 @@ from mitsim.planner.choose import (
     accuracies,
     accuracy_for_time,
     cheapest,
-    told,
+    time_warnings,
 )
 from tests.unit.planner.invented_evidence import EVIDENCE
 
@@ -85,7 +85,7 @@ def test_where_nothing_is_kept_time_alone_counts(seconds: float) -> None:
 
 def test_too_little_time_is_told(bought: list[AccuracyForTime]) -> None:
     assert bought[0].accuracy == HIGHEST_ACCURACY and not bought[0].fits
-    [line] = told(bought[0], 0.01, 2.0)
+    [line] = time_warnings(bought[0], 0.01, 2.0)
     assert line.startswith("0.01 seconds are too few: even accuracy 0.3")
     assert f"{bought[0].seconds + 2.0:.1f} s" in line
-    assert not [*told(bought[3], 1.0, 2.0)]
+    assert not [*time_warnings(bought[3], 1.0, 2.0)]
