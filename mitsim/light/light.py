@@ -125,7 +125,7 @@ class SampledLight:
         relative Monte Carlo error of the frames that were checked; ``reached`` tells whether it met the target.
     samples
         of each group, by the name of the pass; empty where nobody kept them.
-    frame_check
+    looked
         what the last look at its error found.
     known_truth
         :attr:`apparent`, where it was traced with that of other lines.
@@ -142,7 +142,7 @@ class SampledLight:
     sampling_error: float
     reached: bool
     samples: Mapping[str, int] = field(default_factory=dict)
-    frame_check: FrameCheck | None = None
+    looked: FrameCheck | None = None
     known_truth: Truth | None = None
 
     def __repr__(self) -> str:
@@ -206,8 +206,8 @@ class SampledLight:
         """
         rows = self.rows_of(lighting)
         probed = (
-            self.frame_check.at(self, rows, lighting.weights.shape[1])
-            if self.frame_check and seed == self.seed
+            self.looked.at(self, rows, lighting.weights.shape[1])
+            if self.looked and seed == self.seed
             else None
         )
         return self.simulation.expected(self.groups, rows, lighting, seed, leaking, probed)
@@ -450,7 +450,7 @@ def _check(light: SampledLight, parts: Parts, lighting: Lighting, followed: bool
     light = replace(light, sampling_error=error)
     if whole and expected.probed is not None:
         found = FrameCheck(light.groups, light.simulation, light.rows_of(lighting), expected.probed)
-        light = replace(light, frame_check=found)
+        light = replace(light, looked=found)
     by_part = np.concatenate([noise.reshape(len(parts), -1, len(light.groups)) for noise in expected.noise], axis=1)
     variances = dict(zip(parts, shares_of_bound(by_part.sum(axis=1)).tolist(), strict=True))
     if not whole:

@@ -183,19 +183,19 @@ def test_what_a_look_finds_is_used_again(bench: Bench, plan: Plan, family: Light
     """Frames of looked-at light state the errors of frames that nobody looked at before; of other light, shots with
     other classes, or other signs they do not. (Planted: the look's products, times two, and a look for any light.)"""
     light = trace_light(bench, plan, family, 3)
-    frame_check = light.frame_check
-    assert frame_check is not None
+    looked = light.looked
+    assert looked is not None
     pairs, other = Lighting(family.labels // 2, np.eye(8)), light.behind(bench)
     unlit = Lighting(family.labels, np.hstack([family.weights, np.ones((16, 1))]))  # a class that no pixel has
     cases = [(light, family, 3), (light, pairs, 3), (light, family, 4), (light.merged(), family, 3), (other, family, 3)]
     cases.append((light, unlit, 3))
     for which, shots, seed in cases:
-        plain = replace(which, frame_check=None).frames(shots, seed)
+        plain = replace(which, looked=None).frames(shots, seed)
         for found, known in zip(which.frames(shots, seed), plain, strict=True):
             assert np.array_equal(found.irradiance, known.irradiance)
             assert found.variance == pytest.approx(known.variance, rel=1e-9)
     assert [
-        frame_check.at(which, which.rows_of(shots), shots.weights.shape[1]) is not None for which, shots, _ in cases
+        looked.at(which, which.rows_of(shots), shots.weights.shape[1]) is not None for which, shots, _ in cases
     ] == [
         True,
         False,
@@ -255,18 +255,18 @@ def test_light_that_is_divided_lies_where_it_lay(bench: Bench, plan: Plan) -> No
 
 
 @pytest.mark.parametrize(
-    ("bounds", "frame_check"), [([3, 1, 1, 0], [2, 0]), ([1, 2, 1, 0], [2, 0, 1, 3]), ([1, 1, 3, 0], [2])]
+    ("bounds", "looked"), [([3, 1, 1, 0], [2, 0]), ([1, 2, 1, 0], [2, 0, 1, 3]), ([1, 1, 3, 0], [2])]
 )
 def test_lines_are_looked_at_from_the_noisiest_until_one_is_not_good_enough(
-    monkeypatch: pytest.MonkeyPatch, bounds: list[float], frame_check: list[int]
+    monkeypatch: pytest.MonkeyPatch, bounds: list[float], looked: list[int]
 ) -> None:
     """Noise of 2, 1 and 3 in 4 of their light, and a dark line; 2 is enough. (Planted: no end; the quietest first.)"""
     lines: list[Any] = [SimpleNamespace(flux=np.full(3, 4.0), flux_error=np.full(3, noise)) for noise in (2, 1, 3)]
     lines.append(SimpleNamespace(flux=np.zeros(3), flux_error=np.zeros(3)))
     monkeypatch.setattr(module, "_check", lambda light, line, *_: module._Check(light, bounds[line], {}))
     seen = module._checks(lines, lambda line: line, Lighting.uniform(1), False, 2.0)
-    assert list(seen) == frame_check
-    assert all(seen[line].light is lines[line] and seen[line].bound == bounds[line] for line in frame_check)
+    assert list(seen) == looked
+    assert all(seen[line].light is lines[line] and seen[line].bound == bounds[line] for line in looked)
     assert len(module._checks(lines, lambda line: line, Lighting.uniform(1), False, math.inf)) == 4
 
 
