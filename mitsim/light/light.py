@@ -205,11 +205,7 @@ class SampledLight:
             for shots that split a class of the light.
         """
         rows = self.rows_of(lighting)
-        probed = (
-            self.looked.at(self, rows, lighting.weights.shape[1])
-            if self.looked and seed == self.seed
-            else None
-        )
+        probed = self.looked.at(self, rows, lighting.weights.shape[1]) if self.looked and seed == self.seed else None
         return self.simulation.expected(self.groups, rows, lighting, seed, leaking, probed)
 
     @checked

@@ -287,10 +287,11 @@ class _Table:
 
     def candidate(self, index: int) -> Candidate:
         """The choice of a row."""
+        evidence = self.evidence
         lacking = {
-            "light over sharp lobes": self.evidence.unresolved,
-            "light over mirrors or curved glass both ways, or once and a sharp lobe (left out)": self.evidence.left_out,
-            "light over small mirrors alone (not resolved)": self.evidence.glint,
+            "light over sharp lobes": evidence.unresolved,
+            "light over mirrors or curved glass both ways, or once and a sharp lobe (left out)": evidence.left_out,
+            "light over small mirrors alone (not resolved)": evidence.glint,
         }
         missing = min(sum(lacking.values()), 1.0)
         # Errors of the light that is there count for its part of all.
