@@ -223,8 +223,8 @@ class _Words:
         among = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
         rule = (
             f"{self.evidence.glint:.2g} of the light comes over the scene's mirrors and curved glass alone "
-            f"({among}; this is the first), in beams too fine to be placed on the sensor: it is left out, or in the wrong pixels; "
-            "use fewer or larger ones, move them apart, or make them rough"
+            f"({among}; this is the first), in beams too fine to be placed on the sensor: it is left out, or in the "
+            "wrong pixels; use fewer or larger ones, move them apart, or make them rough"
         )
         return str(mirrors[0].refusal("shape", repr(mirrors[0].attributes.get("type", "")), rule))
 
@@ -232,8 +232,8 @@ class _Words:
         """What is lost over a ``mirror`` or curved glass."""
         rule = (
             f"{self.evidence.left_out:.2g} of the light comes over it and, besides, a mirror, curved glass or a "
-            "sharp lobe, where paths find it never or too seldom, so all or most of it is left out of the frames; turn it "
-            "away, make it rough, or give the projector a lens (aperture_radius_mm) with the effect interreflection"
+            "sharp lobe, where paths find it never or too seldom, so all or most of it is left out of the frames; turn "
+            "it away, make it rough, or give the projector a lens (aperture_radius_mm) with the effect interreflection"
         )
         return str(mirror.refusal("shape", repr(mirror.attributes.get("type", "")), rule))
 
