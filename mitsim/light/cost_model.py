@@ -164,22 +164,8 @@ class Numbers:
         occluded, raster_cells
             as above.
         """
-        anchors, layers, cells, followed, occluded_anchors, width, coarse_cells, all_layers = counts
-        return cls(
-            anchors,
-            layers,
-            cells,
-            followed,
-            occluded_anchors,
-            width,
-            coarse_cells,
-            all_layers,
-            waves=float(in_waves(effects)),
-            indirect=float("interreflection" in effects),
-            mixed=float(MIXING in effects),
-            occluded=float(occluded),
-            raster_cells=float(raster_cells),
-        )
+        on = in_waves(effects), "interreflection" in effects, MIXING in effects
+        return cls(*counts, *map(float, (*on, occluded, raster_cells)))  # type: ignore[arg-type]
 
     @classmethod
     def of(cls, settings: Settings) -> Numbers:

@@ -207,8 +207,8 @@ class Look:
         if run == "cells":
             self.fine = DirectRuns(bench, base, sample, self.accuracy, seed)
         elif run == "effects":
-            frame_check = bench, self._everything, sample, seed, self.fine.judging, self.accuracy
-            self.switched = EffectRuns(*frame_check)
+            judged = self.fine.judging, self.accuracy
+            self.switched = EffectRuns(bench, self._everything, sample, seed, *judged)
         elif run == "followed":
             tolerance, lit = self._tolerance(_OF_FOLLOWED), self.switched.received > 0
             self.followed = FollowedRuns(bench, self._everything, sample, tolerance, seed, self.fine.judging, lit=lit)

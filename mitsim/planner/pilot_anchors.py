@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from mitsim.light.passes import Simulation
 from mitsim.light.pilot_result import LOOKS, Noise, Part, SampleCost
 from mitsim.light.settings import Settings
 from mitsim.planner.pilot_direct import shown_pixels, tracer_of
-from mitsim.planner.pilot_samples import EVEN_CELLS, Sample, coarsened, heavy_paths, known, ladder, noise, norm
+from mitsim.planner.pilot_samples import EVEN_CELLS, Sample, coarsened, heavy_paths, ladder, noise, norm
 from mitsim.transport.records import Deposits
 
 _JUDGE = 2
@@ -76,6 +76,8 @@ class AnchorRuns:
         self.bench, self.base, self.sample, self.tolerance = bench, base, sample, tolerance
         self.layers, self._lit = layers, lit
         self._seeds = [integer(seed, "pilot", self._stream, replicate) for replicate in range(LOOKS)]
+        self._frames: Callable[[int], FloatArray] = cache(self._at_anchors)
+        self._beyond_mean: Callable[..., FloatArray] = cache(self._in_cells)
         self._choose(sample)
 
     def _choose(self, sample: Sample) -> None:
@@ -91,7 +93,7 @@ class AnchorRuns:
     @cached_property
     def changes(self) -> dict[Part, FloatArray]:
         """Change of the frames by every number of anchors that was tried, and by coarse cells for what they see."""
-        return {**self._until(self.tolerance), **coarsened(self._pass.name, self._in_cells, self.layers)}
+        return {**self._until(self.tolerance), **coarsened(self._pass.name, self._coarsened, self.layers)}
 
     @property
     def of_few(self) -> dict[Part, FloatArray]:
@@ -108,12 +110,11 @@ class AnchorRuns:
         relative = noise(self._beyond_mean()) / light if light else 0.0
         return {self._pass.name: SampleCost(Noise(relative, self._samples, 0.5), self._lanes)}
 
-    def _in_cells(self, cells: int, layers: tuple[float, ...]) -> FloatArray:
+    def _coarsened(self, cells: int, layers: tuple[float, ...]) -> FloatArray:
         coarse = {"coarse_cells": cells, "coarse_layers": bool(layers), "layers": layers}
         return self._beyond_mean(**coarse) if cells > 1 or layers else self._beyond_mean()
 
-    @known
-    def _beyond_mean(self, **cells: Any) -> FloatArray:
+    def _in_cells(self, **cells: Any) -> FloatArray:
         """Frames of what a few anchors see beyond their mean, in such ``cells``."""
         return self._beyond(self._simulation(self.few, **cells), self._few, None if cells else self._frames(self.few))
 
@@ -135,8 +136,7 @@ class AnchorRuns:
         """Light to a few anchors, replicate by replicate."""
         return self._traced(self._simulation(self.few))
 
-    @known
-    def _frames(self, anchors: int) -> FloatArray:
+    def _at_anchors(self, anchors: int) -> FloatArray:
         simulation = self._simulation(anchors)
         return self._formed(self._grids(simulation), self._few if anchors == self.few else self._traced(simulation))
 
@@ -246,8 +246,7 @@ class FollowedRuns(AnchorRuns):
         tracers = _tracers(self._simulation(self.few))
         return [tracer.trace_looks(self._seeds, self._samples) for tracer in tracers]
 
-    @known
-    def _frames(self, anchors: int) -> FloatArray:
+    def _at_anchors(self, anchors: int) -> FloatArray:
         simulation, samples = self._simulation(anchors), self._samples
         grids, tracers = self._grids(simulation), _tracers(simulation)
         if anchors == self.few:

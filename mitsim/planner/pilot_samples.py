@@ -8,8 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import wraps
-from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -26,7 +24,6 @@ from mitsim.optics.shadow import Places
 from mitsim.transport.from_camera import FromCameraTracer, Together
 from mitsim.transport.records import AMBIENT, Deposits
 
-_Method = TypeVar("_Method", bound=Callable[..., Any])
 Known = dict[Hashable, tuple[Sequence[Deposits], FloatArray]]
 """Frames that were formed, with the light that they show."""
 _SHOTS, _MOST_SHOTS, _SHOWN = 4, 16, 1024
@@ -64,20 +61,6 @@ _UNKNOWN_GAIN = 0.5
 """What a step leaves of the one before where that is not known, or not small."""
 GOOD_ENOUGH = 0.3
 """Part of the accuracy below which a finer step is not tried: its square is a tenth of the budget's."""
-
-
-def known(method: _Method) -> _Method:
-    """A ``method`` that remembers for each object what it returned for which arguments."""
-
-    @wraps(method)
-    def remembering(self: Any, *counts: Any, **cells: Any) -> Any:
-        found = vars(self).setdefault(f"known {method.__name__}", {})
-        key = counts, tuple(sorted(cells.items()))
-        if key not in found:
-            found[key] = method(self, *counts, **cells)
-        return found[key]
-
-    return cast("_Method", remembering)
 
 
 @dataclass(frozen=True)
