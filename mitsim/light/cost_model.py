@@ -106,7 +106,7 @@ _FILED = 0.2
 """What tracing takes more for each further line: 0.15 of a mono capture's seconds, 0.3 of one line's (three lines of
 photograph, benchmarks/colour.py)."""
 _PASSED = 0.4
-"""A place of a ledger, which is emptied and looked through, over an entry of light that is filed (corner in three
+"""A place of a ledger, which is emptied and looked through, over an entry of light that is accumulated (corner in three
 lines: 4e-9 s)."""
 SHARED_COST = 6
 """Paths that a path of shared indirect light takes as long as: corner 5.7, cookie_bag 3.4."""
@@ -367,8 +367,8 @@ def tracing_seconds(evidence: Evidence, settings: Settings, costs: UnitCosts) ->
 
 
 def traced_for(lines: int, parted: bool = False) -> float:
-    """Times what one line takes that tracing and filing take for so many ``lines`` on the same paths, or on paths of
-    their own where glass has ``parted`` them."""
+    """Times what one line takes that tracing and accumulating take for so many ``lines`` on the same paths, or on paths
+    of their own where glass has ``parted`` them."""
     return lines if parted else 1 + _FILED * (lines - 1)
 
 

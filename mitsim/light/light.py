@@ -282,9 +282,9 @@ def trace_light(
     seed
         root of the random streams.
     sampling
-        target, filing and streams.
+        target, accumulation and streams.
     progress
-        told how near the target is.
+        is called with how near the target is.
     """
     (light,) = trace_lines(bench, (bench,), plan, lighting, seed, sampling, progress)
     return light

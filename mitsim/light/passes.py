@@ -274,14 +274,14 @@ def expected_of(
     Parameters
     ----------
     parts
-        simulations of one rig, each with the light that it filed; black pixels leak as the first says, glint is that of
-        the last.
+        simulations of one rig, each with the light that it accumulated; black pixels leak as the first says, glint is
+        that of the last.
     rows, lighting, seed, leaking, probed
         as for :meth:`Simulation.expected`.
     """
     light = emitted(parts[0][0].physics, lighting, leaking)
-    filed = [simulation.with_optics(groups, len(rows)) for simulation, groups in parts]
-    lights, ambient = ([each for part in filed for each in part[kind]] for kind in (0, 1))
+    formed = [simulation.with_optics(groups, len(rows)) for simulation, groups in parts]
+    lights, ambient = ([each for part in formed for each in part[kind]] for kind in (0, 1))
     glint = parts[-1][0].glint_frames(lighting.labels)
     return ExpectedFrames(lights, Lighting(rows, light), seed, ambient, glint, probed)
 

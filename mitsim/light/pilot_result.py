@@ -75,8 +75,8 @@ class Noise:
 
 @dataclass(frozen=True)
 class SampleCost:
-    """What one kind of light takes: its noise relative to all light, paths in a sample, and seconds to trace and file a
-    path, 0 where nobody has timed it."""
+    """What one kind of light takes: its noise relative to all light, paths in a sample, and seconds to trace and
+    accumulate a path, 0 where nobody has timed it."""
 
     noise: Noise
     paths: int

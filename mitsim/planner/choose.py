@@ -43,7 +43,8 @@ _MARGIN = 0.95
 """Part of the accuracy that is planned for: frames that the pilot looks at differ from all by a few percent, and so do
 shots whose error is seen, where it is not that of all."""
 _MOST_ENTRIES = 2.0**25
-"""Entries of one group's filed light beyond which settings are not chosen: 12 GB in all (`mitsim.planner.memory`)."""
+"""Entries of one group's accumulated light beyond which settings are not chosen: 12 GB in all
+(`mitsim.planner.memory`)."""
 _LUCKY = -1.0
 """Standard errors below an estimate at which what keeps no accuracy for certain may still keep it: one case in six."""
 _AS_GOOD = 1.1
@@ -81,7 +82,7 @@ class Candidate:
     fits
         whether the total is within the accuracy, but for what nothing could make up for.
     work
-        seconds at fixed paces.
+        seconds at fixed unit costs.
     """
 
     settings: Settings
@@ -156,7 +157,7 @@ class Candidates:
         return min(found, key=lambda each: each[0].rank(each[1]))
 
     def seconds(self, accuracy: float) -> tuple[float, bool]:
-        """Seconds at fixed paces of that choice and of its truth, and whether it keeps the ``accuracy``."""
+        """Seconds at fixed unit costs of that choice and of its truth, and whether it keeps the ``accuracy``."""
         table, index = self.best(accuracy)
         truth = truth_seconds(self.evidence, table.settings(index), FIXED)
         return float(table.work[index]) + truth, bool(table.fits[index])
@@ -431,19 +432,19 @@ class _Table:
 
     @cached_property
     def _entries(self) -> FloatArray:
-        """(m,) of one group's filed light."""
+        """(m,) of one group's accumulated light."""
         pixels, classes = self.evidence.sample_costs["direct"].paths, self.evidence.forming.classes
         found = entries(pixels, classes, self.numbers, self.samples)
         return np.asarray(found) + np.zeros(len(self.rows))
 
     @cached_property
     def work(self) -> FloatArray:
-        """(m,) seconds at fixed paces."""
+        """(m,) seconds at fixed unit costs."""
         tracing = sum(self.samples[name] * price for name, price in self._work_of_sample.items())
         forming = self.evidence.forming
-        filing = accumulation_seconds(forming, self.numbers, self._entries, FIXED)
+        accumulating = accumulation_seconds(forming, self.numbers, self._entries, FIXED)
         shown = optics_seconds(forming, self.numbers, FIXED) + checking_seconds(forming, self.numbers, FIXED)
-        return np.asarray(tracing + filing + shown)
+        return np.asarray(tracing + accumulating + shown)
 
 
 def _variance(kind: SampleCost) -> Number:
@@ -512,7 +513,8 @@ a thirtieth of what sensors tell, and ladders of anchors and cells end near it."
 
 @dataclass(frozen=True)
 class AccuracyForTime:
-    """An ``accuracy``, the ``seconds`` that its run is predicted to take at fixed paces, and whether that ``fits``."""
+    """An ``accuracy``, the ``seconds`` that its run is predicted to take at fixed unit costs, and whether that
+    ``fits``."""
 
     accuracy: float
     seconds: float

@@ -46,7 +46,7 @@ _FEW_WAVELENGTHS = 2
 """Mean width of a mask's openings below which scalar waves, and shadows, are a guess: half the openings of codes and of
 random masks are one feature, which is half the mean and a wavelength then."""
 _VAGUE = 2.0
-"""An estimate whose bound is above this much of it is told as a bound."""
+"""An estimate whose bound is above this much of it is reported as a bound."""
 
 
 @dataclass(frozen=True)

@@ -26,10 +26,11 @@ _ENTRY_BYTES = 45.0
 """An entry of a sparse matrix of light (12), the sum that it is added to, and what frames are formed of; measured 32 to
 45 where matrices are large."""
 _DEPOSIT_BYTES = 500.0
-"""A path's light while it is filed in one cell or two; measured."""
+"""A path's light while it is accumulated in one cell or two; measured."""
 _PATH_BYTES, _PART_BYTES = 200.0, 75.0
-"""The same where it is shared between more: the light of a path that is filed, and of one that is traced meanwhile (74
-each); and each cell's part of it, its place, row and light, sorted (64; 382 in all for four, glossy balls)."""
+"""The same where it is shared between more: the light of a path that is accumulated, and of one that is traced
+meanwhile (74 each); and each cell's part of it, its place, row and light, sorted (64; 382 in all for four, glossy
+balls)."""
 _TERM_BYTES = 3 * 16.0
 """A pixel and cell of a term of a mask of many: both sides in the shadow, stacked, and picked for a frame."""
 _EXPOSED = 6
@@ -103,18 +104,18 @@ def frames_cost(
 
 
 def light_bytes(bench: Apparatus, classes: int, settings: Settings, lines: int = 1) -> float:
-    """Memory of tracing light, and of filing it.
+    """Memory of tracing light, and of accumulating it.
 
     Parameters
     ----------
     bench, settings
         what is simulated.
     classes
-        of projector pixels, that light is filed by.
+        of projector pixels, that light is accumulated by.
     lines
         that share the paths: the light of each is held.
     """
-    filed = float(entries(bench.n**2, classes, Numbers.of(settings), settings))
+    held = float(entries(bench.n**2, classes, Numbers.of(settings), settings))
     paths = Simulation(bench, settings).paths_at_once
     followed = bool(settings.effects & names(lambda effect: effect.followed))
     geometry, cells = bench.geometry, bench.n * max(settings.subdivision, settings.coarse_cells) * settings.anchors
@@ -125,13 +126,13 @@ def light_bytes(bench: Apparatus, classes: int, settings: Settings, lines: int =
             0.0 if settings.raster else factors,
             raster_bytes(geometry.model_copy(update={"mask_cells": settings.raster_cells}), bench.waves),
         )
-    held = lines * GROUPS * filed * _ENTRY_BYTES + min(lines, workers()) * paths * deposit_bytes(settings)
+    held = lines * GROUPS * held * _ENTRY_BYTES + min(lines, workers()) * paths * deposit_bytes(settings)
     return factors + _LANES_BYTES + _FOLLOWED_BYTES * followed + held
 
 
 def deposit_bytes(settings: Settings) -> float:
-    """Memory of a path's light while it is filed with these ``settings``: that of sharp pixels lies in four cells of
-    two layers at most."""
+    """Memory of a path's light while it is accumulated with these ``settings``: that of sharp pixels lies in four cells
+    of two layers at most."""
     parts = min(len(settings.depths), 2) * (4 if settings.sharp else 1)
     return max(_DEPOSIT_BYTES, _PATH_BYTES + parts * _PART_BYTES)
 

@@ -146,7 +146,7 @@ class Look:
         vars(self).pop("evidence", None)
 
     def work(self, run: str) -> float:
-        """Work of repeating a ``run``, in seconds at fixed paces; infinite where it has all the samples it may."""
+        """Work of repeating a ``run``, in seconds at fixed unit costs; infinite where it has all the samples it may."""
         now, finer = self.samples[run], self._finer(run)
         if (finer.fine, finer.direct) == (now.fine, now.direct):
             return math.inf
@@ -179,7 +179,7 @@ class Look:
 
     @property
     def seconds(self) -> float:
-        """What the look took, about, at fixed paces."""
+        """What the look took, about, at fixed unit costs."""
         repeats = [work / FINER for work in map(self.work, RUNS) if math.isfinite(work)]
         return max(_OVER_WORK * sum(repeats) - _LESS_S, 0.0)
 
@@ -411,7 +411,7 @@ def _equal(values: FloatArray) -> float:
 # -------- How far from the axis light comes
 
 _CONNECTIONS = 2**16
-"""Connections that look for near surfaces, some 10 ms; what they overlook is counted when the light is filed."""
+"""Connections that look for near surfaces, some 10 ms; what they overlook is counted when the light is accumulated."""
 _FLAT = 1e-4
 """Relative distance of the nearest light from the mean below which the scene is flat: single precision is 1e-7."""
 

@@ -55,7 +55,7 @@ _FARTHEST = 1e-4
 
 
 class DirectRuns:
-    """Direct light in many samples a cell, filed in different ways.
+    """Direct light in many samples a cell, accumulated in different ways.
 
     Parameters
     ----------
@@ -187,8 +187,8 @@ class DirectRuns:
         """What a shadow on a raster leaves of a frame, without diffraction and with it."""
         simulation = Simulation(self.bench, self.base)
         bundle, geometry = simulation.grids["fine"].bundle, self.bench.geometry
-        filed = bundle.file(self._deposits[0], self.sample.lighting.labels, self.sample.fine)
-        shot = sparse.csr_array(self.sample.lighting.weights[:1]) @ filed[: self.sample.lighting.weights.shape[1]]
+        light = bundle.file(self._deposits[0], self.sample.lighting.labels, self.sample.fine)
+        shot = sparse.csr_array(self.sample.lighting.weights[:1]) @ light[: self.sample.lighting.weights.shape[1]]
         light = shot.toarray().reshape(bundle.anchors, bundle.cells[0], bundle.anchors, bundle.cells[1])
 
         def drawn(spectrum: Spectrum | None) -> Drawn:
@@ -359,7 +359,8 @@ _TRIAL, _LARGEST_TRIAL = 16, 2**21
 _AFFORDABLE = 2.0**29
 """Connections, some 100 s, beyond which sharp lobes are left unresolved, and said to be."""
 _LOOKS = 64
-"""Rays of each pixel that tell which directions its light comes from; what they overlook is counted when filed."""
+"""Rays of each pixel that tell which directions its light comes from; what they overlook is counted when it is
+accumulated."""
 
 
 def sharp_pixels(

@@ -49,7 +49,7 @@ _CLOSER = 16
 """Times the samples of a replicate that a closer replicate takes at most: its standard errors are a quarter; of four,
 they were as large as before in half of the cases (cookie_bag, corner)."""
 _SHARP_PATHS = 2**18
-"""Paths of sharp pixels in one replicate: each is filed in four cells, again and again."""
+"""Paths of sharp pixels in one replicate: each is accumulated in four cells, again and again."""
 _MOST_SHARP = 256
 """Samples of a sharp pixel in a replicate: its error is then 3e-3 (plates of roughness 1e-3 and 1e-4)."""
 _OCCLUDED, _MOST_OCCLUDED, _FEWEST_OCCLUDED = 2**9, 2**11, 4
@@ -101,7 +101,7 @@ class Sample:
 
     @property
     def rows(self) -> Labels:
-        """Class of each row of light that is filed by class."""
+        """Class of each row of light that is accumulated by class."""
         return np.arange(self.lighting.weights.shape[1])
 
     @property

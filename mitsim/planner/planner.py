@@ -41,12 +41,13 @@ _LONGER = 2.0
 """Seconds of a second, finer look over those of the first (photograph 1.0, corner 1.1, gift_card 1.3, cookie_bag 2.6 at
 a tenth of the accuracy)."""
 _REHEARSED = 2**16
-"""Paths that tell a tracer's pace at first: a tenth of a second or less."""
+"""Paths that tell a pass's unit cost at first: a tenth of a second or less."""
 _SELDOM = 3.0
 """What knowing for certain saves at most, over what a closer look may take for it: the look seldom turns out as hoped
 (corner and cookie_bag at 1e-3: four looks of 1 to 13 s, and no run was the faster for them)."""
 _MORE, _OF_ALL = 4, 0.1
-"""Times as many paths as before that tell a pace, or noise, next, and the part of all planned that they are at most."""
+"""Times as many paths as before that tell a unit cost, or noise, next, and the part of all planned that they are at
+most."""
 _LEAST_SLOPE = 0.25
 """Part of a path's seconds in a launch that are its own at least, whatever shorter launches seem to say."""
 _HEAVY_PATHS, _MOST_HEAVY_PATHS = 2**19, 2**23
@@ -57,8 +58,8 @@ _FEW, _FEWEST = 8.0, 4.0
 tell nothing of its samples: ten glossy balls of alpha 0.005 need a hundred times those planned, one time in ten."""
 _LEAST, _MOST = 0.7, 5.0
 """Times the planned work on heavy paths that a run takes in nine cases of ten where more are met: sampling begins with
-0.8 of it (:mod:`mitsim.light.light`), at a pace known to a tenth (93, 99, 100 and 95 % of 400 pilots and runs, drawn
-from 1.3e8 paths of balls of alpha 0.02, 0.05 and 0.1 and of a torus)."""
+0.8 of it (:mod:`mitsim.light.light`), at a unit cost known to a tenth (93, 99, 100 and 95 % of 400 pilots and runs,
+drawn from 1.3e8 paths of balls of alpha 0.02, 0.05 and 0.1 and of a torus)."""
 _HEAVIER = 1.25
 """Tracing that takes so many times as long as planned is planned anew; less is what predictions are good to."""
 
@@ -112,7 +113,7 @@ def plan_within(
 ) -> Plan:
     """The plan of the finest accuracy whose run is predicted to end within so many seconds.
 
-    Predicted at fixed paces, looking and opening the scene included: the same seconds mean the same plan.
+    Predicted at fixed unit costs, looking and opening the scene included: the same seconds mean the same plan.
 
     Parameters
     ----------
@@ -155,7 +156,7 @@ def _refuse_unfit(bench: Apparatus, switches: Mapping[str, bool]) -> None:
 
 
 def _decided(runs: pilot.Look, accuracy: float, switches: Mapping[str, bool]) -> Plan:
-    """The plan at an ``accuracy`` of what a ``runs`` found, with the paces of its choice measured."""
+    """The plan at an ``accuracy`` of what ``runs`` found, with the unit costs of its choice measured."""
     evidence, bench = runs.evidence, runs.bench
     chosen = cheapest(accuracy, evidence, switches)
     if evidence.sharp is not None and Simulation(bench, chosen.settings).from_camera is not None:
@@ -173,7 +174,7 @@ def _decided(runs: pilot.Look, accuracy: float, switches: Mapping[str, bool]) ->
 def _with_heavy_paths(
     runs: pilot.Look, accuracy: float, chosen: Candidate, switches: Mapping[str, bool]
 ) -> tuple[Evidence, Candidate]:
-    """What a ``runs`` found, and ``chosen`` with samples for rare paths over gloss where these make most of the noise.
+    """What ``runs`` found, and ``chosen`` with samples for rare paths over gloss where these make most of the noise.
 
     Whether the first samples of a run meet such paths is chance, and where they do not, nothing in it tells that their
     light is missing. So sampling begins with what looks of ever more paths ask for, the last of a part of the run's.
