@@ -212,6 +212,9 @@ def sample_costs(evidence: Evidence, effects: frozenset[str]) -> dict[str, Sampl
     return {name: sample_cost for name, sample_cost in found if PASSES[name].called_for(effects)}
 
 
+# -------- Forming frames, and checking their error
+
+
 def _by_fft(forming: Forming, numbers: Numbers) -> bool:
     """Whether frames are correlations, as they must be or as was chosen."""
     return bool(numbers.raster_cells) or forming.correlated[bool(numbers.waves)]
@@ -341,6 +344,9 @@ def tells_all(classes: int, shots: int, pixels: float) -> bool:
         of the family, and a side of the sensor.
     """
     return classes <= MOST_CHECKED and mixes(classes, shots, pixels)
+
+
+# -------- Tracing, accumulating and the truth
 
 
 def tracing_seconds(evidence: Evidence, settings: Settings, costs: UnitCosts) -> dict[str, float]:

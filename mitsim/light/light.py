@@ -261,6 +261,9 @@ class SampledLight:
         return self.apparent.reflectance
 
 
+# -------- Tracing until the error meets its target
+
+
 def trace_light(
     bench: Apparatus,
     plan: Plan,
@@ -392,6 +395,9 @@ def _flux(estimates: Sequence[LightEstimate], like: FloatArray) -> list[FloatArr
     return [np.zeros_like(like) if each.flux is None else each.flux for each in estimates]
 
 
+# -------- Checks of the error, by the frames of some shots
+
+
 @dataclass(frozen=True)
 class _Check:
     """A ``light`` with the Monte Carlo error of the frames, what that is below at 95 %, and what each part of the light
@@ -485,6 +491,9 @@ def _unchecked(light: SampledLight, lighting: Lighting, checked: Lighting) -> tu
     ratios = every.sum() / some.sum(), (bound_of(every, 1.0) / bound_of(some, 1.0)) ** 2
     error, bound = (math.sqrt(max(ratio / _BY_CHANCE, 1.0)) for ratio in ratios)
     return error, bound
+
+
+# -------- A view for people
 
 
 def pinhole_view(bench: Apparatus, board_reflectance: float, seed: int) -> FloatArray:
