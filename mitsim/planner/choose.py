@@ -205,6 +205,9 @@ def value_of_refining(accuracy: float, evidence: Evidence, switches: Mapping[str
     return lucky.work if lucky.fits else 0.0, worst
 
 
+# -------- Predictions of many candidates
+
+
 class _Table:
     """Predictions of many choices with the same effects.
 

@@ -122,6 +122,9 @@ def _limits(bench: Apparatus, waves: bool) -> Iterator[str]:
         )
 
 
+# -------- A plan, and what it says of its choice
+
+
 def decide(
     accuracy: float,
     evidence: Evidence,
