@@ -235,12 +235,13 @@ def _product_seconds() -> float:
 
 
 def shown_pixels(settings: Settings, sample: Sample) -> Labels:
-    """Projector pixels that the shots of a ``sample`` show, but for those that are traced apart."""
+    """Projector pixels that the shots of a ``sample`` show, but for those that ``settings`` trace apart."""
     return np.setdiff1d(sample.shown, settings.sharp.pixels) if settings.sharp else sample.shown
 
 
 def tracer_of(simulation: Simulation, pixels: Labels, anchors: int, spread: bool = False) -> DirectTracer:
-    """Direct light of some projector ``pixels`` to every anchor, or ``spread`` over the sensor."""
+    """Traces direct light of some projector ``pixels`` in a ``simulation`` to so many ``anchors``, or ``spread`` over the
+    sensor."""
     loaded, physics = simulation.bench.loaded, simulation.physics
     parts = loaded.scene, loaded.camera, physics.projector, anchors, physics.geometry
     return DirectTracer(*parts, spread=spread, pixels=pixels)
