@@ -120,7 +120,7 @@ class Group:
 
 
 def trace_groups(groups: Sequence[Group], wanted: Mapping[str, int]) -> None:
-    """Trace until all ``groups`` have so many samples as are ``wanted`` of each pass by its name, and accumulate them."""
+    """Trace until all ``groups`` have as many samples as are ``wanted`` of each pass by its name, accumulated."""
     with Behind[Accumulation](lambda accumulation: accumulation()) as accumulating:
         for group in groups:
             group.trace(wanted, accumulating)

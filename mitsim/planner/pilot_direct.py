@@ -240,7 +240,7 @@ def shown_pixels(settings: Settings, sample: Sample) -> Labels:
 
 
 def tracer_of(simulation: Simulation, pixels: Labels, anchors: int, spread: bool = False) -> DirectTracer:
-    """Traces direct light of some projector ``pixels`` in a ``simulation`` to so many ``anchors``, or ``spread`` over the
+    """What traces direct light of some projector ``pixels`` of a ``simulation`` to ``anchors``, or ``spread`` over the
     sensor."""
     loaded, physics = simulation.bench.loaded, simulation.physics
     parts = loaded.scene, loaded.camera, physics.projector, anchors, physics.geometry
