@@ -240,8 +240,15 @@ def shown_pixels(settings: Settings, sample: Sample) -> Labels:
 
 
 def tracer_of(simulation: Simulation, pixels: Labels, anchors: int, spread: bool = False) -> DirectTracer:
-    """What traces direct light of some projector ``pixels`` of a ``simulation`` to ``anchors``, or ``spread`` over the
-    sensor."""
+    """What traces direct light of some projector pixels.
+
+    Parameters
+    ----------
+    simulation, pixels
+        what is simulated, and the pixels' numbers.
+    anchors, spread
+        to so many anchors a side, or spread over the sensor.
+    """
     loaded, physics = simulation.bench.loaded, simulation.physics
     parts = loaded.scene, loaded.camera, physics.projector, anchors, physics.geometry
     return DirectTracer(*parts, spread=spread, pixels=pixels)
