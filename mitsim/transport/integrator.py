@@ -1,17 +1,24 @@
-"""What paths from the projector and paths from the camera share: launches, who finds which light, how they end."""
+"""The path loop: from a scene, and where paths start and connect, to the light that they bring to the camera.
+
+Paths from the projector (:mod:`mitsim.transport.indirect`, and with common vertices :mod:`~mitsim.transport.path_reuse`)
+and from the camera (:mod:`~mitsim.transport.from_camera`) go through one loop, :class:`PathIntegrator`. Direct light
+(:mod:`~mitsim.transport.direct`) does not: of its points no direction is drawn, it is split where a surface lets it
+pass, and its random numbers are others.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from copy import copy
+from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 
-from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT, Deposits, Sightings
+from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT, Deposits
 from mitsim.transport.transmission import Passage
 
 if TYPE_CHECKING:
@@ -20,7 +27,7 @@ if TYPE_CHECKING:
     from mitsim.transport.projector import ProjectorOptics
 
 KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT, "ambient": AMBIENT})
-"""Kinds of light by their names in a walk."""
+"""Kinds of light by their names in the loop."""
 LANES_PER_LAUNCH = 2**22
 """Paths of one kernel: at some 100 bytes of state each, 0.4 GB; and a launch's fixed cost is small beside its work."""
 _TOGETHER, _ALL = 4, 2**30
@@ -42,7 +49,7 @@ finite only while rho^2 < chance. A chance of 0.95 at most lost 10 % of the ligh
 ANY = 2**31
 """More surfaces than any path meets; one more fits 32 bits."""
 _LEAST_CHANCE = 1e-6
-"""Strength is divided by no less than this: paths of chance 0 have ended, and 1/0 must not be worked out for them."""
+"""Throughput is divided by no less than this: paths of chance 0 have ended, and 1/0 must not be worked out for them."""
 
 
 def launches(
@@ -77,22 +84,6 @@ def _seeds(few: Sequence[int], samples: int, sample: mi.UInt32) -> tuple[mi.UInt
         look += dr.select(sample >= before * count, mi.UInt32(1), 0)
     seeds = mi.UInt32([*few, *[0] * (_TOGETHER - len(few))])
     return dr.gather(mi.UInt32, seeds, look), sample - look * count
-
-
-def camera_part(pdf: mi.Float) -> mi.Float:
-    """Part of the light over the last turn before the sensor that is followed from the camera; the rest is connected.
-
-    ``pdf`` [1/sr] is that of sampling the turn from the camera's side, which both sides know, so the parts add up to
-    one. A connection to a lobe sharper than ``_SHARP`` keeps ``_SHARP / pdf`` of its light: it is bounded however sharp
-    the lobe. What is matt is never followed from the camera.
-    """
-    return dr.select(pdf > _SHARP, 1 - _SHARP * dr.rcp(pdf), 0)
-
-
-def is_delta(sample: mi.BSDFSample3f) -> mi.Bool:
-    """Whether the direction of ``sample`` is a mirror's, reflected or refracted."""
-    mirror = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
-    return (sample.sampled_type & mirror) != 0
 
 
 class Tracer(ABC):
@@ -191,124 +182,213 @@ class FollowingTracer(Tracer):
         return again
 
 
-class Walk(ABC):
-    """The paths of one launch, a lane each: the first surface apart, and all others in a loop of one kernel.
+# -------- The path loop
 
-    Of each kind of light one connection a path is kept. ``STATE`` names the attributes that change on the way; the
-    first tells which paths still go on. ``straight`` are those that have only passed surfaces so far
-    (:mod:`mitsim.transport.transmission`): their light is direct light's own. ``anchor`` is the row and the column of that
-    which each path is followed to.
+
+@dataclass(kw_only=True)
+class PathState:
+    """A buffer of paths under way, one entry a path.
+
+    Attributes
+    ----------
+    active
+        which paths still go on.
+    ray
+        toward their next vertex.
+    rng
+        random numbers of each.
+    sightings
+        light that is kept of each, by its kind in :data:`KINDS`.
+    throughput
+        part of their light, or of their weight, that is left.
+    depth
+        vertices that turned them, mirrors with them.
+    scattered
+        those of them that are no mirrors.
+    straight
+        which have only passed surfaces so far (:mod:`mitsim.transport.transmission`): theirs is direct light's own.
     """
 
-    STATE: ClassVar[tuple[str, ...]]
-
     active: mi.Bool
-    strength: mi.Spectrum
-    bounce: mi.UInt32
-    straight: mi.Bool
+    ray: mi.Ray3f
     rng: mi.PCG32
-    anchor: tuple[mi.UInt32, mi.UInt32]
+    sightings: Any
+    throughput: mi.Spectrum = field(default_factory=lambda: mi.Spectrum(1))
+    depth: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
+    scattered: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
+    straight: mi.Bool = field(default_factory=lambda: mi.Bool(True))
 
-    def __init__(
-        self,
-        passage: Passage,
-        mirrors: bool,
-        interreflection: bool,
-        orders: tuple[int, int] | None = None,
-        by_line: bool = False,
-    ) -> None:
-        """Paths before their first surface.
 
-        Parameters
-        ----------
-        passage
-            the scene, and what light passes in it.
-        mirrors, interreflection
-            paths over delta reflections and transmissions, and over other surfaces.
-        orders
-            of :class:`FollowingTracer`; None: all.
-        by_line
-            whether light is told apart by line.
-        """
-        self.passage, self.scene, self.straight = passage, passage.scene, mi.Bool(True)
-        self.mirrors, self.interreflection = mirrors, interreflection
-        self.by_line = by_line
-        self.kept = {kind: Sightings.none(by_line) for kind in KINDS}
-        self._orders = [dr.opaque(mi.UInt32, order) for order in orders or ()]
+State = TypeVar("State", bound=PathState)
+
+
+@dataclass
+class Turn:
+    """Where paths go on from a vertex: the sample of its BSDF, whether it only passes the surface, and whether a mirror
+    turns it."""
+
+    sample: mi.BSDFSample3f
+    passing: mi.Bool
+    delta: mi.Bool
+
+
+@dataclass(frozen=True, eq=False)
+class PathRules:
+    """Which paths are followed.
+
+    Attributes
+    ----------
+    passage
+        the scene, and what light passes in it.
+    mirrors, interreflection
+        paths over delta reflections and transmissions, and over other surfaces.
+    orders
+        of :class:`FollowingTracer`; None: all.
+    by_line
+        whether light is told apart by line.
+    """
+
+    passage: Passage
+    mirrors: bool
+    interreflection: bool
+    orders: tuple[int, int] | None = None
+    by_line: bool = False
+
+
+class PathIntegrator(ABC, Generic[State]):
+    """The paths of one launch, followed from vertex to vertex: the first apart, all others in a loop of one kernel.
+
+    A subclass says where paths start, what light they bring from a vertex, and whose light they carry: the projector's
+    (``IMPORTANCE``), or that which the camera sees.
+    """
+
+    IMPORTANCE: ClassVar[bool]
+
+    first_turn: mi.Point2f | None = None
+    """Point that the first turn is drawn by, in place of a random one."""
+    reach: int = 1
+    """How many more surfaces that are no mirrors turn the light of a path that goes on, at least."""
+
+    def __init__(self, rules: PathRules) -> None:
+        self.rules, self.passage, self.scene = rules, rules.passage, rules.passage.scene
+        self.followed = rules.mirrors or rules.interreflection or rules.passage.open
+        self._orders = [dr.opaque(mi.UInt32, order) for order in rules.orders or ()]
+
+    def follow(self, paths: State) -> State:
+        """``paths`` at their end, all light of them kept."""
+        self.vertex(paths, first=True)
+        return self.follow_on(paths) if self.followed else paths
+
+    def follow_on(self, paths: State) -> State:
+        """The same from later vertices than the first."""
+
+        def further(paths: State) -> tuple[State]:
+            self.vertex(paths, first=False)
+            return (paths,)
+
+        return dr.while_loop((paths,), lambda paths: paths.active, further)[0]  # type: ignore[no-any-return]
+
+    def vertex(self, paths: State, first: bool) -> None:
+        """The next vertex of all ``paths``: their ``first``, or a later one."""
+        # ---- Surface interaction: to the first one rays of neighbours go side by side, in half the time of others
+        si = self.scene.ray_intersect(paths.ray, mi.RayFlags.All, first, paths.active)
+
+        # ---- Lights that paths have run into
+        self.run_into(paths, si, first)
+        paths.active &= si.is_valid()
+
+        # ---- Connections to the sensor, or to lights
+        self.connect(paths, si, first)
+
+        # ---- On to the next vertex
+        if self.followed:
+            self.scatter(paths, si, first)
+
+    def scatter(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
+        """Turn paths as the BSDF of their vertex says, and end some of them."""
+        # ---- BSDF sample; the connection may have looked at the surface from elsewhere
+        toward, rules = -paths.ray.d, self.rules
+        si.wi = si.to_local(toward)
+        number, point = paths.rng.next_float32(), mi.Point2f(paths.rng.next_float32(), paths.rng.next_float32())
+        if first and self.first_turn is not None:
+            point = self.first_turn
+        mode = mi.TransportMode.Importance if self.IMPORTANCE else mi.TransportMode.Radiance
+        sample, value = si.bsdf().sample(mi.BSDFContext(mode), si, number, point, paths.active)
+        onward, weight = si.to_world(sample.wo), mi.unpolarized_spectrum(value)
+        passing, mirrored = self.passage.passes(si, sample), is_delta(sample)
+        going = paths.active & (sample.pdf > 0)
+        if not rules.interreflection:
+            going &= (mirrored & rules.mirrors) | passing
+        elif not rules.mirrors:
+            going &= ~mirrored | passing
+        turn = Turn(sample, passing, mirrored & ~passing)
+        going &= self.turned(paths, si, turn, first)
+
+        # ---- Throughput
+        if self.IMPORTANCE:
+            corrected = shading_correction(si, sample.wo, onward, toward)
+            weight *= dr.select(dr.isfinite(corrected), dr.abs(corrected), 0)
+        paths.throughput *= weight
+
+        # ---- Russian roulette; chains of mirrors are short and full of light, and what only passes a surface goes on
+        paths.depth += dr.select(passing, mi.UInt32(0), mi.UInt32(1))
+        if not first:
+            chain = paths.scattered == 0
+            if self.IMPORTANCE:
+                chain &= turn.delta
+            carried = dr.minimum(dr.max(paths.throughput), _LONGEST)
+            chance = dr.select((chain & (paths.depth < _MIRRORS)) | passing, 1, carried)
+            going &= paths.rng.next_float32() < chance
+            paths.throughput *= dr.rcp(dr.maximum(chance, _LEAST_CHANCE))
+        paths.active = going & (dr.max(paths.throughput) > 0)
+
+        # ---- Order of the light, and the next ray
+        paths.scattered += dr.select(turn.delta | passing, mi.UInt32(0), mi.UInt32(1))
+        if self._orders:
+            paths.active &= paths.scattered + self.reach <= self._orders[1]
+        if first or self.passage.open:
+            paths.straight &= passing
+        paths.ray = self.passage.leaving(si, onward)
+
+    def run_into(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
+        """Keep light that paths have run into on their way to ``si``; none from the projector's side."""
 
     @abstractmethod
-    def vertex(self, first: bool) -> None:
-        """Find the next surface of every path (its ``first`` or a later one), connect it, and leave it."""
+    def connect(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
+        """Keep light that the vertices at ``si`` send to the sensor, or along their paths to it."""
 
-    def _keep(self, kind: str, seen: Sightings) -> None:
-        """Keep light of one connection a path, or that of an earlier one of its kind, which then stands for both."""
-        self.kept[kind] = self.kept[kind].joined_by(seen, self.rng.next_float32())
+    def turned(self, paths: State, si: mi.SurfaceInteraction3f, turn: Turn, first: bool) -> mi.Bool:
+        """Note a ``turn`` at ``si``; tells which paths may go on."""
+        return mi.Bool(True)
 
-    def _wanted(self, order: mi.UInt32) -> mi.Bool:
+    def wanted(self, order: mi.UInt32) -> mi.Bool:
         """Whether light of an ``order`` is kept."""
         if not self._orders:
             return mi.Bool(True)
         fewest, most = self._orders
         return (order >= fewest) & (order <= most)
 
-    def _goes_on(self, least: mi.UInt32) -> mi.Bool:
-        """Whether a path may bring light that is kept, of which the ``least`` order is to come."""
-        return least <= self._orders[1] if self._orders else mi.Bool(True)
 
-    def _sampled(
-        self, si: mi.SurfaceInteraction3f, mode: mi.TransportMode, chosen: mi.Point2f | None = None
-    ) -> tuple[mi.BSDFSample3f, mi.Spectrum, mi.Bool]:
-        """Where each path could go on, the light it would keep, and whether such turns are followed.
+def is_delta(sample: mi.BSDFSample3f) -> mi.Bool:
+    """Whether the direction of ``sample`` is a mirror's, reflected or refracted."""
+    mirror = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
+    return (sample.sampled_type & mirror) != 0
 
-        The point ``chosen`` stands in for a random one.
-        """
-        number, point = self.rng.next_float32(), mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
-        point = point if chosen is None else chosen
-        sample, value = si.bsdf().sample(mi.BSDFContext(mode), si, number, point, self.active)
-        going = self.active & (sample.pdf > 0)
-        if not self.interreflection:
-            going &= (is_delta(sample) & self.mirrors) | self.passage.passes(si, sample)
-        elif not self.mirrors:
-            going &= ~is_delta(sample) | self.passage.passes(si, sample)
-        return sample, mi.unpolarized_spectrum(value), going
 
-    def _end_some(self, going: mi.Bool, mirrored: mi.Bool, passing: mi.Bool, first: bool) -> None:
-        """Go on with a chance: what a path still carries; but chains of mirrors are short and full of light.
+def shading_correction(
+    si: mi.SurfaceInteraction3f, local: mi.Vector3f, onward: mi.Vector3f, toward: mi.Vector3f
+) -> mi.Float:
+    """Factor of light that comes to ``si`` from ``toward`` and goes on to ``onward``, ``local`` in the shading frame:
+    light that is followed forward sees shading normals the other way round (Veach 1997, 5.3)."""
+    correction = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, onward)
+    return correction / (mi.Frame3f.cos_theta(local) * dr.dot(si.n, toward))
 
-        What only passes a surface goes on.
-        """
-        self.bounce += dr.select(passing, mi.UInt32(0), mi.UInt32(1))
-        if not first:
-            carried = dr.minimum(dr.max(self.strength), _LONGEST)
-            chance = dr.select((mirrored & (self.bounce < _MIRRORS)) | passing, 1, carried)
-            going &= self.rng.next_float32() < chance
-            self.strength *= dr.rcp(dr.maximum(chance, _LEAST_CHANCE))
-        self.active = going & (dr.max(self.strength) > 0)
 
-    def deposits(self, further: bool) -> list[Deposits]:
-        """Light on the host of every path, followed to its end or, unless ``further``, to the first surface only."""
-        self.follow(further)
-        dr.eval(self.kept)
-        return [Deposits.fetched(seen, KINDS[kind], self.anchor) for kind, seen in self.kept.items()]
+def camera_part(pdf: mi.Float) -> mi.Float:
+    """Part of the light over the last turn before the sensor that is followed from the camera; the rest is connected.
 
-    def follow(self, further: bool) -> None:
-        """Follow every path to its end or, unless ``further``, to the first surface only."""
-        self.vertex(first=True)
-        if further:
-            self._follow_on()
-
-    def _follow_on(self) -> None:
-        """Follow every path from where it is."""
-        self._load(dr.while_loop(self._values(), lambda *values: values[0], self._body, labels=self.STATE))
-
-    def _body(self, *values: object) -> tuple[object, ...]:
-        self._load(values)
-        self.vertex(first=False)
-        return self._values()
-
-    def _values(self) -> tuple[object, ...]:
-        return tuple(getattr(self, name) for name in self.STATE)
-
-    def _load(self, values: tuple[object, ...]) -> None:
-        for name, value in zip(self.STATE, values, strict=True):
-            setattr(self, name, value)
+    ``pdf`` [1/sr] is that of sampling the turn from the camera's side, which both sides know, so the parts add up to
+    one. A connection to a lobe sharper than ``_SHARP`` keeps ``_SHARP / pdf`` of its light: it is bounded however sharp
+    the lobe. What is matt is never followed from the camera.
+    """
+    return dr.select(pdf > _SHARP, 1 - _SHARP * dr.rcp(pdf), 0)

@@ -15,8 +15,7 @@ however broad they are.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -26,8 +25,8 @@ from mitsim.core.arrays import FloatArray
 from mitsim.devices.camera import CameraGeometry
 from mitsim.transport.connect import sampled_wavelengths
 from mitsim.transport.connection import LensHit
-from mitsim.transport.from_camera import CameraWalk, FromCameraTracer, Paths
-from mitsim.transport.integrator import camera_part
+from mitsim.transport.from_camera import CameraPaths, CameraState, FromCameraTracer, Paths
+from mitsim.transport.integrator import Turn, camera_part
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.records import DIRECT, INDIRECT, CellGrid, Deposits, Sightings
 from mitsim.transport.sampler import panchromatic, streams
@@ -120,63 +119,60 @@ class _LeftOutTracer(FromCameraTracer):
     """Light that a lens would bring, filed under shapes: that which no connection finds as indirect light, that over a
     mirror and a lobe as direct light, with what a connection brings in the row's stead."""
 
-    def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
-        return _LeftOutWalk(self, seed, sample, lane).deposits(further=True)
+    def _paths(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> _LeftOutPaths:
+        return _LeftOutPaths(self, seed, sample, lane)
 
 
-class _LeftOutWalk(CameraWalk):
-    """Paths from the camera that only running into the lens can end.
+@dataclass(kw_only=True)
+class _LeftOutState(CameraState):
+    """``mirror`` and ``lobe`` are the last shape of either kind that a path met, ``density`` that of the turn there."""
 
-    ``mirror`` and ``lobe`` are the last shape of either kind that a path met, ``density`` that of the turn there.
-    """
+    mirror: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
+    lobe: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
+    density: mi.Float = field(default_factory=lambda: mi.Float(0))
 
-    STATE: ClassVar[tuple[str, ...]] = (*CameraWalk.STATE, "mirror", "lobe", "density")
 
-    def __init__(self, tracer: FromCameraTracer, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> None:
-        super().__init__(tracer, seed, sample, lane)
-        self.mirror, self.lobe, self.density = mi.UInt32(0), mi.UInt32(0), mi.Float(0)
-        self.rays = ProjectorRays(tracer.projector)
+class _LeftOutPaths(CameraPaths[_LeftOutState]):
+    """Paths from the camera that only running into the lens can end."""
 
-    def _connect(self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF) -> None:
+    def __init__(self, tracer: FromCameraTracer, *launch: mi.UInt32) -> None:
+        super().__init__(tracer, _LeftOutState, *launch)
+        self._rays = ProjectorRays(tracer.projector)
+
+    def connect(self, paths: _LeftOutState, si: mi.SurfaceInteraction3f, first: bool) -> None:
         """Nothing: what connections find is not left out."""
 
-    def _projector_hit(self, si: mi.SurfaceInteraction3f) -> None:
+    def hit_lens(self, paths: _LeftOutState, si: mi.SurfaceInteraction3f) -> None:
         """Light that mirrors bring from the lens to the last surface, or over a mirror and a sharp lobe."""
-        lost = self._foreign & self.by_delta
-        once = self.active & (self.surfaces == 2) & (self.in_mirror != self.by_delta)
-        met = once & (camera_part(self.density) > 0)
-        hit = self.connector.hit(self.ray, si.t, self.rng, lost | met, self.since)
-        light, none = self._radiance(hit.radiance), mi.Float(0)
-        missed = dr.select(hit.met & lost, light * self.part, 0)
-        self._keep("indirect", Sightings.of(missed, self.by_line, self.mirror, none, none, none))
+        lost = self.foreign(paths) & paths.by_delta
+        once = paths.active & (paths.scattered == 1) & (paths.in_mirror != paths.by_delta)
+        met = once & (camera_part(paths.density) > 0)
+        hit = self.connector.hit(paths.ray, si.t, paths.rng, lost | met, paths.since)
+        light, none, by_line = self.irradiance(paths, hit.radiance), mi.Float(0), self.rules.by_line
+        missed = dr.select(hit.met & lost, light * paths.part, 0)
+        self.join(paths, "indirect", Sightings.of(missed, by_line, paths.mirror, none, none, none))
         met &= hit.met
-        in_mirror = panchromatic(light) * self.density / hit.pdf
-        connected = dr.select(met, dr.select(self.in_mirror, in_mirror, self._lit(hit)), 0)
-        seen = Sightings.of(dr.select(met, light, 0), self.by_line, self.lobe, connected, none, none)
-        self._keep("direct", seen)
+        in_mirror = panchromatic(light) * paths.density / hit.pdf
+        connected = dr.select(met, dr.select(paths.in_mirror, in_mirror, self._lit(paths, hit)), 0)
+        self.join(paths, "direct", Sightings.of(dr.select(met, light, 0), by_line, paths.lobe, connected, none, none))
 
-    def _lit(self, hit: LensHit) -> mi.Float:
+    def _lit(self, paths: _LeftOutState, hit: LensHit) -> mi.Float:
         """What a connection of the projector's side, from the first surface to the sensor, brings [W m^-2]."""
         grid = self.tracer.grid
-        flux = self.rays.flux(hit.pixel, self.ray.wavelengths)
+        flux = self._rays.flux(hit.pixel, paths.ray.wavelengths)
         # The path's weight without its part of the view; its first surface is at 1 / (inverse depth * slope).
         view = dr.opaque(mi.Float, grid.rows.size * grid.columns.size) * dr.square(dr.square(self.slope))
-        return (
-            panchromatic(self._radiance(flux))
-            / view
-            * self.density
-            * self.slope
-            * dr.square(self.inverse_depth * self.slope)
-        )
+        distance = paths.inverse_depth * self.slope
+        return panchromatic(self.irradiance(paths, flux)) / view * paths.density * self.slope * dr.square(distance)
 
-    def _leave(self, si: mi.SurfaceInteraction3f, first: bool) -> mi.Bool:
-        passing = super()._leave(si, first)
+    def turned(self, paths: _LeftOutState, si: mi.SurfaceInteraction3f, turn: Turn, first: bool) -> mi.Bool:
+        going = super().turned(paths, si, turn, first)
         shape = dr.reinterpret_array(mi.UInt32, dr.select(si.instance != None, si.instance, si.shape))  # noqa: E711
-        turned = ~passing & ~self.by_delta
-        self.mirror = dr.select(~passing & self.by_delta, shape, self.mirror)
-        self.lobe = dr.select(turned, shape, self.lobe)
-        self.density = dr.select(turned, self.came_pdf, self.density)
-        return passing
+        turned = ~turn.passing & ~paths.by_delta
+        paths.mirror = dr.select(~turn.passing & paths.by_delta, shape, paths.mirror)
+        paths.lobe = dr.select(turned, shape, paths.lobe)
+        paths.density = dr.select(turned, paths.came_pdf, paths.density)
+        return going
 
 
 def polished_shapes(scene: mi.Scene) -> tuple[int, ...]:
