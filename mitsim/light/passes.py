@@ -25,11 +25,12 @@ from mitsim.optics.image_formation import FrameOptics, anchor_positions, anchor_
 from mitsim.optics.shadow import Places
 from mitsim.transport.accumulator import Ledger, LitSums
 from mitsim.transport.connect import SensorPoints
-from mitsim.transport.direct import AimedTracer, DirectTracer
+from mitsim.transport.direct import DirectTracer
 from mitsim.transport.from_camera import Counted, FromCameraTracer, LampTracer, Paths, Together
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.path_reuse import NeighbourTracer
 from mitsim.transport.records import DIRECT, INDIRECT, Bundle, CellGrid, Deposits, aligned_grid
+from mitsim.transport.sharp_lobes import AimedTracer
 
 _AMBIENT_NM, _AMBIENT_BANDS = (400.0, 700.0), 13
 """Ambient light: a flat spectrum of photons over what a camera with a usual filter sees, in bands of 23 nm, over which

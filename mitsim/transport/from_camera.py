@@ -32,9 +32,7 @@ import numpy as np
 from mitsim.core.spectral_manifests import MOST_LINES
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.lamps import SPECTRA_NM, Band, Response
-from mitsim.transport.connect import SensorPoints, sampled_wavelengths
-from mitsim.transport.connection import Connection, ProjectorConnector
-from mitsim.transport.coordinates import rows_columns, x_y
+from mitsim.transport.connect import Connection, ProjectorConnector, SensorPoints, sampled_wavelengths
 from mitsim.transport.integrator import (
     KINDS,
     FollowingTracer,
@@ -45,6 +43,7 @@ from mitsim.transport.integrator import (
     camera_part,
     is_delta,
 )
+from mitsim.transport.plugins.base import rows_columns, x_y
 from mitsim.transport.projector import ProjectorOptics
 from mitsim.transport.records import CellAxis, CellGrid, Deposits, Sightings
 from mitsim.transport.sampler import shuffled, stratified, streams

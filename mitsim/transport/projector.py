@@ -23,8 +23,7 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.projector import Lines
-from mitsim.transport.coordinates import Numbers, turn_and_origin
-from mitsim.transport.plugins.base import channels, lanes_of, per_lane
+from mitsim.transport.plugins.base import Numbers, channels, lanes_of, per_lane, turn_and_origin
 
 _WAVELENGTH_SETS = 8
 """Sets of four wavelengths: 15 nm apart, finer than any measured spectrum that a scene would hold."""

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
-from mitsim.transport.coordinates import turn_and_origin
+from mitsim.transport.plugins.base import turn_and_origin
 from mitsim.transport.projector import PinholeRays
 
 if TYPE_CHECKING:

@@ -69,8 +69,7 @@ from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import BoolArray, Mask
 from mitsim.devices.mask_flaws import Flaws
 from mitsim.devices.plate import Plate
-from mitsim.transport.coordinates import RIGID, rigidity_error, rows_columns, turn_and_origin, x_y
-from mitsim.transport.plugins.base import register_once
+from mitsim.transport.plugins.base import RIGID, register_once, rigidity_error, rows_columns, turn_and_origin, x_y
 from mitsim.transport.sampler import generator, shuffled, stratified
 
 PLUGIN = "mitsim_lensless"
