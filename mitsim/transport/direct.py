@@ -9,6 +9,7 @@ meets one is handed out, drawn in proportion to its light.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import drjit as dr
@@ -25,6 +26,7 @@ from mitsim.transport.integrator import LANES_PER_LAUNCH, Tracer
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.records import DIRECT, Deposits, Sightings, check_finite
 from mitsim.transport.sampler import shuffled, stratified, streams, told_apart
+from mitsim.transport.transmission import Arrival
 
 IntArray = npt.NDArray[np.int64]
 _LOBE = 2.0**8
@@ -114,45 +116,19 @@ class DirectTracer(Tracer):
         sensor = self._sensor(row, column, sample, shared, rng)
         flux = self.rays.flux(pixel, wavelengths) * spectral * (weight * share)
 
-        def seen_at(
-            si: mi.SurfaceInteraction3f,
-            direction: mi.Vector3f,
-            light: mi.Spectrum,
-            active: mi.Bool,
-            state: tuple[Sightings, mi.PCG32],
-        ) -> tuple[Sightings, mi.PCG32]:
+        def seen_at(at: Arrival, state: tuple[Sightings, mi.PCG32]) -> tuple[Sightings, mi.PCG32]:
             seen, rng = state
-            reception, received = self._received(si, direction, light, sensor, active, rng)
+            reception, received = self._connected(at, sensor)
             return seen.joined_by(reception.sightings(received, pixel, by_line), rng.next_float32()), rng
 
         by_line = self.projector.by_line
         seen, _ = self.receiver.passage.along(ray, flux, (Sightings.none(by_line), rng), seen_at)
         return seen, DIRECT, (row, column)
 
-    def _received(
-        self,
-        si: mi.SurfaceInteraction3f,
-        direction: mi.Vector3f,
-        light: mi.Spectrum,
-        sensor: mi.Point3f,
-        active: mi.Bool,
-        rng: mi.PCG32,
-    ) -> tuple[Reception, mi.UnpolarizedSpectrum]:
-        """What ``light`` that comes to surfaces in a ``direction`` brings to ``sensor`` points."""
-        del rng
-        return self._connected(si, direction, light, sensor, active)
-
-    def _connected(
-        self,
-        si: mi.SurfaceInteraction3f,
-        direction: mi.Vector3f,
-        light: mi.Spectrum,
-        sensor: mi.Point3f,
-        active: mi.Bool,
-    ) -> tuple[Reception, mi.UnpolarizedSpectrum]:
-        """The same by one connection."""
-        reception = self.receiver.receive(si, -direction, sensor, active)
-        return reception, reception.irradiance * light
+    def _connected(self, at: Arrival, sensor: mi.Point3f) -> tuple[Reception, mi.UnpolarizedSpectrum]:
+        """What light that comes to surfaces brings to ``sensor`` points."""
+        reception = self.receiver.receive(at.si, -at.direction, sensor, at.active)
+        return reception, reception.irradiance * at.light
 
     def _pair(self, seed: int | mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
         """A lane's place in the list of pixels, its anchor, and its weight."""
@@ -277,55 +253,32 @@ class FluxTracer:
         sensor, flux = self._sensor.inside(point), self._rays.flux(pixel, wavelengths) * spectral
 
         def seen_at(
-            si: mi.SurfaceInteraction3f,
-            direction: mi.Vector3f,
-            light: mi.Spectrum,
-            active: mi.Bool,
-            state: tuple[mi.UnpolarizedSpectrum, mi.PCG32],
+            at: Arrival, state: tuple[mi.UnpolarizedSpectrum, mi.PCG32]
         ) -> tuple[mi.UnpolarizedSpectrum, mi.PCG32]:
             total, rng = state
-            if turn is None:
-                return total + self._connected(si, direction, light, sensor, active), rng
-            total = total + self._turned(si, direction, light, (rng.next_float32(), turn), active)
-            return total + self._connected(si, direction, light, sensor, active), rng
+            if turn is not None:
+                total = total + self._turned(at, rng.next_float32(), turn)
+            return total + self._connected(at, sensor), rng
 
         total, _ = self._receiver.passage.along(ray, flux, (mi.UnpolarizedSpectrum(0), rng), seen_at)
         return total
 
-    def _turned(
-        self,
-        si: mi.SurfaceInteraction3f,
-        direction: mi.Vector3f,
-        light: mi.Spectrum,
-        numbers: tuple[mi.Float, mi.Point2f],
-        active: mi.Bool,
-    ) -> mi.UnpolarizedSpectrum:
-        """What ``light`` that comes to surfaces in a ``direction`` brings over turns, which ``numbers`` draw."""
-        si.wi = si.to_local(-direction)
-        context = mi.BSDFContext(mi.TransportMode.Importance)
-        turn, _ = si.bsdf().sample(context, si, *numbers, active)
-        lobe = active & (turn.pdf > 0) & ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
-        place = landing(self._receiver, si, si.to_world(turn.wo), lobe)
+    def _turned(self, at: Arrival, number: mi.Float, point: mi.Point2f) -> mi.UnpolarizedSpectrum:
+        """What light that comes to surfaces brings over turns, drawn by a ``number`` and a ``point``."""
+        turn = at.turn(number, point)
+        lobe = at.active & (turn.pdf > 0) & ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
+        place = landing(self._receiver, at.si, at.si.to_world(turn.wo), lobe)
         half = dr.opaque(mi.Float, self._sensor.half_width)
         lobe = place.arrives & (dr.abs(place.x) <= half) & (dr.abs(place.y) <= half)
-        return self._connected(si, direction, light, mi.Point3f(place.x, place.y, 0), lobe)
+        return self._connected(replace(at, active=lobe), mi.Point3f(place.x, place.y, 0))
 
-    def _connected(
-        self,
-        si: mi.SurfaceInteraction3f,
-        direction: mi.Vector3f,
-        light: mi.Spectrum,
-        point: mi.Point3f,
-        active: mi.Bool,
-    ) -> mi.UnpolarizedSpectrum:
+    def _connected(self, at: Arrival, point: mi.Point3f) -> mi.UnpolarizedSpectrum:
         """What it brings to a ``point`` of the sensor; over glossy surfaces, over 1 + A q."""
-        reception = self._receiver.receive(si, -direction, point, active)
-        value = reception.irradiance * light
+        reception = self._receiver.receive(at.si, -at.direction, point, at.active)
+        value = reception.irradiance * at.light
         if not self._glossy:
             return value
-        si.wi = si.to_local(-direction)
-        context = mi.BSDFContext(mi.TransportMode.Importance)
-        density = si.bsdf().pdf(context, si, si.to_local(reception.direction), active)
+        density = at.density(at.si.to_local(reception.direction))
         area = 4 * dr.square(dr.opaque(mi.Float, self._sensor.half_width))
         # As a spectrum: by a number, Dr.Jit would multiply with the reciprocal, which is rounded.
         share = mi.UnpolarizedSpectrum(1 + area * density * reception.solid_angle(point))

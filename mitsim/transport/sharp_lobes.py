@@ -28,6 +28,7 @@ from mitsim.transport.plugins.base import rows_columns
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.records import check_finite
 from mitsim.transport.sampler import panchromatic, stratified, streams
+from mitsim.transport.transmission import Arrival
 
 _SHARP, _LEAST_SHARP = 100.0, 10.0
 """Density [1/sr] of a turn above which its lobe counts as sharp where all turns of a pixel are, as a GGX lobe of
@@ -199,15 +200,8 @@ class _Connections(DirectTracer):
         self._of_lane = dr.gather(mi.Float, self._least, number)
         return super()._place(number, row, column, jitter)
 
-    def _connected(
-        self,
-        si: mi.SurfaceInteraction3f,
-        direction: mi.Vector3f,
-        light: mi.Spectrum,
-        sensor: mi.Point3f,
-        active: mi.Bool,
-    ) -> tuple[Reception, mi.UnpolarizedSpectrum]:
-        reception, received = super()._connected(si, direction, light, sensor, active)
+    def _connected(self, at: Arrival, sensor: mi.Point3f) -> tuple[Reception, mi.UnpolarizedSpectrum]:
+        reception, received = super()._connected(at, sensor)
         sharp = reception.pdf > self._of_lane
         return reception, dr.select(sharp == self._over_sharp, received, 0)
 
@@ -302,33 +296,21 @@ class _Lobes:
         check_finite(product)
         return number, mean, product, density
 
-    def _at(
-        self,
-        half: mi.Float,
-        least: mi.Float,
-        si: mi.SurfaceInteraction3f,
-        direction: mi.Vector3f,
-        light: mi.Spectrum,
-        active: mi.Bool,
-        state: tuple[_Met, mi.PCG32],
-    ) -> tuple[_Met, mi.PCG32]:
+    def _at(self, half: mi.Float, least: mi.Float, at: Arrival, state: tuple[_Met, mi.PCG32]) -> tuple[_Met, mi.PCG32]:
         """What a turn that is sampled at the surface meets on a sensor of a ``half`` width, over lobes of ``least``
         density."""
         met, rng = state
-        si.wi = si.to_local(-direction)
-        context = mi.BSDFContext(mi.TransportMode.Importance)
-        number, point = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
-        turn, _ = si.bsdf().sample(context, si, number, point, active)
-        density = si.bsdf().pdf(context, si, turn.wo, active)
-        active = active & (turn.pdf > 0) & (density > 0) & ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
+        turn = at.turn(rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
+        density = at.density(turn.wo)
+        active = at.active & (turn.pdf > 0) & (density > 0) & ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
         turns = dr.select(active & (density > least), mi.Float(1), 0)
-        place = landing(self.receiver, si, si.to_world(turn.wo), active)
+        place = landing(self.receiver, at.si, at.si.to_world(turn.wo), active)
         active &= place.arrives & (dr.abs(place.x) <= half) & (dr.abs(place.y) <= half)
         sensor = mi.Point3f(place.x, place.y, 0)
-        reception = self.receiver.receive(si, -direction, sensor, active)
+        reception = self.receiver.receive(at.si, -at.direction, sensor, active)
         active &= reception.pdf > least
         per_area = density * reception.solid_angle(sensor)
-        connected = dr.select(active, panchromatic(reception.irradiance * light), 0)
+        connected = dr.select(active, panchromatic(reception.irradiance * at.light), 0)
         mean = dr.select(active, connected / (4 * dr.square(half) * per_area), 0)
         return met.joined_by(_Met(mean, mean * connected, per_area, turns), rng), rng
 
@@ -497,25 +479,14 @@ class AimedTracer(DirectTracer):
         stacked = [np.stack([np.array(a), np.array(b)], axis=1) for a, b in ((jitter.y, jitter.x), (row, column))]
         return stacked[0], stacked[1], np.array(width, dtype=np.float64), np.array(valid, dtype=np.float64)
 
-    def _axis(
-        self,
-        si: mi.SurfaceInteraction3f,
-        direction: mi.Vector3f,
-        light: mi.Spectrum,
-        active: mi.Bool,
-        state: tuple[_Axis, mi.PCG32],
-    ) -> tuple[_Axis, mi.PCG32]:
+    def _axis(self, at: Arrival, state: tuple[_Axis, mi.PCG32]) -> tuple[_Axis, mi.PCG32]:
         """The axis of the first surface that turns a ray sharply."""
-        del light
         axis, rng = state
-        si.wi = si.to_local(-direction)
         # The middle of the random numbers is the middle of a lobe, or near it.
-        context = mi.BSDFContext(mi.TransportMode.Importance)
-        turn, _ = si.bsdf().sample(context, si, rng.next_float32(), mi.Point2f(0.5), active)
-        active = (
-            active & (turn.pdf > dr.opaque(mi.Float, _SHARP_AXIS)) & ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
-        )
-        place = landing(self.receiver, si, si.to_world(turn.wo), active & ~axis.known)
+        turn = at.turn(rng.next_float32(), mi.Point2f(0.5))
+        sharp = at.active & (turn.pdf > dr.opaque(mi.Float, _SHARP_AXIS))
+        sharp &= ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
+        place = landing(self.receiver, at.si, at.si.to_world(turn.wo), sharp & ~axis.known)
         # 1 / sqrt(pi q), q the density on the sensor.
         width = place.length * dr.rsqrt(dr.pi * turn.pdf * place.cosine)
         found = _Axis(place.x, place.y, width, place.arrives)

@@ -50,6 +50,27 @@ def _instanced(scene: mi.Scene) -> bool:
 
 
 @dataclass
+class Arrival:
+    """Light that comes to points of surfaces: in a ``direction``, and which samples in flight count."""
+
+    si: mi.SurfaceInteraction3f
+    direction: mi.Vector3f
+    light: mi.Spectrum
+    active: mi.Bool
+
+    def turn(self, number: mi.Float, point: mi.Point2f) -> mi.BSDFSample3f:
+        """Where it goes on, sampled as the surfaces scatter by a random ``number`` and ``point``."""
+        self.si.wi = self.si.to_local(-self.direction)
+        context = mi.BSDFContext(mi.TransportMode.Importance)
+        return self.si.bsdf().sample(context, self.si, number, point, self.active)[0]
+
+    def density(self, local: mi.Vector3f) -> mi.Float:
+        """Density [1/sr] of such a turn to ``local`` directions."""
+        self.si.wi = self.si.to_local(-self.direction)
+        return self.si.bsdf().pdf(mi.BSDFContext(mi.TransportMode.Importance), self.si, local, self.active)
+
+
+@dataclass
 class Passed:
     """Light beyond a surface: where it goes on, the part left, and the refractive index there over that before."""
 
@@ -118,11 +139,11 @@ class Passage:
         ray: mi.Ray3f,
         light: mi.Spectrum,
         state: State,
-        visit: Callable[[mi.SurfaceInteraction3f, mi.Vector3f, mi.Spectrum, mi.Bool, State], State],
+        visit: Callable[[Arrival, State], State],
     ) -> State:
         """What is made of all surfaces that rays meet one behind another, as far as these let light pass.
 
-        Rays of neighbouring lanes are taken for coherent, which are found faster.
+        Neighbouring rays are taken for coherent, which are found faster.
 
         Parameters
         ----------
@@ -131,12 +152,11 @@ class Passage:
         state
             before that.
         visit
-            of points of surfaces, the direction and the light that come to them, and the lanes that count, makes
-            another state of one.
+            of what comes to a surface, and a state, makes another state.
         """
         if not self.open:
             si = self.scene.ray_intersect(ray, mi.RayFlags.All, True)
-            return visit(si, ray.d, light, si.is_valid(), state)
+            return visit(Arrival(si, ray.d, light, si.is_valid()), state)
 
         def further(active: mi.Bool, ray: mi.Ray3f, light: mi.Spectrum, *state: object) -> tuple[object, ...]:
             si = self.next_surface(ray, active, coherent=True)
@@ -144,7 +164,7 @@ class Passage:
             # Before the visit, which may turn the surface to where it is seen from.
             passed = self.through(si, ray.d, active)
             onward = self.onward(si, passed.direction)
-            state = visit(si, ray.d, light, active, state)  # type: ignore[arg-type]
+            state = visit(Arrival(si, ray.d, light, active), state)  # type: ignore[arg-type]
             light = light * passed.part
             return active & (dr.max(light) > 0), onward, light, *state
 

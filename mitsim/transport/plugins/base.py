@@ -17,7 +17,6 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 
-
 _REGISTERED: set[tuple[str, str]] = set()
 
 
