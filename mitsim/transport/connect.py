@@ -319,10 +319,10 @@ def landing(receiver: Receiver, si: mi.SurfaceInteraction3f, direction: mi.Vecto
 # -------- Connections to the projector
 #
 # Each has the projector pixel that it used. A pinhole is the stock Mitsuba ``projector``. With a lens of finite radius,
-# a point q of the lens shows the pattern that is sharp on the focus plane: a ray from q through surface point p carries
-# the projector pixel whose image lies where the ray meets that plane. Radiance is pi scale texture / (A cos^4 theta), so
-# that a small lens of area A casts the pinhole's irradiance. A blurred spot moves each connection by a normal deviate in
-# projector pixels.
+# a point q of the lens shows the pattern that is sharp on the focus plane: a ray from q through surface point p
+# carries the projector pixel whose image lies where the ray meets that plane. Radiance is pi scale texture /
+# (A cos^4 theta), so that a small lens of area A casts the pinhole's irradiance. A blurred spot moves each connection
+# by a normal deviate in projector pixels.
 
 
 @dataclass

@@ -1,10 +1,9 @@
 """Direct light: every projector pixel's rays, followed to the first surface and on to each anchor of the sensor.
 
-A ray meets a surface at P, and P is connected to every anchor (:mod:`mitsim.transport.connect`), or to one random
-point of the sensor; those are as even as the places in the projector's pixels, and together with them. All anchors see
-the same points. Where surfaces let light pass (:mod:`mitsim.transport.transmission`), so does the ray: of the points that it
-meets one is handed out, drawn in proportion to its light.
-"""
+A ray meets a surface at P, and P is connected to every anchor (:mod:`mitsim.transport.connect`), or to one random point
+of the sensor; those are as even as the places in the projector's pixels, and together with them. All anchors see the
+same points. Where surfaces let light pass (:mod:`mitsim.transport.transmission`), so does the ray: of the points that
+it meets one is handed out, drawn in proportion to its light."""
 
 from __future__ import annotations
 
@@ -155,8 +154,8 @@ class DirectTracer(Tracer):
 
 # -------- Direct light on the sensor as a whole
 #
-# With A the sensor's area, a connection to an even point of it finds the irradiance I there; over glossy surfaces a turn
-# that is sampled as the surface scatters, and lands on the sensor with density q [1/mm^2], finds I / (A q). By the
+# With A the sensor's area, a connection to an even point of it finds the irradiance I there; over glossy surfaces a
+# turn that is sampled as the surface scatters, and lands on the sensor with density q [1/mm^2], finds I / (A q). By the
 # balance heuristic (Veach 1997, 9.2) either counts I / (1 + A q): unbiased, and bounded however sharp the lobe. Places
 # in the pixel, points of the sensor and turns are as even as each other, and independent.
 

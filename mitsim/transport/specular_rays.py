@@ -315,8 +315,8 @@ def _rows_columns(points: FloatArray) -> FloatArray:
 # -------- Curved mirrors in double precision
 #
 # A float32 place at 400 mm is good to 3e-5 mm. On a mirror ball of 1 mm that turns the normal by 3e-5, and the light by
-# half a sensor pixel; so each ray is met once more with the sphere, cylinder or triangle that it hit. Flat surfaces need
-# none of it: their normal is the same all over.
+# half a sensor pixel; so each ray is met once more with the sphere, cylinder or triangle that it hit. Flat surfaces
+# need none of it: their normal is the same all over.
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,10 +2,9 @@
 
 The hole of a cut-out (``mask``), a thin pane (``thindielectric``), a filter: their *null lobe* lets a part of the light
 go straight on as if nothing were there. Flat glass bends it, but to one way between two points only
-(:mod:`mitsim.transport.transmission`). No direction that is drawn at random tells such light from that of free space, so it is
-what it would be without the surface, weaker: direct light stays direct, and a light is looked for behind a hole as
-before it. Scenes without such surfaces keep a plain test of visibility.
-"""
+(:mod:`mitsim.transport.transmission`). No direction that is drawn at random tells such light from that of free space,
+so it is what it would be without the surface, weaker: direct light stays direct, and a light is looked for behind a
+hole as before it. Scenes without such surfaces keep a plain test of visibility."""
 
 from __future__ import annotations
 
@@ -487,8 +486,8 @@ class _Search:
 
 # -------- Surfaces in contact with what lets light through
 #
-# A ray that has passed a surface starts a little beyond it, and does not see what stands closer: a print in contact with
-# glass comes out black. Mitsuba's own integrators start 9e-5 of the coordinates beyond, 0.036 mm at 400 mm, the tracers
+# A ray that has passed a surface starts a little beyond it, and does not see what stands closer: a print in contact
+# with glass comes out black. Mitsuba's own integrators start 9e-5 of the coordinates beyond, 0.036 mm at 400 mm, the tracers
 # of this room CLEAR.
 
 _OWN, _MITSUBA = 2 * CLEAR, 1.1 * 1500 * 2.0**-24
