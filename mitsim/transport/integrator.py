@@ -1,7 +1,7 @@
 """The path loop: from a scene, and where paths start and connect, to the light that they bring to the camera.
 
-Paths from the projector (:mod:`~mitsim.transport.indirect`; with common vertices,
-:mod:`~mitsim.transport.path_reuse`) and from the camera (:mod:`~mitsim.transport.from_camera`) go through one loop, :class:`PathIntegrator`. Direct light
+Paths from the projector (:mod:`~mitsim.transport.indirect`; with common vertices, :mod:`~mitsim.transport.path_reuse`)
+and from the camera (:mod:`~mitsim.transport.from_camera`) go through one loop, :class:`PathIntegrator`. Direct light
 (:mod:`~mitsim.transport.direct`) does not: at its points no direction is drawn, it is split where a surface lets it
 pass, and its random numbers are others. Nor do specular chains, which are traced on the host in double precision
 (:mod:`~mitsim.transport.specular_rays`).

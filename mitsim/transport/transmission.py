@@ -487,8 +487,8 @@ class _Search:
 # -------- Surfaces in contact with what lets light through
 #
 # A ray that has passed a surface starts a little beyond it, and does not see what stands closer: a print in contact
-# with glass comes out black. Mitsuba's own integrators start 9e-5 of the coordinates beyond, 0.036 mm at 400 mm, the tracers
-# of this room CLEAR.
+# with glass comes out black. Mitsuba's own integrators start 9e-5 of the coordinates beyond, 0.036 mm at 400 mm, the
+# tracers of this room CLEAR.
 
 _OWN, _MITSUBA = 2 * CLEAR, 1.1 * 1500 * 2.0**-24
 """Gaps, for each mm of coordinates, that our tracers and Mitsuba's integrators still see: their own offsets, with what
