@@ -267,6 +267,9 @@ def sampled_wavelengths(camera: mi.Sensor, rng: mi.PCG32, lines: Lines | None = 
 
 
 # -------- Where light lands that leaves surfaces in known directions
+#
+# Light that is sampled from a surface goes where its lobe sends it, through flat glass bent by Snell's law, until it
+# crosses the plane of the sensor.
 
 
 @dataclass

@@ -403,6 +403,13 @@ def _place(axis: CellAxis, index: mi.UInt32, jitter: mi.Float) -> mi.Float:
 
 
 # -------- Lamps' light by their own spectra
+#
+# A path carries four wavelengths, one of each band, all at the same place in theirs. Places of a cell's paths follow a
+# scrambled Sobol sequence, so that their mean is the integral over all wavelengths, unbiased for every spectrum:
+#
+#     sum over bands of L(lambda_b) counts(lambda_b) width_b / 470 nm
+#
+# A spectrum that is 1 everywhere is 1 W m^-2 (sr^-1) over the 470 nm from 360 to 830 nm, so L / 470 nm is spectral.
 
 
 @dataclass(frozen=True, eq=False)

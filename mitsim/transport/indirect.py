@@ -356,7 +356,11 @@ def _sightings(pixel: mi.UInt32, differing: Sequence[mi.Float]) -> Sightings:
     return Sightings(value, pixel, row, column, inverse_depth, mi.UnpolarizedSpectrum(*lines) if lines else None)
 
 
-# -------- Blocks of projector pixels whose indirect light is followed more often than that of others
+# -------- Adaptive sampling: blocks of projector pixels whose light is followed more often than that of others
+#
+# From how noisy each block's light is to how many paths each takes in a sample, and from a lane to its block. With m_b
+# the second moment of a path's light, paths in proportion to sqrt(m_b) leave the least variance for their number; a
+# sample holds the mean of a block's paths, so that the light stays what it is whatever the numbers.
 
 SIDE = 4
 """Pixels a side of a block, below the 7 of usual shifting dots, whose classes then differ."""

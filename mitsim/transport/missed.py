@@ -184,6 +184,9 @@ def polished_shapes(scene: mi.Scene) -> tuple[int, ...]:
 
 
 # -------- Light of a lamp onto the sensor, over no surface
+#
+# No path runs into a point, spot or directional lamp, few run into a small one that has a surface, and no tracer
+# connects the sensor itself to either.
 
 _SENSOR_POINTS = 9
 """Points along each side of the sensor, its edges with them: things in the way are larger than an eighth of it."""

@@ -315,7 +315,14 @@ class _Lobes:
         return met.joined_by(_Met(mean, mean * connected, per_area, turns), rng), rng
 
 
-# -------- Direct light over sharp lobes
+# -------- Direct light aimed at the anchors that sharp lobes meet
+#
+# Connected to an anchor u of the sensor, light over a lobe of roughness alpha comes from a patch of some alpha r about
+# the point that mirrors the projector into u; even rays of a projector pixel seldom meet it. Where in the pixel it lies
+# is told by a few rays that are sent on along their lobes' axes, past holes and through panes: they arrive at about u0
+# + J (x - 1/2), x the place in the pixel, so x is drawn from a Cauchy density about 1/2 + J^-1 (u - u0), as wide as the
+# lobe. Any such density leaves the estimate unbiased; a part of the rays stays even, so that what the axes do not tell
+# of is found as well.
 
 _EVEN = 0.25
 """Part of the rays that stays even: light that the axes do not tell of is found four times slower than without."""

@@ -270,6 +270,17 @@ class Passage:
 
 
 # -------- Flat panes of glass
+#
+# A window, an aquarium's wall, a cover glass: between a surface and the sensor or the projector stand flat faces that
+# bend light. A straight connection misses; but for planes there is one direction that arrives, and Newton's method
+# finds it from the straight one. A ray is traced with its two differentials (Igehy 1999), which planes keep exact:
+# where it crosses the target's plane, and how the crossing moves with the direction. After three or four corrections
+# the same differentials give the solid angle dw that the target's area dA fills, seen from the point, in place of cos /
+# r^2.
+#
+# Seen from the target, the point seems to lie at distance R = (dA / dw)^(1/2) on the line that its light arrives by:
+# with this *apparent* point all else is as without glass, and light is weaker by the faces' transmittance. Reflections
+# inside of a pane are found by paths that are followed.
 
 _STEPS = 8
 """Most corrections of a ray's direction: each squares the error, so that four bring 100 mm to float32's rounding."""

@@ -6,6 +6,7 @@ as tan-angles.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
@@ -13,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
+from pydantic import BaseModel
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
@@ -43,6 +45,37 @@ def register_once(kind: str, plugin: str, build: Callable[[], type]) -> None:
     if (variant, plugin) not in _REGISTERED:
         getattr(mi, f"register_{kind}")(plugin, build())
         _REGISTERED.add((variant, plugin))
+
+
+def numbers(text: str) -> list[float]:
+    """Those of a list in a scene file, apart by commas or blanks; ValueError where one is none."""
+    return [float(word) for word in re.split(r"[\s,]+", text.strip()) if word]
+
+
+def bsdf_class() -> type:
+    """Base of our BSDFs for the variant in use.
+
+    ``name`` is the plugin's, ``model`` holds its checked parameters; without ``eval_pdf`` of its own a BSDF is a delta,
+    which no given direction meets.
+    """
+
+    class ModelBSDF(mi.BSDF):  # type: ignore[misc]
+        name: str
+        model: BaseModel
+
+        def eval_pdf(self, *turn: Any) -> tuple[mi.Spectrum, mi.Float]:
+            return mi.Spectrum(0), mi.Float(0)
+
+        def eval(self, *turn: Any) -> mi.Spectrum:
+            return self.eval_pdf(*turn)[0]
+
+        def pdf(self, *turn: Any) -> mi.Float:
+            return self.eval_pdf(*turn)[1]
+
+        def to_string(self) -> str:
+            return f"{self.name}[{self.model}]"
+
+    return ModelBSDF
 
 
 # -------- Between Dr.Jit and NumPy

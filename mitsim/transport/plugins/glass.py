@@ -35,7 +35,6 @@ Python: ``register(); mi.load_dict({"type": "mitsim_glass", "index": 1.62, "abbe
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from types import MappingProxyType
 from typing import Any, TypeVar
@@ -47,7 +46,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from mitsim.core.configuration import read_toml, shipped, validated
 from mitsim.core.errors import MitsimError
-from mitsim.transport.plugins.base import register_once
+from mitsim.transport.plugins.base import bsdf_class, numbers, register_once
 
 PLUGIN = "mitsim_glass"
 _USUAL = "n-bk7"
@@ -140,7 +139,7 @@ def _model(props: mi.Properties) -> GlassModel:
     text = values.get("sellmeier")
     if text is not None:
         try:
-            values["sellmeier"] = [float(word) for word in re.split(r"[\s,]+", str(text).strip(" []")) if word]
+            values["sellmeier"] = numbers(str(text).strip(" []"))
         except ValueError:
             raise MitsimError(f"{PLUGIN}: sellmeier: got {text!r}; give numbers separated by commas") from None
     return GlassModel.checked(**values)
@@ -171,7 +170,9 @@ def tune(scene: mi.Scene, wavelength_nm: float) -> None:
 def _bsdf_class() -> type:
     """The plugin for the variant in use: Mitsuba's base classes exist per variant."""
 
-    class DispersiveGlass(mi.BSDF):  # type: ignore[misc]
+    class DispersiveGlass(bsdf_class()):  # type: ignore[misc]
+        name = PLUGIN
+
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
             self.model = _model(props)
@@ -215,23 +216,5 @@ def _bsdf_class() -> type:
                 # Radiance over the square of the index is what a face keeps (E. Veach 1997, 5.2).
                 weight *= dr.select(reflected, 1, dr.square(eta_ti))
             return bs, mi.depolarizer(mi.Spectrum(dr.select(active & (bs.pdf > 0), weight, 0)))
-
-        def eval(
-            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> mi.Spectrum:
-            return mi.Spectrum(0)
-
-        def pdf(
-            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> mi.Float:
-            return mi.Float(0)
-
-        def eval_pdf(
-            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> tuple[mi.Spectrum, mi.Float]:
-            return mi.Spectrum(0), mi.Float(0)
-
-        def to_string(self) -> str:
-            return f"{PLUGIN}[{self.model}]"
 
     return DispersiveGlass

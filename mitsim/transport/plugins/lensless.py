@@ -281,6 +281,10 @@ def _sensor_class() -> type:
 
 
 # -------- Where a mask is open
+#
+# A mask is a sum of grids that do not overlap (mitsim.devices.mask.Mask.openings): open where both its row and its
+# column are. On each axis the open length up to a coordinate is piecewise linear and so is its inverse, which makes a
+# random number a place: whatever rows are open, those within the range are met in proportion to their length.
 
 
 class OpenAxis:
