@@ -21,7 +21,7 @@ from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Lines
 from mitsim.transport.accumulator import Ledger
 from mitsim.transport.connect import Receiver, Reception, SensorPoints, landing, sampled_wavelengths
-from mitsim.transport.integrator import LANES_PER_LAUNCH, Tracer
+from mitsim.transport.integrator import LANES_PER_LAUNCH, InFlight, Tracer
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.records import DIRECT, Deposits, Sightings, check_finite
 from mitsim.transport.sampler import shuffled, stratified, streams, told_apart
@@ -87,8 +87,8 @@ class DirectTracer(Tracer):
             as for :meth:`trace`.
         """
         for tracer in self.apart:
-            for sample, lane in self._launches(first, samples):
-                seen, _, anchor = tracer._sightings(seed, sample, lane)
+            for flight in self._in_flight([seed], first, samples):
+                seen, _, anchor = tracer._sightings(flight)
                 lights = seen.by_line(len(ledgers))
                 for place, share in ledgers[0].shares(seen, anchor):
                     for ledger, light in zip(ledgers, lights, strict=True):
@@ -96,23 +96,21 @@ class DirectTracer(Tracer):
                 dr.eval([ledger.sums for ledger in ledgers])
         return Deposits.none()
 
-    def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
-        return [Deposits.fetched(*self._sightings(seed, sample, lane))]
+    def _launch(self, flight: InFlight) -> list[Deposits]:
+        return [Deposits.fetched(*self._sightings(flight))]
 
-    def _sightings(
-        self, seed: int | mi.UInt32, sample: mi.UInt32, lane: mi.UInt32
-    ) -> tuple[Sightings, int, tuple[mi.UInt32, mi.UInt32]]:
-        """Light of each lane, its kind, and its anchor."""
-        number, anchor, share = self._pair(seed, sample, lane)
+    def _sightings(self, flight: InFlight) -> tuple[Sightings, int, tuple[mi.UInt32, mi.UInt32]]:
+        """Light of each sample, its kind, and its anchor."""
+        number, anchor, share = self._pair(flight)
         pixel = dr.gather(mi.UInt32, mi.UInt32(self._pixels), number)
         anchors = dr.opaque(mi.UInt32, self.points.anchors)
         row, column = anchor // anchors, anchor % anchors
         # Streams belong to pixels: every anchor is connected to the same points.
-        shared, rng = streams(seed, pixel, sample)
-        jitter, weight = self._place(number, row, column, stratified(sample, shared))
+        shared, rng = streams(flight.seed, pixel, flight.sample)
+        jitter, weight = self._place(number, row, column, stratified(flight.sample, shared))
         wavelengths, spectral = sampled_wavelengths(self.receiver.camera, rng, self.projector.lines)
         ray = self.rays.sample(pixel, jitter, rng, wavelengths)
-        sensor = self._sensor(row, column, sample, shared, rng)
+        sensor = self._sensor(row, column, flight.sample, shared, rng)
         flux = self.rays.flux(pixel, wavelengths) * spectral * (weight * share)
 
         def seen_at(at: Arrival, state: tuple[Sightings, mi.PCG32]) -> tuple[Sightings, mi.PCG32]:
@@ -129,17 +127,15 @@ class DirectTracer(Tracer):
         reception = self.receiver.receive(at.si, -at.direction, sensor, at.active)
         return reception, reception.irradiance * at.light
 
-    def _pair(self, seed: int | mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
-        """A lane's place in the list of pixels, its anchor, and its weight."""
-        del seed, sample
+    def _pair(self, flight: InFlight) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
+        """Place of each sample in the list of pixels, its anchor, and its weight."""
         count = dr.opaque(mi.UInt32, len(self._pixels))
-        return lane % count, lane // count, mi.Float(1)
+        return flight.index % count, flight.index // count, mi.Float(1)
 
     def _place(
         self, number: mi.UInt32, row: mi.UInt32, column: mi.UInt32, jitter: mi.Point2f
     ) -> tuple[mi.Point2f, mi.Float]:
         """Where in its pixel a ray starts, by the pixel's place in the list and the anchor, and the ray's weight."""
-        del number, row, column
         return jitter, mi.Float(1)
 
     def _sensor(

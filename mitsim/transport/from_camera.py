@@ -36,6 +36,7 @@ from mitsim.transport.connect import Connection, ProjectorConnector, SensorPoint
 from mitsim.transport.integrator import (
     KINDS,
     FollowingTracer,
+    InFlight,
     PathIntegrator,
     PathRules,
     PathState,
@@ -134,11 +135,11 @@ class FromCameraTracer(FollowingTracer):
         """Which paths are followed."""
         return PathRules(self.passage, self.paths.mirrors, self.paths.interreflection, self.orders, self.by_line)
 
-    def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
-        return self._paths(seed, sample, lane).deposits()
+    def _launch(self, flight: InFlight) -> list[Deposits]:
+        return self._paths(flight).deposits()
 
-    def _paths(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> CameraPaths[Any]:
-        return CameraPaths(self, CameraState, seed, sample, lane)
+    def _paths(self, flight: InFlight) -> CameraPaths[Any]:
+        return CameraPaths(self, CameraState, flight)
 
 
 @dataclass(kw_only=True)
@@ -183,9 +184,7 @@ class CameraPaths(PathIntegrator[State]):
 
     IMPORTANCE = False
 
-    def __init__(
-        self, tracer: FromCameraTracer, state: type[State], seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32
-    ) -> None:
+    def __init__(self, tracer: FromCameraTracer, state: type[State], flight: InFlight) -> None:
         """Paths before their first surface.
 
         Parameters
@@ -194,11 +193,11 @@ class CameraPaths(PathIntegrator[State]):
             the scene, and what is followed.
         state
             what is known of paths.
-        seed, sample, lane
-            of the random numbers, and of every path.
+        flight
+            the samples in flight.
         """
         super().__init__(tracer.rules)
-        cell, row, column = tracer.points.of(lane, tracer.grid.shape[0] * tracer.grid.shape[1])
+        cell, row, column = tracer.points.of(flight.index, tracer.grid.shape[0] * tracer.grid.shape[1])
         self.anchor = row, column
         self.tracer, self.geometry, self.connector = tracer, tracer.geometry, tracer.connector
         self.emitters, self.lens = tracer.paths.emitters, tracer.projector.aperture > 0
@@ -207,16 +206,16 @@ class CameraPaths(PathIntegrator[State]):
 
         # ---- Rays from the sensor through the cells
         grid, columns = tracer.grid, dr.opaque(mi.UInt32, tracer.grid.shape[1])
-        shared, rng = streams(seed, cell, sample)
+        shared, rng = streams(flight.seed, cell, flight.sample)
         # A path that leaves a cell's very edge could be filed in the next cell by rounding.
-        jitter = _MARGIN + (1 - 2 * _MARGIN) * stratified(sample, shared)
+        jitter = _MARGIN + (1 - 2 * _MARGIN) * stratified(flight.sample, shared)
         sensor = tracer.points.at(*self.anchor, rng)
         self.origin, nearness = rows_columns(sensor.x, sensor.y), dr.opaque(mi.Float, 1 / tracer.points.distance)
         self.row = _place(grid.rows, cell // columns, jitter.x) - self.origin[0] * nearness
         self.column = _place(grid.columns, cell % columns, jitter.y) - self.origin[1] * nearness
         squared = 1 + dr.square(self.row) + dr.square(self.column)
         self.slope = dr.rsqrt(squared)
-        wavelengths, spectral = tracer.wavelengths(rng, sample, shared)
+        wavelengths, spectral = tracer.wavelengths(rng, flight.sample, shared)
         to_world = tracer.camera.world_transform()
         direction = mi.Vector3f(*x_y(self.row, self.column), 1) * self.slope
         ray = mi.Ray3f(to_world @ sensor, to_world @ direction, 0.0, wavelengths)
@@ -239,7 +238,7 @@ class CameraPaths(PathIntegrator[State]):
 
     # ---- lights that paths run into ---------------------------------------------------------------------------------
 
-    def run_into(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
+    def _run_into(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
         """Keep light of lamps and of the projector's lens that paths have run into on their way to ``si``."""
         if first or self.rules.mirrors or self.passage.open:
             # Where the camera sees this vertex, unless an earlier one that is no mirror has settled it.
@@ -248,22 +247,22 @@ class CameraPaths(PathIntegrator[State]):
         if first:
             paths.active &= paths.inverse_depth < 1 / dr.opaque(mi.Float, self.geometry.mask_distance)
         elif self.tracer.of_projector and self.lens:
-            self.hit_lens(paths, si)
+            self._hit_lens(paths, si)
         if self.emitters:
             self._hit_lamp(paths, si)
 
-    def hit_lens(self, paths: State, si: mi.SurfaceInteraction3f) -> None:
+    def _hit_lens(self, paths: State, si: mi.SurfaceInteraction3f) -> None:
         """Keep light of the projector's lens.
 
         Over mirrors alone it is the beams' (:mod:`mitsim.transport.specular`); over one other surface, unless that is
         seen in a mirror, it is the projector's side's.
         """
-        hit = self.connector.hit(paths.ray, si.t, paths.rng, self.foreign(paths), paths.since)
+        hit = self.connector.hit(paths.ray, si.t, paths.rng, self._is_foreign(paths), paths.since)
         share = dr.select(paths.by_delta, 1, _share(paths.came_pdf, hit.pdf))
-        light = self.irradiance(paths, hit.radiance) * share
+        light = self._irradiance(paths, hit.radiance) * share
         self._keep_projector(paths, hit.met, light, hit.pixel, paths.scattered)
 
-    def foreign(self, paths: State) -> mi.Bool:
+    def _is_foreign(self, paths: State) -> mi.Bool:
         """Paths that would bring light of the projector's lens which neither beams nor the projector's side bring."""
         return paths.active & (paths.scattered > dr.select(paths.in_mirror, mi.UInt32(0), mi.UInt32(1)))
 
@@ -276,12 +275,12 @@ class CameraPaths(PathIntegrator[State]):
         unconnected = paths.by_delta | paths.behind_glass
         pdf = emitter.pdf_direction(before, ds, lamp & ~unconnected)
         share = dr.select(unconnected, 1, _share(paths.came_pdf, pdf))
-        light = self.irradiance(paths, emitter.eval(si, lamp)) * share
-        self._keep(paths, "ambient", lamp & self.wanted(paths.scattered), light, self._lamps)
+        light = self._irradiance(paths, emitter.eval(si, lamp)) * share
+        self._keep(paths, "ambient", lamp & self._is_wanted(paths.scattered), light, self._lamps)
 
     # ---- connections ------------------------------------------------------------------------------------------------
 
-    def connect(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
+    def _connect(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
         """Keep light of the projector and of lamps that surfaces send on along their paths."""
         bsdf = si.bsdf()
         if not first and self.tracer.of_projector:
@@ -299,7 +298,7 @@ class CameraPaths(PathIntegrator[State]):
             value *= _share(connection.pdf, pdf)
         else:
             value = bsdf.eval(mi.BSDFContext(), si, toward, active)
-        light = self.irradiance(paths, value * connection.weight * passed)
+        light = self._irradiance(paths, value * connection.weight * passed)
         self._keep_projector(paths, active, light, connection.pixel, paths.scattered + 1)
 
     def _connection(self, paths: State, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[Connection, mi.Spectrum]:
@@ -332,12 +331,12 @@ class CameraPaths(PathIntegrator[State]):
         value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(direction), active)
         # A path that does not go on cannot run into the lamp, so connecting is the only way to find it.
         share = dr.select(ds.delta, 1, _share(ds.pdf, pdf)) if self.rules.interreflection else 1
-        active &= self.wanted(paths.scattered + 1)
-        self._keep(paths, "ambient", active, self.irradiance(paths, value * light * passed) * share, self._lamps)
+        active &= self._is_wanted(paths.scattered + 1)
+        self._keep(paths, "ambient", active, self._irradiance(paths, value * light * passed) * share, self._lamps)
 
     # ---- turns ------------------------------------------------------------------------------------------------------
 
-    def turned(self, paths: State, si: mi.SurfaceInteraction3f, turn: Turn, first: bool) -> mi.Bool:
+    def _note_turn(self, paths: State, si: mi.SurfaceInteraction3f, turn: Turn, first: bool) -> mi.Bool:
         """Note a ``turn`` at ``si``; tells which paths may bring light that is not connected."""
         passing, pdf, going = turn.passing, turn.sample.pdf, mi.Bool(True)
         if first or self.passage.open:
@@ -356,7 +355,7 @@ class CameraPaths(PathIntegrator[State]):
 
     # ---- light that is kept -----------------------------------------------------------------------------------------
 
-    def irradiance(self, paths: State, radiance: mi.Spectrum) -> mi.UnpolarizedSpectrum:
+    def _irradiance(self, paths: State, radiance: mi.Spectrum) -> mi.UnpolarizedSpectrum:
         """What ``radiance`` of a vertex along its path casts where the path started."""
         return mi.unpolarized_spectrum(radiance) * paths.throughput * self.weight
 
@@ -368,7 +367,7 @@ class CameraPaths(PathIntegrator[State]):
     def _keep_projector(
         self, paths: State, active: mi.Bool, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32, order: mi.UInt32
     ) -> None:
-        active &= self.wanted(order)
+        active &= self._is_wanted(order)
         self._keep(paths, "direct", active & (order == 1), light * paths.part, pixel)
         if self.rules.interreflection:
             self._keep(paths, "indirect", active & (order > 1), light * paths.part, pixel)
@@ -377,9 +376,9 @@ class CameraPaths(PathIntegrator[State]):
         # Filed as the sensor's centre sees it.
         row, column = (t + s * paths.inverse_depth for t, s in zip((self.row, self.column), self.origin, strict=True))
         lit = dr.select(active, light, 0)
-        self.join(paths, kind, Sightings.of(lit, self.rules.by_line, pixel, row, column, paths.inverse_depth))
+        self._join(paths, kind, Sightings.of(lit, self.rules.by_line, pixel, row, column, paths.inverse_depth))
 
-    def join(self, paths: State, kind: str, seen: Sightings) -> None:
+    def _join(self, paths: State, kind: str, seen: Sightings) -> None:
         """Keep light of one connection a path, or that of an earlier one of its kind, which then stands for both."""
         paths.sightings[kind] = paths.sightings[kind].joined_by(seen, paths.rng.next_float32())
 
@@ -500,8 +499,8 @@ class LampTracer(FromCameraTracer):
             wavelengths = [sum(own, mi.Float(0))] * len(own)
         return type(dr.zeros(mi.Ray3f).wavelengths)(*wavelengths), mi.Spectrum(*weights)
 
-    def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
-        return [self._by_band(found) for found in super()._launch(seed, sample, lane)]
+    def _launch(self, flight: InFlight) -> list[Deposits]:
+        return [self._by_band(found) for found in super()._launch(flight)]
 
     def _by_band(self, found: Deposits) -> Deposits:
         """An entry for each band of those that were ``found``, path by path."""

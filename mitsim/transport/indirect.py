@@ -30,7 +30,15 @@ from mitsim.core.arrays import FloatArray, mean_of_neighbours
 from mitsim.devices.camera import CameraGeometry
 from mitsim.transport.accumulator import Ledger
 from mitsim.transport.connect import Receiver, SensorPoints, Way, sampled_wavelengths
-from mitsim.transport.integrator import KINDS, FollowingTracer, PathIntegrator, PathRules, PathState, camera_part
+from mitsim.transport.integrator import (
+    KINDS,
+    FollowingTracer,
+    InFlight,
+    PathIntegrator,
+    PathRules,
+    PathState,
+    camera_part,
+)
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.records import Deposits, Sightings
 from mitsim.transport.sampler import stratified, streams
@@ -88,8 +96,8 @@ class IndirectTracer(FollowingTracer):
         return len(self.turns) if self.turns else self.projector.n**2 * self.points.count
 
     @property
-    def per_lane(self) -> int:
-        """Anchors that each lane follows its path to: all of them."""
+    def connections_per_path(self) -> int:
+        """Anchors that each path is connected to: all of them."""
         return self.points.count
 
     @cached_property
@@ -113,24 +121,22 @@ class IndirectTracer(FollowingTracer):
         seed, first, samples
             as for :meth:`trace`.
         """
-        launched = [
-            tracer._paths(tracer._emission(seed, *launch)).accumulate(ledgers)
-            for tracer in self.apart
-            for launch in self._launches(first, samples)
-        ]
-        return Deposits.joined([deposits for parts in launched for deposits in parts])
+        flights = ((tracer, flight) for tracer in self.apart for flight in self._in_flight([seed], first, samples))
+        return Deposits.joined(
+            [part for tracer, flight in flights for part in tracer._paths(tracer._emission(flight)).accumulate(ledgers)]
+        )
 
-    def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
-        return self._paths(self._emission(seed, sample, lane)).deposits()
+    def _launch(self, flight: InFlight) -> list[Deposits]:
+        return self._paths(self._emission(flight)).deposits()
 
-    def _emission(self, seed: int | mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> Emission:
-        """Where each path of a launch leaves the projector; the ``lane`` tells its pixel and anchor."""
-        weight: mi.Float | float = 1.0
+    def _emission(self, flight: InFlight) -> Emission:
+        """Where each path leaves the projector."""
+        index, sample, weight = flight.index, flight.sample, 1.0
         if self.turns:
-            lane, sample, weight = self.turns.at(lane, sample)
-        pixel, row, column = self.points.of(lane, self.projector.n**2)
+            index, sample, weight = self.turns.at(index, sample)
+        pixel, row, column = self.points.of(index, self.projector.n**2)
         # Stratified where it tells most: a pixel is small, but its light goes every way from the first surface.
-        shared, rng = streams(seed, pixel, sample)
+        shared, rng = streams(flight.seed, pixel, sample)
         return Emission(pixel, (row, column), rng, stratified(sample, shared), weight)
 
     def _paths(self, emission: Emission) -> ProjectorPaths:
@@ -168,6 +174,7 @@ class ProjectorPaths(PathIntegrator[PathState]):
     IMPORTANCE = True
 
     def __init__(self, tracer: IndirectTracer, emission: Emission) -> None:
+        """Of what a ``tracer`` follows, from an ``emission``."""
         super().__init__(tracer.rules)
         self.receiver, self.pixel, self.anchor = tracer.receiver, emission.pixel, emission.anchor
         self.first_turn, rng = emission.first_turn, emission.rng
@@ -175,30 +182,35 @@ class ProjectorPaths(PathIntegrator[PathState]):
         jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
         ray = tracer.rays.sample(self.pixel, jitter, rng, wavelengths)
         self.flux = tracer.rays.flux(self.pixel, wavelengths) * spectral * emission.weight
-        connections = OneConnection if tracer.points.count == 1 else AnchorConnections
+        connections = _OneConnection if tracer.points.count == 1 else _AnchorConnections
         self.connections = connections(tracer.points, emission)
         sightings = self.connections.none(("direct", "indirect") if tracer.mirrors else ("indirect",), tracer.rules)
         self.start = PathState(active=mi.Bool(True), ray=ray, rng=rng, sightings=sightings)
 
-    def connect(self, paths: PathState, si: mi.SurfaceInteraction3f, first: bool) -> None:
+    def _connect(self, paths: PathState, si: mi.SurfaceInteraction3f, first: bool) -> None:
         """Keep light that surfaces send to the sensor; that of the ``first`` is the direct tracer's."""
         if first:
             return
-        drawn = drawn_numbers(paths.rng)
+        drawn = self._draw_numbers(paths)
 
         def connected(held: Held, number: mi.UInt32) -> None:
-            way = self.way(paths, si, self.connections.sensor(number))
-            self.keep(paths, si, way, drawn, (held, number))
+            way = self._way(paths, si, self.connections.sensor(number))
+            self._keep_light(paths, si, way, drawn, (held, number))
 
         paths.sightings = self.connections.at_each(paths.sightings, paths.active, connected)
 
-    def way(self, paths: PathState, si: mi.SurfaceInteraction3f, sensor: mi.Point3f) -> Way:
+    @staticmethod
+    def _draw_numbers(paths: PathState) -> dict[str, mi.Float]:
+        """Those that choose which connection of each kind of light is kept: the same for every anchor."""
+        return {kind: paths.rng.next_float32() for kind in ("direct", "indirect")}
+
+    def _way(self, paths: PathState, si: mi.SurfaceInteraction3f, sensor: mi.Point3f) -> Way:
         """To the sensor, for light that is kept."""
         # Light that has met nothing but what it passes is the direct tracer's.
-        active = paths.active & ~paths.straight & self.wanted(paths.scattered + 1)
+        active = paths.active & ~paths.straight & self._is_wanted(paths.scattered + 1)
         return self.receiver.way(si, sensor, active)
 
-    def keep(
+    def _keep_light(
         self,
         paths: PathState,
         si: mi.SurfaceInteraction3f,
@@ -240,18 +252,13 @@ class ProjectorPaths(PathIntegrator[PathState]):
         return self.connections.fetched(held, caustics, [ledger.sums for ledger in ledgers])
 
 
-def drawn_numbers(rng: mi.PCG32) -> dict[str, mi.Float]:
-    """Numbers that choose which connection of each kind of light is kept: the same for every anchor."""
-    return {kind: rng.next_float32() for kind in ("direct", "indirect")}
-
-
 # -------- Connections of a path: to one point of the sensor, or to every anchor
 
 Held = dict[str, Any]
 """What is kept of each kind of light."""
 
 
-class OneConnection:
+class _OneConnection:
     """Each path is connected to one point: its anchor, the sensor's centre, or a random one."""
 
     def __init__(self, points: SensorPoints, emission: Emission) -> None:
@@ -290,7 +297,7 @@ class OneConnection:
         return [Deposits.fetched(held[kind], KINDS[kind], self._anchor) for kind in kinds]
 
 
-class AnchorConnections(OneConnection):
+class _AnchorConnections(_OneConnection):
     """Each path is followed once, and connected to one anchor after the other.
 
     Each anchor's light is what it would be alone: the same random numbers choose which connection is handed out.

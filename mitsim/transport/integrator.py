@@ -75,16 +75,31 @@ def launches(
         yield mi.UInt32(index // per_sample), mi.UInt32(index % per_sample)
 
 
-def _seeds(few: Sequence[int], samples: int, sample: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
-    """Seed of each path, and the number of its sample, where ``samples`` of each of a ``few`` seeds follow each other.
+@dataclass(frozen=True, eq=False)
+class InFlight:
+    """Samples in flight, those of one kernel: of each its ``seed``, the number of its ``sample`` of that, and the
+    ``index`` of its path in the sample, which tells pixel or cell, and anchor."""
 
-    No division, and one kernel for one seed and for several.
-    """
-    count, look = dr.opaque(mi.UInt32, samples), mi.UInt32(0)
-    for before in range(1, _TOGETHER):
-        look += dr.select(sample >= before * count, mi.UInt32(1), 0)
-    seeds = mi.UInt32([*few, *[0] * (_TOGETHER - len(few))])
-    return dr.gather(mi.UInt32, seeds, look), sample - look * count
+    seed: mi.UInt32
+    sample: mi.UInt32
+    index: mi.UInt32
+
+    @classmethod
+    def of(cls, seeds: Sequence[int], samples: int, sample: mi.UInt32, index: mi.UInt32) -> InFlight:
+        """Those of a few seeds one after the other: no division, and one kernel for one seed and for several.
+
+        Parameters
+        ----------
+        seeds, samples
+            a few, and the samples of each.
+        sample, index
+            number of each among the samples of all seeds, and of its path.
+        """
+        count, number = dr.opaque(mi.UInt32, samples), mi.UInt32(0)
+        for before in range(1, _TOGETHER):
+            number += dr.select(sample >= before * count, mi.UInt32(1), 0)
+        padded = mi.UInt32([*seeds, *[0] * (_TOGETHER - len(seeds))])
+        return cls(dr.gather(mi.UInt32, padded, number), sample - number * count, index)
 
 
 class Tracer(ABC):
@@ -105,13 +120,17 @@ class Tracer(ABC):
         """Paths, or connections, of one sample."""
 
     @property
-    def per_lane(self) -> int:
-        """Paths, or connections, that each lane of a kernel stands for."""
+    def connections_per_path(self) -> int:
+        """Of those, how many each path of a kernel stands for."""
         return 1
 
-    def _launches(self, first: int, samples: int) -> Iterator[tuple[mi.UInt32, mi.UInt32]]:
-        """As :func:`launches`, ``lanes_per_launch`` paths of all lanes together."""
-        return launches(self.lanes // self.per_lane, first, samples, max(1, self.lanes_per_launch // self.per_lane))
+    def _in_flight(self, seeds: Sequence[int], first: int, samples: int) -> Iterator[InFlight]:
+        """Samples ``first`` .. ``first + samples - 1`` of a seed, or of several from the first on, one kernel's at a
+        time."""
+        each, count = samples if len(seeds) > 1 else _ALL, self.connections_per_path
+        at_once = max(1, self.lanes_per_launch // count)
+        for sample, index in launches(self.lanes // count, first, samples * len(seeds), at_once):
+            yield InFlight.of(seeds, each, sample, index)
 
     @property
     def apart(self) -> Sequence[Self]:
@@ -125,8 +144,8 @@ class Tracer(ABC):
         return again
 
     @abstractmethod
-    def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
-        """Light of the paths of one kernel, a ``seed`` for each."""
+    def _launch(self, flight: InFlight) -> list[Deposits]:
+        """Light of the paths of one kernel."""
 
     def trace(self, seed: int, first: int = 0, samples: int = 1) -> Deposits:
         """Light of some samples, their sum.
@@ -143,26 +162,21 @@ class Tracer(ABC):
         MitsimError
             when the scene sends NaN or infinite light to the camera.
         """
-        launched = [
-            tracer._launch(_seeds([seed], _ALL, sample)[0], sample, lane)
-            for tracer in self.apart
-            for sample, lane in self._launches(first, samples)
-        ]
-        return Deposits.joined([deposits for parts in launched for deposits in parts])
+        flights = ((tracer, flight) for tracer in self.apart for flight in self._in_flight([seed], first, samples))
+        return Deposits.joined([part for tracer, flight in flights for part in tracer._launch(flight)])
 
     def trace_looks(self, seeds: Sequence[int], samples: int = 1) -> list[Deposits]:
         """``samples`` as :meth:`trace` finds them for each of some ``seeds``, in as few kernels as may be."""
-        each, found, tracers = self.lanes * samples, list[Deposits](), self.apart
+        each, found = self.lanes * samples, list[Deposits]()
         together = min(self.lanes_per_launch // each, _TOGETHER)
         if together < 2:
             return [self.trace(seed, 0, samples) for seed in seeds]
         for start in range(0, len(seeds), together):
             few = seeds[start : start + together]
-            ((sample, lane),) = self._launches(0, samples * len(few))
-            launched = [tracer._launch(*_seeds(few, samples, sample), lane) for tracer in tracers]
-            parts = [deposits for of_one in launched for deposits in of_one]
-            for look in range(len(few)):
-                found.append(Deposits.joined([part.of_lanes(look * each, (look + 1) * each) for part in parts]))
+            (flight,) = self._in_flight(few, 0, samples)
+            parts = [part for tracer in self.apart for part in tracer._launch(flight)]
+            for start_of_one in range(0, each * len(few), each):
+                found.append(Deposits.joined([part.of_lanes(start_of_one, start_of_one + each) for part in parts]))
         return found
 
 
@@ -271,6 +285,7 @@ class PathIntegrator(ABC, Generic[State]):
     """How many more surfaces that are no mirrors turn the light of a path that goes on, at least."""
 
     def __init__(self, rules: PathRules) -> None:
+        """Of what ``rules`` say."""
         self.rules, self.passage, self.scene = rules, rules.passage, rules.passage.scene
         self.followed = rules.mirrors or rules.interreflection or rules.passage.open
         self._orders = [dr.opaque(mi.UInt32, order) for order in rules.orders or ()]
@@ -281,7 +296,7 @@ class PathIntegrator(ABC, Generic[State]):
         return self.follow_on(paths) if self.followed else paths
 
     def follow_on(self, paths: State) -> State:
-        """The same from later vertices than the first."""
+        """The same of ``paths`` from a later vertex than the first."""
 
         def further(paths: State) -> tuple[State]:
             self.vertex(paths, first=False)
@@ -290,23 +305,31 @@ class PathIntegrator(ABC, Generic[State]):
         return dr.while_loop((paths,), lambda paths: paths.active, further)[0]  # type: ignore[no-any-return]
 
     def vertex(self, paths: State, first: bool) -> None:
-        """The next vertex of all ``paths``: their ``first``, or a later one."""
+        """Take all ``paths`` over their next vertex: their ``first``, or a later one."""
         # ---- Surface interaction: to the first one rays of neighbours go side by side, in half the time of others
         si = self.scene.ray_intersect(paths.ray, mi.RayFlags.All, first, paths.active)
 
         # ---- Lights that paths have run into
-        self.run_into(paths, si, first)
+        self._run_into(paths, si, first)
         paths.active &= si.is_valid()
 
         # ---- Connections to the sensor, or to lights
-        self.connect(paths, si, first)
+        self._connect(paths, si, first)
 
         # ---- On to the next vertex
         if self.followed:
             self.scatter(paths, si, first)
 
     def scatter(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
-        """Turn paths as the BSDF of their vertex says, and end some of them."""
+        """Turn paths as the BSDFs of their vertices say, and end some of them.
+
+        Parameters
+        ----------
+        paths, si
+            their state, and the surfaces that they have met.
+        first
+            whether these are their first vertices.
+        """
         # ---- BSDF sample; the connection may have looked at the surface from elsewhere
         toward, rules = -paths.ray.d, self.rules
         si.wi = si.to_local(toward)
@@ -323,7 +346,7 @@ class PathIntegrator(ABC, Generic[State]):
         elif not rules.mirrors:
             going &= ~mirrored | passing
         turn = Turn(sample, passing, mirrored & ~passing)
-        going &= self.turned(paths, si, turn, first)
+        going &= self._note_turn(paths, si, turn, first)
 
         # ---- Throughput
         if self.IMPORTANCE:
@@ -351,18 +374,18 @@ class PathIntegrator(ABC, Generic[State]):
             paths.straight &= passing
         paths.ray = self.passage.leaving(si, onward)
 
-    def run_into(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
+    def _run_into(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
         """Keep light that paths have run into on their way to ``si``; none from the projector's side."""
 
     @abstractmethod
-    def connect(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
+    def _connect(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
         """Keep light that the vertices at ``si`` send to the sensor, or along their paths to it."""
 
-    def turned(self, paths: State, si: mi.SurfaceInteraction3f, turn: Turn, first: bool) -> mi.Bool:
+    def _note_turn(self, paths: State, si: mi.SurfaceInteraction3f, turn: Turn, first: bool) -> mi.Bool:
         """Note a ``turn`` at ``si``; tells which paths may go on."""
         return mi.Bool(True)
 
-    def wanted(self, order: mi.UInt32) -> mi.Bool:
+    def _is_wanted(self, order: mi.UInt32) -> mi.Bool:
         """Whether light of an ``order`` is kept."""
         if not self._orders:
             return mi.Bool(True)
@@ -379,8 +402,17 @@ def is_delta(sample: mi.BSDFSample3f) -> mi.Bool:
 def shading_correction(
     si: mi.SurfaceInteraction3f, local: mi.Vector3f, onward: mi.Vector3f, toward: mi.Vector3f
 ) -> mi.Float:
-    """Factor of light that comes to ``si`` from ``toward`` and goes on to ``onward``, ``local`` in the shading frame:
-    light that is followed forward sees shading normals the other way round (Veach 1997, 5.3)."""
+    """Factor of light that is followed forward and so sees shading normals the other way round (Veach 1997, 5.3).
+
+    Parameters
+    ----------
+    si
+        points of surfaces.
+    local, onward
+        direction in which it goes on, in the shading frame and in the world.
+    toward
+        that in which it came from, in the world.
+    """
     correction = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, onward)
     return correction / (mi.Frame3f.cos_theta(local) * dr.dot(si.n, toward))
 

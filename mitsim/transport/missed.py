@@ -26,7 +26,7 @@ from mitsim.core.arrays import FloatArray, Labels
 from mitsim.devices.camera import CameraGeometry
 from mitsim.transport.connect import LensHit, sampled_wavelengths
 from mitsim.transport.from_camera import CameraPaths, CameraState, FromCameraTracer, Paths
-from mitsim.transport.integrator import Turn, camera_part
+from mitsim.transport.integrator import InFlight, Turn, camera_part
 from mitsim.transport.plugins.base import channels, lanes_of, per_lane, turn_and_origin, vectors
 from mitsim.transport.projector import PinholeRays, ProjectorOptics, ProjectorRays, wavelength_sets
 from mitsim.transport.records import DIRECT, INDIRECT, CellGrid, Deposits, Sightings
@@ -120,8 +120,8 @@ class _LeftOutTracer(FromCameraTracer):
     """Light that a lens would bring, filed under shapes: that which no connection finds as indirect light, that over a
     mirror and a lobe as direct light, with what a connection brings in the row's stead."""
 
-    def _paths(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> _LeftOutPaths:
-        return _LeftOutPaths(self, seed, sample, lane)
+    def _paths(self, flight: InFlight) -> _LeftOutPaths:
+        return _LeftOutPaths(self, flight)
 
 
 @dataclass(kw_only=True)
@@ -136,26 +136,26 @@ class _LeftOutState(CameraState):
 class _LeftOutPaths(CameraPaths[_LeftOutState]):
     """Paths from the camera that only running into the lens can end."""
 
-    def __init__(self, tracer: FromCameraTracer, *launch: mi.UInt32) -> None:
-        super().__init__(tracer, _LeftOutState, *launch)
+    def __init__(self, tracer: FromCameraTracer, flight: InFlight) -> None:
+        super().__init__(tracer, _LeftOutState, flight)
         self._rays = ProjectorRays(tracer.projector)
 
-    def connect(self, paths: _LeftOutState, si: mi.SurfaceInteraction3f, first: bool) -> None:
+    def _connect(self, paths: _LeftOutState, si: mi.SurfaceInteraction3f, first: bool) -> None:
         """Nothing: what connections find is not left out."""
 
-    def hit_lens(self, paths: _LeftOutState, si: mi.SurfaceInteraction3f) -> None:
+    def _hit_lens(self, paths: _LeftOutState, si: mi.SurfaceInteraction3f) -> None:
         """Light that mirrors bring from the lens to the last surface, or over a mirror and a sharp lobe."""
-        lost = self.foreign(paths) & paths.by_delta
+        lost = self._is_foreign(paths) & paths.by_delta
         once = paths.active & (paths.scattered == 1) & (paths.in_mirror != paths.by_delta)
         met = once & (camera_part(paths.density) > 0)
         hit = self.connector.hit(paths.ray, si.t, paths.rng, lost | met, paths.since)
-        light, none, by_line = self.irradiance(paths, hit.radiance), mi.Float(0), self.rules.by_line
+        light, none, by_line = self._irradiance(paths, hit.radiance), mi.Float(0), self.rules.by_line
         missed = dr.select(hit.met & lost, light * paths.part, 0)
-        self.join(paths, "indirect", Sightings.of(missed, by_line, paths.mirror, none, none, none))
+        self._join(paths, "indirect", Sightings.of(missed, by_line, paths.mirror, none, none, none))
         met &= hit.met
         in_mirror = panchromatic(light) * paths.density / hit.pdf
         connected = dr.select(met, dr.select(paths.in_mirror, in_mirror, self._lit(paths, hit)), 0)
-        self.join(paths, "direct", Sightings.of(dr.select(met, light, 0), by_line, paths.lobe, connected, none, none))
+        self._join(paths, "direct", Sightings.of(dr.select(met, light, 0), by_line, paths.lobe, connected, none, none))
 
     def _lit(self, paths: _LeftOutState, hit: LensHit) -> mi.Float:
         """What a connection of the projector's side, from the first surface to the sensor, brings [W m^-2]."""
@@ -164,10 +164,10 @@ class _LeftOutPaths(CameraPaths[_LeftOutState]):
         # The path's weight without its part of the view; its first surface is at 1 / (inverse depth * slope).
         view = dr.opaque(mi.Float, grid.rows.size * grid.columns.size) * dr.square(dr.square(self.slope))
         distance = paths.inverse_depth * self.slope
-        return panchromatic(self.irradiance(paths, flux)) / view * paths.density * self.slope * dr.square(distance)
+        return panchromatic(self._irradiance(paths, flux)) / view * paths.density * self.slope * dr.square(distance)
 
-    def turned(self, paths: _LeftOutState, si: mi.SurfaceInteraction3f, turn: Turn, first: bool) -> mi.Bool:
-        going = super().turned(paths, si, turn, first)
+    def _note_turn(self, paths: _LeftOutState, si: mi.SurfaceInteraction3f, turn: Turn, first: bool) -> mi.Bool:
+        going = super()._note_turn(paths, si, turn, first)
         shape = dr.reinterpret_array(mi.UInt32, dr.select(si.instance != None, si.instance, si.shape))  # noqa: E711
         turned = ~turn.passing & ~paths.by_delta
         paths.mirror = dr.select(~turn.passing & paths.by_delta, shape, paths.mirror)

@@ -42,11 +42,10 @@ from mitsim.transport.indirect import (
     IndirectTracer,
     ProjectorPaths,
     blocks_of,
-    drawn_numbers,
 )
-from mitsim.transport.integrator import camera_part, shading_correction
+from mitsim.transport.integrator import InFlight, camera_part, shading_correction
 from mitsim.transport.records import INDIRECT, Deposits, Sightings, check_finite
-from mitsim.transport.sampler import generator, seed_of, stratified, told_apart
+from mitsim.transport.sampler import generator, stratified, told_apart
 
 if TYPE_CHECKING:
     ByLine = list[mi.Float]
@@ -106,9 +105,9 @@ class NeighbourTracer(IndirectTracer):
         """Whether all surfaces are: pairs then take no look at a material."""
         return len(self.diffuse) == len(self.scene.shapes())
 
-    def _emission(self, seed: int | mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> Emission:
+    def _emission(self, flight: InFlight) -> Emission:
         """Of whole blocks of pixels, the members of each one after the other."""
-        block, member, weight = lane // MEMBERS, lane % MEMBERS, 1.0
+        block, member, sample, weight = flight.index // MEMBERS, flight.index % MEMBERS, flight.sample, 1.0
         if self.turns:
             block, sample, weight = self.turns.at(block, sample)
         n, blocks = (dr.opaque(mi.UInt32, count) for count in (self.projector.n, blocks_of(self.projector.n)))
@@ -116,10 +115,10 @@ class NeighbourTracer(IndirectTracer):
         column = (block % blocks) * SIDE + member % SIDE
         inside = (row < n) & (column < n)
         pixel = dr.minimum(row, n - 1) * n + dr.minimum(column, n - 1)
-        none, shared = dr.zeros(mi.UInt32, dr.width(lane)), seed_of(seed)
-        rng = generator(shared ^ (sample * 0x9E3779B9 + 1), pixel)
+        none, seed = dr.zeros(mi.UInt32, dr.width(flight.index)), flight.seed
+        rng = generator(seed ^ (sample * 0x9E3779B9 + 1), pixel)
         place = (member + sample * _STEP + sample // _TURN) % MEMBERS
-        first_turn = stratified(sample * MEMBERS + place, generator(shared, block))
+        first_turn = stratified(sample * MEMBERS + place, generator(seed, block))
         return Emission(pixel, (none, none), rng, first_turn, dr.select(inside, mi.Float(weight), 0))
 
     def _paths(self, emission: Emission) -> ReusedPaths:
@@ -139,6 +138,7 @@ class ReusedPaths(ProjectorPaths):
     tracer: NeighbourTracer
 
     def __init__(self, tracer: NeighbourTracer, emission: Emission) -> None:
+        """Of what a ``tracer`` follows, from an ``emission``."""
         super().__init__(tracer, emission)
         self.tracer = tracer
         self.member = dr.arange(mi.UInt32, dr.width(self.pixel)) % MEMBERS
@@ -213,9 +213,9 @@ class ReusedPaths(ProjectorPaths):
         self.shared = paths.active & (paths.scattered == 1)
         self.point, self.normal = mi.Point3f(si.p), mi.Normal3f(si.n)
         number = mi.UInt32(0)
-        self.to_sensor_way = self.way(paths, si, self.connections.sensor(number))
+        self.to_sensor_way = self._way(paths, si, self.connections.sensor(number))
         own = replace(self.to_sensor_way, open=self.to_sensor_way.open & ~self.shared)
-        self.keep(paths, si, own, drawn_numbers(paths.rng), (paths.sightings, number))
+        self._keep_light(paths, si, own, self._draw_numbers(paths), (paths.sightings, number))
         self.follows = self.shared & self._diffuse(si)
         self.shading = mi.Normal3f(si.sh_frame.n)
         self.side = dr.sign(dr.dot(self.shading, -self.arrived_by.d))

@@ -23,7 +23,7 @@ from mitsim.core.arrays import FloatArray, Labels, mean_of_neighbours
 from mitsim.devices.camera import CameraGeometry
 from mitsim.transport.connect import Receiver, Reception, landing, sampled_wavelengths
 from mitsim.transport.direct import DirectTracer
-from mitsim.transport.integrator import launches
+from mitsim.transport.integrator import InFlight, launches
 from mitsim.transport.plugins.base import rows_columns
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.records import check_finite
@@ -401,12 +401,12 @@ class AimedTracer(DirectTracer):
         """Connections of one sample: all near pairs of pixel and anchor, and one of a few others."""
         return len(self._near) - (-len(self.far) // _SELDOM)
 
-    def _pair(self, seed: int | mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
+    def _pair(self, flight: InFlight) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
         near, far = (dr.opaque(mi.UInt32, len(pairs)) for pairs in (self._near, self.far))
-        _, rng = streams(seed, lane, sample)
-        one_of = (lane - near) * _SELDOM + dr.minimum(mi.UInt32(rng.next_float32() * _SELDOM), _SELDOM - 1)
-        is_near = lane < near
-        place = dr.select(is_near, lane, near + one_of)
+        index, (_, rng) = flight.index, streams(flight.seed, flight.index, flight.sample)
+        one_of = (index - near) * _SELDOM + dr.minimum(mi.UInt32(rng.next_float32() * _SELDOM), _SELDOM - 1)
+        is_near = index < near
+        place = dr.select(is_near, index, near + one_of)
         share = dr.select(is_near, 1.0, dr.select(one_of < far, float(_SELDOM), 0.0))
         pairs = mi.UInt32(np.concatenate([self._near, self.far]))
         pair = dr.gather(mi.UInt32, pairs, place, place < near + far)

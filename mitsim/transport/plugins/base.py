@@ -48,7 +48,7 @@ def register_once(kind: str, plugin: str, build: Callable[[], type]) -> None:
 
 
 def numbers(text: str) -> list[float]:
-    """Those of a list in a scene file, apart by commas or blanks; ValueError where one is none."""
+    """Those of a list in a scene file, a ``text`` with commas or blanks between them; ValueError where one is none."""
     return [float(word) for word in re.split(r"[\s,]+", text.strip()) if word]
 
 
