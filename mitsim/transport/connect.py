@@ -391,11 +391,11 @@ class ProjectorConnector:
         local = self._to_world.inverse() @ si.p
         lens = self.lens_point(rng) if lens is None else lens
         offset = local - lens
-        pixel, strength, valid = self._seen(lens, offset, rng, active & (local.z > 0))
+        pixel, power, valid = self._pixel_power(lens, offset, rng, active & (local.z > 0))
         distance = dr.norm(offset)
         cosine = offset.z / distance
         # Irradiance on a plane z = const is pi scale texture / z^2 from every point of the lens.
-        weight = strength / (dr.square(local.z) * cosine)
+        weight = power / (dr.square(local.z) * cosine)
         target = self._to_world @ lens
         pdf = dr.square(distance) / (cosine * self._area) if self.projector.aperture > 0 else mi.Float(0)
         return Connection(dr.normalize(target - si.p), target, weight, pdf, pixel, valid)
@@ -425,16 +425,16 @@ class ProjectorConnector:
         radius = dr.opaque(mi.Float, self.projector.aperture)
         met = active & (origin.z > 0) & (direction.z < 0) & (distance < reach)
         met &= dr.square(lens.x) + dr.square(lens.y) <= dr.square(radius)
-        pixel, strength, met = self._seen(lens, -direction, rng, met)
+        pixel, power, met = self._pixel_power(lens, -direction, rng, met)
         cosine = -direction.z
-        radiance = strength / (self._area * dr.square(dr.square(cosine)))
+        radiance = power / (self._area * dr.square(dr.square(cosine)))
         return LensHit(radiance, dr.square(distance + since) / (cosine * self._area), pixel, met)
 
     @property
     def _area(self) -> mi.Float:
         return dr.pi * dr.square(dr.opaque(mi.Float, self.projector.aperture))
 
-    def _seen(
+    def _pixel_power(
         self, lens: mi.Point3f, direction: mi.Vector3f, rng: mi.PCG32, active: mi.Bool
     ) -> tuple[mi.UInt32, mi.Spectrum, mi.Bool]:
         """Pixel, pi scale texture, and validity of the light that leaves a lens point in a direction (both local)."""
@@ -448,5 +448,5 @@ class ProjectorConnector:
         # A point plus a vector is a vector to Mitsuba, and vectors are not moved.
         at.p = self._to_world @ mi.Point3f(image)
         ds, weight = self.emitter.sample_direction(at, mi.Point2f(0.5), active)
-        strength = weight * (dr.square(image.z) * image.z / dr.norm(image))
-        return self.projector.pixel_at(ds.uv), strength, active & (ds.pdf > 0)
+        power = weight * (dr.square(image.z) * image.z / dr.norm(image))
+        return self.projector.pixel_at(ds.uv), power, active & (ds.pdf > 0)

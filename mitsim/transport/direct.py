@@ -113,16 +113,16 @@ class DirectTracer(Tracer):
         sensor = self._sensor(row, column, flight.sample, shared, rng)
         flux = self.rays.flux(pixel, wavelengths) * spectral * (weight * share)
 
-        def seen_at(at: Arrival, state: tuple[Sightings, mi.PCG32]) -> tuple[Sightings, mi.PCG32]:
+        def add_light(at: Arrival, state: tuple[Sightings, mi.PCG32]) -> tuple[Sightings, mi.PCG32]:
             seen, rng = state
-            reception, received = self._connected(at, sensor)
+            reception, received = self._by_connection(at, sensor)
             return seen.joined_by(reception.sightings(received, pixel, by_line), rng.next_float32()), rng
 
         by_line = self.projector.by_line
-        seen, _ = self.receiver.passage.along(ray, flux, (Sightings.none(by_line), rng), seen_at)
+        seen, _ = self.receiver.passage.along(ray, flux, (Sightings.none(by_line), rng), add_light)
         return seen, DIRECT, (row, column)
 
-    def _connected(self, at: Arrival, sensor: mi.Point3f) -> tuple[Reception, mi.UnpolarizedSpectrum]:
+    def _by_connection(self, at: Arrival, sensor: mi.Point3f) -> tuple[Reception, mi.UnpolarizedSpectrum]:
         """What light that comes to surfaces brings to ``sensor`` points."""
         reception = self.receiver.receive(at.si, -at.direction, sensor, at.active)
         return reception, reception.irradiance * at.light
@@ -247,27 +247,27 @@ class FluxTracer:
         turn = stratified(shuffled(sample, shared), shared) if self._glossy else None
         sensor, flux = self._sensor.inside(point), self._rays.flux(pixel, wavelengths) * spectral
 
-        def seen_at(
+        def add_light(
             at: Arrival, state: tuple[mi.UnpolarizedSpectrum, mi.PCG32]
         ) -> tuple[mi.UnpolarizedSpectrum, mi.PCG32]:
             total, rng = state
             if turn is not None:
-                total = total + self._turned(at, rng.next_float32(), turn)
-            return total + self._connected(at, sensor), rng
+                total = total + self._by_turn(at, rng.next_float32(), turn)
+            return total + self._by_connection(at, sensor), rng
 
-        total, _ = self._receiver.passage.along(ray, flux, (mi.UnpolarizedSpectrum(0), rng), seen_at)
+        total, _ = self._receiver.passage.along(ray, flux, (mi.UnpolarizedSpectrum(0), rng), add_light)
         return total
 
-    def _turned(self, at: Arrival, number: mi.Float, point: mi.Point2f) -> mi.UnpolarizedSpectrum:
+    def _by_turn(self, at: Arrival, number: mi.Float, point: mi.Point2f) -> mi.UnpolarizedSpectrum:
         """What light that comes to surfaces brings over turns, drawn by a ``number`` and a ``point``."""
         turn = at.turn(number, point)
         lobe = at.active & (turn.pdf > 0) & ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
         place = landing(self._receiver, at.si, at.si.to_world(turn.wo), lobe)
         half = dr.opaque(mi.Float, self._sensor.half_width)
         lobe = place.arrives & (dr.abs(place.x) <= half) & (dr.abs(place.y) <= half)
-        return self._connected(replace(at, active=lobe), mi.Point3f(place.x, place.y, 0))
+        return self._by_connection(replace(at, active=lobe), mi.Point3f(place.x, place.y, 0))
 
-    def _connected(self, at: Arrival, point: mi.Point3f) -> mi.UnpolarizedSpectrum:
+    def _by_connection(self, at: Arrival, point: mi.Point3f) -> mi.UnpolarizedSpectrum:
         """What it brings to a ``point`` of the sensor; over glossy surfaces, over 1 + A q."""
         reception = self._receiver.receive(at.si, -at.direction, point, at.active)
         value = reception.irradiance * at.light

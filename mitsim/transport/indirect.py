@@ -77,23 +77,23 @@ class IndirectTracer(FollowingTracer):
         self.scene, self.projector, self.mirrors, self.interreflection = scene, projector, mirrors, interreflection
         self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
         self.points = points or SensorPoints(self.receiver.geometry.half_width)
-        self.turns: Turns | None = None
+        self.adaptive: AdaptiveSamples | None = None
 
     def repeating(self, repeats: Sequence[int]) -> IndirectTracer:
         """The same to one point of the sensor, blocks of pixels (:mod:`mitsim.transport.indirect`) as often as
         ``repeats`` (blocks^2,) say."""
-        return self._taking(by_pixel(repeats, self.projector.n))
+        return self._with_counts(by_pixel(repeats, self.projector.n))
 
-    def _taking(self, repeats: npt.NDArray[np.int64]) -> IndirectTracer:
+    def _with_counts(self, repeats: npt.NDArray[np.int64]) -> IndirectTracer:
         """The same with ``repeats`` of single pixels, or of what else it counts."""
         again = copy(self)
-        again.turns = Turns.of(repeats)
+        again.adaptive = AdaptiveSamples.of(repeats)
         return again
 
     @property
     def lanes(self) -> int:
         """Paths of one sample: one per projector pixel and anchor, or as often as they are repeated."""
-        return len(self.turns) if self.turns else self.projector.n**2 * self.points.count
+        return len(self.adaptive) if self.adaptive else self.projector.n**2 * self.points.count
 
     @property
     def connections_per_path(self) -> int:
@@ -132,8 +132,8 @@ class IndirectTracer(FollowingTracer):
     def _emission(self, flight: InFlight) -> Emission:
         """Where each path leaves the projector."""
         index, sample, weight = flight.index, flight.sample, 1.0
-        if self.turns:
-            index, sample, weight = self.turns.at(index, sample)
+        if self.adaptive:
+            index, sample, weight = self.adaptive.at(index, sample)
         pixel, row, column = self.points.of(index, self.projector.n**2)
         # Stratified where it tells most: a pixel is small, but its light goes every way from the first surface.
         shared, rng = streams(flight.seed, pixel, sample)
@@ -193,11 +193,11 @@ class ProjectorPaths(PathIntegrator[PathState]):
             return
         drawn = self._draw_numbers(paths)
 
-        def connected(held: Held, number: mi.UInt32) -> None:
+        def connect(held: Held, number: mi.UInt32) -> None:
             way = self._way(paths, si, self.connections.sensor(number))
             self._keep_light(paths, si, way, drawn, (held, number))
 
-        paths.sightings = self.connections.at_each(paths.sightings, paths.active, connected)
+        paths.sightings = self.connections.at_each(paths.sightings, paths.active, connect)
 
     @staticmethod
     def _draw_numbers(paths: PathState) -> dict[str, mi.Float]:
@@ -326,11 +326,11 @@ class _AnchorConnections(_OneConnection):
             held[kind][number * self._numbers + place] = value
 
     def at_each(self, held: Held, active: mi.Bool, visit: Callable[[Held, mi.UInt32], None]) -> Held:
-        def one(number: mi.UInt32, held: Held) -> tuple[mi.UInt32, Held]:
+        def step(number: mi.UInt32, held: Held) -> tuple[mi.UInt32, Held]:
             visit(held, number)
             return number + 1, held
 
-        found: Held = dr.while_loop((mi.UInt32(0), held), lambda number, _: active & (number < self._count), one)[1]
+        found: Held = dr.while_loop((mi.UInt32(0), held), lambda number, _: active & (number < self._count), step)[1]
         return found
 
     def fetched(self, held: Held, kinds: Sequence[str], also: object = ()) -> list[Deposits]:
@@ -338,13 +338,13 @@ class _AnchorConnections(_OneConnection):
         size, first = paths * self._points.count, dr.arange(mi.UInt32, paths) * self._count
         found = {kind: [dr.zeros(mi.Float, size) for _ in range(self._numbers)] for kind in kinds}
 
-        def unpacked(held: Held, number: mi.UInt32) -> None:
+        def unpack(held: Held, number: mi.UInt32) -> None:
             for kind, values in found.items():
                 for into, value in zip(values, _differing(self.load(held, kind, number)), strict=True):
                     dr.scatter(into, value, first + number)
 
         if kinds:
-            self.at_each(held, mi.Bool(True), unpacked)
+            self.at_each(held, mi.Bool(True), unpack)
         dr.eval(found, self._pixel, also)
         index = dr.arange(mi.UInt32, size)
         pixel, anchor = dr.gather(mi.UInt32, self._pixel, index // self._count), self.anchor(index % self._count)
@@ -420,7 +420,7 @@ def effect_of(repeats: npt.NDArray[np.int64], moments: FloatArray) -> tuple[floa
 
 
 @dataclass(frozen=True, eq=False)
-class Turns:
+class AdaptiveSamples:
     """Which block, or pixel, each of a sample's units of paths belongs to.
 
     Attributes
@@ -434,7 +434,7 @@ class Turns:
     count: mi.UInt32
 
     @classmethod
-    def of(cls, repeats: npt.NDArray[np.int64]) -> Turns:
+    def of(cls, repeats: npt.NDArray[np.int64]) -> AdaptiveSamples:
         """Those of units that have so many ``repeats`` (units,)."""
         unit = np.repeat(np.arange(len(repeats)), repeats)
         starts = np.cumsum(repeats) - repeats

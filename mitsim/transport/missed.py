@@ -97,7 +97,7 @@ def left_out_light(
     """
     lens = replace(projector, aperture=_LENS * geometry.scene_distance, focus=geometry.scene_distance)
     paths = Paths(mirrors=True, interreflection=True)
-    found = _LeftOutTracer(scene, camera, lens, grid, paths, geometry).trace(seed, 0, samples)
+    found = _MissedTracer(scene, camera, lens, grid, paths, geometry).trace(seed, 0, samples)
     # Deposits name shapes by their number in Dr.Jit's registry.
     numbers = np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr())).astype(np.int64)
 
@@ -105,27 +105,27 @@ def left_out_light(
         return np.asarray(np.bincount(light.pixel, values, int(numbers.max()) + 1)[numbers] / samples)
 
     lost, met = (found.where(found.kind == kind) for kind in (INDIRECT, DIRECT))
-    mirrors, hits = _seen(by_shape(lost, lost.value), by_shape(lost, np.square(lost.value)))
+    mirrors, hits = _equal_hits(by_shape(lost, lost.value), by_shape(lost, np.square(lost.value)))
     # A lens of half the radius is met a quarter as often, and four times as bright.
     seldom = np.square(projector.aperture / lens.aperture)
-    return LeftOut(mirrors, hits * seldom, *_seen(by_shape(met, met.value), by_shape(met, met.value * met.row)))
+    return LeftOut(mirrors, hits * seldom, *_equal_hits(by_shape(met, met.value), by_shape(met, met.value * met.row)))
 
 
-def _seen(light: FloatArray, moments: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _equal_hits(light: FloatArray, moments: FloatArray) -> tuple[FloatArray, FloatArray]:
     """``light`` (k,) by shape, and from the second ``moments`` of a sample how many equal hits it is."""
     return light, np.divide(np.square(light), moments, out=np.zeros(len(light)), where=light > 0)
 
 
-class _LeftOutTracer(FromCameraTracer):
+class _MissedTracer(FromCameraTracer):
     """Light that a lens would bring, filed under shapes: that which no connection finds as indirect light, that over a
     mirror and a lobe as direct light, with what a connection brings in the row's stead."""
 
-    def _paths(self, flight: InFlight) -> _LeftOutPaths:
-        return _LeftOutPaths(self, flight)
+    def _paths(self, flight: InFlight) -> _MissedPaths:
+        return _MissedPaths(self, flight)
 
 
 @dataclass(kw_only=True)
-class _LeftOutState(CameraState):
+class _MissedState(CameraState):
     """``mirror`` and ``lobe`` are the last shape of either kind that a path met, ``density`` that of the turn there."""
 
     mirror: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
@@ -133,17 +133,17 @@ class _LeftOutState(CameraState):
     density: mi.Float = field(default_factory=lambda: mi.Float(0))
 
 
-class _LeftOutPaths(CameraPaths[_LeftOutState]):
+class _MissedPaths(CameraPaths[_MissedState]):
     """Paths from the camera that only running into the lens can end."""
 
     def __init__(self, tracer: FromCameraTracer, flight: InFlight) -> None:
-        super().__init__(tracer, _LeftOutState, flight)
+        super().__init__(tracer, _MissedState, flight)
         self._rays = ProjectorRays(tracer.projector)
 
-    def _connect(self, paths: _LeftOutState, si: mi.SurfaceInteraction3f, first: bool) -> None:
+    def _connect(self, paths: _MissedState, si: mi.SurfaceInteraction3f, first: bool) -> None:
         """Nothing: what connections find is not left out."""
 
-    def _hit_lens(self, paths: _LeftOutState, si: mi.SurfaceInteraction3f) -> None:
+    def _hit_lens(self, paths: _MissedState, si: mi.SurfaceInteraction3f) -> None:
         """Light that mirrors bring from the lens to the last surface, or over a mirror and a sharp lobe."""
         lost = self._is_foreign(paths) & paths.by_delta
         once = paths.active & (paths.scattered == 1) & (paths.in_mirror != paths.by_delta)
@@ -157,7 +157,7 @@ class _LeftOutPaths(CameraPaths[_LeftOutState]):
         connected = dr.select(met, dr.select(paths.in_mirror, in_mirror, self._lit(paths, hit)), 0)
         self._join(paths, "direct", Sightings.of(dr.select(met, light, 0), by_line, paths.lobe, connected, none, none))
 
-    def _lit(self, paths: _LeftOutState, hit: LensHit) -> mi.Float:
+    def _lit(self, paths: _MissedState, hit: LensHit) -> mi.Float:
         """What a connection of the projector's side, from the first surface to the sensor, brings [W m^-2]."""
         grid = self.tracer.grid
         flux = self._rays.flux(hit.pixel, paths.ray.wavelengths)
@@ -166,7 +166,7 @@ class _LeftOutPaths(CameraPaths[_LeftOutState]):
         distance = paths.inverse_depth * self.slope
         return panchromatic(self._irradiance(paths, flux)) / view * paths.density * self.slope * dr.square(distance)
 
-    def _note_turn(self, paths: _LeftOutState, si: mi.SurfaceInteraction3f, turn: Turn, first: bool) -> mi.Bool:
+    def _note_turn(self, paths: _MissedState, si: mi.SurfaceInteraction3f, turn: Turn, first: bool) -> mi.Bool:
         going = super()._note_turn(paths, si, turn, first)
         shape = dr.reinterpret_array(mi.UInt32, dr.select(si.instance != None, si.instance, si.shape))  # noqa: E711
         turned = ~turn.passing & ~paths.by_delta
@@ -319,12 +319,12 @@ def highlights(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, g
     turn, eye = turn_and_origin(camera.world_transform())
     centre = np.array([np.array(ball.bbox().center(), dtype=np.float64).ravel() for ball in balls])
     radius = np.array([float(np.array(ball.bbox().extents()).max()) / 2 for ball in balls])
-    normal = _middles(centre, radius, rays.origin, eye)
+    normal = _mirror_normals(centre, radius, rays.origin, eye)
     # Angles from the middle, evenly in their logarithm, and about it.
     octaves = math.log(math.pi / 2 / _NEAREST)
     angle = np.asarray(_NEAREST * np.exp(octaves * (np.arange(_POINTS) + 0.5) / _POINTS), dtype=np.float64)
     area = np.sin(angle) * angle * octaves * 2 * math.pi / _POINTS
-    points = centre[:, None] + radius[:, None, None] * _about(
+    points = centre[:, None] + radius[:, None, None] * _directions_about(
         normal, angle, np.asarray(_GOLDEN * np.arange(_POINTS, dtype=np.float64))
     )
     aimed = points.reshape(-1, 3)
@@ -338,7 +338,7 @@ def highlights(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, g
     pixel = np.where(
         inside, np.clip(window[:, 0].astype(int), 0, n - 1) * n + np.clip(window[:, 1].astype(int), 0, n - 1), 0
     )
-    sent, facing = _sent(scene, rays.origin, aimed, eye, np.repeat(radius, _POINTS))
+    sent, facing = _radiance_toward(scene, rays.origin, aimed, eye, np.repeat(radius, _POINTS))
     local = -back @ turn
     stop = (np.abs(local[:, :2]) <= geometry.tan_half_fov * local[:, 2:]).all(axis=1)
     # Part of the window that each point stands for, by the tangents of one pixel, and what it brings.
@@ -354,7 +354,7 @@ def _glossy(bsdf: mi.BSDF) -> bool:
     return bool(bsdf.flags() & int(mi.BSDFFlags.GlossyReflection))
 
 
-def _middles(centre: FloatArray, radius: FloatArray, one: FloatArray, other: FloatArray) -> FloatArray:
+def _mirror_normals(centre: FloatArray, radius: FloatArray, one: FloatArray, other: FloatArray) -> FloatArray:
     """(k, 3) normals of balls where a mirror would turn light from ``one`` place to the ``other``."""
     normal = np.zeros_like(centre)
     for _ in range(50):
@@ -365,7 +365,7 @@ def _middles(centre: FloatArray, radius: FloatArray, one: FloatArray, other: Flo
     return normal
 
 
-def _about(normal: FloatArray, angle: FloatArray, turned: FloatArray) -> FloatArray:
+def _directions_about(normal: FloatArray, angle: FloatArray, turned: FloatArray) -> FloatArray:
     """(k, p, 3) directions at (p,) angles from normals (k, 3), ``turned`` about them."""
     helper = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
     first = np.cross(normal, helper)
@@ -375,7 +375,7 @@ def _about(normal: FloatArray, angle: FloatArray, turned: FloatArray) -> FloatAr
     return np.asarray(np.cos(angle)[:, None] * normal[:, None] + np.sin(angle)[:, None] * across)
 
 
-def _sent(
+def _radiance_toward(
     scene: mi.Scene, origin: FloatArray, aimed: FloatArray, eye: FloatArray, radius: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """(k,) light that sharp lobes at points send to the ``eye`` [1/sr], mean over channels, and cosines of what comes

@@ -72,11 +72,11 @@ class NeighbourTracer(IndirectTracer):
     @property
     def lanes(self) -> int:
         """Paths of one sample: one for each pixel of whole blocks, or as often as these are repeated."""
-        return MEMBERS * (len(self.turns) if self.turns else blocks_of(self.projector.n) ** 2)
+        return MEMBERS * (len(self.adaptive) if self.adaptive else blocks_of(self.projector.n) ** 2)
 
     def repeating(self, repeats: Sequence[int]) -> IndirectTracer:
         """The same, as :meth:`IndirectTracer.repeating`; ``repeats`` (blocks^2,)."""
-        return self._taking(np.asarray(repeats, dtype=np.int64))
+        return self._with_counts(np.asarray(repeats, dtype=np.int64))
 
     def trace_looks(self, seeds: Sequence[int], samples: int = 1) -> list[Deposits]:
         """``samples`` of each of some ``seeds``, one after the other: pairs of paths have no lane of their own."""
@@ -108,8 +108,8 @@ class NeighbourTracer(IndirectTracer):
     def _emission(self, flight: InFlight) -> Emission:
         """Of whole blocks of pixels, the members of each one after the other."""
         block, member, sample, weight = flight.index // MEMBERS, flight.index % MEMBERS, flight.sample, 1.0
-        if self.turns:
-            block, sample, weight = self.turns.at(block, sample)
+        if self.adaptive:
+            block, sample, weight = self.adaptive.at(block, sample)
         n, blocks = (dr.opaque(mi.UInt32, count) for count in (self.projector.n, blocks_of(self.projector.n)))
         row = (block // blocks) * SIDE + member // SIDE
         column = (block % blocks) * SIDE + member % SIDE
@@ -153,9 +153,9 @@ class ReusedPaths(ProjectorPaths):
                 for each, value in zip(kept, by_line, strict=True):
                     dr.scatter(each, value, place, active)
 
-        self._hand_on(*self._weights(), store)
+        self._pair_light(*self._weights(), store)
         dr.eval(values)
-        return [*own, self._paired(values[0], self.to_sensor_way), self._paired(values[1], self.further)]
+        return [*own, self._pair_samples(values[0], self.to_sensor_way), self._pair_samples(values[1], self.further)]
 
     def accumulate(self, ledgers: Sequence[Ledger]) -> list[Deposits]:
         """Light of each pixel's own paths on the host; that of pairs in ``ledgers``, one for each line."""
@@ -170,7 +170,7 @@ class ReusedPaths(ProjectorPaths):
                     lit = active & ~(value == 0)  # not a number is light to be refused
                     ledger.add(value, self.pixel, dr.gather(mi.UInt32, each, at, lit), lit)
 
-        self._hand_on(*self._weights(), store)
+        self._pair_light(*self._weights(), store)
         return own
 
     # ---- the paths themselves ---------------------------------------------------------------------------------------
@@ -178,8 +178,8 @@ class ReusedPaths(ProjectorPaths):
     def _own(self) -> list[Deposits]:
         """Follow all paths; on the host the light that is not shared."""
         self.paths = self.start
-        self._first()
-        self._second()
+        self._first_vertex()
+        self._second_vertex()
         self.paths = self.follow_on(self.paths)
         kept = self.paths.sightings["indirect"]
         place = kept.pixel, kept.row, kept.column, kept.inverse_depth
@@ -193,22 +193,22 @@ class ReusedPaths(ProjectorPaths):
         dr.eval(vars(self))
         return self.connections.fetched(self.paths.sightings, tuple(self.paths.sightings))
 
-    def _first(self) -> None:
+    def _first_vertex(self) -> None:
         """The first surface, and each path's turn there."""
         paths = self.paths
-        self.lit_by, self.power = mi.Ray3f(paths.ray), told_apart(self.flux, self.tracer.lines)
-        self.lit_at = self.scene.ray_intersect_preliminary(paths.ray, True, active=paths.active)
-        si = self.lit_at.compute_surface_interaction(paths.ray, active=paths.active)
+        self.first_ray, self.power = mi.Ray3f(paths.ray), told_apart(self.flux, self.tracer.lines)
+        self.first_hit = self.scene.ray_intersect_preliminary(paths.ray, True, active=paths.active)
+        si = self.first_hit.compute_surface_interaction(paths.ray, active=paths.active)
         paths.active &= si.is_valid()
         self.lit = mi.Bool(paths.active)
         self.scatter(paths, si, True)
 
-    def _second(self) -> None:
+    def _second_vertex(self) -> None:
         """The second surface, its way to the sensor, and each path's turn there: of unit light where it is shared."""
         paths = self.paths
-        self.arrived_by = mi.Ray3f(paths.ray)
-        self.arrived_at = self.scene.ray_intersect_preliminary(paths.ray, active=paths.active)
-        si = self.arrived_at.compute_surface_interaction(paths.ray, active=paths.active)
+        self.second_ray = mi.Ray3f(paths.ray)
+        self.second_hit = self.scene.ray_intersect_preliminary(paths.ray, active=paths.active)
+        si = self.second_hit.compute_surface_interaction(paths.ray, active=paths.active)
         paths.active &= si.is_valid()
         self.shared = paths.active & (paths.scattered == 1)
         self.point, self.normal = mi.Point3f(si.p), mi.Normal3f(si.n)
@@ -218,11 +218,11 @@ class ReusedPaths(ProjectorPaths):
         self._keep_light(paths, si, own, self._draw_numbers(paths), (paths.sightings, number))
         self.follows = self.shared & self._diffuse(si)
         self.shading = mi.Normal3f(si.sh_frame.n)
-        self.side = dr.sign(dr.dot(self.shading, -self.arrived_by.d))
+        self.side = dr.sign(dr.dot(self.shading, -self.second_ray.d))
         paths.throughput = dr.select(self.follows, 1, paths.throughput)
         self.flux = dr.select(self.follows, 1, self.flux)
         self.scatter(paths, si, False)
-        self.turned_light = self._turn(si, -self.arrived_by.d, paths.ray.d, paths.active & self.follows)
+        self.own_turn = self._turn(si, -self.second_ray.d, paths.ray.d, paths.active & self.follows)
         self.onward = mi.Vector3f(paths.ray.d)
 
     def _diffuse(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
@@ -289,7 +289,7 @@ class ReusedPaths(ProjectorPaths):
             whole, same_side = whole + dr.abs(each), same_side + dr.maximum(each, 0)
         return sent, whole, same_side
 
-    def _hand_on(self, sent: ByLine, whole: mi.Float, same_side: mi.Float, store: Store) -> None:
+    def _pair_light(self, sent: ByLine, whole: mi.Float, same_side: mi.Float, store: Store) -> None:
         """Light of each pixel by each second point of its block, straight to the sensor and further on.
 
         Parameters
@@ -326,7 +326,7 @@ class ReusedPaths(ProjectorPaths):
 
     def _sender(self, si: mi.SurfaceInteraction3f) -> Sender:
         """What first surfaces at ``si`` send in a direction [1/sr], and the density [1/sr] of sampling that."""
-        context, toward = mi.BSDFContext(mi.TransportMode.Importance), -self.lit_by.d
+        context, toward = mi.BSDFContext(mi.TransportMode.Importance), -self.first_ray.d
 
         def send(direction: mi.Vector3f, active: mi.Bool) -> tuple[ByLine, mi.Float]:
             local = si.to_local(direction)
@@ -341,14 +341,14 @@ class ReusedPaths(ProjectorPaths):
         are followed further."""
 
         def turn(at: mi.UInt32, active: mi.Bool) -> tuple[ByLine, ByLine]:
-            met, ray = (dr.gather(type(each), each, at, active) for each in (self.arrived_at, self.arrived_by))
+            met, ray = (dr.gather(type(each), each, at, active) for each in (self.second_hit, self.second_ray))
             second = met.compute_surface_interaction(ray, active=active)
             toward = dr.normalize(si.p - second.p)
             way = dr.gather(Way, self.to_sensor_way, at, active)
             reception = self.tracer.receiver.received(second, toward, replace(way, open=way.open & active))
             connected = self._factors(reception.irradiance * (1 - camera_part(reception.pdf)))
             beyond, turned = (
-                [dr.gather(mi.Float, each, at, active) for each in lines] for lines in (self.beyond, self.turned_light)
+                [dr.gather(mi.Float, each, at, active) for each in lines] for lines in (self.beyond, self.own_turn)
             )
             handed = [active & (light > 0) & (own > 0) for light, own in zip(beyond, turned, strict=True)]
             onward = dr.gather(mi.Vector3f, self.onward, at, active)
@@ -359,9 +359,9 @@ class ReusedPaths(ProjectorPaths):
         return turn
 
     def _first_points(self) -> mi.SurfaceInteraction3f:
-        return self.lit_at.compute_surface_interaction(self.lit_by, active=self.lit)
+        return self.first_hit.compute_surface_interaction(self.first_ray, active=self.lit)
 
-    def _paired(self, values: ByLine, seen: Way | Sightings) -> Deposits:
+    def _pair_samples(self, values: ByLine, seen: Way | Sightings) -> Deposits:
         """Light on the host of pairs of pixels and second points."""
         by_line = np.array(values)
         light = by_line.sum(axis=0)
@@ -369,12 +369,12 @@ class ReusedPaths(ProjectorPaths):
         pairs = np.flatnonzero(light)
         lines = np.zeros((len(mi.Spectrum()), len(pairs)), np.float32)
         lines[: len(by_line)] = by_line[:, pairs]
-        lane, other = np.divmod(pairs, MEMBERS)
-        at = lane - lane % MEMBERS + other
+        index, other = np.divmod(pairs, MEMBERS)
+        at = index - index % MEMBERS + other
         none = np.zeros(len(pairs), np.int64)
         row, column, inverse = (np.array(part)[at] for part in (seen.row, seen.column, seen.inverse_depth))
         return Deposits(
-            pixel=np.array(self.pixel)[lane].astype(np.int64),
+            pixel=np.array(self.pixel)[index].astype(np.int64),
             anchor_row=none,
             anchor_column=none,
             row=row.astype(np.float64),
@@ -395,17 +395,17 @@ class DiffuseReusedPaths(ReusedPaths):
 
     sends = 1
 
-    def _first(self) -> None:
-        super()._first()
+    def _first_vertex(self) -> None:
+        super()._first_vertex()
         si = self._first_points()
         self.facing = dr.sign(mi.Frame3f.cos_theta(si.wi))
-        turned = self._turn(si, -self.lit_by.d, si.sh_frame.n * self.facing, self.lit)
+        turned = self._turn(si, -self.first_ray.d, si.sh_frame.n * self.facing, self.lit)
         self.lit &= reduce(dr.maximum, turned) > 0
         self.power = [power * own for power, own in zip(self.power, turned, strict=True)]
 
-    def _second(self) -> None:
-        super()._second()
-        second = self.arrived_at.compute_surface_interaction(self.arrived_by, active=self.shared)
+    def _second_vertex(self) -> None:
+        super()._second_vertex()
+        second = self.second_hit.compute_surface_interaction(self.second_ray, active=self.shared)
         self.sensor_side = dr.sign(dr.dot(self.shading, self.to_sensor_way.direction))
         facing = self.shading * self.sensor_side
         way = replace(self.to_sensor_way, open=self.to_sensor_way.open & self.shared)
@@ -421,7 +421,7 @@ class DiffuseReusedPaths(ReusedPaths):
         return send
 
     def _turner(self, si: mi.SurfaceInteraction3f) -> Turner:
-        own = self._cosines(self.shading, self.normal, -self.arrived_by.d)
+        own = self._cosines(self.shading, self.normal, -self.second_ray.d)
         further = [dr.select(own > 0, light / own, 0) for light in self.beyond]
         dr.eval(further)
 

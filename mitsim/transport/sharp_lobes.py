@@ -109,17 +109,17 @@ def sharp_light(
     """
     lanes = projector.n**2
     lobes = _Lobes(scene, camera, projector, geometry)
-    first = lobes.look(np.arange(lanes), seed, 0, -(-samples // _FEWER), _WIDER)
+    first = lobes.trace(np.arange(lanes), seed, 0, -(-samples // _FEWER), _WIDER)
     if not len(first.widths):
         return SharpLight.none(lanes)
     lobes.least = least = mi.Float(np.clip(_SHARP * first.sharp, _LEAST_SHARP, _SHARP).astype(np.float32))
-    found = lobes.look(np.arange(lanes), seed, 0, samples)
+    found = lobes.trace(np.arange(lanes), seed, 0, samples)
     if len(found.widths) < _PLENTY:
         search = _Connections(scene, camera, projector, 1, geometry, spread=True).over(least, sharp=True)
         lit = np.bincount(search.trace(seed, 0, max(1, _SEARCHING // lanes)).pixel, minlength=lanes)
         pixels = with_neighbours((found.by_pixel > 0) | (lit > 0), projector.n)
         if len(pixels):
-            found = lobes.look(pixels, seed, samples, samples * lanes // len(pixels))
+            found = lobes.trace(pixels, seed, samples, samples * lanes // len(pixels))
     total, moment = float(found.by_pixel.sum()), float(found.moments.sum())
     hits = total**2 / moment if moment else 0.0
     rest = 0.0
@@ -152,7 +152,7 @@ def with_neighbours(chosen: npt.NDArray[np.bool_], side: int) -> Labels:
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
+class _LobeLight:
     """Irradiance and second moment of every projector pixel, the part of its turns that are sharp, the irradiance's
     error, and width and weight of each lobe."""
 
@@ -165,7 +165,7 @@ class _Found:
 
 
 @dataclass
-class _Met:
+class _SensorHits:
     """Of points met on the sensor: estimates x of the mean irradiance, x I, and density q of one, drawn by x; and sharp
     turns, wherever they went."""
 
@@ -174,12 +174,12 @@ class _Met:
     density: mi.Float
     turns: mi.Float
 
-    def joined_by(self, more: _Met, rng: mi.PCG32) -> _Met:
+    def joined_by(self, more: _SensorHits, rng: mi.PCG32) -> _SensorHits:
         """These and ``more``; in x I, points that are met over one surface are no points of another."""
         mean = self.mean + more.mean
         new = rng.next_float32() * mean < more.mean
         density = dr.select(new, more.density, self.density)
-        return _Met(mean, self.moment + more.moment, density, self.turns + more.turns)
+        return _SensorHits(mean, self.moment + more.moment, density, self.turns + more.turns)
 
 
 class _Connections(DirectTracer):
@@ -187,7 +187,7 @@ class _Connections(DirectTracer):
 
     _over_sharp: bool
     _least: mi.Float
-    _of_lane: mi.Float
+    _own_least: mi.Float
 
     def over(self, least: mi.Float, sharp: bool) -> _Connections:
         """The same over ``sharp`` lobes, of at ``least`` such a density [1/sr] by pixel, or over all others."""
@@ -197,12 +197,12 @@ class _Connections(DirectTracer):
     def _place(
         self, number: mi.UInt32, row: mi.UInt32, column: mi.UInt32, jitter: mi.Point2f
     ) -> tuple[mi.Point2f, mi.Float]:
-        self._of_lane = dr.gather(mi.Float, self._least, number)
+        self._own_least = dr.gather(mi.Float, self._least, number)
         return super()._place(number, row, column, jitter)
 
-    def _connected(self, at: Arrival, sensor: mi.Point3f) -> tuple[Reception, mi.UnpolarizedSpectrum]:
-        reception, received = super()._connected(at, sensor)
-        sharp = reception.pdf > self._of_lane
+    def _by_connection(self, at: Arrival, sensor: mi.Point3f) -> tuple[Reception, mi.UnpolarizedSpectrum]:
+        reception, received = super()._by_connection(at, sensor)
+        sharp = reception.pdf > self._own_least
         return reception, dr.select(sharp == self._over_sharp, received, 0)
 
 
@@ -222,7 +222,7 @@ class _Lobes:
         self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
         self.least = dr.full(mi.Float, _LEAST_SHARP, projector.n**2)
 
-    def look(self, pixels: Labels, seed: int, first: int, samples: int, wider: float = 1.0) -> _Found:
+    def trace(self, pixels: Labels, seed: int, first: int, samples: int, wider: float = 1.0) -> _LobeLight:
         """What rays of the projector meet on the sensor.
 
         Parameters
@@ -251,7 +251,7 @@ class _Lobes:
         variance = max(squares / samples - float(by_pixel.sum()) ** 2 / len(pixels), 0.0)
         pixel_of, densities = (np.concatenate(parts) for parts in zip(*met, strict=True))
         widths = np.sqrt(sharp[pixel_of] / (np.pi * densities))
-        return _Found(by_pixel, moments, sharp, math.sqrt(variance / samples), widths, np.concatenate(weights))
+        return _LobeLight(by_pixel, moments, sharp, math.sqrt(variance / samples), widths, np.concatenate(weights))
 
     def meet(
         self, seed: int, sample: mi.UInt32, pixel: mi.UInt32, wider: float, turned: mi.Float
@@ -263,7 +263,7 @@ class _Lobes:
         seed, sample, pixel
             of the rays.
         wider
-            as for :meth:`look`.
+            as for :meth:`trace`.
         turned
             (n^2,) sharp turns of each pixel's rays, to which these add theirs.
 
@@ -278,9 +278,9 @@ class _Lobes:
         wavelengths, spectral = sampled_wavelengths(self.camera, rng, self.rays.projector.lines)
         ray = self.rays.sample(pixel, jitter, rng, wavelengths)
         flux = self.rays.flux(pixel, wavelengths) * spectral
-        none = _Met(mi.Float(0), mi.Float(0), mi.Float(1), mi.Float(0))
+        none = _SensorHits(mi.Float(0), mi.Float(0), mi.Float(1), mi.Float(0))
         met, _ = self.receiver.passage.along(
-            ray, flux, (none, rng), partial(self._at, half, dr.gather(mi.Float, self.least, pixel))
+            ray, flux, (none, rng), partial(self._meet_sensor, half, dr.gather(mi.Float, self.least, pixel))
         )
         # Whole numbers, whose sums in any order are the same.
         dr.scatter_reduce(dr.ReduceOp.Add, turned, met.turns, pixel, met.turns > 0)
@@ -296,7 +296,9 @@ class _Lobes:
         check_finite(product)
         return number, mean, product, density
 
-    def _at(self, half: mi.Float, least: mi.Float, at: Arrival, state: tuple[_Met, mi.PCG32]) -> tuple[_Met, mi.PCG32]:
+    def _meet_sensor(
+        self, half: mi.Float, least: mi.Float, at: Arrival, state: tuple[_SensorHits, mi.PCG32]
+    ) -> tuple[_SensorHits, mi.PCG32]:
         """What a turn that is sampled at the surface meets on a sensor of a ``half`` width, over lobes of ``least``
         density."""
         met, rng = state
@@ -312,7 +314,7 @@ class _Lobes:
         per_area = density * reception.solid_angle(sensor)
         connected = dr.select(active, panchromatic(reception.irradiance * at.light), 0)
         mean = dr.select(active, connected / (4 * dr.square(half) * per_area), 0)
-        return met.joined_by(_Met(mean, mean * connected, per_area, turns), rng), rng
+        return met.joined_by(_SensorHits(mean, mean * connected, per_area, turns), rng), rng
 
 
 # -------- Direct light aimed at the anchors that sharp lobes meet
@@ -444,16 +446,16 @@ class AimedTracer(DirectTracer):
         place, sensor, width, valid = (values.reshape(_AXES, count, -1) for values in self._axes())
         aims = _Aims(np.zeros((count, 2)), np.zeros((count, 2, 2)), np.ones((count, 2)), np.zeros(count, bool))
         for number in range(count):
-            told = valid[:, number, 0] > 0
-            if np.count_nonzero(told) < _FEWEST:
+            known = valid[:, number, 0] > 0
+            if np.count_nonzero(known) < _FEWEST:
                 continue
-            design = np.concatenate([np.ones((told.sum(), 1)), place[told, number] - 0.5], axis=1)
-            fit = np.linalg.lstsq(design, sensor[told, number], rcond=None)[0]
-            jacobian, spread = fit[1:].T, sensor[told, number] - design @ fit
+            design = np.concatenate([np.ones((known.sum(), 1)), place[known, number] - 0.5], axis=1)
+            fit = np.linalg.lstsq(design, sensor[known, number], rcond=None)[0]
+            jacobian, spread = fit[1:].T, sensor[known, number] - design @ fit
             if abs(np.linalg.det(jacobian)) < _ROUND * np.square(jacobian).sum():
                 continue
             slope = np.linalg.inv(jacobian)
-            radius = np.hypot(np.median(width[told, number]), np.median(np.abs(spread)))
+            radius = np.hypot(np.median(width[known, number]), np.median(np.abs(spread)))
             aims.known[number] = True
             aims.slope[number], aims.centre[number] = slope, 0.5 - slope @ fit[0]
             aims.scale[number] = np.linalg.norm(slope, axis=1) * radius

@@ -117,7 +117,9 @@ class GlintRays:
         self.rays = PinholeRays(projector, self._wavelengths)
         mean = self.rays.power.mean(axis=0)
         self._colour = mean / mean.sum() if mean.sum() > 0 else np.full(len(mean), 1 / len(mean))
-        self._lobes = _by_choice(lobe for bsdf in delta_bsdfs(scene, int(mi.BSDFFlags.Delta)) for lobe in _lobes(bsdf))
+        self._lobes = _group_lobes(
+            lobe for bsdf in delta_bsdfs(scene, int(mi.BSDFFlags.Delta)) for lobe in _lobes(bsdf)
+        )
         polished = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
         self.mirrors = [s for s in scene.shapes() if s.bsdf() is not None and s.bsdf().flags() & polished]
         self._exact = ExactHits(self.mirrors)
@@ -176,8 +178,8 @@ class GlintRays:
     def _bounce(self, rays: _Rays, si: mi.SurfaceInteraction3f, active: Mask) -> list[_Rays]:
         """The rays that go on, polished, by lobe; see the module."""
         count = len(active)
-        hits = _polished(rays, si)
-        shaded = hits.normal.copy()
+        hits = _plane_hits(rays, si)
+        shading = hits.normal.copy()
         shapes = per_lane(dr.reinterpret_array(mi.UInt32, si.shape), count).astype(np.uint64)
         numbers = shapes.astype(np.int64), per_lane(si.prim_index, count).astype(np.int64)
         self._exact.refine(rays.origin, rays.direction, hits, *numbers)
@@ -185,20 +187,20 @@ class GlintRays:
         onward: list[_Rays] = []
         materials = per_lane(dr.reinterpret_array(mi.UInt32, si.bsdf()), count)
         for lobe, own in self._lobes:
-            met = active & np.isin(materials, own)
-            if not met.any():
+            own_lobe = active & np.isin(materials, own)
+            if not own_lobe.any():
                 continue
-            here = mi.Bool(met)
-            sample, weight = self._sampled(lobe, si, here)
+            here = mi.Bool(own_lobe)
+            sample, weight = self._sample_lobe(lobe, si, here)
             kind, eta = per_lane(sample.sampled_type, count), per_lane(sample.eta, count)
             single = (kind & int(mi.BSDFFlags.Delta)) != 0
             spectrum = rays.spectrum * np.nan_to_num(weight)
-            chosen = np.flatnonzero(met & single & ((spectrum @ self._colour) > _FAINTEST))
+            chosen = np.flatnonzero(own_lobe & single & ((spectrum @ self._colour) > _FAINTEST))
             traced = vectors(si.to_world(sample.wo), count)[chosen]
             turn = kind[chosen], eta[chosen], rays.direction[chosen]
             # What Mitsuba did with its own normal tells which law it is; the better normal is for where light goes.
-            lawful = np.linalg.norm(_redirected(shaded[chosen], *turn) - traced, axis=1) < _AGREEMENT
-            direction = np.where(lawful[:, None], _redirected(normal[chosen], *turn), traced)
+            as_by_law = np.linalg.norm(_redirect(shading[chosen], *turn) - traced, axis=1) < _AGREEMENT
+            direction = np.where(as_by_law[:, None], _redirect(normal[chosen], *turn), traced)
             direction /= np.linalg.norm(direction, axis=1, keepdims=True)
             slope = np.abs((direction * geometric[chosen]).sum(axis=1))
             clear = self._clear * (1 + np.abs(point[chosen]).max(axis=1, initial=0)) / np.maximum(slope, _GRAZING)
@@ -211,7 +213,9 @@ class GlintRays:
                 onward.append(_Rays(rays.index[chosen], point[chosen], direction, start, chain, spectrum[chosen]))
         return onward
 
-    def _sampled(self, lobe: _Lobe, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.BSDFSample3f, FloatArray]:
+    def _sample_lobe(
+        self, lobe: _Lobe, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[mi.BSDFSample3f, FloatArray]:
         """Direction sample, and weights (k, channels) over all wavelength sets."""
         weights = []
         choice = lobe.choice * (1 - dr.max(Passage.straight(si, active))) if lobe.by_chance else lobe.choice
@@ -243,7 +247,7 @@ class _Lobe:
     by_chance: bool = False
 
 
-def _by_choice(lobes: Iterable[_Lobe]) -> list[tuple[_Lobe, list[int]]]:
+def _group_lobes(lobes: Iterable[_Lobe]) -> list[tuple[_Lobe, list[int]]]:
     """One of all ``lobes`` that are chosen alike, and the numbers of their materials in Dr.Jit's registry."""
     found: dict[tuple[object, ...], tuple[_Lobe, list[int]]] = {}
     for lobe in lobes:
@@ -284,7 +288,7 @@ def _context() -> mi.BSDFContext:
     return mi.BSDFContext(mi.TransportMode.Importance)
 
 
-def _polished(rays: _Rays, si: mi.SurfaceInteraction3f) -> Hits:
+def _plane_hits(rays: _Rays, si: mi.SurfaceInteraction3f) -> Hits:
     """Where rays met surfaces, in float64 with the tangent plane of each."""
     count = len(rays.index)
     hit, geometric, normal = (vectors(v, count) for v in (si.p, si.n, si.sh_frame.n))
@@ -297,7 +301,7 @@ def _polished(rays: _Rays, si: mi.SurfaceInteraction3f) -> Hits:
     return Hits(np.where(good[:, None], point, hit), geometric, normal)
 
 
-def _redirected(normal: FloatArray, kind: IntArray, eta: FloatArray, direction: FloatArray) -> FloatArray:
+def _redirect(normal: FloatArray, kind: IntArray, eta: FloatArray, direction: FloatArray) -> FloatArray:
     """(k, 3) directions after a surface in float64: reflected, refracted by ``eta`` (Snell) or straight on."""
     cosine = (direction * normal).sum(axis=1, keepdims=True)
     reflected = direction - 2 * cosine * normal
@@ -335,7 +339,7 @@ class Hits:
 
 
 class _Surface(Protocol):
-    def met(self, origin: FloatArray, direction: FloatArray, hits: Hits, face: IntArray) -> Hits: ...
+    def meet(self, origin: FloatArray, direction: FloatArray, hits: Hits, face: IntArray) -> Hits: ...
 
 
 class ExactHits:
@@ -365,7 +369,7 @@ class ExactHits:
             mine = np.flatnonzero(shape == number)
             old = Hits(*(getattr(hits, name)[mine] for name in vars(hits)))
             with np.errstate(all="ignore"):
-                hits.put(mine, self._surfaces[int(number)].met(origin[mine], direction[mine], old, face[mine]))
+                hits.put(mine, self._surfaces[int(number)].meet(origin[mine], direction[mine], old, face[mine]))
 
 
 def _surface(shape: mi.Shape) -> _Surface | None:
@@ -390,7 +394,7 @@ class _Round:
     axis: FloatArray
     radius: float
 
-    def met(self, origin: FloatArray, direction: FloatArray, hits: Hits, face: IntArray) -> Hits:
+    def meet(self, origin: FloatArray, direction: FloatArray, hits: Hits, face: IntArray) -> Hits:
         start, way = (self._across(vectors) for vectors in (origin - self.centre, direction))
         a, b = np.square(way).sum(axis=1), (start * way).sum(axis=1)
         root = np.sqrt(b**2 - a * (np.square(start).sum(axis=1) - self.radius**2))
@@ -420,7 +424,7 @@ class _Mesh:
         of_vertices = (data["vertex_positions"], data["vertex_normals"])
         return cls(*(np.array(values, dtype=np.float64).reshape(-1, 3)[corners] for values in of_vertices))
 
-    def met(self, origin: FloatArray, direction: FloatArray, hits: Hits, face: IntArray) -> Hits:
+    def meet(self, origin: FloatArray, direction: FloatArray, hits: Hits, face: IntArray) -> Hits:
         corner, along, across = _edges(self.places[face])
         geometric = np.cross(along, across)
         scale = (direction * geometric).sum(axis=1)

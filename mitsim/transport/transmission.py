@@ -119,7 +119,7 @@ class Passage:
             return ~self.scene.ray_test(self.leaving_to(si, target), active), mi.Spectrum(1)
         ray = self.leaving_to(si, target)
 
-        def further(active: mi.Bool, ray: mi.Ray3f, part: mi.Spectrum) -> tuple[mi.Bool, mi.Ray3f, mi.Spectrum]:
+        def advance(active: mi.Bool, ray: mi.Ray3f, part: mi.Spectrum) -> tuple[mi.Bool, mi.Ray3f, mi.Spectrum]:
             met = self.next_surface(ray, active)
             active &= met.is_valid()
             part = dr.select(active, part * self.straight(met, active), part)
@@ -130,7 +130,7 @@ class Passage:
             return active, ray, part
 
         state = mi.Bool(active), ray, mi.Spectrum(1)
-        _, _, part = dr.while_loop(state, lambda active, *_: active, further, labels=("active", "ray", "part"))
+        _, _, part = dr.while_loop(state, lambda active, *_: active, advance, labels=("active", "ray", "part"))
         return dr.max(part) > 0, part
 
     def along(
@@ -157,7 +157,7 @@ class Passage:
             si = self.scene.ray_intersect(ray, mi.RayFlags.All, True)
             return visit(Arrival(si, ray.d, light, si.is_valid()), state)
 
-        def further(active: mi.Bool, ray: mi.Ray3f, light: mi.Spectrum, *state: object) -> tuple[object, ...]:
+        def advance(active: mi.Bool, ray: mi.Ray3f, light: mi.Spectrum, *state: object) -> tuple[object, ...]:
             si = self.next_surface(ray, active, coherent=True)
             active &= si.is_valid()
             # Before the visit, which may turn the surface to where it is seen from.
@@ -168,7 +168,7 @@ class Passage:
             return active & (dr.max(light) > 0), onward, light, *state
 
         begun = mi.Bool(True), ray, light, *state
-        return dr.while_loop(begun, lambda active, *_: active, further)[3:]  # type: ignore[no-any-return]
+        return dr.while_loop(begun, lambda active, *_: active, advance)[3:]  # type: ignore[no-any-return]
 
     def next_surface(self, ray: mi.Ray3f, active: mi.Bool, coherent: bool = False) -> mi.SurfaceInteraction3f:
         """Where a ray that goes on meets the next surface: never behind its start, so that it gets on.
@@ -372,13 +372,13 @@ class _Ray:
     part: mi.Spectrum
     eta: mi.Float
 
-    def moved(self, distance: mi.Float, normal: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f]:
+    def move_crossing(self, distance: mi.Float, normal: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f]:
         """How its crossing moves with the plane of a ``normal`` at a ``distance``."""
-        moved = []
+        moves = []
         for place, direction in ((self.place_a, self.direction_a), (self.place_b, self.direction_b)):
             at = place + direction * distance
-            moved.append(at - self.direction * (dr.dot(at, normal) / dr.dot(self.direction, normal)))
-        return moved[0], moved[1]
+            moves.append(at - self.direction * (dr.dot(at, normal) / dr.dot(self.direction, normal)))
+        return moves[0], moves[1]
 
 
 @dataclass
@@ -416,7 +416,7 @@ def refracted_way(passage: Passage, si: mi.SurfaceInteraction3f, target: mi.Poin
         mi.Bool(active), search.facing, mi.UInt32(0), mi.Float(dr.inf), search.facing, nothing, nothing, mi.Spectrum(0),
         mi.Float(1),
     )  # fmt: skip
-    (aim,) = dr.while_loop((start,), lambda aim: aim.active, lambda aim: (search.corrected(aim),))
+    (aim,) = dr.while_loop((start,), lambda aim: aim.active, lambda aim: (search.correct(aim),))
     seen = active & (aim.miss < _MET) & (dr.max(aim.part) > 0)
     apparent = target - aim.arriving * dr.sqrt(aim.squared)
     return Way(aim.direction, apparent, aim.length, aim.part, aim.eta, seen)
@@ -431,7 +431,7 @@ class _Search:
     target: mi.Point3f
     facing: mi.Vector3f
 
-    def corrected(self, aim: _Aim) -> _Aim:
+    def correct(self, aim: _Aim) -> _Aim:
         """What the ray of ``aim`` does at the target's plane, and a better direction."""
         facing, (a, b) = self.facing, mi.coordinate_system(aim.direction)
         zero, clear = mi.Vector3f(0), self.passage.clear(self.si, aim.direction)
@@ -439,12 +439,12 @@ class _Search:
             mi.Bool(aim.active), self.si.p, aim.direction, clear, zero, zero, a, b, mi.Float(0), mi.Spectrum(1),
             mi.Float(1),
         )  # fmt: skip
-        (ray,) = dr.while_loop((ray,), lambda ray: ray.active, lambda ray: (self.further(ray),))
+        (ray,) = dr.while_loop((ray,), lambda ray: ray.active, lambda ray: (self.advance(ray),))
         distance = self.reach(ray)
         error = self.target - (ray.place + ray.direction * distance)
         u, v = mi.coordinate_system(facing)
         (au, av), (bu, bv), (eu, ev) = (
-            (dr.dot(moved, u), dr.dot(moved, v)) for moved in (*ray.moved(distance, facing), error)
+            (dr.dot(move, u), dr.dot(move, v)) for move in (*ray.move_crossing(distance, facing), error)
         )
         area = au * bv - av * bu
         step = a * ((eu * bv - ev * bu) / area) + b * ((au * ev - av * eu) / area)
@@ -468,30 +468,30 @@ class _Search:
         """Distance [mm] of a ``ray`` to the target's plane."""
         return dr.dot(self.target - ray.place, self.facing) / dr.dot(ray.direction, self.facing)
 
-    def further(self, ray: _Ray) -> _Ray:
+    def advance(self, ray: _Ray) -> _Ray:
         """A ``ray`` beyond the next surface before the target; what is opaque stops its light, not the search."""
         origin = ray.place + ray.direction * ray.clear
         onward = mi.Ray3f(origin, ray.direction, self.si.time, self.si.wavelengths)
         met = self.passage.next_surface(onward, ray.active)
         distance = met.t + ray.clear
         before = ray.active & met.is_valid() & (distance < self.reach(ray))
-        place_a, place_b = ray.moved(distance, met.n)
+        place_a, place_b = ray.move_crossing(distance, met.n)
         passed = self.passage.through(met, ray.direction, before)
         # Snell: d' = d / eta + (c / eta - c') n, c and c' the cosines to the normal that faces the ray.
         normal = met.n * -dr.sign(dr.dot(met.n, ray.direction))
         cosine, inside = -dr.dot(normal, ray.direction), -dr.dot(normal, passed.direction)
         ratio = dr.rcp(passed.eta)
 
-        def turned(direction: mi.Vector3f) -> mi.Vector3f:
+        def turn(direction: mi.Vector3f) -> mi.Vector3f:
             change = -dr.dot(normal, direction)
             return direction * ratio + normal * (ratio * change - dr.square(ratio) * cosine * change / inside)
 
-        changed = _Ray(
+        refracted = _Ray(
             before, met.p, passed.direction, self.passage.clear(met, passed.direction), place_a, place_b,
-            turned(ray.direction_a), turned(ray.direction_b), ray.length + distance, ray.part * passed.part,
+            turn(ray.direction_a), turn(ray.direction_b), ray.length + distance, ray.part * passed.part,
             ray.eta * passed.eta,
         )  # fmt: skip
-        chosen = {name: dr.select(before, getattr(changed, name), getattr(ray, name)) for name in vars(ray)}
+        chosen = {name: dr.select(before, getattr(refracted, name), getattr(ray, name)) for name in vars(ray)}
         return _Ray(**{**chosen, "active": before})
 
 
