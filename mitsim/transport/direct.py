@@ -24,7 +24,7 @@ from mitsim.transport.connect import Receiver, Reception, SensorPoints, landing,
 from mitsim.transport.integrator import LANES_PER_LAUNCH, InFlight, Tracer
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.records import DIRECT, Deposits, Sightings, check_finite
-from mitsim.transport.sampler import shuffled, stratified, streams, told_apart
+from mitsim.transport.sampler import shuffled, split_by_line, stratified, streams
 from mitsim.transport.transmission import Arrival
 
 IntArray = npt.NDArray[np.int64]
@@ -86,7 +86,7 @@ class DirectTracer(Tracer):
         seed, first, samples
             as for :meth:`trace`.
         """
-        for tracer in self.apart:
+        for tracer in self.per_wavelength:
             for flight in self._in_flight([seed], first, samples):
                 seen, _, anchor = tracer._sightings(flight)
                 lights = seen.by_line(len(ledgers))
@@ -212,7 +212,7 @@ class FluxTracer:
             when the scene sends NaN or infinite light to the camera.
         """
         blocks, at_once = groups * len(pixels), max(1, self.lanes_per_launch // samples)
-        lines, apart = self._rays.projector.lines, self._rays.projector.apart
+        lines, projectors = self._rays.projector.lines, self._rays.projector.per_wavelength
         total = np.zeros((len(lines.shares) if lines and lines.several else 1, blocks))
         numbers, starts = mi.UInt32(pixels), mi.UInt32(first)
         # Opaque numbers keep the compiled kernel the same for all of them.
@@ -225,11 +225,11 @@ class FluxTracer:
             group = block // count
             number = block - group * count
             sample = dr.gather(mi.UInt32, starts, number) + (lane - place * each)
-            for projector in apart:
+            for projector in projectors:
                 light = self._light(seed, group, dr.gather(mi.UInt32, numbers, number), sample, projector.lines)
                 if len(total) > 1:
                     dr.eval(light)  # together: apart, each line would trace it
-                for own, value in zip(total, told_apart(light, len(total)), strict=True):
+                for own, value in zip(total, split_by_line(light, len(total)), strict=True):
                     own[start:stop] += np.array(dr.block_sum(mi.Float64(value), samples))
         check_finite(total)
         return total.reshape(len(total), groups, -1)

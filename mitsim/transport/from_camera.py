@@ -455,7 +455,7 @@ class LampTracer(FromCameraTracer):
         self._alone: mi.UInt32 | None = None
 
     @property
-    def apart(self) -> Sequence[LampTracer]:
+    def per_wavelength(self) -> Sequence[LampTracer]:
         """Itself, or where glass parts wavelengths, the same for each band alone."""
         if not self.projector.parted:
             return [self]

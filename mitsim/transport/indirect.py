@@ -121,7 +121,9 @@ class IndirectTracer(FollowingTracer):
         seed, first, samples
             as for :meth:`trace`.
         """
-        flights = ((tracer, flight) for tracer in self.apart for flight in self._in_flight([seed], first, samples))
+        flights = (
+            (tracer, flight) for tracer in self.per_wavelength for flight in self._in_flight([seed], first, samples)
+        )
         return Deposits.joined(
             [part for tracer, flight in flights for part in tracer._paths(tracer._emission(flight)).accumulate(ledgers)]
         )

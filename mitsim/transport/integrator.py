@@ -133,9 +133,9 @@ class Tracer(ABC):
             yield InFlight.of(seeds, each, sample, index)
 
     @property
-    def apart(self) -> Sequence[Self]:
+    def per_wavelength(self) -> Sequence[Self]:
         """Itself, or where glass parts light of several wavelengths, the same for each of them alone."""
-        projectors = self.projector.apart
+        projectors = self.projector.per_wavelength
         return [self] if len(projectors) == 1 else [self._lit_by(projector) for projector in projectors]
 
     def _lit_by(self, projector: ProjectorOptics) -> Self:
@@ -162,7 +162,9 @@ class Tracer(ABC):
         MitsimError
             when the scene sends NaN or infinite light to the camera.
         """
-        flights = ((tracer, flight) for tracer in self.apart for flight in self._in_flight([seed], first, samples))
+        flights = (
+            (tracer, flight) for tracer in self.per_wavelength for flight in self._in_flight([seed], first, samples)
+        )
         return Deposits.joined([part for tracer, flight in flights for part in tracer._launch(flight)])
 
     def trace_looks(self, seeds: Sequence[int], samples: int = 1) -> list[Deposits]:
@@ -174,7 +176,7 @@ class Tracer(ABC):
         for start in range(0, len(seeds), together):
             few = seeds[start : start + together]
             (flight,) = self._in_flight(few, 0, samples)
-            parts = [part for tracer in self.apart for part in tracer._launch(flight)]
+            parts = [part for tracer in self.per_wavelength for part in tracer._launch(flight)]
             for start_of_one in range(0, each * len(few), each):
                 found.append(Deposits.joined([part.of_lanes(start_of_one, start_of_one + each) for part in parts]))
         return found

@@ -45,7 +45,7 @@ from mitsim.transport.indirect import (
 )
 from mitsim.transport.integrator import InFlight, camera_part, shading_correction
 from mitsim.transport.records import INDIRECT, Deposits, Sightings, check_finite
-from mitsim.transport.sampler import generator, stratified, told_apart
+from mitsim.transport.sampler import generator, split_by_line, stratified
 
 if TYPE_CHECKING:
     ByLine = list[mi.Float]
@@ -196,7 +196,7 @@ class ReusedPaths(ProjectorPaths):
     def _first_vertex(self) -> None:
         """The first surface, and each path's turn there."""
         paths = self.paths
-        self.first_ray, self.power = mi.Ray3f(paths.ray), told_apart(self.flux, self.tracer.lines)
+        self.first_ray, self.power = mi.Ray3f(paths.ray), split_by_line(self.flux, self.tracer.lines)
         self.first_hit = self.scene.ray_intersect_preliminary(paths.ray, True, active=paths.active)
         si = self.first_hit.compute_surface_interaction(paths.ray, active=paths.active)
         paths.active &= si.is_valid()

@@ -59,7 +59,7 @@ class ProjectorOptics:
     parted: bool = False
 
     @property
-    def apart(self) -> tuple[ProjectorOptics, ...]:
+    def per_wavelength(self) -> tuple[ProjectorOptics, ...]:
         """Itself, or where its lines part, one for each line, of which a path carries that alone.
 
         MitsimError where wavelengths that part would be drawn.

@@ -85,7 +85,7 @@ def panchromatic(radiance: mi.UnpolarizedSpectrum) -> mi.Float:
     return dr.mean(radiance)
 
 
-def told_apart(light: mi.UnpolarizedSpectrum, lines: int) -> list[mi.Float]:
+def split_by_line(light: mi.UnpolarizedSpectrum, lines: int) -> list[mi.Float]:
     """Light of each of several ``lines``, or of all in one, whose weights ``light`` has as :func:`panchromatic` takes
     them."""
     return [panchromatic(light)] if lines == 1 else [light[line] / len(light) for line in range(lines)]

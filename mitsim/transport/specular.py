@@ -92,7 +92,7 @@ def trace_glint(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, 
     if not has_mirrors(scene):
         return _join([], np.zeros(2))
     parts, left = [], np.zeros(2)
-    for each in projector.apart:
+    for each in projector.per_wavelength:
         beams, lost = _projector_beams(GlintRays(scene, camera, each, max_depth), projector.n, camera.geometry)
         parts += beams
         left += lost

@@ -133,9 +133,11 @@ def grazing(tracer: GlintRays, half_width: float, unit: int) -> tuple[list[Boxes
         one, other = order[:-1], order[1:]
         beside = (met.ray[other] == met.ray[one] + 1) & (met.ray[other] % _ACROSS != 0)
         one, other = one[beside], other[beside]
-        apart = np.linalg.norm(met.sensor[other] - met.sensor[one], axis=1)
-        near = np.linalg.norm((met.sensor[one] + met.sensor[other]) / 2, axis=1) < apart / 2 + math.sqrt(2) * half_width
-        for first, width in zip(one[near], apart[near], strict=True):
+        distance = np.linalg.norm(met.sensor[other] - met.sensor[one], axis=1)
+        near = (
+            np.linalg.norm((met.sensor[one] + met.sensor[other]) / 2, axis=1) < distance / 2 + math.sqrt(2) * half_width
+        )
+        for first, width in zip(one[near], distance[near], strict=True):
             ball, place = divmod(int(met.ray[first]), _ACROSS)
             plane, part = planes[ball], across[place : place + 2]
             arc = plane.arc(part, half_width, tracer.rays, unit)
