@@ -290,16 +290,9 @@ class ReusedPaths(ProjectorPaths):
         return sent, whole, same_side
 
     def _pair_light(self, sent: ByLine, whole: mi.Float, same_side: mi.Float, store: Store) -> None:
-        """Light of each pixel by each second point of its block, straight to the sensor and further on.
-
-        Parameters
-        ----------
-        sent, whole, same_side
-            as :meth:`_weights` has them.
-        store
-            takes the light of pairs: their place among all, the lane of the second point, the two lights, and which
-            lanes count.
-        """
+        """Light of each pixel by each second point of its block, straight to the sensor and further on, by what
+        :meth:`_weights` has. ``store`` takes, of pairs, the place among all, the path of the second point, the two
+        lights, and which count."""
         index, si = dr.arange(mi.UInt32, dr.width(self.lit)), self._first_points()
         first = index - self.member
         dr.eval(whole, same_side)

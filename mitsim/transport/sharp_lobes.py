@@ -223,19 +223,7 @@ class _Lobes:
         self.least = dr.full(mi.Float, _LEAST_SHARP, projector.n**2)
 
     def trace(self, pixels: Labels, seed: int, first: int, samples: int, wider: float = 1.0) -> _LobeLight:
-        """What rays of the projector meet on the sensor.
-
-        Parameters
-        ----------
-        pixels
-            of the projector.
-        seed
-            of the random numbers.
-        first, samples
-            rays ``first`` to ``first + samples`` - 1 of each pixel are followed.
-        wider
-            times the sensor's width that is looked at.
-        """
+        """What rays ``first`` to ``first + samples`` - 1 of some ``pixels`` meet on a sensor so many times ``wider``."""
         squares, met, weights = 0.0, [], []
         by_pixel, moments = np.zeros((2, self.rays.projector.n**2))
         turned = dr.zeros(mi.Float, len(by_pixel))
@@ -256,22 +244,8 @@ class _Lobes:
     def meet(
         self, seed: int, sample: mi.UInt32, pixel: mi.UInt32, wider: float, turned: mi.Float
     ) -> tuple[Labels, FloatArray, FloatArray, FloatArray]:
-        """Pixels of the rays that meet the sensor, and for each x, x I, and density q of one of the points met.
-
-        Parameters
-        ----------
-        seed, sample, pixel
-            of the rays.
-        wider
-            as for :meth:`trace`.
-        turned
-            (n^2,) sharp turns of each pixel's rays, to which these add theirs.
-
-        Raises
-        ------
-        MitsimError
-            when the scene sends NaN or infinite light to the camera.
-        """
+        """Pixels of the rays that meet the sensor, and for each x, x I, and density q of one of the points met; sharp
+        turns are added to those ``turned`` (n^2,). MitsimError where light is NaN or infinite."""
         half = dr.opaque(mi.Float, wider * self.geometry.half_width)
         _, rng = streams(seed, pixel, sample)
         jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
