@@ -223,7 +223,7 @@ class _Lobes:
         self.least = dr.full(mi.Float, _LEAST_SHARP, projector.n**2)
 
     def trace(self, pixels: Labels, seed: int, first: int, samples: int, wider: float = 1.0) -> _LobeLight:
-        """What rays ``first`` to ``first + samples`` - 1 of some ``pixels`` meet on a sensor so many times ``wider``."""
+        """What rays ``first`` to ``first + samples`` - 1 of ``pixels`` meet on a sensor so many times ``wider``."""
         squares, met, weights = 0.0, [], []
         by_pixel, moments = np.zeros((2, self.rays.projector.n**2))
         turned = dr.zeros(mi.Float, len(by_pixel))
