@@ -228,11 +228,11 @@ class CameraPaths(PathIntegrator[State]):
             solid *= dr.power(squared, -0.5 * dr.opaque(mi.Float, self.geometry.angular_exponent))
         self.weight = spectral * solid
         sightings = {kind: Sightings.none(tracer.by_line) for kind in KINDS}
-        self.start = state(active=active, ray=ray, rng=rng, sightings=sightings)
+        self.paths = state(active=active, ray=ray, rng=rng, sightings=sightings)
 
     def deposits(self) -> list[Deposits]:
         """Light on the host of every path."""
-        kept = self.follow(self.start).sightings
+        kept = self.follow(self.paths).sightings
         dr.eval(kept)
         return [Deposits.fetched(seen, KINDS[kind], self.anchor) for kind, seen in kept.items()]
 

@@ -187,7 +187,7 @@ class ProjectorPaths(PathIntegrator[PathState]):
         connections = _OneConnection if tracer.points.count == 1 else _AnchorConnections
         self.connections = connections(tracer.points, emission)
         sightings = self.connections.none(("direct", "indirect") if tracer.mirrors else ("indirect",), tracer.rules)
-        self.start = PathState(active=mi.Bool(True), ray=ray, rng=rng, sightings=sightings)
+        self.paths = PathState(active=mi.Bool(True), ray=ray, rng=rng, sightings=sightings)
 
     def _connect(self, paths: PathState, si: mi.SurfaceInteraction3f, first: bool) -> None:
         """Keep light that surfaces send to the sensor; that of the ``first`` is the direct tracer's."""
@@ -235,12 +235,12 @@ class ProjectorPaths(PathIntegrator[PathState]):
 
     def deposits(self) -> list[Deposits]:
         """Light on the host of every path at every anchor."""
-        held = self.follow(self.start).sightings
+        held = self.follow(self.paths).sightings
         return self.connections.fetched(held, tuple(held))
 
     def accumulate(self, ledgers: Sequence[Ledger]) -> list[Deposits]:
         """Follow all paths; indirect light goes into ``ledgers``, caustics to the host."""
-        paths = self.follow(self.start)
+        paths = self.follow(self.paths)
         drawn = paths.rng.next_float32()
 
         def add(held: Held, number: mi.UInt32) -> None:

@@ -177,7 +177,6 @@ class ReusedPaths(ProjectorPaths):
 
     def _own(self) -> list[Deposits]:
         """Follow all paths; on the host the light that is not shared."""
-        self.paths = self.start
         self._first_vertex()
         self._second_vertex()
         self.paths = self.follow_on(self.paths)
