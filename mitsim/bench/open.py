@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mitsim.devices.mask_profile import MaskProfile
     from mitsim.devices.projector import ProjectorModel
     from mitsim.scene.load import LoadedScene
-    from mitsim.transport.contact import Contact
+    from mitsim.transport.transmission import Contact
 
 Opened = TypeVar("Opened", bound=Apparatus)
 _PITCH_TOLERANCE = 1e-3
@@ -154,11 +154,11 @@ def _loaded(variant: str, path: Path, defines: Mapping[str, str], **options: boo
     """A scene in a variant that is set from then on, as :func:`mitsim.scene.load.load_scene` takes it."""
     mitsuba = load_variant(variant)
     from mitsim.scene.load import load_scene
-    from mitsim.transport.contact import contacts
-    from mitsim.transport.plugins import all
+    from mitsim.transport import plugins
+    from mitsim.transport.transmission import contacts
 
     mitsuba.set_log_level(mitsuba.LogLevel.Error)
-    all.register()
+    plugins.register()
     loaded = load_scene(path, defines, **options)
     of_factored, of_reference = contacts(loaded.scene)
     factored = _in_contact(loaded, of_factored, "the factored estimator")
