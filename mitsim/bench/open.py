@@ -60,13 +60,16 @@ def check_scene(
 
 
 def check_devices(camera: Path | str | None, projector: Path | str | None) -> tuple[Path, Path]:
-    """Files of a ``camera`` and a ``projector``, as of :func:`mitsim.api.open_bench`; MitsimError for one that there is not."""
+    """Files of a ``camera`` and a ``projector``, as of :func:`mitsim.api.bench.open_bench`; MitsimError for one that
+    there is not."""
     found = ((camera, DEFAULT_CAMERA), (projector, "mp_cl1"))
     first, second = (locate(default if name is None else name, "calibration", ".toml") for name, default in found)
     return first, second
 
 
-def open_apparatus(
+def open_as(
+    kind: type[Opened],
+    /,
     scene: Path | str,
     variant: str = DEFAULT_VARIANT,
     camera: Path | str | None = None,
@@ -74,8 +77,8 @@ def open_apparatus(
     allow_outside_files: bool = False,
     for_render: bool = False,
     **parameters: object,
-) -> Apparatus:
-    """What :func:`mitsim.api.open_bench` opens, with its arguments; MitsimError as there."""
+) -> Opened:
+    """What :func:`mitsim.api.open_bench` opens, with its arguments, as a ``kind`` of bench; MitsimError as there."""
     defines = {name: _text(value) for name, value in parameters.items()}
     path = check_scene(scene, defines, allow_outside_files)
     sensor_path, projector_path = check_devices(camera, projector)
@@ -114,11 +117,12 @@ def open_apparatus(
     _wear(loaded, mask, sensor_path)
     _tune(loaded, light)
     rig = Rig(loaded.camera.geometry, sensor, light, str(sensor_path))
-    return Apparatus(loaded, rig, variant, defines)
+    return kind(loaded, rig, variant, defines)
 
 
 def reopened(bench: Opened, variant: str) -> Opened:
-    """The ``bench`` loaded anew into a ``variant``, which is set from then on. MitsimError as :func:`mitsim.api.open_bench`."""
+    """The ``bench`` loaded anew into a ``variant``, which is set from then on. MitsimError as
+    :func:`mitsim.api.bench.open_bench`."""
     from mitsim.devices.mask_profile import load_mask
 
     camera = Path(bench.rig.camera_file)

@@ -1,9 +1,15 @@
-"""What is asked of a bench: one model for the command line's options, the arguments of Python, and the manifest."""
+"""What is asked of a bench: one model for the command line's options, the arguments of Python, and the manifest.
+
+Arguments that travel together are one value: :class:`Request` is what a capture is to show, :class:`SessionRequest`
+what a calibration is to find, and :class:`Task` where results go and who watches the work.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -12,12 +18,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from mitsim.bench.effects import check_switches, parse_switches
 from mitsim.core.configuration import refusal, validated
 from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.job import Job
 from mitsim.core.seeds import check_root
 from mitsim.devices.families import NAMES, check_patterns
 from mitsim.devices.sensor import EXPOSURE_FRACTION, EXPOSURE_S, SensorModel
 
 if TYPE_CHECKING:
     from mitsim.devices.camera import Rig
+    from mitsim.devices.session import SessionRecipe
 
 LOWEST_ACCURACY, HIGHEST_ACCURACY = 1e-6, 0.3
 """Below, single precision in the renderer (6e-8 a connection) and the pilot's samples tell nothing; above, no frame is
@@ -34,6 +42,55 @@ MOST_SAMPLES = 2**20
 """An error of a thousandth of one sample's: an hour a pixel row, beyond use."""
 _LEAST_NOISE = 1e-3
 """Rendering noise of a thousandth of the sensor's adds a millionth to its variance: sampling beyond buys nothing."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """Where the results of a work go, and how it is watched; of no influence on them.
+
+    Attributes
+    ----------
+    output
+        folder that is written; None keeps them in memory.
+    resume
+        whether to go on with what an interrupted work left there.
+    job
+        clock, progress and limits.
+    """
+
+    output: Path | None = None
+    resume: bool = False
+    job: Job = field(default_factory=Job)
+
+    @classmethod
+    def of(cls, output: Path | str | None = None, resume: bool = False, job: Job | None = None) -> Task:
+        """Of arguments of the Python face."""
+        return cls(None if output is None else Path(output), resume, job or Job())
+
+    @contextmanager
+    def importing(self) -> Iterator[None]:
+        """The stage "imports" of the job's clock."""
+        with self.job.clock.stage("imports"):
+            yield
+
+
+@dataclass(frozen=True)
+class SessionRequest:
+    """Which factors are wanted, and how well.
+
+    Attributes
+    ----------
+    seed
+        root of every random stream.
+    accuracy
+        relative rms error of the expected responses.
+    recipe
+        how the session is run; None: the shipped one.
+    """
+
+    seed: int = 0
+    accuracy: float = 1e-3
+    recipe: SessionRecipe | None = None
 
 
 @dataclass(frozen=True)

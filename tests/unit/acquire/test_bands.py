@@ -57,7 +57,7 @@ def chosen(monkeypatch: pytest.MonkeyPatch) -> Callable[..., bands.Coloured]:
         monkeypatch.setattr(bands._Look, "errors", found)
         monkeypatch.setattr(bands, "plan_request", planned)
         monkeypatch.setattr(bands, "plan_lines", planned)
-        monkeypatch.setattr(bands.ColourBench, "of", lambda whole, kind: {RUN: whole}[kind])
+        monkeypatch.setattr(bands.SpectralBench, "of", lambda whole, kind: {RUN: whole}[kind])
         return bands.choose_colour(of, Request.of(accuracy=accuracy))
 
     return choose

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mitsim.acquire import mosaic
-from mitsim.acquire.mosaic import MosaicBench, MosaicFrames, MosaicLight
+from mitsim.acquire.spectral import without_filters, MosaicFrames, MosaicLight
 from mitsim.api.bench import Bench, open_bench
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimates
 from mitsim.calibrate.session import Session
@@ -159,7 +159,7 @@ def test_lamps_are_seen_by_each_pixel_through_its_filter(shared_scene: Callable[
     all.)
     """
     scene = shared_scene("lit mosaic", extra='<emitter type="constant"/>')
-    seen = MosaicBench.of(coloured(open_bench(scene, variant)))
+    seen = without_filters(coloured(open_bench(scene, variant)))
     responses = Response.of_each(seen.counting)
     assert [response.planes for response in responses] == [(0,), (1, 2), (3,)]
     spectra = tuple(Spectrum(np.array([nm]), np.ones(1)) for nm in np.linspace(420.0, 690.0, 12))
@@ -212,11 +212,11 @@ def test_frames_that_cut_through_filters_are_refused(bench: Bench, part: dict[st
     seen = coloured(bench)
     rig = replace(seen.rig, camera=seen.rig.camera.model_copy(update=part))
     with pytest.raises(MitsimError, match=r"do not hold whole filters of 2 x 2; give the scene's film even numbers"):
-        MosaicBench.of(replace(seen, rig=rig))
+        without_filters(replace(seen, rig=rig))
 
 
 def test_a_bench_behind_filters_says_which_camera_it_has(bench: Bench) -> None:
     """The sensor's own identity, filters and all, though frames are formed of bare pixels."""
-    seen = MosaicBench.of(coloured(bench))
+    seen = without_filters(coloured(bench))
     assert seen.identity()["sensor"]["mosaic"] == "RGGB" and seen.sensor.quantum_efficiency == 1.0
     assert seen.identity()["geometry"] == bench.identity()["geometry"]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import mitsim as ms
-from mitsim.acquire.capture import digital_scale
+from mitsim.devices.sensor import digital_of
 from mitsim.calibrate.calibrate import estimate
 from mitsim.calibrate.plan import least_dose
 from mitsim.calibrate.session import Session
@@ -149,7 +149,7 @@ def test_the_promise_is_kept_within_half_a_decibel(scene: str, wanted: float, va
     assert plan.reached
     shots, session = bench.capture(patterns, seed=11), Session(bench, plan.recipe, 11)
     lit = session.lit(session.trace(session.plan(1e-3, Job()), Job()), Job())
-    manifest = CalibrationManifest(camera=bench.identity(), digital=digital_scale(bench, lit.exposure_s))
+    manifest = CalibrationManifest(camera=bench.identity(), digital=digital_of(bench.sensor, lit.exposure_s))
     found = []
     for seed in range(11, 15):
         estimated, _ = estimate(replace(lit, session=replace(session, seed=seed)), Job())

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 import mitsim as ms
-from mitsim.calibrate.model_fit import fit_placement, model_of, simulated
+from mitsim.calibrate.model import fit_placement, model_of, simulated
 from mitsim.calibrate.session import Session
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job

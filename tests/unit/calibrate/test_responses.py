@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from mitsim.acquire.capture import digital_scale
+from mitsim.devices.sensor import digital_of
 from mitsim.acquire.exposure import Exposer
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, Checkpoint, estimate, estimates
 from mitsim.calibrate.session import LitSession, Session, _Shot
@@ -401,7 +401,7 @@ def test_frames_of_a_session_in_a_folder_give_its_factors_bit_for_bit(
 
     monkeypatch.setattr(Exposer, "digital", kept)
     simulated, _ = estimate(lit, Job())
-    digital = digital_scale(lit.session.bench, EXPOSURE_S).model_dump(mode="json")
+    digital = digital_of(lit.session.bench.sensor, EXPOSURE_S).model_dump(mode="json")
     listed = {"camera": "toy", "n": 7, "signed_capture": mode, "digital": digital, "dark": dark}
     shared = {name: value for name, value in more.items() if name != "dark_frames"}
     (tmp_path / "session.json").write_text(json.dumps({**listed, **shared}))
