@@ -33,8 +33,7 @@ from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.patterns import Lighting
-from mitsim.devices.sensor import SensorModel
-from mitsim.devices.sensor import digital_of
+from mitsim.devices.sensor import SensorModel, digital_of
 from mitsim.devices.session import load_recipe
 from mitsim.reconstruct.estimate_factors import Estimate, factors_of_sums, stripe_sums
 from mitsim.reconstruct.factors import Factors

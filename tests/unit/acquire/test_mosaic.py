@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from mitsim.acquire import mosaic
-from mitsim.acquire.spectral import without_filters, MosaicFrames, MosaicLight
+from mitsim.acquire.spectral import MosaicFrames, MosaicLight, without_filters
 from mitsim.api.bench import Bench, open_bench
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimates
+from mitsim.calibrate.lit_session import LitSession
 from mitsim.calibrate.session import Session
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
@@ -128,7 +129,7 @@ def test_a_session_behind_filters_tells_the_bare_camera(bench: Bench, kept_plans
     job, recipe = Job(), load_recipe()
     session = Session(bench, recipe, 0, filters=passed)
     plan = session.plan(1e-2, job)
-    lit = session.lit(session.trace(plan, job), job)
+    lit = LitSession.of(session, session.trace(plan, job), job)
     (noisy, clean), saturated = estimates(lit, job, (NOISY, NOISE_FREE))
     assert saturated == 0
     for name, predicted in zip(("left", "right"), noisy.predicted_error, strict=True):
@@ -140,7 +141,7 @@ def test_a_session_behind_filters_tells_the_bare_camera(bench: Bench, kept_plans
     assert noisy.noise == pytest.approx(lit.response_noise, rel=0.02)
     # The brightest pixel behind its filter fills the well, so light is gathered longer than without.
     bare = Session(bench, recipe, 0)
-    assert lit.exposure_s == pytest.approx(2 * bare.lit(lit.light, job).exposure_s, rel=0.1)
+    assert lit.exposure_s == pytest.approx(2 * LitSession.of(bare, lit.light, job).exposure_s, rel=0.1)
 
 
 def test_only_a_camera_with_filters_has_a_mosaic(bench: Bench) -> None:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mitsim.calibrate.calibrate import estimate
+from mitsim.calibrate.lit_session import LitSession
 from mitsim.calibrate.plan import PredictedSession
-from mitsim.calibrate.session import LitSession
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.reconstruct.estimate_factors import Estimate

@@ -16,15 +16,16 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from mitsim.devices.sensor import digital_of
 from mitsim.acquire.exposure import Exposer
-from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, Checkpoint, estimate, estimates
-from mitsim.calibrate.session import LitSession, Session, _Shot
+from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimate, estimates
+from mitsim.calibrate.checkpoint import Checkpoint
+from mitsim.calibrate.lit_session import LitSession, _Shot
+from mitsim.calibrate.session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.devices.camera import Rig
 from mitsim.devices.patterns import Lighting
-from mitsim.devices.sensor import SensorModel
+from mitsim.devices.sensor import SensorModel, digital_of
 from mitsim.devices.session import SIDES, load_recipe
 from mitsim.optics.frames import Frame
 from mitsim.reconstruct.captured_session import Ladder, calibrate_frames
@@ -295,15 +296,15 @@ def test_saturated_shots_are_counted_once_across_an_interruption(monkeypatch: py
 
 
 def test_the_error_of_factors_is_that_of_both_whatever_their_common_sign() -> None:
-    from mitsim.calibrate.calibrate import _factor_error
+    from mitsim.calibrate.calibrate import factor_error
 
     def factors(left: list[float], right: list[float]) -> Estimate:
         return SimpleNamespace(left=np.array([left]), right=np.array([right]))  # type: ignore[return-value]
 
     clean = factors([3.0, 4.0], [0.0, 10.0])
-    assert _factor_error(factors([3.0, 4.5], [0.0, 10.0]), clean) == pytest.approx(0.1)
-    assert _factor_error(factors([3.0, 4.0], [1.0, 10.0]), clean) == pytest.approx(0.1)
-    assert _factor_error(factors([-3.3, -4.4], [0.0, -11.0]), clean) == pytest.approx(np.hypot(0.1, 0.1))
+    assert factor_error(factors([3.0, 4.5], [0.0, 10.0]), clean) == pytest.approx(0.1)
+    assert factor_error(factors([3.0, 4.0], [1.0, 10.0]), clean) == pytest.approx(0.1)
+    assert factor_error(factors([-3.3, -4.4], [0.0, -11.0]), clean) == pytest.approx(np.hypot(0.1, 0.1))
 
 
 # ---- differences -----------------------------------------------------------------------------------------------------

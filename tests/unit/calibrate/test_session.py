@@ -16,7 +16,8 @@ import pytest
 from mitsim.acquire.exposure import Exposer
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.effects import EFFECTS
-from mitsim.calibrate.calibrate import Checkpoint, calibrate
+from mitsim.calibrate.calibrate import calibrate
+from mitsim.calibrate.checkpoint import Checkpoint
 from mitsim.calibrate.session import Session, session_cost
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import checksum, read_frame

@@ -22,8 +22,7 @@ import pytest
 
 from mitsim.acquire import spectral as colour
 from mitsim.acquire.capture import _of_unknown_light
-from mitsim.acquire.spectral import without_filters
-from mitsim.acquire.spectral import SpectralBench
+from mitsim.acquire.spectral import SpectralBench, without_filters
 from mitsim.api.bench import open_bench
 from mitsim.bench.request import Request
 from mitsim.core.spectral_manifests import MOSAIC, RUN
