@@ -119,7 +119,15 @@ def trace_request(bench: Apparatus, plan: Plan, job: Job | None = None) -> Light
 def expose(
     light: SampledLight, patterns: str, output: Path | str | None = None, job: Job | None = None, **request: Any
 ) -> Capture:
-    """One noisy frame for each shot of a family in a ``light``; see :meth:`Light.expose`."""
+    """One noisy frame for each shot of a family in given light.
+
+    Parameters
+    ----------
+    light
+        that the family is shown in.
+    patterns, output, job, request
+        as for :meth:`Light.expose`, which has the errors raised as well.
+    """
     own = replace(light.plan, request=request_of(light.plan, {}).changed(patterns=patterns))
     bench = SpectralBench(light.bench)
     return capture(bench, request_of(own, request), Task.of(output, job=job), lights=[light]).runs[0]
@@ -324,13 +332,25 @@ def colour_folder(task: Task, manifest: ColourManifest) -> Iterator[Path | None]
 
 
 def capture_lines(bench: Apparatus, request: Request, task: Task, plan: Plan | None = None) -> dict[str, Capture]:
-    """A run for each line, by its name; see :meth:`mitsim.api.bench.Bench.capture_lines`."""
+    """A run for each line, by its name.
+
+    Parameters
+    ----------
+    bench, request, task, plan
+        as for :meth:`mitsim.api.bench.Bench.capture_lines`, which has the errors raised as well.
+    """
     lines = SpectralBench.of(bench, RUN)
     return dict(zip(lines.names, capture(lines, request, task, plan).runs, strict=True))
 
 
 def capture_mosaic(bench: Apparatus, request: Request, task: Task) -> MosaicCapture:
-    """A run of all lines at once; see :meth:`mitsim.api.bench.Bench.capture_mosaic`."""
+    """A run of all lines at once.
+
+    Parameters
+    ----------
+    bench, request, task
+        as for :meth:`mitsim.api.bench.Bench.capture_mosaic`, which has the errors raised as well.
+    """
     lines = SpectralBench.of(bench, MOSAIC)
     assert isinstance(lines.manifest, MosaicManifest)
     captured, board = capture(lines, request, task), load_recipe().board_reflectance

@@ -37,7 +37,7 @@ def check_scene(
     Parameters
     ----------
     scene
-        as of :func:`mitsim.api.open_bench`.
+        as of :func:`mitsim.api.bench.open_bench`.
     defines
         values of its parameters by name.
     outside
@@ -78,7 +78,15 @@ def open_as(
     for_render: bool = False,
     **parameters: object,
 ) -> Opened:
-    """What :func:`mitsim.api.open_bench` opens, with its arguments, as a ``kind`` of bench; MitsimError as there."""
+    """Scene, camera and projector, loaded.
+
+    Parameters
+    ----------
+    kind
+        of bench that is made.
+    scene, variant, camera, projector, allow_outside_files, for_render, **parameters
+        as for :func:`mitsim.api.bench.open_bench`, which has the errors raised as well.
+    """
     defines = {name: _text(value) for name, value in parameters.items()}
     path = check_scene(scene, defines, allow_outside_files)
     sensor_path, projector_path = check_devices(camera, projector)

@@ -133,12 +133,24 @@ def write_session(bench: Apparatus, frames: Path | str, request: SessionRequest,
 
 
 def calibrate_lines(bench: Apparatus, request: SessionRequest, task: Task) -> dict[str, Factors]:
-    """Factors at each line, by its name; see :meth:`mitsim.api.bench.Bench.calibrate_lines`."""
+    """Factors at each line, by its name.
+
+    Parameters
+    ----------
+    bench, request, task
+        as for :meth:`mitsim.api.bench.Bench.calibrate_lines`, which has the errors raised as well.
+    """
     return _by_line(SpectralBench.of(bench, CALIBRATION), request, task)
 
 
 def calibrate_mosaic(bench: Apparatus, request: SessionRequest, task: Task) -> dict[str, Factors]:
-    """Factors at each line behind filters; see :meth:`mitsim.api.bench.Bench.calibrate_mosaic`."""
+    """Factors at each line behind filters, by its name.
+
+    Parameters
+    ----------
+    bench, request, task
+        as for :meth:`mitsim.api.bench.Bench.calibrate_mosaic`, which has the errors raised as well.
+    """
     lines = SpectralBench.of(without_filters(bench), CALIBRATION)
     if request.recipe is None:
         request = replace(request, recipe=load_recipe().model_copy(update={"repeats": _REPEATS_BEHIND_FILTERS}))
@@ -216,9 +228,8 @@ def _calibrated(
                 light = lights[number]
                 keep_light(checkpoint, light)
             lit = LitSession.of(session, light, job)
-            found.append(
-                _factors(lit if frames is None else replace(lit, kept=KeptFrames(session, frames)), checkpoint, job)
-            )
+            lit = replace(lit, kept=frames and KeptFrames(session, frames))
+            found.append(_factors(lit, checkpoint, job))
     return found
 
 
