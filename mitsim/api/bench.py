@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from mitsim.bench.bench import Apparatus
-from mitsim.bench.open import open_as, reopened
+from mitsim.bench.open import open_apparatus, reopened
 from mitsim.bench.request import Request, SessionRequest, Task
 from mitsim.core.arguments import checked
 from mitsim.core.environment import DEFAULT_VARIANT
@@ -63,7 +63,8 @@ def open_bench(
         for anything wrong with the files, a camera file whose pixel pitch is not the scene's, or a mask of the
         scene's where the camera file has one.
     """
-    return open_as(Bench, scene, variant, camera, projector, allow_outside_files, for_render, **parameters)
+    opened = open_apparatus(scene, variant, camera, projector, allow_outside_files, for_render, **parameters)
+    return Bench(**vars(opened))
 
 
 class Bench(Apparatus):

@@ -67,9 +67,7 @@ def check_devices(camera: Path | str | None, projector: Path | str | None) -> tu
     return first, second
 
 
-def open_as(
-    kind: type[Opened],
-    /,
+def open_apparatus(
     scene: Path | str,
     variant: str = DEFAULT_VARIANT,
     camera: Path | str | None = None,
@@ -77,13 +75,11 @@ def open_as(
     allow_outside_files: bool = False,
     for_render: bool = False,
     **parameters: object,
-) -> Opened:
+) -> Apparatus:
     """Scene, camera and projector, loaded.
 
     Parameters
     ----------
-    kind
-        of bench that is made.
     scene, variant, camera, projector, allow_outside_files, for_render, **parameters
         as for :func:`mitsim.api.bench.open_bench`, which has the errors raised as well.
     """
@@ -125,7 +121,7 @@ def open_as(
     _wear(loaded, mask, sensor_path)
     _tune(loaded, light)
     rig = Rig(loaded.camera.geometry, sensor, light, str(sensor_path))
-    return kind(loaded, rig, variant, defines)
+    return Apparatus(loaded, rig, variant, defines)
 
 
 def reopened(bench: Opened, variant: str) -> Opened:

@@ -64,7 +64,7 @@ class Task:
 
     @classmethod
     def of(cls, output: Path | str | None = None, resume: bool = False, job: Job | None = None) -> Task:
-        """Of arguments of the Python face."""
+        """Of arguments of the Python face: ``output``, ``resume`` and ``job`` as there."""
         return cls(None if output is None else Path(output), resume, job or Job())
 
     @contextmanager

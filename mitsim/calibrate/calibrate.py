@@ -255,7 +255,7 @@ def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
         "separability_residual": noisy.separability_residual,
         "unexplained_residual": noisy.unexplained,
         "noise_free_residual": clean.separability_residual,
-        "phi_error": factor_error(noisy, clean),
+        "phi_error": _factor_error(noisy, clean),
         "faults": faults.listed(frame_words),
         "lamp": faults.lamp.listed(),
         "shadow_residual": lacks and lacks.residual,
@@ -401,7 +401,7 @@ def _lacking(lit: LitSession, clean: Estimate) -> Lacking | None:
     return lacking(lit.session.shadow(physics.geometry, physics.spectrum), clean.left, clean.right)
 
 
-def factor_error(noisy: Estimate, clean: Estimate) -> float:
+def _factor_error(noisy: Estimate, clean: Estimate) -> float:
     """Relative error of both factors, in quadrature.
 
     (left, right) and (-left, -right) are one camera; centred factors have no sum that would tell which it is.

@@ -136,7 +136,15 @@ def _check_same(path: Path, configuration: Mapping[str, Any]) -> None:
 
 
 def kept_light(checkpoint: Checkpoint, session: Session, plan: Plan) -> SampledLight | None:
-    """The light of a ``session``'s board by a ``plan``; None where the ``checkpoint`` has none."""
+    """The light of a session's board; None where there is none.
+
+    Parameters
+    ----------
+    checkpoint
+        that may hold it.
+    session, plan
+        whose light it is.
+    """
     arrays = checkpoint.load("light")
     if arrays is None:
         return None
@@ -199,7 +207,15 @@ class SessionSums:
 
     @classmethod
     def kept(cls, checkpoint: Checkpoint, kinds: Sequence[str], session: Session) -> SessionSums | None:
-        """Those of these ``kinds`` of a ``session``; None where the ``checkpoint`` has none."""
+        """Those of an interrupted session; None where there are none.
+
+        Parameters
+        ----------
+        checkpoint
+            that may hold them.
+        kinds, session
+            of responses, and what they are responses to.
+        """
         arrays = checkpoint.load("stripes")
         if arrays is None:
             return None

@@ -72,7 +72,15 @@ class LitSession:
 
     @classmethod
     def of(cls, session: Session, light: SampledLight, job: Job) -> LitSession:
-        """A ``session`` in the ``light`` that it traced; ``job`` takes the time of choosing the exposure."""
+        """The session in its light.
+
+        Parameters
+        ----------
+        session, light
+            what is shown, and the board's light.
+        job
+            takes the time of choosing the exposure.
+        """
         with job.clock.stage("optics"):
             n, signs = session.bench.n, session.signs
             white = next(iter(light.frames(Lighting.uniform(n), session.seed)))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.acquire import mosaic
+from mitsim.acquire import spectral
 from mitsim.acquire.spectral import MosaicFrames, MosaicLight, without_filters
 from mitsim.api.bench import Bench, open_bench
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimates
@@ -97,14 +97,14 @@ def test_sampling_looks_at_lamps_behind_each_filter(monkeypatch: pytest.MonkeyPa
     def alone(light: Any, bands: slice, seed: int) -> Any:
         return SimpleNamespace(sampling_error=lambda: (errors[bands.start], 0.0))
 
-    monkeypatch.setattr(mosaic, "_lamps_alone", alone)
+    monkeypatch.setattr(spectral, "_lamps_alone", alone)
     light: Any = SimpleNamespace(bench=SimpleNamespace(lamplight=lamplight), seed=0)
     energy = np.array([16.0, 2 * 4.0, 1.0])
     expected = np.sqrt(np.dot(energy, [1, 4, 9]) / energy.sum())
-    assert mosaic._excess([light, light]) == pytest.approx(expected)
+    assert spectral.excess_behind_filters([light, light]) == pytest.approx(expected)
     errors[None] = 0.05
     dark: Any = SimpleNamespace(bench=SimpleNamespace(lamplight=None))
-    assert mosaic._excess([light]) == mosaic._excess([dark]) == 1
+    assert spectral.excess_behind_filters([light]) == spectral.excess_behind_filters([dark]) == 1
 
 
 @pytest.fixture(scope="module")
@@ -202,7 +202,7 @@ def test_lamps_are_seen_by_each_pixel_through_its_filter(shared_scene: Callable[
     assert frames.projector_off.irradiance == pytest.approx(expected, rel=1e-9, abs=1e-12 * expected.max())
     (lit,), off = frames, [light.frames(lighting, 0) for light in lights]
     lines = [next(iter(each)).irradiance - each.projector_off.irradiance for each in off]
-    weights = np.array(seen.mosaic.planes([nm for nm, _ in units])) * [nm for nm, _ in units]
+    weights = np.array(seen.counting.planes([nm for nm, _ in units])) * [nm for nm, _ in units]
     passed = behind(weights / seen.projector.effective_wavelength_nm, expected.shape)
     assert lit.irradiance - expected == pytest.approx(np.einsum("lij,lij->ij", passed, np.array(lines)), rel=1e-6)
 

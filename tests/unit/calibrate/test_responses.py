@@ -296,15 +296,15 @@ def test_saturated_shots_are_counted_once_across_an_interruption(monkeypatch: py
 
 
 def test_the_error_of_factors_is_that_of_both_whatever_their_common_sign() -> None:
-    from mitsim.calibrate.calibrate import factor_error
+    from mitsim.calibrate.calibrate import _factor_error
 
     def factors(left: list[float], right: list[float]) -> Estimate:
         return SimpleNamespace(left=np.array([left]), right=np.array([right]))  # type: ignore[return-value]
 
     clean = factors([3.0, 4.0], [0.0, 10.0])
-    assert factor_error(factors([3.0, 4.5], [0.0, 10.0]), clean) == pytest.approx(0.1)
-    assert factor_error(factors([3.0, 4.0], [1.0, 10.0]), clean) == pytest.approx(0.1)
-    assert factor_error(factors([-3.3, -4.4], [0.0, -11.0]), clean) == pytest.approx(np.hypot(0.1, 0.1))
+    assert _factor_error(factors([3.0, 4.5], [0.0, 10.0]), clean) == pytest.approx(0.1)
+    assert _factor_error(factors([3.0, 4.0], [1.0, 10.0]), clean) == pytest.approx(0.1)
+    assert _factor_error(factors([-3.3, -4.4], [0.0, -11.0]), clean) == pytest.approx(np.hypot(0.1, 0.1))
 
 
 # ---- differences -----------------------------------------------------------------------------------------------------

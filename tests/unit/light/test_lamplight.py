@@ -20,9 +20,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from mitsim.acquire import spectral as colour
 from mitsim.acquire.capture import _of_unknown_light
-from mitsim.acquire.spectral import SpectralBench, without_filters
+from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import open_bench
 from mitsim.bench.request import Request
 from mitsim.core.spectral_manifests import MOSAIC, RUN
@@ -149,7 +148,7 @@ def through_filters(place: Path, scene: Path, lamp: str) -> dict[str, Any]:
     """Light of a ``lamp`` behind filters: by band and line of all lines, and of the second line alone."""
     sheet = SHEETS["coloured" if lamp == "d65" else "grey"]
     bench = open_bench(scene, "llvm_ad_spectral", place / "filters.toml", place / "lines.toml", albedo=sheet)
-    colours = SpectralBench.of(without_filters(bench), MOSAIC).lit_by_lamps({}, 0)
+    colours = SpectralBench.of(bench, MOSAIC).lit_by_lamps({}, 0)
     lamplight, found = colours.whole.lamplight, {}
     assert lamplight is not None
     for name, each in {"lines": colours.whole, "alone": colours.benches[1]}.items():
@@ -308,8 +307,10 @@ def test_lines_are_planned_with_their_lamps_lit(monkeypatch: pytest.MonkeyPatch)
     )
     lit = SimpleNamespace(roughest=lambda seed, part: alone)
     colours: Any = SimpleNamespace(
-        manifest=SimpleNamespace(channels=(1, 2, 3)),
+        manifest=object(),
+        benches=(1, 2, 3),
         whole=whole,
+        check=lambda request: None,
         lit_by_lamps=lambda effects, seed: lit,
         roughest=lambda seed, part: SimpleNamespace(lamplight=None),
     )
@@ -318,6 +319,6 @@ def test_lines_are_planned_with_their_lamps_lit(monkeypatch: pytest.MonkeyPatch)
         planned.append((bench, dict(request.effects), lines))
         return SimpleNamespace(settings=SimpleNamespace(effects=frozenset()))
 
-    monkeypatch.setattr(colour, "plan_request", plan_request)
-    colour.plan_lines(colours, Request.of(patterns="uniform"))
+    monkeypatch.setattr("mitsim.acquire.spectral.plan_request", plan_request)
+    SpectralBench.plan(colours, Request.of(patterns="uniform"))
     assert planned == [(alone, {}, 3), (alone, {"ambient": True}, 3)]
