@@ -64,7 +64,13 @@ class Task:
 
     @classmethod
     def of(cls, output: Path | str | None = None, resume: bool = False, job: Job | None = None) -> Task:
-        """Of arguments of the Python face: ``output``, ``resume`` and ``job`` as there."""
+        """Of the Python face's arguments.
+
+        Parameters
+        ----------
+        output, resume, job
+            as there.
+        """
         return cls(None if output is None else Path(output), resume, job or Job())
 
     @contextmanager
