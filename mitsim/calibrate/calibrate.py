@@ -228,7 +228,7 @@ def _calibrated(
                 light = lights[number]
                 keep_light(checkpoint, light)
             lit = LitSession.of(session, light, job)
-            lit = replace(lit, kept=frames and KeptFrames(session, frames))
+            lit = replace(lit, kept=KeptFrames(session, frames) if frames else None)
             found.append(_factors(lit, checkpoint, job))
     return found
 
