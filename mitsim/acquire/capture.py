@@ -215,7 +215,7 @@ def capture(
             places.enter_context(colour_folder(task, colours))
         heads = [RunHead.of(_configuration(each, request)) for each in readings]
         recorders = [
-            places.enter_context(_recorder(place, head, task.resume))
+            places.enter_context(claimed(place, head, task.resume)) if place else RunMemory()
             for place, head in zip(folders, heads, strict=True)
         ]
         with job.planning(request.patterns):
@@ -295,15 +295,6 @@ def _run(
 def _configuration(bench: Apparatus, request: Request) -> dict[str, Any]:
     """All that decides the frames."""
     return {**bench.provenance(), **bench.identity(), **request.deciding, "versions": deciding_versions()}
-
-
-@contextmanager
-def _recorder(output: Path | None, head: RunHead, resume: bool) -> Iterator[Recorder]:
-    if output is None:
-        yield RunMemory()
-        return
-    with claimed(output, head, resume) as folder:
-        yield folder
 
 
 @contextmanager

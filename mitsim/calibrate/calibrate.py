@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -237,7 +237,7 @@ def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
     """Factors of a session, written where its ``checkpoint`` is."""
     session, plan = lit.session, lit.light.plan
     bench, digital = session.bench, digital_of(session.bench.sensor, lit.exposure_s)
-    (noisy, clean), saturated, faults = checked_estimates(lit, job, (NOISY, NOISE_FREE), checkpoint)
+    (noisy, clean), saturated, faults = estimates(lit, job, (NOISY, NOISE_FREE), checkpoint)
     if lit.kept is not None:
         lit.kept.finish(digital)
     lacks = _lacking(lit, clean)
@@ -293,103 +293,91 @@ def estimate(
 
     Parameters
     ----------
-    lit
-        the session, its light traced.
-    job
-        takes the time and is told how far the session is.
+    lit, job, checkpoint
+        as for :func:`session_sums`.
     noise_free
         whether to take the expected frames instead of noisy ones.
-    checkpoint
-        where finished stripes are kept, and those of an interrupted session found.
     """
-    (found,), saturated = estimates(lit, job, (NOISE_FREE if noise_free else NOISY,), checkpoint)
-    return found, saturated
-
-
-def estimates(
-    lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Checkpoint | None = None
-) -> tuple[list[Estimate], int]:
-    """Factors from each kind of responses to a session, and its saturated shots.
-
-    Parameters
-    ----------
-    lit, job, kinds, checkpoint
-        as for :func:`checked_estimates`.
-    """
-    found, saturated, _ = checked_estimates(lit, job, kinds, checkpoint)
+    (found,), saturated, _ = estimates(lit, job, (NOISE_FREE if noise_free else NOISY,), checkpoint)
     return found, saturated
 
 
 @single_threaded_blas()
-def checked_estimates(
+def estimates(
     lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Checkpoint | None = None
 ) -> tuple[list[Estimate], int, Checked]:
-    """Factors from each kind of responses to a session, whose frames are formed once, its saturated shots, and what its
-    noisy frames show of faults.
+    """Factors from each kind of responses to a session, its saturated shots, and what noisy frames show of faults.
 
     Parameters
     ----------
-    lit, job, checkpoint
-        as for :func:`estimate`.
+    lit, job, kinds, checkpoint
+        as for :func:`session_sums`.
+    """
+    session, found = lit.session, session_sums(lit, job, kinds, checkpoint)
+    sensor, drift = session.bench.sensor, session.recipe.drift
+    taken = Circumstances(
+        session.order,
+        saturated=bool(found.saturated),
+        # Who states that the lamp drifts asks what that costs, which is gone once it is divided out.
+        unsteady=bool(drift.session_ramp or drift.session_flicker),
+        step=0.0 if sensor.largest_dn is None else 1 / sensor.gain_dn_per_e / lit.exposure_s,
+    )
+    with job.clock.stage("estimate"):
+        judged = [
+            check_session(sums, session.signs, taken) if kind == NOISY else Checked(sums)
+            for kind, sums in found.sums.items()
+        ]
+        factors = [
+            each.estimate(session.signs, lit.response_noise if kind == NOISY else None)
+            for kind, each in zip(kinds, judged, strict=True)
+        ]
+    return factors, found.saturated, judged[0]
+
+
+def session_sums(lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Checkpoint | None = None) -> SessionSums:
+    """Sums over all responses to a session, whose frames are formed once.
+
+    Parameters
+    ----------
+    lit
+        the session, its light traced.
+    job
+        takes the time and is told how far the session is.
     kinds
         of ``NOISY`` and ``NOISE_FREE``, one or both.
+    checkpoint
+        where finished stripes are kept, and those of an interrupted session found.
     """
     session, checkpoint = lit.session, checkpoint or Checkpoint()
     count = session.signs.shape[1]
+
+    def response(kind: str, side: str, number: int, frame: Frame) -> Response:
+        return lit.noisy(side, number, frame) if kind == NOISY else Response(lit.noise_free(frame))
+
+    def seen(sums: Sequence[StripeSums], shown: tuple[int, Frame]) -> list[tuple[Seen, int]]:
+        each = [response(kind, sums[0].side, *shown) for kind in kinds]
+        return [(own.seen(one.rate, shown[0], one.light), one.saturated) for own, one in zip(sums, each, strict=True)]
+
     stripes = SessionSums.kept(checkpoint, kinds, session)
     if stripes is None:
+        stripes = SessionSums({}, 0)
         with job.clock.stage("sensor"):
-            first = [list(_responses(lit, kinds, side, 0, lit.white)) for side in SIDES]
-        both = [
-            stripe_sums(left.rate, right.rate, count, session.centre, lights=(left.light, right.light))
-            for left, right in zip(*first, strict=True)
-        ]
-        stripes = SessionSums(
-            dict(zip(kinds, both, strict=True)), sum(each.saturated for side in first for each in side)
-        )
-        del first
+            for kind in kinds:
+                one, other = (response(kind, side, 0, lit.white) for side in SIDES)
+                lights = one.light, other.light
+                stripes.sums[kind] = stripe_sums(one.rate, other.rate, count, session.centre, lights=lights)
+                stripes.saturated += one.saturated + other.saturated
     saved = time.monotonic()
     for side, sums in zip(SIDES, zip(*stripes.sums.values(), strict=True), strict=True):
-        for looked in lit.each(side, partial(_looked, lit, kinds, sums), job, sums[0].done):
-            for own, (seen, saturated) in zip(sums, looked, strict=True):
-                own.put(seen)
+        for looked in lit.each(side, partial(seen, sums), job, sums[0].done):
+            for own, (vectors, saturated) in zip(sums, looked, strict=True):
+                own.put(vectors)
                 stripes.saturated += saturated
             due = sums[0].done % _SAVED_EVERY == 0 and time.monotonic() >= saved + _SAVED_AFTER_S
             if due or sums[0].done == count:
                 stripes.save(checkpoint)
                 saved = time.monotonic()
-    drift = session.recipe.drift
-    # Who states that the lamp drifts asks what that costs, which is gone once it is divided out.
-    unsteady = bool(drift.session_ramp or drift.session_flicker)
-    sensor = session.bench.sensor
-    step = 0.0 if sensor.largest_dn is None else 1 / sensor.gain_dn_per_e / lit.exposure_s
-    taken = Circumstances(session.order, saturated=bool(stripes.saturated), unsteady=unsteady, step=step)
-    with job.clock.stage("estimate"):
-        judged = [
-            check_session(stripes.sums[kind], session.signs, taken) if kind == NOISY else Checked(stripes.sums[kind])
-            for kind in kinds
-        ]
-        found = [
-            each.estimate(session.signs, lit.response_noise if kind == NOISY else None)
-            for kind, each in zip(kinds, judged, strict=True)
-        ]
-    return found, stripes.saturated, judged[0]
-
-
-def _responses(lit: LitSession, kinds: Sequence[str], side: str, number: int, frame: Frame) -> Iterator[Response]:
-    """Each of the ``kinds`` of responses to a pattern, as :meth:`LitSession.each` has it."""
-    for kind in kinds:
-        yield lit.noisy(side, number, frame) if kind == NOISY else Response(lit.noise_free(frame))
-
-
-def _looked(
-    lit: LitSession, kinds: Sequence[str], sums: Sequence[StripeSums], shown: tuple[int, Frame]
-) -> list[tuple[Seen, int]]:
-    """What the responses to a pattern add to the ``sums`` of each kind, and their saturated shots."""
-    responses = _responses(lit, kinds, sums[0].side, *shown)
-    return [
-        (own.seen(each.rate, shown[0], each.light), each.saturated) for own, each in zip(sums, responses, strict=True)
-    ]
+    return stripes
 
 
 def _lacking(lit: LitSession, clean: Estimate) -> Lacking | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -24,7 +25,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.files import PARTS, output_folder, plain, read_json, sweep, whole_file, write_json
 from mitsim.core.manifests import MANIFEST, Digital, resumable
 from mitsim.devices.framelist import LISTS, DarkFile, FrameList, StripeFile
-from mitsim.devices.session import SIDES, UNIFORM, Half, Side
+from mitsim.devices.session import SIDES, Side
 from mitsim.light.light import SampledLight
 from mitsim.light.passes import TRAYS, FiledLight, Simulation
 from mitsim.light.plan import Plan
@@ -250,6 +251,25 @@ MOST_TIFF = 2**16 - 1
 """Largest digital number of a 16-bit TIFF; frames of larger or real numbers become NPY."""
 
 
+Names = tuple[str | int, ...]
+"""Of a frame's noise: side and number of its shot, or ``dark`` and numbers of exposure and frame; of a shot then
+``exposure`` and ``repeat``, each with its number where that is not 0."""
+
+
+def repeat_names(shot: tuple[str, int], exposure: int, repeat: int) -> Names:
+    """Names of a frame of a shot.
+
+    Parameters
+    ----------
+    shot
+        as :meth:`Session.shot` has it.
+    exposure, repeat
+        numbers of the frame.
+    """
+    own: Names = ("exposure", exposure) if exposure else ()
+    return (*shot, *own, "repeat", repeat) if repeat else (*shot, *own)
+
+
 @dataclass(frozen=True, eq=False)
 class KeptFrames:
     """Frames of a ``session`` in a ``folder`` that is held, called by the number at which they are taken."""
@@ -257,23 +277,9 @@ class KeptFrames:
     session: Session
     folder: Path
 
-    def write(self, names: tuple[str | int, ...], numbers: DigitalNumbers) -> None:
-        """Write one frame.
-
-        Parameters
-        ----------
-        names
-            of its noise: side and number of the shot, or ``dark`` and numbers of exposure and frame; then ``exposure``
-            and ``repeat``, each with its number where that is not 0.
-        numbers
-            (rows, columns) as read.
-        """
-        if names[0] == "dark":
-            place = self._dark(int(names[1]), int(names[2]))
-        else:
-            options = dict(zip(names[2::2], names[3::2], strict=True))
-            half = self._half(str(names[0]), int(names[1]))
-            place = self._lit(half, int(options.get("exposure", 0)), int(options.get("repeat", 0)))
+    def write(self, names: Names, numbers: DigitalNumbers) -> None:
+        """Write one frame, by ``names`` of its noise; ``numbers`` (rows, columns) as read."""
+        place = (self._dark if names[0] == "dark" else self._lit)[names].file
         with whole_file(self.folder / place) as part, part.open("wb") as file:
             if self._tiff:
                 Image.fromarray(numbers.astype(np.uint16)).save(file, "TIFF")
@@ -282,35 +288,19 @@ class KeptFrames:
 
     def finish(self, digital: Digital) -> None:
         """Write the list, when all frames are there; ``digital`` is of the shortest exposure."""
-        recipe, exposures = self.session.recipe, range(len(self.session.recipe.exposure_ladder))
+        session, recipe = self.session, self.session.recipe
         listed = FrameList(
-            camera=self.session.bench.identity(),
-            n=self.session.bench.n,
+            camera=session.bench.identity(),
+            n=session.bench.n,
             signed_capture=recipe.signed_capture,
             repeats=recipe.repeats,
             exposure_ladder=recipe.exposure_ladder,
             ladder_merge=recipe.ladder_merge,
             digital=digital,
-            centre=self.session.centre,
+            centre=session.centre,
             board_reflectance=recipe.board_reflectance,
-            frames=tuple(
-                StripeFile(
-                    file=self._lit(half, exposure, repeat),
-                    side=half[0],
-                    index=half[1],
-                    sign=half[2],
-                    exposure=exposure,
-                    repeat=repeat,
-                )
-                for half in self.session.order
-                for exposure in exposures
-                for repeat in range(recipe.repeats)
-            ),
-            dark=tuple(
-                DarkFile(file=self._dark(exposure, number), exposure=exposure)
-                for exposure in exposures
-                for number in range(recipe.dark_frames)
-            ),
+            frames=tuple(self._lit.values()),
+            dark=tuple(self._dark.values()),
         )
         write_json(self.folder / LISTS[1], listed.model_dump(mode="json", exclude_defaults=True))
 
@@ -319,26 +309,24 @@ class KeptFrames:
         largest = self.session.bench.sensor.largest_dn
         return largest is not None and largest <= MOST_TIFF
 
+    def _name(self, kind: str, number: int) -> str:
+        return f"{kind}_{number:05d}{'.tif' if self._tiff else '.npy'}"
+
     @cached_property
-    def _numbers(self) -> dict[Half, int]:
-        """At which number each is taken, of those with one exposure and no repeats."""
-        return {half: number for number, half in enumerate(self.session.order)}
+    def _lit(self) -> dict[Names, StripeFile]:
+        """Frames of stripes, as they are taken."""
+        found: dict[Names, StripeFile] = {}
+        exposures, repeats = range(len(self.session.recipe.exposure_ladder)), range(self.session.recipe.repeats)
+        for half, exposure, repeat in itertools.product(self.session.order, exposures, repeats):
+            names, (side, index, sign) = repeat_names(self.session.shot(half), exposure, repeat), half
+            file = self._name("frame", len(found))
+            found[names] = StripeFile(file=file, side=side, index=index, sign=sign, exposure=exposure, repeat=repeat)
+        return found
 
-    def _half(self, side: str, index: int) -> Half:
-        """What shot number ``index`` of a ``side`` shows."""
-        (own,) = (known for known in SIDES if known == side)
-        if self.session.pairs:
-            return own, index // 2, -1 if index % 2 else 1
-        return (own, index - 1, 1) if index else (own, 0, UNIFORM)
-
-    def _lit(self, half: Half, exposure: int, repeat: int) -> str:
+    @cached_property
+    def _dark(self) -> dict[Names, DarkFile]:
+        found: dict[Names, DarkFile] = {}
         recipe = self.session.recipe
-        number = (self._numbers[half] * len(recipe.exposure_ladder) + exposure) * recipe.repeats + repeat
-        return f"frame_{number:05d}{self._ending}"
-
-    def _dark(self, exposure: int, number: int) -> str:
-        return f"dark_{exposure * self.session.recipe.dark_frames + number:05d}{self._ending}"
-
-    @property
-    def _ending(self) -> str:
-        return ".tif" if self._tiff else ".npy"
+        for exposure, number in itertools.product(range(len(recipe.exposure_ladder)), range(recipe.dark_frames)):
+            found["dark", exposure, number] = DarkFile(file=self._name("dark", len(found)), exposure=exposure)
+        return found

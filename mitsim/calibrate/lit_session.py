@@ -12,7 +12,7 @@ import numpy as np
 
 from mitsim.acquire.exposure import Exposer, in_chunks
 from mitsim.bench.request import Exposure
-from mitsim.calibrate.checkpoint import KeptFrames
+from mitsim.calibrate.checkpoint import KeptFrames, repeat_names
 from mitsim.calibrate.session import Session, stripe_frames
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
@@ -321,14 +321,11 @@ class LitSession:
             pixels that count.
         """
         exposer, repeats = self._exposers[exposure], self.session.recipe.repeats
-        names: tuple[str | int, ...] = (side, index)
-        names += ("exposure", exposure) if exposure else ()
-
         powers = self.session.powers[side, index][exposure]
 
         def read(repeat: int) -> tuple[DigitalNumbers, int]:
             light = powers[repeat] * lit
-            digital = self._read(exposer, light, *names, *(("repeat", repeat) if repeat else ()))
+            digital = self._read(exposer, light, *repeat_names((side, index), exposure, repeat))
             if used is True:
                 return digital, int(exposer.saturated(digital, light))
             return digital, int(exposer.saturated(np.where(used, digital, 0), np.where(used, light, 0.0)))

@@ -8,12 +8,14 @@ unknowns, which a few frames tell. What it leaves unexplained is what no number 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mitsim.bench.bench import Apparatus
+from mitsim.bench.request import SessionRequest
 from mitsim.calibrate.lit_session import LitSession
 from mitsim.calibrate.placement import GAIN_STEP, STEPS, Fitted, Shown, fit_placement
 from mitsim.calibrate.session import Session
@@ -82,22 +84,15 @@ def calibrate_model(
         for numbers that these frames cannot tell apart, frames of another size than the bench's, an output that cannot
         be written, and as :meth:`mitsim.api.bench.Bench.calibrate`.
     """
-    job = job or Job()
-    if output is None:
-        return _calibrated(bench, modelling, frames, recipe, seed, job)
-    with output_folder(output) as place:
-        factors = _calibrated(bench, modelling, frames, recipe, seed, job)
-        factors.write(place)
+    with nullcontext() if output is None else output_folder(output) as place:
+        factors = _modelled(bench, modelling, frames, SessionRequest(seed, modelling.accuracy, recipe), job or Job())
+        if place is not None:
+            factors.write(place)
     return factors
 
 
-def _calibrated(
-    bench: Apparatus,
-    modelling: Modelling,
-    frames: Path | str | SessionFrames | None,
-    recipe: SessionRecipe | None,
-    seed: int,
-    job: Job,
+def _modelled(
+    bench: Apparatus, modelling: Modelling, frames: Path | str | SessionFrames | None, request: SessionRequest, job: Job
 ) -> Factors:
     if frames is not None:
         listed = frames if isinstance(frames, SessionFrames) else load_frames(frames)
@@ -105,16 +100,16 @@ def _calibrated(
         reflectance = listed.listed.board_reflectance
         configuration: dict[str, Any] = {"frames": str(listed.folder)}
     else:
-        recipe = recipe or load_recipe()
+        recipe = request.recipe or load_recipe()
         if recipe.depths:
             raise MitsimError("recipe: has depths; a model is fitted on the aligned plane, so leave them out")
-        session = Session(bench, recipe, seed)
-        plan = session.plan(modelling.accuracy, job)
+        session = Session(bench, recipe, request.seed)
+        plan = session.plan(request.accuracy, job)
         lit = LitSession.of(session, session.trace(plan, job), job)
         with job.clock.stage("sensor"):
             shown, used = simulated(lit, modelling)
         digital, reflectance = digital_of(bench.sensor, lit.exposure_s), recipe.board_reflectance
-        configuration = {"seed": seed, "recipe": recipe.model_dump(exclude_defaults=True)}
+        configuration = {"seed": request.seed, "recipe": recipe.model_dump(exclude_defaults=True)}
     job.progress("fit", 0.5)
     with job.clock.stage("fit"):
         camera = model_of(bench, modelling.model)

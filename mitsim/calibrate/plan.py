@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,6 +27,7 @@ from mitsim.acquire.exposure import Exposer
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.bench.bench import Apparatus
 from mitsim.bench.request import Exposure, Request, check_psnr
+from mitsim.calibrate.calibrate import NOISE_FREE, session_sums
 from mitsim.calibrate.lit_session import LitSession
 from mitsim.calibrate.session import Session, session_seconds
 from mitsim.core.arguments import checked
@@ -42,8 +42,7 @@ from mitsim.devices.sensor import EXPOSURE_FRACTION, digital_of
 from mitsim.devices.session import MOST_REPEATS, SIDES, SessionRecipe, load_recipe
 from mitsim.metrics import psnr as psnr_of
 from mitsim.metrics import truth_for
-from mitsim.optics.frames import Frame
-from mitsim.reconstruct.estimate_factors import Estimate, Seen, StripeSums, factors_of_sums, stripe_sums
+from mitsim.reconstruct.estimate_factors import Estimate, StripeSums, factors_of_sums
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.sensor.moments import frame_moments
@@ -382,12 +381,7 @@ class PredictedSession:
     @single_threaded_blas()
     def of(cls, lit: LitSession, job: Job) -> PredictedSession:
         """Those of a session ``lit``; ``job`` takes the time of forming its responses, and is told how far it is."""
-        first = lit.noise_free(lit.white)
-        sums = stripe_sums(first, first, lit.session.signs.shape[1], lit.session.centre)
-        for side, own in zip(SIDES, sums, strict=True):
-            for seen in lit.each(side, partial(_seen, lit, own), job, own.done):
-                own.put(seen)
-        return cls(lit, sums)
+        return cls(lit, session_sums(lit, job, (NOISE_FREE,)).sums[NOISE_FREE])
 
     def by(self, recipe: SessionRecipe) -> LitSession:
         """The session with the exposure and the repeats of a ``recipe``, whose other fields are those it was lit by."""
@@ -446,10 +440,6 @@ def _noisy(lit: LitSession, sums: StripeSums, draw: int) -> StripeSums:
         misfit=sums.misfit + fitted * energy,
         energy=sums.energy + energy,
     )
-
-
-def _seen(lit: LitSession, sums: StripeSums, shown: tuple[int, Frame]) -> Seen:
-    return sums.seen(lit.noise_free(shown[1]), shown[0])
 
 
 def _variances(lit: LitSession) -> tuple[FloatArray, FloatArray | None]:

@@ -178,12 +178,12 @@ class Session:
         drift, order = self.recipe.drift, self.order
         each = len(order), len(self.recipe.exposure_ladder), self.recipe.repeats
         found = levels(self.seed, "session", math.prod(each), drift.session_ramp, drift.session_flicker).reshape(each)
+        return {self.shot(half): power for half, power in zip(order, found, strict=True)}
 
-        def shot(half: Half) -> tuple[str, int]:
-            side, number, sign = half
-            return side, 2 * number + (sign < 0) if self.pairs else number + (sign != UNIFORM)
-
-        return {shot(half): power for half, power in zip(order, found, strict=True)}
+    def shot(self, half: Half) -> tuple[str, int]:
+        """Side and number of the shot that shows a ``half``, which name its noise."""
+        side, number, sign = half
+        return side, 2 * number + (sign < 0) if self.pairs else number + (sign != UNIFORM)
 
     def plan(self, accuracy: float, job: Job) -> Plan:
         """What to simulate for responses of this relative ``accuracy``, and what the session takes.

@@ -78,7 +78,7 @@ def measure(bench: Bench, request: Request, job: Job, recipe: SessionRecipe | No
     session = Session(bench, recipe.model_copy(update={"drift": Drift()}), request.seed)
     plan = session.plan(request.accuracy, job)
     lit = LitSession.of(session, session.trace(plan, job), job)
-    (noisy, clean), _ = estimates(lit, job, (NOISY, NOISE_FREE))
+    (noisy, clean), _, _ = estimates(lit, job, (NOISY, NOISE_FREE))
     found = judged(lit, noisy, clean, tuple(_by_cause(lit, noisy, clean, job)))
     scene = LitScene(bench.light(request.patterns, job, accuracy=request.accuracy, seed=request.seed))
     stand = DriftStand(scene, _factors(lit, noisy), recipe, family, request.seed)

@@ -130,7 +130,7 @@ def test_a_session_behind_filters_tells_the_bare_camera(bench: Bench, kept_plans
     session = Session(bench, recipe, 0, filters=passed)
     plan = session.plan(1e-2, job)
     lit = LitSession.of(session, session.trace(plan, job), job)
-    (noisy, clean), saturated = estimates(lit, job, (NOISY, NOISE_FREE))
+    (noisy, clean), saturated, _ = estimates(lit, job, (NOISY, NOISE_FREE))
     assert saturated == 0
     for name, predicted in zip(("left", "right"), noisy.predicted_error, strict=True):
         found, exact = getattr(noisy, name), getattr(clean, name)

@@ -235,7 +235,7 @@ class Kept(Checkpoint):
 def test_a_resumed_estimate_is_the_same_to_the_bit(mode: str, kinds: tuple[str, ...]) -> None:
     """16 responses a side are kept after 8 and after 16: interrupted after each of the four parts, and finished."""
     lit = lit_session(13, mode)
-    whole, _ = estimates(lit, Job(), kinds)
+    whole, _, _ = estimates(lit, Job(), kinds)
     kept = Kept()
     for life in range(4):
         kept.left = 1
@@ -244,7 +244,7 @@ def test_a_resumed_estimate_is_the_same_to_the_bit(mode: str, kinds: tuple[str, 
         for kind in kinds:
             done = [kept.parts["stripes"][f"{kind}_{side}_vectors"].shape[1] for side in SIDES]
             assert done == [[8, 1], [16, 1], [16, 8], [16, 16]][life]
-    again, _ = estimates(lit, Job(), kinds, kept)
+    again, _, _ = estimates(lit, Job(), kinds, kept)
     for ours, theirs in zip(again, whole, strict=True):
         for name in ("left", "right", "noise", "separability_residual", "unexplained", "predicted_error", "status"):
             assert np.array_equal(getattr(ours, name), getattr(theirs, name)), name
