@@ -88,7 +88,7 @@ class Exposer:
         """
         positive: FloatArray | None = None
         for shots in in_chunks(zip(family.shots, expected, strict=True)):
-            rates = in_threads(lambda item: self._measured(item[1], *item[0].names), shots)
+            rates = in_threads(lambda item: self._measurement(item[1], *item[0].names), shots)
             for (shot, _), rate in zip(shots, rates, strict=True):
                 if shot.sign == 1:
                     positive = rate
@@ -96,7 +96,7 @@ class Exposer:
                 yield rate if positive is None else positive - rate, shot.row, shot.column
                 positive = None
 
-    def _measured(self, frame: Frame, *names: str | int) -> FloatArray:
+    def _measurement(self, frame: Frame, *names: str | int) -> FloatArray:
         """Noisy electrons a second of the frame ``names``."""
         return self.rate(self.digital(self.lit(frame, *names), *names))
 
@@ -289,7 +289,7 @@ class Totals:
         peak = energy = variance = removed = heaviest = 0.0
         parts = np.zeros(GROUPS)
         for chunk in in_chunks((frame,) for frame in expected):
-            for (frame,), (brightest, squares) in zip(chunk, in_threads(_seen, chunk), strict=True):
+            for (frame,), (brightest, squares) in zip(chunk, in_threads(_peak_and_energy, chunk), strict=True):
                 removed = max(removed, frame.removed)
                 peak = max(peak, brightest)
                 energy += squares
@@ -300,7 +300,7 @@ class Totals:
         return cls(peak, mc_error, removed, heaviest / variance if variance else 0.0, bound_of(parts, energy))
 
 
-def _seen(item: tuple[Frame]) -> tuple[float, float]:
+def _peak_and_energy(item: tuple[Frame]) -> tuple[float, float]:
     """Irradiance of the brightest pixel of a frame, and the sum of its squares."""
     (frame,) = item
     return float(frame.irradiance.max()), sum_of_squares(frame.irradiance)

@@ -419,7 +419,7 @@ class MosaicFrames(ExpectedFrames):
             if self._lamps is not None:
                 light += self._lamps.irradiance
             groups = zip(*(frame.by_group or (frame.variance,) for frame in (*shot, *always)), strict=True)
-            parts = [self._added(each) for each in groups]
+            parts = [self._sum_of_variances(each) for each in groups]
             variance = sum(parts)
             yield Frame(
                 light,
@@ -429,7 +429,7 @@ class MosaicFrames(ExpectedFrames):
                 tuple(parts) if shot[0].by_group else (),
             )
 
-    def _added(self, variances: Sequence[float]) -> float:
+    def _sum_of_variances(self, variances: Sequence[float]) -> float:
         """Variance of the sum of all lines' light and lamps', from a group's of each."""
         lines, lamps = variances[: len(self._lines)], sum(variances[len(self._lines) :])
         own = float(self._spread @ np.sqrt(lines))

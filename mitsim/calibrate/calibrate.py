@@ -76,7 +76,7 @@ def calibrate(bench: Apparatus, request: SessionRequest, task: Task) -> Factors:
         as there.
     """
     session = Session(bench, (request.recipe or load_recipe()).of_one_depth(), request.seed)
-    return _calibrated([session], request, task, [task.output])[0]
+    return _run_sessions([session], request, task, [task.output])[0]
 
 
 def calibrate_depths(bench: Apparatus, request: SessionRequest, task: Task) -> dict[float, Factors]:
@@ -105,7 +105,7 @@ def calibrate_depths(bench: Apparatus, request: SessionRequest, task: Task) -> d
         for depth in recipe.depths:
             session = Session(bench, recipe, integer(request.seed, "depth", f"{depth:g}"), depth)
             own = replace(task, job=replace(task.job, clock=Clock()))
-            (found[depth],) = _calibrated([session], request, own, [folder and folder / f"{depth:g}"])
+            (found[depth],) = _run_sessions([session], request, own, [folder and folder / f"{depth:g}"])
     return found
 
 
@@ -129,7 +129,7 @@ def write_session(bench: Apparatus, frames: Path | str, request: SessionRequest,
         number_bytes = 2 if (bench.sensor.largest_dn or math.inf) <= MOST_TIFF else 8
         size = Cost(disk_bytes=float(session.shots * math.prod(bench.geometry.frame_shape) * number_bytes))
         size.check("frames", Limits(), folder)
-        return _calibrated([session], request, task, [task.output], folder)[0]
+        return _run_sessions([session], request, task, [task.output], folder)[0]
 
 
 def calibrate_lines(bench: Apparatus, request: SessionRequest, task: Task) -> dict[str, Factors]:
@@ -179,10 +179,10 @@ def _by_line(bench: SpectralBench, request: SessionRequest, task: Task) -> dict[
     ]
     with colour_folder(task, bench.manifest) as folder:
         places = [folder and folder / name for name in names]
-        return dict(zip(names, _calibrated(sessions, request, task, places), strict=True))
+        return dict(zip(names, _run_sessions(sessions, request, task, places), strict=True))
 
 
-def _calibrated(
+def _run_sessions(
     lines: Sequence[Session],
     request: SessionRequest,
     task: Task,

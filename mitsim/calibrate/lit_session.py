@@ -153,9 +153,9 @@ class LitSession:
 
         def used(item: tuple[int, Frame]) -> Result:
             number, frame = item
-            return use((number, self._leaking(frame) if number else frame))
+            return use((number, self._with_leak(frame) if number else frame))
 
-        chunks = in_chunks(self._formed(side, first))
+        chunks = in_chunks(self._stripes(side, first))
         while True:
             with job.clock.stage("optics"):
                 chunk = next(chunks, None)
@@ -166,7 +166,7 @@ class LitSession:
             job.progress(f"{side} stripes", (chunk[-1][0] + 1) / self.session.signs.shape[1])
             yield from results
 
-    def _formed(self, side: str, first: int) -> Iterator[tuple[int, Frame]]:
+    def _stripes(self, side: str, first: int) -> Iterator[tuple[int, Frame]]:
         """Numbers and frames from ``first`` on, without what black pixels leak; none is formed for number 0."""
         if first == 0:
             yield 0, self.white
@@ -176,17 +176,17 @@ class LitSession:
         shape = self.session.bench.geometry.frame_shape
         yield from stripe_frames(self.light, stripes, self.session.seed, shape, max(first, 1))
 
-    def _leaking(self, frame: Frame) -> Frame:
+    def _with_leak(self, frame: Frame) -> Frame:
         """The ``frame`` with the light of black pixels: to form it with them would be twice the work."""
         black = self.light.simulation.physics.black_level
         if not black:
             return frame
         light = (1 - black) * frame.irradiance
-        light += self._leaked
+        light += self._leak
         return replace(frame, irradiance=light)
 
     @cached_property
-    def _leaked(self) -> FloatArray:
+    def _leak(self) -> FloatArray:
         """(m, m') light of all pixels when they are black [W m^-2]."""
         return np.asarray(self.light.simulation.physics.black_level * self.white.irradiance)
 
@@ -201,16 +201,16 @@ class LitSession:
             of the pattern, as :meth:`each` has them.
         """
         if not self.session.pairs:
-            shot, uniform = self._exposed(frame.irradiance, side, number + 1), self._uniform[side]
+            shot, uniform = self._expose(frame.irradiance, side, number + 1), self._uniform[side]
             rate = self._rates(lambda rows: 2 * self._rate(shot, rows) - uniform.rate[rows], shot)
             if self._dark is not None:
                 rate -= self._dark[side]
             return Response(rate, shot.saturated + (uniform.saturated if number == 0 else 0))
         negative = self._both - frame.irradiance
         shots = (
-            self._exposed(frame.irradiance, side, 2 * number),
+            self._expose(frame.irradiance, side, 2 * number),
             # Rounding leaves pixels that see the +1 stripes alone a little below zero.
-            self._exposed(np.maximum(negative, 0.0, out=negative), side, 2 * number + 1),
+            self._expose(np.maximum(negative, 0.0, out=negative), side, 2 * number + 1),
         )
         light: FloatArray = np.empty(frame.irradiance.shape)
 
@@ -253,7 +253,7 @@ class LitSession:
             return {side: Ladder(digitals) for side in SIDES}
         recipe, found = self.session.recipe, dict[str, Ladder]()
         for side, other in zip(SIDES, reversed(SIDES), strict=True):
-            uniform, _ = self._repeated(self._lit(self.white.irradiance, 0, other, 0), 0, True, other, 0)
+            uniform, _ = self._mean_of_repeats(self._lit(self.white.irradiance, 0, other, 0), 0, True, other, 0)
             rate = self._exposers[0].rate(uniform)
             found[side] = Ladder.of(digitals, rate, recipe.repeats, recipe.ladder_merge)
         return found
@@ -271,7 +271,7 @@ class LitSession:
             for index in range(number):
                 total += self._read(exposer, still, "dark", exposure, index)
             rates.append(exposer.rate(total / number))
-        return {side: self._unfiltered(ladder.merged(rates)) for side, ladder in self.ladders.items()}
+        return {side: self._without_filters(ladder.merged(rates)) for side, ladder in self.ladders.items()}
 
     @cached_property
     def uniform_rate(self) -> FloatArray:
@@ -289,14 +289,14 @@ class LitSession:
     @cached_property
     def _uniform(self) -> Mapping[str, Response]:
         """Noisy uniform frames, from which each side's responses are taken where they are no pairs."""
-        shots = {side: self._exposed(self.white.irradiance, side, 0) for side in SIDES}
+        shots = {side: self._expose(self.white.irradiance, side, 0) for side in SIDES}
         return {side: Response(self._rate(shot, slice(None)), shot.saturated) for side, shot in shots.items()}
 
-    def _exposed(self, irradiance: FloatArray, side: str, index: int) -> _Shot:
+    def _expose(self, irradiance: FloatArray, side: str, index: int) -> _Shot:
         """The noisy frames of shot number ``index`` of a ``side``, of expected ``irradiance`` (m, m')."""
         ladder = self.ladders[side]
         found = [
-            self._repeated(self._lit(irradiance, exposure, side, index), exposure, ladder.used(exposure), side, index)
+            self._mean_of_repeats(self._lit(irradiance, exposure, side, index), exposure, ladder.used(exposure), side, index)
             for exposure in range(len(self._exposers))
         ]
         return _Shot(ladder, tuple(digital for digital, _ in found), sum(saturated for _, saturated in found))
@@ -306,7 +306,7 @@ class LitSession:
         passed = Frame(self.session.filtered(irradiance), 0.0, 0.0, 0.0)
         return self._exposers[exposure].lit(passed, "calibration", *names)
 
-    def _repeated(
+    def _mean_of_repeats(
         self, lit: FloatArray, exposure: int, used: Chosen, side: str, index: int
     ) -> tuple[DigitalNumbers, int]:
         """The mean of all repeats of a shot at one exposure, and how many have saturated pixels that are used.
@@ -352,9 +352,9 @@ class LitSession:
         """Rates of some ``rows`` of a ``shot``."""
         each = zip(self._exposers, shot.digital, strict=True)
         merged = shot.ladder.merged((exposer.rate(digital[rows]) for exposer, digital in each), rows)
-        return self._unfiltered(merged, rows)
+        return self._without_filters(merged, rows)
 
-    def _unfiltered(self, rate: FloatArray, rows: slice = slice(None)) -> FloatArray:
+    def _without_filters(self, rate: FloatArray, rows: slice = slice(None)) -> FloatArray:
         """What pixels without filters would read, from the ``rate`` of some ``rows``."""
         return rate if self.session.filters is None else rate / self.session.filters[rows]
 

@@ -85,18 +85,18 @@ def calibrate_model(
         be written, and as :meth:`mitsim.api.bench.Bench.calibrate`.
     """
     with nullcontext() if output is None else output_folder(output) as place:
-        factors = _modelled(bench, modelling, frames, SessionRequest(seed, modelling.accuracy, recipe), job or Job())
+        factors = _fit_factors(bench, modelling, frames, SessionRequest(seed, modelling.accuracy, recipe), job or Job())
         if place is not None:
             factors.write(place)
     return factors
 
 
-def _modelled(
+def _fit_factors(
     bench: Apparatus, modelling: Modelling, frames: Path | str | SessionFrames | None, request: SessionRequest, job: Job
 ) -> Factors:
     if frames is not None:
         listed = frames if isinstance(frames, SessionFrames) else load_frames(frames)
-        shown, digital, used = _real(bench, listed, modelling)
+        shown, digital, used = _of_frames(bench, listed, modelling)
         reflectance = listed.listed.board_reflectance
         configuration: dict[str, Any] = {"frames": str(listed.folder)}
     else:
@@ -152,7 +152,7 @@ def simulated(lit: LitSession, modelling: Modelling) -> tuple[list[Shown], int]:
         frames = lit.light.frames(lighting, session.seed) if own else ()
         formed |= {(side, index): frame for index, frame in zip(own, frames, strict=True)}
     shown = [
-        _shown(
+        _response(
             signs[:, index],
             side,
             lit.noisy(side, index, formed.get((side, index), lit.white)).rate,
@@ -164,7 +164,7 @@ def simulated(lit: LitSession, modelling: Modelling) -> tuple[list[Shown], int]:
     return shown, frames_of(chosen, pairs, repeats) * len(session.recipe.exposure_ladder)
 
 
-def _real(bench: Apparatus, session: SessionFrames, modelling: Modelling) -> tuple[list[Shown], Digital, int]:
+def _of_frames(bench: Apparatus, session: SessionFrames, modelling: Modelling) -> tuple[list[Shown], Digital, int]:
     """The same of a real session's frames, with their exposure."""
     listed, pairs = session.listed, session.pairs
     if listed.n != bench.n:
@@ -182,7 +182,7 @@ def _real(bench: Apparatus, session: SessionFrames, modelling: Modelling) -> tup
                 f"frames {session.folder}: are {rate.shape[0]} x {rate.shape[1]} pixels, but the scene's camera has "
                 f"{rows} x {columns}; give the scene of this rig"
             )
-        shown.append(_shown(signs[:, index], side, rate, noise, listed.centre))
+        shown.append(_response(signs[:, index], side, rate, noise, listed.centre))
     return shown, listed.digital, frames_of(chosen, pairs, listed.repeats) * len(listed.exposure_ladder)
 
 
@@ -192,7 +192,7 @@ def _changes(signs: FloatArray) -> list[int]:
     return found
 
 
-def _shown(signs: FloatArray, side: Side, rate: FloatArray, noise: float, centre: bool) -> Shown:
+def _response(signs: FloatArray, side: Side, rate: FloatArray, noise: float, centre: bool) -> Shown:
     across = side == SIDES[0]
     even = np.ones_like(signs)
     return Shown(signs if across else even, even if across else signs, centred(rate) if centre else rate, noise)

@@ -104,7 +104,7 @@ def fit_placement(camera: ModelledCamera, shown: Sequence[Shown], free: Sequence
     MitsimError
         for numbers that these responses cannot tell apart, and a mask that is off too far to be found.
     """
-    at = _found_roughly(camera, shown[0], free)
+    at = _first_guess(camera, shown[0], free)
     for _ in range(_PASSES):
         pass_ = _Pass.of(camera, shown, free, at)
         bounds = -_REACH, _REACH
@@ -117,7 +117,7 @@ def fit_placement(camera: ModelledCamera, shown: Sequence[Shown], free: Sequence
     chi_square = 2 * float(done.cost) / (len(done.fun) - len(free))
     scale = np.array([*pass_.steps.values()])
     covariance = max(chi_square, 1.0) * inverse * scale[:, None] * scale
-    return Fitted(at, tuple(free), covariance, chi_square, _unexplained(pass_.terms(at), shown))
+    return Fitted(at, tuple(free), covariance, chi_square, _unexplained_part(pass_.terms(at), shown))
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +144,7 @@ class _Pass:
         spanning = [*turned, *(term for place in near for term in empty.terms(place)[:1])]
         directions, data = [], []
         for each in shown:
-            lefts, rights = (np.stack(vectors, axis=1) for vectors in zip(*_seen(spanning, each), strict=True))
+            lefts, rights = (np.stack(vectors, axis=1) for vectors in zip(*_vectors_of(spanning, each), strict=True))
             across, along = np.linalg.qr(lefts)[0], np.linalg.qr(rights)[0]
             directions.append((across, along))
             data.append((across.T @ each.rate @ along / each.noise).ravel())
@@ -165,7 +165,7 @@ class _Pass:
         """Model less data, in units of the noise."""
         terms, model = self.terms(self.placement(x)), []
         for each, (across, along) in zip(self.shown, self.directions, strict=True):
-            frame = sum(np.multiply.outer(across.T @ left, along.T @ right) for left, right in _seen(terms, each))
+            frame = sum(np.multiply.outer(across.T @ left, along.T @ right) for left, right in _vectors_of(terms, each))
             model.append(np.ravel(frame) / each.noise)
         return np.asarray(np.concatenate(model) - self.data)
 
@@ -175,7 +175,7 @@ class _Pass:
         return np.stack([self.residual(x + one) - here for one in np.eye(len(x))], axis=1)
 
 
-def _seen(terms: SeparableTerms, shown: Shown) -> Iterable[tuple[FloatArray, FloatArray]]:
+def _vectors_of(terms: SeparableTerms, shown: Shown) -> Iterable[tuple[FloatArray, FloatArray]]:
     """u (pixels,) and v (pixels,) of the frame of each term under what was shown."""
     return [(left @ shown.rows, right @ shown.columns) for left, right in terms]
 
@@ -200,7 +200,7 @@ def _inverse(jacobian: FloatArray, free: Sequence[str]) -> FloatArray:
     return np.asarray(covariance / np.outer(lengths, lengths))
 
 
-def _found_roughly(camera: ModelledCamera, uniform: Shown, free: Sequence[str]) -> Placement:
+def _first_guess(camera: ModelledCamera, uniform: Shown, free: Sequence[str]) -> Placement:
     """The built placement, its mask moved to where the response to ``uniform`` light is most like the model's, with
     the gain that fits."""
     shifts = np.zeros(1)
@@ -209,7 +209,7 @@ def _found_roughly(camera: ModelledCamera, uniform: Shown, free: Sequence[str]) 
     geometric = replace(camera, spectrum=None)  # a shadow's fringes move with it
     lefts, rights = [], []
     for shift in shifts:
-        (pair,) = _seen([geometric.factors(camera.built.moved(dict.fromkeys(_SHIFTS, float(shift))))], uniform)
+        (pair,) = _vectors_of([geometric.factors(camera.built.moved(dict.fromkeys(_SHIFTS, float(shift))))], uniform)
         lefts.append(pair[0])
         rights.append(pair[1])
     products = np.stack(lefts) @ uniform.rate @ np.stack(rights).T
@@ -232,11 +232,11 @@ _SHIFTS = ("mask_shift_row", "mask_shift_column")
 """That are looked for before the fit."""
 
 
-def _unexplained(terms: SeparableTerms, shown: Sequence[Shown]) -> float:
+def _unexplained_part(terms: SeparableTerms, shown: Sequence[Shown]) -> float:
     """Part of the responses, rms, that ``terms`` and the stated noise leave."""
     left = energy = 0.0
     for each in shown:
-        frame = sum(np.multiply.outer(*pair) for pair in _seen(terms, each))
+        frame = sum(np.multiply.outer(*pair) for pair in _vectors_of(terms, each))
         left += float(np.square(each.rate - frame).sum()) - each.rate.size * each.noise**2
         energy += float(np.square(each.rate).sum())
     return float(np.sqrt(max(left, 0.0) / energy))

@@ -212,7 +212,12 @@ def plan_calibration(
         for another PSNR than 1 to 100 dB, patterns that do not fit, and as :meth:`mitsim.api.bench.Bench.capture`.
     """
     check_psnr(psnr)
-    recipe, job = _predictable((recipe or load_recipe()).of_one_depth()), job or Job()
+    recipe, job = (recipe or load_recipe()).of_one_depth(), job or Job()
+    if len(recipe.exposure_ladder) > 1 or recipe.dark_frames:
+        raise MitsimError(
+            f"recipe: has {len(recipe.exposure_ladder)} exposures of a frame and {recipe.dark_frames} dark frames; a "
+            "plan knows sessions of one exposure without dark frames, so leave exposure_ladder and dark_frames out"
+        )
     Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.rig.camera_file)
     job.progress("capture", 0.0)
     with job.clock.stage("capture"):
@@ -230,6 +235,9 @@ def plan_calibration(
         trial = search.least(psnr, ceiling)
     lit = predicted.by(trial.recipe or recipe)
     taken = session_seconds(session.board, session.signs.shape[1], lit.session.shots, plan.settings)
+    contrast, unknown = lit.speckle, list[str]()
+    if contrast:
+        unknown = [f"speckle of contrast {contrast:g}: it is in every frame, and not in the plan's calibration"]
     # Half of the projector's pixels are lit in every frame but the uniform ones.
     electrons = float(Exposer(bench.rig, lit.exposure_s, seed).electrons(lit.white).mean()) / 2
     return CalibrationPlan(
@@ -244,25 +252,8 @@ def plan_calibration(
         photons=electrons / bench.sensor.efficiency(bench.projector.effective_wavelength_nm),
         simulation_s=plan.taking(start=0.0, **taken).predicted_seconds,
         seconds=job.clock.seconds(),
-        flags=(*shots.warnings, *session.warnings, *_unknown(predicted)),
+        flags=(*shots.warnings, *session.warnings, *unknown),
     )
-
-
-def _predictable(recipe: SessionRecipe) -> SessionRecipe:
-    """The ``recipe``; MitsimError where it has what a plan does not know."""
-    if len(recipe.exposure_ladder) > 1 or recipe.dark_frames:
-        raise MitsimError(
-            f"recipe: has {len(recipe.exposure_ladder)} exposures of a frame and {recipe.dark_frames} dark frames; a "
-            "plan knows sessions of one exposure without dark frames, so leave exposure_ladder and dark_frames out"
-        )
-    return recipe
-
-
-def _unknown(predicted: PredictedSession) -> tuple[str, ...]:
-    """What sessions do that the plan does not know."""
-    if not predicted.lit.speckle:
-        return ()
-    return (f"speckle of contrast {predicted.lit.speckle:g}: it is in every frame, and not in the plan's calibration",)
 
 
 @dataclass(frozen=True, eq=False)
@@ -333,18 +324,18 @@ def least_dose(quality: Callable[[float], float], wanted: float, smallest: float
         if high == MOST_REPEATS:
             return high
         low, high = high, min(high * _STEP, float(MOST_REPEATS))
-    while not _found(low, high, quality(high) - wanted):
-        dose = _between(low, high, quality(low) - wanted, quality(high) - wanted)
+    while not _is_close(low, high, quality(high) - wanted):
+        dose = _next_dose(low, high, quality(low) - wanted, quality(high) - wanted)
         low, high = (low, dose) if quality(dose) >= wanted else (dose, high)
     return high
 
 
-def _found(low: float, high: float, beyond_db: float) -> bool:
+def _is_close(low: float, high: float, beyond_db: float) -> bool:
     """Whether no dose between ``low`` and ``high`` is worth a look; ``beyond_db`` is what the latter has too much."""
     return (low >= 1 and high - low <= 1) or beyond_db <= _NEAR_DB or high / low < 1 + 10.0 ** (1 - _DIGITS)
 
 
-def _between(low: float, high: float, under_db: float, over_db: float) -> float:
+def _next_dose(low: float, high: float, under_db: float, over_db: float) -> float:
     """The dose at which a straight line over log dose meets what is wanted, well within; whole repeats.
 
     Parameters

@@ -361,7 +361,7 @@ def stripe_frames(
         if lines is None:
             frames: Iterator[Frame] = iter(light.frames(stripes.shots(numbers), seed, leaking=False))
         else:
-            frames = (Frame(frame, 0.0, 0.0, 0.0) for frame in _mixed(stripes.weights[numbers], lines, shape))
+            frames = (Frame(frame, 0.0, 0.0, 0.0) for frame in _mix(stripes.weights[numbers], lines, shape))
         yield from (item for item in zip(numbers.tolist(), frames, strict=True) if item[0] >= first)
 
 
@@ -377,7 +377,7 @@ def _stripe_lines(light: SampledLight, lines: Lighting, seed: int, shape: tuple[
     return frames
 
 
-def _mixed(weights: FloatArray, lines: FloatArray, shape: tuple[int, int]) -> FloatArray:
+def _mix(weights: FloatArray, lines: FloatArray, shape: tuple[int, int]) -> FloatArray:
     """(patterns, m, m') sums of ``lines`` (lines, m m') by ``weights`` (patterns, lines), for frames of a ``shape``."""
     mixed = np.empty((len(weights), lines.shape[1]))
 

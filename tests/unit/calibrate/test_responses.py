@@ -258,7 +258,7 @@ def test_stripes_that_are_formed_in_lots_are_all_there(monkeypatch: pytest.Monke
     monkeypatch.setattr("mitsim.calibrate.session.lines_held", lambda *_: False)
     monkeypatch.setattr("mitsim.calibrate.session.at_once", lambda _: 4)
     lit, formed = lit_session(13), []
-    whole = {number: frame.irradiance for number, frame in lit._formed("vertical", 0)}
+    whole = {number: frame.irradiance for number, frame in lit._stripes("vertical", 0)}
     frames = ToyLight.frames
 
     def counted(self: ToyLight, lighting: Lighting, seed: int, leaking: bool = True) -> list[Frame]:
@@ -266,7 +266,7 @@ def test_stripes_that_are_formed_in_lots_are_all_there(monkeypatch: pytest.Monke
         return frames(self, lighting, seed, leaking)
 
     monkeypatch.setattr(ToyLight, "frames", counted)
-    found = dict(lit._formed("vertical", first))
+    found = dict(lit._stripes("vertical", first))
     assert list(found) == list(range(first, 16)) and all(
         np.array_equal(frame.irradiance, whole[number]) for number, frame in found.items()
     )
@@ -320,7 +320,7 @@ def played(pairs: bool, monkeypatch: pytest.MonkeyPatch) -> LitSession:
     monkeypatch.setattr(LitSession, "_exposers", (SimpleNamespace(rate=lambda digital: digital),))
     monkeypatch.setattr(LitSession, "_dark", None)
     monkeypatch.setattr(
-        LitSession, "_exposed", lambda self, light, side, index: _Shot(Ladder(()), (RATES[index],), index + 1)
+        LitSession, "_expose", lambda self, light, side, index: _Shot(Ladder(()), (RATES[index],), index + 1)
     )
     return lit
 
@@ -459,7 +459,7 @@ def test_responses_have_the_mean_and_the_noise_of_the_closed_form(mode: str, mor
     total, squares, saturated = 0.0, 0.0, 0
     for seed in range(seeds):
         own = replace(lit, session=replace(lit.session, seed=seed))
-        responses = [(own.noisy(side, *it), own.noise_free(it[1])) for side in SIDES for it in own._formed(side, 0)]
+        responses = [(own.noisy(side, *it), own.noise_free(it[1])) for side in SIDES for it in own._stripes(side, 0)]
         off = np.array([response.rate - clean for response, clean in responses])
         total, squares = total + off, squares + np.square(off)
         saturated += sum(response.saturated for response, _ in responses)
