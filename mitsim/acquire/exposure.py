@@ -325,33 +325,33 @@ class _Exposed:
     signal: float
 
 
+@dataclass(eq=False)
 class Shooting:
-    """Turns expected frames into noisy ones and records them; frames that a resumed run has already are kept."""
+    """Turns expected frames into noisy ones and records them; frames that a resumed run has already are kept.
 
-    def __init__(
-        self,
-        family: PatternFamily,
-        recorder: Recorder,
-        exposer: Exposer,
-        ambient: AmbientFrame | None,
-        always: FloatArray,
-    ) -> None:
-        """Nothing is exposed yet.
+    Attributes
+    ----------
+    family, recorder, exposer
+        the shots, where they are kept, and the camera.
+    ambient
+        what is taken off the frames.
+    always
+        (m, m') expected electrons of ambient light, which is in every frame.
+    saturated, noise_ratio
+        frames with saturated pixels, and the largest ratio of rendering to sensor noise, so far.
+    """
 
-        Parameters
-        ----------
-        family, recorder, exposer
-            the shots, where they are kept, and the camera.
-        ambient
-            what is taken off the frames.
-        always
-            (m, m') expected electrons of ambient light, which is in every frame.
-        """
-        self.family, self.recorder, self.exposer = family, recorder, exposer
-        self.ambient, self.always = ambient, always
-        self._has_ambient = bool(always.any())
-        self.saturated, self.noise_ratio = 0, 0.0
-        self._noise_energy = self._energy = self._signal = self._light = 0.0
+    family: PatternFamily
+    recorder: Recorder
+    exposer: Exposer
+    ambient: AmbientFrame | None
+    always: FloatArray
+    saturated: int = 0
+    noise_ratio: float = 0.0
+    _noise_energy: float = 0.0
+    _energy: float = 0.0
+    _signal: float = 0.0
+    _light: float = 0.0
 
     @property
     def sensor_noise(self) -> float:
@@ -432,7 +432,7 @@ class Shooting:
             saturated=self.exposer.saturated(digital, electrons),
             light=float(electrons.sum()),
             energy=energy,
-            signal=sum_of_squares(electrons - self.always) if self._has_ambient else energy,
+            signal=sum_of_squares(electrons - self.always) if self.always.any() else energy,
         )
 
     def _record(self, exposed: _Exposed) -> None:

@@ -332,9 +332,8 @@ class MosaicLight(SampledLight):
         for number, response in enumerate(lamplight.responses):
             frames += _lamps_alone(light, lamplight.rows(number), seed)
             # Filed is the mean over all pixels, of which the response's have it all.
-            counted[list(response.planes), number] = 1 / (
-                response.part * unit * self.bench.projector.effective_wavelength_nm
-            )
+            scale = response.part * unit * self.bench.projector.effective_wavelength_nm
+            counted[list(response.planes), number] = 1 / scale
         shape = self.bench.geometry.frame_shape
         irradiance = np.einsum("fij,fij->ij", behind(counted, shape), np.stack([each.irradiance for each in frames]))
         parts = np.square(counted).mean(axis=0) @ np.array([each.by_group for each in frames])  # no pixel has two
@@ -389,14 +388,14 @@ class MosaicFrames(ExpectedFrames):
         (lines, m, m') part of its irradiance that counts.
     lamps
         their light, as it counts, which is in every frame.
-    apart
+    independent
         whether no other light is on their paths.
     """
 
     def __init__(
-        self, lines: Sequence[ExpectedFrames], passed: FloatArray, lamps: Frame | None = None, apart: bool = False
+        self, lines: Sequence[ExpectedFrames], passed: FloatArray, lamps: Frame | None = None, independent: bool = False
     ) -> None:
-        self._lines, self._passed, self._lamps, self._apart = tuple(lines), passed, lamps, apart
+        self._lines, self._passed, self._lamps, self._independent = tuple(lines), passed, lamps, independent
         self._spread = np.sqrt(np.square(passed).mean(axis=(1, 2)))
 
     def __len__(self) -> int:
@@ -419,46 +418,28 @@ class MosaicFrames(ExpectedFrames):
             if self._lamps is not None:
                 light += self._lamps.irradiance
             groups = zip(*(frame.by_group or (frame.variance,) for frame in (*shot, *always)), strict=True)
-            parts = [self._sum_of_variances(each) for each in groups]
-            variance = sum(parts)
-            yield Frame(
-                light,
-                variance,
-                max(frame.removed for frame in (*shot, *always)),
-                max(parts) / variance if variance else 0.0,
-                tuple(parts) if shot[0].by_group else (),
-            )
+            parts = tuple(self._sum_of_variances(each) for each in groups)
+            variance, removed = sum(parts), max(frame.removed for frame in (*shot, *always))
+            heaviest = max(parts) / variance if variance else 0.0
+            yield Frame(light, variance, removed, heaviest, parts if shot[0].by_group else ())
 
     def _sum_of_variances(self, variances: Sequence[float]) -> float:
         """Variance of the sum of all lines' light and lamps', from a group's of each."""
         lines, lamps = variances[: len(self._lines)], sum(variances[len(self._lines) :])
         own = float(self._spread @ np.sqrt(lines))
-        return own**2 + lamps if self._apart else (own + math.sqrt(lamps)) ** 2
+        return own**2 + lamps if self._independent else (own + math.sqrt(lamps)) ** 2
 
 
 def _truth_of_all(lights: Sequence[SampledLight], counted: FloatArray) -> Truth:
-    """What a perfect image of all pixels together would show: the lines' truths by the light that is counted of each
-    on the board.
-
-    Parameters
-    ----------
-    lights
-        of the lines.
-    counted
-        (lines,) part of each line's light.
-    """
+    """What a perfect image of all pixels together would show: the lines' truths by the light that is ``counted``
+    (lines,) of each on the board."""
     truths = [light.apparent for light in lights]
     shape = truths[0].reflectance.shape
     board = counted[:, None] * np.stack([truth.board_flux for truth in truths])
     whole = board.sum(axis=0)
     shares = np.divide(board, whole, out=np.zeros_like(board), where=whole > 0).reshape(-1, *shape)
-    return Truth(
-        reflectance=sum(
-            (share * truth.reflectance for share, truth in zip(shares, truths, strict=True)), np.zeros(shape)
-        ),
-        standard_error=sum(
-            (share * truth.standard_error for share, truth in zip(shares, truths, strict=True)), np.zeros(shape)
-        ),
-        board_flux=whole,
-        rays=truths[0].rays,
+    reflectance, error = (
+        (shares * np.stack([getattr(truth, name) for truth in truths])).sum(axis=0)
+        for name in ("reflectance", "standard_error")
     )
+    return Truth(reflectance, error, whole, truths[0].rays)

@@ -296,7 +296,9 @@ class LitSession:
         """The noisy frames of shot number ``index`` of a ``side``, of expected ``irradiance`` (m, m')."""
         ladder = self.ladders[side]
         found = [
-            self._mean_of_repeats(self._lit(irradiance, exposure, side, index), exposure, ladder.used(exposure), side, index)
+            self._mean_of_repeats(
+                self._lit(irradiance, exposure, side, index), exposure, ladder.used(exposure), side, index
+            )
             for exposure in range(len(self._exposers))
         ]
         return _Shot(ladder, tuple(digital for digital, _ in found), sum(saturated for _, saturated in found))
