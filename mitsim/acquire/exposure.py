@@ -35,10 +35,8 @@ Item = TypeVar("Item", bound=tuple[Any, ...])
 
 @dataclass(frozen=True)
 class Exposer:
-    """A rig's camera at one exposure time; every frame's noise has streams of its own, found by its names.
-
-    ``speckle`` is the contrast of laser speckle in the frames; 0 without.
-    """
+    """A camera at one exposure time, whose frames have speckle of a contrast (0: none); every frame's noise has streams
+    of its own, found by its names."""
 
     rig: Rig
     exposure_s: float
@@ -82,10 +80,8 @@ class Exposer:
         return saturated_pixels(digital, electrons, self.exposure_s, self.rig.sensor) > 0
 
     def measurements(self, family: PatternFamily, expected: ExpectedFrames) -> Iterator[tuple[FloatArray, int, int]]:
-        """Noisy measurement [electrons / s] of every pattern (i, j) of ``family``, from its ``expected`` frames.
-
-        A signed pattern is a difference of two frames.
-        """
+        """Noisy measurement [electrons / s] of every pattern (i, j) of ``family``, from its ``expected`` frames: of a
+        signed pattern the difference of two."""
         positive: FloatArray | None = None
         for shots in in_chunks(zip(family.shots, expected, strict=True)):
             rates = in_threads(lambda item: self._measurement(item[1], *item[0].names), shots)
@@ -355,7 +351,7 @@ class Shooting:
 
     @property
     def sensor_noise(self) -> float:
-        """Relative noise of the sensor, ||noise|| / ||expected||, over all frames, from its closed form."""
+        """Relative noise of the sensor, ||noise|| / ||expected||, over all frames, in closed form."""
         return math.sqrt(self._noise_energy / self._energy) if self._energy else 0.0
 
     @property
