@@ -98,7 +98,8 @@ class Bench(Apparatus):
 
     @checked
     def light(self, patterns: str = "dots:7", job: Job | None = None, **request: Any) -> Light:
-        """Light of the scene by projector pixel, traced once, from which any family can be exposed.
+        """Light of the scene by projector pixel, traced once, from which any family can be exposed. MitsimError as
+        :meth:`plan`.
 
         Parameters
         ----------
@@ -108,11 +109,6 @@ class Bench(Apparatus):
             clock, progress and limits.
         **request
             other fields of :class:`mitsim.bench.request.Request`.
-
-        Raises
-        ------
-        MitsimError
-            as :meth:`plan`.
         """
         from mitsim.acquire.capture import trace_request
 
@@ -372,7 +368,8 @@ class Bench(Apparatus):
         resume: bool = False,
         job: Job | None = None,
     ) -> dict[float, Factors]:
-        """The camera's two factors at each of a recipe's depths, by depth [mm].
+        """The camera's two factors at each of a recipe's depths, by depth [mm]. MitsimError as :meth:`calibrate`, and
+        for a recipe without depths, or with one at which the mask is.
 
         Parameters
         ----------
@@ -380,11 +377,6 @@ class Bench(Apparatus):
             as :meth:`calibrate`.
         output
             folder of a CAL folder for each depth, called by its millimetres; None keeps the factors in memory.
-
-        Raises
-        ------
-        MitsimError
-            as :meth:`calibrate`, and for a recipe without depths, or with one at which the mask is.
         """
         from mitsim.calibrate.calibrate import calibrate_depths
 
@@ -401,7 +393,8 @@ class Bench(Apparatus):
         job: Job | None = None,
     ) -> Factors:
         """What :meth:`calibrate` does; and the session's frames, as a real camera's user has them, in a folder from
-        which :func:`mitsim.calibrate_frames` makes the same factors.
+        which :func:`mitsim.calibrate_frames` makes the same factors. MitsimError as :meth:`calibrate`, for a recipe with
+        depths, and a folder that holds something or has no room.
 
         Parameters
         ----------
@@ -409,11 +402,6 @@ class Bench(Apparatus):
             new or empty folder.
         output, seed, accuracy, recipe, job
             as :meth:`calibrate`.
-
-        Raises
-        ------
-        MitsimError
-            as :meth:`calibrate`, for a recipe with depths, and a folder that holds something or has no room.
         """
         from mitsim.calibrate.calibrate import write_session
 
@@ -455,7 +443,7 @@ class Bench(Apparatus):
 
     @checked
     def with_board(self, reflectance: float, shape: BoardShape | None = None, depth: float | None = None) -> Self:
-        """The same rig before a diffuse board.
+        """The same devices before a diffuse board. MitsimError for a reflectance or a depth that no board has.
 
         Parameters
         ----------
@@ -465,11 +453,6 @@ class Bench(Apparatus):
             its size, bow and tilt; None: flat, and larger than the view.
         depth
             distance of its middle [mm]; None: on the aligned plane.
-
-        Raises
-        ------
-        MitsimError
-            for a reflectance or a depth that no board has.
         """
         from mitsim.bench.board import before_board
 

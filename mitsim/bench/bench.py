@@ -54,8 +54,8 @@ class Apparatus:
     lamplight
         how the camera counts lamps' light of all wavelengths; None: as light of the projector's effective wavelength.
     filters
-        the camera with its colour filters, which are put over frames; its sensor in ``rig`` then has none, and makes
-        one electron of a photon. None: frames are as the sensor has them.
+        the camera with its colour filters, which are put over frames; the sensor in ``rig`` then has none, and
+        makes one electron of a photon. None: frames are as the sensor has them.
     """
 
     loaded: LoadedScene

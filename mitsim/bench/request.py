@@ -132,7 +132,8 @@ class Exposure:
             )
 
     def choose(self, rig: Rig, peak_irradiance: float) -> float:
-        """Exposure time [s] of ``rig`` for frames whose brightest expected pixel has ``peak_irradiance`` [W m^-2]."""
+        """Exposure time [s] of a ``rig`` for frames whose brightest expected pixel has ``peak_irradiance``
+        [W m^-2]."""
         if self.seconds is not None:
             return self.seconds
         from mitsim.sensor.chain import exposure_for_peak  # here: it needs numpy, and checking a request does not

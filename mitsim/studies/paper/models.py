@@ -3,7 +3,7 @@
 The camera is not built as it was to be: its mask is 50 um too far from the sensor, and 37 and -21 um off the axis. A
 model starts from the plan and is fitted to the first frames of a session; measured factors need all patterns of it, and
 more frames by taking each several times, or fewer by one uniform shot instead of a second half of each pair. Measured
-factors have the noise of their session in closed form (:mod:`mitsim.calibrate.plan`), so that one session is formed.
+factors have the noise of their session in closed form (:mod:`mitsim.calibrate.plan`), so one session is formed.
 """
 
 from __future__ import annotations
