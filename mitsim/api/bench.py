@@ -393,8 +393,8 @@ class Bench(Apparatus):
         job: Job | None = None,
     ) -> Factors:
         """What :meth:`calibrate` does; and the session's frames, as a real camera's user has them, in a folder from
-        which :func:`mitsim.calibrate_frames` makes the same factors. MitsimError as :meth:`calibrate`, for a recipe with
-        depths, and a folder that holds something or has no room.
+        which :func:`mitsim.calibrate_frames` makes the same factors. MitsimError as :meth:`calibrate`, for a recipe
+        with depths, and a folder that holds something or has no room.
 
         Parameters
         ----------
