@@ -9,9 +9,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from mitsim.api.light import Light
 from scipy import sparse
 
+from mitsim.acquire.capture import Light
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.effects import EFFECTS
 from mitsim.core.errors import MitsimError
