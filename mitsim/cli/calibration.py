@@ -381,7 +381,7 @@ def calibrate_model(context: typer.Context, modelling: Modelling, output: Path) 
     with job_of(asked["quiet"] or asked["as_json"], asked["max_seconds"], asked["max_memory"]) as job:
         with job.clock.stage("open scene"):
             bench = bench_of(*bench_words)
-        from mitsim.calibrate.model_fit import calibrate_model as fit_model
+        from mitsim.calibrate.model import calibrate_model as fit_model
 
         factors = fit_model(bench, modelling, frames, recipe, asked["seed"], output, job)
     result = factors.manifest.result
