@@ -14,7 +14,7 @@ from mitsim.bench.bench import Apparatus
 from mitsim.core.configuration import DEFAULT_CAMERA, load_model, locate
 from mitsim.core.environment import DEFAULT_VARIANT, load_variant
 from mitsim.core.errors import MitsimError
-from mitsim.devices.families import read_name
+from mitsim.devices.patterns import read_name
 from mitsim.scene.guard.outline import Outline, SceneFiles
 from mitsim.scene.window import lit_side
 

@@ -29,9 +29,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.drift import Drift
-from mitsim.devices.families import read_name
 from mitsim.devices.mask import CameraMask
-from mitsim.devices.patterns import PatternFamily
+from mitsim.devices.patterns import PatternFamily, read_name
 from mitsim.devices.projector import Spectrum
 from mitsim.light.light import SampledLight
 from mitsim.metrics import Quality, psnr, relative_error
@@ -121,7 +120,7 @@ def check_sweep(sweep: Sweep, pictures: int) -> None:
         if text not in CONVENTIONS:
             raise MitsimError(f"--over exposure={text}: use {', '.join(CONVENTIONS)}")
     for text in knobs.get("patterns", ()):
-        read_name(text, None)
+        read_name(text)
     for name, kind in (("seed", int), ("accuracy", float)):
         for text in knobs.get(name, ()):
             Request.of(**{name: number_of(name, text, kind)})
