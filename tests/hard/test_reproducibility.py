@@ -22,7 +22,7 @@ from mitsim.core.exr import read_frame
 from mitsim.light import light
 from mitsim.light.light import trace_light
 from mitsim.light.settings import GROUPS, LOOKS, Changes, Part, Settings
-from mitsim.optics import frames
+from mitsim.optics import forming
 from mitsim.planner import pilot_direct, pilot_samples
 from mitsim.planner.planner import make_plan
 from mitsim.transport.direct import DirectTracer
@@ -139,7 +139,7 @@ def test_mixing_does_not_depend_on_threads(monkeypatch: pytest.MonkeyPatch, colu
     found = set()
     for count in (*THREADS, 5, 7):
         monkeypatch.setattr(parallel, "workers", lambda count=count: count)
-        found.add(frames._mix(weights, basis).tobytes())
+        found.add(forming.mix_frames(weights, basis).tobytes())
     assert len(found) == 1
     assert np.allclose(np.frombuffer(found.pop()), (weights @ basis).ravel(), rtol=1e-13, atol=0)
 
