@@ -16,10 +16,8 @@ from mitsim.scene.guard.check import check_file, looking_beside
 from mitsim.scene.guard.estimators import Unfit
 from mitsim.scene.guard.limits import Range
 from mitsim.scene.guard.outline import Tag
-from mitsim.scene.mesh_lamps import emit_by_faces
-from mitsim.scene.origin import check_meshes, move_to_camera
 from mitsim.scene.projector import ProjectorGrid, locate_projector
-from mitsim.scene.thin import with_thin_shapes_as_meshes
+from mitsim.scene.tree import check_meshes, emit_by_faces, move_to_camera, with_thin_shapes_as_meshes
 
 SENSOR_PLUGIN = "mitsim_lensless"
 _SMALL_LAMPS = ("DirectionalEmitter", "PointLight", "SpotLight")
