@@ -28,8 +28,7 @@ from scipy import fft
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask import Mask
-from mitsim.devices.mask_flaws import NO_FLAWS, Flaws
+from mitsim.devices.mask import NO_FLAWS, Flaws, Mask
 from mitsim.devices.plate import Plate
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.diffraction import EdgeWaves, grid_step, wave_profiles

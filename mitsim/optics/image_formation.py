@@ -24,7 +24,7 @@ from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.plate import FEW
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.fft_shadow import Correlation, cells_per_pixel, raster
-from mitsim.optics.shadow import Directions, Places, SeparableTerms, ShadowGeometry
+from mitsim.optics.shadow import Directions, Places, SeparableTerms, ShadowGeometry, lagrange_weights
 from mitsim.optics.terms import shadow_terms
 
 IntArray = npt.NDArray[np.integer]
@@ -408,9 +408,4 @@ def anchor_positions(count: int, half_width: float) -> FloatArray:
 
 def anchor_weights(anchors: Sequence[float] | FloatArray, at: FloatArray) -> FloatArray:
     """(len(at), len(anchors)) Lagrange weights that interpolate values known at ``anchors`` to the points ``at``."""
-    nodes = np.asarray(anchors, dtype=np.float64)
-    weights = np.ones((len(at), len(nodes)))
-    for j, node in enumerate(nodes):
-        for zero in np.delete(nodes, j):
-            weights[:, j] *= (at - zero) / (node - zero)
-    return weights
+    return np.stack(lagrange_weights(at, np.asarray(anchors, dtype=np.float64)), axis=1)

@@ -15,7 +15,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import stream
 
 PROBES = 8
-"""Random signs beside the constant vector; chosen so that probing costs less than a frame, see :func:`probe_vectors`."""
+"""Random signs beside the constant vector; chosen so that probing costs less than a frame (:func:`probe_vectors`)."""
 _SURE = 0.95
 """How often an error is to be below its bound."""
 

@@ -12,8 +12,7 @@ import pytest
 from scipy import ndimage, special
 
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask import mls_mask
-from mitsim.devices.mask_flaws import NO_FLAWS
+from mitsim.devices.mask import NO_FLAWS, mls_mask
 from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.plate import Plate
 from mitsim.devices.projector import Spectrum

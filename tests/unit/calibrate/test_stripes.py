@@ -7,8 +7,7 @@ import pytest
 
 from mitsim.calibrate import session
 from mitsim.core.arrays import FloatArray
-from mitsim.devices.hadamard import hadamard_matrix
-from mitsim.devices.patterns import Lighting
+from mitsim.devices.patterns import Lighting, hadamard_matrix
 from mitsim.optics.frames import Frame
 
 N, ROWS, COLUMNS = 12, 20, 23

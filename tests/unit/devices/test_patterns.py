@@ -10,8 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mitsim.core.errors import MitsimError
-from mitsim.devices.hadamard import hadamard_matrix, hadamard_orders
-from mitsim.devices.patterns import FAMILIES, Lighting, parse_patterns, pattern_family, shot_count
+from mitsim.devices.patterns import (
+    FAMILIES,
+    Lighting,
+    hadamard_matrix,
+    hadamard_orders,
+    parse_patterns,
+    pattern_family,
+    shot_count,
+)
 
 EXAMPLES = [
     *(form.replace("RxC", "3x5").replace("K", "4") for family in FAMILIES.values() for form in family.forms),

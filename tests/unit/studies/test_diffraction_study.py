@@ -11,7 +11,7 @@ import pytest
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.request import Request
 from mitsim.core.errors import MitsimError
-from mitsim.devices.hadamard import hadamard_matrix
+from mitsim.devices.patterns import hadamard_matrix
 from mitsim.devices.projector import Spectrum
 from mitsim.metrics import relative_error
 from mitsim.optics.separable import best_term, centred
