@@ -328,7 +328,7 @@ def pattern_family(
 
 @pattern_family("uniform")
 def uniform(side: Side) -> PatternFactor:
-    """All pixels, in one shot."""
+    """All pixels of a ``side``, in one shot."""
     import numpy as np
 
     return np.ones((side.n, 1), dtype=np.int8)
@@ -336,7 +336,7 @@ def uniform(side: Side) -> PatternFactor:
 
 @pattern_family("dots:K", "dots:RxC")
 def shifting_dots(side: Side) -> PatternFactor:
-    """Column i lights every K-th of n pixels from i on; n need not be a multiple of K."""
+    """Column i lights every K-th pixel of a ``side`` from i on; their number need not be a multiple of K."""
     import numpy as np
 
     return np.asarray(np.arange(side.n)[:, None] % side.k == np.arange(side.k)[None, :], dtype=np.int8)
@@ -344,7 +344,7 @@ def shifting_dots(side: Side) -> PatternFactor:
 
 @pattern_family("hadamard:K", label="Hadamard", signed=lambda k: k > 1, check=way_to)
 def repeated_hadamard(side: Side) -> PatternFactor:
-    """The rows of the Hadamard matrix of order K, repeated down n pixels; +-1."""
+    """The rows of the Hadamard matrix of order K, repeated down the pixels of a ``side``; +-1."""
     import numpy as np
 
     return np.asarray(hadamard_matrix(side.k)[np.arange(side.n) % side.k])
@@ -352,7 +352,7 @@ def repeated_hadamard(side: Side) -> PatternFactor:
 
 @pattern_family("random:K", random=True)
 def random_binary(side: Side) -> PatternFactor:
-    """Fair coin flips, each pixel lit by at least one column: the union must cover the scene."""
+    """Fair coin flips, each pixel of a ``side`` lit by at least one column: the union must cover the scene."""
     import numpy as np
 
     rng = stream(side.seed, "patterns", "random", side.name)

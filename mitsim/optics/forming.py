@@ -50,9 +50,20 @@ class Filed:
 def form_frames(
     lights: Sequence[Filed], basis: sparse.csr_array, probes: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Frames (b, m, m') of mixtures ``basis`` (b, rows), and the groups' own as ``probes`` see them.
+    """Frames of mixtures of light, and its replicates times probes.
 
-    The latter are (b, m * groups * probes); none without probes.
+    Parameters
+    ----------
+    lights
+        of the same rows; their frames add up.
+    basis
+        (b, rows) mixtures.
+    probes
+        (m', probes) of :func:`mitsim.optics.replicates.probe_vectors`; None: no replicates.
+
+    Returns
+    -------
+    (b, m, m') frames, and (b, m * groups * probes) of single groups.
     """
     shape, groups = lights[0].optics.frame_shape, len(lights[0].groups)
     mixed, count = _mixed(lights, basis), basis.shape[0]
@@ -71,7 +82,17 @@ def form_frames(
 
 
 def probe_frames(lights: Sequence[Filed], basis: sparse.csr_array, probes: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """As :func:`form_frames`, without the frames; and (b, lights, groups) squared norms of the groups' differences."""
+    """Replicates of mixtures of light, without the frames themselves.
+
+    Parameters
+    ----------
+    lights, basis, probes
+        as for :func:`form_frames`.
+
+    Returns
+    -------
+    (b, m * groups * probes) of single groups, and (b, lights, groups) squared norms of their differences.
+    """
     rows, groups = lights[0].optics.frame_shape[0], len(lights[0].groups)
     mixed, count = _mixed(lights, basis), basis.shape[0]
     probed, noise = np.zeros((count, rows * groups * probes.shape[1])), np.zeros((count, len(lights), groups))
@@ -168,7 +189,15 @@ class Mixture:
         return in_threads(turned, range(len(self.weights)))
 
     def shots(self, basis: FloatArray, start: int, stop: int) -> Sequence[FloatArray]:
-        """Those from ``start`` to ``stop``, of the held frames ``basis`` (b, ...); some may be of the basis itself."""
+        """Shots of the frames that are held; some may be of these themselves.
+
+        Parameters
+        ----------
+        basis
+            (b, ...) frames that are held.
+        start, stop
+            numbers of shots.
+        """
         if not self.sparse:
             return list(mix_frames(self.weights[start:stop], basis))
         common = mix_frames(self.least[None], basis)[0] if self.least.any() else None

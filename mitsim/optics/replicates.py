@@ -24,6 +24,11 @@ def probe_vectors(pixels: int, seed: int) -> FloatArray:
     """(pixels, 1 + 8) vectors v with E sum |A v|^2 = ||A||^2: the constant one exactly, the rest by random signs.
 
     Most of a frame's error is common to its columns, and a few signs alone would see that part with 12 % scatter.
+
+    Parameters
+    ----------
+    pixels, seed
+        columns of a frame, and of the signs.
     """
     constant = np.full((pixels, 1), pixels**-0.5)
     signs = stream(seed, "probe").choice((-1.0, 1.0), size=(pixels, PROBES)) / PROBES**0.5
