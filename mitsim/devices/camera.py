@@ -30,17 +30,9 @@ mrad at the paper's geometry (benchmarks/masks.py)."""
 _MOST_TILTED_TERMS = 64
 """Separable terms that a tilted mask is formed of: 0.8 GB at 512 pixels and as many cells a side."""
 _NOT_KNOWN_BEFORE = (
-    "mask_offset",
-    "mask_plate",
-    "mask_motion",
-    "mask_lean",
-    "mask_fft",
-    "mask_cells",
-    "rows",
-    "columns",
-    "row_pitch",
-    "roi",
-)
+    "mask_offset", "mask_plate", "mask_motion", "mask_lean", "mask_fft", "mask_cells", "rows", "columns",
+    "row_pitch", "roi",
+)  # fmt: skip
 """Beginnings of the names of fields that calibrations of 0.4 do not know."""
 
 
