@@ -250,8 +250,8 @@ def stripe_signs(n: int) -> PatternFactor:
 
 
 @dataclass(frozen=True)
-class Side:
-    """One side of a family's patterns that is to be made.
+class PatternAxis:
+    """One axis of a family's patterns: what its factor is made from.
 
     Attributes
     ----------
@@ -277,7 +277,7 @@ class Family:
 
     name: str
     forms: tuple[str, ...]
-    factor: Callable[[Side], PatternFactor]
+    factor: Callable[[PatternAxis], PatternFactor]
     label: str
     random: bool
     signed: Callable[[int], bool]
@@ -294,8 +294,8 @@ def pattern_family(
     random: bool = False,
     signed: Callable[[int], bool] = lambda k: False,
     check: Callable[[int], object] | None = None,
-) -> Callable[[Callable[[Side], PatternFactor]], Callable[[Side], PatternFactor]]:
-    """Register a function from a :class:`Side` to its (n, K) factor of 0/1 or +-1 as a pattern family.
+) -> Callable[[Callable[[PatternAxis], PatternFactor]], Callable[[PatternAxis], PatternFactor]]:
+    """Register a function from a :class:`PatternAxis` to its (n, K) factor of 0/1 or +-1 as a pattern family.
 
     Parameters
     ----------
@@ -319,7 +319,7 @@ def pattern_family(
     if name in FAMILIES:
         raise ValueError(f"pattern_family: {name!r} is there already; known are {', '.join(FAMILIES)}")
 
-    def register(factor: Callable[[Side], PatternFactor]) -> Callable[[Side], PatternFactor]:
+    def register(factor: Callable[[PatternAxis], PatternFactor]) -> Callable[[PatternAxis], PatternFactor]:
         FAMILIES[name] = Family(name, forms, factor, label or name, random, signed, check)
         return factor
 
@@ -327,38 +327,38 @@ def pattern_family(
 
 
 @pattern_family("uniform")
-def uniform(side: Side) -> PatternFactor:
-    """All pixels of a ``side``, in one shot."""
+def uniform(axis: PatternAxis) -> PatternFactor:
+    """All pixels of an ``axis``, in one shot."""
     import numpy as np
 
-    return np.ones((side.n, 1), dtype=np.int8)
+    return np.ones((axis.n, 1), dtype=np.int8)
 
 
 @pattern_family("dots:K", "dots:RxC")
-def shifting_dots(side: Side) -> PatternFactor:
-    """Column i lights every K-th pixel of a ``side`` from i on; their number need not be a multiple of K."""
+def shifting_dots(axis: PatternAxis) -> PatternFactor:
+    """Column i lights every K-th pixel of an ``axis`` from i on; their number need not be a multiple of K."""
     import numpy as np
 
-    return np.asarray(np.arange(side.n)[:, None] % side.k == np.arange(side.k)[None, :], dtype=np.int8)
+    return np.asarray(np.arange(axis.n)[:, None] % axis.k == np.arange(axis.k)[None, :], dtype=np.int8)
 
 
 @pattern_family("hadamard:K", label="Hadamard", signed=lambda k: k > 1, check=way_to)
-def repeated_hadamard(side: Side) -> PatternFactor:
-    """The rows of the Hadamard matrix of order K, repeated down the pixels of a ``side``; +-1."""
+def repeated_hadamard(axis: PatternAxis) -> PatternFactor:
+    """The rows of the Hadamard matrix of order K, repeated down the pixels of an ``axis``; +-1."""
     import numpy as np
 
-    return np.asarray(hadamard_matrix(side.k)[np.arange(side.n) % side.k])
+    return np.asarray(hadamard_matrix(axis.k)[np.arange(axis.n) % axis.k])
 
 
 @pattern_family("random:K", random=True)
-def random_binary(side: Side) -> PatternFactor:
-    """Fair coin flips, each pixel of a ``side`` lit by at least one column: the union must cover the scene."""
+def random_binary(axis: PatternAxis) -> PatternFactor:
+    """Fair coin flips, each pixel of an ``axis`` lit by at least one column: the union must cover the scene."""
     import numpy as np
 
-    rng = stream(side.seed, "patterns", "random", side.name)
-    bits = rng.integers(0, 2, size=(side.n, side.k), dtype=np.int8)
+    rng = stream(axis.seed, "patterns", "random", axis.name)
+    bits = rng.integers(0, 2, size=(axis.n, axis.k), dtype=np.int8)
     dark = np.flatnonzero(~bits.any(axis=1))
-    bits[dark, rng.integers(0, side.k, size=dark.size)] = 1
+    bits[dark, rng.integers(0, axis.k, size=dark.size)] = 1
     return bits
 
 
@@ -441,5 +441,5 @@ def parse_patterns(text: str, n: int, seed: int = 0) -> PatternFamily:
     family, periods = read_name(text, n)
     if (count := shot_count(text)) > MOST_SHOTS:
         raise MitsimError(f"patterns {text!r}: are {count} shots; a run has at most {MOST_SHOTS}, give a smaller K")
-    left = family.factor(Side(n, periods[0], "left", seed))
-    return PatternFamily(text, left, family.factor(Side(n, periods[-1], "right", seed)))
+    left = family.factor(PatternAxis(n, periods[0], "left", seed))
+    return PatternFamily(text, left, family.factor(PatternAxis(n, periods[-1], "right", seed)))

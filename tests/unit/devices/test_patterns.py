@@ -187,9 +187,9 @@ import sys
 from mitsim.devices.patterns import pattern_family
 
 @pattern_family("bars:K", label="broad bars")
-def bars(side):
+def bars(axis):
     import numpy as np
-    return (np.arange(side.n)[:, None] * side.k // side.n == np.arange(side.k)).astype(np.int8)
+    return (np.arange(axis.n)[:, None] * axis.k // axis.n == np.arange(axis.k)).astype(np.int8)
 
 from mitsim.cli import run
 run()
