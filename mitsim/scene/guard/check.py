@@ -106,15 +106,11 @@ def check_file(
         mi.parser.transform_all(config, state)
     tree = _Tree(outline, files, variant, [mi.parser.SceneNode(node) for node in state.nodes])
     tree.check()
-    unfit = Unfit.of(outline, tree.nodes)
     # Groups are in the scene by their instances alone.
     shapes = [plugin for plugin in PLUGINS["shape"].split() if plugin != "shapegroup"]
-    listed = (tuple(tree.listed(plugins)) for plugins in (shapes, SMALL_LAMPS))
-    facts = tuple(files.used), tree.limits, unfit
-    shown, small = listed
-    return CheckedScene(
-        outline, config, state, *facts, shown, small, tuple(tree.coloured), tuple(tree.parting), tree.samples
-    )
+    facts = tuple(files.used), tree.limits, Unfit.of(outline, tree.nodes)
+    listed = tuple(tree.listed(shapes)), tuple(tree.listed(SMALL_LAMPS)), tuple(tree.coloured), tuple(tree.parting)
+    return CheckedScene(outline, config, state, *facts, *listed, tree.samples)
 
 
 @contextmanager
