@@ -32,6 +32,12 @@ Positive = Annotated[float, pydantic.Field(ge=1 / LARGEST, le=LARGEST, allow_inf
 NonNegative = Annotated[float, pydantic.Field(ge=0, le=LARGEST, allow_inf_nan=False)]
 
 
+class Configuration(pydantic.BaseModel):
+    """A frozen model of finite numbers, of the very types that it states, without further fields."""
+
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
 def shipped(*parts: str) -> Path:
     """A file or folder that comes with mitsim, for example ``shipped("calibration", "imx249.toml")`` of ``parts``.
 

@@ -11,11 +11,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.configuration import validated
+from mitsim.core.configuration import Configuration, validated
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import FRAME_LIMITS, fits_a_frame
 from mitsim.devices.drift import MaskMotion
@@ -36,12 +36,8 @@ _NOT_KNOWN_BEFORE = (
 """Beginnings of the names of fields that calibrations of 0.4 do not know."""
 
 
-class CameraGeometry(BaseModel):
+class CameraGeometry(Configuration, arbitrary_types_allowed=True):
     """Bare sensor under a coded mask; the defaults are the geometry of Zheng & Asif, section IV-A."""
-
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True
-    )
 
     pixels: int = Field(512, ge=1, le=16384, description="sensor pixels a side, of a square sensor")
     """More than the largest square sensors, 10 560, of which a region is read."""

@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from mitsim.core.configuration import validated
+from mitsim.core.configuration import Configuration, validated
 from mitsim.core.errors import MitsimError
 
 LARGEST_ROTATION_MRAD = 10.0
@@ -45,19 +45,15 @@ STILL = "gap_um_per_k", "power_ripple_hz", "lamp_ripple_hz"
 """Fields of :class:`Drift` that move nothing by themselves: they say what a kind does."""
 
 
-class MaskMotion(BaseModel):
+class MaskMotion(Configuration):
     """How a mask is turned in its plane about its centre, from rows to columns, and how it moves during an exposure."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     rotation_mrad: float = Field(default=0.0, ge=-LARGEST_ROTATION_MRAD, le=LARGEST_ROTATION_MRAD)
     vibration_um: float = Field(default=0.0, ge=0, le=1000, description="rms along each axis, um")
 
 
-class Drift(BaseModel):
+class Drift(Configuration):
     """What moves between a calibration and a capture, and by how much."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     mask_rows_um: float = Field(default=0.0, ge=-1000, le=1000, description="mask moves down the rows, um")
     mask_columns_um: float = Field(default=0.0, ge=-1000, le=1000, description="the same along the columns, um")

@@ -12,9 +12,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, FailFast, Field, model_validator
+from pydantic import BeforeValidator, FailFast, Field, model_validator
 
-from mitsim.core.configuration import Positive, read_toml, validated
+from mitsim.core.configuration import Configuration, Positive, read_toml, validated
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import read_json
 from mitsim.core.imagelist import Raw, Wanted, image_files
@@ -30,11 +30,7 @@ Key = tuple[Side, int, int, int, int]
 """Side, number of the pattern, sign, number of the exposure and repeat of a frame."""
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
-
-
-class StripeFile(_Part):
+class StripeFile(Configuration):
     """One frame of a session: the +1 or -1 half of a stripe pattern, or the uniform frame of a side."""
 
     file: FileName = Field(description="name of the frame in the folder, without a path")
@@ -48,7 +44,7 @@ class StripeFile(_Part):
     )
 
 
-class DarkFile(_Part):
+class DarkFile(Configuration):
     """One frame with the projector off."""
 
     file: FileName = Field(description="name of the frame in the folder, without a path")
@@ -60,7 +56,7 @@ def _named(camera: Any) -> Any:
     return {"name": camera} if isinstance(camera, str) else camera
 
 
-class FrameList(_Part):
+class FrameList(Configuration):
     """What a real session's frames are of, and how they are read."""
 
     camera: Annotated[Plain, BeforeValidator(_named)] = Field(

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Literal, cast, get_args
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.configuration import read_toml, validated
+from mitsim.core.configuration import Configuration, read_toml, validated
 from mitsim.core.errors import MitsimError
 from mitsim.core.imagelist import Wanted
 from mitsim.core.images import image_size, read_image
@@ -49,10 +49,8 @@ _MOST_GROWTH = 8
 """Features by which openings grow or shrink at most: beyond it nothing of a code is left."""
 
 
-class MaskProfile(BaseModel):
+class MaskProfile(Configuration):
     """What a mask is made of; the scene states where it stands."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     kind: Literal["separable", "flatcam", "open", "mura", "random", "drawing", "psf"] = Field(description="see below")
     feature_mm: float = Field(ge=1e-6, le=1e3, description="side of a feature, or of a picture's pixel [mm]")

@@ -8,9 +8,10 @@ from itertools import pairwise
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from mitsim.core.arrays import ByValue, FloatArray
+from mitsim.core.configuration import Configuration
 from mitsim.core.errors import MitsimError
 from mitsim.core.spectral_manifests import MOST_LINES
 
@@ -140,10 +141,8 @@ Share = Annotated[float, Field(ge=0, le=1e6)]
 """Power beside the other lines' power: a millionth is none."""
 
 
-class Coherence(BaseModel):
+class Coherence(Configuration):
     """What decides the contrast of a laser projector's speckle (:func:`mitsim.optics.speckle.contrast_of`)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     beam_radius_mm: float | None = Field(
         default=None,
@@ -170,14 +169,12 @@ class Coherence(BaseModel):
         return self
 
 
-class ProjectorModel(BaseModel):
+class ProjectorModel(Configuration):
     """A projector's light and lens, and where their numbers come from.
 
     Ranges hold every device known, with room. The fields from ``luminous_flux_lm`` on are not simulated: from them
     follows the power that scenes state, irradiance = flux / efficacy / area of the picture.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     name: str = Field(description="what the projector is called in reports")
     effective_wavelength_nm: Nanometres = Field(description="one wavelength that carries as many photons per watt [nm]")

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from mitsim.core.configuration import read_toml, validated
+from mitsim.core.configuration import Configuration, read_toml, validated
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import Digital
 
@@ -29,7 +29,7 @@ _LEVELS = 256
 """Parts of the full well at which the linearity polynomial must rise: its terms end at the fifth power."""
 
 
-class SensorModel(BaseModel):
+class SensorModel(Configuration, defer_build=True):
     """A camera after EMVA 1288 release 4.0: per-pixel electronics and how pixels are binned.
 
     The fields describe one **pixel**; a frame's element is a **superpixel** of `binning` x `binning` = b^2
@@ -43,8 +43,6 @@ class SensorModel(BaseModel):
 
     Ranges hold every device known, with room: what lies outside is a slip of the unit or of the keyboard.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
 
     name: str = Field(description="what the sensor is called in reports")
     pixel_pitch_um: float = Field(ge=1e-3, le=1e4, description="distance between centres of pixels in a row, um")
@@ -455,10 +453,8 @@ _MOST_POINTS = 1024
 """The visible and near infrared in steps of a nanometre have 800."""
 
 
-class EfficiencyCurve(BaseModel):
+class EfficiencyCurve(Configuration):
     """Electrons per photon over wavelength, linear between its points and unknown outside them."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     wavelengths_nm: tuple[Annotated[float, Field(ge=1, le=1e6)], ...] = Field(
         strict=False, min_length=2, max_length=_MOST_POINTS, description="wavelengths of its points, rising [nm]"
@@ -498,10 +494,8 @@ class EfficiencyCurve(BaseModel):
         return self.efficiency[above - 1] * (1 - part) + self.efficiency[above] * part
 
 
-class MosaicCurves(BaseModel):
+class MosaicCurves(Configuration):
     """Curves of the pixels under each colour of a filter array, filters included."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     R: EfficiencyCurve = Field(description="of pixels under red filters")
     G: EfficiencyCurve = Field(description="of pixels under green filters")

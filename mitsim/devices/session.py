@@ -12,10 +12,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from mitsim.core.arguments import checked, checked_fields
-from mitsim.core.configuration import load_model, shipped
+from mitsim.core.configuration import Configuration, load_model, shipped
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.devices.drift import Drift
 from mitsim.devices.sensor import ExposureFraction
@@ -35,10 +35,8 @@ CELLS = 64
 """Facets a side of a bowed board: they lie up to 1/4096 of the bow off the paraboloid."""
 
 
-class BoardShape(BaseModel):
+class BoardShape(Configuration):
     """Size, bow and tilt of the white board; its middle stays on the camera's axis."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     size_mm: float | None = Field(
         default=None, ge=1e-3, le=1e7, description="side of the square board [mm]; none: larger than the view"
@@ -160,10 +158,8 @@ Depths = Annotated[
 """As `scene_distance`; 64 sessions of the shipped scenes take ten minutes."""
 
 
-class SessionRecipe(BaseModel):
+class SessionRecipe(Configuration):
     """A session's board and exposure, how signed patterns are taken, and how often."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     board_reflectance: float = Field(ge=0.01, le=1, description="diffuse reflectance of the white board")
     """Black velvet reflects 0.004, and a board of 1 % would take a hundred times the exposure."""
