@@ -52,14 +52,14 @@ class DarkFile(Configuration):
     exposure_s: Positive | None = Field(default=None, description="its exposure [s]; none: as for other frames")
 
 
-def _named(camera: Any) -> Any:
+def _with_name(camera: Any) -> Any:
     return {"name": camera} if isinstance(camera, str) else camera
 
 
 class FrameList(Configuration):
     """What a real session's frames are of, and how they are read."""
 
-    camera: Annotated[Plain, BeforeValidator(_named)] = Field(
+    camera: Annotated[Plain, BeforeValidator(_with_name)] = Field(
         description="identity that a run must share: a name, or anything as a run's manifest has it"
     )
     n: int = Field(ge=1, le=MOST_PIXELS, description="projector pixels a side")
@@ -167,7 +167,7 @@ def load_frames(folder: Path | str) -> SessionFrames:
         )
     data = read_toml(lists[0]) if lists[0].suffix == ".toml" else read_json(lists[0])
     listed = validated(FrameList, data, f"frames {lists[0]}")
-    wanted = [*_wanted(listed)]
+    wanted = [*_keys_of_session(listed)]
     if listed.frames:
         frames, dark = listed.frames, listed.dark
     else:
@@ -191,7 +191,7 @@ def load_frames(folder: Path | str) -> SessionFrames:
     return session
 
 
-def _wanted(listed: FrameList) -> Iterator[Key]:
+def _keys_of_session(listed: FrameList) -> Iterator[Key]:
     """Frames of a session in the order in which they are listed."""
     for half in taken(stripe_count(listed.n), listed.signed_capture == "pair"):
         for exposure in range(len(listed.exposure_ladder)):

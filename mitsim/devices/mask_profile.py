@@ -16,7 +16,7 @@ from mitsim.core.images import image_size, read_image
 from mitsim.core.resources import Cost, Limits
 from mitsim.core.seeds import stream
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask import Dust, Flaws, MaskKind, etched, mls_mask
+from mitsim.devices.mask import Dust, Flaws, MaskKind, etch, mls_mask
 from mitsim.devices.plate import LARGEST, Plate, read_drawing, squared
 
 _OWN = {
@@ -44,7 +44,7 @@ _DUST = {"dust_per_mm2", "dust_radius_um", "dust_opacity", "dust_seed"}
 _QUARTER = 90
 """Degrees of a turn that takes features to features."""
 _MOST_ETCHED = LARGEST // 2
-"""Features a side of a mask that is etched: each has two lines then."""
+"""Features a side of a mask that is etch: each has two lines then."""
 _MOST_GROWTH = 8
 """Features by which openings grow or shrink at most: beyond it nothing of a code is left."""
 
@@ -126,7 +126,7 @@ class MaskProfile(Configuration):
                     f"{drawn.words}: has {len(values)} features a side, and over_etch_um is worked out for at most "
                     f"{_MOST_ETCHED}; draw the part that the sensor sees"
                 )
-            lines, values = etched(values, feature, self.over_etch_um * 1e-3)
+            lines, values = etch(values, feature, self.over_etch_um * 1e-3)
         values = self.opaque_transmission + (self.clear_transmission - self.opaque_transmission) * values
         extent = drawn.extent_mm + 2 * max(self.over_etch_um, 0.0) * 1e-3
         dust = (

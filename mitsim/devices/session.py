@@ -131,13 +131,13 @@ MOST_SEED = 2**32 - 1
 Merge = Literal["weighted", "longest"]
 
 
-def _rising(exposures: tuple[float, ...]) -> tuple[float, ...]:
+def _check_rising(exposures: tuple[float, ...]) -> tuple[float, ...]:
     if exposures[0] != 1 or any(later <= earlier for earlier, later in itertools.pairwise(exposures)):
         raise ValueError(f"got {', '.join(f'{value:g}' for value in exposures)}; give 1, and rising numbers after it")
     return exposures
 
 
-def _different(depths: tuple[float, ...]) -> tuple[float, ...]:
+def _check_different(depths: tuple[float, ...]) -> tuple[float, ...]:
     names = [f"{depth:g}" for depth in depths]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
@@ -148,12 +148,12 @@ def _different(depths: tuple[float, ...]) -> tuple[float, ...]:
 Exposures = Annotated[
     tuple[Annotated[float, Field(ge=1, le=LONGEST)], ...],
     Field(strict=False, min_length=1, max_length=MOST_RUNGS),
-    AfterValidator(_rising),
+    AfterValidator(_check_rising),
 ]
 Depths = Annotated[
     tuple[Annotated[float, Field(ge=1e-6, le=1e10)], ...],
     Field(strict=False, max_length=64),
-    AfterValidator(_different),
+    AfterValidator(_check_different),
 ]
 """As `scene_distance`; 64 sessions of the shipped scenes take ten minutes."""
 
