@@ -23,10 +23,10 @@ Box = Annotated[tuple[Edge, ...], Field(strict=False, min_length=4, max_length=4
 class ChartPlace(Configuration):
     """The patches of a chart in an image."""
 
-    spectra: Literal["ColorChecker N Ohta"] = Field(description="measured spectra of the patches, in colour-science")
-    patches: Annotated[tuple[Box, ...], Field(strict=False, min_length=PATCHES, max_length=PATCHES)] = Field(
-        description="of each patch, row by row: [first row, end, first column, end] inside it [image pixels]"
-    )
+    spectra: Literal["ColorChecker N Ohta"]
+    """Measured spectra of the patches, in colour-science."""
+    patches: Annotated[tuple[Box, ...], Field(strict=False, min_length=PATCHES, max_length=PATCHES)]
+    """Of each patch, row by row: [first row, end, first column, end] inside it [image pixels]."""
 
     @field_validator("patches")
     @classmethod

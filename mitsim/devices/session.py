@@ -38,22 +38,20 @@ CELLS = 64
 class BoardShape(Configuration):
     """Size, bow and tilt of the white board; its middle stays on the camera's axis."""
 
-    size_mm: float | None = Field(
-        default=None, ge=1e-3, le=1e7, description="side of the square board [mm]; none: larger than the view"
-    )
-    """From a board for masks in contact to one 10 km away."""
-    bow_mm: float = Field(
-        default=0.0,
-        ge=-1e6,
-        le=1e6,
-        description="height of the middle over the middles of the edges, a paraboloid [mm]; above 0: to the camera",
-    )
-    """Up to a tenth of the largest board."""
-    tilt_row_deg: float = Field(
-        default=0.0, ge=-60, le=60, description="tilt [degrees]; above 0: later rows are farther from the camera"
-    )
-    """At 60 degrees half of the light is left, and no board is hung worse."""
-    tilt_column_deg: float = Field(default=0.0, ge=-60, le=60, description="the same of later columns")
+    size_mm: float | None = Field(None, ge=1e-3, le=1e7)
+    """Side of the square board [mm]; none: larger than the view.
+
+    From a board for masks in contact to one 10 km away."""
+    bow_mm: float = Field(0.0, ge=-1e6, le=1e6)
+    """Height of the middle over the middles of the edges, a paraboloid [mm]; above 0: to the camera.
+
+    Up to a tenth of the largest board."""
+    tilt_row_deg: float = Field(0.0, ge=-60, le=60)
+    """Tilt [degrees]; above 0: later rows are farther from the camera.
+
+    At 60 degrees half of the light is left, and no board is hung worse."""
+    tilt_column_deg: float = Field(0.0, ge=-60, le=60)
+    """The same of later columns."""
 
     @model_validator(mode="after")
     def _a_bow_has_a_size(self) -> BoardShape:
@@ -161,20 +159,34 @@ Depths = Annotated[
 class SessionRecipe(Configuration):
     """A session's board and exposure, how signed patterns are taken, and how often."""
 
-    board_reflectance: float = Field(ge=0.01, le=1, description="diffuse reflectance of the white board")
-    """Black velvet reflects 0.004, and a board of 1 % would take a hundred times the exposure."""
-    board: BoardShape = Field(default=BoardShape(), description="size, bow and tilt of the board; none: ideal")
-    exposure_fraction: ExposureFraction = Field(description="brightest pixel's mean, as a part of the full well")
-    signed_capture: Literal["pair", "uniform"] = Field(description="how a +-1 pattern is captured")
-    repeats: int = Field(default=1, ge=1, le=MOST_REPEATS, description="shots of every frame, whose mean is taken")
-    depths: Depths = Field(default=(), description="of the board [mm], a CAL folder each; none: on the aligned plane")
-    exposure_ladder: Exposures = Field(default=(1.0,), description="exposures of every frame, over the shortest")
-    ladder_merge: Merge = Field(default="weighted", description="how they make one: by variance, or the longest alone")
-    dark_frames: int = Field(default=0, ge=0, le=MOST_REPEATS, description="frames without light, of each exposure")
-    order: Order = Field(default="listed", description="order in which patterns are taken")
-    order_seed: int = Field(default=0, ge=0, le=MOST_SEED, description="of a random order")
-    drift: Drift = Field(default=Drift(), description="what moves between calibration and capture; none: nothing")
-    source: str = Field(description="where the numbers come from")
+    board_reflectance: float = Field(ge=0.01, le=1)
+    """Diffuse reflectance of the white board.
+
+    Black velvet reflects 0.004, and a board of 1 % would take a hundred times the exposure."""
+    board: BoardShape = BoardShape()
+    """Size, bow and tilt of the board; none: ideal."""
+    exposure_fraction: ExposureFraction
+    """Brightest pixel's mean, as a part of the full well."""
+    signed_capture: Literal["pair", "uniform"]
+    """How a +-1 pattern is captured."""
+    repeats: int = Field(1, ge=1, le=MOST_REPEATS)
+    """Shots of every frame, whose mean is taken."""
+    depths: Depths = ()
+    """Of the board [mm], a CAL folder each; none: on the aligned plane."""
+    exposure_ladder: Exposures = (1.0,)
+    """Exposures of every frame, over the shortest."""
+    ladder_merge: Merge = "weighted"
+    """How they make one: by variance, or the longest alone."""
+    dark_frames: int = Field(0, ge=0, le=MOST_REPEATS)
+    """Frames without light, of each exposure."""
+    order: Order = "listed"
+    """Order in which patterns are taken."""
+    order_seed: int = Field(0, ge=0, le=MOST_SEED)
+    """Of a random order."""
+    drift: Drift = Drift()
+    """What moves between calibration and capture; none: nothing."""
+    source: str
+    """Where the numbers come from."""
 
     @model_validator(mode="after")
     def _dark_frames_are_of_use(self) -> SessionRecipe:
