@@ -102,7 +102,7 @@ class Digital(_Part):
     """Step between digital numbers; 0: real output; none: not stated, taken as 0."""
     saturation_dn: BinnedSum | None = None
     """Digital number at the full well or the ADC's end; none: never, or not stated."""
-    exposure_uncertainty: float = Field(0.0, ge=0, le=1)
+    exposure_uncertainty: float = Field(default=0.0, ge=0, le=1)
     """Relative standard uncertainty of exposure times light."""
 
     @property
@@ -169,7 +169,7 @@ class Patterns(_Part):
 
     family: str | None = None
     """Name of the family, such as `dots:7`."""
-    n: int | None = Field(None, ge=1, le=MOST_PIXELS)
+    n: int | None = Field(default=None, ge=1, le=MOST_PIXELS)
     """Projector pixels a side."""
     P_L: Rows
     """Rows of P_L: for each scene row, one number a pattern column i."""
@@ -244,7 +244,7 @@ class Patterns(_Part):
 
 
 class _Head(_Part):
-    format: int = Field(FORMAT, ge=1, le=FORMAT)
+    format: int = Field(default=FORMAT, ge=1, le=FORMAT)
     """Version of this format; without it unknown fields are ignored, as by version 0.3.0."""
     status: Literal["incomplete", "complete"] = "complete"
     """Whether all files are written."""
@@ -420,7 +420,7 @@ class CalibrationManifest(_Head):
     """Identity that a run must share."""
     centre: bool = False
     """Frames and factors lose row and column means (FlatCam masks)."""
-    board_reflectance: float | None = Field(None, gt=0, le=1)
+    board_reflectance: float | None = Field(default=None, gt=0, le=1)
     """Reflectance of the board that counts as 1 in the image; none: unknown."""
     digital: Digital | None = None
     """Of the session's frames."""

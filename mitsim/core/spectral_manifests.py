@@ -64,7 +64,7 @@ class Line(BaseModel):
     """Of the line, and of its folder."""
     wavelength_nm: float = Field(ge=1, le=1e6, allow_inf_nan=False)
     """Of the line's light [nm]."""
-    radiant_share: float | None = Field(None, ge=0, le=1, allow_inf_nan=False)
+    radiant_share: float | None = Field(default=None, ge=0, le=1, allow_inf_nan=False)
     """Part of the projector's power; none: not known."""
 
     @field_validator("name")

@@ -49,68 +49,68 @@ class MaskMotion(Configuration):
     """How a mask is turned in its plane about its centre, from rows to columns, and how it moves during an exposure."""
 
     rotation_mrad: float = Field(default=0.0, ge=-LARGEST_ROTATION_MRAD, le=LARGEST_ROTATION_MRAD)
-    vibration_um: float = Field(0.0, ge=0, le=1000)
+    vibration_um: float = Field(default=0.0, ge=0, le=1000)
     """Rms along each axis, um."""
 
 
 class Drift(Configuration):
     """What moves between a calibration and a capture, and by how much."""
 
-    mask_rows_um: float = Field(0.0, ge=-1000, le=1000)
+    mask_rows_um: float = Field(default=0.0, ge=-1000, le=1000)
     """Mask moves down the rows, um."""
-    mask_columns_um: float = Field(0.0, ge=-1000, le=1000)
+    mask_columns_um: float = Field(default=0.0, ge=-1000, le=1000)
     """The same along the columns, um."""
-    mask_axis_um: float = Field(0.0, ge=-1000, le=1000)
+    mask_axis_um: float = Field(default=0.0, ge=-1000, le=1000)
     """Mask moves away from the sensor, um.
 
     A millimetre: a mask that has come loose."""
-    mask_rotation_mrad: float = Field(0.0, ge=-LARGEST_ROTATION_MRAD, le=LARGEST_ROTATION_MRAD)
+    mask_rotation_mrad: float = Field(default=0.0, ge=-LARGEST_ROTATION_MRAD, le=LARGEST_ROTATION_MRAD)
     """Mask turns in its plane, mrad."""
-    mask_tilt_rows_mrad: float = Field(0.0, ge=-LARGEST_TILT_MRAD, le=LARGEST_TILT_MRAD)
+    mask_tilt_rows_mrad: float = Field(default=0.0, ge=-LARGEST_TILT_MRAD, le=LARGEST_TILT_MRAD)
     """Mask tilts about its centre, its distance growing down the rows, mrad."""
-    mask_tilt_columns_mrad: float = Field(0.0, ge=-LARGEST_TILT_MRAD, le=LARGEST_TILT_MRAD)
+    mask_tilt_columns_mrad: float = Field(default=0.0, ge=-LARGEST_TILT_MRAD, le=LARGEST_TILT_MRAD)
     """The same along the columns, mrad."""
-    vibration_um: float = Field(0.0, ge=0, le=1000)
+    vibration_um: float = Field(default=0.0, ge=0, le=1000)
     """Normal motion of the mask during each exposure, um rms along each axis."""
-    temperature_k: float = Field(0.0, ge=-200, le=200)
+    temperature_k: float = Field(default=0.0, ge=-200, le=200)
     """Sensor and camera grow warmer, K."""
-    gap_um_per_k: float = Field(0.0, ge=-100, le=100)
+    gap_um_per_k: float = Field(default=0.0, ge=-100, le=100)
     """Gap from sensor to mask grows, um/K; moves nothing by itself.
 
     A metre of aluminium has 23 um/K."""
-    exposure: float = Field(0.0, gt=-1, le=10)
+    exposure: float = Field(default=0.0, gt=-1, le=10)
     """Exposure time's error, as a part of it."""
-    power: float = Field(0.0, ge=-1, le=10)
+    power: float = Field(default=0.0, ge=-1, le=10)
     """Projector's power changes, as a part of it."""
-    power_ramp: float = Field(0.0, ge=-1, le=10)
+    power_ramp: float = Field(default=0.0, ge=-1, le=10)
     """The same, evenly from begin to end of the capture, as a part of it."""
-    power_flicker: float = Field(0.0, ge=0, le=1)
+    power_flicker: float = Field(default=0.0, ge=0, le=1)
     """The same from frame to frame, normal deviates, rms as a part of it."""
-    power_ripple: float = Field(0.0, ge=0, le=1)
+    power_ripple: float = Field(default=0.0, ge=0, le=1)
     """Power during each frame, a sine of any phase, amplitude as a part of it."""
-    power_ripple_hz: float | None = Field(None, ge=1e-3, le=1e7)
+    power_ripple_hz: float | None = Field(default=None, ge=1e-3, le=1e7)
     """Its frequency, Hz.
 
     Mains bring 100 or 120, a projector's pictures some 60, drivers of light-emitting diodes up to 1e6."""
-    session_ramp: float = Field(0.0, ge=-1, le=10)
+    session_ramp: float = Field(default=0.0, ge=-1, le=10)
     """Power changes from begin to end of the session, as a part of it."""
-    session_flicker: float = Field(0.0, ge=0, le=1)
+    session_flicker: float = Field(default=0.0, ge=0, le=1)
     """Power from frame to frame of the session, rms as a part of it."""
-    lamp: float = Field(0.0, ge=-1, le=10)
+    lamp: float = Field(default=0.0, ge=-1, le=10)
     """Lamps change after the ambient frame, as a part of their light."""
-    lamp_flicker: float = Field(0.0, ge=0, le=1)
+    lamp_flicker: float = Field(default=0.0, ge=0, le=1)
     """Lamps from frame to frame, normal deviates, rms as a part of their light."""
-    lamp_ripple: float = Field(0.0, ge=0, le=1)
+    lamp_ripple: float = Field(default=0.0, ge=0, le=1)
     """Lamps during each frame, a sine of any phase, amplitude as a part of it."""
-    lamp_ripple_hz: float | None = Field(None, ge=1e-3, le=1e7)
+    lamp_ripple_hz: float | None = Field(default=None, ge=1e-3, le=1e7)
     """Its frequency, Hz."""
-    projector_rows: float = Field(0.0, gt=-0.5, lt=0.5)
+    projector_rows: float = Field(default=0.0, gt=-0.5, lt=0.5)
     """Picture moves down the rows, its pixels."""
-    projector_columns: float = Field(0.0, gt=-0.5, lt=0.5)
+    projector_columns: float = Field(default=0.0, gt=-0.5, lt=0.5)
     """The same along the columns.
 
     Beyond half a pixel, pixels at the window's edge would light nothing."""
-    black_level_dn: float = Field(0.0, ge=-1e4, le=1e4)
+    black_level_dn: float = Field(default=0.0, ge=-1e4, le=1e4)
     """Black level of a pixel moves, DN."""
 
     @model_validator(mode="after")

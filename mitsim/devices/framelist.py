@@ -41,9 +41,9 @@ class StripeFile(Configuration):
     """Column of H; 0 of a uniform frame."""
     sign: int = Field(ge=-1, le=1)
     """Half (1 + P)/2 or (1 - P)/2 of a pattern P; 0: uniform frame."""
-    repeat: int = Field(0, ge=0, lt=MOST_REPEATS)
+    repeat: int = Field(default=0, ge=0, lt=MOST_REPEATS)
     """Which one of `repeats`."""
-    exposure: int = Field(0, ge=0, lt=MOST_RUNGS)
+    exposure: int = Field(default=0, ge=0, lt=MOST_RUNGS)
     """Which one of `exposure_ladder`."""
     exposure_s: Positive | None = None
     """Its exposure [s]; none: as in `digital`, times that of `exposure_ladder`."""
@@ -54,7 +54,7 @@ class DarkFile(Configuration):
 
     file: FileName
     """Name of the frame in the folder, without a path."""
-    exposure: int = Field(0, ge=0, lt=MOST_RUNGS)
+    exposure: int = Field(default=0, ge=0, lt=MOST_RUNGS)
     """Which one of `exposure_ladder`."""
     exposure_s: Positive | None = None
     """Its exposure [s]; none: as for other frames."""
@@ -73,7 +73,7 @@ class FrameList(Configuration):
     """Projector pixels a side."""
     signed_capture: Literal["pair", "uniform"]
     """How a +-1 pattern was captured."""
-    repeats: int = Field(1, ge=1, le=MOST_REPEATS)
+    repeats: int = Field(default=1, ge=1, le=MOST_REPEATS)
     """Frames of each half, whose mean is taken."""
     exposure_ladder: Exposures = (1.0,)
     """Exposures of every frame, over the shortest, which `digital` states."""
@@ -83,15 +83,15 @@ class FrameList(Configuration):
     """How digital numbers become electrons a second, as in a run's manifest."""
     centre: bool = False
     """Frames lose row and column means (FlatCam masks)."""
-    board_reflectance: float | None = Field(None, gt=0, le=1)
+    board_reflectance: float | None = Field(default=None, gt=0, le=1)
     """Reflectance of the board that counts as 1 in the image; none: unknown."""
     parallax: Parallax | None = None
     """How the factors move with depth; none: not known, and no `--focus`."""
     raw: Raw | None = None
     """How frames without a header are read; none: there are none."""
-    frames: Annotated[tuple[StripeFile, ...], FailFast()] = Field((), strict=False, max_length=MOST_SHOTS)
+    frames: Annotated[tuple[StripeFile, ...], FailFast()] = Field(default=(), strict=False, max_length=MOST_SHOTS)
     """Every frame; none: by the order of their names."""
-    dark: Annotated[tuple[DarkFile, ...], FailFast()] = Field((), strict=False, max_length=MOST_SHOTS)
+    dark: Annotated[tuple[DarkFile, ...], FailFast()] = Field(default=(), strict=False, max_length=MOST_SHOTS)
     """Frames with the projector off."""
 
     @model_validator(mode="after")

@@ -58,43 +58,43 @@ class MaskProfile(Configuration):
     """Side of a feature, or of a picture's pixel [mm].
 
     As a scene's ``mask_feature``."""
-    order: int = Field(9, ge=2, le=16)
+    order: int = Field(default=9, ge=2, le=16)
     """Separable, flatcam, open: order of the maximum length sequence."""
-    features: int | None = Field(None, ge=1, le=LARGEST)
+    features: int | None = Field(default=None, ge=1, le=LARGEST)
     """Mura (an odd prime), random: features a side."""
-    open_part: float = Field(0.5, gt=0, le=1)
+    open_part: float = Field(default=0.5, gt=0, le=1)
     """Random: probability that a feature is open."""
-    seed: int = Field(0, ge=0, le=2**63 - 1)
+    seed: int = Field(default=0, ge=0, le=2**63 - 1)
     """Random: which of all such masks."""
-    file: str | None = Field(None, min_length=1, max_length=4096)
+    file: str | None = Field(default=None, min_length=1, max_length=4096)
     """Drawing, psf: PNG, TIFF, NPY or OpenEXR file."""
-    psf_distance_mm: float | None = Field(None, gt=0, le=1e10)
+    psf_distance_mm: float | None = Field(default=None, gt=0, le=1e10)
     """Psf: from the sensor to the point that the picture shows the light of [mm]."""
-    aperture_mm2: float | None = Field(None, gt=0, le=1e8)
+    aperture_mm2: float | None = Field(default=None, gt=0, le=1e8)
     """Psf: area of the mask that lets light through."""
-    psf_reduce: int = Field(1, ge=1, le=1024)
+    psf_reduce: int = Field(default=1, ge=1, le=1024)
     """Psf: pixels a side of the picture that become one."""
-    over_etch_um: float = Field(0.0, ge=-1000, le=1000)
+    over_etch_um: float = Field(default=0.0, ge=-1000, le=1000)
     """How far every opening has grown on each side [um]; below 0 shrunk."""
-    edge_blur_um: float = Field(0.0, ge=0, le=1000)
+    edge_blur_um: float = Field(default=0.0, ge=0, le=1000)
     """Standard deviation of a Gaussian blur of the transmission [um]."""
-    opaque_transmission: float = Field(0.0, ge=0, le=1)
+    opaque_transmission: float = Field(default=0.0, ge=0, le=1)
     """Part of the light that a closed feature lets through."""
-    clear_transmission: float = Field(1.0, ge=0, le=1)
+    clear_transmission: float = Field(default=1.0, ge=0, le=1)
     """Part of the light that an open feature lets through."""
-    rotation_deg: float = Field(0.0, ge=-180, le=180)
+    rotation_deg: float = Field(default=0.0, ge=-180, le=180)
     """Turn in its plane, from the rows' direction to the columns' [degrees]."""
-    tilt_row_mrad: float = Field(0.0, ge=-300, le=300)
+    tilt_row_mrad: float = Field(default=0.0, ge=-300, le=300)
     """How its distance grows down the rows [mrad]."""
-    tilt_column_mrad: float = Field(0.0, ge=-300, le=300)
+    tilt_column_mrad: float = Field(default=0.0, ge=-300, le=300)
     """The same along the columns [mrad]."""
-    dust_per_mm2: float = Field(0.0, ge=0, le=1e4)
+    dust_per_mm2: float = Field(default=0.0, ge=0, le=1e4)
     """Discs of dust, mean number on a square millimetre."""
-    dust_radius_um: float = Field(10.0, gt=0, le=1e5)
+    dust_radius_um: float = Field(default=10.0, gt=0, le=1e5)
     """Their radius [um]."""
-    dust_opacity: float = Field(1.0, gt=0, le=1)
+    dust_opacity: float = Field(default=1.0, gt=0, le=1)
     """Part of the light that a disc takes."""
-    dust_seed: int = Field(0, ge=0, le=2**63 - 1)
+    dust_seed: int = Field(default=0, ge=0, le=2**63 - 1)
     """Which of all such dusts."""
 
     @model_validator(mode="after")

@@ -144,15 +144,15 @@ Share = Annotated[float, Field(ge=0, le=1e6)]
 class Coherence(Configuration):
     """What decides the contrast of a laser projector's speckle (:func:`mitsim.optics.speckle.contrast_of`)."""
 
-    beam_radius_mm: float | None = Field(None, ge=1e-3, le=1e3)
+    beam_radius_mm: float | None = Field(default=None, ge=1e-3, le=1e3)
     """1/e^2 radius of a scanned beam's spot [mm]; none: all is lit at once.
 
     A micrometre, less than any grain, to a metre, which is all at once."""
-    polarisation: float = Field(0.0, ge=0, le=1)
+    polarisation: float = Field(default=0.0, ge=0, le=1)
     """Degree of polarisation of the scattered light; 0: paper, paint; 1: metal."""
-    roughness_um: float | None = Field(None, ge=0, le=1e6)
+    roughness_um: float | None = Field(default=None, ge=0, le=1e6)
     """Surface's height, standard deviation [um]; none: lines speckle apart."""
-    linewidth_nm: float = Field(0.0, ge=0, le=1e3)
+    linewidth_nm: float = Field(default=0.0, ge=0, le=1e3)
     """Standard deviation of each line [nm]; needs roughness_um.
 
     Laser diodes have some 1."""
@@ -175,63 +175,63 @@ class ProjectorModel(Configuration):
     """What the projector is called in reports."""
     effective_wavelength_nm: Nanometres
     """One wavelength that carries as many photons per watt [nm]."""
-    wavelengths_nm: tuple[Nanometres, ...] = Field((), strict=False, max_length=256)
+    wavelengths_nm: tuple[Nanometres, ...] = Field(default=(), strict=False, max_length=256)
     """Spectral lines [nm]; none: the effective wavelength.
 
     A lamp's visible spectrum in steps of 2 nm has 200; each costs a shadow of its own."""
-    radiant_shares: tuple[Share, ...] = Field((), strict=False)
+    radiant_shares: tuple[Share, ...] = Field(default=(), strict=False)
     """Part of the power in each line, relative to their sum."""
-    contrast_ratio: float = Field(math.inf, gt=1, allow_inf_nan=True)
+    contrast_ratio: float = Field(default=math.inf, gt=1, allow_inf_nan=True)
     """Light of a white pixel over that of a black one.
 
     Without an upper end: inf is a black that is black."""
-    aperture_radius_mm: float = Field(0.0, ge=0, le=1000)
+    aperture_radius_mm: float = Field(default=0.0, ge=0, le=1000)
     """Radius of the lens [mm]; 0: pinhole.
 
     Lenses for the largest screens have some 100."""
-    focus_mm: float | None = Field(None, ge=1, le=1e7)
+    focus_mm: float | None = Field(default=None, ge=1, le=1e7)
     """Distance of the sharp plane [mm]; none: scene_distance.
 
     A millimetre, for microscopes, to 10 km."""
-    speckle_contrast: float = Field(0.0, ge=0, le=1)
+    speckle_contrast: float = Field(default=0.0, ge=0, le=1)
     """Of one sensor pixel's light; see docs/physics.md.
 
     1 is speckle fully developed; more needs light that is not laser light."""
     speckle: Coherence | None = None
     """Table, in place of a number: what the contrast is computed from."""
-    blur_pixels: float = Field(0.0, ge=0, le=16)
+    blur_pixels: float = Field(default=0.0, ge=0, le=16)
     """Spot's standard deviation [pixels].
 
     16 leaves 0.7 % of the contrast of stripes of 16 pixels: a projector with fewer pixels than it says."""
-    luminous_flux_lm: float | None = Field(None, ge=1e-3, le=1e6)
+    luminous_flux_lm: float | None = Field(default=None, ge=1e-3, le=1e6)
     """Light of a white picture [lm].
 
     The largest cinemas have 75 000."""
-    luminous_efficacy_lm_per_w: float | None = Field(None, ge=0, le=684)
+    luminous_efficacy_lm_per_w: float | None = Field(default=None, ge=0, le=684)
     """Lumens per watt of light.
 
     683 at most, at 555 nm."""
-    radiant_flux_w: float | None = Field(None, ge=1e-9, le=1e5)
+    radiant_flux_w: float | None = Field(default=None, ge=1e-9, le=1e5)
     """Power of a white picture's light [W].
 
     The largest cinemas have some 300."""
-    throw_ratio: float | None = Field(None, ge=0.01, le=100)
+    throw_ratio: float | None = Field(default=None, ge=0.01, le=100)
     """Distance over width of the picture.
 
     0.2 beside the screen, 15 across a hall."""
-    columns: int | None = Field(None, ge=1, le=65536)
+    columns: int | None = Field(default=None, ge=1, le=65536)
     """Pixels a row of the device's own raster."""
-    rows: int | None = Field(None, ge=1, le=65536)
+    rows: int | None = Field(default=None, ge=1, le=65536)
     """Rows of the device's own raster."""
-    pixel_aspect: float = Field(1.0, ge=0.1, le=10)
+    pixel_aspect: float = Field(default=1.0, ge=0.1, le=10)
     """Width of a pixel of this raster on the scene, over its height; 1: square.
 
     0.1 to 10: a picture of 16:9 in a raster ten times too wide or too high."""
     laser_class: Literal["1", "1C", "1M", "2", "2M", "3R", "3B", "4"] | None = None
     """Class printed on the device (IEC 60825-1)."""
-    assumed: tuple[str, ...] = Field((), strict=False)
+    assumed: tuple[str, ...] = Field(default=(), strict=False)
     """Fields without a public measurement."""
-    derived: tuple[str, ...] = Field((), strict=False)
+    derived: tuple[str, ...] = Field(default=(), strict=False)
     """Fields computed from others."""
     source: str = ""
     """Where the numbers come from."""

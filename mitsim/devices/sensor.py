@@ -50,9 +50,9 @@ class SensorModel(Configuration, defer_build=True):
     """Distance between centres of pixels in a row, um.
 
     Pixels of telephones have 0.5 um, those of X-ray panels some 100 um."""
-    row_pitch_um: float | None = Field(None, ge=1e-3, le=1e4)
+    row_pitch_um: float | None = Field(default=None, ge=1e-3, le=1e4)
     """Distance between rows of pixels that are not square, um; none: as above."""
-    binning: int = Field(1, ge=1, le=64)
+    binning: int = Field(default=1, ge=1, le=64)
     """Pixels summed along each side of a superpixel.
 
     Cameras bin up to 16 x 16."""
@@ -64,61 +64,61 @@ class SensorModel(Configuration, defer_build=True):
     """Standard deviation of one pixel's reading, electrons.
 
     0.2 in the quietest cameras, some 1e4 in photodiode arrays."""
-    dark_current_e_per_s: float = Field(0.0, ge=0, le=1e10)
+    dark_current_e_per_s: float = Field(default=0.0, ge=0, le=1e10)
     """Electrons a second and pixel.
 
     Warm infrared arrays have 1e8."""
-    dark_current_temperature_c: float | None = Field(None, ge=-273.15, le=200)
+    dark_current_temperature_c: float | None = Field(default=None, ge=-273.15, le=200)
     """Temperature that the dark current is stated at, degrees Celsius."""
-    dark_doubling_c: float | None = Field(None, ge=1, le=100)
+    dark_doubling_c: float | None = Field(default=None, ge=1, le=100)
     """Rise of the temperature that doubles the dark current, kelvin.
 
     5 to 10 in silicon."""
-    temperature_c: float | None = Field(None, ge=-273.15, le=200)
+    temperature_c: float | None = Field(default=None, ge=-273.15, le=200)
     """Temperature of the sensor, degrees Celsius; none: as stated."""
-    dark_current_spread_e_per_s: float = Field(0.0, ge=0, le=1e10)
+    dark_current_spread_e_per_s: float = Field(default=0.0, ge=0, le=1e10)
     """Its standard deviation over the pixels, electrons a second."""
-    dsnu_pixel_e: float = Field(0.0, ge=0, le=1e6)
+    dsnu_pixel_e: float = Field(default=0.0, ge=0, le=1e6)
     """Standard deviation of pixels' offsets, electrons."""
-    dsnu_row_e: float = Field(0.0, ge=0, le=1e6)
+    dsnu_row_e: float = Field(default=0.0, ge=0, le=1e6)
     """The same of offsets that a row shares."""
-    dsnu_column_e: float = Field(0.0, ge=0, le=1e6)
+    dsnu_column_e: float = Field(default=0.0, ge=0, le=1e6)
     """The same of offsets that a column shares.
 
     As read noise."""
-    prnu_pixel: float = Field(0.0, ge=0, le=0.1)
+    prnu_pixel: float = Field(default=0.0, ge=0, le=0.1)
     """Relative standard deviation of pixels' response."""
-    prnu_row: float = Field(0.0, ge=0, le=0.1)
+    prnu_row: float = Field(default=0.0, ge=0, le=0.1)
     """The same of what a row shares."""
-    prnu_column: float = Field(0.0, ge=0, le=0.1)
+    prnu_column: float = Field(default=0.0, ge=0, le=0.1)
     """The same of what a column shares.
 
     Cameras have some 1e-2; beyond 0.1 the normal law of the response would reach zero."""
-    row_noise_e: float = Field(0.0, ge=0, le=1e6)
+    row_noise_e: float = Field(default=0.0, ge=0, le=1e6)
     """Standard deviation of a noise that a row's pixels share, electrons."""
-    hot_pixels: float = Field(0.0, ge=0, le=0.5)
+    hot_pixels: float = Field(default=0.0, ge=0, le=0.5)
     """Part of the pixels that are hot."""
-    hot_dark_current_e_per_s: float = Field(0.0, ge=0, le=1e10)
+    hot_dark_current_e_per_s: float = Field(default=0.0, ge=0, le=1e10)
     """What a hot pixel has of dark current beyond others, electrons a second."""
-    dead_pixels: float = Field(0.0, ge=0, le=0.5)
+    dead_pixels: float = Field(default=0.0, ge=0, le=0.5)
     """Part of the pixels that do not respond to light."""
-    pattern_seed: int = Field(0, ge=0, lt=2**64)
+    pattern_seed: int = Field(default=0, ge=0, lt=2**64)
     """Which specimen: root of all that is fixed in space, apart from a run's."""
     linearity: Annotated[tuple[float, ...], Field(strict=False, max_length=4)] = ()
     """c_k of N (1 + sum c_k (N/F)^k), k = 1, 2, ..: what N of F electrons are read as."""
-    crosstalk: float = Field(0.0, ge=0, le=0.5)
+    crosstalk: float = Field(default=0.0, ge=0, le=0.5)
     """Part of a pixel's light that its four neighbours get, a quarter each."""
     binning_on_chip: bool = False
     """Charge is summed and read once, in place of readings."""
-    binned_full_well_e: float | None = Field(None, ge=0.1, le=1e14)
+    binned_full_well_e: float | None = Field(default=None, ge=0.1, le=1e14)
     """Electrons a superpixel holds on chip; none: binning^2 full wells."""
     shutter: Literal["global", "rolling"] = "global"
     """Whether all rows are exposed at once, or each some time after the one before."""
-    line_time_us: float | None = Field(None, ge=1e-3, le=1e6)
+    line_time_us: float | None = Field(default=None, ge=1e-3, le=1e6)
     """From the begin of a row's exposure to that of the next one, us; needed where light ripples.
 
     Some 1 to 100 in cameras; long exposures of a telephone's sensor stretch it to 1e4."""
-    quantum_efficiency: float | None = Field(None, ge=1e-6, le=1)
+    quantum_efficiency: float | None = Field(default=None, ge=1e-6, le=1)
     """Electrons per photon, at source's wavelength; none: no source gives it.
 
     One electron a photon at most; photocathodes and silicon at their red end fall to 1e-4."""
@@ -132,11 +132,11 @@ class SensorModel(Configuration, defer_build=True):
     """Digital numbers per electron.
 
     1e-12 spreads the largest full well over one number; electron multiplication brings some 1e3."""
-    black_level_dn: float = Field(0.0, ge=0, lt=2**24)
+    black_level_dn: float = Field(default=0.0, ge=0, lt=2**24)
     """Digital number of a pixel without charge.
 
     Below the largest ADC's last number."""
-    bits: int | None = Field(None, ge=1, le=24)
+    bits: int | None = Field(default=None, ge=1, le=24)
     """Bits of the ADC; None = real output.
 
     Cameras have up to 16, laboratory converters 24."""

@@ -38,19 +38,19 @@ CELLS = 64
 class BoardShape(Configuration):
     """Size, bow and tilt of the white board; its middle stays on the camera's axis."""
 
-    size_mm: float | None = Field(None, ge=1e-3, le=1e7)
+    size_mm: float | None = Field(default=None, ge=1e-3, le=1e7)
     """Side of the square board [mm]; none: larger than the view.
 
     From a board for masks in contact to one 10 km away."""
-    bow_mm: float = Field(0.0, ge=-1e6, le=1e6)
+    bow_mm: float = Field(default=0.0, ge=-1e6, le=1e6)
     """Height of the middle over the middles of the edges, a paraboloid [mm]; above 0: to the camera.
 
     Up to a tenth of the largest board."""
-    tilt_row_deg: float = Field(0.0, ge=-60, le=60)
+    tilt_row_deg: float = Field(default=0.0, ge=-60, le=60)
     """Tilt [degrees]; above 0: later rows are farther from the camera.
 
     At 60 degrees half of the light is left, and no board is hung worse."""
-    tilt_column_deg: float = Field(0.0, ge=-60, le=60)
+    tilt_column_deg: float = Field(default=0.0, ge=-60, le=60)
     """The same of later columns."""
 
     @model_validator(mode="after")
@@ -169,7 +169,7 @@ class SessionRecipe(Configuration):
     """Brightest pixel's mean, as a part of the full well."""
     signed_capture: Literal["pair", "uniform"]
     """How a +-1 pattern is captured."""
-    repeats: int = Field(1, ge=1, le=MOST_REPEATS)
+    repeats: int = Field(default=1, ge=1, le=MOST_REPEATS)
     """Shots of every frame, whose mean is taken."""
     depths: Depths = ()
     """Of the board [mm], a CAL folder each; none: on the aligned plane."""
@@ -177,11 +177,11 @@ class SessionRecipe(Configuration):
     """Exposures of every frame, over the shortest."""
     ladder_merge: Merge = "weighted"
     """How they make one: by variance, or the longest alone."""
-    dark_frames: int = Field(0, ge=0, le=MOST_REPEATS)
+    dark_frames: int = Field(default=0, ge=0, le=MOST_REPEATS)
     """Frames without light, of each exposure."""
     order: Order = "listed"
     """Order in which patterns are taken."""
-    order_seed: int = Field(0, ge=0, le=MOST_SEED)
+    order_seed: int = Field(default=0, ge=0, le=MOST_SEED)
     """Of a random order."""
     drift: Drift = Drift()
     """What moves between calibration and capture; none: nothing."""
