@@ -19,7 +19,7 @@ from functools import cache
 from pathlib import Path
 from types import ModuleType
 
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import MitsimError, reason_of
 from mitsim.core.worker import held_back
 from mitsim.version import __version__
 
@@ -93,7 +93,7 @@ def _set_variant(name: str) -> ModuleType:
     try:
         mitsuba.set_variant(name)
     except ImportError as error:
-        raise MitsimError(f"variant {name}: cannot be loaded ({_one_line(error)}); run: mitsim doctor") from error
+        raise MitsimError(f"variant {name}: cannot be loaded ({reason_of(error)}); run: mitsim doctor") from error
     import drjit
 
     if drjit.thread_count() < _FEWEST_THREADS:
@@ -207,7 +207,7 @@ def _attempt(name: str, look: Callable[[], str], remedy: str) -> Check:
     try:
         return Check(name, True, look())
     except (MitsimError, OSError, ImportError) as error:
-        return Check(name, False, _one_line(error), remedy)
+        return Check(name, False, reason_of(error), remedy)
 
 
 def _child(name: str, program: str, success: str, remedy: str) -> Check:
@@ -217,10 +217,6 @@ def _child(name: str, program: str, success: str, remedy: str) -> Check:
 
 def _reinstall(package: str) -> str:
     return f"{sys.executable} -m pip install --force-reinstall {package}"
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())
 
 
 # -------- The LLVM library Dr.Jit compiles with

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrayfile import Npy
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import MitsimError, reason_of
 from mitsim.core.files import FRAME_LIMITS, check_plain, fits_a_frame, stderr_silenced
 from mitsim.core.imagelist import BARE, FORMATS, FRAME, Wanted
 from mitsim.core.resources import Cost, Limits
@@ -395,7 +395,8 @@ def _one_line_refusals(path: Path, wanted: Wanted) -> Iterator[None]:
         raise
     # Readers of damaged files raise whatever they stumble over.
     except Exception as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
         raise wanted.refusal(
-            path, f"cannot be read: damaged, or of another kind than its name says ({reason}); write or copy it again"
+            path,
+            f"cannot be read: damaged, or of another kind than its name says ({reason_of(error)}); "
+            "write or copy it again",
         ) from error
