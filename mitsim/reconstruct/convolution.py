@@ -26,7 +26,7 @@ from scipy import fft
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import PatternFamily
-from mitsim.reconstruct.status import Status, Verdict
+from mitsim.reconstruct.status import Solution, Status, Verdict
 
 Operator = Callable[[FloatArray], FloatArray]
 """From an image (n, n) to another."""
@@ -147,36 +147,6 @@ class ConvolutionalCamera:
         return np.asarray(fft.rfft2(self.psf, self._grid))
 
 
-@dataclass(frozen=True, eq=False)
-class ConvolutionSolution:
-    """What a solver of a convolutional camera found.
-
-    Attributes
-    ----------
-    image
-        (n, n), neither clipped nor normalised.
-    lam
-        lambda that was used, in the unit of the point spread function squared.
-    iterations
-        that were spent; 0 where the normal equations were factorised.
-    residual
-        of the normal equations, relative to their right-hand side.
-    status
-        not ok when the iterations did not converge.
-    """
-
-    image: FloatArray
-    lam: float
-    iterations: int
-    residual: float
-    status: Status
-
-    @property
-    def ok(self) -> bool:
-        """Whether the image solves the equations."""
-        return self.status.ok
-
-
 def solve_iteratively(
     camera: ConvolutionalCamera,
     family: PatternFamily,
@@ -185,7 +155,7 @@ def solve_iteratively(
     tolerance: float = 1e-6,
     iterations: int = 500,
     watch: Watch = _unwatched,
-) -> ConvolutionSolution:
+) -> Solution:
     """Tikhonov image of any ``family`` by conjugate gradients.
 
     Parameters
@@ -221,7 +191,7 @@ def conjugate_gradients(
     tolerance: float = 1e-6,
     most: int = 500,
     watch: Watch = _unwatched,
-) -> ConvolutionSolution:
+) -> Solution:
     """Solve (``normal`` + lambda) X = ``target``, from X = 0 (Hestenes and Stiefel 1952).
 
     Parameters
@@ -262,7 +232,7 @@ def conjugate_gradients(
         status = Status(Verdict.NOT_CONVERGED, f"Not converged to {tolerance:g}", remedy, figures)
     else:
         status = Status(Verdict.SOLVED, "Solved", "", figures)
-    return ConvolutionSolution(image, lam, spent, residual, status)
+    return Solution(image, lam, residual, status, iterations=spent)
 
 
 def checked_lambda(lam: float) -> float:

@@ -29,7 +29,7 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import STEP, stated_parallax
 from mitsim.reconstruct.misfit import Balance, Misfit
 from mitsim.reconstruct.noise import FrameNoise
-from mitsim.reconstruct.status import Status, Verdict
+from mitsim.reconstruct.status import Solution, Status, Verdict
 
 _STEPS, _STEP_POOLED = 4, 3.0
 """Gauss-Newton steps at most, and the standard deviation [pixels] over which changes of depth are pooled: with 2 and
@@ -95,14 +95,11 @@ class DepthMap:
         return f"focus: depths of {depths}, told for {said['told_part']:.0%} of pixels"
 
     @property
-    def residual(self) -> float:
-        """||Y - model|| / ||Y|| over all frames."""
-        return float(np.sqrt(self.left_over / self.energy))
-
-    @property
-    def status(self) -> Status:
-        """Solved: dots leave fewer unknowns in a frame than the sensor has data."""
-        return Status(Verdict.SOLVED, "Solved: a depth and a reflectance for each projector pixel")
+    def solution(self) -> Solution:
+        """The image; solved, as dots leave fewer unknowns in a frame than the sensor has data."""
+        residual = float(np.sqrt(self.left_over / self.energy))
+        status = Status(Verdict.SOLVED, "Solved: a depth and a reflectance for each projector pixel")
+        return Solution(self.image, self.lam, residual, status)
 
     @property
     def alternatives(self) -> tuple[Alternative, ...]:

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -34,14 +34,12 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads, single_threaded_blas
 from mitsim.reconstruct.convolution import (
     ConvolutionalCamera,
-    ConvolutionSolution,
     Operator,
     checked_lambda,
     conjugate_gradients,
 )
-from mitsim.reconstruct.sides import Side
 from mitsim.reconstruct.solver import Prepared
-from mitsim.reconstruct.status import Status, Verdict
+from mitsim.reconstruct.status import Solution, Status, Verdict
 
 MOST_FACTORISED = 2048
 """Pixels of a class up to which it is factorised: at 128 x 128 scene pixels all classes then take 270 MB, and their
@@ -244,7 +242,7 @@ class FactorisedClasses:
     lam: float
     factors: list[FloatArray] | None
 
-    def solve(self, projected: FloatArray, tolerance: float = 1e-6) -> ConvolutionSolution:
+    def solve(self, projected: FloatArray, tolerance: float = 1e-6) -> Solution:
         """The Tikhonov image of frames.
 
         Parameters
@@ -267,7 +265,7 @@ class FactorisedClasses:
                 image[place].shape
             )
         status = Status(Verdict.SOLVED, "Solved", "", f"{classes.k**2} classes of {factor.shape[0]} pixels factorised.")
-        return ConvolutionSolution(classes._joined(image), self.lam, 0, 0.0, status)
+        return Solution(classes._joined(image), self.lam, 0.0, status)
 
 
 # -------- Frames under shifting dots and the factorised model in
@@ -327,10 +325,10 @@ def separate(
         raise MitsimError("separation: takes dots before a mask that is not centred; use dots:K")
     nodes = [_hats(factor.shape[1], side.shape[1]) for factor, side in zip(seen, patterns, strict=True)]
     bases, triangles = zip(*(np.linalg.qr(side @ hats) for side, hats in zip(seen, nodes, strict=True)), strict=True)
-    lit = [_summed(side).T @ basis for side, basis in zip((model.left, model.right), bases, strict=True)]
+    lit = [side.common.T @ basis for side, basis in zip((model.left, model.right), bases, strict=True)]
     shape = bases[0].shape[1], bases[1].shape[1]
     count = model.left.pattern_count * model.right.pattern_count
-    measured = (np.outer(model.left.singular, model.right.singular) > 0).astype(np.float64)
+    measured = (model.sigma > 0).astype(np.float64)
     target = bases[0].T @ total @ bases[1] - lit[0].T @ (measured * weights) @ lit[1]
     unexplained: FloatArray = np.eye(target.size) - _explained(lit, measured) / count
     told, modes = np.linalg.eigh(unexplained)
@@ -357,17 +355,6 @@ def _hats(pixels: int, period: int) -> FloatArray:
     count = max(2, 1 + -(-(pixels - 1) // period))
     place = np.arange(pixels) * (count - 1) / max(pixels - 1, 1)
     return np.asarray(np.maximum(0.0, 1 - np.abs(place[:, None] - np.arange(count))))
-
-
-def _summed(side: Side) -> FloatArray:
-    """(m, r) sum_i U_i over all patterns of a ``side``."""
-
-    def add(total: FloatArray, index: int) -> FloatArray:
-        slab = side.slabs[index]
-        total[:, slab.columns] += slab.matrix
-        return total
-
-    return reduce(add, range(side.pattern_count), np.zeros((side.sensor_size, side.accumulated_size)))
 
 
 def _explained(lit: Sequence[FloatArray], measured: FloatArray) -> FloatArray:

@@ -44,7 +44,7 @@ from mitsim.reconstruct.sides import (
     factorise,
     group_pixels,
 )
-from mitsim.reconstruct.status import Status, Verdict
+from mitsim.reconstruct.status import Solution, Status, Verdict
 
 ROUNDING_LIMIT = 0.01
 """Rounding above this part of the image flags a solution: two digits are the least that anyone can see or use."""
@@ -57,46 +57,6 @@ _SMALLEST, _LARGEST = 1e-30, 1e30
 """Largest number of a factor or pattern: sigma^2, a product of eight of them, then stays far from 1e-308 and 1e308."""
 _UNSEEN = 1e-60
 """Singular values below it are zero: the square of ``_SMALLEST``, a factor that small times a pattern that small."""
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """An image and how far to trust it.
-
-    Attributes
-    ----------
-    image
-        (n, n') estimate of X, neither clipped nor normalised.
-    lam
-        lambda that was used, in the unit of (Phi_L Phi_R)^2; ``lam_relative`` is that over the largest
-        sigma^2.
-    rank, unknowns
-        numerical rank of the whole model, and n n'.
-    condition
-        the larger cond(A) of the two sides; inf when rank deficient.
-    residual
-        ||Y - model|| / ||Y|| over all frames; rounding hides what is below about 1e-8.
-    rounding
-        what rounding may have changed, ||error|| / ||image||; see above.
-    status
-        not ok when the image lacks something that no lambda explains, or rounding may have changed more than
-        ROUNDING_LIMIT of it; with rank, condition and rounding.
-    """
-
-    image: FloatArray
-    lam: float
-    lam_relative: float
-    rank: int
-    unknowns: int
-    condition: float
-    residual: float
-    rounding: float
-    status: Status
-
-    @property
-    def ok(self) -> bool:
-        """Whether the image can be used as it is."""
-        return self.status.ok
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +96,33 @@ class Prepared:
         return self.left.scene_size * self.right.scene_size
 
     @property
+    def sigma(self) -> FloatArray:
+        """(r, r') singular values of the whole model, exact zeros beyond its rank."""
+        return np.outer(self.left.singular, self.right.singular)
+
+    def as_solved(self, frame: FloatArray) -> FloatArray:
+        """A ``frame`` (m, m') as the solver takes it: centred where the model is."""
+        return centred(frame) if self.centre else frame
+
+    def slabs(self, row: int, column: int) -> tuple[Slab, Slab]:
+        """What a pattern's ``row`` and ``column`` contribute."""
+        return self.left.slabs[row], self.right.slabs[column]
+
+    def places(self, row: int, column: int) -> Any:
+        """Where in W the coefficients of the pattern of a ``row`` and a ``column`` are."""
+        return np.ix_(self.left.columns(row), self.right.columns(column))
+
+    def modelled(self, weights: FloatArray, row: int, column: int) -> FloatArray:
+        """(m, m') frame of the pattern of a ``row`` and a ``column``, as the ``weights`` W tell it."""
+        left, right = self.slabs(row, column)
+        return np.asarray(left.matrix @ weights[left.columns][:, right.columns] @ right.matrix.T)
+
+    def weighed(self, frame: FloatArray, row: int, column: int) -> FloatArray:
+        """What a ``frame`` (m, m'), as the solver takes it, adds to W at the :meth:`places` of its pattern."""
+        left, right = self.slabs(row, column)
+        return np.asarray(left.matrix.T @ frame @ right.matrix)
+
+    @property
     def extent(self) -> str:
         """Rank and condition of the whole model and of its two sides, as every status ends with them."""
         left, right = self.left, self.right
@@ -146,8 +133,8 @@ class Prepared:
         )
 
     def correlated(self) -> Prepared:
-        """The same model for images whose neighbouring pixels are alike (:mod:`mitsim.reconstruct.solver`); frames go to
-        its own accumulator. MitsimError for the Gram method."""
+        """The same model for images whose neighbouring pixels are alike; frames go to its own accumulator. MitsimError
+        for the Gram method."""
         with single_threaded_blas():
             left = correlated(self.left)
             return replace(self, left=left, right=left if self.right is self.left else correlated(self.right))
@@ -167,7 +154,7 @@ class Prepared:
         if missing:
             total = self.left.pattern_count * self.right.pattern_count
             raise MitsimError(f"{len(missing)} of {total} frames are missing, first {missing[0]}; add them all")
-        sigma = np.outer(self.left.singular, self.right.singular)
+        sigma = self.sigma
         quarters = frames.quarters
         if self.method == "gram":
             rotated = self.left.basis.T @ quarters @ self.right.basis
@@ -230,13 +217,9 @@ class Prepared:
         return Solution(
             image=self.image(filtered),
             lam=lam,
-            lam_relative=lam / problem.scale,
-            rank=self.rank,
-            unknowns=self.unknowns,
-            condition=self.condition,
             residual=float(np.sqrt(residual / problem.energy)) if problem.energy > 0 else 0.0,
-            rounding=rounding,
             status=self._status(lam, rounding, problem.scale),
+            rounding=rounding,
         )
 
     def _rounding(self, problem: DiagonalProblem, lam: float) -> float:
