@@ -6,9 +6,8 @@ solved. Under shifting dots no pixel is in two frames, and those left out have l
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +19,7 @@ from mitsim.core.runs import Measurement
 from mitsim.reconstruct.framefault import Fault, FrameFault, listed
 from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.sides import group_pixels
-from mitsim.reconstruct.solver import Prepared, centred
+from mitsim.reconstruct.solver import Prepared
 
 Pattern = tuple[int, int]
 BoolArray = npt.NDArray[np.bool_]
@@ -137,46 +136,12 @@ class LeaveOneOut:
         self.signed = any(shot.sign for shot in self.shots)
         all_lit = [np.flatnonzero((side > 0).all(axis=0)) for side in patterns]
         self._whole = (int(all_lit[0][0]), int(all_lit[1][0])) if self.signed and all(map(len, all_lit)) else None
-        self.sigma = sigma = np.outer(prepared.left.singular, prepared.right.singular)
+        self.sigma = sigma = prepared.sigma
         self._kept = np.divide(np.square(sigma), np.square(sigma) + lam, out=np.zeros_like(sigma), where=sigma > 0)
         self._periods = tuple(len(group_pixels(side, "block")) for side in patterns)
         lit = [(side != 0).sum(axis=1) for side in patterns]
         self.exclusive = bool(max(lit[0]) == 1 and max(lit[1]) == 1) and noise.variance.size > 1
         self.size = prepared.left.sensor_size * prepared.right.sensor_size
-
-    def columns(self, row: int, column: int) -> Any:
-        """Where the coefficients of the pattern of a ``row`` and a ``column`` are in W."""
-        places = [
-            np.arange(side.accumulated_size)[side.slabs[index].columns]
-            for side, index in ((self.prepared.left, row), (self.prepared.right, column))
-        ]
-        return np.ix_(*places)
-
-    def modelled(self, weights: FloatArray, row: int, column: int) -> FloatArray:
-        """(m, m') the frame of a pattern.
-
-        Parameters
-        ----------
-        weights
-            W.
-        row, column
-            of the pattern.
-        """
-        left, right = self.prepared.left.slabs[row], self.prepared.right.slabs[column]
-        return np.asarray(left.matrix @ weights[left.columns][:, right.columns] @ right.matrix.T)
-
-    def projected(self, frame: FloatArray, row: int, column: int) -> FloatArray:
-        """What a frame adds to W at its columns.
-
-        Parameters
-        ----------
-        frame
-            (m, m') as the solver takes it.
-        row, column
-            of its pattern.
-        """
-        left, right = self.prepared.left.slabs[row], self.prepared.right.slabs[column]
-        return np.asarray(left.matrix.T @ frame @ right.matrix)
 
     def image(self, weights: FloatArray) -> FloatArray:
         """(n, n') image of the ``weights`` W at the image's lambda."""
@@ -185,8 +150,7 @@ class LeaveOneOut:
 
     def _seen(self, image: FloatArray) -> FloatArray:
         """W of an ``image`` without noise."""
-        duals = [side.basis if side.dual is None else side.dual for side in (self.prepared.left, self.prepared.right)]
-        return np.asarray(self.sigma * (duals[0].T @ image @ duals[1]))
+        return np.asarray(self.sigma * (self.prepared.left.seeing.T @ image @ self.prepared.right.seeing))
 
     def lit(self, good: BoolArray) -> BoolArray:
         """(n, n') pixels that a ``good`` pattern lights."""
@@ -207,38 +171,37 @@ class LeaveOneOut:
         wanted = set(patterns)
         return {key: each for each in self.measured() if (key := (each.row, each.column)) in wanted}
 
-    def as_solved(self, frame: FloatArray) -> FloatArray:
-        """A ``frame`` as the solver takes it."""
-        return centred(frame) if self.prepared.centre else frame
+    def all_but(self, bad: Iterable[Pattern]) -> BoolArray:
+        """(K, K') whether patterns are none of the ``bad``."""
+        good = np.ones(self.noise.variance.shape, dtype=np.bool_)
+        for pattern in bad:
+            good[pattern] = False
+        return good
+
+    def rest(self, measurements: Mapping[Pattern, Measurement]) -> FloatArray:
+        """W without what some ``measurements`` add to it."""
+        rest = self.weights.copy()
+        for pattern, each in measurements.items():
+            rest[self.prepared.places(*pattern)] -= self.prepared.weighed(self.prepared.as_solved(each.frame), *pattern)
+        return rest
 
     def without(self, bad: tuple[Pattern, ...]) -> tuple[FloatArray, float]:
         """W of all patterns, the ``bad`` ones as the others foretell them, and what it explains of these others'
         energy."""
-        rest = self.weights.copy()
-        for pattern, measurement in self.measurements(bad).items():
-            rest[self.columns(*pattern)] -= self.projected(self.as_solved(measurement.frame), *pattern)
-        good = np.ones(self.noise.variance.shape, dtype=np.bool_)
-        for pattern in bad:
-            good[pattern] = False
+        rest = self.rest(self.measurements(bad))
         image = self.image(self.weights)
         if not self.exclusive and max(self._periods) > 1:
             # One pattern of +-1 that is wrong is a comb of the dots' period, without a mean.
             image = uniform_filter(image, self._periods, mode="nearest")
-        lit = self.lit(good)
+        lit = self.lit(self.all_but(bad))
         image = np.where(lit, image, self.neighbours(image, lit))
         weights = self._seen(image)
-        grams = {
-            pattern: (
-                self.prepared.left.slabs[pattern[0]].matrix.T @ self.prepared.left.slabs[pattern[0]].matrix,
-                self.prepared.right.slabs[pattern[1]].matrix.T @ self.prepared.right.slabs[pattern[1]].matrix,
-            )
-            for pattern in bad
-        }
+        grams = {pattern: [slab.matrix.T @ slab.matrix for slab in self.prepared.slabs(*pattern)] for pattern in bad}
 
         def of_bad(values: FloatArray) -> FloatArray:
             own = np.zeros_like(values)
             for pattern, (left, right) in grams.items():
-                places = self.columns(*pattern)
+                places = self.prepared.places(*pattern)
                 own[places] += left @ values[places] @ right
             return own
 
@@ -269,19 +232,17 @@ class LeaveOneOut:
         sums = FrameSums((self.noise.variance.shape[0], self.noise.variance.shape[1]))
         total = np.zeros(0)
         if self.signed:
-            total = sum((each.light for each in self.measurements(self._good(bad)).values()), start=np.zeros(()))
+            good = zip(*np.nonzero(self.all_but(bad)), strict=True)
+            total = sum((each.light for each in self.measurements(good).values()), start=np.zeros(()))
         others = max(self.noise.variance.size - len(set(bad)), 2)
         for each in self.measured():
-            pattern, frame = (each.row, each.column), self.as_solved(each.frame)
-            residual = frame - self.modelled(weights, each.row, each.column)
+            pattern, frame = (each.row, each.column), self.prepared.as_solved(each.frame)
+            residual = frame - self.prepared.modelled(weights, *pattern)
             sums.residual[pattern], sums.power[pattern] = sum_of_squares(residual), each.power
             sums.energy[pattern] = sum_of_squares(frame)
             if self.signed:
                 sums.sums[pattern] = sum_of_squares((each.light * others - total) / (others - 1))
         return sums
-
-    def _good(self, bad: Iterable[Pattern]) -> set[Pattern]:
-        return set(np.ndindex(self.noise.variance.shape)) - set(bad)
 
     def fault(self, fault: Fault, numbers: Iterable[int], words: str) -> FrameFault:
         """That.
