@@ -6,10 +6,18 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
 from mitsim.devices.session import UNIFORM, Half, Side
 
 DARK = 0.03
 """Light of a black frame, as a part of what it should have: stray light and the projector's own black level."""
+
+
+def robust_scatter(values: FloatArray, middle: float = 0.0) -> float:
+    """Standard deviation of normal ``values`` about their ``middle``, by the median, which a few others do not move."""
+    return 1.4826 * float(np.median(np.abs(values - middle)))
 
 
 @dataclass(frozen=True)

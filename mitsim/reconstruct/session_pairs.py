@@ -7,14 +7,14 @@ shifted or clipped shows in the sum. What the sums share is the lamp's power, in
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.session import Half
-from mitsim.reconstruct.session_findings import DARK, Lamp, SessionFault, dimmed, frame_words
+from mitsim.reconstruct.session_findings import DARK, Lamp, dimmed, frame_words, robust_scatter
 from mitsim.reconstruct.session_lamp import MATTERS, end_to_end, flickers, trend_of
 from mitsim.reconstruct.session_side import MOST_FAULTS, SideCheck
 
@@ -50,16 +50,35 @@ _BOTH = 36.0
 foretell the other by."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Shown:
-    """What is known of one frame, in deviations of a pair's noise: ``parts`` are means of its rows, of its columns, and
-    its vector."""
+class _Frame(NamedTuple):
+    """One frame of a session: the ``number`` of its side, 0 or 1, and the ``index`` and ``sign`` of its pattern."""
 
-    parts: tuple[FloatArray, FloatArray, FloatArray]
+    number: int
+    index: int
+    sign: int
 
     @property
-    def all(self) -> FloatArray:
-        return np.concatenate(self.parts)
+    def half(self) -> int:
+        """Its place in its pair."""
+        return 0 if self.sign > 0 else 1
+
+    @property
+    def other(self) -> _Frame:
+        """The other frame of its pair."""
+        return self._replace(sign=-self.sign)
+
+
+class _Fault(NamedTuple):
+    """What may be wrong with a frame, and the mean squared deviation that it leaves unexplained."""
+
+    rest: float
+    kind: str
+    detail: str
+    other: Half | None = None
+
+
+_Parts = tuple[FloatArray, FloatArray, FloatArray]
+"""What is known of one frame, in deviations of a pair's noise: means of its rows, of its columns, and its vector."""
 
 
 class Pairs:
@@ -149,7 +168,7 @@ class Pairs:
         self.excess = np.maximum(found[0], np.concatenate(found[1:]))
         away_from_trend = np.abs(self.power - self.trend)
         middle = max(float(np.median(self.excess)), 1.0)
-        scatter = 1.4826 * float(np.median(np.abs(self.excess - middle)))
+        scatter = robust_scatter(self.excess, middle)
         bad = away_from_trend > max(_DEVIATIONS * max(self.scatter, self.noise), _LEAST)
         bad |= self.excess > max(_EXCESS * middle, middle + _DEVIATIONS * scatter)
         known = {(side, index) for side, index, _ in wrong}
@@ -258,211 +277,161 @@ class Pairs:
     # ---- which frame of a pair is wrong
 
     def repair(self, lamp: Lamp) -> None:
-        """Name their faulty frames, and put what their pairs foretell in the place of those; all that is right is
-        divided by the power of the ``lamp`` where that is corrected for."""
+        """Name the faulty frames of wrong pairs, and put what their pairs foretell in the place of those; all that is
+        right is divided by the power of the ``lamp`` where that is corrected for."""
         for place in np.flatnonzero(~self.good):
-            self._repair(
-                self.sides[place // self.count],
-                int(place // self.count),
-                int(place % self.count),
-                lamp,
-            )
+            self._repair(int(place // self.count), int(place % self.count), lamp)
         for number, (own, pairs) in enumerate(zip(self.sides, self.pairs, strict=True)):
             fluxes = pairs.rows.mean(axis=2)
             if self.good[number * self.count] and fluxes[0, 0] < fluxes[0, 1]:
-                own.faults.append(
-                    SessionFault(
-                        own.side,
-                        0,
-                        None,
-                        "exchanged",
-                        "in each other's place",
-                        "they count in their right order",
-                    )
-                )
+                own.add(0, "exchanged", "in each other's place", "they count in their right order")
 
-    def _shown(self, number: int, index: int, sign: int) -> _Shown:
+    def _shown(self, frame: _Frame) -> _Parts:
         """A frame, in deviations of a pair's noise."""
-        own, pairs = self.sides[number].sums, self.pairs[number]
-        vector = (pairs.light[:, index] + (1 if sign > 0 else -1) * own.vectors[:, index]) / 2
-        half = 0 if sign > 0 else 1
-        scale = 1 / np.sqrt(self.floor)
-        return _Shown(
-            (
-                pairs.rows[index, half] * scale,
-                pairs.columns[index, half] * scale,
-                vector / np.sqrt(self.light_noise[number]),
-            )
-        )
+        number, index, sign = frame
+        pairs, scale = self.pairs[number], 1 / np.sqrt(self.floor)
+        vector = (pairs.light[:, index] + sign * self.sides[number].sums.vectors[:, index]) / 2
+        rows, columns = pairs.rows[index, frame.half] * scale, pairs.columns[index, frame.half] * scale
+        return rows, columns, vector / np.sqrt(self.light_noise[number])
 
-    def _expected(self, number: int, index: int, sign: int) -> _Shown:
+    def _expected(self, frame: _Frame) -> _Parts:
         """What the other frame of its pair foretells of a frame."""
-        more = float(self.side_of(number, self.trend)[index]) - 1
-        other = self._shown(number, index, -sign).parts
-        rows = len(other[0])
-        scale = 1 / np.sqrt(self.floor)
-        both = (self.ambient_and_all + more * self.common) * scale
-        vector = (self.lights[number] + more * self.uniforms[number]) / np.sqrt(self.light_noise[number])
-        return _Shown((both[:rows] - other[0], both[rows:] - other[1], vector - other[2]))
+        number, more = frame.number, self._power(frame) - 1
+        rows, columns, vector = self._shown(frame.other)
+        both = (self.ambient_and_all + more * self.common) * (1 / np.sqrt(self.floor))
+        light = (self.lights[number] + more * self.uniforms[number]) / np.sqrt(self.light_noise[number])
+        return both[: len(rows)] - rows, both[len(rows) :] - columns, light - vector
 
-    def _flux(self, number: int, index: int, sign: int) -> float:
+    def _power(self, frame: _Frame) -> float:
+        """The lamp's trend at a frame."""
+        return float(self.side_of(frame.number, self.trend)[frame.index])
+
+    def _flux(self, frame: _Frame) -> float:
         """Light of a frame over that of all light."""
-        more = float(self.side_of(number, self.trend)[index]) - 1
-        rows = self.pairs[number].rows[index, 0 if sign > 0 else 1]
-        whole = float((self.ambient_and_all + more * self.common)[: rows.size].mean())
+        rows = self.pairs[frame.number].rows[frame.index, frame.half]
+        whole = float((self.ambient_and_all + (self._power(frame) - 1) * self.common)[: rows.size].mean())
         return float(rows.mean() / whole) if whole else 0.0
 
     def _usual(self, number: int) -> tuple[float, float]:
         """The flux of half the light, and its robust deviation."""
-        fluxes = [
-            self._flux(number, index, 1) for index in range(1, self.count) if self.good[number * self.count + index]
-        ]
+        good = self.side_of(number, self.good)
+        fluxes = [self._flux(_Frame(number, index, 1)) for index in range(1, self.count) if good[index]]
         middle = float(np.median(fluxes)) if fluxes else 0.5
-        return middle, max(1.4826 * float(np.median(np.abs(np.asarray(fluxes) - middle))) if fluxes else 0.0, 1e-3)
+        return middle, max(robust_scatter(np.array(fluxes), middle) if fluxes else 0.0, 1e-3)
 
-    def _repair(self, own: SideCheck, number: int, index: int, lamp: Lamp) -> None:
+    def _repair(self, number: int, index: int, lamp: Lamp) -> None:
         """Name the faulty frame of a pair, and take its vector from the other one."""
-        usual, deviation = self._usual(number)
-        found = []
-        for sign in (1, -1):
-            kept = self._flux(number, index, -sign)
-            right = usual if sign < 0 else 1 - usual
-            if index == 0:
-                right = 1 - self.dark if sign < 0 else self.dark
-            penalty = ((kept - right) / (4 * deviation)) ** 2
-            rest, kind, detail, other = self._best(number, index, sign)
-            found.append((rest + penalty, penalty, sign, kind, detail, other))
+        own, (usual, deviation) = self.sides[number], self._usual(number)
         known = [sign for sign in (1, -1) if (own.side, index, sign) in self.wrong]
-        found.sort(key=lambda one: (one[2] not in known, one[0]))
-        _, penalty, sign, kind, detail, other = found[0]
+        found = []
+        for frame in (_Frame(number, index, 1), _Frame(number, index, -1)):
+            right = usual if frame.sign < 0 else 1 - usual
+            if index == 0:
+                right = 1 - self.dark if frame.sign < 0 else self.dark
+            penalty = ((self._flux(frame.other) - right) / (4 * deviation)) ** 2
+            found.append((penalty, frame.sign, self._fault(frame)))
+        found.sort(key=lambda one: (one[1] not in known, one[2].rest + one[0]))
+        penalty, sign, fault = found[0]
         if known:
-            kind, detail, other = "wrong", f"is wrong: {self.wrong[own.side, index, sign]}", None
-        elif kind == "wrong" and self.slight[number * self.count + index]:
+            fault = _Fault(0.0, "wrong", f"is wrong: {self.wrong[own.side, index, sign]}")
+        elif fault.kind == "wrong" and self.slight[number * self.count + index]:
             return
         own.uncounted.add(index)
-        if len(known) == 2 or (not known and penalty > _BOTH and found[1][1] > _BOTH):
+        if len(known) == 2 or (not known and penalty > _BOTH and found[1][0] > _BOTH):
             if index:
                 own.unknown.add(index)
             else:  # by definition, where it is the other side's that all vectors are projected on
                 own.change(0, self.uniforms[number])
-            own.faults.append(
-                SessionFault(
-                    own.side,
-                    index,
-                    None,
-                    kind,
-                    f"{detail}, and the other frame of its pair is wrong too",
-                    "both are left out",
-                    other,
-                )
-            )
+            detail = f"{fault.detail}, and the other frame of its pair is wrong too"
+            own.add(index, fault.kind, detail, "both are left out", fault.other)
             return
         power = float(self.side_of(number, self.trend)[index])
-        light, vector = self.pairs[number].light[:, index], own.sums.vectors[:, index]
-        sound = (light - sign * vector) / 2
+        sound = (self.pairs[number].light[:, index] - sign * own.sums.vectors[:, index]) / 2
         both = self.lights[number] + (power - 1) * self.uniforms[number]
         corrected = power / float(self.power[self.good].mean()) if lamp.corrected else 1.0
         own.change(index, -sign * (2 * sound - both) / corrected)
         own.extras[index] += own.noise
-        own.faults.append(
-            SessionFault(
-                own.side,
-                index,
-                sign,
-                kind,
-                detail,
-                "it is left out, and foretold by the other frame of its pair",
-                other,
-            )
-        )
+        repair = "it is left out, and foretold by the other frame of its pair"
+        own.add(index, fault.kind, fault.detail, repair, fault.other, sign)
 
-    def _best(self, number: int, index: int, sign: int) -> tuple[float, str, str, Half | None]:
-        """The name that leaves least of a frame unexplained, mean squared deviations, of those that explain it."""
-        shown, expected = self._shown(number, index, sign), self._expected(number, index, sign)
-        whole = float(np.square(shown.all - expected.all).mean())
-        names: list[tuple[float, str, str, Half | None]] = []
-        size = float(np.dot(expected.all, expected.all))
-        part = float(np.dot(shown.all, expected.all)) / size if size else 0.0
-        flux = float(shown.parts[0].sum() / expected.parts[0].sum()) if expected.parts[0].sum() else 0.0
-        if index == 0 and sign < 0 and self.dark < DARK:
+    def _fault(self, frame: _Frame) -> _Fault:
+        """The fault that leaves least of a frame unexplained, of those that explain it."""
+        shown, expected = self._shown(frame), self._expected(frame)
+        seen, told = np.concatenate(shown), np.concatenate(expected)
+        size = float(np.dot(told, told))
+        part = float(np.dot(seen, told)) / size if size else 0.0
+        flux = float(shown[0].sum() / expected[0].sum()) if expected[0].sum() else 0.0
+        if frame.index == 0 and frame.sign < 0 and self.dark < DARK:
             flux = part = 1.0  # a dark frame of a dark room
-        if self.clipped((self.sides[number].side, index, sign)) and flux > DARK:
-            return 1.0, "clipped", "is clipped: many of its pixels share its largest number", None
-        if flux < DARK and all(
-            np.ptp(each) < DARK * 2 * np.ptp(whole_part) + 12
-            for each, whole_part in zip(shown.parts, expected.parts, strict=True)
-        ):
-            return 1.0, "black", "is black", None
-        names.append((float(np.square(shown.all - part * expected.all).mean()), *dimmed(part), None))
-        names += self._lost(shown, expected)
-        names += self._repeats(number, index, sign, shown)
-        names += self._shifted(number, shown, expected)
-        rest, kind, detail, other = min(names, key=lambda one: one[0])
-        if rest > max(_FITS, _EXPLAINED * whole):
-            return rest, "wrong", "is not what the other frame of its pair foretells", None
-        return rest, kind, detail, other
+        if self.clipped((self.sides[frame.number].side, frame.index, frame.sign)) and flux > DARK:
+            return _Fault(1.0, "clipped", "is clipped: many of its pixels share its largest number")
+        even = (np.ptp(own) < DARK * 2 * np.ptp(other) + 12 for own, other in zip(shown, expected, strict=True))
+        if flux < DARK and all(even):
+            return _Fault(1.0, "black", "is black")
+        tried = [_Fault(float(np.square(seen - part * told).mean()), *dimmed(part))]
+        tried += [*_lost(shown, expected), *self._repeats(frame, shown), *_shifted(frame.number, shown, expected)]
+        best = min(tried, key=lambda fault: fault.rest)
+        if best.rest > max(_FITS, _EXPLAINED * float(np.square(seen - told).mean())):
+            return _Fault(best.rest, "wrong", "is not what the other frame of its pair foretells")
+        return best
 
-    @staticmethod
-    def _lost(shown: _Shown, expected: _Shown) -> Iterator[tuple[float, str, str, Half | None]]:
-        """A frame that ends early or begins late, along its rows or columns."""
-        for axis, word in ((0, "rows"), (1, "columns")):
-            seen, whole = shown.parts[axis], expected.parts[axis]
-            missing, there = np.square(seen), np.square(seen - whole)
-            ahead = np.concatenate([[0.0], np.cumsum(there)])
-            behind = np.concatenate([np.cumsum(missing[::-1])[::-1], [0.0]])
-            early = ahead + behind
-            late = np.concatenate([[0.0], np.cumsum(missing)]) + np.concatenate([np.cumsum(there[::-1])[::-1], [0.0]])
-            for cost, first in ((early, False), (late, True)):
-                cut = int(np.argmin(cost[1:-1])) + 1
-                rest = float(cost[cut]) / len(seen)
-                lost = (cut if first else len(seen) - cut) / len(seen)
-                yield rest, "half lost", f"lost its {'first' if first else 'last'} {word}, {lost:.0%} of them", None
-
-    def _repeats(
-        self, number: int, index: int, sign: int, shown: _Shown
-    ) -> Iterator[tuple[float, str, str, Half | None]]:
+    def _repeats(self, frame: _Frame, shown: _Parts) -> Iterator[_Fault]:
         """Other frames that it equals."""
-        for place, own in enumerate(self.sides):
-            scale = 1 / np.sqrt(self.floor)
-            pairs = self.pairs[place]
+        number, index, sign = frame
+        scale = 1 / np.sqrt(self.floor)
+        before = self.before.get((self.sides[number].side, index, sign))
+        for place, (own, pairs) in enumerate(zip(self.sides, self.pairs, strict=True)):
             for half, signed in ((0, 1), (1, -1)):
-                away = np.square(pairs.rows[:, half] * scale - shown.parts[0]).sum(axis=1)
-                away += np.square(pairs.columns[:, half] * scale - shown.parts[1]).sum(axis=1)
-                numbers = len(shown.parts[0]) + len(shown.parts[1])
+                away = np.square(pairs.rows[:, half] * scale - shown[0]).sum(axis=1)
+                away += np.square(pairs.columns[:, half] * scale - shown[1]).sum(axis=1)
+                numbers = len(shown[0]) + len(shown[1])
                 if place == number:
                     vectors = (pairs.light + signed * own.sums.vectors) / 2 / np.sqrt(self.light_noise[number])
-                    away += np.square(vectors - shown.parts[2][:, None]).sum(axis=0)
-                    numbers += len(shown.parts[2])
+                    away += np.square(vectors - shown[2][:, None]).sum(axis=0)
+                    numbers += len(shown[2])
                     if signed == sign:
                         away[index] = np.inf
+                else:
+                    away[np.arange(self.count) != (before[1] if before and before[0] == own.side else -1)] = np.inf
                 if signed < 0:
                     away[0] = np.inf  # dark, as a black frame is
-                if place != number:
-                    before = self.before.get((self.sides[number].side, index, sign))
-                    away[np.arange(self.count) != (before[1] if before and before[0] == own.side else -1)] = np.inf
                 nearest = int(np.argmin(away))
                 other: Half = (own.side, nearest, signed)
-                yield float(away[nearest]) / numbers, "repeated", f"repeats {frame_words(other)}", other
+                yield _Fault(float(away[nearest]) / numbers, "repeated", f"repeats {frame_words(other)}", other)
 
-    def _shifted(self, number: int, shown: _Shown, expected: _Shown) -> Iterator[tuple[float, str, str, Half | None]]:
-        """A frame that is moved by some rows or columns."""
-        for axis, word in ((0, "rows"), (1, "columns")):
-            length = len(shown.parts[axis])
-            if length < 4 * _SHIFTS:
-                continue
-            inner = slice(_SHIFTS, length - _SHIFTS)
-            still = np.square(shown.parts[1 - axis] - expected.parts[1 - axis])
-            vector, whole = shown.parts[2], expected.parts[2]
-            # Across its stripes a frame's vector moves; along them it becomes shorter.
-            part = float(np.dot(vector, whole)) / max(float(np.dot(whole, whole)), 1e-300)
-            scaled = np.square(vector - part * whole)
-            for shift in (*range(-_SHIFTS, 0), *range(1, _SHIFTS + 1)):
-                moved = np.square(shown.parts[axis] - np.roll(expected.parts[axis], shift))[inner]
-                third = scaled
-                if axis == number and len(vector) == length:
-                    third = np.square(vector - np.roll(whole, shift))[inner]
-                rest = float(np.concatenate([moved, still, third]).mean())
-                yield rest, "shifted", f"is shifted by {abs(shift)} of its {word}", None
+
+def _lost(shown: _Parts, expected: _Parts) -> Iterator[_Fault]:
+    """A frame that ends early or begins late, along its rows or columns."""
+    for seen, whole, word in zip(shown, expected, ("rows", "columns"), strict=False):
+        missing, there = (np.insert(np.cumsum(np.square(each)), 0, 0.0) for each in (seen, seen - whole))
+        missing_after, there_after = (
+            np.append(np.cumsum(np.square(each)[::-1])[::-1], 0.0) for each in (seen, seen - whole)
+        )
+        for cost, first in ((there + missing_after, False), (missing + there_after, True)):
+            cut = int(np.argmin(cost[1:-1])) + 1
+            lost = (cut if first else len(seen) - cut) / len(seen)
+            detail = f"lost its {'first' if first else 'last'} {word}, {lost:.0%} of them"
+            yield _Fault(float(cost[cut]) / len(seen), "half lost", detail)
+
+
+def _shifted(number: int, shown: _Parts, expected: _Parts) -> Iterator[_Fault]:
+    """A frame, of the side of a ``number``, that is moved by some rows or columns."""
+    vector, whole = shown[2], expected[2]
+    for axis, word in ((0, "rows"), (1, "columns")):
+        length = len(shown[axis])
+        if length < 4 * _SHIFTS:
+            continue
+        inner = slice(_SHIFTS, length - _SHIFTS)
+        still = np.square(shown[1 - axis] - expected[1 - axis])
+        # Across its stripes a frame's vector moves; along them it becomes shorter.
+        part = float(np.dot(vector, whole)) / max(float(np.dot(whole, whole)), 1e-300)
+        third = np.square(vector - part * whole)
+        for shift in (*range(-_SHIFTS, 0), *range(1, _SHIFTS + 1)):
+            moved = np.square(shown[axis] - np.roll(expected[axis], shift))[inner]
+            if axis == number and len(vector) == length:
+                third = np.square(vector - np.roll(whole, shift))[inner]
+            rest = float(np.concatenate([moved, still, third]).mean())
+            yield _Fault(rest, "shifted", f"is shifted by {abs(shift)} of its {word}")
 
 
 def _unshaken(rests: FloatArray, differences: FloatArray, flicker: float, noise: float) -> FloatArray:

@@ -19,7 +19,7 @@ from mitsim.devices import session
 from mitsim.devices.session import SIDES, UNIFORM, Half
 from mitsim.reconstruct.estimate_factors import StripeSums
 from mitsim.reconstruct.moving_shadow import MovingShadow
-from mitsim.reconstruct.session_findings import DARK, SessionFault, dimmed, frame_words
+from mitsim.reconstruct.session_findings import DARK, SessionFault, dimmed, frame_words, robust_scatter
 
 MOST_FAULTS = 0.1
 """Part of the patterns that may be wrong before the session is refused: with more, what most share is in doubt."""
@@ -199,7 +199,7 @@ class SideCheck:
                 continue
             if sign == UNIFORM:
                 raise MitsimError(f"{side} stripes: of their uniform frame, {detail}; take the session again")
-            self._add(index, "wrong", f"is wrong: {detail}", "it is left out")
+            self.add(index, "wrong", f"is wrong: {detail}", "it is left out")
             self.unknown.add(index)
             self.uncounted.add(index)
 
@@ -207,7 +207,7 @@ class SideCheck:
         """Responses that hold much that no separable camera explains, where the others do not."""
         misfits, energies = self.sums.misfits, self.sums.energies
         middle = float(np.median(misfits))
-        scatter = 1.4826 * float(np.median(np.abs(misfits - middle)))
+        scatter = robust_scatter(misfits, middle)
         excess = misfits - middle - max(_UNEXPLAINED * float(np.median(energies)), _DEVIATIONS * scatter)
         # Where no separable camera explains any, one that is no worse than others says nothing.
         noise = middle * float(np.sqrt(2 / self.length / len(self.sums.common)))
@@ -219,12 +219,16 @@ class SideCheck:
             detail = f"no {self.side} stripes: {part:.0%} of their response is of other shape"
             # One frame for the mean of many is of other noise alone.
             kind, detail, other = self._repeated(int(index)) or ("wrong", detail, None)
-            self._add(int(index), kind, detail, "it is left out", other)
+            self.add(int(index), kind, detail, "it is left out", other)
             self.unknown.add(int(index))
             self.uncounted.add(int(index))
 
-    def _add(self, index: int, kind: str, detail: str, repair: str, other: Half | None = None) -> None:
-        self.faults.append(SessionFault(self.side, index, None if self.pairs else 1, kind, detail, repair, other))
+    def add(
+        self, index: int, kind: str, detail: str, repair: str, other: Half | None = None, sign: int | None = None
+    ) -> None:
+        """A fault of a pattern, of both frames of its pair or that of a ``sign``; its fields as it has them."""
+        sign = sign if self.pairs else 1
+        self.faults.append(SessionFault(self.side, index, sign, kind, detail, repair, other))
 
     # ---- patterns that do not fit the others -------------------------------------------------------------------------
 
@@ -281,7 +285,7 @@ class SideCheck:
         part = float(light[index])
         self.change(index, (self.vectors[:, index] + uniform) / part - uniform)
         self.extras[index] = self.errors[index] + max(1 / part**2 - 1, 0.0) * self.noise
-        self._add(index, *dimmed(part), "its numbers are divided by that")
+        self.add(index, *dimmed(part), "its numbers are divided by that")
         return True
 
     def _repeated(self, index: int) -> tuple[str, str, Half] | None:
@@ -317,11 +321,11 @@ class SideCheck:
         self._settled.update(places)
         if rest:
             detail = f"in the place of {self.side} stripes {rest[0]}, and those in theirs"
-            self._add(first, "swapped", detail, "both count in their right order", (self.side, rest[0], UNIFORM))
+            self.add(first, "swapped", detail, "both count in their right order", (self.side, rest[0], UNIFORM))
         elif not self.pairs:
-            self._add(first, "exchanged", "shows black where white should be", "it counts with its sign")
+            self.add(first, "exchanged", "shows black where white should be", "it counts with its sign")
         elif not self._turned(first):
-            self._add(first, "exchanged", "in each other's place", "they count in their right order")
+            self.add(first, "exchanged", "in each other's place", "they count in their right order")
 
     def _turned(self, index: int) -> bool:
         """Whether a pattern's faulty frame is the other one of its pair: a frame may repeat the other, or that it."""
@@ -341,7 +345,7 @@ class SideCheck:
         self.uncounted.add(index)
         self.unknown.add(index)
         self._foretell_unknown()
-        self._add(index, kind, detail, "it is left out", other)
+        self.add(index, kind, detail, "it is left out", other)
 
     # ---- what others foretell of a pattern ---------------------------------------------------------------------------
 
