@@ -37,6 +37,11 @@ _EVERYWHERE = 0.75
 """The same of what light of all scene pixels explains: a lamp's own colours leave 0.06 to 0.2 of theirs."""
 _ALL = 0.3
 """Unexplained part of the measurements above which neither depth nor ambient light is the cause, but another rig."""
+STEPS = (
+    "one step late: each shot shows the pattern of the shot before",
+    "one step early: each shot shows the pattern of the next",
+)
+"""Ways in which shots are a step beside their patterns."""
 
 
 class Cause(Enum):
@@ -98,6 +103,16 @@ class Cause(Enum):
         "unknown: depth, gloss or indirect light",
         "compare the map of the misfit with the scene",
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """Another way to take the frames: the ``cause`` that it is, in ``words``; which leaves the part ``left`` of all
+    measurements, rms."""
+
+    cause: Cause
+    words: str
+    left: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,9 @@ from scipy.ndimage import uniform_filter
 from mitsim.core.arrays import FloatArray
 from mitsim.core.manifests import RunManifest
 from mitsim.core.runs import Measurement
-from mitsim.reconstruct.causes import Cause
-from mitsim.reconstruct.faults import STEPS
+from mitsim.reconstruct.causes import STEPS, Cause, Reading
 from mitsim.reconstruct.noise import FrameNoise
-from mitsim.reconstruct.solver import Prepared, centred
+from mitsim.reconstruct.solver import Prepared
 
 _FITS = 0.05
 """Part of the unexplained energy that a reading may leave: chosen, so that it explains nearly all of it."""
@@ -51,16 +50,6 @@ _TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "transposed about the other diagonal": lambda frame: frame[::-1, ::-1].T,
 }
 """What frames may be, and what brings them back."""
-
-
-@dataclass(frozen=True, eq=False)
-class Reading:
-    """Another way to take the frames: the ``cause`` that it is, in ``words``; which leaves the part ``left`` of all
-    measurements, rms."""
-
-    cause: Cause
-    words: str
-    left: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +97,7 @@ class Readings:
     def curved(self) -> Reading | None:
         """The tone curve that the numbers went through, where one is likelier than none."""
         words = ToneCurves(self.prepared, self.manifest, self.measured).likeliest()
-        return Reading(Cause.GAMMA, words, 0.0) if words else None
+        return Reading(Cause.GAMMA, words) if words else None
 
     def _left_over(self, frames: Frames) -> tuple[float, float]:
         """Part of the energy of ``frames`` that the model leaves, and that noise is expected to leave."""
@@ -149,11 +138,9 @@ class Readings:
         """Number and light of each shot."""
         number = {(shot.row, shot.column, shot.sign): n for n, shot in enumerate(self.manifest.patterns.captures)}
         for each in self.measured():
-            if each.shots == 1:
-                yield number[each.row, each.column, 0], each.frame
-                continue
-            for sign in (1, -1):
-                yield number[each.row, each.column, sign], (each.light + sign * each.frame) / 2
+            shots = (each.frame,) if each.shots == 1 else _shots(each)
+            for sign, light in zip((0,) if each.shots == 1 else (1, -1), shots, strict=True):
+                yield number[each.row, each.column, sign], light
 
     def _ordered(self, order: Callable[[int], int]) -> Frames:
         """Measurements of the shots, each taken for that which ``order`` gives for its number."""
@@ -193,7 +180,7 @@ def multiple(noise: FrameNoise, chi_square: float) -> Reading | None:
     words = f"all numbers are multiples of {factor}"
     if factor & (factor - 1) == 0:
         words += f", as of fewer bits that were moved up by {factor.bit_length() - 1}"
-    return Reading(Cause.SCALE, words, 0.0)
+    return Reading(Cause.SCALE, words)
 
 
 # ---- Tone curves that numbers went through ---------------------------------------------------------------------------
@@ -337,9 +324,7 @@ class ToneCurves:
         weights, prepared = self._held(curve).weights, self.prepared
         parts = np.zeros((2, _CURVE_PARTS))
         for each in self._linear(curve):
-            left, right = prepared.left.slabs[each.pattern[0]], prepared.right.slabs[each.pattern[1]]
-            frame = centred(each.frame) if prepared.centre else each.frame
-            residual = frame - left.matrix @ weights[left.columns][:, right.columns] @ right.matrix.T
+            residual = prepared.as_solved(each.frame) - prepared.modelled(weights, *each.pattern)
             # By the light around a reading, which does not know of its noise.
             near = uniform_filter(each.light, _AROUND) - each.light / _AROUND**2
             part = np.searchsorted(np.quantile(near, np.arange(1, _CURVE_PARTS) / _CURVE_PARTS), near.ravel())

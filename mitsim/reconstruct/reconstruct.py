@@ -21,9 +21,9 @@ from mitsim.reconstruct.depth import Depth, best_depth
 from mitsim.reconstruct.depth_map import DepthMap, depth_map
 from mitsim.reconstruct.detail import Model, print_energy
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.faults import FrameCheck
+from mitsim.reconstruct.faults import FrameFault
 from mitsim.reconstruct.focus import focused
-from mitsim.reconstruct.framefault import FrameFault
+from mitsim.reconstruct.frame_check import FrameCheck
 from mitsim.reconstruct.margin import Margin
 from mitsim.reconstruct.misfit import Lack, Misfit, faulty_frames, judge
 from mitsim.reconstruct.noise import FrameNoise, factor_energy

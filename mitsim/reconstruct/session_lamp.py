@@ -10,7 +10,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.devices.session import Half
 from mitsim.reconstruct.estimate_factors import FLUX_NOISE
-from mitsim.reconstruct.session_findings import DARK, Lamp, robust_scatter
+from mitsim.reconstruct.faults import DARK, Lamp, robust_scatter
 from mitsim.reconstruct.session_side import SLIGHT, SideCheck
 
 MATTERS = 0.5

@@ -14,7 +14,7 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.session import Half
-from mitsim.reconstruct.session_findings import DARK, Lamp, dimmed, frame_words, robust_scatter
+from mitsim.reconstruct.faults import DARK, Lamp, dimmed, frame_words, robust_scatter
 from mitsim.reconstruct.session_lamp import MATTERS, end_to_end, flickers, trend_of
 from mitsim.reconstruct.session_side import MOST_FAULTS, SideCheck
 

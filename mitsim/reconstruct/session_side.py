@@ -18,8 +18,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices import session
 from mitsim.devices.session import SIDES, UNIFORM, Half
 from mitsim.reconstruct.estimate_factors import StripeSums
+from mitsim.reconstruct.faults import DARK, SessionFault, dimmed, frame_words, robust_scatter
 from mitsim.reconstruct.moving_shadow import MovingShadow
-from mitsim.reconstruct.session_findings import DARK, SessionFault, dimmed, frame_words, robust_scatter
 
 MOST_FAULTS = 0.1
 """Part of the patterns that may be wrong before the session is refused: with more, what most share is in doubt."""
@@ -199,9 +199,13 @@ class SideCheck:
                 continue
             if sign == UNIFORM:
                 raise MitsimError(f"{side} stripes: of their uniform frame, {detail}; take the session again")
-            self.add(index, "wrong", f"is wrong: {detail}", "it is left out")
-            self.unknown.add(index)
-            self.uncounted.add(index)
+            self._do_without(index, "wrong", f"is wrong: {detail}")
+
+    def _do_without(self, index: int, kind: str, detail: str, other: Half | None = None) -> None:
+        """A pattern is left out, and what others foretell will come in its place."""
+        self.add(index, kind, detail, "it is left out", other)
+        self.unknown.add(index)
+        self.uncounted.add(index)
 
     def _check_misfits(self) -> None:
         """Responses that hold much that no separable camera explains, where the others do not."""
@@ -218,10 +222,7 @@ class SideCheck:
             part = misfits[index] / energies[index]
             detail = f"no {self.side} stripes: {part:.0%} of their response is of other shape"
             # One frame for the mean of many is of other noise alone.
-            kind, detail, other = self._repeated(int(index)) or ("wrong", detail, None)
-            self.add(int(index), kind, detail, "it is left out", other)
-            self.unknown.add(int(index))
-            self.uncounted.add(int(index))
+            self._do_without(int(index), *(self._repeated(int(index)) or ("wrong", detail)))
 
     def add(
         self, index: int, kind: str, detail: str, repair: str, other: Half | None = None, sign: int | None = None
@@ -342,10 +343,8 @@ class SideCheck:
     def _leave_out(self, index: int, kind: str, detail: str, other: Half | None = None) -> None:
         """Put what the others foretell in place of a pattern."""
         self.faults = [fault for fault in self.faults if fault.index != index]
-        self.uncounted.add(index)
-        self.unknown.add(index)
+        self._do_without(index, kind, detail, other)
         self._foretell_unknown()
-        self.add(index, kind, detail, "it is left out", other)
 
     # ---- what others foretell of a pattern ---------------------------------------------------------------------------
 

@@ -135,7 +135,7 @@ def test_lambda_heeds_what_factors_lack() -> None:
     shots = camera.run("dots:3", picture(), 0)
     sums = accumulated(shots, factors)
     first = sums.prepared.solve(sums.frames)
-    lack = sums.lack(factors, first.image)
+    lack = sums.lack(first.image)
     image = reconstruct(shots, factors)
     assert lack and image.misfit
     known = sums.prepared.solve(sums.frames, "auto", not image.misfit.flagged, (lack.struck, lack.energy))

@@ -16,7 +16,7 @@ from scipy.ndimage import uniform_filter
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.manifests import RunManifest
 from mitsim.core.runs import Measurement
-from mitsim.reconstruct.framefault import Fault, FrameFault, listed
+from mitsim.reconstruct.faults import Fault, FrameFault, listed
 from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.sides import group_pixels
 from mitsim.reconstruct.solver import Prepared

@@ -16,8 +16,8 @@ from scipy import fft
 from scipy.optimize import minimize_scalar
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
-from mitsim.reconstruct.framefault import Fault, FrameFault
-from mitsim.reconstruct.leaveoneout import CHANCE, OFF, BoolArray, LeaveOneOut, Pattern
+from mitsim.reconstruct.faults import Fault, FrameFault
+from mitsim.reconstruct.leave_one_out import CHANCE, OFF, BoolArray, LeaveOneOut, Pattern
 
 _EXPLAINS = 0.2
 """Part of what a frame is off by that a fault may leave: chosen, with room for what the others foretell badly."""
