@@ -47,18 +47,9 @@ STEPS = (
 class Cause(Enum):
     """Why measurements do not fit; the value is its sentence and the remedy."""
 
-    FRAMES = (
-        "frames that are not what they say",
-        "capture these frames again",
-    )
-    ORIENTATION = (
-        "frames that are turned or mirrored",
-        "turn them back, or calibrate with the camera as it is",
-    )
-    ORDER = (
-        "frames in another order than their patterns",
-        "bring the frames into the order of the patterns",
-    )
+    FRAMES = ("frames that are not what they say", "capture these frames again")
+    ORIENTATION = ("frames that are turned or mirrored", "turn them back, or calibrate with the camera as it is")
+    ORDER = ("frames in another order than their patterns", "bring the frames into the order of the patterns")
     GAMMA = (
         "numbers that are not proportional to the light",
         "save the camera's raw numbers, without gamma or tone curve",
@@ -67,14 +58,8 @@ class Cause(Enum):
         "numbers that were multiplied, as of few bits left-aligned in more",
         "divide the numbers by that factor, or give a camera file of these numbers",
     )
-    SATURATION = (
-        "readings at the full well or the ADC's end",
-        "expose for less",
-    )
-    AMBIENT = (
-        "ambient light, the same in every shot",
-        "darken the room, or capture with ambient_frame=yes",
-    )
+    SATURATION = ("readings at the full well or the ADC's end", "expose for less")
+    AMBIENT = ("ambient light, the same in every shot", "darken the room, or capture with ambient_frame=yes")
     DEPTH = (
         "depth, light that lands beside where the calibration saw it",
         "put the scene at the calibrated distance, calibrate at the scene's, or give its depth as focus",
@@ -99,10 +84,7 @@ class Cause(Enum):
         "print finer than a scene pixel, light beside the centres of the pixels",
         "use a projector of more pixels, or bring projector and scene closer together",
     )
-    UNKNOWN = (
-        "unknown: depth, gloss or indirect light",
-        "compare the map of the misfit with the scene",
-    )
+    UNKNOWN = ("unknown: depth, gloss or indirect light", "compare the map of the misfit with the scene")
 
 
 @dataclass(frozen=True, eq=False)

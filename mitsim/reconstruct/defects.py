@@ -93,14 +93,14 @@ class Defects:
         for _ in range(_ROUNDS):
             change = np.zeros_like(weights)
             for (row, column), value in values.items():
-                left, right = prepared.slabs(row, column)
+                left, right = prepared.slabs((row, column))
                 own, other = left.matrix[self.rows], right.matrix[self.columns]
                 told = (own @ weights[left.columns][:, right.columns] * other).sum(axis=1)
                 leverage = np.square(own).sum(axis=1) * np.square(other).sum(axis=1)
                 step = (told - value) / np.maximum(1 - leverage / gain, 0.5)
                 value += step
                 step /= gain
-                change[prepared.places(row, column)] += own.T @ (step[:, None] * other)
+                change[prepared.places((row, column))] += own.T @ (step[:, None] * other)
             weights += change
         moved = {pattern: (values[pattern] - first[pattern]) / gain for pattern in values}
         return LeftOut(shots, measured, self, moved)

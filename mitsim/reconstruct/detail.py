@@ -6,7 +6,8 @@ dipole of its ramp, g / 12, but not of finer print; frames do. A slope is anothe
 the sensor's columns take it for different images: W_0 - G W of :mod:`mitsim.reconstruct.regularisation` holds
 sum_j (U_0j - U_j G)^T Phi_R' diag(p_j) d^T, as known as the sum_j U_j^T Phi_R' diag(p_j) d^T that strikes the image.
 For independent dipoles one energy is in closed form a multiple of the other, and turns the disagreement that noise does
-not explain into an error of the image, place by place. A surface beside the calibrated distance moves light alike, and is told too.
+not explain into an error of the image, place by place. A surface beside the calibrated distance moves light alike, and
+is told too.
 """
 
 from __future__ import annotations

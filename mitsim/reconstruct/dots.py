@@ -32,12 +32,7 @@ from scipy import fft, linalg
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads, single_threaded_blas
-from mitsim.reconstruct.convolution import (
-    ConvolutionalCamera,
-    Operator,
-    checked_lambda,
-    conjugate_gradients,
-)
+from mitsim.reconstruct.convolution import ConvolutionalCamera, Operator, checked_lambda, conjugate_gradients
 from mitsim.reconstruct.solver import Prepared
 from mitsim.reconstruct.status import Solution, Status, Verdict
 

@@ -97,19 +97,20 @@ class Explanations:
         the patterns, each with whether its brightness alone is off.
     weights
         W, with these as the others foretell them.
+
+    Attributes
+    ----------
+    others_left
+        energy that the model leaves of patterns that are not suspected, less all of theirs.
     """
 
     def __init__(self, check: LeaveOneOut, bad: dict[Pattern, bool], weights: FloatArray) -> None:
         self._check, self._model, self._bad, self._weights = check, check.prepared, bad, weights
         self._measured = check.measurements(bad)
         self._total = check.noise.light
-        self._foretold = {pattern: self._model.modelled(weights, *pattern) for pattern in bad}
+        self._foretold = {pattern: self._model.frame(weights, pattern) for pattern in bad}
         self._rest = check.rest(self._measured)
-        self._least = self._left({}, weights)
-
-    def others_left(self, energy: float) -> float:
-        """Of the ``energy`` of patterns that are not suspected, what the model leaves."""
-        return energy + self._least
+        self.others_left = self._left({}, weights)
 
     # ---- what frames leave
 
@@ -117,7 +118,7 @@ class Explanations:
         """W of the patterns that are not suspected, and of these ``frames`` of others; of the rest as foretold."""
         weights = self._rest.copy()
         for pattern, foretold in self._foretold.items():
-            weights[self._model.places(*pattern)] += self._model.weighed(frames.get(pattern, foretold), *pattern)
+            weights[self._model.places(pattern)] += self._model.weights(frames.get(pattern, foretold), pattern)
         return np.where(self._check.sigma > 0, weights, 0.0)
 
     def _left(self, frames: dict[Pattern, FloatArray], weights: FloatArray) -> float:
@@ -127,7 +128,7 @@ class Explanations:
 
     def _beyond(self, frames: dict[Pattern, FloatArray], variance: float) -> float:
         """Energy beyond noise that all frames are off by with these, at a ``variance`` of a datum."""
-        left = self._left(frames, self._together(frames)) - self._least
+        left = self._left(frames, self._together(frames)) - self.others_left
         return left - sum(frame.size for frame in frames.values()) * variance * self._model.spare
 
     def _filled(self, one: _Suspect, raw: FloatArray, known: BoolArray) -> float:
@@ -143,8 +144,8 @@ class Explanations:
             frame = self._model.as_solved(filled)
             means = filled - frame
             weights = self._together({one.pattern: frame})
-            fit = self._model.modelled(weights, *one.pattern)
-        left = self._left({one.pattern: frame}, weights) - self._least
+            fit = self._model.frame(weights, one.pattern)
+        left = self._left({one.pattern: frame}, weights) - self.others_left
         # The noise of a frame is that of its mean light, which what is lost makes too little.
         variance = max(one.variance, float(self._check.noise.of(float(raw[known].mean()), 1)))
         return left - float(known.sum()) * variance * self._model.spare
@@ -232,13 +233,13 @@ class Explanations:
 
     def _outside(self, frame: FloatArray, pattern: Pattern, variance: float) -> float:
         """Energy of a ``frame`` beyond noise that no light of the pixels of a ``pattern`` explains."""
-        left, right = (slab.matrix for slab in self._model.slabs(*pattern))
+        left, right = (slab.matrix for slab in self._model.slabs(pattern))
         return self._unexplained(frame, left, right, variance)
 
     def _ranges(self, pattern: Pattern, rows: Any, columns: Any) -> tuple[FloatArray, FloatArray]:
         """Orthonormal ranges of a ``pattern`` on part of the sensor's ``rows`` and ``columns``."""
         bases = []
-        for slab, kept in zip(self._model.slabs(*pattern), (rows, columns), strict=True):
+        for slab, kept in zip(self._model.slabs(pattern), (rows, columns), strict=True):
             part = slab.matrix[kept]
             if self._model.centre:
                 part = np.concatenate([part, np.ones((len(part), 1))], axis=1)
@@ -323,8 +324,8 @@ class Explanations:
         check = self._check
         if not check.exclusive:
             return
-        told = self._weights[self._model.places(*one.pattern)]
-        ratio = float(np.vdot(self._model.weighed(one.frame, *one.pattern), told)) / max(sum_of_squares(told), 1e-300)
+        told = self._weights[self._model.places(one.pattern)]
+        ratio = float(np.vdot(self._model.weights(one.frame, one.pattern), told)) / max(sum_of_squares(told), 1e-300)
         fault = Fault.DIM if ratio < 1 else Fault.BRIGHT
         words = f"holds {ratio:.2f} of the light that its neighbours' pixels tell"
         yield _Named(-np.inf, fault, one.numbers, words)
@@ -434,18 +435,14 @@ class Explanations:
                 if best >= left:
                     break
                 left, (rows, columns) = best, place
-            if (rows, columns) == (0, 0):
-                return
-            words = f"is shifted by {rows} rows and {columns} columns of the sensor"
-            yield _Named(left, Fault.SHIFTED, one.numbers, words)
+            if (rows, columns) != (0, 0):
+                yield _shifted(one, left, rows, columns)
             return
         ends = [slice(reach + step, size - reach + step) for step, size in zip(shift, one.raw.shape, strict=True)]
         still = [slice(reach, size - reach) for size in one.raw.shape]
         moved, unmoved = (self._inside(one, window, still) for window in (ends, still))
         if unmoved > 0:
-            rows, columns = shift
-            words = f"is shifted by {rows} rows and {columns} columns of the sensor"
-            yield _Named(moved / unmoved * one.off, Fault.SHIFTED, one.numbers, words)
+            yield _shifted(one, moved / unmoved * one.off, *shift)
 
     def _put_back(self, one: _Suspect, shift: tuple[int, int]) -> float:
         """Energy beyond noise that a frame leaves that is moved back by a ``shift``, rows and columns."""
@@ -506,6 +503,11 @@ class Explanations:
                 yield self._check.fault(Fault.SWAPPED, (*pair.numbers, *pair.place), "are exchanged")
             else:
                 yield self._check.fault(best.fault, best.numbers, best.words)
+
+
+def _shifted(one: _Suspect, left: float, rows: int, columns: int) -> _Named:
+    words = f"is shifted by {rows} rows and {columns} columns of the sensor"
+    return _Named(left, Fault.SHIFTED, one.numbers, words)
 
 
 def _correlated(frame: FloatArray, foretold: FloatArray, reach: int) -> tuple[int, int]:

@@ -109,7 +109,7 @@ class FrameCheck(LeaveOneOut):
         good = self.all_but(bad)
         variance, energy, total = self.noise.variance[good], float(sums.energy[good].sum()), float(sums.power.sum())
         beside = beside_noise * float(sums.power[good].sum()) / max(total, np.finfo(float).tiny)
-        off = explanations.others_left(energy) - float(variance.sum()) * self.size * self.prepared.spare - beside
+        off = energy + explanations.others_left - float(variance.sum()) * self.size * self.prepared.spare - beside
         chance = CHANCE / 2 * float(np.sqrt(2 * self.size * np.square(variance).sum()))
         return explanations.faults(off if off > max(chance, (OFF / 2) ** 2 * energy) else 0.0)
 
@@ -143,7 +143,7 @@ class FrameCheck(LeaveOneOut):
     def whole(self) -> FloatArray | None:
         """(m, m') the sum of a signed pattern's halves, as the model has it of the pattern of +1 alone; None without
         that."""
-        return None if self._whole is None else self.prepared.modelled(self.weights, *self._whole)
+        return None if self._whole is None else self.prepared.frame(self.weights, self._whole)
 
     def negative(self) -> Reading | None:
         """That signed patterns were taken the wrong way round, if they were: pixels that are always lit alike then have
@@ -202,11 +202,9 @@ class FrameCheck(LeaveOneOut):
         if self.exclusive:
             ratio = odd_brightness(self, weights, good)
             return [] if ratio is None else [(ratio, True)]
-        return [((0, 0), True)] if good.size == 1 and self._is_dark() else []
-
-    def _is_dark(self) -> bool:
-        """Whether the only frame has no more light than noise makes."""
-        return bool(abs(self.noise.means[0, 0]) < CHANCE * float(np.sqrt(self.noise.variance[0, 0] / self.size)))
+        # The only frame may have no more light than noise makes.
+        least = CHANCE * float(np.sqrt(self.noise.variance[0, 0] / self.size))
+        return [((0, 0), True)] if good.size == 1 and abs(self.noise.means[0, 0]) < least else []
 
     def _same(self, sums: FrameSums) -> Iterable[FrameFault]:
         """Shots that are one and the same frame, noise and all."""

@@ -7,7 +7,6 @@ solved. Under shifting dots no pixel is in two frames, and those left out have l
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -35,7 +34,6 @@ _SETTLED, _MOST_STEPS = 0.1, 100
 which patterns that know nothing of each other do not need: chosen."""
 
 
-@dataclass(eq=False)
 class FrameSums:
     """Energies by pattern, (K, K') each, gathered as measurements are held against a model.
 
@@ -49,15 +47,9 @@ class FrameSums:
     tell the two apart.
     """
 
-    counts: tuple[int, int]
-    residual: FloatArray = field(init=False)
-    power: FloatArray = field(init=False)
-    energy: FloatArray = field(init=False)
-    sums: FloatArray = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.residual, self.power, self.energy = (np.zeros(self.counts) for _ in range(3))
-        self.sums = np.zeros(self.counts)
+    def __init__(self, counts: tuple[int, int]) -> None:
+        """Nothing yet, of ``counts`` K and K' of patterns."""
+        self.residual, self.power, self.energy, self.sums = (np.zeros(counts) for _ in range(4))
         self.digests: dict[int, list[tuple[Pattern, int]]] = {}
         self.clipped: dict[tuple[Pattern, int], int] = {}
         self.halves: dict[Pattern, tuple[float, float]] = {}
@@ -182,7 +174,7 @@ class LeaveOneOut:
         """W without what some ``measurements`` add to it."""
         rest = self.weights.copy()
         for pattern, each in measurements.items():
-            rest[self.prepared.places(*pattern)] -= self.prepared.weighed(self.prepared.as_solved(each.frame), *pattern)
+            rest[self.prepared.places(pattern)] -= self.prepared.weights(self.prepared.as_solved(each.frame), pattern)
         return rest
 
     def without(self, bad: tuple[Pattern, ...]) -> tuple[FloatArray, float]:
@@ -196,12 +188,12 @@ class LeaveOneOut:
         lit = self.lit(self.all_but(bad))
         image = np.where(lit, image, self.neighbours(image, lit))
         weights = self._seen(image)
-        grams = {pattern: [slab.matrix.T @ slab.matrix for slab in self.prepared.slabs(*pattern)] for pattern in bad}
+        grams = {pattern: [slab.matrix.T @ slab.matrix for slab in self.prepared.slabs(pattern)] for pattern in bad}
 
         def of_bad(values: FloatArray) -> FloatArray:
             own = np.zeros_like(values)
             for pattern, (left, right) in grams.items():
-                places = self.prepared.places(*pattern)
+                places = self.prepared.places(pattern)
                 own[places] += left @ values[places] @ right
             return own
 
@@ -237,7 +229,7 @@ class LeaveOneOut:
         others = max(self.noise.variance.size - len(set(bad)), 2)
         for each in self.measured():
             pattern, frame = (each.row, each.column), self.prepared.as_solved(each.frame)
-            residual = frame - self.prepared.modelled(weights, *pattern)
+            residual = frame - self.prepared.frame(weights, pattern)
             sums.residual[pattern], sums.power[pattern] = sum_of_squares(residual), each.power
             sums.energy[pattern] = sum_of_squares(frame)
             if self.signed:

@@ -226,7 +226,7 @@ class Residuals:
     def add(self, measurement: Measurement) -> None:
         """Count in one ``measurement``."""
         frame = self._prepared.as_solved(measurement.frame)
-        left, right = self._prepared.slabs(measurement.row, measurement.column)
+        left, right = self._prepared.slabs((measurement.row, measurement.column))
         modelled = left.matrix @ self._weights[left.columns][:, right.columns]
         residual = np.matmul(modelled, right.matrix.T, out=self._residual)
         np.subtract(frame, residual, out=residual)
@@ -305,11 +305,7 @@ class Residuals:
 
 
 def judge(
-    check: FrameCheck,
-    factor_energy: float | None,
-    print_energy: float,
-    evidence: Evidence,
-    with_defects: bool = True,
+    check: FrameCheck, factor_energy: float | None, print_energy: float, evidence: Evidence, with_defects: bool = True
 ) -> Misfit | None:
     """Hold all measurements against the model; None where there are no more data than unknowns.
 

@@ -143,15 +143,12 @@ class Readings:
                 yield number[each.row, each.column, sign], light
 
     def _ordered(self, order: Callable[[int], int]) -> Frames:
-        """Measurements of the shots, each taken for that which ``order`` gives for its number."""
-        return self._paired((order(number), light) for number, light in self._shots())
-
-    def _paired(self, shots: Iterable[tuple[int, FloatArray]]) -> Frames:
-        """Measurements of ``shots``, by their number: halves of signed patterns as their difference."""
+        """Measurements of the shots, each taken for that which ``order`` gives for its number: halves of signed
+        patterns as their difference."""
         captures = self.manifest.patterns.captures
         waiting: dict[tuple[int, int], tuple[FloatArray, float]] = {}
-        for number, light in shots:
-            shot = captures[number % len(captures)]
+        for number, light in self._shots():
+            shot = captures[order(number) % len(captures)]
             noise = float(np.maximum(self.manifest.digital.variance(light), 0.0).sum())
             own = (shot.sign * light if shot.sign else light), noise
             if shot.sign and (shot.row, shot.column) not in waiting:
@@ -324,7 +321,7 @@ class ToneCurves:
         weights, prepared = self._held(curve).weights, self.prepared
         parts = np.zeros((2, _CURVE_PARTS))
         for each in self._linear(curve):
-            residual = prepared.as_solved(each.frame) - prepared.modelled(weights, *each.pattern)
+            residual = prepared.as_solved(each.frame) - prepared.frame(weights, each.pattern)
             # By the light around a reading, which does not know of its noise.
             near = uniform_filter(each.light, _AROUND) - each.light / _AROUND**2
             part = np.searchsorted(np.quantile(near, np.arange(1, _CURVE_PARTS) / _CURVE_PARTS), near.ravel())

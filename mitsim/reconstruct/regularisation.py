@@ -247,10 +247,7 @@ def _least(score: Callable[[float], float], scale: float, exponents: FloatArray)
         return 0.0
     lower, upper = exponents[max(best - 1, 0)], exponents[min(best + 1, len(exponents) - 1)]
     refined = minimize_scalar(
-        lambda exponent: score(scale * 10.0**exponent),
-        bounds=(lower, upper),
-        method="bounded",
-        options={"xatol": 1e-3},
+        lambda exponent: score(scale * 10.0**exponent), bounds=(lower, upper), method="bounded", options={"xatol": 1e-3}
     )
     return float(scale * 10.0 ** float(refined.x))
 

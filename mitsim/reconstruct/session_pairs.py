@@ -51,10 +51,10 @@ foretell the other by."""
 
 
 class _Frame(NamedTuple):
-    """One frame of a session: the ``number`` of its side, 0 or 1, and the ``index`` and ``sign`` of its pattern."""
+    """One frame of a session: the ``number`` of its side, 0 or 1, its ``pattern`` and its ``sign``."""
 
     number: int
-    index: int
+    pattern: int
     sign: int
 
     @property
@@ -241,7 +241,7 @@ class Pairs:
         remaining = 0.0
         for number, own in enumerate(self.sides):
             self._divided(number, own, self.side_of(number, used), flicker if shakes else 0.0)
-            own.rescale(scale)
+            own.vectors = own.vectors * scale
             remaining += float(own.extras.sum() / np.sum(np.square(own.vectors)))
         return Lamp(
             drift=end_to_end(self.times.mean(axis=1), trend) if drifts else 0.0,
@@ -304,11 +304,11 @@ class Pairs:
 
     def _power(self, frame: _Frame) -> float:
         """The lamp's trend at a frame."""
-        return float(self.side_of(frame.number, self.trend)[frame.index])
+        return float(self.side_of(frame.number, self.trend)[frame.pattern])
 
     def _flux(self, frame: _Frame) -> float:
         """Light of a frame over that of all light."""
-        rows = self.pairs[frame.number].rows[frame.index, frame.half]
+        rows = self.pairs[frame.number].rows[frame.pattern, frame.half]
         whole = float((self.ambient_and_all + (self._power(frame) - 1) * self.common)[: rows.size].mean())
         return float(rows.mean() / whole) if whole else 0.0
 
@@ -361,9 +361,9 @@ class Pairs:
         size = float(np.dot(told, told))
         part = float(np.dot(seen, told)) / size if size else 0.0
         flux = float(shown[0].sum() / expected[0].sum()) if expected[0].sum() else 0.0
-        if frame.index == 0 and frame.sign < 0 and self.dark < DARK:
+        if frame.pattern == 0 and frame.sign < 0 and self.dark < DARK:
             flux = part = 1.0  # a dark frame of a dark room
-        if self.clipped((self.sides[frame.number].side, frame.index, frame.sign)) and flux > DARK:
+        if self.clipped((self.sides[frame.number].side, frame.pattern, frame.sign)) and flux > DARK:
             return _Fault(1.0, "clipped", "is clipped: many of its pixels share its largest number")
         even = (np.ptp(own) < DARK * 2 * np.ptp(other) + 12 for own, other in zip(shown, expected, strict=True))
         if flux < DARK and all(even):

@@ -145,10 +145,6 @@ class SideCheck:
             self.vectors = self.vectors.copy()
         self.vectors[:, index] = vector
 
-    def rescale(self, factor: float) -> None:
-        """Make the uniform response's share in all vectors smaller by ``factor``, and them larger."""
-        self.vectors = self.vectors * factor
-
     def result(self) -> StripeSums:
         """The sums with what was changed."""
         if self.vectors is self.sums.vectors and not self.uncounted:
@@ -174,8 +170,11 @@ class SideCheck:
         self._check_misfits()
         count = self.signs.shape[1]
         if not self.enough:
-            for index in self.unknown:
-                self._forget(index)
+            for (
+                index
+            ) in self.unknown:  # nothing foretells them: their error is then their size, which the others' tells
+                self.extras[index] = self._size(index)
+                self.change(index, np.zeros(self.length))
             return
         if self.unknown:
             self._foretell_unknown()
@@ -347,11 +346,6 @@ class SideCheck:
         self._foretell_unknown()
 
     # ---- what others foretell of a pattern ---------------------------------------------------------------------------
-
-    def _forget(self, index: int) -> None:
-        """Leave a pattern out where nothing foretells it; its error is then its own size, which the others' tells."""
-        self.extras[index] = self._size(index)
-        self.change(index, np.zeros(self.length))
 
     def _size(self, index: int) -> float:
         """Mean squared length of the other patterns' vectors, but for the uniform one."""

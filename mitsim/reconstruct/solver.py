@@ -104,22 +104,22 @@ class Prepared:
         """A ``frame`` (m, m') as the solver takes it: centred where the model is."""
         return centred(frame) if self.centre else frame
 
-    def slabs(self, row: int, column: int) -> tuple[Slab, Slab]:
-        """What a pattern's ``row`` and ``column`` contribute."""
-        return self.left.slabs[row], self.right.slabs[column]
+    def slabs(self, pattern: tuple[int, int]) -> tuple[Slab, Slab]:
+        """What the row and the column of a ``pattern`` contribute."""
+        return self.left.slabs[pattern[0]], self.right.slabs[pattern[1]]
 
-    def places(self, row: int, column: int) -> Any:
-        """Where in W the coefficients of the pattern of a ``row`` and a ``column`` are."""
-        return np.ix_(self.left.columns(row), self.right.columns(column))
+    def places(self, pattern: tuple[int, int]) -> Any:
+        """Where the coefficients of a ``pattern`` are in W."""
+        return np.ix_(self.left.columns(pattern[0]), self.right.columns(pattern[1]))
 
-    def modelled(self, weights: FloatArray, row: int, column: int) -> FloatArray:
-        """(m, m') frame of the pattern of a ``row`` and a ``column``, as the ``weights`` W tell it."""
-        left, right = self.slabs(row, column)
+    def frame(self, weights: FloatArray, pattern: tuple[int, int]) -> FloatArray:
+        """(m, m') frame of a ``pattern``, as the ``weights`` W tell it."""
+        left, right = self.slabs(pattern)
         return np.asarray(left.matrix @ weights[left.columns][:, right.columns] @ right.matrix.T)
 
-    def weighed(self, frame: FloatArray, row: int, column: int) -> FloatArray:
-        """What a ``frame`` (m, m'), as the solver takes it, adds to W at the :meth:`places` of its pattern."""
-        left, right = self.slabs(row, column)
+    def weights(self, frame: FloatArray, pattern: tuple[int, int]) -> FloatArray:
+        """What a ``frame`` (m, m') of a ``pattern``, as the solver takes it, adds to W at its :meth:`places`."""
+        left, right = self.slabs(pattern)
         return np.asarray(left.matrix.T @ frame @ right.matrix)
 
     @property
