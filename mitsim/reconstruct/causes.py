@@ -17,7 +17,7 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.runs import Measurement
-from mitsim.reconstruct.detail import LitFrame, blocks_of, orthonormal, print_part, slope_of
+from mitsim.reconstruct.detail import LitFrame, block_indices, factor_slope, orthonormal, print_part
 from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.sides import IndexArray, group_pixels
@@ -205,12 +205,12 @@ class Evidence:
 
     @cached_property
     def _lit_frames(self) -> list[LitFrame]:
-        slopes = [slope_of(side, spline=True) for side in self._factors]
+        slopes = [factor_slope(side, spline=True) for side in self._factors]
         frames = []
         for groups, frame, variance in zip(self._groups, self._frames, self._variances, strict=True):
             rows, columns = (group.pixels for group in groups)
             lit = self._factors[0][:, rows], self._factors[1][:, columns]
-            blocks = blocks_of(rows, self._factors[0].shape[1]), blocks_of(columns, self._factors[1].shape[1])
+            blocks = block_indices(rows, self._factors[0].shape[1]), block_indices(columns, self._factors[1].shape[1])
             frames.append(LitFrame(frame, variance, lit, (slopes[0][:, rows], slopes[1][:, columns]), blocks))
         return frames
 

@@ -209,7 +209,7 @@ def conjugate_gradients(
     watch
         called with the image after each step; where it says True, that was the last.
     """
-    lam = checked_lambda(lam)
+    lam = check_lambda(lam)
     image, left = np.zeros_like(target), target.copy()
     size = float(np.linalg.norm(target))
     turned = inverse(left) if inverse else left
@@ -235,7 +235,7 @@ def conjugate_gradients(
     return Solution(image, lam, residual, status, iterations=spent)
 
 
-def checked_lambda(lam: float) -> float:
+def check_lambda(lam: float) -> float:
     """``lam``; MitsimError where it is no finite number of at least 0."""
     if not (np.isfinite(lam) and lam >= 0):
         raise MitsimError(f"lambda is {lam}; give a finite number of at least 0")

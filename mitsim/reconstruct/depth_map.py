@@ -24,9 +24,9 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture, Measurement
-from mitsim.reconstruct.depth import AllDepths, Alternative, best_depth, by_chance, searched
+from mitsim.reconstruct.depth import Alternative, CommonBasis, best_depth, chance_difference, shifts_searched
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import STEP, dotted, pixels_of_parallax, stated_parallax, unambiguous
+from mitsim.reconstruct.focus import STEP, are_dots, parallax_of, pixels_of_parallax, unambiguous_parallax
 from mitsim.reconstruct.misfit import Balance, Misfit
 from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.solver import prepare
@@ -177,8 +177,8 @@ class _Search:
 
     def __init__(self, shots: Capture, factors: Factors, depth_range: tuple[float, float] | None) -> None:
         # Of a flat scene far from the calibrated depth dots of any period tell the rest.
-        self._ends = searched(factors, depth_range)
-        inverse = 1 / stated_parallax(factors).depth_mm
+        self._ends = shifts_searched(factors, depth_range)
+        inverse = 1 / parallax_of(factors).depth_mm
         self._plane = best_depth(shots, factors, (1 / (inverse + self._ends[1]), 1 / (inverse + self._ends[0])))
         self._middle = (self._ends[0] + self._ends[1]) / 2
         # A start, so in doubt any of several depths will do; but an end of the range is the depth of nothing.
@@ -227,7 +227,7 @@ class _Search:
         variance, unknowns = self._pixels.variance(found), 2 * shift.size
         less = found.left_over - self._left_over(np.zeros(shift.shape))
         # Of a sheet at the calibrated depth either may leave more.
-        if not told.any() or less > by_chance(less, variance, unknowns):
+        if not told.any() or less > chance_difference(less, variance, unknowns):
             return "Depths by pixel explain no more of the measurements than the calibrated one, which the image is of."
         span = float(np.ptp(np.percentile(shift[told], (1, 99))))
         astray = max(
@@ -241,7 +241,7 @@ class _Search:
                 "the calibrated one. Use dots of a longer period along the baseline, such as dots:7x16."
             )
         ties = [(other.mm, other.difference**2 * self._all.energy) for other in self._plane.alternatives]
-        others = [f"{mm:.1f}" for mm, more in ties if more < by_chance(more, variance, unknowns)]
+        others = [f"{mm:.1f}" for mm, more in ties if more < chance_difference(more, variance, unknowns)]
         if others:
             return (
                 f"Depths may be off by a whole period of the dots: {self._plane.mm:.1f} or {' or '.join(others)} mm "
@@ -317,7 +317,7 @@ class PixelDepths:
         between them.
     """
 
-    def __init__(self, depths: AllDepths, limit: float, step: float) -> None:
+    def __init__(self, depths: CommonBasis, limit: float, step: float) -> None:
         self._all = depths
         self._shifts = np.linspace(-limit, limit, max(2 * int(np.ceil(limit / step)) + 1, len(_CUBIC)))
         self._tables = [np.stack([depths.side(axis, shift).T for shift in self._shifts], axis=1) for axis in (0, 1)]
@@ -470,7 +470,7 @@ class Arrivals:
 
     def __init__(self, shots: Capture, factors: Factors, ends: tuple[float, float], beside: float) -> None:
         self._classes = [_classes(patterns) for patterns in shots.patterns]
-        parallax, counts = stated_parallax(factors), (factors.left.shape[1], factors.right.shape[1])
+        parallax, counts = parallax_of(factors), (factors.left.shape[1], factors.right.shape[1])
         self._span = ends[1] - ends[0]
         moves = [max(map(abs, pixels_of_parallax(parallax, axis, count)[:2])) for axis, count in enumerate(counts)]
         self._open = [move * self._span > _LEAST_PARALLAX for move in moves]
@@ -481,9 +481,11 @@ class Arrivals:
             )
         self.pixel = 1 / max(moves)
         periods = [own.shape[1] for own in shots.patterns]
-        self.width = min(self._span, unambiguous(np.where(self._open, moves, 0.0) * self.pixel, periods) * self.pixel)
+        self.width = min(
+            self._span, unambiguous_parallax(np.where(self._open, moves, 0.0) * self.pixel, periods) * self.pixel
+        )
         self.reach = beside + self.width / 2 + (max(OFFSETS) + _BESIDE_LARGEST) * self.pixel
-        self.depths = AllDepths(shots, factors, (-self.reach, self.reach))
+        self.depths = CommonBasis(shots, factors, (-self.reach, self.reach))
         self._margin = int(np.ceil(self.reach / self.pixel)) + 1
 
     @property
@@ -560,6 +562,6 @@ class Arrivals:
 
 def _classes(patterns: FloatArray) -> np.ndarray:
     """(n,) which of the (n, K) ``patterns`` lights each pixel; MitsimError where it is not one of them, as of dots."""
-    if not dotted(patterns):
+    if not are_dots(patterns):
         raise MitsimError("focus map: needs shifting dots, such as dots:7x16, whose displacement tells depth")
     return np.asarray(patterns.argmax(axis=1))

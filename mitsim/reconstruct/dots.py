@@ -32,7 +32,7 @@ from scipy import fft, linalg
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads, single_threaded_blas
-from mitsim.reconstruct.convolution import ConvolutionalCamera, Operator, checked_lambda, conjugate_gradients
+from mitsim.reconstruct.convolution import ConvolutionalCamera, Operator, check_lambda, conjugate_gradients
 from mitsim.reconstruct.solver import Prepared
 from mitsim.reconstruct.status import Solution, Status, Verdict
 
@@ -70,7 +70,7 @@ class Classes:
     def divided(self, frames: Iterable[FloatArray], lam: float) -> FloatArray:
         """(n, n) image by one division, of ``frames`` at ``lam``: the Tikhonov image of a plane without a dark
         surround, exact for the whole light."""
-        weight = 1 / (self._power + checked_lambda(lam))
+        weight = 1 / (self._power + check_lambda(lam))
         return self._interleaved(spectrum * weight for spectrum in self._folded(frames))
 
     def factorise(self, lam: float) -> FactorisedClasses:
@@ -78,7 +78,7 @@ class Classes:
 
         MitsimError for another lambda, or where a class is too ill-conditioned for it.
         """
-        lam = checked_lambda(lam)
+        lam = check_lambda(lam)
         if not self.factorised:
             return FactorisedClasses(self, lam, None)
         grams = self._grams.reshape(self.k**2, self._side**2, self._side**2)

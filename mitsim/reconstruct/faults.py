@@ -56,7 +56,7 @@ class FrameFault:
         }
 
 
-def listed(numbers: tuple[int, ...], files: tuple[str, ...]) -> str:
+def frame_list(numbers: tuple[int, ...], files: tuple[str, ...]) -> str:
     """Frames by their ``numbers`` and ``files``, the first few."""
     shown = ", ".join(f"{number} ({file})" for number, file in zip(numbers[:4], files[:4], strict=True))
     more = f" and {len(numbers) - 4} more" if len(numbers) > 4 else ""
@@ -177,7 +177,7 @@ def frame_words(half: Half) -> str:
     return f"{side} stripes {index} of sign {sign:+d}" if sign != UNIFORM else f"{side} stripes {index}"
 
 
-def dimmed(part: float) -> tuple[str, str]:
+def name_by_light(part: float) -> tuple[str, str]:
     """Kind and words of a frame with a ``part`` of its light."""
     kind = "dim" if part < 1 else "bright"
     return kind, f"is {kind}: it has {part:.3g} of its light"

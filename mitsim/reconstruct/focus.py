@@ -47,7 +47,7 @@ LEAST_PART = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Focused:
+class MovedFactors:
     """``factors`` of a depth, on the sensor's ``rows`` and ``columns`` where these are known; ``sensor`` is the whole's
     shape, and ``hidden`` the part of the scene's pixels that the field stop takes most of the light of."""
 
@@ -62,13 +62,13 @@ class Focused:
         return _Part(shots, self)
 
 
-def focused(factors: Factors, depth_mm: float) -> Focused:
+def move_factors(factors: Factors, depth_mm: float) -> MovedFactors:
     """The factors of a surface at ``depth_mm`` from the sensor, from calibrated ``factors``.
 
     ArgumentError for a depth where too little of them is known, MitsimError for a calibration that does not state its
     parallax.
     """
-    parallax = stated_parallax(factors)
+    parallax = parallax_of(factors)
     if not (np.isfinite(depth_mm) and depth_mm > parallax.mask_distance_mm):
         raise ArgumentError(
             "focus", f"{depth_mm:g}: give a depth above {parallax.mask_distance_mm:g} mm, where the mask is"
@@ -77,7 +77,7 @@ def focused(factors: Factors, depth_mm: float) -> Focused:
     if shift == 0:
         # The calibration's own, to the last bit.
         shape = len(factors.left), len(factors.right)
-        return Focused(replace(factors, lacking=()), slice(0, shape[0]), slice(0, shape[1]), shape)
+        return MovedFactors(replace(factors, lacking=()), slice(0, shape[0]), slice(0, shape[1]), shape)
     sides = [FactorOfDepths(side, parallax, axis) for axis, side in enumerate((factors.left, factors.right))]
     (left, rows), (right, columns) = (side.at(shift) for side in sides)
     for known, size in ((rows, len(factors.left)), (columns, len(factors.right))):
@@ -95,10 +95,10 @@ def focused(factors: Factors, depth_mm: float) -> Focused:
         manifest = manifest.model_copy(update={"noise": noise.model_copy(update=less)})
     moved = replace(factors, left=left[rows], right=right[columns], manifest=manifest, lacking=())
     seen = [float((side.hidden(shift) < _HIDDEN).mean()) for side in sides]
-    return Focused(moved, rows, columns, (len(factors.left), len(factors.right)), 1 - seen[0] * seen[1])
+    return MovedFactors(moved, rows, columns, (len(factors.left), len(factors.right)), 1 - seen[0] * seen[1])
 
 
-def stated_parallax(factors: Factors) -> Parallax:
+def parallax_of(factors: Factors) -> Parallax:
     """How ``factors`` move with depth; MitsimError where their calibration does not state it."""
     parallax = check_parallax(factors.manifest.parallax, factors.name)
     if min(factors.left.shape[1], factors.right.shape[1]) < _NEIGHBOURS:
@@ -301,7 +301,7 @@ def _cubic(factor: FloatArray, row: npt.NDArray[np.intp], column: FloatArray) ->
 class _Part(Capture):
     """What a part of the sensor saw of a capture."""
 
-    def __init__(self, whole: Capture, part: Focused) -> None:
+    def __init__(self, whole: Capture, part: MovedFactors) -> None:
         super().__init__(whole.manifest, whole.folder)
         self._whole, self._seen = whole, part
 
@@ -334,19 +334,19 @@ def parallax_period(patterns: tuple[FloatArray, FloatArray], parallax: Parallax)
     """
     ends = [pixels_of_parallax(parallax, axis, len(lit))[:2] for axis, lit in enumerate(patterns)]
     moves = np.array([max(map(abs, each)) for each in ends])
-    if not (moves.any() and all(dotted(lit) for lit in patterns)):
+    if not (moves.any() and all(are_dots(lit) for lit in patterns)):
         return np.inf
     pixel = 1 / moves.max()
-    return float(unambiguous(moves * pixel, [lit.shape[1] for lit in patterns]) * pixel)
+    return float(unambiguous_parallax(moves * pixel, [lit.shape[1] for lit in patterns]) * pixel)
 
 
-def dotted(patterns: FloatArray) -> bool:
+def are_dots(patterns: FloatArray) -> bool:
     """Whether each pixel is lit by one of the (n, K) ``patterns``, as dots light it."""
     values = np.sort(patterns, axis=1)
     return not values[:, :-1].any() and bool((values[:, -1] == 1).all())
 
 
-def unambiguous(moves: FloatArray, periods: list[int]) -> float:
+def unambiguous_parallax(moves: FloatArray, periods: list[int]) -> float:
     """Projector pixels of parallax by which light moves onto the place of another dot's of the same frame.
 
     Parameters

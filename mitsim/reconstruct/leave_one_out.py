@@ -15,7 +15,7 @@ from scipy.ndimage import uniform_filter
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.manifests import RunManifest
 from mitsim.core.runs import Measurement
-from mitsim.reconstruct.faults import Fault, FrameFault, listed
+from mitsim.reconstruct.faults import Fault, FrameFault, frame_list
 from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.sides import group_pixels
 from mitsim.reconstruct.solver import Prepared
@@ -142,7 +142,7 @@ class LeaveOneOut:
 
     def _seen(self, image: FloatArray) -> FloatArray:
         """W of an ``image`` without noise."""
-        return np.asarray(self.sigma * (self.prepared.left.seeing.T @ image @ self.prepared.right.seeing))
+        return np.asarray(self.sigma * (self.prepared.left.duals.T @ image @ self.prepared.right.duals))
 
     def lit(self, good: BoolArray) -> BoolArray:
         """(n, n') pixels that a ``good`` pattern lights."""
@@ -246,4 +246,4 @@ class LeaveOneOut:
         """
         numbers = tuple(sorted(numbers))
         files = tuple(self.shots[number].file for number in numbers)
-        return FrameFault(fault, numbers, files, f"{listed(numbers, files)} {words}")
+        return FrameFault(fault, numbers, files, f"{frame_list(numbers, files)} {words}")

@@ -304,7 +304,7 @@ class Residuals:
         return np.asarray(np.add.reduceat(rows, self._starts, axis=1))
 
 
-def judge(
+def find_misfit(
     check: FrameCheck, factor_energy: float | None, print_energy: float, evidence: Evidence, with_defects: bool = True
 ) -> Misfit | None:
     """Hold all measurements against the model; None where there are no more data than unknowns.
@@ -371,7 +371,7 @@ def faulty_frames(check: FrameCheck, beside_noise: float, evidence: Evidence) ->
     Parameters
     ----------
     check, evidence
-        as :func:`judge` takes them.
+        as :func:`find_misfit` takes them.
     beside_noise
         as :meth:`FrameCheck.faults` takes it.
     """

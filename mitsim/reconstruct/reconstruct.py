@@ -22,12 +22,12 @@ from mitsim.reconstruct.depth_map import DepthMap, depth_map
 from mitsim.reconstruct.detail import Model, print_energy
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.faults import FrameFault
-from mitsim.reconstruct.focus import focused
+from mitsim.reconstruct.focus import move_factors
 from mitsim.reconstruct.frame_check import FrameCheck
 from mitsim.reconstruct.margin import Margin
-from mitsim.reconstruct.misfit import Lack, Misfit, faulty_frames, judge
+from mitsim.reconstruct.misfit import Lack, Misfit, faulty_frames, find_misfit
 from mitsim.reconstruct.noise import FrameNoise, factor_energy
-from mitsim.reconstruct.request import BYTES_A_NUMBER, ImageRequest, is_kept, predicted, slab_numbers
+from mitsim.reconstruct.request import BYTES_A_NUMBER, ImageRequest, keeps_frames, predict_cost, slab_numbers
 from mitsim.reconstruct.result import Reconstruction
 from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.reconstruct.solvers import SOLVERS, TIKHONOV, SeparableSolver
@@ -97,7 +97,7 @@ def reconstruct(
         wider = beside.factors(factors)
         shots, factors = beside.of(wider.of(shots)), wider.factors
     # Depths that are looked for, and total variation, take as long as the data ask for.
-    cost = predicted(shots, factors) if method == TIKHONOV and not request.looks_for_depth else None
+    cost = predict_cost(shots, factors) if method == TIKHONOV and not request.looks_for_depth else None
     _check_factorising(shots, factors, solver)
     if cost:
         Cost(sum(cost.seconds.values()), cost.memory_bytes).check(f"{shots.name}: its image", Limits())
@@ -106,12 +106,12 @@ def reconstruct(
     doubts = [depth.doubt] if depth else []
     found = time.perf_counter()
     if isinstance(depth, Depth):
-        of_depth = focused(factors, depth.mm)
+        of_depth = move_factors(factors, depth.mm)
         shots, factors = of_depth.of(shots), of_depth.factors
         if of_depth.hidden:
             hidden = f"{of_depth.hidden:.1%} of the scene's pixels, which come out dark"
             doubts.append(f"At {depth.mm:.4g} mm the field stop takes most of the light of {hidden}.")
-    data = accumulated(shots, factors, method)
+    data = accumulate(shots, factors, method)
     added = time.perf_counter()
     by_pixel = depth if isinstance(depth, DepthMap) and not depth.doubt else None
     solution = by_pixel.solution if by_pixel else data.solution(lam)
@@ -167,7 +167,7 @@ def reconstruct(
 
 
 @dataclass(frozen=True, eq=False)
-class Accumulated:
+class Accumulation:
     """A run's frames added up.
 
     Attributes
@@ -232,15 +232,15 @@ class Accumulated:
         lam = solution.lam if self.solver.linear else _LAMBDA_BESIDE * self.prepared.problem(self.frames).scale
         evidence = Evidence(self.factors, self.shots.patterns, lack.energy if lack else None)
         of_factors = self._factor_energy(image)
-        return judge(self._check(lam), of_factors, print_energy(self.model, image), evidence, with_defects)
+        return find_misfit(self._check(lam), of_factors, print_energy(self.model, image), evidence, with_defects)
 
     def misfit_at(self, depths: DepthMap) -> Misfit:
         """The same of an image with a depth for each pixel."""
         of_factors = self._factor_energy(depths.image)
         misfit = depths.misfit(self.noise, of_factors, print_energy(self.model, depths.image))
         # At the depth of most of the scene a frame that is not what it says is off by more than depth puts it.
-        most = focused(self.factors, float(np.median(depths.mm)))
-        faults = accumulated(most.of(self.shots), most.factors)._faulty_frames(depths)
+        most = move_factors(self.factors, float(np.median(depths.mm)))
+        faults = accumulate(most.of(self.shots), most.factors)._faulty_frames(depths)
         return replace(misfit, flagged=True, cause=Cause.FRAMES, faults=faults) if faults else misfit
 
     def _faulty_frames(self, depths: DepthMap) -> tuple[FrameFault, ...]:
@@ -273,14 +273,14 @@ class Accumulated:
 
 
 def _without_defects(
-    data: Accumulated, lam: float | Literal["auto"], misfit: Misfit
-) -> tuple[Accumulated, Solution, Misfit | None]:
+    data: Accumulation, lam: float | Literal["auto"], misfit: Misfit
+) -> tuple[Accumulation, Solution, Misfit | None]:
     """Sums without the readings of defective pixels, their solution at ``lam`` and misfit; all as it was where the
     frames fit no better so. ``misfit`` is that of ``data``, with the first defects."""
 
-    def left_out(defects: Defects) -> tuple[LeftOut, Accumulated, Solution]:
+    def left_out(defects: Defects) -> tuple[LeftOut, Accumulation, Solution]:
         rest = defects.left_out(data.shots, data.measured, data.prepared, data.weights)
-        without = accumulated(rest, data.factors, data.method)
+        without = accumulate(rest, data.factors, data.method)
         return rest, without, without.solution(lam)
 
     found, now, without = None, misfit, data
@@ -303,7 +303,7 @@ def _without_defects(
     return without, solution, replace(now, defects=found)
 
 
-def accumulated(shots: Capture, factors: Factors, method: str = TIKHONOV) -> Accumulated:
+def accumulate(shots: Capture, factors: Factors, method: str = TIKHONOV) -> Accumulation:
     """The model of shots and factors factorised, and every frame added.
 
     Parameters
@@ -323,14 +323,14 @@ def accumulated(shots: Capture, factors: Factors, method: str = TIKHONOV) -> Acc
     prepared = solver.init(factors, shots.patterns)
     noise = FrameNoise(shots.manifest, _ambient_noise(shots))
     frames, kept = prepared.accumulator(), list[Measurement]()
-    few = is_kept(shots, factors)
+    few = keeps_frames(shots, factors)
     for measurement in shots.measured((len(factors.left), len(factors.right))):
         frames.add(measurement.frame, measurement.row, measurement.column)
         noise.add(measurement)
         if few:
             kept.append(measurement)
     model = Model(prepared, factors.sides, shots.patterns)
-    return Accumulated(shots, factors, method, model, frames, noise, tuple(kept))
+    return Accumulation(shots, factors, method, model, frames, noise, tuple(kept))
 
 
 def _check_factorising(shots: Capture, factors: Factors, solver: SeparableSolver) -> None:

@@ -18,7 +18,7 @@ from mitsim.core.pictures import card, png, scaled, span
 from mitsim.reconstruct.depth import Depth
 from mitsim.reconstruct.depth_map import DepthMap
 from mitsim.reconstruct.misfit import Misfit
-from mitsim.reconstruct.request import IMAGE_FILE, Predicted
+from mitsim.reconstruct.request import IMAGE_FILE, ImageCost
 from mitsim.reconstruct.status import Status
 from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Uncertainty
 
@@ -81,7 +81,7 @@ class Reconstruction:
     seconds: dict[str, float]
     inputs: dict[str, Any]
     focus: Depth | DepthMap | None = None
-    predicted: Predicted | None = None
+    predicted: ImageCost | None = None
     objective: float | None = None
     relative_gap: float | None = None
 

@@ -14,7 +14,7 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.session import Half
-from mitsim.reconstruct.faults import DARK, Lamp, dimmed, frame_words, robust_scatter
+from mitsim.reconstruct.faults import DARK, Lamp, frame_words, name_by_light, robust_scatter
 from mitsim.reconstruct.session_lamp import MATTERS, end_to_end, flickers, trend_of
 from mitsim.reconstruct.session_side import MOST_FAULTS, SideCheck
 
@@ -368,7 +368,7 @@ class Pairs:
         even = (np.ptp(own) < DARK * 2 * np.ptp(other) + 12 for own, other in zip(shown, expected, strict=True))
         if flux < DARK and all(even):
             return _Fault(1.0, "black", "is black")
-        tried = [_Fault(float(np.square(seen - part * told).mean()), *dimmed(part))]
+        tried = [_Fault(float(np.square(seen - part * told).mean()), *name_by_light(part))]
         tried += [*_lost(shown, expected), *self._repeats(frame, shown), *_shifted(frame.number, shown, expected)]
         best = min(tried, key=lambda fault: fault.rest)
         if best.rest > max(_FITS, _EXPLAINED * float(np.square(seen - told).mean())):

@@ -18,7 +18,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices import session
 from mitsim.devices.session import SIDES, UNIFORM, Half
 from mitsim.reconstruct.estimate_factors import StripeSums
-from mitsim.reconstruct.faults import DARK, SessionFault, dimmed, frame_words, robust_scatter
+from mitsim.reconstruct.faults import DARK, SessionFault, frame_words, name_by_light, robust_scatter
 from mitsim.reconstruct.moving_shadow import MovingShadow
 
 MOST_FAULTS = 0.1
@@ -285,7 +285,7 @@ class SideCheck:
         part = float(light[index])
         self.change(index, (self.vectors[:, index] + uniform) / part - uniform)
         self.extras[index] = self.errors[index] + max(1 / part**2 - 1, 0.0) * self.noise
-        self.add(index, *dimmed(part), "its numbers are divided by that")
+        self.add(index, *name_by_light(part), "its numbers are divided by that")
         return True
 
     def _repeated(self, index: int) -> tuple[str, str, Half] | None:

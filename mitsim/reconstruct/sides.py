@@ -95,10 +95,10 @@ class Side:
     @cached_property
     def response(self) -> FloatArray:
         """B^T U (n, r): what the coefficients see of light of each scene pixel."""
-        return _frozen(self.seeing * self.singular)
+        return _frozen(self.duals * self.singular)
 
     @property
-    def seeing(self) -> FloatArray:
+    def duals(self) -> FloatArray:
         """V' (n, r) of B = U S V'^T."""
         return self.basis if self.dual is None else self.dual
 

@@ -19,8 +19,8 @@ from mitsim.core.runs import Capture, RunMemory, frame_name, load_run
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.convolution import ConvolutionalCamera
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.reconstruct import accumulated, reconstruct
-from mitsim.reconstruct.request import Predicted, predicted
+from mitsim.reconstruct.reconstruct import accumulate, reconstruct
+from mitsim.reconstruct.request import ImageCost, predict_cost
 from mitsim.reconstruct.result import may_replace
 from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.reconstruct.solvers import SOLVERS, Convolutional, Tikhonov
@@ -163,7 +163,7 @@ def test_the_time_of_both_parts_is_stated(shots: Capture, factors: Factors) -> N
 def test_what_an_image_takes_is_predicted_where_that_can_be_told(shots: Capture, factors: Factors) -> None:
     """By the stages that it states; every shot is read, and held against the model. (Planted: half of the shots.)"""
     image = reconstruct(shots, factors)
-    assert image.predicted == predicted(shots, factors) and image.predicted is not None
+    assert image.predicted == predict_cost(shots, factors) and image.predicted is not None
     assert image.predicted.seconds.keys() == image.seconds.keys()
     summary = image.summary()
     assert summary["predicted_seconds"] == sum(summary["predicted"].values()) > 0
@@ -175,14 +175,14 @@ def test_large_sensors_are_predicted_to_be_read_twice() -> None:
     """16 times the pixels take 16 times as long, and once more for frames that are not kept; memory grows with a frame,
     not with their number. (Planted: one look at frames that are not kept.)"""
 
-    def told(pixels: int, dots: int) -> Predicted:
+    def told(pixels: int, dots: int) -> ImageCost:
         family = parse_patterns(f"dots:{dots}", 128)
         captures = [None] * dots**2
         shots = SimpleNamespace(
             patterns=(family.left, family.right), manifest=SimpleNamespace(patterns=SimpleNamespace(captures=captures))
         )
         side = np.zeros((pixels, 128))
-        return predicted(shots, SimpleNamespace(left=side, right=side))  # type: ignore[arg-type]
+        return predict_cost(shots, SimpleNamespace(left=side, right=side))  # type: ignore[arg-type]
 
     small, large, many = told(512, 7), told(2048, 7), told(2048, 32)
     assert 10 < large.seconds["accumulate"] / small.seconds["accumulate"] <= 16
@@ -196,7 +196,7 @@ def test_dots_may_have_a_period_for_each_axis(tmp_path: Path) -> None:
     shots, factors = ideal_sessions.bench().run("dots:2x6", picture(), 0), ideal_sessions.bench().calibrated(0)
     again = load_run(shots.save(tmp_path / "run"))
     assert len(again.manifest.patterns.captures) == 12 and again.manifest.patterns.family == "dots:2x6"
-    prepared = accumulated(again, factors).prepared
+    prepared = accumulate(again, factors).prepared
     assert (prepared.left.n_blocks, prepared.right.n_blocks) == (2, 6)
     image = reconstruct(again, factors)
     assert image.ok and np.abs(image.image - picture()).max() < 0.1  # 0.02 of noise; 0.4 with the periods exchanged
@@ -208,7 +208,7 @@ def test_the_memory_that_is_asked_for_holds_the_factorised_model(
     """At least what the slabs and bases take, at most thirty times as much (of so few numbers)."""
     asked: list[float] = []
     monkeypatch.setattr(Cost, "check", lambda self, *_: asked.append(self.memory_bytes))
-    prepared = accumulated(shots, factors).prepared
+    prepared = accumulate(shots, factors).prepared
     sides = prepared.left, prepared.right
     held = sum(side.basis.nbytes + sum(slab.matrix.nbytes for slab in side.slabs) for side in sides)
     assert len(asked) == 1 and held <= asked[0] <= 30 * held
@@ -221,11 +221,11 @@ def test_the_noise_of_the_ambient_frame_is_that_of_rows_and_of_columns(
     variance = np.random.default_rng(0).random((PIXELS, PIXELS))
     ambient = SimpleNamespace(variance=variance, rate=np.zeros((PIXELS, PIXELS)))
     monkeypatch.setattr(Capture, "ambient", ambient)
-    assert accumulated(shots, factors).noise.ambient is None
+    assert accumulate(shots, factors).noise.ambient is None
     patterns = shots.manifest.patterns
     halves = tuple(shot.model_copy(update={"sign": 0}) for shot in patterns.captures if shot.sign >= 0)
     manifest = shots.manifest.model_copy(update={"patterns": patterns.model_copy(update={"captures": halves})})
-    by_row, by_column = accumulated(Capture(manifest, memory=shots._memory), factors).noise.ambient
+    by_row, by_column = accumulate(Capture(manifest, memory=shots._memory), factors).noise.ambient
     assert by_row == pytest.approx(variance.mean(axis=1)) and by_column == pytest.approx(variance.mean(axis=0))
 
 
