@@ -16,6 +16,7 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import Capture, Measurement
 from mitsim.reconstruct.causes import Cause, Evidence
+from mitsim.reconstruct.cost import BYTES_A_NUMBER, keeps_frames, predict_cost, slab_numbers
 from mitsim.reconstruct.defects import Defects, LeftOut
 from mitsim.reconstruct.depth import Depth, best_depth
 from mitsim.reconstruct.depth_map import DepthMap, depth_map
@@ -27,10 +28,10 @@ from mitsim.reconstruct.frame_check import FrameCheck
 from mitsim.reconstruct.margin import Margin
 from mitsim.reconstruct.misfit import Lack, Misfit, faulty_frames, find_misfit
 from mitsim.reconstruct.noise import FrameNoise, factor_energy
-from mitsim.reconstruct.request import BYTES_A_NUMBER, ImageRequest, keeps_frames, predict_cost, slab_numbers
+from mitsim.reconstruct.request import TIKHONOV, ImageRequest
 from mitsim.reconstruct.result import Reconstruction
 from mitsim.reconstruct.solver import Accumulator, Prepared
-from mitsim.reconstruct.solvers import SOLVERS, TIKHONOV, SeparableSolver
+from mitsim.reconstruct.solvers import SOLVERS, SeparableSolver
 from mitsim.reconstruct.status import Solution, Verdict
 from mitsim.reconstruct.uncertainty import Propagation, Uncertainty, uncertainty
 

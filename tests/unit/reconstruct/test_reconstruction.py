@@ -17,10 +17,11 @@ from mitsim.core.manifests import CalibrationManifest, Digital, Patterns, RunHea
 from mitsim.core.resources import Cost
 from mitsim.core.runs import Capture, RunMemory, frame_name, load_run
 from mitsim.devices.patterns import parse_patterns
+from mitsim.reconstruct import request
 from mitsim.reconstruct.convolution import ConvolutionalCamera
+from mitsim.reconstruct.cost import ImageCost, predict_cost
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import accumulate, reconstruct
-from mitsim.reconstruct.request import ImageCost, predict_cost
 from mitsim.reconstruct.result import may_replace
 from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.reconstruct.solvers import SOLVERS, Convolutional, Tikhonov
@@ -93,12 +94,13 @@ class NonNegative(Tikhonov):
         return Solution(image, 0.0, float(residual / np.sqrt(problem.energy)), status, iterations=spent)
 
 
-def test_a_further_solver_is_a_class_and_a_line(
+def test_a_further_solver_is_a_class_and_its_name(
     shots: Capture, factors: Factors, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Asked for by its name, judged for misfit, written and refused as all are. (Planted: its image replaced by the
     closed form's; uncertainties of an image that is not linear in the frames.)"""
     monkeypatch.setitem(SOLVERS, "nonnegative", NonNegative())
+    monkeypatch.setattr(request, "METHODS", (*request.METHODS, "nonnegative"))
     found = reconstruct(shots, factors, method="nonnegative")
     least = reconstruct(shots, factors, 0.0)
     assert str(found.status).startswith("Solved: no pixel is negative") and found.image.min() >= 0
