@@ -125,7 +125,15 @@ class Defects:
 
 
 class LeftOut(Capture):
-    """A capture whose readings at some pixels are ``moved``, by pattern."""
+    """A capture whose readings at some pixels are other ones.
+
+    Parameters
+    ----------
+    whole, measured
+        the capture, and what gives its measurements.
+    defects, moved
+        the pixels, and by pattern what is added to their readings.
+    """
 
     def __init__(
         self,

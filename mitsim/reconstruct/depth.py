@@ -6,6 +6,9 @@ neighbours' light: parallax by k pixels moves the image by as much, and all that
 edges and what the sensor's own width adds to parallax. So depths are tried in steps of a pixel of parallax, every
 valley that may be the lowest is followed to its bottom, and those that chance or the model's own misfit may have made
 lower are named beside the lowest.
+
+*The basis that depths share.* Columns of neighbouring depths are much alike: a few hundred vectors span all of them,
+and what of a frame lies outside is not explained at any depth. So frames are read once and kept small.
 """
 
 from __future__ import annotations

@@ -1,12 +1,20 @@
 """Shots under shifting dots and factors in; a depth for each projector pixel, and the image in focus everywhere, out.
 
-The start is where most light of each pixel arrives (:mod:`mitsim.reconstruct.arrivals`). Then the model is each pixel's
-own: columns of both factors at its own depth (:mod:`mitsim.reconstruct.depth_map`). It is linear in (X, X o d), d a
+The start is where most light of each pixel arrives (:class:`Arrivals`). Then the model is each pixel's own: columns of
+both factors at its own depth (:class:`PixelDepths`). It is linear in (X, X o d), d a
 change of 1/z, so each Gauss-Newton step, the d of neighbours pooled, is one closed-form solve for each frame. Last,
 single pixels beside an edge take the depth on its other side where that explains more. Steps end when they leave no
 less.
 
 A displacement by a whole period of the dots is the neighbour's: depths whose parallax spans more are not told.
+
+*Where light arrives.* Every frame is reconstructed at the calibrated depth as if all pixels along the baseline were
+lit, which shows where each dot's light arrives; dots a period apart do not meet as long as their parallax differs by
+less.
+
+*A depth for each pixel.* Of a frame under dots Y = sum_p X_p l_p(z_p) r_p(z_p)^T over its lit pixels p, with columns of
+both factors at the pixels' own depths. The normal matrix of a frame is (L^T L) o (R^T R), a number for each pair of lit
+pixels; frames of dots share no pixel, so they are solved one by one.
 """
 
 from __future__ import annotations

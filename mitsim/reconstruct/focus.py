@@ -11,6 +11,11 @@ left out, of frames and factors alike.
 What moves is the shadow, not the light: an image is light relative to the board's, pixel by pixel, so each pixel keeps
 the brightness that it had at z_0, while values are taken from columns that fall off more or less than its own. Sensor
 pixels that see one part of the mask in two columns tell how much.
+
+*Between columns.* Sensor row u + k sees in column i what row u sees at i + k s, s being the columns that one sensor
+pixel's step makes up for: the mask's shadow hangs on one coordinate. So each row has the numbers of its neighbours too,
+at places between its own, and a cubic spline with knots finer than columns is fitted to all of them: where a projector
+pixel is wide, a polynomial through columns alone misses the edges of the mask's features.
 """
 
 from __future__ import annotations

@@ -3,6 +3,9 @@
 A frame is suspected where it is off by more than noise, and by more than the other frames are: a scene that does not
 fit has all its frames off. It is named where one fault explains what it is off by. The halves of signed patterns add up
 to the same frame for all of them, which foretells each half by the other without any model.
+
+*Brightness under dots.* No pixel is in two frames, so that half of a frame's light fits as well; but dots:k are k^2
+samples of one picture.
 """
 
 from __future__ import annotations

@@ -4,6 +4,15 @@ Of data Y the model can explain what lies in its range, U_L W U_R^T, whatever th
 U_R^T hangs on no lambda. Its energy is held against what the sensor's stated noise, that of the calibrated factors and
 the error of simulated frames put there; what is more is *unexplained*: light that no flat, matt scene at the calibrated
 distance sends.
+
+*What factors lack.* A camera whose shadow is no single product, as of waves behind a FlatCam or MURA mask, adds sum_k
+L_k (P_ij o X) R_k^T to the frames that Phi_L (P_ij o X) Phi_R^T explains. With G_kl = L_k^T L_l and H_kl = R_l^T R_k
+its energy over all patterns is ::
+
+    sum_kl <X, (G_kl o P_L P_L^T) X (H_kl o P_R P_R^T)>
+
+of which |T|^2 lies in the model's range, T = sum_k (sum_i U_Li^T L_k diag(p_i)) X (sum_j U_Rj^T R_k diag(q_j))^T being
+what coefficients W take for image.
 """
 
 from __future__ import annotations
@@ -204,7 +213,7 @@ class Residuals:
 
     @classmethod
     def of(cls, check: FrameCheck, evidence: Evidence) -> Residuals:
-        """Of all measurements of a ``check``, which are read once more."""
+        """Of all measurements of a ``check``, which are read once more; ``evidence`` is empty."""
         sums = cls(check.prepared, check.weights, check.noise, evidence)
         for measurement in check.measured():
             sums.add(measurement)

@@ -3,6 +3,11 @@
 Each other reading is added up anew by the same factorised model: frames turned or mirrored, shots in another order,
 numbers without a tone curve (:mod:`mitsim.reconstruct.tonecurve`). U of the model is orthonormal, so that
 |Y|^2 - |W|^2 is what a reading leaves.
+
+*Tone curves.* Curves are compared by the likelihood of the numbers as they were read (Box and Cox, 1964): where light
+is g(y) of numbers y, -2 log L = n log s + sum log v - 2 sum log g'(y) but for a constant, with v the variance of noise
+in that light, and s what the model leaves in units of it. A curve counts that is likelier than none, and of which s is
+1 in the dark and in the light: numbers that are crushed to 0 fit any image, but with less noise than the sensor makes.
 """
 
 from __future__ import annotations

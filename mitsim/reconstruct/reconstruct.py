@@ -236,7 +236,7 @@ class Accumulation:
         return find_misfit(self._check(lam), of_factors, print_energy(self.model, image), evidence, with_defects)
 
     def misfit_at(self, depths: DepthMap) -> Misfit:
-        """The same of an image with a depth for each pixel."""
+        """The same of an image with a depth for each pixel, ``depths``."""
         of_factors = self._factor_energy(depths.image)
         misfit = depths.misfit(self.noise, of_factors, print_energy(self.model, depths.image))
         # At the depth of most of the scene a frame that is not what it says is off by more than depth puts it.

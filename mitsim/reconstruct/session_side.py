@@ -226,7 +226,15 @@ class SideCheck:
     def add(
         self, index: int, kind: str, detail: str, repair: str, other: Half | None = None, sign: int | None = None
     ) -> None:
-        """A fault of a pattern, of both frames of its pair or that of a ``sign``; its fields as it has them."""
+        """Note a fault.
+
+        Parameters
+        ----------
+        index, kind, detail, repair, other
+            as :class:`mitsim.reconstruct.faults.SessionFault` has them.
+        sign
+            of the frame of a pair that is at fault; None: both.
+        """
         sign = sign if self.pairs else 1
         self.faults.append(SessionFault(self.side, index, sign, kind, detail, repair, other))
 

@@ -19,6 +19,16 @@ of ending the SVD of a side, magnified by sigma_max max_ij sigma_ij / (sigma_ij^
 sqrt(lambda_rel)); for ``gram``, whose data carry sigma_max^2 eps, by sigma_max^2 / min_ij (sigma_ij^2 +
 lambda). That is relative to the image, for frames that the model explains; what it does not explain is
 magnified as noise, and by more.
+
+*Neighbours alike.* Tikhonov's lambda ||X||^2 says that every pixel is near black and knows nothing of the next one.
+Where the frames are noisy lambda then darkens the image, its large even parts too. Pictures are not so: with the
+covariance rho^|p - p'| along rows and along columns (a separable first-order Markov field; Jain, Fundamentals of
+Digital Image Processing, 1989, chapter 2) an even part of many pixels has many times the variance of a single pixel,
+and is kept.
+
+With C = F F^T on each side the image is X = F_L Z F_R^T, Z independent numbers, so that the penalty lambda ||Z||^2 is
+Tikhonov's of the model B F in the place of B = U S V^T. From the SVD S V^T F = U' S' V'^T follow U U', S', and the
+columns F V' that make an image of coefficients: all that was a closed form stays one.
 """
 
 from __future__ import annotations

@@ -41,7 +41,15 @@ class Tikhonov:
         return prepare(camera.left, camera.right, *patterns, centre=camera.manifest.centre)
 
     def compute(self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"]) -> Solution:
-        """The image at ``lam``; ``auto``: :func:`mitsim.reconstruct.regularisation.automatic_lambda`."""
+        """The image of ``frames``.
+
+        Parameters
+        ----------
+        prepared, frames
+            what :meth:`init` gives, and all frames, added up.
+        lam
+            lambda; ``auto``: :func:`mitsim.reconstruct.regularisation.automatic_lambda`.
+        """
         return prepared.solve(frames, lam)
 
 
@@ -61,7 +69,15 @@ class TotalVariation(Tikhonov):
     linear = False
 
     def compute(self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"]) -> Solution:
-        """The image at the weight ``lam``; ``auto``: :func:`mitsim.reconstruct.tv.automatic_weight`."""
+        """The image of ``frames``.
+
+        Parameters
+        ----------
+        prepared, frames
+            what :meth:`init` gives, and all frames, added up.
+        lam
+            weight; ``auto``: :func:`mitsim.reconstruct.tv.automatic_weight`.
+        """
         return solve_tv(prepared, frames, lam)
 
 
@@ -89,7 +105,15 @@ class Convolutional:
         frames: Iterable[FloatArray],
         lam: float | Literal["auto"],
     ) -> Solution:
-        """The image at ``lam``, of a frame of each pattern, row-major over (i, j). MitsimError for ``auto``."""
+        """The image of ``frames``.
+
+        Parameters
+        ----------
+        prepared, frames
+            what :meth:`init` gives, and a frame of each pattern, row-major over (i, j).
+        lam
+            lambda; MitsimError for ``auto``.
+        """
         if isinstance(lam, str):
             raise MitsimError(f"lambda is {lam!r}; give a finite number of at least 0")
         return solve_iteratively(*prepared, frames, lam, self.tolerance, self.iterations)

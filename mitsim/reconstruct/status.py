@@ -132,9 +132,17 @@ class Solver(Protocol[CameraT, PatternsT, PreparedT, FramesT]):
     linear: bool
 
     def init(self, camera: CameraT, patterns: PatternsT) -> PreparedT:
-        """What depends on the camera and the patterns alone; applying it changes nothing in it."""
+        """What depends on the ``camera`` and the ``patterns`` alone; applying it changes nothing in it."""
         ...
 
     def compute(self, prepared: PreparedT, frames: FramesT, lam: float | Literal["auto"]) -> Solution:
-        """The image of ``frames`` at ``lam``; what ``auto`` does is the solver's own."""
+        """The image of one scene.
+
+        Parameters
+        ----------
+        prepared, frames
+            what :meth:`init` gives, and frames of all patterns.
+        lam
+            lambda; what ``auto`` does is the solver's own.
+        """
         ...

@@ -20,8 +20,7 @@ from mitsim.core.seeds import stream
 from mitsim.devices.patterns import PatternFamily, parse_patterns
 from mitsim.devices.sensor import SensorModel
 from mitsim.metrics import psnr, relative_error
-from mitsim.reconstruct.convolution import ConvolutionalCamera, solve_iteratively
-from mitsim.reconstruct.dots import Classes, FactorisedClasses
+from mitsim.reconstruct.convolution import Classes, ConvolutionalCamera, FactorisedClasses, solve_iteratively
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.status import Solution
 from mitsim.report.exposures import CONVENTIONS, IdealCamera

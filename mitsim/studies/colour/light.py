@@ -30,9 +30,9 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.chart import ChartPlace
 from mitsim.devices.patterns import PatternFamily
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e
+from mitsim.reconstruct.request import MARKOV, TIKHONOV
 from mitsim.reconstruct.sides import Side
 from mitsim.reconstruct.solver import Prepared, prepare
-from mitsim.reconstruct.request import MARKOV, TIKHONOV
 from mitsim.report.charts import curves
 from mitsim.report.compare import label
 from mitsim.report.exposures import RENDERED
