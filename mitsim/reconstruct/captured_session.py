@@ -526,7 +526,7 @@ Chosen = npt.NDArray[np.bool_] | bool
 """Pixels (rows, columns) that are chosen, or all or none."""
 _ROOM = 5.0
 """Deviations of its noise that a uniform frame's pixel must stay below saturation: one of 3 million goes beyond."""
-_ladder_LIT = 0.5
+_STRIPES_LIGHT = 0.5
 """Light of stripes over that of the uniform frame, whose noise decides on the weights."""
 
 
@@ -566,7 +566,7 @@ class Ladder:
         usable = np.ones((len(digitals), *uniform.shape), dtype=bool)
         variance = np.empty(usable.shape)
         for rung, digital in enumerate(digitals):
-            variance[rung] = digital.variance(_ladder_LIT * light)
+            variance[rung] = digital.variance(_STRIPES_LIGHT * light)
             if rung and digital.saturation_dn is not None:
                 unit = digital.gain_dn_per_e * digital.exposure_s
                 brightest = uniform + digital.dark_current_e_per_s + _ROOM * np.sqrt(error + digital.variance(light))

@@ -103,7 +103,7 @@ class Signatures:
 
     ``rows``, ``columns``, ``everywhere``: explained by light of any scene row, of any column, of any pixel.
     ``gloss``: explained by factors that change over the sensor. ``common``: the same in every shot. ``saturated``: part
-    of the readings at the end of their range. ``mask``: foretold by what the calibration knows that its factors lack.
+    of the readings at the end of their range. ``mask``: predicted by what the calibration knows that its factors lack.
     ``detail``: light beside the centres of the lit pixels, but not because of depth; NaN where pixels of patterns
     overlap.
     """
@@ -127,14 +127,14 @@ class Evidence:
         of the model.
     patterns
         P_L (n, K) and P_R (n', K').
-    foretold
+    predicted
         energy that terms of the camera which the factors lack leave; None: not known.
     """
 
     def __init__(
-        self, factors: Factors, patterns: tuple[FloatArray, FloatArray], foretold: float | None = None
+        self, factors: Factors, patterns: tuple[FloatArray, FloatArray], predicted: float | None = None
     ) -> None:
-        self.foretold = foretold
+        self.predicted = predicted
         self._factors = factors.sides
         noise = factors.manifest.noise
         self.of_factors = noise.unexplained if noise else 0.0
@@ -194,7 +194,7 @@ class Evidence:
             ranges = own, (everything[0], own[1]), (own[0], everything[1]), everything, glossy
             left += [each.beyond(*pair) for pair in ranges]
         rows, columns, everywhere, gloss = 1 - left[1:] / left[0] if left[0] > 0 else np.full(4, np.nan)
-        mask = self.foretold / unexplained if self.foretold is not None and unexplained > 0 else np.nan
+        mask = self.predicted / unexplained if self.predicted is not None and unexplained > 0 else np.nan
         told = rows, columns, everywhere, gloss, common, saturated, mask, self.print_part()
         return Signatures(*(float(value) for value in told))
 

@@ -30,7 +30,7 @@ OFF = 7e-3
 _ALIKE = 1e-3
 """Square of the sine between sum and difference of a pair's halves, below which one of them is as good as black."""
 _SETTLED, _MOST_STEPS = 0.1, 100
-"""Of :data:`CHANCE`, the energy below which a step of foretelling changes nothing that counts; and the most steps,
+"""Of :data:`CHANCE`, the energy below which a step of predicting changes nothing that counts; and the most steps,
 which patterns that know nothing of each other do not need: chosen."""
 
 
@@ -93,7 +93,7 @@ class FrameSums:
 
 
 class LeaveOneOut:
-    """Foretells each frame of a run from its others.
+    """Predicts each frame of a run from its others.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ class LeaveOneOut:
         return rest
 
     def without(self, bad: tuple[Pattern, ...]) -> tuple[FloatArray, float]:
-        """W of all patterns, the ``bad`` ones as the others foretell them, and what it explains of these others'
+        """W of all patterns, the ``bad`` ones as the others predict them, and what it explains of these others'
         energy."""
         rest = self.rest(self.measurements(bad))
         image = self.image(self.weights)

@@ -1,4 +1,4 @@
-"""Sums of a session's pairs in; which are wrong, what their other frame foretells, and the lamp's power, out.
+"""Sums of a session's pairs in; which are wrong, what their other frame predicts, and the lamp's power, out.
 
 The two frames of a pair add up to one frame for all patterns, so that a frame which is black, dim, half lost, a repeat,
 shifted or clipped shows in the sum. What the sums share is the lamp's power, in the order of the session.
@@ -47,7 +47,7 @@ _FITS = 4.0
 """Mean squared deviation, in that of a good pair's sum, up to which a name fits."""
 _BOTH = 36.0
 """Squared deviation of a frame's light from the usual, in four times its robust scatter, that makes it no frame to
-foretell the other by."""
+predict the other by."""
 
 
 class _Frame(NamedTuple):
@@ -277,7 +277,7 @@ class Pairs:
     # ---- which frame of a pair is wrong
 
     def repair(self, lamp: Lamp) -> None:
-        """Name the faulty frames of wrong pairs, and put what their pairs foretell in the place of those; all that is
+        """Name the faulty frames of wrong pairs, and put what their pairs predict in the place of those; all that is
         right is divided by the power of the ``lamp`` where that is corrected for."""
         for place in np.flatnonzero(~self.good):
             self._repair(int(place // self.count), int(place % self.count), lamp)
@@ -295,7 +295,7 @@ class Pairs:
         return rows, columns, vector / np.sqrt(self.light_noise[number])
 
     def _expected(self, frame: _Frame) -> _Parts:
-        """What the other frame of its pair foretells of a frame."""
+        """What the other frame of its pair predicts of a frame."""
         number, more = frame.number, self._power(frame) - 1
         rows, columns, vector = self._shown(frame.other)
         both = (self.ambient_and_all + more * self.common) * (1 / np.sqrt(self.floor))

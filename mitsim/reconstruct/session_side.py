@@ -1,8 +1,8 @@
 """Vectors of one side's stripe patterns in; those that are out of their place put back, those that are wrong left out.
 
-What a pattern's vector should be, the others foretell, as all are of one moving shadow
+What a pattern's vector should be, the others predict, as all are of one moving shadow
 (:mod:`mitsim.reconstruct.moving_shadow`). Where that is a shadow of nothing, and columns are independent, nothing is
-foretold and nothing is found.
+predicted and nothing is found.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ of its amplitude."""
 _NOISY = 4.0
 """Robust scatter of misfits, over that by noise, up to which they are noise: of 60 good sides none has 1.5."""
 _FAR = 10.0
-"""Squared deviation of a vector from the foretold one, in that of the median pattern, from which it is suspected."""
+"""Squared deviation of a vector from the predicted one, in that of the median pattern, from which it is suspected."""
 _WRONG, _UNLIKE = 40.0, 0.1
 """The same, and that deviation as a part of the vector's own square, from which it is wrong whatever it shows: of 600
 good sides of 64 and 260 of 128 patterns none has more than 17 and 20 of such a part; nearly all that show other stripes
@@ -63,7 +63,7 @@ _SEEN = 64.0
 _FLOOR = 0.02
 """Relative error of a factor that its columns' covariance is taken to have at least, as it is no exact law; chosen."""
 _TURNS = 8
-"""Steps that foretell left-out patterns with a covariance free of them, which has their foretold variance in their
+"""Steps that predict left-out patterns with a covariance free of them, which has their predicted variance in their
 place; where another pattern of the same period is known, each step takes off half of the error."""
 
 
@@ -83,7 +83,7 @@ class SideCheck:
     uncounted
         responses whose misfit does not count.
     unknown
-        patterns whose vector the others must foretell.
+        patterns whose vector the others must predict.
     extras
         (N,) squared error of each vector beyond its noise.
     parts, errors
@@ -129,11 +129,11 @@ class SideCheck:
 
     @property
     def enough(self) -> bool:
-        """Whether columns are known well enough to foretell patterns."""
+        """Whether columns are known well enough to predict patterns."""
         return self.signs.shape[1] >= _ENOUGH[0] and self.length >= _ENOUGH[1]
 
     def far(self) -> npt.NDArray[np.bool_]:
-        """(N,) whether patterns are not what the others foretell, or left out."""
+        """(N,) whether patterns are not what the others predict, or left out."""
         shadow = MovingShadow(self.vectors, self.signs, self.unknown)
         far = (shadow.deviations > _WRONG) & (shadow.unlike > _UNLIKE)
         far[list(self.unknown)] = True
@@ -158,7 +158,7 @@ class SideCheck:
         )
 
     def check(self, unsteady: bool = False, name: Callable[[Half], str] = frame_words) -> None:
-        """Find patterns that show no stripes, are out of their place or are not what others foretell.
+        """Find patterns that show no stripes, are out of their place or are not what others predict.
 
         Parameters
         ----------
@@ -170,14 +170,12 @@ class SideCheck:
         self._check_misfits()
         count = self.signs.shape[1]
         if not self.enough:
-            for (
-                index
-            ) in self.unknown:  # nothing foretells them: their error is then their size, which the others' tells
+            for index in self.unknown:  # nothing predicts them: their error is then their size, which the others' tells
                 self.extras[index] = self._size(index)
                 self.change(index, np.zeros(self.length))
             return
         if self.unknown:
-            self._foretell_unknown()
+            self._predict_unknown()
         steady = self.pairs or not unsteady
         for _ in range(int(MOST_FAULTS * count) + 2):
             shadow = MovingShadow(self.vectors, self.signs, self.unknown)
@@ -201,7 +199,7 @@ class SideCheck:
             self._do_without(index, "wrong", f"is wrong: {detail}")
 
     def _do_without(self, index: int, kind: str, detail: str, other: Half | None = None) -> None:
-        """A pattern is left out, and what others foretell will come in its place."""
+        """A pattern is left out, and what others predict will come in its place."""
         self.add(index, kind, detail, "it is left out", other)
         self.unknown.add(index)
         self.uncounted.add(index)
@@ -348,31 +346,31 @@ class SideCheck:
         return False
 
     def _leave_out(self, index: int, kind: str, detail: str, other: Half | None = None) -> None:
-        """Put what the others foretell in place of a pattern."""
+        """Put what the others predict in place of a pattern."""
         self.faults = [fault for fault in self.faults if fault.index != index]
         self._do_without(index, kind, detail, other)
-        self._foretell_unknown()
+        self._predict_unknown()
 
-    # ---- what others foretell of a pattern ---------------------------------------------------------------------------
+    # ---- what others predict of a pattern ---------------------------------------------------------------------------
 
     def _size(self, index: int) -> float:
         """Mean squared length of the other patterns' vectors, but for the uniform one."""
         others = np.delete(self.vectors, [0, index], axis=1)
         return float(np.square(others).sum(axis=0).mean()) if others.size else 0.0
 
-    def _foretell_unknown(self) -> None:
-        """In place of patterns that are left out comes what others foretell, and the error of that counts.
+    def _predict_unknown(self) -> None:
+        """In place of patterns that are left out comes what others predict, and the error of that counts.
 
-        That is of columns as they are, as a moving shadow foretells nothing at the sensor's ends; where it does, what
+        That is of columns as they are, as a moving shadow predicts nothing at the sensor's ends; where it does, what
         both differ by is an error too: a period that no other pattern has is known by the motion alone.
         """
         for index in sorted(self.unknown):
-            self._foretell(index)
+            self._predict(index)
         amended = MovingShadow(self.vectors, self.signs, self.unknown).amended
         for index in self.unknown:
             self.extras[index] = min(max(self.extras[index], float(amended[index])), self._size(index))
 
-    def _foretell(self, index: int) -> None:
+    def _predict(self, index: int) -> None:
         """The same of one pattern."""
         self.change(index, np.zeros(self.length))
         variance = 0.0
