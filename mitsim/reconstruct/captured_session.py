@@ -96,9 +96,9 @@ def calibrate_frames(
         session, doubts = _with_camera(session, camera)
     _check_sizes(session)
     if output is None:
-        return _calibrated(session, job, doubts)
+        return _calibrate(session, job, doubts)
     with output_folder(output) as place:
-        factors = _calibrated(session, job, doubts)
+        factors = _calibrate(session, job, doubts)
         factors.write(place)
     return factors
 
@@ -138,7 +138,7 @@ def chosen_responses(session: SessionFrames, chosen: Iterable[tuple[Side, int]])
         yield rate, float(np.sqrt(variance))
 
 
-def _calibrated(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -> Factors:
+def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -> Factors:
     listed = session.listed
     readings = _Readings(session)
     estimate, noise, found = _estimate(readings, job)
@@ -330,9 +330,9 @@ class _Readings:
         side, index
             of the pattern.
         """
-        positive = self._merged((side, index, 1))
+        positive = self._merge((side, index, 1))
         if self.session.pairs:
-            negative = self._merged((side, index, -1))
+            negative = self._merge((side, index, -1))
             light = positive.rate + negative.rate
             return positive.rate - negative.rate, positive.ladder.variance(light, 2) / positive.shots, light
         uniform = self._uniform[side]
@@ -352,7 +352,7 @@ class _Readings:
 
     @cached_property
     def _uniform(self) -> dict[Side, _Reading]:
-        return {side: self._merged((side, 0, UNIFORM)) for side in SIDES}
+        return {side: self._merge((side, 0, UNIFORM)) for side in SIDES}
 
     @cached_property
     def _ladders(self) -> dict[Side, Ladder] | None:
@@ -413,7 +413,7 @@ class _Readings:
                     return True
         return False
 
-    def _merged(self, half: Half) -> _Reading:
+    def _merge(self, half: Half) -> _Reading:
         """What shows a ``half`` of a pattern, of all exposures and repeats."""
         if self._ladders is None:
             return self._read(self.session.repeated(half), True)

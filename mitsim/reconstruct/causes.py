@@ -190,7 +190,7 @@ class Evidence:
         left = np.zeros(5)
         for each in self._lit_frames:
             own = each.ranges
-            glossy = [orthonormal(_modulated(side)) for side in each.factors]
+            glossy = [orthonormal(_modulate(side)) for side in each.factors]
             ranges = own, (everything[0], own[1]), (own[0], everything[1]), everything, glossy
             left += [each.beyond(*pair) for pair in ranges]
         rows, columns, everywhere, gloss = 1 - left[1:] / left[0] if left[0] > 0 else np.full(4, np.nan)
@@ -264,7 +264,7 @@ def likely_cause(signatures: Signatures, unexplained: float, of_factors: float =
     return Cause.GLOSS if signatures.gloss > _MOST else Cause.UNKNOWN
 
 
-def _modulated(factor: FloatArray) -> FloatArray:
+def _modulate(factor: FloatArray) -> FloatArray:
     """A factor's columns (m, c), and these times powers of the place along the sensor: (m, c (degree + 1))."""
     place = np.linspace(-1, 1, len(factor))[:, None]
     return np.concatenate([factor * place**power for power in range(_DEGREE + 1)], axis=1)

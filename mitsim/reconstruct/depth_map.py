@@ -207,7 +207,7 @@ class _Search:
         start = min(tried, key=lambda start: tried[start])
         rivals = [other for other, left_over in tried.items() if left_over < _RIVAL * tried[start]]
         shift, confidence = self._arrivals.most(*start)
-        shift = self._sharpened(self._refined(shift, start[1] * self.pixel, tried[start]))
+        shift = self._sharpen(self._refine(shift, start[1] * self.pixel, tried[start]))
         doubt = self._doubt(shift, confidence, rivals)
         if doubt:
             shift, confidence = np.zeros(shift.shape), np.zeros(shift.shape)
@@ -261,7 +261,7 @@ class _Search:
     def _left_over(self, shift: FloatArray) -> float:
         return self._pixels.solve(shift).left_over
 
-    def _refined(self, shift: FloatArray, offset: float, left_over: float) -> FloatArray:
+    def _refine(self, shift: FloatArray, offset: float, left_over: float) -> FloatArray:
         """The ``shift`` after steps that leave less and less."""
         for _ in range(_STEPS):
             image, moved = self._pixels.step(shift, self.pixel)
@@ -276,7 +276,7 @@ class _Search:
             shift, left_over = ahead, now
         return shift
 
-    def _sharpened(self, shift: FloatArray) -> FloatArray:
+    def _sharpen(self, shift: FloatArray) -> FloatArray:
         """The ``shift`` with edges where they are, as long as that leaves less and less."""
         solved = self._pixels.solve(shift)
         for _ in range(_ROUNDS):
@@ -513,7 +513,7 @@ class Arrivals:
         """
         count = 2 * int(np.ceil(self.width / self.pixel / STEP / 2)) + 1
         shifts = np.linspace(-self.width / 2, self.width / 2, count) + offset * self.pixel
-        light = np.stack([self._arriving(self._seen[lam], shift) for shift in shifts])
+        light = np.stack([self._arriving(self._class_images[lam], shift) for shift in shifts])
         light = np.maximum(gaussian_filter(light, (0, _POOLED, _POOLED)), 0.0)
         place, step = light.argmax(axis=0), shifts[1] - shifts[0]
         near = round(_NEIGHBOURHOOD * self.pixel / step)
@@ -546,7 +546,7 @@ class Arrivals:
         return total
 
     @cached_property
-    def _seen(self) -> dict[float, FloatArray]:
+    def _class_images(self) -> dict[float, FloatArray]:
         """By lambda, (K, K', rows, columns) images of each class of dots along axes with parallax, all pixels of these
         axes, and so many beside the window, taken for lit; K = 1 along an axis without."""
         sides, patterns = [], []

@@ -67,11 +67,11 @@ class FrameCheck(LeaveOneOut):
         fits
             whether what frames predict counts only where they fit; not of a scene whose depths are known to differ.
         """
-        found = [*self._same(sums), *self._clipped(sums), *self._noiseless(sums)]
+        found = [*self._same(sums), *self._clipped_frames(sums), *self._noiseless(sums)]
         suspects = self._suspects(sums, beside_noise)
         if suspects is None:  # too many
             return tuple(found or self._flicker(sums))
-        named = self._explained(sums, beside_noise, fits, *suspects) if suspects[0] else []
+        named = self._explain(sums, beside_noise, fits, *suspects) if suspects[0] else []
         if not named and not found:
             return tuple(self._flicker(sums))
         # What is known without the model is said where that does not say more; of clipped frames it explains the rest.
@@ -99,10 +99,10 @@ class FrameCheck(LeaveOneOut):
                 if (left := noise - float(sums.energy[pattern]) - explained) < least:
                     least, found = left, (pattern, by_brightness, rest)
             bad[found[0]], weights = found[1:]
-            sums = self.gathered(weights, bad)
+            sums = self.sums_against(weights, bad)
         return bad, weights
 
-    def _explained(
+    def _explain(
         self, sums: FrameSums, beside_noise: float, fits: bool, bad: dict[Pattern, bool], weights: FloatArray
     ) -> list[FrameFault]:
         """Faults of patterns that are suspected, :meth:`_suspects` as :meth:`faults` takes its parameters."""
@@ -218,7 +218,7 @@ class FrameCheck(LeaveOneOut):
                 numbers = [self.number[(*pattern, (1 - 2 * half) if self.signed else 0)] for pattern, half in shots]
                 yield self.fault(Fault.REPEATED, numbers, "are one and the same")
 
-    def _clipped(self, sums: FrameSums) -> Iterable[FrameFault]:
+    def _clipped_frames(self, sums: FrameSums) -> Iterable[FrameFault]:
         """Shots with many readings at their largest number; where most have, it is the end of the sensor's range."""
         if len(sums.clipped) <= max(1, _MOST_BAD * len(self.shots)):
             for (pattern, half), count in sums.clipped.items():

@@ -162,7 +162,7 @@ class Misfit:
         if self.faults:
             more = f"; and {len(self.faults) - _SHOWN} more" if len(self.faults) > _SHOWN else ""
             named = "; ".join(map(str, self.faults[:_SHOWN]))
-            return self._flagged(status, f"Faulty frames: {named}{more}", Cause.FRAMES)
+            return self._flag(status, f"Faulty frames: {named}{more}", Cause.FRAMES)
         times = f", {shown(self.chi_square)} times what its noise makes" if self.stated else ""
         predicted = ""
         if self.predicted:
@@ -170,9 +170,9 @@ class Misfit:
         sentence = (
             f"{self.unexplained:.1%} of the measurements fit no image{times}{predicted}; likely cause: {self.reason}"
         )
-        return self._flagged(status, f"Misfit: {sentence}", self.cause)
+        return self._flag(status, f"Misfit: {sentence}", self.cause)
 
-    def _flagged(self, status: Status, sentence: str, cause: Cause) -> Status:
+    def _flag(self, status: Status, sentence: str, cause: Cause) -> Status:
         """The ``status`` of a solution with a ``sentence`` and the remedy of a ``cause``."""
         remedy = cause.value[1]
         if not status.verdict.good:
@@ -476,11 +476,14 @@ class Lack:
         """(r, r') what they add to the coefficients W of all frames."""
         sides, patterns = self.model.sides, self.model.patterns
         return np.asarray(
-            sum(_seen(sides[0], a, patterns[0]) @ self.image @ _seen(sides[1], b, patterns[1]).T for a, b in self.terms)
+            sum(
+                _term_response(sides[0], a, patterns[0]) @ self.image @ _term_response(sides[1], b, patterns[1]).T
+                for a, b in self.terms
+            )
         )
 
 
-def _seen(side: Side, term: FloatArray, patterns: FloatArray) -> FloatArray:
+def _term_response(side: Side, term: FloatArray, patterns: FloatArray) -> FloatArray:
     """(r, n) sum_i U_i^T L diag(p_i), of one side of a ``term`` L (m, n) and its ``patterns`` (n, K)."""
     seen = np.zeros((len(side.singular), term.shape[1]))
     for slab, lit in zip(side.slabs, patterns.T, strict=True):

@@ -202,7 +202,7 @@ class JointMosaic:
         images = np.zeros(self.shape) if start is None else start.copy()
         residual = gathered - self.normal(images) - lam * images
         size = float(np.linalg.norm(gathered)) or 1.0
-        near = self._preconditioned(residual, lam)
+        near = self._precondition(residual, lam)
         direction, energy = near, float(np.vdot(residual, near))
         step = 0
         while np.linalg.norm(residual) > _TOLERANCE * size and step < _MOST_STEPS:
@@ -211,12 +211,12 @@ class JointMosaic:
             length = energy / float(np.vdot(direction, through))
             images += length * direction
             residual = residual - length * through
-            near = self._preconditioned(residual, lam)
+            near = self._precondition(residual, lam)
             energy, before = float(np.vdot(residual, near)), energy
             direction = near + energy / before * direction
         return JointSolution(images, lam, step, float(np.linalg.norm(residual)) / size)
 
-    def _preconditioned(self, images: FloatArray, lam: float) -> FloatArray:
+    def _precondition(self, images: FloatArray, lam: float) -> FloatArray:
         (rows, left), (columns, right), (lines, mixed) = self._spectra
         turned = np.tensordot(mixed.T, left.T @ images @ right, axes=1)
         turned /= lines[:, None, None] * np.outer(rows, columns) + lam

@@ -219,7 +219,7 @@ class SideCheck:
             part = misfits[index] / energies[index]
             detail = f"no {self.side} stripes: {part:.0%} of their response is of other shape"
             # One frame for the mean of many is of other noise alone.
-            self._do_without(int(index), *(self._repeated(int(index)) or ("wrong", detail)))
+            self._do_without(int(index), *(self._repeat_of(int(index)) or ("wrong", detail)))
 
     def add(
         self, index: int, kind: str, detail: str, repair: str, other: Half | None = None, sign: int | None = None
@@ -251,7 +251,7 @@ class SideCheck:
         exchanges = np.where(fixed | (shadow.by_exchange < _EXPLAINED * deviations), -np.inf, shadow.by_exchange)
         flip = int(np.argmax(exchanges))
         gain, places = float(exchanges[flip]), [flip]
-        swapped = self._swapped(shadow, np.where(fixed, -np.inf, deviations))
+        swapped = self._best_swap(shadow, np.where(fixed, -np.inf, deviations))
         if swapped is not None and swapped[0] > gain:
             gain, places = swapped
         if gain > max(_GAIN, _EXPLAINED * deviations[worst] if shadow.unlike[worst] > _UNLIKE else 0.0):
@@ -275,7 +275,7 @@ class SideCheck:
             if np.linalg.norm(own + uniform) / 2 < DARK * np.linalg.norm(uniform):
                 self._leave_out(int(index), "black", "is black")
                 return True
-            if repeated := self._repeated(int(index)):
+            if repeated := self._repeat_of(int(index)):
                 self._leave_out(int(index), *repeated)
                 return True
         gains, light = shadow.by_scale(), self.parts
@@ -294,7 +294,7 @@ class SideCheck:
         self.add(index, *name_by_light(part), "its numbers are divided by that")
         return True
 
-    def _repeated(self, index: int) -> tuple[str, str, Half] | None:
+    def _repeat_of(self, index: int) -> tuple[str, str, Half] | None:
         """Kind, words and the other frame where one that is shown against a uniform one is the same as another."""
         own = self.vectors[:, index]
         away = np.square(own[:, None] - self.vectors).sum(axis=0)
@@ -305,7 +305,7 @@ class SideCheck:
         return "repeated", f"repeats {self.side} stripes {nearest}", (self.side, nearest, 1)
 
     @staticmethod
-    def _swapped(shadow: MovingShadow, deviations: FloatArray) -> tuple[float, list[int]] | None:
+    def _best_swap(shadow: MovingShadow, deviations: FloatArray) -> tuple[float, list[int]] | None:
         """What a swap of two that deviate takes off at most, and which two; None where there are no two."""
         far = np.flatnonzero(deviations > _FAR / 2)
         tried = np.sort(far[np.argsort(-deviations[far])[:_TRIED]])
@@ -330,10 +330,10 @@ class SideCheck:
             self.add(first, "swapped", detail, "both count in their right order", (self.side, rest[0], UNIFORM))
         elif not self.pairs:
             self.add(first, "exchanged", "shows black where white should be", "it counts with its sign")
-        elif not self._turned(first):
+        elif not self._turn_fault(first):
             self.add(first, "exchanged", "in each other's place", "they count in their right order")
 
-    def _turned(self, index: int) -> bool:
+    def _turn_fault(self, index: int) -> bool:
         """Whether a pattern's faulty frame is the other one of its pair: a frame may repeat the other, or that it."""
         for place, fault in enumerate(self.faults):
             if fault.index == index and fault.sign is not None:
