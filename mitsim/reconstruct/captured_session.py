@@ -221,15 +221,8 @@ def _check_sizes(session: SessionFrames) -> None:
 
 
 def _check_levels(session: SessionFrames, uniform: FloatArray) -> None:
-    """MitsimError where frames have no light by the levels that the list states.
-
-    Parameters
-    ----------
-    session
-        whose list it is.
-    uniform
-        (rows, columns) the brighter of both uniform responses [electrons/s].
-    """
+    """MitsimError where frames have no light by the levels that the list of a ``session`` states, ``uniform`` (rows,
+    columns) being the brighter of both uniform responses [electrons/s]."""
     first = session.repeated((SIDES[0], 0, 1 if session.pairs else UNIFORM))[0]
     values, digital = read_image(session.folder / first.file, session.wanted), session.listed.digital
     if digital.rate(values).max() <= 0 or not uniform.any():
@@ -323,13 +316,7 @@ class _Readings:
 
     def response(self, side: Side, index: int) -> tuple[FloatArray, float, FloatArray | None]:
         """Response (rows, columns) to a +-1 pattern [electrons/s], its mean noise variance, and the sum of its two
-        frames (rows, columns); None where it is not their difference.
-
-        Parameters
-        ----------
-        side, index
-            of the pattern.
-        """
+        frames (rows, columns); None where it is not their difference."""
         positive = self._merge((side, index, 1))
         if self.session.pairs:
             negative = self._merge((side, index, -1))
@@ -484,17 +471,8 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Ch
 def _sums(
     readings: _Readings, count: int, job: Job, uniform: Side | None = None
 ) -> tuple[tuple[StripeSums, StripeSums], list[float]]:
-    """Sums over all responses, and the noise variance of each.
-
-    Parameters
-    ----------
-    readings, job
-        as for :func:`_estimate`.
-    count
-        patterns of a side.
-    uniform
-        the side whose first response is the uniform one; None: the mean of both.
-    """
+    """Sums over all responses, and the noise variance of each; ``uniform`` is the side whose first response is the
+    uniform one, None: the mean of both."""
     with job.clock.stage("frames"):
         first = [readings.response(side, 0) for side in SIDES]
     (left, *_), (right, *_) = first

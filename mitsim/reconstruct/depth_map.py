@@ -221,15 +221,8 @@ class _Search:
         return DepthMap(solved.image, z, confidence, solved.lam, solved.left_over, *known, doubt, range_mm, smoothing)
 
     def _doubt(self, shift: FloatArray, confidence: FloatArray, rivals: Sequence[tuple[float, float]]) -> str:
-        """Why depths are not to be trusted, or nothing.
-
-        Parameters
-        ----------
-        shift, confidence
-            changes of 1/z by pixel, and how sure each is.
-        rivals
-            starts (look, offset) that explain nearly as much as that of these.
-        """
+        """Why depths are not to be trusted, or nothing; ``rivals`` are starts (look, offset) that explain nearly as much
+        as that of these."""
         told = confidence >= _TOLD
         found = self._pixels.solve(shift)
         variance, unknowns = self._pixels.variance(found), 2 * shift.size

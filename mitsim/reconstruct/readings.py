@@ -1,7 +1,7 @@
 """Measurements that fit no image in; out comes how else their frames may be read, where they fit that way.
 
 Each other reading is added up anew by the same factorised model: frames turned or mirrored, shots in another order,
-numbers without a tone curve (:mod:`mitsim.reconstruct.tonecurve`). U of the model is orthonormal, so that
+numbers without a tone curve (:class:`ToneCurves`). U of the model is orthonormal, so that
 |Y|^2 - |W|^2 is what a reading leaves.
 
 *Tone curves.* Curves are compared by the likelihood of the numbers as they were read (Box and Cox, 1964): where light
