@@ -186,11 +186,12 @@ class _Search:
     def __init__(self, shots: Capture, factors: Factors, depth_range: tuple[float, float] | None) -> None:
         # Of a flat scene far from the calibrated depth dots of any period tell the rest.
         self._ends = shifts_searched(factors, depth_range)
-        inverse = 1 / parallax_of(factors).depth_mm
-        self._plane = best_depth(shots, factors, (1 / (inverse + self._ends[1]), 1 / (inverse + self._ends[0])))
+        self._inverse = 1 / parallax_of(factors).depth_mm
+        self._range_mm = 1 / (self._inverse + self._ends[1]), 1 / (self._inverse + self._ends[0])
+        self._plane = best_depth(shots, factors, self._range_mm)
         self._middle = (self._ends[0] + self._ends[1]) / 2
         # A start, so in doubt any of several depths will do; but an end of the range is the depth of nothing.
-        self._start = self._middle if self._plane.at_end else 1 / self._plane.mm - inverse
+        self._start = self._middle if self._plane.at_end else 1 / self._plane.mm - self._inverse
         self._arrivals = Arrivals(shots, factors, self._ends, max(abs(self._start), abs(self._middle)))
         self._all, self.width, self.pixel = self._arrivals.depths, self._arrivals.width, self._arrivals.pixel
         self._pixels = PixelDepths(self._all, self._arrivals.reach, STEP * self.pixel)
@@ -213,16 +214,21 @@ class _Search:
             shift, confidence = np.zeros(shift.shape), np.zeros(shift.shape)
         solved = self._pixels.solve(shift, None if lam == "auto" else lam)
         solved = self._pixels.final(shift, solved) if lam == "auto" else solved
-        z = 1 / (1 / self._all.parallax.depth_mm + shift)
-        known = self._all.energy, self._all.data, self._all.part
-        inverse = 1 / self._all.parallax.depth_mm
-        range_mm = 1 / (inverse + self._ends[1]), 1 / (inverse + self._ends[0])
-        smoothing = self._all.smoothing(float(np.median(shift)))
-        return DepthMap(solved.image, z, confidence, solved.lam, solved.left_over, *known, doubt, range_mm, smoothing)
+        return DepthMap(
+            solved.image,
+            1 / (self._inverse + shift),
+            confidence,
+            solved.lam,
+            solved.left_over,
+            *(self._all.energy, self._all.data, self._all.part),
+            doubt,
+            self._range_mm,
+            self._all.smoothing(float(np.median(shift))),
+        )
 
     def _doubt(self, shift: FloatArray, confidence: FloatArray, rivals: Sequence[tuple[float, float]]) -> str:
-        """Why depths are not to be trusted, or nothing; ``rivals`` are starts (look, offset) that explain nearly as much
-        as that of these."""
+        """Why depths are not to be trusted, or nothing; ``rivals`` are starts (look, offset) that explain nearly as
+        much as that of these."""
         told = confidence >= _TOLD
         found = self._pixels.solve(shift)
         variance, unknowns = self._pixels.variance(found), 2 * shift.size
