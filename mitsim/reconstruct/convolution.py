@@ -210,15 +210,16 @@ def conjugate_gradients(
     tolerance: float = 1e-6,
     most: int = 500,
     watch: Watch = _never_enough,
+    start: FloatArray | None = None,
 ) -> Solution:
-    """Solve (``normal`` + lambda) X = ``target``, from X = 0 (Hestenes and Stiefel 1952).
+    """Solve (``normal`` + lambda) X = ``target`` (Hestenes and Stiefel 1952).
 
     Parameters
     ----------
     normal
         a symmetric operator without negative eigenvalues.
     target
-        (n, n) right-hand side.
+        right-hand side, of the shape of X.
     lam
         lambda >= 0.
     inverse
@@ -227,13 +228,16 @@ def conjugate_gradients(
         relative residual at which it ends, and the most steps.
     watch
         called with the image after each step; where it says True, that was the last.
+    start
+        X to begin with; None: 0.
     """
     lam = check_lambda(lam)
-    image, left = np.zeros_like(target), target.copy()
-    size = float(np.linalg.norm(target))
+    image = np.zeros_like(target) if start is None else start
+    left = target.copy() if start is None else target - normal(start) - lam * start
+    size = float(np.linalg.norm(target)) or 1.0
     turned = inverse(left) if inverse else left
     direction, power, spent = turned, float(np.vdot(left, turned)), 0
-    residual = 1.0 if size > 0 else 0.0
+    residual = float(np.linalg.norm(left)) / size
     while residual > tolerance and spent < most:
         spent += 1
         moved = normal(direction) + lam * direction
