@@ -21,7 +21,7 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import check_plain
 from mitsim.core.job import Job
 from mitsim.core.seeds import check_root
-from mitsim.devices.patterns import pattern_names
+from mitsim.devices.patterns import pattern_names, read_name
 from mitsim.devices.sensor import EXPOSURE_FRACTION, EXPOSURE_S, SensorModel
 
 if TYPE_CHECKING:
