@@ -19,7 +19,7 @@ from mitsim.core.errors import MitsimError, cut
 from mitsim.core.files import read_json, write_json
 from mitsim.core.job import Job
 from mitsim.core.resources import workers
-from mitsim.studies import find_experiment
+from mitsim.studies.framework.experiment import find_experiment
 from mitsim.studies.framework.experiment import HEADS, Claim, Experiment, Found, Scope
 from mitsim.studies.framework.folder import POINTS, check_study_folder, study_folder
 from mitsim.studies.framework.run import Shard, Store, batches, write_figures

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from mitsim.core.errors import MitsimError
 from mitsim.studies.framework.setup import Point, Setup
+from mitsim.studies.names import ALL, EXPERIMENTS, STUDIES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -183,3 +186,25 @@ def grouped(points: Sequence[Point]) -> list[Point]:
     """The ``points``, those of one setup together: they share its light."""
     order = {setup: index for index, setup in enumerate(dict.fromkeys(point.setup for point in points))}
     return sorted(points, key=lambda point: order[point.setup])
+
+
+def find_experiment(name: str) -> Experiment:
+    """The experiment ``name``, a shipped one or a module of the user's with a dot in its name.
+
+    MitsimError for another name, with those that there are, and for a module without an ``EXPERIMENT``.
+    """
+    if not is_experiment(name) or name == ALL:
+        raise MitsimError(f"study {name!r}: there is no such study; use {', '.join((*STUDIES, *EXPERIMENTS))}")
+    module = name if "." in name else f"mitsim.studies.paper.{name}"
+    try:
+        found: Experiment = importlib.import_module(module).EXPERIMENT
+    except (ImportError, AttributeError) as error:
+        raise MitsimError(
+            f"study {name}: the module {module} cannot be used ({error}); it needs an EXPERIMENT"
+        ) from error
+    return found
+
+
+def is_experiment(name: str) -> bool:
+    """Whether ``name`` is that of a study of many points."""
+    return name in (*EXPERIMENTS, ALL) or "." in name

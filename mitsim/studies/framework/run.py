@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-from mitsim.api.bench import Bench
 from mitsim.bench.request import Request
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
@@ -19,9 +20,12 @@ from mitsim.core.job import Job
 from mitsim.studies.framework.experiment import Found, Results
 from mitsim.studies.framework.folder import study_folder
 from mitsim.studies.framework.setup import Point
+from mitsim.studies.names import EXPERIMENTS, STUDIES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from mitsim.api.bench import Bench
 
     from mitsim.report.table import Table
     from mitsim.studies.framework.page import Part
@@ -103,7 +107,6 @@ class StudyResult:
 
 
 Measure = Callable[[Any, Request, Job], Findings]
-Study = Callable[[Bench | None, Path | str, Request | None, Job | None], StudyResult]
 
 
 def run_study(
@@ -147,6 +150,35 @@ def run_study(
         for file, table in findings.tables().items() if isinstance(findings, Tabled) else ():
             table.write(folder / file)
         return result
+
+
+def find_study(name: str, **settings: object) -> Callable[..., StudyResult]:
+    """The study ``name``, to be called with (bench, output, request, job); nothing heavy is imported before the name is
+    known to be one, and its folder to be free.
+
+    Parameters
+    ----------
+    name
+        of the study.
+    **settings
+        further arguments of its function.
+
+    Raises
+    ------
+    MitsimError
+        for another name, with those that there are.
+    """
+    if name not in STUDIES:
+        raise MitsimError(f"study {name!r}: there is no such study; use {', '.join((*STUDIES, *EXPERIMENTS))}")
+    def measure(bench: Bench | None, request: Request, job: Job) -> Findings:
+        """What the study finds."""
+        module, function = STUDIES[name].split(":")
+        found: Findings = getattr(importlib.import_module(f"mitsim.studies.{module}"), function)(
+            bench, request, job, **settings
+        )
+        return found
+
+    return partial(run_study, name, measure)
 
 
 # -------- Findings of points on disk

@@ -55,7 +55,7 @@ def measured(name: str, point: Point, shared: str | None = None) -> Found:
     shared
         folder of calibrations that processes share; None: this process keeps its own.
     """
-    from mitsim.studies import find_experiment
+    from mitsim.studies.framework.experiment import find_experiment
 
     return find_experiment(name).measure(cast("Studio", _Studio(shared)), point)
 

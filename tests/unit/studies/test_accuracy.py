@@ -18,7 +18,7 @@ from mitsim.light.settings import GROUPS
 from mitsim.planner.choose import counted
 from mitsim.planner.planner import make_plan
 from mitsim.report import plots
-from mitsim.studies import find_study
+from mitsim.studies.framework.run import find_study
 from mitsim.studies.accuracy import parts
 from mitsim.studies.accuracy import study as accuracy
 from mitsim.studies.accuracy.findings import AccuracyFindings, PartCost

@@ -15,7 +15,7 @@ import pytest
 from mitsim.devices.chart import load_chart
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e
 from mitsim.report.table import Table
-from mitsim.studies import find_experiment
+from mitsim.studies.framework.experiment import find_experiment
 from mitsim.studies.framework.experiment import Results, Scope
 from mitsim.studies.framework.run import batches
 from mitsim.studies.framework.setup import Point, Setup

@@ -21,7 +21,8 @@ from mitsim.reconstruct.estimate_factors import estimate_factors
 from mitsim.report import exposures
 from mitsim.report.exposures import IdealCamera
 from mitsim.sensor.chain import electrons_from_irradiance
-from mitsim.studies import diffraction, find_study
+from mitsim.studies.framework.run import find_study
+from mitsim.studies import diffraction
 from mitsim.studies.framework.run import StudyResult
 
 pytestmark = pytest.mark.usefixtures("draft_figures")

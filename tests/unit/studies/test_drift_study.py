@@ -20,7 +20,7 @@ from mitsim.devices.drift import UNITS, Drift
 from mitsim.devices.session import load_recipe
 from mitsim.report.exposures import RENDERED, LitScene
 from mitsim.report.table import Table
-from mitsim.studies import find_experiment
+from mitsim.studies.framework.experiment import find_experiment
 from mitsim.studies.drift.drift import SESSION, DriftStand, Outcome
 from mitsim.studies.framework.experiment import Results, Scope
 from mitsim.studies.framework.setup import Setup

@@ -10,7 +10,7 @@ import pytest
 
 from mitsim.devices.camera import CameraGeometry
 from mitsim.report.table import Table, Value
-from mitsim.studies import find_experiment
+from mitsim.studies.framework.experiment import find_experiment
 from mitsim.studies.framework.experiment import Results, Scope
 from mitsim.studies.framework.setup import Setup
 from mitsim.studies.paper import models

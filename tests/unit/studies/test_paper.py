@@ -10,7 +10,7 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.report.exposures import MODELS, measures_of, values_of
 from mitsim.report.table import Table
-from mitsim.studies import find_experiment
+from mitsim.studies.framework.experiment import find_experiment
 from mitsim.studies.framework.campaign import Where, run_experiment
 from mitsim.studies.framework.experiment import IMAGE, Results, Scope
 from mitsim.studies.framework.page import Section, build_page, flagged

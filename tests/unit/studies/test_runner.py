@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from mitsim.bench.request import Request
 from mitsim.core.errors import MitsimError
 from mitsim.report import plots
-from mitsim.studies import find_study
+from mitsim.studies.framework.run import find_study
 from mitsim.studies.framework.folder import study_folder
 from mitsim.studies.framework.run import StudyResult, run_study
 from mitsim.studies.names import STUDIES

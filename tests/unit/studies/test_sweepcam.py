@@ -18,7 +18,7 @@ from mitsim.optics.frames import Frame
 from mitsim.report.exposures import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODELS, IdealCamera, LitScene
 from mitsim.report.table import Table
 from mitsim.sensor.chain import electrons_from_irradiance
-from mitsim.studies import find_experiment
+from mitsim.studies.framework.experiment import find_experiment
 from mitsim.studies.framework.experiment import Results
 from mitsim.studies.framework.setup import Setup
 from mitsim.studies.framework.studio import Studio

@@ -11,7 +11,7 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.report.exposures import EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED
 from mitsim.report.table import Mean, Table, Value
-from mitsim.studies import find_experiment
+from mitsim.studies.framework.experiment import find_experiment
 from mitsim.studies.drift.levels import EFFECTS
 from mitsim.studies.framework.experiment import Results
 from mitsim.studies.framework.verdicts import (
