@@ -9,7 +9,8 @@ is a plane of a frame of twice the rows and columns, so that nothing is left out
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from mitsim.core.manifests import CalibrationManifest, RunManifest, ShotFile
 from mitsim.core.spectral_manifests import RUN, ColourManifest
 from mitsim.exchange.matlab import (
     COLOURED,
+    ELECTRONS,
     Variables,
     array_in,
     calibration_in,
@@ -30,6 +32,7 @@ from mitsim.exchange.matlab import (
     dn_per_rate,
     endings,
     factors_in_dn,
+    folders_of,
     lines_in,
     matrix_in,
     of_folders,
@@ -38,30 +41,56 @@ from mitsim.exchange.matlab import (
     text_in,
     write_variables,
 )
-from mitsim.exchange.packed import FACTORS, Coloured, Packed, checked_channel, shots_of, unpacked_colours, unpacked_run
-from mitsim.exchange.planes import PLANES, check_channel
+from mitsim.exchange.packed import (
+    FACTORS,
+    Calibration,
+    Coloured,
+    Loaded,
+    Packed,
+    Run,
+    checked_channel,
+    line_of,
+    shots_of,
+    unpacked_colours,
+    unpacked_run,
+)
+from mitsim.exchange.real_capture import PLANES, check_channel
 
 _COLOURS = (("r",), ("gr", "gb"), ("b",))
 """Planes of each colour, the longest wavelength first. Either green plane has the whole frame."""
 
 
-def write_flatcam(path: Path, run: Packed[RunManifest], calibration: Packed[CalibrationManifest]) -> None:
-    """Write a run with FlatCam's variables, whole or not at all.
+def write_flatcam(path: Path, run: Run, calibration: Calibration) -> tuple[str, ...]:
+    """Write a run with FlatCam's variables, whole or not at all; returns a sentence on what is left out.
 
     Parameters
     ----------
     path
         of the file.
     run
-        with frames of an even number of rows and columns.
+        with frames of an even number of rows and columns; or of three lines, of which the longest is taken for red and
+        the shortest for blue, and each plane is the whole frame of a line.
     calibration
-        that goes with it.
+        that goes with it, of the same lines.
 
     Raises
     ------
     MitsimError
-        for other frames, or more of them than such a file holds.
+        for other frames or lines, lines that differ in the number or size of their frames, and more frames than such a
+        file holds.
     """
+    own = line_of(calibration, "") if isinstance(run, Packed) else None
+    if isinstance(run, Packed) and own is not None:
+        variables = _of_one(run, own)
+    elif isinstance(run, Coloured) and isinstance(calibration, Coloured):
+        variables = _of_lines(path, run, calibration)
+    else:
+        raise AssertionError  # formats.export_run takes no others
+    write_variables(path, variables)
+    return (f"Left out: {ELECTRONS}",)
+
+
+def _of_one(run: Packed[RunManifest], calibration: Packed[CalibrationManifest]) -> dict[str, Any]:
     left, right = factors_in_dn(calibration, dn_per_rate(run.manifest.digital)).values()
     if len(left) % 2 or len(right) % 2:
         size = f"{len(left)}x{len(right)}"
@@ -69,27 +98,10 @@ def write_flatcam(path: Path, run: Packed[RunManifest], calibration: Packed[Cali
     meas = np.empty((len(left), len(right), len(run.manifest.patterns.captures)), order="F")
     kind = _fill(meas, run)
     factors = {name: (left[row::2], right[column::2]) for name, (row, column) in PLANES.items()}
-    variables = {"meas": meas, "dn_class": kind, **_planes(factors)}
-    write_variables(path, {**variables, **of_folders(run, calibration)})
+    return {"meas": meas, "dn_class": kind, **_planes(factors), **of_folders(run, calibration)}
 
 
-def write_flatcam_lines(path: Path, run: Coloured[RunManifest], calibration: Coloured[CalibrationManifest]) -> None:
-    """Write a coloured run with FlatCam's variables, whole or not at all: each plane is the whole frame of a line.
-
-    Parameters
-    ----------
-    path
-        of the file.
-    run
-        of three lines, of which the longest is taken for red and the shortest for blue.
-    calibration
-        of the same lines.
-
-    Raises
-    ------
-    MitsimError
-        for lines that are not three or differ in the number or size of their frames, and as for :func:`write_flatcam`.
-    """
+def _of_lines(path: Path, run: Coloured[RunManifest], calibration: Coloured[CalibrationManifest]) -> dict[str, Any]:
     ends, planes = endings(run.colours.names, path), _lines_of_planes(run.colours, path)
     counts = {name: len(run.lines[name].manifest.patterns.captures) for name in run.colours.names}
     if len({*counts.values()}) > 1:
@@ -105,34 +117,45 @@ def write_flatcam_lines(path: Path, run: Coloured[RunManifest], calibration: Col
         kind = _fill(meas[row::2, column::2], run.lines[name])
         own = {"dn_class": kind, **of_folders(run.lines[name], calibration.lines[name])}
         variables.update({f"{key}{ends[name]}": values for key, values in own.items()})
-    write_variables(path, {**variables, "meas": meas, **_planes({plane: sides[planes[plane]] for plane in PLANES})})
+    return {**variables, "meas": meas, **_planes({plane: sides[planes[plane]] for plane in PLANES})}
 
 
-def read_flatcam(path: Path) -> tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]:
-    """Run and calibration in the file ``path`` of :func:`write_flatcam`.
+@contextmanager
+def load_mat(path: Path, channel: str | None) -> Iterator[Loaded]:
+    """Run and calibration in a MATLAB file of `mitsim export`, with the paper's variables or FlatCam's.
 
-    MitsimError for a file that is none, or is damaged.
+    Parameters
+    ----------
+    path
+        of the file.
+    channel
+        the file is the calibration of a real FlatCam, of which this plane is taken.
+
+    Raises
+    ------
+    MitsimError
+        for a file that is none of these, or is damaged.
     """
+    if channel is not None:
+        yield Loaded(None, flatcam_calibration(path, channel))
+        return
     variables = read_variables(path)
-    return _folders_in(variables, _meas_in(variables, path), path)
+    if "meas" not in variables:
+        run, calibration = folders_of(variables, path)
+    elif COLOURED not in variables:
+        run, calibration = _folders_in(variables, _meas_in(variables, path), path)
+    else:
+        meas = _meas_in(variables, path)
+        colours = unpacked_colours(text_in(variables, COLOURED, path), RUN, path)
+        planes = {name: plane for plane, name in _lines_of_planes(colours, path).items()}
 
+        def folders_in(name: str, own: Variables) -> tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]:
+            """Run and calibration of the line ``name``, whose other variables are its ``own``."""
+            row, column = PLANES[planes[name]]
+            return _folders_in(own, meas[row::2, column::2], path)
 
-def read_flatcam_lines(path: Path) -> tuple[Coloured[RunManifest], Coloured[CalibrationManifest] | None]:
-    """Coloured run and calibration in the file ``path`` of :func:`write_flatcam_lines`.
-
-    MitsimError for a file that is none, or is damaged.
-    """
-    variables = read_variables(path)
-    meas = _meas_in(variables, path)
-    colours = unpacked_colours(text_in(variables, COLOURED, path), RUN, path)
-    planes = {name: plane for plane, name in _lines_of_planes(colours, path).items()}
-
-    def folders_in(name: str, own: Variables) -> tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]:
-        """Run and calibration of the line ``name``, whose other variables are its ``own``."""
-        row, column = PLANES[planes[name]]
-        return _folders_in(own, meas[row::2, column::2], path)
-
-    return lines_in(variables, folders_in, path)
+        run, calibration = lines_in(variables, folders_in, path)
+    yield Loaded(run, calibration, (ELECTRONS,))
 
 
 def flatcam_calibration(path: Path, channel: str) -> Packed[CalibrationManifest]:
@@ -143,7 +166,7 @@ def flatcam_calibration(path: Path, channel: str) -> Packed[CalibrationManifest]
     path
         of the file, with `P1*` and `Q1*`.
     channel
-        a key of :data:`mitsim.exchange.planes.PLANES`.
+        a key of :data:`mitsim.exchange.real_capture.PLANES`.
 
     Returns
     -------

@@ -25,9 +25,12 @@ from mitsim.core.runs import TRUTH, Capture
 from mitsim.core.spectral_manifests import CALIBRATION, MOSAIC, RUN, ColourManifest
 from mitsim.exchange.packed import (
     FACTORS,
+    Calibration,
     Coloured,
     Filtered,
+    Loaded,
     Packed,
+    Run,
     checked_channel,
     line_of,
     manifest_text,
@@ -45,8 +48,6 @@ if TYPE_CHECKING:
 
     from mitsim.reconstruct.factors import Factors
 
-Run = Packed[RunManifest] | Coloured[RunManifest] | Filtered
-Calibration = Packed[CalibrationManifest] | Coloured[CalibrationManifest]
 _LINES = "lines"
 """Group that has a group of each line."""
 _MOST_CHUNK = 4 * MOST_PIXELS
@@ -58,32 +59,8 @@ _PACKED: dict[str, Any] = {"shuffle": True, "compression": "gzip", "compression_
 that does not get smaller."""
 
 
-def write_hdf5(path: Path, run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None = None) -> None:
-    """Write a run to one file, whole or not at all.
-
-    Parameters
-    ----------
-    path
-        of the file.
-    run
-        with shots of one shape.
-    calibration
-        that goes with it.
-
-    Raises
-    ------
-    MitsimError
-        for shots that differ in shape or channels, or a file that cannot be read or written.
-    """
-    with _begun(path) as file:
-        _write_run(file, run)
-        _write_calibration(file, calibration)
-
-
-def write_hdf5_lines(
-    path: Path, run: Coloured[RunManifest] | Filtered, calibration: Coloured[CalibrationManifest] | None = None
-) -> None:
-    """Write a run of several lines to one file, whole or not at all.
+def write_hdf5(path: Path, run: Run, calibration: Calibration | None = None) -> tuple[str, ...]:
+    """Write a run to one file, whole or not at all; nothing is left out.
 
     Parameters
     ----------
@@ -92,16 +69,20 @@ def write_hdf5_lines(
     run
         with shots of one shape, each line's where they are told apart.
     calibration
-        of the same lines.
+        that goes with it, of the same lines.
 
     Raises
     ------
     MitsimError
-        as for :func:`write_hdf5`.
+        for shots that differ in shape or channels, or a file that cannot be read or written.
     """
     with _begun(path) as file:
+        if isinstance(run, Packed):
+            _write_run(file, run)
+            _write_calibration(file, line_of(calibration, ""))
+            return ()
         _write_text(file, run.colours.kind, run.text)
-        if calibration is not None:
+        if isinstance(calibration, Coloured):
             _write_text(file, CALIBRATION, calibration.text)
         if isinstance(run, Filtered):
             _write_run(file, run.shots)
@@ -113,6 +94,7 @@ def write_hdf5_lines(
             elif name in run.truths:
                 _write_frame(line.create_group("truth"), *run.truths[name])
             _write_calibration(line, line_of(calibration, name))
+    return ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,8 +129,8 @@ class ExchangeFile:
 
 @contextmanager
 def open_hdf5(path: Path | str, line: str | None = None) -> Iterator[ExchangeFile]:
-    """The file ``path`` of :func:`write_hdf5`, or one ``line`` of that of :func:`write_hdf5_lines`, while the context
-    lasts. Behind colour filters the run is that of all lines, and a ``line`` is needed for its calibration alone.
+    """The file ``path`` of :func:`write_hdf5`, or one ``line`` of it where it holds several, while the context lasts.
+    Behind colour filters the run is that of all lines, and a ``line`` is needed for its calibration alone.
 
     MitsimError for a file that is missing or damaged, is none of these, or leads to other files; and for a line that it
     does not have.
@@ -182,8 +164,21 @@ def open_folders(path: Path | str) -> Iterator[tuple[Run, Calibration | None]]:
                 raise MitsimError(
                     f"{path}: is no HDF5 file of `mitsim export` (mitsim_exchange is {layout}, 1 to {LAYOUT} are read)"
                 )
-            held = _of_lines(file, path) if _LINES in file else _of_one(file, path)
-        yield held
+            if _LINES in file:
+                run, calibration = _of_lines(file, path)
+            else:
+                run, calibration = _run(file, path), _calibration(file, path) if "calibration" in file else None
+        yield run, calibration
+
+
+@contextmanager
+def load_hdf5(path: Path, channel: str | None) -> Iterator[Loaded]:
+    """All of the file ``path``, while the context lasts. MitsimError as :func:`open_hdf5`, and for a ``channel``: its
+    frames have one."""
+    if channel is not None:
+        raise ArgumentError("channel", f"{channel}: {path} has frames of one; leave it out")
+    with open_folders(path) as (run, calibration):
+        yield Loaded(run, calibration)
 
 
 class _Lazily(Mapping[str, tuple[Channels, Metadata]]):
@@ -271,13 +266,7 @@ def _strings() -> Any:
     return h5py.string_dtype("utf-8")
 
 
-def _of_one(place: h5py.Group, path: Path) -> tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]:
-    return _run(place, path), _calibration(place, path) if "calibration" in place else None
-
-
-def _of_lines(
-    file: h5py.File, path: Path
-) -> tuple[Coloured[RunManifest] | Filtered, Coloured[CalibrationManifest] | None]:
+def _of_lines(file: h5py.File, path: Path) -> tuple[Run, Calibration | None]:
     group, run = _group(file, _LINES, path), _coloured(file, path) if RUN in file else _filtered(file, path)
     if CALIBRATION not in file:
         return run, None

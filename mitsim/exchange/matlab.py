@@ -28,9 +28,11 @@ from mitsim.core.runs import TRUTH
 from mitsim.core.spectral_manifests import CALIBRATION, RUN
 from mitsim.exchange.packed import (
     FACTORS,
+    Calibration,
     Coloured,
     Filtered,
     Packed,
+    Run,
     checked_channel,
     line_of,
     manifest_text,
@@ -45,76 +47,56 @@ ELECTRONS = "expected electrons of the frames"
 """What such a file does not hold of a simulated run."""
 
 
-def write_matlab(path: Path, run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None) -> None:
-    """Write a run with the paper's variables, whole or not at all.
+def write_matlab(path: Path, run: Run, calibration: Calibration | None) -> tuple[str, ...]:
+    """Write a run with the paper's variables, whole or not at all; returns sentences on what is left out.
+
+    Of several lines, the variables of each end in its name: `phi_left_638nm`. Behind colour filters the frames are
+    those of all lines, only the truths and factors of each line end in its name, and `weights` is (4, lines) of what
+    each filter passes.
 
     Parameters
     ----------
     path
         of the file.
     run
-        of whole shots, or of signed pairs.
+        of whole shots, or of signed pairs; with lines called as `mitsim capture` calls them.
     calibration
-        that goes with it; without one `phi_left` and `phi_right` are left out.
+        that goes with it, of the same lines; without one `phi_left` and `phi_right` are left out.
 
     Raises
     ------
     MitsimError
-        for a run that mixes whole shots and pairs, or is larger than such a file may be.
+        for a run that mixes whole shots and pairs, or is larger than such a file may be, and for lines whose names
+        cannot end one of a variable.
     """
-    write_variables(path, _variables(run, calibration))
-
-
-def write_matlab_lines(
-    path: Path, run: Coloured[RunManifest] | Filtered, calibration: Coloured[CalibrationManifest] | None
-) -> None:
-    """Write a run of several lines with the paper's variables, those of a line ending in its name: `phi_left_638nm`.
-
-    Parameters
-    ----------
-    path
-        of the file.
-    run
-        with lines called as `mitsim capture` calls them. Behind colour filters the frames are those of all lines, and
-        only the truths and factors of each line end in its name; `weights` is (4, lines) of what each filter passes.
-    calibration
-        of the same lines; without one `phi_left_638nm` and so on are left out.
-
-    Raises
-    ------
-    MitsimError
-        for lines whose names cannot end one of a variable, and as for :func:`write_matlab`.
-    """
-    ends, variables = endings(run.colours.names, path), colours_in(run, calibration)
-    if isinstance(run, Filtered):
-        variables.update({**_variables(run.shots, None), "weights": np.array(run.colours.weights)})
-    for name, end in ends.items():
+    if isinstance(run, Packed):
+        variables = _variables(run, line_of(calibration, ""))
+    else:
+        ends, variables = endings(run.colours.names, path), colours_in(run, calibration)
         if isinstance(run, Filtered):
-            held = truth_variables(*run.truths[name]) if name in run.truths else {}
-            held.update(calibration_variables(line_of(calibration, name), run.shots.manifest.digital))
-        else:
-            held = _variables(run.lines[name], line_of(calibration, name))
-        variables.update({f"{key}{end}": values for key, values in held.items()})
+            variables.update({**_variables(run.shots, None), "weights": np.array(run.colours.weights)})
+        for name, end in ends.items():
+            if isinstance(run, Filtered):
+                held = truth_variables(*run.truths[name]) if name in run.truths else {}
+                held.update(calibration_variables(line_of(calibration, name), run.shots.manifest.digital))
+            else:
+                held = _variables(run.lines[name], line_of(calibration, name))
+            variables.update({f"{key}{end}": values for key, values in held.items()})
     write_variables(path, variables)
+    without = () if calibration else ("phi_left and phi_right are left out: no calibration was given",)
+    return (*without, f"Left out: {ELECTRONS}")
 
 
-def read_matlab(path: Path) -> tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]:
-    """Run and calibration in the file ``path`` of :func:`write_matlab`.
-
-    MitsimError for a file that is none, or is damaged.
-    """
-    return _folders_in(read_variables(path), path)
-
-
-def read_matlab_lines(path: Path) -> tuple[Coloured[RunManifest] | Filtered, Coloured[CalibrationManifest] | None]:
-    """Run and calibration in the file ``path`` of :func:`write_matlab_lines`.
+def folders_of(variables: Variables, path: Path) -> tuple[Run, Calibration | None]:
+    """Run and calibration in the ``variables`` of the file ``path`` of :func:`write_matlab`.
 
     MitsimError for a file that is none, or is damaged.
     """
-    variables = read_variables(path)
     if FILTERED in variables:
         return _filtered_in(variables, path)
-    return lines_in(variables, lambda name, own: _folders_in(own, path), path)
+    if COLOURED in variables:
+        return lines_in(variables, lambda name, own: _folders_in(own, path), path)
+    return _folders_in(variables, path)
 
 
 def _filtered_in(variables: Variables, path: Path) -> tuple[Filtered, Coloured[CalibrationManifest] | None]:
@@ -128,8 +110,7 @@ def _filtered_in(variables: Variables, path: Path) -> tuple[Filtered, Coloured[C
 
 
 def _variables(run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None) -> dict[str, Any]:
-    variables = _frames(run)
-    return {**variables, **of_folders(run, calibration)}
+    return {**_frames(run), **of_folders(run, calibration)}
 
 
 def _folders_in(variables: Variables, path: Path) -> tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]:
@@ -234,11 +215,6 @@ def write_variables(path: Path, variables: Variables) -> None:
         savemat(file, dict(variables), do_compression=True, long_field_names=True)
 
 
-def names_in(path: Path) -> frozenset[str]:
-    """Names of the arrays and texts in the MATLAB file ``path``; MitsimError as for :func:`read_variables`."""
-    return frozenset(_looked_into(path, _arrays_in))
-
-
 def read_variables(path: Path) -> dict[str, Any]:
     """The arrays of real numbers and the texts of the MATLAB file ``path``, by name; cells, structures and objects,
     which files of `mitsim export` and FlatCam have none of, are not looked into.
@@ -247,9 +223,20 @@ def read_variables(path: Path) -> dict[str, Any]:
     """
     from scipy.io import loadmat
 
-    arrays = _looked_into(path, _arrays_in)
-    Cost(memory_bytes=_COPIES * sum(arrays.values())).check(f"{path}", Limits())
-    return dict(_looked_into(path, lambda file: loadmat(file, variable_names=[*arrays])))
+    check_plain(path)
+    try:
+        with open(path, "rb") as file:
+            arrays = _arrays_in(file)
+            Cost(memory_bytes=_COPIES * sum(arrays.values())).check(f"{path}", Limits())
+            file.seek(0)
+            return dict(loadmat(file, variable_names=[*arrays]))
+    except MitsimError:
+        raise
+    except NotImplementedError:
+        raise MitsimError(f"{path}: is HDF5 (version 7.3); save it in MATLAB with -v7, or name an export .h5") from None
+    except Exception as error:  # SciPy's reader raises of all kinds
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise MitsimError(f"{path}: damaged, or no MATLAB file ({reason}); write or copy it again") from error
 
 
 def _arrays_in(file: BinaryIO) -> dict[str, int]:
@@ -324,18 +311,6 @@ def _element(data: bytes, place: int, order: str) -> tuple[bytes, int]:
     if start + length > len(data):
         raise ValueError(f"a name or shape in it takes {length} bytes")
     return data[start : start + length], place + 8 if start == place + 4 else start + -(-length // 8) * 8
-
-
-def _looked_into(path: Path, look: Callable[..., Any]) -> Any:
-    check_plain(path)
-    try:
-        with open(path, "rb") as file:
-            return look(file)
-    except NotImplementedError:
-        raise MitsimError(f"{path}: is HDF5 (version 7.3); save it in MATLAB with -v7, or name an export .h5") from None
-    except Exception as error:  # SciPy's reader raises of all kinds
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise MitsimError(f"{path}: damaged, or no MATLAB file ({reason}); write or copy it again") from error
 
 
 def text_in(variables: Variables, name: str, path: Path) -> str:
@@ -501,12 +476,10 @@ def by_line(variables: Variables, names: Sequence[str], path: Path) -> dict[str,
     }
 
 
-def colours_in(
-    run: Coloured[RunManifest] | Filtered, calibration: Coloured[CalibrationManifest] | None
-) -> dict[str, Any]:
+def colours_in(run: Coloured[RunManifest] | Filtered, calibration: Calibration | None) -> dict[str, Any]:
     """Variables that say of which lines a file is: the colour.json of ``run`` and ``calibration``."""
     variables = {FILTERED if isinstance(run, Filtered) else COLOURED: run.text}
-    return variables if calibration is None else {**variables, _CALIBRATED: calibration.text}
+    return {**variables, _CALIBRATED: calibration.text} if isinstance(calibration, Coloured) else variables
 
 
 def endings(names: Sequence[str], path: Path) -> dict[str, str]:

@@ -1,4 +1,7 @@
-"""A RUN or CAL folder in, its manifest and files by name out; or the other way, from wherever they were kept."""
+"""A RUN or CAL folder in, its manifest and files by name out; or the other way, from wherever they were kept.
+
+A run behind colour filters is one RUN folder of all lines; of each there is what a perfect image would show.
+"""
 
 from __future__ import annotations
 
@@ -31,6 +34,8 @@ from mitsim.core.spectral_manifests import (
     MosaicManifest,
     checked_colours,
     checked_mosaic,
+    is_coloured,
+    is_mosaic,
     read_colours,
     read_mosaic,
 )
@@ -268,26 +273,48 @@ class Filtered:
         write_text(folder / COLOUR, self.text)
 
 
-def filtered_run(folder: Path) -> Filtered:
-    """The run behind colour filters in ``folder``. MitsimError when it is not a complete one."""
-    colours = read_mosaic(folder)
-    files = {name: folder / name / TRUTH for name in colours.names}
-    truths = {name: read_frame(path) for name, path in files.items() if path.is_file()}
-    return Filtered(colours, _colour_text_of(folder), packed_run(folder), truths)
+Run = Packed[RunManifest] | Coloured[RunManifest] | Filtered
+Calibration = Packed[CalibrationManifest] | Coloured[CalibrationManifest]
 
 
-def coloured_run(folder: Path) -> Coloured[RunManifest]:
-    """The coloured RUN ``folder``. MitsimError when it, or a line's folder, is not a complete one."""
+@dataclass(frozen=True, eq=False)
+class Loaded:
+    """What an exchanged file holds.
+
+    Attributes
+    ----------
+    run, calibration
+        content of the folders, where the file has them.
+    left_out
+        parts of a run that the file does not hold.
+    """
+
+    run: Run | None
+    calibration: Calibration | None
+    left_out: tuple[str, ...] = ()
+
+
+def any_run(folder: Path) -> Run:
+    """The RUN ``folder``, coloured, behind colour filters, or neither. MitsimError when it, or a line's folder, is not
+    a complete one."""
+    if is_mosaic(folder):
+        filters = read_mosaic(folder)
+        files = {name: folder / name / TRUTH for name in filters.names}
+        truths = {name: read_frame(path) for name, path in files.items() if path.is_file()}
+        return Filtered(filters, _colour_text_of(folder), packed_run(folder), truths)
+    if not is_coloured(folder):
+        return packed_run(folder)
     colours = read_colours(folder, RUN)
     return Coloured(colours, _colour_text_of(folder), {name: packed_run(folder / name) for name in colours.names})
 
 
-def coloured_calibration(folder: Path) -> Coloured[CalibrationManifest]:
-    """The coloured CAL ``folder``. MitsimError when it, or a line's folder, is not a complete one."""
+def any_calibration(folder: Path) -> Calibration:
+    """The CAL ``folder``, coloured or not. MitsimError when it, or a line's folder, is not a complete one."""
+    if not is_coloured(folder):
+        return packed_calibration(folder)
     colours = read_colours(folder, CALIBRATION)
-    return Coloured(
-        colours, _colour_text_of(folder), {name: packed_calibration(folder / name) for name in colours.names}
-    )
+    lines = {name: packed_calibration(folder / name) for name in colours.names}
+    return Coloured(colours, _colour_text_of(folder), lines)
 
 
 def unpacked_colours(text: str, kind: str, place: Path) -> ColourManifest:
@@ -346,12 +373,12 @@ def _check_names(colours: ColourManifest, place: Path, others: Sequence[str]) ->
         raise MitsimError(f"{place}: a line is called {name}; give it a name of its own")
 
 
-def line_of(held: Coloured[Manifest] | None, name: str) -> Packed[Manifest] | None:
-    """The folder of the line ``name`` of ``held``; None of nothing."""
-    return None if held is None else held.lines[name]
+def line_of(held: Packed[Manifest] | Coloured[Manifest] | None, name: str) -> Packed[Manifest] | None:
+    """The folder of the line ``name`` of ``held``, which is that folder itself where it tells no lines apart."""
+    return held.lines[name] if isinstance(held, Coloured) else held
 
 
-def run_parts(run: Packed[RunManifest] | Coloured[RunManifest] | Filtered) -> dict[str, Packed[RunManifest]]:
+def run_parts(run: Run) -> dict[str, Packed[RunManifest]]:
     """The shots that a ``run`` is of, as :func:`parts_of`."""
     return {"": run.shots} if isinstance(run, Filtered) else parts_of(run)
 

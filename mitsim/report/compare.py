@@ -12,8 +12,9 @@ from mitsim.core.runs import Capture
 from mitsim.light.light import SampledLight
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.report.exposures import CONVENTIONS, EQUAL_PEAK, LitScene, Unexposed
-from mitsim.report.report import FamilyResult, Recovery, Trust
+from mitsim.report import CONVENTIONS, EQUAL_PEAK
+from mitsim.report.demo_page import FamilyResult, Recovery, Trust
+from mitsim.report.lit_scene import LitScene, Unexposed
 from mitsim.sensor.chain import Digital
 
 _SECOND_SHOWN = 0.4

@@ -1,1 +1,35 @@
-"""Experiments: capture, calibrate and reconstruct together, judged against the truth and shown to people."""
+"""Experiments: capture, calibrate and reconstruct together, judged against the truth and shown to people.
+
+This file has their names alone. The study NAME is the module ``mitsim.studies.NAME_study``.
+"""
+
+from __future__ import annotations
+
+STUDIES = ("accuracy", "calibration", "diffraction", "solver")
+"""Studies of one bench: the function ``measure`` of their module takes (bench, request, job) and gives
+:class:`mitsim.studies.framework.run.Findings`."""
+OF_NO_SCENE = ("solver",)
+"""Those whose bench is None."""
+EXPOSED = ("calibration", "diffraction")
+"""Those whose frames fill a part of the camera's full well."""
+PAPER = (
+    "patterns",
+    "distance",
+    "binning",
+    "multishot",
+    "exposure",
+    "resolution",
+    "ambient",
+    "reflectivity",
+    "regularisation",
+    "convolutional",
+    "depth",
+    "separation",
+    "waterfall",
+)
+"""Studies of the paper's experiments, and of what lies beyond them, which `mitsim study all` puts on one page in this
+order."""
+EXPERIMENTS = (*PAPER, "colour", "drift", "models", "sweep")
+"""Studies of many points: their modules have an ``EXPERIMENT``."""
+ALL = "all"
+"""What the study of all experiments of the paper is called."""

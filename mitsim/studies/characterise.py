@@ -27,8 +27,7 @@ from mitsim.report.plots import BLACK, BLUE, FONT, GREY, ORANGE, VERMILION, WIDT
 from mitsim.sensor.emva import LEAST_DARK, QUANTISATION, SPLIT, Session, figures
 from mitsim.sensor.specimen import mean_dark_current
 from mitsim.studies.emva_procedure import Frames, Procedure, capacity_of, drawn, efficiency_of
-from mitsim.studies.framework.folder import study_folder
-from mitsim.studies.framework.run import write_figures
+from mitsim.studies.framework.run import study_folder, write_figures
 
 UNITS: Mapping[str, tuple[str, str]] = {
     "system_gain": ("K", "DN/e-"),

@@ -27,8 +27,8 @@ from mitsim.devices.session import load_recipe
 from mitsim.light.light import SampledLight, pinhole_view
 from mitsim.reconstruct.factors import Factors
 from mitsim.report.compare import Comparison, label
-from mitsim.report.report import BudgetRow, FamilyResult, ReportData, build_report, verdict
-from mitsim.studies.framework.folder import DEMO_FOLDERS, DEMO_PAGE, study_folder
+from mitsim.report.demo_page import BudgetRow, FamilyResult, ReportData, build_report, verdict
+from mitsim.studies.framework.run import DEMO_FOLDERS, DEMO_PAGE, study_folder
 
 _BEFORE, _AFTER = ("uniform", "dots:4", "dots:5"), ("hadamard:8",)
 """Families that the main one stands between in the report: the paper's, from the fewest frames to the most."""

@@ -19,13 +19,11 @@ from mitsim.core.errors import MitsimError, cut
 from mitsim.core.files import read_json, write_json
 from mitsim.core.job import Job
 from mitsim.core.resources import workers
-from mitsim.studies.framework.experiment import find_experiment
-from mitsim.studies.framework.experiment import HEADS, Claim, Experiment, Found, Scope
-from mitsim.studies.framework.folder import POINTS, check_study_folder, study_folder
-from mitsim.studies.framework.run import Shard, Store, batches, write_figures
+from mitsim.studies import ALL, EXPERIMENTS, PAPER
+from mitsim.studies.framework.experiment import HEADS, Claim, Experiment, Found, Scope, find_experiment
+from mitsim.studies.framework.run import POINTS, Shard, Store, batches, check_study_folder, study_folder, write_figures
 from mitsim.studies.framework.setup import Point
 from mitsim.studies.framework.workers import in_processes, on_cluster
-from mitsim.studies.names import ALL, EXPERIMENTS, PAPER
 
 # What draws is imported where it is used: a study that cannot be is refused without it.
 if TYPE_CHECKING:

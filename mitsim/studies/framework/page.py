@@ -13,8 +13,7 @@ from matplotlib.figure import Figure
 from mitsim.core.environment import versions
 from mitsim.report.html import rendered, shown_figure, write_html
 from mitsim.studies.framework.experiment import HEADS, KNOBS, Claim, Experiment, PageTable, Results, Scope
-from mitsim.studies.framework.pictures import TEST_IMAGES
-from mitsim.studies.framework.setup import Setup
+from mitsim.studies.framework.setup import TEST_IMAGES, Setup
 
 _NUMBER = re.compile(r"[+-]?\d|nothing$")
 """How a cell of a column of numbers begins."""

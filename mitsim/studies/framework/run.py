@@ -5,28 +5,29 @@ from __future__ import annotations
 import importlib
 import json
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from functools import partial
 from itertools import groupby
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from mitsim.bench.request import Request
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
-from mitsim.core.files import check_plain, sweep, whole_file, write_json
+from mitsim.core.files import check_output, check_plain, output_folder, read_json, sweep, whole_file, write_json
 from mitsim.core.job import Job
+from mitsim.studies import ALL, EXPERIMENTS, PAPER, STUDIES
 from mitsim.studies.framework.experiment import Found, Results
-from mitsim.studies.framework.folder import study_folder
 from mitsim.studies.framework.setup import Point
-from mitsim.studies.names import EXPERIMENTS, STUDIES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from mitsim.api.bench import Bench
-
     from mitsim.report.table import Table
     from mitsim.studies.framework.page import Part
 
@@ -170,10 +171,10 @@ def find_study(name: str, **settings: object) -> Callable[..., StudyResult]:
     """
     if name not in STUDIES:
         raise MitsimError(f"study {name!r}: there is no such study; use {', '.join((*STUDIES, *EXPERIMENTS))}")
+
     def measure(bench: Bench | None, request: Request, job: Job) -> Findings:
         """What the study finds."""
-        module, function = STUDIES[name].split(":")
-        found: Findings = getattr(importlib.import_module(f"mitsim.studies.{module}"), function)(
+        found: Findings = importlib.import_module(f"mitsim.studies.{name}_study").measure(
             bench, request, job, **settings
         )
         return found
@@ -272,3 +273,51 @@ class Shard:
         """The ``points`` of this part: every ``count``-th batch, as a batch's light is traced once."""
         own = batches(points)[self.number - 1 :: self.count]
         return [point for batch in own for point in batch]
+
+
+# -------- The folder of a study
+
+POINTS = "points"
+"""Folder of what the points of a study came to."""
+DEMO_FOLDERS, DEMO_PAGE = ("run", "calibration"), "report.html"
+"""What `mitsim demo` writes."""
+_PARTS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        ALL: (*PAPER, "*.html"),
+        "characterise": ("*.png",),
+        "demo": (*DEMO_FOLDERS, DEMO_PAGE),
+        **{name: ("*.png", "*.csv", f"{name}.html") for name in STUDIES},
+    }
+)
+"""What a study writes beside NAME.json, with wildcards."""
+_OF_POINTS = ("*.png", "*.csv", "*.html", POINTS)
+"""The same of all others, which are of many points."""
+
+
+def check_study_folder(output: Path | str, name: str) -> None:
+    """Refuse an ``output`` that :func:`study_folder` of the study ``name`` would refuse, before what is slow to import.
+
+    MitsimError as there.
+    """
+    check_output(output, overwrite=_is_earlier(Path(output), name))
+
+
+@contextmanager
+def study_folder(output: Path | str, name: str) -> Iterator[Path]:
+    """The folder ``output`` of the study ``name``, held while the context lasts.
+
+    It is new or empty, or holds an earlier study of that name alone, of which nothing is removed. MitsimError when it
+    holds anything else, or cannot be written.
+    """
+    with output_folder(output, overwrite=_is_earlier(Path(output), name)) as folder:
+        sweep(folder)
+        yield folder
+
+
+def _is_earlier(place: Path, name: str) -> bool:
+    """Whether an earlier study of a ``name``, whose NAME.json says ``"kind": NAME``, has a ``place`` to itself."""
+    head, names = place / f"{name}.json", (f"{name}.json", ".*", *_PARTS.get(name, _OF_POINTS))
+    found = read_json(head) if head.is_file() else None
+    if not isinstance(found, dict) or found.get("kind") != name:
+        return False
+    return all(any(fnmatch(item.name, known) for known in names) for item in place.iterdir())

@@ -16,7 +16,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.devices.model_fit import Modelling
 from mitsim.devices.session import load_recipe
-from mitsim.studies.paper.models import OFF_MM, as_built
+from mitsim.studies.models_study import OFF_MM, as_built
 from tests.real_session import RealSession, write_list
 
 FIT = ("mask_distance", "mask_shift_row", "mask_shift_column", "mask_rotation")

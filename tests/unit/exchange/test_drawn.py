@@ -12,7 +12,7 @@ from PIL import Image
 
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import parse_patterns
-from mitsim.exchange.pictures import SQUARE, Raster, cells_told, draw_family, draw_stripes, grid_in, session_of
+from mitsim.exchange.png_files import SQUARE, Raster, cells_told, draw_family, draw_stripes, grid_in, session_of
 from mitsim.reconstruct.captured_session import calibrate_frames
 from tests.real_session import RealSession, write_image
 

@@ -14,9 +14,8 @@ from scipy.io import loadmat, savemat
 import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.exchange import tensors
-from mitsim.exchange.formats import export_run
+from mitsim.exchange.formats import export_run, import_file
 from mitsim.exchange.hdf5 import open_hdf5
-from mitsim.exchange.loaders import import_file
 from mitsim.reconstruct.mosaic import behind
 from tests.coloured import WEIGHTS, mosaic_folders
 from tests.unit.exchange.test_coloured import octave, whole

@@ -15,9 +15,8 @@ import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame, write_frame
 from mitsim.exchange import packed
-from mitsim.exchange.formats import export_run
+from mitsim.exchange.formats import export_run, import_file
 from mitsim.exchange.hdf5 import open_hdf5
-from mitsim.exchange.loaders import import_file
 from tests.exchanged import COLUMNS, ROWS, SCENE, Made, bytes_of, made
 
 

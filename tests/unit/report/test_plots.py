@@ -11,7 +11,7 @@ import numpy as np
 from mitsim.report import plots
 from mitsim.report.html import typeset
 from mitsim.report.table import Mean
-from mitsim.studies.solver import LAMBDAS, LAYOUTS, METHODS, PRECISIONS, SolverRow
+from mitsim.studies.solver_study import LAMBDAS, LAYOUTS, METHODS, PRECISIONS, SolverRow
 
 SOLVER_ROWS = [
     SolverRow(method, precision, layout, lam, seconds=0.02 * 1.2**index, error=1e-3 * 0.1**index, judge_error=0, seed=0)
@@ -130,7 +130,7 @@ def test_an_error_of_nothing_has_no_dot() -> None:
 
 def test_no_pyplot_is_loaded() -> None:
     program = (
-        "import sys, numpy; from mitsim.study import plots; plots.frame(numpy.ones((4, 4)));"
+        "import sys, numpy; from mitsim.report import plots; plots.frame(numpy.ones((4, 4)));"
         "sys.exit('matplotlib.pyplot' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

@@ -21,10 +21,10 @@ from mitsim.core.job import Job
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.session import load_recipe
 from mitsim.optics.frames import Frame
-from mitsim.studies.budget import LAMBDA, REST, SCENE, SOLVER, LossRow, _of_scene, gained, session_rendering
-from mitsim.studies.calibration import CalibrationFindings, _row, judged, measure, singular_rows, spent
-from mitsim.studies.drift.perturbation import Expected, Noise
+from mitsim.studies.calibration_study import CalibrationFindings, _row, judged, measure, singular_rows, spent
+from mitsim.studies.error_budget import LAMBDA, REST, SCENE, SOLVER, LossRow, _of_scene, gained, session_rendering
 from mitsim.studies.framework.page import build_findings
+from mitsim.studies.perturbation import Expected, Noise
 from tests.unit.calibrate.test_responses import CLIPPED, EXPOSURE_S, ToyLight, lit_session
 
 SEEDS = 40

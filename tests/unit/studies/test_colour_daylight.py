@@ -13,11 +13,11 @@ from mitsim.devices.chart import ChartPlace
 from mitsim.devices.patterns import parse_patterns
 from mitsim.devices.sensor import SensorModel
 from mitsim.report.table import Mean, Table
-from mitsim.studies.colour import light as by_lux
-from mitsim.studies.colour.light import BY_LUX, LEAST, METHODS, DaylitLine, claim_of, expected, kept_lx, most
+from mitsim.studies import daylight as by_lux
+from mitsim.studies.daylight import BY_LUX, LEAST, METHODS, DaylitLine, claim_of, expected, kept_lx, most
+from mitsim.studies.framework.claims import UNDECIDED
 from mitsim.studies.framework.experiment import Scope
 from mitsim.studies.framework.setup import Setup
-from mitsim.studies.framework.verdicts import UNDECIDED
 
 N, PIXELS = 8, 15
 BOXES = ((0, 2, 1, 4), (3, 8, 5, 7), *[(0, 1, 0, 1)] * 22)

@@ -18,8 +18,8 @@ from mitsim.metrics import psnr
 from mitsim.reconstruct.colour import chart
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.mosaic import PLANES, JointMosaic
-from mitsim.report.colour.ways import demosaiced
-from mitsim.studies.colour.lit import ARRAY, HALF, JOINT, MosaicShots, filter_weights, respectred, serving
+from mitsim.report.mosaic_images import demosaiced
+from mitsim.studies.lit_lines import ARRAY, HALF, JOINT, MosaicShots, filter_weights, respectred, serving
 from tests.ideal_sessions import picture, shadow
 from tests.invented import sensor
 

@@ -18,14 +18,14 @@ from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
 from mitsim.devices.drift import UNITS, Drift
 from mitsim.devices.session import load_recipe
-from mitsim.report.exposures import RENDERED, LitScene
+from mitsim.report import RENDERED
+from mitsim.report.lit_scene import LitScene
 from mitsim.report.table import Table
-from mitsim.studies.framework.experiment import find_experiment
-from mitsim.studies.drift.drift import SESSION, DriftStand, Outcome
-from mitsim.studies.framework.experiment import Results, Scope
+from mitsim.studies.drift_loss import SESSION, DriftStand, Outcome
+from mitsim.studies.drift_study import _moved
+from mitsim.studies.framework.experiment import Results, Scope, find_experiment
 from mitsim.studies.framework.setup import Setup
 from mitsim.studies.framework.studio import Studio
-from mitsim.studies.paper.drift import _moved
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
 

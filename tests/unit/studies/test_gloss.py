@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import open_bench
-from mitsim.report.exposures import EQUAL_PEAK, IdealCamera, LitScene, Unexposed
-from mitsim.studies.gloss import CAUSES, INTERREFLECTION, PIXELS, REST, SATURATION, SENSOR, Split, split
+from mitsim.report import EQUAL_PEAK
+from mitsim.report.lit_scene import IdealCamera, LitScene, Unexposed
+from mitsim.studies.reflectivity_study import CAUSES, INTERREFLECTION, PIXELS, REST, SATURATION, SENSOR, Split, split
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
 

@@ -8,17 +8,15 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.report.exposures import MODELS, measures_of, values_of
+from mitsim.report import MODELS
 from mitsim.report.table import Table
-from mitsim.studies.framework.experiment import find_experiment
+from mitsim.studies import EXPERIMENTS, PAPER
 from mitsim.studies.framework.campaign import Where, run_experiment
-from mitsim.studies.framework.experiment import IMAGE, Results, Scope
+from mitsim.studies.framework.claims import UNDECIDED, judged, pictured, stated
+from mitsim.studies.framework.experiment import IMAGE, Results, Scope, find_experiment, measures_of, values_of
 from mitsim.studies.framework.page import Section, build_page, flagged
 from mitsim.studies.framework.run import batches
 from mitsim.studies.framework.setup import Point, Setup
-from mitsim.studies.framework.verdicts import UNDECIDED, judged
-from mitsim.studies.names import EXPERIMENTS, PAPER
-from mitsim.studies.paper.measure import pictured, stated
 
 TIMES = "\N{MULTIPLICATION SIGN}"
 WHOLE = Scope(Setup(), ("coins", "page"))

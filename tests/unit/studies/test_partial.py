@@ -12,9 +12,10 @@ from mitsim.core.arrays import FloatArray
 from mitsim.light.light import SampledLight, traced_again
 from mitsim.light.passes import TRAYS, Simulation
 from mitsim.light.settings import SharpPixels
-from mitsim.report.exposures import IDEALISED, LitScene
-from mitsim.studies.accuracy import partial_light
-from mitsim.studies.accuracy.partial_light import Anatomy
+from mitsim.report import IDEALISED
+from mitsim.report.lit_scene import LitScene
+from mitsim.studies import ablation
+from mitsim.studies.ablation import Anatomy
 from mitsim.transport.records import DIRECT, Deposits
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
@@ -59,24 +60,22 @@ def turned(shared_scene: Callable[..., Path], variant: str) -> SampledLight:
 def test_nothing_taken_out_is_the_light_itself(far: SampledLight) -> None:
     anatomy = Anatomy.of(far)
     assert anatomy.without(frozenset()) is far
-    assert anatomy.without(frozenset({"ambient", partial_light.KEYSTONE, partial_light.GLOSS})) is far, (
-        "which it does not have"
-    )
+    assert anatomy.without(frozenset({"ambient", ablation.KEYSTONE, ablation.GLOSS})) is far, "which it does not have"
     assert anatomy.effects == (
-        partial_light.FALLOFF,
-        partial_light.DIFFRACTION,
-        partial_light.DEPTH,
-        partial_light.DETAIL,
-        partial_light.BLACK_LEVEL,
-        partial_light.DEFOCUS,
-        partial_light.SPECKLE,
-        partial_light.RENDER_NOISE,
+        ablation.FALLOFF,
+        ablation.DIFFRACTION,
+        ablation.DEPTH,
+        ablation.DETAIL,
+        ablation.BLACK_LEVEL,
+        ablation.DEFOCUS,
+        ablation.SPECKLE,
+        ablation.RENDER_NOISE,
     )
 
 
 def test_the_same_paths_are_traced_again(far: SampledLight) -> None:
     """To the renderer's float32. (Planted: another purpose's streams.)"""
-    again = traced_again(far, partial_light._Filing(far.bench, far.simulation.settings, True, frozenset()))
+    again = traced_again(far, ablation._Filing(far.bench, far.simulation.settings, True, frozenset()))
     for own, other in zip(far.groups, again.groups, strict=True):
         for tray in TRAYS:
             assert abs(getattr(own, tray) - getattr(other, tray)).sum() <= 1e-6 * own.fine.sum()
@@ -92,15 +91,15 @@ def test_without_all_it_is_the_idealised_model(scene: str, request: pytest.Fixtu
     wanted = np.stack([frame.irradiance for frame in lit.expected(IDEALISED, light.bench.family(FAMILY))])
     whole = frozenset(anatomy.effects)
     assert apart(frames(anatomy.without(whole)), wanted) < 5e-5
-    for effect in whole - {partial_light.SPECKLE, partial_light.DETAIL}:
+    for effect in whole - {ablation.SPECKLE, ablation.DETAIL}:
         assert apart(frames(anatomy.without(whole - {effect})), wanted) > 1e-4, effect
     assert apart(frames(light), wanted) > 0.05
 
 
 def test_a_turned_projector_has_a_keystone(turned: SampledLight) -> None:
     anatomy = Anatomy.of(turned)
-    assert partial_light.KEYSTONE in anatomy.effects and partial_light.DEPTH not in anatomy.effects
-    assert not partial_light._off_plane(turned)
+    assert ablation.KEYSTONE in anatomy.effects and ablation.DEPTH not in anatomy.effects
+    assert not ablation._off_plane(turned)
 
 
 def sharp_deposits(light: SampledLight) -> Deposits:
@@ -123,20 +122,20 @@ def pixel_of(light: SampledLight, deposits: Deposits) -> FloatArray:
 def test_depth_is_parallax(far: SampledLight) -> None:
     """The projector, 60 mm aside (x = 60, column -60), 20 mm before the plane: light is seen 60 (1/380 - 1/400) aside,
     0.35 pixels, and without depth in its pixel on the plane. (Planted: the projector on the other side.)"""
-    deposits, place = sharp_deposits(far), partial_light._Place(far.bench)
+    deposits, place = sharp_deposits(far), ablation._Place(far.bench)
     aside = place.parallax(deposits)
     assert np.allclose(aside[1], -60 * (1 / 380 - 1 / 400), rtol=1e-3) and np.abs(aside[0]).max() < 1e-6
     assert (pixel_of(far, deposits) != deposits.pixel).mean() > 0.2
-    back = place.moved(deposits, frozenset({partial_light.DEPTH}))
+    back = place.moved(deposits, frozenset({ablation.DEPTH}))
     assert np.allclose(back.inverse_depth, 1 / 400) and np.array_equal(pixel_of(far, back), deposits.pixel)
-    assert partial_light._off_plane(far)
+    assert ablation._off_plane(far)
 
 
 def test_without_keystone_light_lies_in_its_pixel(turned: SampledLight) -> None:
     """(Planted: the homography the other way round.)"""
     deposits = sharp_deposits(turned)
     assert (pixel_of(turned, deposits) != deposits.pixel).mean() > 0.2
-    straight = partial_light._Place(turned.bench).moved(deposits, frozenset({partial_light.KEYSTONE}))
+    straight = ablation._Place(turned.bench).moved(deposits, frozenset({ablation.KEYSTONE}))
     assert np.array_equal(pixel_of(turned, straight), deposits.pixel)
     assert np.array_equal(straight.inverse_depth, deposits.inverse_depth)
 
@@ -163,7 +162,7 @@ def test_black_level_adds_a_part_of_uniform_light(far: SampledLight) -> None:
     """b + (1 - b) w of every pixel: frames are (1 - b) of those without, and b of the uniform frame. (Planted: 1 for
     1 - b.)"""
     anatomy, leak = Anatomy.of(far), 1 / 100
-    without = anatomy.without(frozenset({partial_light.BLACK_LEVEL}))
+    without = anatomy.without(frozenset({ablation.BLACK_LEVEL}))
     (uniform,) = without.frames(far.bench.family("uniform").lighting, 0)
     assert apart(frames(far), (1 - leak) * frames(without) + leak * uniform.irradiance) < 1e-9
 
@@ -172,7 +171,7 @@ def test_detail_is_what_cells_of_a_pixel_differ_in(far: SampledLight) -> None:
     """The same flux of each pixel, spread evenly over its cells: c x c of them have the same light. (Planted: the mean
     over all pixels.)"""
     anatomy = Anatomy.of(far)
-    off = frozenset({partial_light.DETAIL, partial_light.DEFOCUS, partial_light.DEPTH})
+    off = frozenset({ablation.DETAIL, ablation.DEFOCUS, ablation.DEPTH})
     even = anatomy.without(off)
     cells = sum(group.fine for group in even.groups)[:-1]
     per_pixel = even.simulation.settings.subdivision**2
@@ -180,7 +179,7 @@ def test_detail_is_what_cells_of_a_pixel_differ_in(far: SampledLight) -> None:
     for pixel in (0, 37, 255):
         lit = np.sort(cells[[pixel]].toarray()[0])[::-1][:per_pixel]
         assert lit.min() > 0.9 * lit.max() and lit.sum() > 0.999 * cells[[pixel]].sum()
-    uneven = sum(group.fine for group in anatomy.without(off - {partial_light.DETAIL}).groups)[:-1]
+    uneven = sum(group.fine for group in anatomy.without(off - {ablation.DETAIL}).groups)[:-1]
     assert np.allclose(uneven.sum(axis=1), cells.sum(axis=1), rtol=1e-9)
     spread = [np.ptp(np.sort(light[[37]].toarray()[0])[::-1][:per_pixel]) for light in (cells, uneven)]
     assert spread[1] > 10 * spread[0]
@@ -190,7 +189,7 @@ def test_what_hides_or_moves_points_leaves_them_where_they_are(far: SampledLight
     """Where depth stays on, all points of a pixel have the mean of their values. (Planted: that of all pixels.)"""
     deposits = sharp_deposits(far)
     two = Deposits.joined([deposits, replace(deposits, value=3 * deposits.value)])
-    even = partial_light._even(two, far.bench.n**2)
+    even = ablation._even(two, far.bench.n**2)
     assert np.allclose(even.value, 2 * np.tile(deposits.value, 2)) and np.array_equal(even.row, two.row)
 
 
@@ -203,8 +202,8 @@ def test_gloss_is_what_the_sensor_sees_beyond_its_mean(shared_scene: Callable[..
     path.write_text(text.replace('name="reflectance" type="bitmap"', 'name="diffuse_reflectance" type="bitmap"'))
     light = ms.open_bench(path, variant).light(FAMILY, accuracy=1e-3)
     anatomy = Anatomy.of(light)
-    assert partial_light.GLOSS in anatomy.effects
-    plain = anatomy.without(frozenset({partial_light.GLOSS}))
+    assert ablation.GLOSS in anatomy.effects
+    plain = anatomy.without(frozenset({ablation.GLOSS}))
     assert plain.simulation.settings.anchors == 1
     whole, mean = frames(light), frames(plain)
     assert 1e-4 < apart(mean, whole) < 0.1
@@ -212,17 +211,17 @@ def test_gloss_is_what_the_sensor_sees_beyond_its_mean(shared_scene: Callable[..
 
 
 def test_lobes_are_averaged_over_anchors_with_their_weights(far: SampledLight) -> None:
-    """SampledLight of one anchor alone comes to all, times its weight in the mean over it. (Planted: its row's twice.)"""
+    """Light of one anchor alone comes to all, times its weight in the mean over it. (Planted: its row's twice.)"""
     sharp = SharpPixels((5,), 3, (-0.05, 0.05, -0.05, 0.05))
     simulation = Simulation(far.bench, replace(far.simulation.settings, sharp=sharp))
     one, zero = np.ones(1), np.zeros(1, np.int64)
     deposits = Deposits(zero + 5, zero + 2, zero + 1, 0 * one, 0 * one, one / 400, one, np.full(1, DIRECT, np.int16))
     labels = np.arange(far.bench.n**2)
     filed = simulation.sharp.file(deposits, labels, 1)
-    mean = partial_light._even_lobes(filed, simulation)
+    mean = ablation._even_lobes(filed, simulation)
     weight = simulation.sharp_weights[2] * simulation.sharp_weights[1]
     again = simulation.sharp.bundle.repeated(
         replace(simulation.sharp.bundle, anchors=1).file(deposits.averaged(simulation.sharp_weights), labels, 1)
     )
     assert abs(mean - again).max() < 1e-12 and mean.sum() == pytest.approx(9 * weight)
-    assert partial_light._even_lobes(filed, far.simulation) is filed, "nothing to average where nothing is sharp"
+    assert ablation._even_lobes(filed, far.simulation) is filed, "nothing to average where nothing is sharp"

@@ -11,19 +11,9 @@ import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
-from mitsim.report.exposures import (
-    DIM,
-    DIM_E,
-    EQUAL_FRAME,
-    EQUAL_PEAK,
-    EQUAL_TOTAL,
-    IDEALISED,
-    RENDERED,
-    Plane,
-    averaged,
-)
-from mitsim.studies.framework.pictures import SIDE, TEST_IMAGES, picture
-from mitsim.studies.framework.setup import Setup
+from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, RENDERED
+from mitsim.report.lit_scene import DIM, DIM_E, Plane, averaged
+from mitsim.studies.framework.setup import SIDE, TEST_IMAGES, Setup, picture
 from mitsim.studies.framework.studio import Image, Studio
 
 pytestmark = pytest.mark.usefixtures("kept_plans")

@@ -15,14 +15,14 @@ from mitsim.calibrate.session import Session
 from mitsim.core.job import Job
 from mitsim.devices.session import load_recipe
 from mitsim.optics.frames import Frame
-from mitsim.report.exposures import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODELS, IdealCamera, LitScene
+from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODELS
+from mitsim.report.lit_scene import IdealCamera, LitScene
 from mitsim.report.table import Table
 from mitsim.sensor.chain import electrons_from_irradiance
-from mitsim.studies.framework.experiment import find_experiment
-from mitsim.studies.framework.experiment import Results
+from mitsim.studies.framework.experiment import Results, find_experiment
 from mitsim.studies.framework.setup import Setup
 from mitsim.studies.framework.studio import Studio
-from mitsim.studies.sweepcam import MovedMask, _consistent, calibrated_places, ideal_places, moved
+from mitsim.studies.multishot_study import MovedMask, _consistent, calibrated_places, ideal_places, moved
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
 

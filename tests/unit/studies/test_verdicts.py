@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.report.exposures import EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED
+from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED
 from mitsim.report.table import Mean, Table, Value
-from mitsim.studies.framework.experiment import find_experiment
-from mitsim.studies.drift.levels import EFFECTS
-from mitsim.studies.framework.experiment import Results
-from mitsim.studies.framework.verdicts import (
+from mitsim.studies import drift_study
+from mitsim.studies.framework.claims import (
     CONFIRMED,
     NOT_CONFIRMED,
     UNDECIDED,
@@ -24,7 +22,8 @@ from mitsim.studies.framework.verdicts import (
     verdict_at,
     within,
 )
-from mitsim.studies.paper import drift
+from mitsim.studies.framework.experiment import Results, find_experiment
+from mitsim.studies.waterfall_study import EFFECTS
 
 Row = dict[str, Value]
 Build = Callable[[float], list[Row]]
@@ -264,7 +263,7 @@ BORDERS = [
     ("ambient", 2, lamps, -math.inf, 0.0),
     ("separation", 0, lambda value: lit(corner=value, cookie_bag=9.0), 0.0, math.inf),
     ("models", 0, fitted, -0.5, math.inf),
-    ("drift", 0, drifted, -drift.AGREE_DB, drift.AGREE_DB),
+    ("drift", 0, drifted, -drift_study.AGREE_DB, drift_study.AGREE_DB),
     ("waterfall", 0, lambda value: fallen(lost=value), -math.inf, 2.0),
     ("waterfall", 1, lambda value: fallen(gained=value), 0.0, math.inf),
     ("reflectivity", 0, lambda value: glossy(card=value), 20.0, math.inf),
@@ -298,7 +297,7 @@ def test_claims_are_decided_on_both_sides_of_each_border(
 
 
 def test_every_study_of_the_paper_is_held() -> None:
-    from mitsim.studies.names import PAPER
+    from mitsim.studies import PAPER
 
     assert {study for study, *_ in BORDERS} == set(PAPER) | {"models", "drift"}
 

@@ -13,26 +13,32 @@ from mitsim.core.job import Job
 from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.light.passes import Simulation
 from mitsim.metrics import psnr
+from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.charts import Fall, Step, waterfall
-from mitsim.report.exposures import EQUAL_PEAK, RENDERED, LitScene
+from mitsim.report.lit_scene import LitScene
 from mitsim.report.table import Mean, Table
-from mitsim.studies.accuracy.partial_light import BLACK_LEVEL, DEPTH, FALLOFF, Anatomy
-from mitsim.studies.drift.levels import (
+from mitsim.studies.ablation import BLACK_LEVEL, DEPTH, FALLOFF, Anatomy
+from mitsim.studies.framework.claims import UNDECIDED
+from mitsim.studies.framework.experiment import Results, Scope
+from mitsim.studies.framework.setup import Setup
+from mitsim.studies.framework.studio import Studio
+from mitsim.studies.waterfall_study import (
+    ALONE,
     CALIBRATED,
     EFFECTS,
+    EXPERIMENT,
+    IN_ORDER,
+    LEFT_OUT,
     MODELS,
     QUANTISATION,
     SATURATION,
     Levels,
     Sessions,
+    ends,
+    fall,
     fills_well,
     sensor_without,
 )
-from mitsim.studies.framework.experiment import Results, Scope
-from mitsim.studies.framework.setup import Setup
-from mitsim.studies.framework.studio import Studio
-from mitsim.studies.framework.verdicts import UNDECIDED
-from mitsim.studies.paper.waterfall import ALONE, EXPERIMENT, IN_ORDER, LEFT_OUT, ends, fall
 
 pytestmark = pytest.mark.usefixtures("kept_plans", "draft_figures")
 
