@@ -35,7 +35,7 @@ def characterise(
     """Measure a camera after EMVA 1288 on simulated frames; figures found beside those that its file sets."""
     from mitsim.core.configuration import locate
     from mitsim.devices.sensor import load_sensor
-    from mitsim.studies.emva_procedure import Procedure, capacity_of, efficiency_of
+    from mitsim.studies.emva_options import Procedure, capacity_of, efficiency_of
     from mitsim.studies.framework.run import check_study_folder
 
     sensor = load_sensor(locate(camera, "calibration", ".toml"))
@@ -72,7 +72,7 @@ def sense(
     quiet: Quiet = False,
 ) -> int:
     """Put an image of any renderer behind a camera's sensor: digital numbers with its noise."""
-    from mitsim.acquire.sense import check_ending, check_f_number, check_image, check_wavelength
+    from mitsim.acquire.sense_options import check_ending, check_f_number, check_image, check_wavelength
     from mitsim.bench.request import Exposure
     from mitsim.core.configuration import locate
     from mitsim.core.files import check_apart, output_file
