@@ -12,12 +12,11 @@ from dataclasses import replace
 import numpy as np
 from matplotlib.figure import Figure
 
-from mitsim.report import EQUAL_PEAK, RENDERED
-from mitsim.report.charts import curves, image_grid
-from mitsim.report.compare import in_text
+from mitsim.report import EQUAL_PEAK, RENDERED, in_text
+from mitsim.report.charts import curves
 from mitsim.report.lit_scene import Unexposed
 from mitsim.report.table import Mean, Table, Value
-from mitsim.studies.framework.claims import by_patterns, difference, found, pictured, verdict, within
+from mitsim.studies.framework.claims import by_patterns, difference, found, images, verdict, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import Point
 from mitsim.studies.framework.studio import Studio
@@ -33,16 +32,13 @@ _SPREAD = (1.0, 99.0)
 def _points(scope: Scope) -> Sequence[Point]:
     own = scope.pictures == (None,)
     setup = scope.setup if own else replace(scope.setup, scene="lamp_bench")
-    return [
-        Point.of(
-            setup.printed(name).changed(lamp=f"{radiance:g}"),
-            model=RENDERED, patterns=family, exposure=EQUAL_PEAK, seed=seed,
-        )
+    setups = [
+        setup.printed(name).changed(lamp=f"{radiance:g}")
         for name in scope.chosen(scope.pictures, scope.pictures[:1])
         for radiance in scope.chosen(RADIANCES, RADIANCES[::2])
-        for seed in scope.seeds
-        for family in FAMILIES
-    ]  # fmt: skip
+    ]
+    fixed = {"model": (RENDERED,), "exposure": (EQUAL_PEAK,)}
+    return Point.grid(setups, "model patterns exposure seed", seed=scope.seeds, patterns=FAMILIES, **fixed)
 
 
 def _measure(studio: Studio, point: Point) -> Found:
@@ -135,11 +131,8 @@ def _figures(results: Results) -> Mapping[str, Figure]:
         ),
     }
     ratios: list[Value] = table.distinct("ratio")
-    if grid := pictured(results, lines, "ratio", ratios):
-        drawn["images.png"] = image_grid(
-            grid, [f"lamp {ratio:g} times" for ratio in ratios], "Images by the lamp's light, exposure equal peak"
-        )
-    return drawn
+    names, title = [f"lamp {ratio:g} times" for ratio in ratios], "Images by the lamp's light, exposure equal peak"
+    return drawn | images("images.png", results, lines, "ratio", ratios, title, names)
 
 
 EXPERIMENT = Experiment(

@@ -9,21 +9,16 @@ from collections.abc import Mapping, Sequence
 
 from matplotlib.figure import Figure
 
-from mitsim.report import EQUAL_PEAK, MODELS
-from mitsim.report.charts import curves, image_grid
-from mitsim.report.compare import label
-from mitsim.report.table import Mean, Table
+from mitsim.report import EQUAL_PEAK, MODELS, label
+from mitsim.report.charts import curves
+from mitsim.report.table import Value
 from mitsim.studies.framework.claims import (
-    Holds,
     by_patterns,
     by_print,
-    difference,
+    compared,
     found,
-    judged,
+    images,
     panels,
-    pictured,
-    sampled,
-    within,
 )
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import Point
@@ -39,14 +34,14 @@ _STABLE_DB = 3.0
 
 
 def _points(scope: Scope) -> Sequence[Point]:
-    return [
-        Point.of(scope.setup.printed(name), model=model, patterns=family, binning=binning, seed=seed)
-        for name in scope.pictures
-        for seed in scope.seeds
-        for family in scope.chosen(FAMILIES, _SHOWN)
-        for binning in scope.chosen(BINNINGS, (_FINE, _COARSE))
-        for model in MODELS
-    ]
+    return Point.grid(
+        map(scope.setup.printed, scope.pictures),
+        "model patterns binning seed",
+        seed=scope.seeds,
+        patterns=scope.chosen(FAMILIES, _SHOWN),
+        binning=scope.chosen(BINNINGS, (_FINE, _COARSE)),
+        model=MODELS,
+    )
 
 
 def _measure(studio: Studio, point: Point) -> Found:
@@ -59,48 +54,28 @@ def _measure(studio: Studio, point: Point) -> Found:
 
 
 def _claims(results: Results) -> Sequence[Claim]:
-    def lost(family: str, rows: Table) -> tuple[str, Mean]:
-        fine, coarse = (rows.where(patterns=family, binning=binning) for binning in (_FINE, _COARSE))
-        loss = difference(fine, coarse, "psnr_db")
-        return f"{sampled(fine, 'psnr_db')} to {sampled(coarse, 'psnr_db')} dB: {loss} dB lost", loss
-
-    def stable(rows: Table) -> tuple[str, Holds]:
-        said, loss = lost("dots:7", rows)
-        return said, within(loss, high=_STABLE_DB)
-
-    def degrades(rows: Table) -> tuple[str, Holds]:
-        said, loss = lost("uniform", rows)
-        return said, within(loss, low=0)
-
-    def better(rows: Table) -> tuple[str, Holds]:
-        dots, uniform = rows.where(patterns="dots:7", binning=_COARSE), rows.where(patterns="uniform", binning=_FINE)
-        gain = difference(dots, uniform, "psnr_db")
-        return f"{gain:+} dB", within(gain, low=0)
-
-    table = results.table
+    few, few_coarse, many, many_coarse = (
+        dict[str, Value](patterns=family, binning=binning) for family in _SHOWN for binning in (_FINE, _COARSE)
+    )
+    lost, table = "{one} to {other} dB: {gain} dB lost", results.table
+    stable = "49 dots are stable down to 64 x 64 pixels (3 dB lost at most)"
+    better = "49 dots on 64 x 64 pixels are better than uniform light on 512 x 512"
     return [
-        judged(table, "49 dots are stable down to 64 x 64 pixels (3 dB lost at most)", "stable", stable),
-        judged(table, "Uniform light degrades with fewer pixels", "degrades", degrades),
-        judged(table, "49 dots on 64 x 64 pixels are better than uniform light on 512 x 512", "better", better),
+        compared(table, stable, "stable", many, many_coarse, lost, high=_STABLE_DB),
+        compared(table, "Uniform light degrades with fewer pixels", "degrades", few, few_coarse, lost),
+        compared(table, better, "better", many_coarse, few),
     ]
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:
     table = results.table
-    drawn = {
-        "psnr.png": curves(
-            panels(by_patterns(table), "pixels"),
-            "rows of the sensor [pixel]",
-            log=True,
-            title=f"PSNR by the sensor's rows, exposure {EQUAL_PEAK}",
-        )
-    }
+    shown, title = panels(by_patterns(table), "pixels"), f"PSNR by the sensor's rows, exposure {EQUAL_PEAK}"
+    drawn = {"psnr.png": curves(shown, "rows of the sensor [pixel]", log=True, title=title)}
     pixels = table.distinct("pixels")
     for family in _SHOWN:
-        if grid := pictured(results, by_print(table.where(patterns=family)), "pixels", pixels):
-            drawn[f"images_{family.replace(':', '')}.png"] = image_grid(
-                grid, [f"{each} rows" for each in pixels], f"{label(family)}, {EQUAL_PEAK}, by sensor rows"
-            )
+        lines, title = by_print(table.where(patterns=family)), f"{label(family)}, {EQUAL_PEAK}, by sensor rows"
+        names = [f"{each} rows" for each in pixels]
+        drawn |= images(f"images_{family.replace(':', '')}.png", results, lines, "pixels", pixels, title, names)
     return drawn
 
 

@@ -25,8 +25,8 @@ from mitsim.metrics import psnr
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
+from mitsim.report import label
 from mitsim.report.colour_image import by_patch, halves
-from mitsim.report.compare import label
 from mitsim.report.plots import BLUE, FONT, VERMILION, figure_of, label_axes
 from mitsim.report.table import Table, Value
 from mitsim.studies import daylight as by_lux

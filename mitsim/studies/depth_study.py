@@ -15,12 +15,11 @@ from dataclasses import replace
 
 from matplotlib.figure import Figure
 
-from mitsim.report import EQUAL_PEAK, IDEALISED, RENDERED
-from mitsim.report.charts import curves, image_grid
-from mitsim.report.compare import label
+from mitsim.report import EQUAL_PEAK, IDEALISED, RENDERED, label
+from mitsim.report.charts import curves
 from mitsim.report.lit_scene import Plane
 from mitsim.report.table import Mean, Table, Value
-from mitsim.studies.framework.claims import by_patterns, difference, every, found, pictured, sampled, verdict, within
+from mitsim.studies.framework.claims import by_patterns, difference, every, found, images, sampled, verdict, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope, grouped
 from mitsim.studies.framework.setup import Point
 from mitsim.studies.framework.studio import Image, Studio
@@ -188,11 +187,8 @@ def _figures(results: Results) -> Mapping[str, Figure]:
         for family in DEEP[scene]
     }
     shown: list[Value] = [NONE, MAP]
-    if grid := pictured(results, lines, "focus", shown):
-        drawn["images.png"] = image_grid(
-            grid, ["one depth", "a depth for each pixel"], "Rendered scenes of many depths"
-        )
-    return drawn
+    titles = ["one depth", "a depth for each pixel"]
+    return drawn | images("images.png", results, lines, "focus", shown, "Rendered scenes of many depths", titles)
 
 
 EXPERIMENT = Experiment(

@@ -9,22 +9,15 @@ from collections.abc import Mapping, Sequence
 
 from matplotlib.figure import Figure
 
-from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, MODELS
-from mitsim.report.charts import curves, image_grid
-from mitsim.report.compare import label
-from mitsim.report.table import Table
+from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, MODELS, label
 from mitsim.studies.framework.claims import (
-    Holds,
+    by_exposure,
     by_patterns,
     by_print,
-    difference,
+    compared,
     imaged,
-    judged,
-    panels,
-    pictured,
-    sampled,
+    images,
     stated,
-    within,
 )
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import Point
@@ -42,18 +35,18 @@ _SHOWN = ("uniform", "dots:7")
 
 
 def _points(scope: Scope) -> Sequence[Point]:
-    return [
-        Point.of(
-            scope.setup.changed(mask_distance=distance).printed(name),
-            model=model, patterns=family, exposure=exposure, seed=seed,
-        )
-        for distance in scope.chosen(DISTANCES_MM, _FEW_MM)
-        for name in scope.pictures
-        for seed in scope.seeds
-        for family in FAMILIES
-        for exposure in (EQUAL_PEAK, EQUAL_FRAME)
-        for model in MODELS
-    ]  # fmt: skip
+    return Point.grid(
+        [
+            scope.setup.changed(mask_distance=distance).printed(name)
+            for distance in scope.chosen(DISTANCES_MM, _FEW_MM)
+            for name in scope.pictures
+        ],
+        "model patterns exposure seed",
+        seed=scope.seeds,
+        patterns=FAMILIES,
+        exposure=(EQUAL_PEAK, EQUAL_FRAME),
+        model=MODELS,
+    )
 
 
 def _measure(studio: Studio, point: Point) -> Found:
@@ -65,36 +58,28 @@ def _claims(results: Results) -> Sequence[Claim]:
     return [
         stated(near.where(patterns="uniform"), "At 750 um, uniform light gives 16.9 to 19 dB", _NEAR_UNIFORM),
         stated(near.where(patterns="dots:7"), "At 750 um, 49 dots give 30 to 30.5 dB", _NEAR_DOTS),
-        judged(
+        compared(
             results.table,
             f"25 dots at 750 um are comparable to uniform light at 2000 um (within {_COMPARABLE_DB:g} dB)",
             "comparable",
-            _as_good,
+            {"mask_distance": "0.75", "patterns": "dots:5"},
+            {"mask_distance": "2.0", "patterns": "uniform"},
+            "{one} against {other} dB: {gain:+} dB",
+            low=-_COMPARABLE_DB,
+            high=_COMPARABLE_DB,
         ),
     ]
 
 
-def _as_good(rows: Table) -> tuple[str, Holds]:
-    dots = rows.where(mask_distance="0.75", patterns="dots:5")
-    uniform = rows.where(mask_distance="2.0", patterns="uniform")
-    means, gain = [sampled(each, "psnr_db") for each in (dots, uniform)], difference(dots, uniform, "psnr_db")
-    return f"{means[0]} against {means[1]} dB: {gain:+} dB", within(gain, -_COMPARABLE_DB, _COMPARABLE_DB)
-
-
 def _figures(results: Results) -> Mapping[str, Figure]:
-    table, drawn = results.table, {}
-    for exposure in table.distinct("exposure"):
-        shown = panels(by_patterns(table.where(exposure=exposure)), "mask_distance")
-        drawn[f"psnr_{exposure.replace(' ', '_')}.png"] = curves(
-            shown, "sensor to mask [mm]", log=True, title=f"PSNR by the mask's distance, exposure {exposure}"
-        )
+    table, title = results.table, "PSNR by the mask's distance"
+    drawn = dict(by_exposure(table, by_patterns, "mask_distance", "sensor to mask [mm]", title, log=True))
     distances = table.distinct("mask_distance")
+    names = [f"{float(each):g} mm" for each in distances]
     for family in _SHOWN:
-        lines = by_print(table.where(patterns=family, exposure=EQUAL_FRAME))
-        if grid := pictured(results, lines, "mask_distance", distances):
-            drawn[f"images_{family.replace(':', '')}.png"] = image_grid(
-                grid, [f"{float(each):g} mm" for each in distances], f"{label(family)}, exposure {EQUAL_FRAME}"
-            )
+        shown = by_print(table.where(patterns=family, exposure=EQUAL_FRAME))
+        file, title = f"images_{family.replace(':', '')}.png", f"{label(family)}, exposure {EQUAL_FRAME}"
+        drawn |= images(file, results, shown, "mask_distance", distances, title, names)
     return drawn
 
 

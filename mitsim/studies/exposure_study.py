@@ -14,19 +14,15 @@ from matplotlib.figure import Figure
 
 from mitsim.devices.patterns import PatternFamily
 from mitsim.report import EQUAL_FRAME, IDEALISED, MODELS
-from mitsim.report.charts import image_grid
 from mitsim.report.lit_scene import Unexposed
 from mitsim.report.plots import quality_bars
-from mitsim.report.table import Mean, Table
+from mitsim.report.table import Mean
 from mitsim.studies.framework.claims import (
-    Holds,
     bars,
     by_print,
-    difference,
+    compared,
     found,
-    judged,
-    pictured,
-    sampled,
+    images,
     verdict,
     within,
 )
@@ -50,13 +46,8 @@ def _family(studio: Studio, point: Point) -> PatternFamily:
 
 
 def _points(scope: Scope) -> Sequence[Point]:
-    return [
-        Point.of(scope.setup.printed(name), model=model, patterns=patterns, seed=seed)
-        for name in scope.pictures
-        for seed in scope.seeds
-        for patterns in SHARED
-        for model in MODELS
-    ]
+    setups = map(scope.setup.printed, scope.pictures)
+    return Point.grid(setups, "model patterns seed", seed=scope.seeds, patterns=SHARED, model=MODELS)
 
 
 def _measure(studio: Studio, point: Point) -> Found:
@@ -80,20 +71,12 @@ def _law(frames: Unexposed, seconds: float) -> dict[str, float]:
 
 
 def _claims(results: Results) -> Sequence[Claim]:
-    table = results.table
-
-    def gain(claim: str, paper: str, better: str, other: str) -> Claim:
-        def judge(rows: Table) -> tuple[str, Holds]:
-            one, two = (rows.where(patterns=name) for name in (better, other))
-            more = difference(one, two, "psnr_db")
-            return f"{sampled(one, 'psnr_db')} dB, {more:+} dB", within(more, low=0)
-
-        return judged(table, claim, paper, judge)
-
+    table, said = results.table, "{one} dB, {gain:+} dB"
     ratio = np.divide(table.numbers("ser"), table.numbers("ser_law")).tolist()
+    one, many, dots = ({"patterns": name} for name in SHARED)
     return [
-        gain("49 dots beat 49 uniform frames of the same time", "higher", DOTS, MANY),
-        gain("49 uniform frames are slightly better than one", "slightly higher", MANY, ONE),
+        compared(table, "49 dots beat 49 uniform frames of the same time", "higher", dots, many, said),
+        compared(table, "49 uniform frames are slightly better than one", "slightly higher", many, one, said),
         Claim(
             "Without regularisation, ||x|| / ||x - x'|| is SNR / rho (49 dots)", "equal",
             f"measured / law {min(ratio):.3f} to {max(ratio):.3f}", "not defined: factors are calibrated",
@@ -103,13 +86,10 @@ def _claims(results: Results) -> Sequence[Claim]:
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:
-    table = results.table
-    drawn = {
-        "psnr.png": quality_bars(bars({name: table.where(patterns=name) for name in SHARED}), f"exposure {EQUAL_FRAME}")
-    }
-    if grid := pictured(results, by_print(table), "patterns", SHARED):
-        drawn["images.png"] = image_grid(grid, SHARED, f"exposure {EQUAL_FRAME}")
-    return drawn
+    table, title = results.table, f"exposure {EQUAL_FRAME}"
+    lines = {name: table.where(patterns=name) for name in SHARED}
+    psnr = {"psnr.png": quality_bars(bars(lines), title)}
+    return psnr | images("images.png", results, by_print(table), "patterns", SHARED, title)
 
 
 EXPERIMENT = Experiment(

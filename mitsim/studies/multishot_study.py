@@ -41,23 +41,20 @@ from mitsim.light.light import SampledLight
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.reconstruct.solver import Solution, centred, centred_columns, prepare
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODELS, RENDERED
-from mitsim.report.charts import curves, image_grid
 from mitsim.report.lit_scene import IdealCamera, LitScene, Pair, Unexposed
 from mitsim.report.table import Table
 from mitsim.studies.framework.claims import (
-    Holds,
+    Lines,
+    by_exposure,
     by_print,
-    difference,
+    compared,
     every,
-    judged,
+    images,
     near,
-    panels,
-    pictured,
     sampled,
     shown,
     stated,
     verdict,
-    within,
 )
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import QUICK_IMAGES, Point
@@ -150,46 +147,36 @@ def _claims(results: Results) -> Sequence[Claim]:
     many = table.where(frames=_FRAMES)
     line = {each: sampled(many.where(patterns=LINE, exposure=each), "psnr_db") for each in EXPOSURES}
     on_the_line = every(*(near(mean, _SWEPT_DB) for mean in line.values()))
-
-    def gain(claim: str, paper: str, better: Table, other: Table) -> Claim:
-        def judge(rows: Table) -> tuple[str, Holds]:
-            same = {"model": rows.rows[0]["model"], "exposure": rows.rows[0]["exposure"]}
-            more = difference(rows, other.where(**same), "psnr_db")
-            return f"{more:+} dB", within(more, low=_TELLS_DB)
-
-        return judged(better, claim, paper, judge)
-
-    one, still = table.where(patterns=UNIFORM, frames=1), many.where(patterns=UNIFORM)
-    swept, dots = many.where(patterns=SWEPT), many.where(patterns=DOTS)
     on_a_line = "; ".join(f"{exposure}: {mean} dB" for exposure, mean in line.items())
+    still, swept, dots = ({"patterns": name} for name in (UNIFORM, SWEPT, DOTS))
+    gained = "SweepCam's 49 frames beat 49 frames through a mask that rests"
     return [
-        stated(one, "One uniform frame gives 21.3 to 22.9 dB", (21.3, 22.9)),
-        stated(swept, "SweepCam with 49 frames gives 24.9 to 26.8 dB, here on a grid", _SWEPT_DB),
+        stated(table.where(patterns=UNIFORM, frames=1), "One uniform frame gives 21.3 to 22.9 dB", (21.3, 22.9)),
+        stated(many.where(**swept), "SweepCam with 49 frames gives 24.9 to 26.8 dB, here on a grid", _SWEPT_DB),
         Claim(
             "The same on a line along the rows", "24.9 to 26.8 dB", on_a_line, "",
             "confirmed only idealised" if on_the_line else verdict(on_the_line),
         ),
-        stated(dots, "49 shifting dots give 34 to 35.5 dB", (34.0, 35.5)),
-        gain("49 dots beat SweepCam's 49 frames", "higher", dots, swept),
-        gain("SweepCam's 49 frames beat 49 frames through a mask that rests", "", swept, still),
+        stated(many.where(**dots), "49 shifting dots give 34 to 35.5 dB", (34.0, 35.5)),
+        compared(many, "49 dots beat SweepCam's 49 frames", "higher", dots, swept, low=_TELLS_DB),
+        compared(many, gained, "", swept, still, low=_TELLS_DB),
     ]  # fmt: skip
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:
-    table, drawn = results.table, {}
-    for exposure in EXPOSURES:
-        rows = table.where(exposure=exposure)
-        first = rows.where(patterns=UNIFORM, frames=1).rows  # one uniform frame is the first of each
-        lines = {name: Table((*first, *rows.where(patterns=name).rows)) for name in (SWEPT, DOTS)}
-        lines = {UNIFORM: rows.where(patterns=UNIFORM), **lines}
-        drawn[f"psnr_{exposure.replace(' ', '_')}.png"] = curves(
-            panels(lines, "frames"), "frames", log=True, title=f"PSNR by the number of frames, exposure {exposure}"
-        )
+    table = results.table
+
+    def lines(rows: Table) -> Lines:
+        """By method; one uniform frame is the first of each."""
+        first = rows.where(patterns=UNIFORM, frames=1).rows
+        moved = {name: Table((*first, *rows.where(patterns=name).rows)) for name in (SWEPT, DOTS)}
+        return {UNIFORM: rows.where(patterns=UNIFORM), **moved}
+
+    drawn = dict(by_exposure(table, lines, "frames", "frames", "PSNR by the number of frames", log=True))
     names = {UNIFORM: "49 uniform", SWEPT: "SweepCam, 49", DOTS: "49 dots"}
-    shown = table.where(exposure=EQUAL_FRAME, frames=_FRAMES)
-    if grid := pictured(results, by_print(shown), "patterns", list(names)):
-        drawn["images.png"] = image_grid(grid, list(names.values()), f"Images of 49 frames, exposure {EQUAL_FRAME}")
-    return drawn
+    shown = by_print(table.where(exposure=EQUAL_FRAME, frames=_FRAMES))
+    title = f"Images of 49 frames, exposure {EQUAL_FRAME}"
+    return drawn | images("images.png", results, shown, "patterns", list(names), title, list(names.values()))
 
 
 EXPERIMENT = Experiment(

@@ -10,22 +10,18 @@ from dataclasses import replace
 
 from matplotlib.figure import Figure
 
-from mitsim.report import CONVENTIONS, EQUAL_FRAME, MODELS, RENDERED
-from mitsim.report.charts import curves, image_grid
-from mitsim.report.compare import label
+from mitsim.report import CONVENTIONS, EQUAL_FRAME, MODELS, RENDERED, label
 from mitsim.report.lit_scene import DIM
 from mitsim.report.plots import singular_values
 from mitsim.report.table import Table
 from mitsim.studies.framework.claims import (
-    Holds,
+    Lines,
+    by_exposure,
     by_print,
-    difference,
+    compared,
     imaged,
-    judged,
-    panels,
-    pictured,
+    images,
     stated,
-    within,
 )
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import Point
@@ -68,48 +64,38 @@ def _measure(studio: Studio, point: Point) -> Found:
 def _claims(results: Results) -> Sequence[Claim]:
     table = results.table
     families = Table(tuple(row for row in table.rows if row["exposure"] != DIM))
+
+    def better(claim: str, family: str, other: str) -> Claim:
+        return compared(families, claim, "higher", {"patterns": family}, {"patterns": other})
+
     return [
         stated(table.where(patterns="uniform"), "One uniform pattern gives 21 to 23 dB", _STATED["uniform"]),
         stated(table.where(patterns="dots:7"), "49 shifting dots give 34 to 35.5 dB", _STATED["dots:7"]),
-        _better(families, "More dots, better images (49 against 4)", "dots:7", "dots:2"),
-        _better(families, "Orthogonal patterns outperform random ones (49 each)", "dots:7", "random:7"),
-        _better(families, "Hadamard patterns perform best, for their light (64 each)", "hadamard:8", "dots:8"),
+        better("More dots, better images (49 against 4)", "dots:7", "dots:2"),
+        better("Orthogonal patterns outperform random ones (49 each)", "dots:7", "random:7"),
+        better("Hadamard patterns perform best, for their light (64 each)", "hadamard:8", "dots:8"),
     ]
 
 
-def _better(table: Table, claim: str, better: str, other: str) -> Claim:
-    """A claim that one family is ``better`` than an ``other``."""
-
-    def judge(rows: Table) -> tuple[str, Holds]:
-        gain = difference(rows.where(patterns=better), rows.where(patterns=other), "psnr_db")
-        return f"{gain:+} dB", within(gain, low=0)
-
-    return judged(table, claim, "higher", judge)
-
-
 def _figures(results: Results) -> Mapping[str, Figure]:
-    table, drawn = results.table, {}
-    for exposure in (each for each in CONVENTIONS if each in table.distinct("exposure")):
-        lines = {
-            said: Table(tuple(row for row in table.where(exposure=exposure).rows if _is(row["patterns"], kind)))
-            for kind, said in _KINDS.items()
+    table = results.table
+
+    def lines(rows: Table) -> Lines:
+        """By kind; one uniform pattern is the first of each."""
+        kinds = {kind: (kind, "uniform") for kind in _KINDS}
+        return {
+            _KINDS[kind]: Table(tuple(row for row in rows.rows if str(row["patterns"]).partition(":")[0] in of))
+            for kind, of in kinds.items()
         }
-        drawn[f"psnr_{exposure.replace(' ', '_')}.png"] = curves(
-            panels(lines, "patterns_count"), "patterns", title=f"PSNR by the number of patterns, exposure {exposure}"
-        )
+
+    known = Table(tuple(row for row in table.rows if row["exposure"] in CONVENTIONS))
+    drawn = dict(by_exposure(known, lines, "patterns_count", "patterns", "PSNR by the number of patterns"))
     spectra = {
         label(str(row["patterns"])): found for row in table.rows if (found := results.array(row, _SPECTRUM)) is not None
     }
     drawn["singular_values.png"] = singular_values(spectra)
-    grid = pictured(results, by_print(table.where(exposure=EQUAL_FRAME)), "patterns", _SHOWN)
-    if grid:
-        drawn["images.png"] = image_grid(grid, [label(family) for family in _SHOWN], f"exposure {EQUAL_FRAME}")
-    return drawn
-
-
-def _is(patterns: object, kind: str) -> bool:
-    """Whether ``patterns`` are of a ``kind``; one uniform pattern is the first of each."""
-    return str(patterns).partition(":")[0] in (kind, "uniform")
+    shown, names = by_print(table.where(exposure=EQUAL_FRAME)), [label(family) for family in _SHOWN]
+    return drawn | images("images.png", results, shown, "patterns", _SHOWN, f"exposure {EQUAL_FRAME}", names)
 
 
 EXPERIMENT = Experiment(

@@ -14,22 +14,19 @@ from matplotlib.figure import Figure
 
 from mitsim.metrics import psnr
 from mitsim.reconstruct.tv import solve_tv
-from mitsim.report import EQUAL_FRAME, MODELS
-from mitsim.report.charts import image_grid
-from mitsim.report.compare import in_text, label
+from mitsim.report import EQUAL_FRAME, MODELS, in_text, label
 from mitsim.report.lit_scene import LAMBDAS
 from mitsim.report.plots import quality_bars
 from mitsim.report.table import Table
 from mitsim.studies.framework.claims import (
     Holds,
-    Judge,
     bars,
     by_print,
+    compared,
     difference,
     found,
+    images,
     judged,
-    pictured,
-    sampled,
     within,
 )
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
@@ -49,16 +46,15 @@ _VISIBLE_DB = 1.0
 
 
 def _points(scope: Scope) -> Sequence[Point]:
-    return [
-        Point.of(
-            scope.setup.printed(name), model=model, patterns=family, exposure=EQUAL_FRAME, seed=seed, method=method
-        )
-        for name in scope.chosen(scope.pictures, scope.pictures[:1])
-        for seed in scope.seeds
-        for family in scope.chosen(FAMILIES, _SHOWN)
-        for model in MODELS
-        for method in METHODS
-    ]
+    return Point.grid(
+        map(scope.setup.printed, scope.chosen(scope.pictures, scope.pictures[:1])),
+        "model patterns exposure seed method",
+        seed=scope.seeds,
+        patterns=scope.chosen(FAMILIES, _SHOWN),
+        model=MODELS,
+        method=METHODS,
+        exposure=(EQUAL_FRAME,),
+    )
 
 
 def _measure(studio: Studio, point: Point) -> Found:
@@ -83,32 +79,23 @@ def _measure(studio: Studio, point: Point) -> Found:
 
 
 def _claims(results: Results) -> Sequence[Claim]:
-    def alike(column: str) -> Judge:
-        def judge(rows: Table) -> tuple[str, Holds]:
-            plain, tv = (rows.where(method=method) for method in METHODS)
-            gain = difference(tv, plain, column)
-            means = f"Tikhonov {sampled(plain, column)} dB, total variation {sampled(tv, column)} dB"
-            return f"{means}: {gain:+} dB", within(gain, -_VISIBLE_DB, _VISIBLE_DB)
-
-        return judge
-
     def faster(rows: Table) -> tuple[str, Holds]:
         plain, tv = (rows.where(method=method) for method in METHODS)
         costs = [f"{each.mean('seconds').value:.2g} s, {each.mean('peak_mib').value:.2g} MiB" for each in (plain, tv)]
         return " against ".join(costs), within(difference(plain, tv, "seconds"), high=0)
 
-    table = results.table
-    told = [
-        judged(
+    table, plain, tv = results.table, {"method": TIKHONOV}, {"method": TV}
+    alike = [
+        compared(
             table.where(patterns=family),
             f"Total variation is as good (within {_VISIBLE_DB:g} dB), {in_text(family)}, {which} weight",
-            "not visibly better",
-            alike(column),
+            "not visibly better", tv, plain, "Tikhonov {other} dB, total variation {one} dB: {gain:+} dB",
+            low=-_VISIBLE_DB, high=_VISIBLE_DB, column=column,
         )
         for column, which in _COLUMNS.items()
         for family in _SHOWN
-    ]
-    return [*told, judged(table, "The closed form takes less time than total variation", "less", faster)]
+    ]  # fmt: skip
+    return [*alike, judged(table, "The closed form takes less time than total variation", "less", faster)]
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:
@@ -123,10 +110,9 @@ def _figures(results: Results) -> Mapping[str, Figure]:
             bars(lines, column), f"PSNR by the regularisation, {which} weight, exposure {EQUAL_FRAME}"
         )
     for family in _SHOWN:
-        if grid := pictured(results, by_print(table.where(patterns=family)), "method", METHODS):
-            drawn[f"images_{family.replace(':', '')}.png"] = image_grid(
-                grid, _NAMES, f"{label(family)}, exposure {EQUAL_FRAME}, automatic weight"
-            )
+        shown = by_print(table.where(patterns=family))
+        title = f"{label(family)}, exposure {EQUAL_FRAME}, automatic weight"
+        drawn |= images(f"images_{family.replace(':', '')}.png", results, shown, "method", METHODS, title, _NAMES)
     return drawn
 
 

@@ -53,14 +53,14 @@ _SHOWS = 0.4
 
 def _points(scope: Scope) -> Sequence[Point]:
     pairs = scope.chosen(PAIRS_A_MM, (0.13, 0.26, 0.52))
-    prints = [f"bars {each:g}" for each in pairs] + ["edge"]
-    return [
-        Point.of(scope.setup.printed(name), model=model, patterns=family, exposure=EQUAL_FRAME, seed=seed)
-        for name in prints
-        for seed in scope.repeats
-        for family in scope.chosen(FAMILIES, ("uniform", "dots:7"))
-        for model in MODELS
-    ]
+    return Point.grid(
+        map(scope.setup.printed, [f"bars {each:g}" for each in pairs] + ["edge"]),
+        "model patterns exposure seed",
+        seed=scope.repeats,
+        patterns=scope.chosen(FAMILIES, ("uniform", "dots:7")),
+        model=MODELS,
+        exposure=(EQUAL_FRAME,),
+    )
 
 
 def _measure(studio: Studio, point: Point) -> Found:

@@ -238,13 +238,9 @@ _KEPT = 64
 
 def _points(scope: Scope) -> Sequence[Point]:
     pictures = [name for name in scope.pictures if name in (*QUICK_IMAGES, None)] or list(scope.pictures)
-    return [
-        Point.of(scope.setup.printed(name), patterns=PATTERNS, seed=seed, way=way, effect=effect)
-        for name in scope.chosen(pictures, pictures[:1])
-        for seed in scope.repeats
-        for way in scope.chosen(WAYS, WAYS[:2])
-        for effect in EFFECTS
-    ]
+    setups, ways = map(scope.setup.printed, scope.chosen(pictures, pictures[:1])), scope.chosen(WAYS, WAYS[:2])
+    fixed = {"patterns": (PATTERNS,)}
+    return Point.grid(setups, "patterns seed way effect", seed=scope.repeats, way=ways, effect=EFFECTS, **fixed)
 
 
 def _measure(studio: Studio, point: Point) -> Found:

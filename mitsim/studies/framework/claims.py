@@ -12,12 +12,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 
+from matplotlib.figure import Figure
 from scipy.special import stdtrit
 
 from mitsim.core.arrays import FloatArray
-from mitsim.report import EQUAL_PEAK, IDEALISED, MODELS, RENDERED
-from mitsim.report.charts import Curve
-from mitsim.report.compare import label
+from mitsim.report import EQUAL_PEAK, IDEALISED, MODELS, RENDERED, label
+from mitsim.report.charts import Curve, curves, image_grid
 from mitsim.report.table import Mean, Table, Value
 from mitsim.studies.framework.experiment import IMAGE, Claim, Found, Results
 from mitsim.studies.framework.setup import QUICK_IMAGES, Point
@@ -250,6 +250,52 @@ def pictured(
     return grid
 
 
+def images(
+    file: str,
+    results: Results,
+    lines: Lines,
+    across: str,
+    columns: Sequence[Value],
+    title: str,
+    names: Sequence[str] | None = None,
+) -> dict[str, Figure]:
+    """A grid of images by its file's name; empty where not all images of any row were kept.
+
+    Parameters
+    ----------
+    file, title
+        of the figure.
+    results, lines, across, columns
+        as for :func:`pictured`.
+    names
+        of the columns; None: their values.
+    """
+    grid = pictured(results, lines, across, columns)
+    return {file: image_grid(grid, names or [str(value) for value in columns], title)} if grid else {}
+
+
+def by_exposure(
+    table: Table, lines: Callable[[Table], Lines], by: str, axis: str, title: str, log: bool = False
+) -> dict[str, Figure]:
+    """PSNR in both models, a figure for each way of exposing.
+
+    Parameters
+    ----------
+    table, lines
+        what was measured, and from the rows of one exposure to rows by name.
+    by, axis
+        column along the axis, and the axis' name with its unit.
+    title, log
+        of each, but for the exposure; and whether the axis is logarithmic.
+    """
+    return {
+        f"psnr_{exposure.replace(' ', '_')}.png": curves(
+            panels(lines(table.where(exposure=exposure)), by), axis, log=log, title=f"{title}, exposure {exposure}"
+        )
+        for exposure in table.distinct("exposure")
+    }
+
+
 def stated(table: Table, claim: str, band: tuple[float, float]) -> Claim:
     """A claim of PSNR within a band.
 
@@ -266,6 +312,44 @@ def stated(table: Table, claim: str, band: tuple[float, float]) -> Claim:
         return f"{mean} dB", near(mean, band)
 
     return judged(table, claim, f"{band[0]:g} to {band[1]:g} dB", judge)
+
+
+def compared(
+    table: Table,
+    claim: str,
+    paper: str,
+    one: Mapping[str, Value],
+    other: Mapping[str, Value],
+    said: str = "{gain:+} dB",
+    *,
+    low: float | None = None,
+    high: float = math.inf,
+    column: str = "psnr_db",
+) -> Claim:
+    """A claim of what some images have over others; higher than 0 where no range is given.
+
+    Parameters
+    ----------
+    table
+        rows of both.
+    claim, paper
+        what is claimed, and what the paper says.
+    one, other
+        values of their columns that choose the rows of either.
+    said
+        what is said of them: ``one`` and ``other`` are their means, ``gain`` that of the paired differences.
+    low, high, column
+        range of the gain that the claim holds in, and what it is a gain of.
+    """
+    least = low if low is not None else 0.0 if high == math.inf else -math.inf
+
+    def judge(rows: Table) -> tuple[str, Holds]:
+        both = rows.where(**one), rows.where(**other)
+        gain = difference(*both, column)
+        means = dict(zip(("one", "other"), (sampled(each, column) for each in both), strict=True))
+        return said.format(gain=gain, **means), within(gain, least, high)
+
+    return judged(table, claim, paper, judge)
 
 
 def near(psnr_db: Mean, band: tuple[float, float]) -> Holds:

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 from mitsim.core.environment import DEFAULT_VARIANT
@@ -73,6 +75,21 @@ class Point:
     def of(cls, setup: Setup, **values: Value) -> Point:
         """Of a ``setup``, with these ``values``."""
         return cls(setup, tuple(values.items()))
+
+    @classmethod
+    def grid(cls, setups: Iterable[Setup], columns: str, **varied: Sequence[Value]) -> list[Point]:
+        """All combinations of what varies, the last fastest, at each of some ``setups``.
+
+        Parameters
+        ----------
+        setups, columns
+            where, and names of the values in the order in which the table has them.
+        **varied
+            values by name; what is fixed has one.
+        """
+        names = columns.split()
+        chosen = [dict(zip(varied, values, strict=True)) for values in product(*varied.values())]
+        return [cls.of(setup, **{name: values[name] for name in names}) for setup in setups for values in chosen]
 
     def __getitem__(self, name: str) -> Any:
         return dict(self.values)[name]
