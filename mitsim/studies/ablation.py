@@ -25,6 +25,7 @@ the mask); light of sharp lobes is not moved, and indirect light stays where it 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from types import MappingProxyType
@@ -33,6 +34,7 @@ import numpy as np
 from scipy import sparse
 
 from mitsim.bench.bench import Apparatus
+from mitsim.bench.effects import names
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
@@ -80,7 +82,7 @@ _IN_PLACE = 1e-3
 """Projector pixels that light may lie beside its place on the aligned plane and count as on it: float32 leaves 1e-4."""
 
 
-class Anatomy:
+class Ablation:
     """A light that any of its effects can be taken out of; what was traced anew for it is kept.
 
     Parameters
@@ -107,7 +109,7 @@ class Anatomy:
         self.effects = tuple(name for name, present in _present(light).items() if present)
 
     @classmethod
-    def of(cls, light: SampledLight) -> Anatomy:
+    def of(cls, light: SampledLight) -> Ablation:
         """That of a scene's ``light``, with its own truth."""
         truth = light.apparent
         return cls(light, truth.reflectance.ravel() * truth.board_flux, truth.board_flux)
@@ -128,7 +130,7 @@ class Anatomy:
         simulation = self._simulated(_formed(direct.simulation.settings, off, bench.loaded.glossy))
         own = {field.name: getattr(self.light, field.name) for field in fields(SampledLight)}
         own |= {"groups": groups, "simulation": simulation}
-        return PartialLight(**own, whole=self.light, rest=self._rest(off))
+        return AblatedLight(**own, whole=self.light, rest=self._rest(off))
 
     def _rest(self, off: frozenset[str]) -> SampledLight | None:
         """All but direct light; None where there is none."""
@@ -171,7 +173,7 @@ class Anatomy:
 
 
 @dataclass(frozen=True, eq=False)
-class PartialLight(SampledLight):
+class AblatedLight(SampledLight):
     """Direct light without some effects, and the ``rest`` of the light ``whole`` without them."""
 
     whole: SampledLight | None = None
@@ -353,6 +355,32 @@ def _weighted(rows: sparse.csr_array, by: FloatArray) -> sparse.csr_array:
     scaled = sparse.csr_array(sparse.diags_array(by) @ rows)
     scaled.eliminate_zeros()
     return scaled
+
+
+# -------- Effects that need no light to be traced anew, and settings without one of them
+
+
+def reformed(light: SampledLight, absent: frozenset[str]) -> SampledLight:
+    """The same ``light``, traced no further, whose frames are formed with the effects ``absent`` at their neutral
+    values: of such as need no light to be traced anew."""
+    simulation = light.simulation
+    settings = replace(simulation.settings, effects=simulation.settings.effects - absent)
+    return replace(light, simulation=Simulation(simulation.bench, settings))
+
+
+def ablations(settings: Settings, present: frozenset[str]) -> Iterator[tuple[str, Settings]]:
+    """The name of each effect of those ``present`` that shows in expected frames, and ``settings`` without it; numbers
+    fall to one."""
+    for name in sorted(present & names(lambda effect: effect.in_frames)):
+        yield name, replace(settings, effects=settings.effects - {name})
+    if settings.anchors > 1:
+        yield "anchors", replace(settings, anchors=1, occluded_anchors=1)
+    if settings.followed_anchors > 1:
+        yield "followed-anchors", replace(settings, followed_anchors=1, followed_width=1)
+    if len(settings.depths) > 1:
+        yield "layers", replace(settings, layers=())
+    if settings.subdivision > 1:
+        yield "cells", replace(settings, subdivision=1, coarse_cells=1)
 
 
 # -------- A bench, settings and orders of light in

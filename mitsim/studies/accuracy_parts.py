@@ -25,9 +25,9 @@ from mitsim.light.settings import GROUPS, LOOKS, Changes, Estimate, Part, Settin
 from mitsim.metrics import relative_error
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.planner.choose import predicted
-from mitsim.studies.ablation import MOST, OfOrders
+from mitsim.studies.ablation import MOST, OfOrders, ablations, reformed
 from mitsim.studies.accuracy_findings import Budget, JudgeFacts, PartCost, Row, Spread, Timed
-from mitsim.studies.trials import Stand, Trial, at_once, one_line, reformed, stacked, warmed, without
+from mitsim.studies.trials import Stand, Trial, at_once, one_line, stacked, warmed
 
 _LONGEST_S = 3.5
 """Seconds of light with all parts in: a dozen parts are then timed once in less than the study has."""
@@ -108,7 +108,7 @@ class Parts:
 
     def _parts(self, settings: Settings) -> Iterator[_Left]:
         stand, evidence = self._stand, self._stand.evidence
-        for name, less in without(settings, frozenset(present(stand.bench))):
+        for name, less in ablations(settings, frozenset(present(stand.bench))):
             known = _NUMBERS.get(name, name)
             part = Part(known, 1) if known in evidence.ladders else Part(known)
             yield self._without(name, evidence.error(part), stand.bench, replace(self.full, settings=less))

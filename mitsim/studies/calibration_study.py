@@ -38,6 +38,7 @@ from mitsim.report.charts import bars
 from mitsim.report.html import with_error
 from mitsim.report.lit_scene import LitScene
 from mitsim.report.table import Mean, Table
+from mitsim.studies.ablation import ablations, reformed
 from mitsim.studies.drift_loss import SESSION, DriftStand, squared_error
 from mitsim.studies.error_budget import (
     CAPTURE,
@@ -51,7 +52,6 @@ from mitsim.studies.error_budget import (
     losses,
 )
 from mitsim.studies.framework.page import Part
-from mitsim.studies.trials import reformed, without
 
 _FORMED = frozenset({"diffraction", "mask-thickness", "black-level"})
 """Effects of which frames are formed again in the same light; for others light is traced again, by the same seed."""
@@ -244,7 +244,7 @@ def _by_cause(lit: LitSession, noisy: Estimate, clean: Estimate, job: Job) -> It
     residual = clean.separability_residual
     yield _row("noise", noisy.separability_residual, residual)
     simulation, session = lit.light.simulation, lit.session
-    for name, settings in without(simulation.settings, simulation.settings.effects):
+    for name, settings in ablations(simulation.settings, simulation.settings.effects):
         if name in _FORMED:
             light = reformed(lit.light, frozenset({name}))
         else:

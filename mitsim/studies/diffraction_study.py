@@ -54,7 +54,7 @@ from mitsim.report.lit_scene import (
     point_profiles,
     shadow_row,
 )
-from mitsim.studies.trials import reformed
+from mitsim.studies.ablation import reformed
 
 MASKS: tuple[CameraMask, ...] = ("separable", "flatcam")
 ASSUMED, SEPARABLE, CALIBRATED = "geometric factors", "best separable factors", "calibrated factors"

@@ -30,7 +30,7 @@ from mitsim.devices.session import SIDES
 from mitsim.reconstruct.factors import Factors
 from mitsim.report.lit_scene import SPECKLE
 from mitsim.studies import ablation
-from mitsim.studies.ablation import Anatomy
+from mitsim.studies.ablation import Ablation
 from mitsim.studies.drift_loss import AMBIENT, SESSION, DriftStand, Foretold, squared_error
 from mitsim.studies.perturbation import Noise, Scatter
 
@@ -193,12 +193,12 @@ def _budget(stand: DriftStand, lit: LitSession, clear: Factors) -> _Budget:
 
 def _seen(stand: DriftStand, clear: Factors) -> Iterator[tuple[str, FloatArray]]:
     """Images without noise of the scene's light, and of it without one cause after another."""
-    anatomy, off = Anatomy.of(stand.lit.light), frozenset[str]()
+    scene_ablation, off = Ablation.of(stand.lit.light), frozenset[str]()
     yield "", stand.clear(clear, stand.lit.light)
     for name in CAUSES:
-        if name in anatomy.effects:
+        if name in scene_ablation.effects:
             off |= {name}
-            yield name, stand.clear(clear, anatomy.without(off))
+            yield name, stand.clear(clear, scene_ablation.without(off))
 
 
 def _of_scene(scatter: Scatter, seen: Mapping[str, FloatArray], sampled: Noise) -> dict[tuple[str, str], _Part]:

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from mitsim.bench.bench import Apparatus
-from mitsim.bench.effects import names, present
+from mitsim.bench.effects import present
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.devices.patterns import PatternFamily
 from mitsim.light.light import SampledLight, Sampling, Target, trace_light
-from mitsim.light.passes import Simulation
 from mitsim.light.plan import Plan
 from mitsim.light.settings import COUNTED, Evidence, Part, Settings
 from mitsim.optics.frames import ExpectedFrames
@@ -57,29 +56,6 @@ def sampled(settings: Settings, samples: int) -> Settings:
         followed_from_camera_samples=each / 8,
         occluded_samples=each / 8,
     )
-
-
-def reformed(light: SampledLight, absent: frozenset[str]) -> SampledLight:
-    """The same ``light``, traced no further, whose frames are formed with the effects ``absent`` at their neutral
-    values: of such as need no light to be traced anew."""
-    simulation = light.simulation
-    settings = replace(simulation.settings, effects=simulation.settings.effects - absent)
-    return replace(light, simulation=Simulation(simulation.bench, settings))
-
-
-def without(settings: Settings, present: frozenset[str]) -> Iterator[tuple[str, Settings]]:
-    """The name of each effect of those ``present`` that shows in expected frames, and ``settings`` without it; numbers
-    fall to one."""
-    for name in sorted(present & names(lambda effect: effect.in_frames)):
-        yield name, replace(settings, effects=settings.effects - {name})
-    if settings.anchors > 1:
-        yield "anchors", replace(settings, anchors=1, occluded_anchors=1)
-    if settings.followed_anchors > 1:
-        yield "followed-anchors", replace(settings, followed_anchors=1, followed_width=1)
-    if len(settings.depths) > 1:
-        yield "layers", replace(settings, layers=())
-    if settings.subdivision > 1:
-        yield "cells", replace(settings, subdivision=1, coarse_cells=1)
 
 
 def one_line(bench: Apparatus) -> Apparatus:

@@ -46,7 +46,7 @@ from mitsim.report.charts import Fall, Step, image_grid, waterfall
 from mitsim.report.lit_scene import IdealCamera, LitScene
 from mitsim.report.table import Table
 from mitsim.studies import ablation
-from mitsim.studies.ablation import Anatomy
+from mitsim.studies.ablation import Ablation
 from mitsim.studies.framework.claims import TOLERANCE_DB, difference, single, verdict, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import QUICK_IMAGES, Point
@@ -84,10 +84,10 @@ class Sessions:
     def __init__(self, bench: Apparatus, seed: int) -> None:
         self._session, job = Session(bench, load_recipe(), seed), Job()
         light = self._session.trace(self._session.plan(1e-3, job), job)
-        self._anatomy = Anatomy(light, light.flux, light.flux, "calibration")
+        self._ablation = Ablation(light, light.flux, light.flux, "calibration")
         self._lit = self._session.lit(light, job)
         self._kept: dict[frozenset[str], Estimate] = {}
-        self._effects = _OF_SESSIONS & frozenset(self._anatomy.effects)
+        self._effects = _OF_SESSIONS & frozenset(self._ablation.effects)
 
     @cached_property
     def noisy(self) -> Factors:
@@ -144,7 +144,7 @@ class Sessions:
     @single_threaded_blas()
     def _by_lines(self, off: frozenset[str]) -> Estimate:
         """From lines of the projector, each alone: what +-1 stripes come to without noise."""
-        light, n = self._anatomy.without(off), self._session.bench.n
+        light, n = self._ablation.without(off), self._session.bench.n
         second = Exposer(self._session.bench.rig, 1.0, self._session.seed)
 
         def rates(lighting: Lighting) -> Iterator[FloatArray]:
@@ -164,7 +164,7 @@ class Levels:
 
     Parameters
     ----------
-    lit, anatomy
+    lit, scene_ablation
         the scene, and its light.
     sessions
         of the camera.
@@ -172,13 +172,19 @@ class Levels:
         the family, and seed of the frames' noise.
     """
 
-    def __init__(self, lit: LitScene, anatomy: Anatomy, sessions: Sessions, patterns: str, seed: int) -> None:
-        self.lit, self._anatomy, self._sessions, self._patterns, self._seed = lit, anatomy, sessions, patterns, seed
+    def __init__(self, lit: LitScene, scene_ablation: Ablation, sessions: Sessions, patterns: str, seed: int) -> None:
+        self.lit, self._ablation, self._sessions, self._patterns, self._seed = (
+            lit,
+            scene_ablation,
+            sessions,
+            patterns,
+            seed,
+        )
         camera = IdealCamera(lit.bench, lit.bench.geometry.mask)
         self._assumed = sessions.idealised(camera.calibrated(float(lit.light.apparent.board_flux.mean())))
         fills = fills_well(lit.bench.sensor, lit.light.simulation.physics.speckle)
         own = {SATURATION: fills, QUANTISATION: lit.bench.sensor.bits is not None, CALIBRATION_NOISE: True}
-        self.effects = tuple(name for name in EFFECTS if name in anatomy.effects or own.get(name, False))
+        self.effects = tuple(name for name in EFFECTS if name in scene_ablation.effects or own.get(name, False))
 
     def images(self, on: frozenset[str]) -> Mapping[str, FloatArray]:
         """The image by model, with the effects ``on`` that the scene has."""
@@ -189,7 +195,7 @@ class Levels:
         request = light.plan.request
         assert request is not None
         asked = request.changed(patterns=self._patterns, seed=self._seed, exposure_fraction=fraction)
-        shots = capture(bench, asked, light=self._anatomy.without(off))
+        shots = capture(bench, asked, light=self._ablation.without(off))
         calibrated = self._sessions.factors(off, CALIBRATION_NOISE not in off)
         found = {}
         for model, factors in zip(MODELS, (self._assumed, calibrated), strict=True):
@@ -247,10 +253,10 @@ def _measure(studio: Studio, point: Point) -> Found:
     """What the effect changes, and the level that it comes to: without it, for one that is left out."""
     setup, seed, way, effect = point.setup, int(point["seed"]), point["way"], str(point["effect"])
     lit = studio.lit(setup)
-    anatomy = studio.once("anatomy", 1, setup, lambda: Anatomy.of(lit.light))
+    scene_ablation = studio.once("ablation", 1, setup, lambda: Ablation.of(lit.light))
     sessions = studio.once("sessions", 1, (setup, seed), lambda: Sessions(lit.bench, seed))
     levels = studio.once(
-        "levels", 1, (setup, seed), lambda: Levels(lit, anatomy, sessions, str(point["patterns"]), seed)
+        "levels", 1, (setup, seed), lambda: Levels(lit, scene_ablation, sessions, str(point["patterns"]), seed)
     )
 
     def images(on: frozenset[str]) -> Mapping[str, FloatArray]:

@@ -20,10 +20,11 @@ from mitsim.planner.planner import make_plan
 from mitsim.report import plots
 from mitsim.studies import accuracy_parts
 from mitsim.studies import accuracy_study as accuracy
+from mitsim.studies.ablation import ablations, reformed
 from mitsim.studies.accuracy_findings import AccuracyFindings, Budget, PartCost, Spread
 from mitsim.studies.accuracy_parts import Judge
 from mitsim.studies.framework.run import StudyResult, find_study
-from mitsim.studies.trials import Stand, at_once, one_line, reformed, sampled, without
+from mitsim.studies.trials import Stand, at_once, one_line, sampled
 
 pytestmark = pytest.mark.usefixtures("kept_plans", "draft_figures")
 PATTERNS, SEED = "dots:2", 5
@@ -211,11 +212,11 @@ def test_without_names_each_effect_once(bench: Bench) -> None:
     plan = make_plan(bench, bench.family(PATTERNS).lighting, 1e-4, SEED)
     present = frozenset({"diffraction", "interreflection", "speckle"})
     settings = replace(plan.settings, anchors=2)
-    switched = dict(without(settings, present))
+    switched = dict(ablations(settings, present))
     assert present - switched.keys() == {"speckle"}, "it is not part of expected frames"
     assert "anchors" in switched and switched["anchors"] == replace(settings, anchors=1)
     finest = replace(settings, followed_anchors=2, followed_width=2, subdivision=4, coarse_cells=2, layers=(3.0, 2.0))
-    fallen = dict(without(finest, frozenset()))
+    fallen = dict(ablations(finest, frozenset()))
     assert fallen["followed-anchors"] == replace(finest, followed_anchors=1, followed_width=1)
     assert fallen["cells"] == replace(finest, subdivision=1, coarse_cells=1)
     assert fallen["layers"] == replace(finest, layers=())

@@ -104,8 +104,8 @@ def test_causes_are_taken_out_one_after_another(monkeypatch: pytest.MonkeyPatch)
     """In the order of CAUSES, each beside those before it; what the white board's light has as well stays. (Planted:
     each alone.)"""
     effects = ("falloff", ablation.GLOSS, ablation.DETAIL, ablation.DEPTH)
-    anatomy = SimpleNamespace(effects=effects, without=lambda off: sorted(off))
-    monkeypatch.setattr(error_budget.Anatomy, "of", lambda light: anatomy)
+    scene_ablation = SimpleNamespace(effects=effects, without=lambda off: sorted(off))
+    monkeypatch.setattr(error_budget.Ablation, "of", lambda light: scene_ablation)
     stand: Any = SimpleNamespace(lit=SimpleNamespace(light="all"), clear=lambda factors, light: (factors, light))
     assert list(error_budget._seen(stand, "exact")) == [  # type: ignore[arg-type]
         ("", ("exact", "all")),

@@ -17,7 +17,7 @@ from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.charts import Fall, Step, waterfall
 from mitsim.report.lit_scene import LitScene
 from mitsim.report.table import Mean, Table
-from mitsim.studies.ablation import BLACK_LEVEL, DEPTH, FALLOFF, Anatomy
+from mitsim.studies.ablation import BLACK_LEVEL, DEPTH, FALLOFF, Ablation
 from mitsim.studies.framework.claims import UNDECIDED
 from mitsim.studies.framework.experiment import Results, Scope
 from mitsim.studies.framework.setup import Setup
@@ -67,7 +67,7 @@ def studio() -> Iterator[Studio]:
 @pytest.fixture(scope="module")
 def levels(studio: Studio, setup: Setup) -> Levels:
     lit = studio.lit(setup)
-    return Levels(lit, Anatomy.of(lit.light), Sessions(lit.bench, 3), FAMILY, 3)
+    return Levels(lit, Ablation.of(lit.light), Sessions(lit.bench, 3), FAMILY, 3)
 
 
 def test_with_all_effects_it_is_what_a_user_gets(studio: Studio, setup: Setup, levels: Levels) -> None:
@@ -150,10 +150,10 @@ def test_quantisation_costs_a_twelfth_of_its_step(studio: Studio, setup: Setup, 
     eight = {"bits": 8, "gain_dn_per_e": 7e-3, "black_level_dn": 2.0}
     camera = replace(bench, rig=replace(bench.rig, sensor=bench.sensor.model_copy(update=eight)))
     light = replace(lit.light, simulation=Simulation(camera, lit.light.simulation.settings))
-    other, anatomy = LitScene(light), Anatomy.of(light)
+    other, scene_ablation = LitScene(light), Ablation.of(light)
     squares = []
     for seed in range(SEEDS):
-        own = Levels(other, anatomy, levels._sessions, FAMILY, seed)
+        own = Levels(other, scene_ablation, levels._sessions, FAMILY, seed)
         rounded, exact = (own.images(on)[MODELS[0]] for on in (frozenset({QUANTISATION}), frozenset[str]()))
         squares.append(float(np.square(rounded - exact).mean()))
     frames = other.idealised(bench.family(FAMILY), 0)

@@ -15,7 +15,7 @@ from mitsim.light.settings import SharpPixels
 from mitsim.report import IDEALISED
 from mitsim.report.lit_scene import LitScene
 from mitsim.studies import ablation
-from mitsim.studies.ablation import Anatomy
+from mitsim.studies.ablation import Ablation
 from mitsim.transport.records import DIRECT, Deposits
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
@@ -58,10 +58,12 @@ def turned(shared_scene: Callable[..., Path], variant: str) -> SampledLight:
 
 
 def test_nothing_taken_out_is_the_light_itself(far: SampledLight) -> None:
-    anatomy = Anatomy.of(far)
-    assert anatomy.without(frozenset()) is far
-    assert anatomy.without(frozenset({"ambient", ablation.KEYSTONE, ablation.GLOSS})) is far, "which it does not have"
-    assert anatomy.effects == (
+    scene_ablation = Ablation.of(far)
+    assert scene_ablation.without(frozenset()) is far
+    assert scene_ablation.without(frozenset({"ambient", ablation.KEYSTONE, ablation.GLOSS})) is far, (
+        "which it does not have"
+    )
+    assert scene_ablation.effects == (
         ablation.FALLOFF,
         ablation.DIFFRACTION,
         ablation.DEPTH,
@@ -87,18 +89,18 @@ def test_without_all_it_is_the_idealised_model(scene: str, request: pytest.Fixtu
     """An even sheet at the aligned distance that shows the truth, pixel by pixel, though the traced one lies elsewhere,
     blurred, under a keystone. (Planted: each effect left in.)"""
     light = request.getfixturevalue(scene)
-    anatomy, lit = Anatomy.of(light), LitScene(light)
+    scene_ablation, lit = Ablation.of(light), LitScene(light)
     wanted = np.stack([frame.irradiance for frame in lit.expected(IDEALISED, light.bench.family(FAMILY))])
-    whole = frozenset(anatomy.effects)
-    assert apart(frames(anatomy.without(whole)), wanted) < 5e-5
+    whole = frozenset(scene_ablation.effects)
+    assert apart(frames(scene_ablation.without(whole)), wanted) < 5e-5
     for effect in whole - {ablation.SPECKLE, ablation.DETAIL}:
-        assert apart(frames(anatomy.without(whole - {effect})), wanted) > 1e-4, effect
+        assert apart(frames(scene_ablation.without(whole - {effect})), wanted) > 1e-4, effect
     assert apart(frames(light), wanted) > 0.05
 
 
 def test_a_turned_projector_has_a_keystone(turned: SampledLight) -> None:
-    anatomy = Anatomy.of(turned)
-    assert ablation.KEYSTONE in anatomy.effects and ablation.DEPTH not in anatomy.effects
+    scene_ablation = Ablation.of(turned)
+    assert ablation.KEYSTONE in scene_ablation.effects and ablation.DEPTH not in scene_ablation.effects
     assert not ablation._off_plane(turned)
 
 
@@ -144,7 +146,7 @@ def test_falloff_over_pixels_is_that_of_a_matt_sheet(turned: SampledLight) -> No
     """A sheet that faces the camera, evenly lit from z = 0: E r^4 / z^2 is the same for all points, and pixels of a
     shifted lens are of one size. What is taken out is the flux over the board, in units of its mean."""
     truth = turned.apparent
-    even, lit = Anatomy.of(turned)._even, truth.board_flux > 0
+    even, lit = Ablation.of(turned)._even, truth.board_flux > 0
     assert lit.mean() > 0.9 and np.allclose((even * truth.board_flux)[lit], truth.board_flux.mean())
 
 
@@ -153,7 +155,7 @@ def test_falloff_is_the_fourth_power_of_the_cosine(far: SampledLight) -> None:
     rows, columns = (np.linspace(*window, far.bench.n + 1) for window in far.bench.windows)
     middles = [(edges[1:] + edges[:-1]) / 2 for edges in (rows, columns)]
     wanted = (1 + middles[0][:, None] ** 2 + middles[1][None, :] ** 2) ** -2.0
-    brightness = (1 / Anatomy.of(far)._even).reshape(wanted.shape)
+    brightness = (1 / Ablation.of(far)._even).reshape(wanted.shape)
     # The mean over a small sensor is that of its centre to (half-width / distance)^2 = 1e-6; pixels of 7.5 mm: 2e-4.
     assert np.allclose(brightness, wanted / wanted.mean(), rtol=2e-3)
 
@@ -161,8 +163,8 @@ def test_falloff_is_the_fourth_power_of_the_cosine(far: SampledLight) -> None:
 def test_black_level_adds_a_part_of_uniform_light(far: SampledLight) -> None:
     """b + (1 - b) w of every pixel: frames are (1 - b) of those without, and b of the uniform frame. (Planted: 1 for
     1 - b.)"""
-    anatomy, leak = Anatomy.of(far), 1 / 100
-    without = anatomy.without(frozenset({ablation.BLACK_LEVEL}))
+    scene_ablation, leak = Ablation.of(far), 1 / 100
+    without = scene_ablation.without(frozenset({ablation.BLACK_LEVEL}))
     (uniform,) = without.frames(far.bench.family("uniform").lighting, 0)
     assert apart(frames(far), (1 - leak) * frames(without) + leak * uniform.irradiance) < 1e-9
 
@@ -170,16 +172,16 @@ def test_black_level_adds_a_part_of_uniform_light(far: SampledLight) -> None:
 def test_detail_is_what_cells_of_a_pixel_differ_in(far: SampledLight) -> None:
     """The same flux of each pixel, spread evenly over its cells: c x c of them have the same light. (Planted: the mean
     over all pixels.)"""
-    anatomy = Anatomy.of(far)
+    scene_ablation = Ablation.of(far)
     off = frozenset({ablation.DETAIL, ablation.DEFOCUS, ablation.DEPTH})
-    even = anatomy.without(off)
+    even = scene_ablation.without(off)
     cells = sum(group.fine for group in even.groups)[:-1]
     per_pixel = even.simulation.settings.subdivision**2
     assert per_pixel > 1
     for pixel in (0, 37, 255):
         lit = np.sort(cells[[pixel]].toarray()[0])[::-1][:per_pixel]
         assert lit.min() > 0.9 * lit.max() and lit.sum() > 0.999 * cells[[pixel]].sum()
-    uneven = sum(group.fine for group in anatomy.without(off - {ablation.DETAIL}).groups)[:-1]
+    uneven = sum(group.fine for group in scene_ablation.without(off - {ablation.DETAIL}).groups)[:-1]
     assert np.allclose(uneven.sum(axis=1), cells.sum(axis=1), rtol=1e-9)
     spread = [np.ptp(np.sort(light[[37]].toarray()[0])[::-1][:per_pixel]) for light in (cells, uneven)]
     assert spread[1] > 10 * spread[0]
@@ -201,9 +203,9 @@ def test_gloss_is_what_the_sensor_sees_beyond_its_mean(shared_scene: Callable[..
     text = path.read_text().replace(matt, glossy)
     path.write_text(text.replace('name="reflectance" type="bitmap"', 'name="diffuse_reflectance" type="bitmap"'))
     light = ms.open_bench(path, variant).light(FAMILY, accuracy=1e-3)
-    anatomy = Anatomy.of(light)
-    assert ablation.GLOSS in anatomy.effects
-    plain = anatomy.without(frozenset({ablation.GLOSS}))
+    scene_ablation = Ablation.of(light)
+    assert ablation.GLOSS in scene_ablation.effects
+    plain = scene_ablation.without(frozenset({ablation.GLOSS}))
     assert plain.simulation.settings.anchors == 1
     whole, mean = frames(light), frames(plain)
     assert 1e-4 < apart(mean, whole) < 0.1
