@@ -38,8 +38,7 @@ from mitsim.planner.memory import frame_seconds
 from mitsim.report import plots
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.studies.accuracy_findings import AccuracyFindings, Budget, Row, Timed
-from mitsim.studies.accuracy_parts import PARENT, Judge, Orders, Parts
-from mitsim.studies.trials import Stand
+from mitsim.studies.accuracy_parts import PARENT, Judge, Orders, Parts, Stand
 
 ACCURACIES = (3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4)
 """Two steps a decade, from a first look to far below the sensor's noise."""

@@ -22,9 +22,8 @@ from mitsim.studies import accuracy_parts
 from mitsim.studies import accuracy_study as accuracy
 from mitsim.studies.ablation import ablations, reformed
 from mitsim.studies.accuracy_findings import AccuracyFindings, Budget, PartCost, Spread
-from mitsim.studies.accuracy_parts import Judge
+from mitsim.studies.accuracy_parts import Judge, Stand, at_once, one_line, sampled
 from mitsim.studies.framework.run import StudyResult, find_study
-from mitsim.studies.trials import Stand, at_once, one_line, sampled
 
 pytestmark = pytest.mark.usefixtures("kept_plans", "draft_figures")
 PATTERNS, SEED = "dots:2", 5

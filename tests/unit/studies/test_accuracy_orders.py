@@ -11,9 +11,8 @@ from mitsim.core.job import Job
 from mitsim.light.settings import Part
 from mitsim.studies import accuracy_findings
 from mitsim.studies.accuracy_findings import Budget, PartCost, Spread
-from mitsim.studies.accuracy_parts import Judge, Orders
+from mitsim.studies.accuracy_parts import Judge, Orders, Stand, sampled
 from mitsim.studies.accuracy_study import PARENT
-from mitsim.studies.trials import Stand, sampled
 from tests.unit.transport.test_indirect import MATT, SPHERE
 
 pytestmark = pytest.mark.usefixtures("variant", "kept_plans", "draft_figures")
