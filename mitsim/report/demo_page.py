@@ -26,6 +26,7 @@ from mitsim.reconstruct.misfit import shown
 from mitsim.reconstruct.result import Reconstruction
 from mitsim.report import plots
 from mitsim.report.html import DASH, figure_uri, reflectance, rendered, sentence, write_html
+from mitsim.report.plots import FONT, WIDTH, figure_of, panels_of
 from mitsim.report.table import Mean
 
 _PATTERN_CORNER = 40
@@ -190,7 +191,7 @@ def _finite(image: npt.ArrayLike, name: str) -> FloatArray:
 def _figures(report: ReportData) -> dict[str, Any]:
     """The page's plots as data URIs, by name, where there are data for them; and the total time in s."""
     figures: dict[str, Any] = {"total": report.seconds.get("total", math.fsum(report.seconds.values()))}
-    figures["frames"] = {name: _picture(plots.frame(_finite(dn, name))) for name, dn in report.frames.items()}
+    figures["frames"] = {name: _picture(frame(_finite(dn, name))) for name, dn in report.frames.items()}
     curves = {f.label: f.singular_values for f in report.families if f.singular_values is not None}
     if curves:
         figures["singular_values"] = _picture(plots.singular_values(curves))
@@ -203,7 +204,7 @@ def _figures(report: ReportData) -> dict[str, Any]:
         figures["quality"] = _picture(plots.quality_bars(both))
     trusted = next((f.rendered.trust for f in report.families if f.rendered and f.name == report.main), None)
     if trusted:
-        figures["trust"] = _picture(plots.stated_and_actual(trusted.uncertainty, trusted.error))
+        figures["trust"] = _picture(stated_and_actual(trusted.uncertainty, trusted.error))
     positive = {row.name: row.value for row in report.budget if row.value}
     if positive:
         figures["budget"] = _picture(plots.error_bars(positive, report.accuracy))
@@ -240,6 +241,44 @@ def _seconds(value: float) -> str:
 def _trouble(status: str) -> str:
     """How the solver's sentence begins, unless it says that nothing is missing: those begin with "Solved: "."""
     return "" if status.startswith("Solved: ") else sentence(re.split(r"; |\. ", status)[0])
+
+
+# -------- Frames and errors as figures
+
+_FRAME_WIDTH = 3.6
+"""Inches of a frame: three stand side by side with room for their labels."""
+_SHOWN_PERCENT = 99.0
+"""Of the errors, those that the scale holds: a normal error's are then within 2.6 deviations."""
+
+
+def frame(values: npt.ArrayLike) -> Figure:
+    """A sensor frame ``values`` (m, m') [DN] with its colour bar; pixel (0, 0) is top left."""
+    figure, axes = figure_of(0.75 * _FRAME_WIDTH, _FRAME_WIDTH, layout="compressed")
+    drawn = axes.imshow(np.asarray(values, dtype=np.float64), cmap="viridis", interpolation="none")
+    bar = figure.colorbar(drawn, ax=axes)
+    bar.set_label("signal [DN]", fontsize=FONT - 1)
+    bar.ax.tick_params(labelsize=FONT - 2)
+    axes.set_xlabel("sensor column [pixel]", fontsize=FONT - 1)
+    axes.set_ylabel("sensor row [pixel]", fontsize=FONT - 1)
+    axes.tick_params(labelsize=FONT - 2)
+    return figure
+
+
+def stated_and_actual(uncertainty: FloatArray, error: FloatArray) -> Figure:
+    """An image's standard ``uncertainty`` beside its actual ``error``, both (n, n') [reflectance], on one scale."""
+    figure, (panels,) = panels_of(1, 2, 0.46 * WIDTH, layout="compressed", sharex=True, sharey=True)
+    largest = max(float(uncertainty.max()), float(np.percentile(error, _SHOWN_PERCENT)))
+    titled = {"stated: standard uncertainty": uncertainty, "actual: |image \N{MINUS SIGN} truth|": error}
+    for axes, (title, values) in zip(panels, titled.items(), strict=True):
+        drawn = axes.imshow(values, vmin=0, vmax=largest, cmap="viridis", interpolation="none")
+        axes.set_title(f"{title}\nrms {reflectance(float(np.sqrt(np.mean(np.square(values)))))}", fontsize=FONT)
+        axes.set_xlabel("column [projector pixel]", fontsize=FONT - 1)
+        axes.tick_params(labelsize=FONT - 2)
+    panels[0].set_ylabel("row [projector pixel]", fontsize=FONT - 1)
+    bar = figure.colorbar(drawn, ax=panels, extend="max")
+    bar.set_label("reflectance, 1 = board", fontsize=FONT - 1)
+    bar.ax.tick_params(labelsize=FONT - 2)
+    return figure
 
 
 # -------- A reconstruction and the truth in

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
 
 from mitsim.report.html import scientific
-from mitsim.report.plots import BLUE, FONT, GREY, LINK, VERMILION, WIDTH, figure_of, label_axes
+from mitsim.report.plots import BLUE, FONT, GREY, LINK, VERMILION, WIDTH, label_axes, log_ticks, panels_of
 
 SOLVER = "mitsim study solver"
 """Where the part that no scene changes is measured."""
@@ -270,10 +269,8 @@ def front(rows: Sequence[Row], judge: float, noise: float | None) -> Figure:
     """
     runs = [row for row in rows if row.estimator == "factored"]
     others = [row for row in rows if row.estimator != "factored"]
-    figure, _ = figure_of(0.5 * WIDTH)
-    figure.clear()
     ratios = {"width_ratios": (3, 2)} if others else None
-    panels: Any = figure.subplots(1, 2 if others else 1, squeeze=False, gridspec_kw=ratios)[0]
+    figure, (panels,) = panels_of(1, 2 if others else 1, 0.5 * WIDTH, gridspec_kw=ratios)
     _draw(panels[0], runs, BLUE, "o")
     titles = [f"whole runs, opening the scene to the last file\n{_counted(runs)}"]
     if others:
@@ -293,9 +290,8 @@ def front(rows: Sequence[Row], judge: float, noise: float | None) -> Figure:
         if noise is not None:
             axes.axhline(noise, color=GREY, lw=1.5, ls="--", zorder=1)
         axes.set_title(title, fontsize=FONT)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.tick_params(labelsize=FONT - 1)
-        _ticks(axes)
+        low, high = axes.get_xlim()
+        log_ticks(axes, _FEW if high > _FEWEST * low else _MANY)
         label_axes(axes, "wall time of all frames [s]", "")
     panels[0].set_ylabel("relative error of the frames [1]", fontsize=FONT)
     figure.suptitle("What accuracy costs in time", fontsize=FONT + 1)
@@ -319,10 +315,8 @@ def parts(costs: Sequence[PartCost], accuracy: float) -> Figure:
     accuracy
         whose samples they were timed with.
     """
-    figure, _ = figure_of(_AROUND_IN + _ROW_IN * max(len(costs), 1))
-    figure.clear()
     timed = any(part.extra is not None for part in costs)
-    panels: Any = figure.subplots(1, 1 + timed, sharey=True, squeeze=False)[0]
+    figure, (panels,) = panels_of(1, 1 + timed, _AROUND_IN + _ROW_IN * max(len(costs), 1), sharey=True)
     places = range(len(costs))[::-1]
     errors = panels[0]
     figure.suptitle(f"What each part of the light buys{', and what it takes' if timed else ''}", fontsize=FONT + 1)
@@ -345,8 +339,6 @@ def parts(costs: Sequence[PartCost], accuracy: float) -> Figure:
     for axes, title in zip(panels, ("error that is left without it", "seconds that it takes"), strict=False):
         axes.set_xscale("log")
         axes.set_title(title, fontsize=FONT)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.tick_params(labelsize=FONT - 1)
         axes.margins(x=0.05)
         low, high = axes.get_xlim()
         axes.set_xlim(low, high * (high / low) ** _BESIDE_PARTS)
@@ -416,14 +408,6 @@ def _times(repeats: int) -> str:
 
 def _beside(axes: Axes, at: float, place: float, text: str) -> None:
     axes.annotate(text, (at, place), (8, 0), textcoords="offset points", va="center", fontsize=FONT - 1)
-
-
-def _ticks(axes: Axes) -> None:
-    low, high = axes.get_xlim()
-    if high < _NARROW * low:
-        axes.xaxis.set_major_locator(LogLocator(subs=_FEW if high > _FEWEST * low else _MANY))
-        axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 # -------- Repeated times in, what they tell out

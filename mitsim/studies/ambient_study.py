@@ -13,8 +13,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mitsim.report import EQUAL_PEAK, RENDERED, in_text
-from mitsim.report.charts import curves
 from mitsim.report.lit_scene import Unexposed
+from mitsim.report.plots import curves
 from mitsim.report.table import Mean, Table, Value
 from mitsim.studies.framework.claims import by_patterns, difference, found, images, verdict, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope

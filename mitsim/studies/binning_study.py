@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from matplotlib.figure import Figure
 
 from mitsim.report import EQUAL_PEAK, MODELS, label
-from mitsim.report.charts import curves
+from mitsim.report.plots import curves
 from mitsim.report.table import Value
 from mitsim.studies.framework.claims import (
     by_patterns,

@@ -27,7 +27,7 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.report import label
 from mitsim.report.colour_image import by_patch, halves
-from mitsim.report.plots import BLUE, FONT, VERMILION, figure_of, label_axes
+from mitsim.report.plots import BLUE, FONT, VERMILION, figure_of, label_axes, panels_of
 from mitsim.report.table import Table, Value
 from mitsim.studies import daylight as by_lux
 from mitsim.studies.daylight import BY_LUX, GOAL, DaylitLine
@@ -226,9 +226,7 @@ def _patches(rows: Sequence[Mapping[str, Any]]) -> Figure:
 
 def _images(results: Results) -> Figure:
     """What each family of patterns recovers, in colour."""
-    figure, _ = figure_of(3.2)
-    figure.clear()
-    places: Any = figure.subplots(1, len(FAMILIES))
+    figure, (places,) = panels_of(1, len(FAMILIES), 3.2)
     for axes, family in zip(places, FAMILIES, strict=True):
         row = results.table.where(way=OWN, patterns=family).rows[0]
         image = results.array(row, _IMAGE)

@@ -36,8 +36,8 @@ from mitsim.reconstruct.convolution import ConvolutionalCamera, ConvolutionSolut
 from mitsim.reconstruct.dots import Classes, FactorisedClasses
 from mitsim.reconstruct.solver import prepare
 from mitsim.report import CONVENTIONS, EQUAL_FRAME, EQUAL_PEAK
-from mitsim.report.charts import curves, image_grid
 from mitsim.report.lit_scene import IdealCamera
+from mitsim.report.plots import curves, image_grid
 from mitsim.report.table import Mean, Table, Value
 from mitsim.sensor.chain import dn_to_electrons, electrons_from_irradiance, expose, exposure_for_peak
 from mitsim.studies.framework.claims import Holds, every, near, sampled, shown, verdict, verdict_at, within

@@ -39,7 +39,7 @@ from mitsim.reconstruct.sides import Side
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.reconstruct.uncertainty import common_response
 from mitsim.report import RENDERED, label
-from mitsim.report.charts import curves
+from mitsim.report.plots import curves
 from mitsim.report.table import Mean, Table
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.studies.framework.claims import verdict, within

@@ -16,8 +16,8 @@ from dataclasses import replace
 from matplotlib.figure import Figure
 
 from mitsim.report import EQUAL_PEAK, IDEALISED, RENDERED, label
-from mitsim.report.charts import curves
 from mitsim.report.lit_scene import Plane
+from mitsim.report.plots import curves
 from mitsim.report.table import Mean, Table, Value
 from mitsim.studies.framework.claims import by_patterns, difference, every, found, images, sampled, verdict, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope, grouped

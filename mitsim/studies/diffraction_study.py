@@ -17,11 +17,13 @@ from it, four bins a pixel, and the spectrum of the derivative is the modulation
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from textwrap import fill
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from matplotlib.figure import Figure
 
 from mitsim.acquire.exposure import Exposer
@@ -40,7 +42,6 @@ from mitsim.light.light import SampledLight
 from mitsim.metrics import Quality, psnr
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.reconstruct.solver import prepare
-from mitsim.report import plots
 from mitsim.report.lit_scene import (
     GEOMETRIC,
     LINE,
@@ -53,6 +54,19 @@ from mitsim.report.lit_scene import (
     peak_time,
     point_profiles,
     shadow_row,
+)
+from mitsim.report.plots import (
+    BLUE,
+    FONT,
+    GREEN,
+    LINK,
+    MARKERS,
+    VERMILION,
+    WIDTH,
+    figure_of,
+    label_axes,
+    legend_below,
+    line_style,
 )
 from mitsim.studies.ablation import reformed
 
@@ -152,8 +166,8 @@ class DiffractionFindings:
         message = f"A point's shadow in the projector's light is {100 * off.point_source:.0f} % off the geometric one"
         position = self.bench.geometry.centres(0)
         return {
-            "quality.png": plots.quality_by_factors(quality, self.verdict),
-            "shadow.png": plots.shadow_profiles(position, profiles, _PROFILE_MM, message),
+            "quality.png": quality_by_factors(quality, self.verdict),
+            "shadow.png": shadow_profiles(position, profiles, _PROFILE_MM, message),
         }
 
 
@@ -254,6 +268,55 @@ class _Trials:
                 residual=solution.residual,
                 status=str(solution.status),
             )
+
+
+# -------- Figures
+
+_TITLE_LETTERS = 100
+"""Of a line above a figure of the page's width."""
+
+
+def quality_by_factors(rows: Sequence[tuple[str, str, float]], message: str) -> Figure:
+    """PSNR [dB] of each system by the factors that its solver used, ``rows`` (system, factors, PSNR), first on top;
+    ``message`` above."""
+    systems = list(dict.fromkeys(system for system, _, _ in rows))[::-1]
+    factors = list(dict.fromkeys(name for _, name, _ in rows))
+    figure, axes = figure_of(1.3 + 0.46 * len(systems))
+    for place, system in enumerate(systems):
+        values = [value for name, _, value in rows if name == system]
+        axes.plot([min(values), max(values)], [place, place], color=LINK, lw=2, zorder=1)
+    for index, name in enumerate(factors):
+        points = [(value, systems.index(system)) for system, kind, value in rows if kind == name]
+        style = {"color": (VERMILION, BLUE, GREEN)[index % 3], "marker": MARKERS[index % len(MARKERS)]}
+        axes.plot(*zip(*points, strict=True), ls="", ms=8, label=name, zorder=3, **style)
+    axes.set_yticks(range(len(systems)), systems, fontsize=FONT - 2)
+    label_axes(axes, "PSNR of the image [dB]", "", grid="x")
+    figure.suptitle(fill(message, _TITLE_LETTERS), fontsize=FONT)
+    legend_below(figure, len(factors), *axes.get_legend_handles_labels())
+    return figure
+
+
+def shadow_profiles(
+    position_mm: npt.ArrayLike, profiles: Mapping[str, npt.ArrayLike], reach_mm: float, message: str
+) -> Figure:
+    """Shadows on one row of the sensor.
+
+    Parameters
+    ----------
+    position_mm, profiles
+        (pixels,) along the row, and relative irradiance there by light.
+    reach_mm, message
+        how far from the middle of the ``position_mm`` is shown, and what is said above.
+    """
+    figure, axes = figure_of(0.4 * WIDTH)
+    position = np.asarray(position_mm, dtype=np.float64)
+    inside = np.abs(position - position.mean()) <= reach_mm
+    for index, (name, values) in enumerate(profiles.items()):
+        axes.plot(position[inside], np.asarray(values)[inside], lw=1.8, label=name, **line_style(index))
+    axes.set_title(message, fontsize=FONT)
+    label_axes(axes, "position on the sensor [mm]", "irradiance, open sensor = 1 [1]")
+    axes.legend(fontsize=FONT - 1, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
+    return figure
 
 
 # -------- Images of bars and of a slanted edge in, how much contrast is left by spatial frequency out

@@ -23,8 +23,8 @@ from mitsim.devices.families import check_patterns
 from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import SessionRecipe, load_recipe
 from mitsim.reconstruct.factors import Factors
-from mitsim.report.charts import curves, paired
 from mitsim.report.lit_scene import LitScene
+from mitsim.report.plots import curves, paired
 from mitsim.report.table import Mean, Table
 from mitsim.studies.drift_loss import DriftStand
 from mitsim.studies.framework.claims import difference, verdict, within

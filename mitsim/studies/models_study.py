@@ -24,8 +24,8 @@ from mitsim.devices.model_fit import Modelling
 from mitsim.devices.session import SessionRecipe, load_recipe
 from mitsim.reconstruct.factors import Factors
 from mitsim.report import EQUAL_PEAK
-from mitsim.report.charts import curves
 from mitsim.report.lit_scene import LitScene
+from mitsim.report.plots import curves
 from mitsim.studies.framework.claims import difference, found, sampled, verdict, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import Point, Setup

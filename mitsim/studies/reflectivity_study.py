@@ -35,8 +35,8 @@ from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solver import Prepared, Solution
 from mitsim.report import EQUAL_PEAK, RENDERED, label
-from mitsim.report.charts import curves, image_grid
 from mitsim.report.lit_scene import LitScene, Unexposed, peak_time
+from mitsim.report.plots import curves, image_grid
 from mitsim.report.table import Mean, Table, Value
 from mitsim.sensor.moments import frame_moments
 from mitsim.studies.framework.claims import Holds, difference, every, sampled, single, verdict_at, within

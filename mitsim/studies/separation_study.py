@@ -23,8 +23,8 @@ from mitsim.reconstruct.dots import separate
 from mitsim.reconstruct.focus import FactorOfDepths, stated_parallax
 from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.report import EQUAL_PEAK, RENDERED
-from mitsim.report.charts import image_grid
 from mitsim.report.lit_scene import LitScene, Unexposed
+from mitsim.report.plots import image_grid
 from mitsim.studies.framework.claims import every, sampled, single, verdict, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import Point

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from functools import cached_property
@@ -29,7 +29,9 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from mitsim.bench.request import Request
 from mitsim.core.arrays import FloatArray
@@ -43,6 +45,21 @@ from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.sides import Method, Structure
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.report import plots
+from mitsim.report.html import typeset
+from mitsim.report.plots import (
+    BLUE,
+    FONT,
+    GREEN,
+    GREY,
+    MARKERS,
+    ORANGE,
+    VERMILION,
+    WIDTH,
+    label_axes,
+    legend_below,
+    log_ticks,
+    panels_of,
+)
 
 
 @dataclass(frozen=True)
@@ -70,7 +87,7 @@ class SolverFindings:
 
     def figures(self) -> dict[str, Figure]:
         """Error against time, a panel for each lambda."""
-        return {"solver.png": plots.solver_costs(self.rows)}
+        return {"solver.png": solver_costs(self.rows)}
 
 
 def measure(bench: None, request: Request, job: Job) -> SolverFindings:
@@ -323,3 +340,42 @@ def _double(values: Any, bits: int) -> FloatArray:
     """Integers in units of 2^-bits, rounded to double precision."""
     unit = 2**bits
     return np.array([value / unit for value in values.ravel().tolist()], dtype=np.float64).reshape(values.shape)
+
+
+# -------- Error against seconds as a figure
+
+_BEST = "best for its time"
+
+
+def solver_costs(rows: Sequence[SolverRow]) -> Figure:
+    """Error of the image against seconds of the solver in ``rows``, a panel for each lambda, the best ringed."""
+    lambdas = sorted({row.lambda_rel for row in rows}, reverse=True)
+    figure, (panels,) = panels_of(1, len(lambdas), 0.55 * WIDTH, sharex=True, sharey=True)
+    colours = (BLUE, ORANGE, VERMILION, GREEN)
+    precisions = list(dict.fromkeys(row.precision for row in rows))
+    forms = list(dict.fromkeys((row.method, row.layout) for row in rows))
+    for axes, lam in zip(panels, lambdas, strict=True):
+        panel = [row for row in rows if row.lambda_rel == lam]
+        for row in panel:
+            colour = colours[precisions.index(row.precision)]
+            marker = MARKERS[forms.index((row.method, row.layout))]
+            axes.plot([row.seconds], [row.error], marker, color=colour, ms=8, mec="white", mew=0.6, zorder=3)
+        _draw_front(axes, [(row.seconds, row.error) for row in panel])
+        axes.set(xscale="log", yscale="log")
+        log_ticks(axes)
+        axes.set_title(typeset(f"relative \N{GREEK SMALL LETTER LAMDA} {lam:.0e}"), fontsize=FONT)
+        label_axes(axes, "wall time [s]", "")
+    panels[0].set_ylabel("relative error of the image [1]", fontsize=FONT)
+    grey: dict[str, Any] = {"ls": "", "ms": 8, "color": "#9ca3af"}
+    entries = [(Line2D([], [], ls="", ms=8, color=colours[i], marker="o"), name) for i, name in enumerate(precisions)]
+    entries.append((panels[0].lines[-1], _BEST))
+    entries += [(Line2D([], [], **grey, marker=MARKERS[i]), ", ".join(form)) for i, form in enumerate(forms)]
+    legend_below(figure, 4, *zip(*entries, strict=True))
+    return figure
+
+
+def _draw_front(axes: Axes, points: Sequence[plots.Point]) -> None:
+    """Rings around the points that nothing beats, and the staircase that joins them."""
+    seconds, error = zip(*plots.pareto_front(points), strict=True)
+    style: dict[str, Any] = {"color": GREY, "lw": 1.0, "ls": ":", "drawstyle": "steps-post", "zorder": 2}
+    axes.plot(seconds, error, "o", ms=13, mfc="none", mec=GREY, mew=1.3, label=_BEST, **style)

@@ -16,9 +16,11 @@ the real session with its seed. Everything on, frames and calibrated factors are
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from textwrap import wrap
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -42,9 +44,9 @@ from mitsim.reconstruct.estimate_factors import Estimate, factors_of_sums, strip
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.status import Status, Verdict
-from mitsim.report.charts import Fall, Step, image_grid, waterfall
 from mitsim.report.lit_scene import IdealCamera, LitScene
-from mitsim.report.table import Table
+from mitsim.report.plots import BLUE, FONT, GREEN, GREY, PALE, ROW, VERMILION, beside, image_grid, label_axes, panels_of
+from mitsim.report.table import Mean, Table
 from mitsim.studies import ablation
 from mitsim.studies.ablation import Ablation
 from mitsim.studies.framework.claims import TOLERANCE_DB, difference, single, verdict, within
@@ -356,6 +358,118 @@ def _images(results: Results) -> dict[str, list[tuple[FloatArray, str]]]:
         if len(cells) == len(columns):
             grid[str(name or "scene")] = cells
     return grid
+
+
+# -------- Levels and steps as a figure
+
+_COLUMNS = (14.0, 92.0)
+"""Points from a waterfall to the numbers beside it: "-23.1 ± 0.2" has 60."""
+_LETTERS = 122
+"""Of a line below a figure, small ones."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """Change [dB] that an effect called ``name`` brings: as a step in order, alone, and to the whole without it; None
+    where one was not measured."""
+
+    name: str
+    in_order: Mean
+    alone: Mean | None = None
+    left_out: Mean | None = None
+
+    @property
+    def largest(self) -> float:
+        """Of the three, by size [dB]."""
+        return max(abs(mean.value) for mean in (self.in_order, self.alone, self.left_out) if mean)
+
+
+@dataclass(frozen=True)
+class Fall:
+    """A waterfall: PSNR of a ``first`` and of a ``last`` level, and the ``steps`` between them."""
+
+    first: Mean
+    steps: tuple[Step, ...]
+    last: Mean
+
+    def step(self, name: str) -> Step:
+        """That of the effect ``name``."""
+        return next(step for step in self.steps if step.name == name)
+
+    @property
+    def levels(self) -> FloatArray:
+        """(steps + 1,) PSNR [dB] before the first step and after each."""
+        return self.first.value + np.cumsum([0.0, *(step.in_order.value for step in self.steps)])
+
+
+def waterfall(panels: Mapping[str, Fall], seen: float) -> Figure:
+    """Levels of PSNR from a first to a last one, a bar for each step, in panels below each other on one scale.
+
+    Parameters
+    ----------
+    panels
+        by their titles; the steps' names are the same in all.
+    seen
+        change [dB] from which a step has a row, if any panel has it; others are named below, and are one bar.
+    """
+    names = [step.name for step in next(iter(panels.values())).steps]
+    change = {name: max(fall.step(name).largest for fall in panels.values()) for name in names}
+    large = {name for name in names if change[name] >= seen}
+    figure, places = panels_of(len(panels), 1, len(panels) * (ROW * (len(large) + 3) + 0.6) + 0.9, sharex=True)
+    places = places[:, 0]
+    levels = np.concatenate([fall.levels for fall in panels.values()])
+    low, high = levels.min(), levels.max()
+    room = max(high - low, 1.0)
+    places[0].set_xlim(low - 0.12 * room, high + 0.22 * room)
+    for axes, (title, fall) in zip(places, panels.items(), strict=True):
+        axes.set_title(title, fontsize=FONT, loc="left", fontweight="bold")
+        _draw_fall(axes, fall, large)
+        label_axes(axes, "PSNR [dB]" if axes is places[-1] else "", "", grid="x")
+    small = ", ".join(name for name in names if 0 < change[name] < seen)
+    none = ", ".join(name for name in names if change[name] == 0)
+    said = ["Changes of PSNR [dB] by each effect: bars in order, beside them alone and on the whole without it."]
+    said += [f"Less than {seen:g} dB each, in the bar called others: {small}."] if small else []
+    said += [f"Nothing at all, as the scene does not call for them: {none}."] if none else []
+    lines = [line for sentence in said for line in wrap(sentence, _LETTERS)]
+    figure.supxlabel("\n".join(lines), fontsize=FONT - 2, color=GREY, x=0.01, ha="left")
+    return figure
+
+
+def _draw_fall(axes: Any, fall: Fall, large: Collection[str]) -> None:
+    """Bars of the steps that are ``large``, and one of all others."""
+    others = sum(step.in_order.value for step in fall.steps if step.name not in large)
+    steps = [step for step in fall.steps if step.name in large]
+    steps += [Step("others", Mean(others, np.nan, 1))] if others else []
+    last, level, text = len(steps) + 1, fall.first.value, {"fontsize": FONT - 2, "va": "center"}
+    for row, step in enumerate(steps, start=1):
+        change = step.in_order.value
+        axes.plot([level, level], [row - 1, row], color=GREY, lw=0.8, zorder=1)
+        axes.barh(row, change, 0.66, left=level, color=VERMILION if change < 0 else GREEN, zorder=3)
+        level += change
+        place = max(level, level - change), row
+        axes.annotate(_signed(step.in_order), place, (5, 0), textcoords="offset points", **text)
+        for points, mean in zip(_COLUMNS, (step.alone, step.left_out), strict=True):
+            if mean:
+                beside(axes, row, points, _signed(mean), fontsize=FONT - 2, color=GREY)
+    axes.plot([level, level], [last - 1, last], color=GREY, lw=0.8, zorder=1)
+    for row, end, colour in ((0, fall.first, PALE), (last, fall.last, BLUE)):
+        left = axes.get_xlim()[0]
+        axes.barh(row, end.value - left, 0.66, left=left, color=colour, zorder=3)
+        axes.annotate(f"{end} dB", (end.value, row), (5, 0), textcoords="offset points", fontweight="bold", **text)
+    for points, heading in zip(_COLUMNS, ("alone", "left out"), strict=True):
+        if any(getattr(step, heading.replace(" ", "_")) for step in steps):
+            beside(axes, 0, points, heading, fontsize=FONT - 2, color=GREY)
+    axes.set_yticks(range(last + 1), ["idealised", *(step.name for step in steps), "rendered"])
+    axes.set_ylim(last + 0.5, -0.5)
+    axes.tick_params(axis="y", length=0)
+    axes.spines["left"].set_visible(False)
+
+
+def _signed(mean: Mean) -> str:
+    """A change with its sign, and with its standard error."""
+    text = f"{mean.value:+.1f}" if round(mean.value, 1) else "0.0"
+    text = text.replace("-", "\N{MINUS SIGN}")
+    return text if np.isnan(mean.error) else f"{text} \N{PLUS-MINUS SIGN} {mean.error:.1f}"
 
 
 EXPERIMENT = Experiment(

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mitsim.report.charts import bars, curves, image_grid, paired
+from mitsim.report.plots import bars, curves, image_grid, paired
 from mitsim.report.table import Mean
 
 

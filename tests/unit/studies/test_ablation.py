@@ -58,12 +58,10 @@ def turned(shared_scene: Callable[..., Path], variant: str) -> SampledLight:
 
 
 def test_nothing_taken_out_is_the_light_itself(far: SampledLight) -> None:
-    scene_ablation = Ablation.of(far)
-    assert scene_ablation.without(frozenset()) is far
-    assert scene_ablation.without(frozenset({"ambient", ablation.KEYSTONE, ablation.GLOSS})) is far, (
-        "which it does not have"
-    )
-    assert scene_ablation.effects == (
+    ablated = Ablation.of(far)
+    assert ablated.without(frozenset()) is far
+    assert ablated.without(frozenset({"ambient", ablation.KEYSTONE, ablation.GLOSS})) is far, "which it does not have"
+    assert ablated.effects == (
         ablation.FALLOFF,
         ablation.DIFFRACTION,
         ablation.DEPTH,
@@ -89,18 +87,18 @@ def test_without_all_it_is_the_idealised_model(scene: str, request: pytest.Fixtu
     """An even sheet at the aligned distance that shows the truth, pixel by pixel, though the traced one lies elsewhere,
     blurred, under a keystone. (Planted: each effect left in.)"""
     light = request.getfixturevalue(scene)
-    scene_ablation, lit = Ablation.of(light), LitScene(light)
+    ablated, lit = Ablation.of(light), LitScene(light)
     wanted = np.stack([frame.irradiance for frame in lit.expected(IDEALISED, light.bench.family(FAMILY))])
-    whole = frozenset(scene_ablation.effects)
-    assert apart(frames(scene_ablation.without(whole)), wanted) < 5e-5
+    whole = frozenset(ablated.effects)
+    assert apart(frames(ablated.without(whole)), wanted) < 5e-5
     for effect in whole - {ablation.SPECKLE, ablation.DETAIL}:
-        assert apart(frames(scene_ablation.without(whole - {effect})), wanted) > 1e-4, effect
+        assert apart(frames(ablated.without(whole - {effect})), wanted) > 1e-4, effect
     assert apart(frames(light), wanted) > 0.05
 
 
 def test_a_turned_projector_has_a_keystone(turned: SampledLight) -> None:
-    scene_ablation = Ablation.of(turned)
-    assert ablation.KEYSTONE in scene_ablation.effects and ablation.DEPTH not in scene_ablation.effects
+    ablated = Ablation.of(turned)
+    assert ablation.KEYSTONE in ablated.effects and ablation.DEPTH not in ablated.effects
     assert not ablation._off_plane(turned)
 
 
@@ -163,8 +161,8 @@ def test_falloff_is_the_fourth_power_of_the_cosine(far: SampledLight) -> None:
 def test_black_level_adds_a_part_of_uniform_light(far: SampledLight) -> None:
     """b + (1 - b) w of every pixel: frames are (1 - b) of those without, and b of the uniform frame. (Planted: 1 for
     1 - b.)"""
-    scene_ablation, leak = Ablation.of(far), 1 / 100
-    without = scene_ablation.without(frozenset({ablation.BLACK_LEVEL}))
+    ablated, leak = Ablation.of(far), 1 / 100
+    without = ablated.without(frozenset({ablation.BLACK_LEVEL}))
     (uniform,) = without.frames(far.bench.family("uniform").lighting, 0)
     assert apart(frames(far), (1 - leak) * frames(without) + leak * uniform.irradiance) < 1e-9
 
@@ -172,16 +170,16 @@ def test_black_level_adds_a_part_of_uniform_light(far: SampledLight) -> None:
 def test_detail_is_what_cells_of_a_pixel_differ_in(far: SampledLight) -> None:
     """The same flux of each pixel, spread evenly over its cells: c x c of them have the same light. (Planted: the mean
     over all pixels.)"""
-    scene_ablation = Ablation.of(far)
+    ablated = Ablation.of(far)
     off = frozenset({ablation.DETAIL, ablation.DEFOCUS, ablation.DEPTH})
-    even = scene_ablation.without(off)
+    even = ablated.without(off)
     cells = sum(group.fine for group in even.groups)[:-1]
     per_pixel = even.simulation.settings.subdivision**2
     assert per_pixel > 1
     for pixel in (0, 37, 255):
         lit = np.sort(cells[[pixel]].toarray()[0])[::-1][:per_pixel]
         assert lit.min() > 0.9 * lit.max() and lit.sum() > 0.999 * cells[[pixel]].sum()
-    uneven = sum(group.fine for group in scene_ablation.without(off - {ablation.DETAIL}).groups)[:-1]
+    uneven = sum(group.fine for group in ablated.without(off - {ablation.DETAIL}).groups)[:-1]
     assert np.allclose(uneven.sum(axis=1), cells.sum(axis=1), rtol=1e-9)
     spread = [np.ptp(np.sort(light[[37]].toarray()[0])[::-1][:per_pixel]) for light in (cells, uneven)]
     assert spread[1] > 10 * spread[0]
@@ -203,9 +201,9 @@ def test_gloss_is_what_the_sensor_sees_beyond_its_mean(shared_scene: Callable[..
     text = path.read_text().replace(matt, glossy)
     path.write_text(text.replace('name="reflectance" type="bitmap"', 'name="diffuse_reflectance" type="bitmap"'))
     light = ms.open_bench(path, variant).light(FAMILY, accuracy=1e-3)
-    scene_ablation = Ablation.of(light)
-    assert ablation.GLOSS in scene_ablation.effects
-    plain = scene_ablation.without(frozenset({ablation.GLOSS}))
+    ablated = Ablation.of(light)
+    assert ablation.GLOSS in ablated.effects
+    plain = ablated.without(frozenset({ablation.GLOSS}))
     assert plain.simulation.settings.anchors == 1
     whole, mean = frames(light), frames(plain)
     assert 1e-4 < apart(mean, whole) < 0.1

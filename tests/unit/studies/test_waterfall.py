@@ -14,7 +14,6 @@ from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.light.passes import Simulation
 from mitsim.metrics import psnr
 from mitsim.report import EQUAL_PEAK, RENDERED
-from mitsim.report.charts import Fall, Step, waterfall
 from mitsim.report.lit_scene import LitScene
 from mitsim.report.table import Mean, Table
 from mitsim.studies.ablation import BLACK_LEVEL, DEPTH, FALLOFF, Ablation
@@ -32,12 +31,15 @@ from mitsim.studies.waterfall_study import (
     MODELS,
     QUANTISATION,
     SATURATION,
+    Fall,
     Levels,
     Sessions,
+    Step,
     ends,
     fall,
     fills_well,
     sensor_without,
+    waterfall,
 )
 
 pytestmark = pytest.mark.usefixtures("kept_plans", "draft_figures")
