@@ -22,25 +22,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.exr import Channels, Metadata
 from mitsim.core.manifests import CalibrationManifest, RunManifest, ShotFile
 from mitsim.core.spectral_manifests import RUN, ColourManifest
-from mitsim.exchange.matlab import (
-    COLOURED,
-    ELECTRONS,
-    Variables,
-    array_in,
-    calibration_in,
-    colours_in,
-    dn_per_rate,
-    endings,
-    factors_in_dn,
-    folders_of,
-    lines_in,
-    matrix_in,
-    of_folders,
-    read_variables,
-    run_in,
-    text_in,
-    write_variables,
-)
+from mitsim.exchange import matlab
+from mitsim.exchange.matlab import Variables
 from mitsim.exchange.packed import (
     FACTORS,
     Calibration,
@@ -86,36 +69,38 @@ def write_flatcam(path: Path, run: Run, calibration: Calibration) -> tuple[str, 
         variables = _of_lines(path, run, calibration)
     else:
         raise AssertionError  # formats.export_run takes no others
-    write_variables(path, variables)
-    return (f"Left out: {ELECTRONS}",)
+    matlab.write_variables(path, variables)
+    return (f"Left out: {matlab.ELECTRONS}",)
 
 
 def _of_one(run: Packed[RunManifest], calibration: Packed[CalibrationManifest]) -> dict[str, Any]:
-    left, right = factors_in_dn(calibration, dn_per_rate(run.manifest.digital)).values()
+    left, right = matlab.factors_in_dn(calibration, matlab.dn_per_rate(run.manifest.digital)).values()
     if len(left) % 2 or len(right) % 2:
         size = f"{len(left)}x{len(right)}"
         raise MitsimError(f"{run.place}: frames are {size}; FlatCam's four planes need even sides, use mat")
     meas = np.empty((len(left), len(right), len(run.manifest.patterns.captures)), order="F")
     kind = _fill(meas, run)
     factors = {name: (left[row::2], right[column::2]) for name, (row, column) in PLANES.items()}
-    return {"meas": meas, "dn_class": kind, **_planes(factors), **of_folders(run, calibration)}
+    return {"meas": meas, "dn_class": kind, **_planes(factors), **matlab.of_folders(run, calibration)}
 
 
 def _of_lines(path: Path, run: Coloured[RunManifest], calibration: Coloured[CalibrationManifest]) -> dict[str, Any]:
-    ends, planes = endings(run.colours.names, path), _lines_of_planes(run.colours, path)
+    ends, planes = matlab.endings(run.colours.names, path), _lines_of_planes(run.colours, path)
     counts = {name: len(run.lines[name].manifest.patterns.captures) for name in run.colours.names}
     if len({*counts.values()}) > 1:
         told = ", ".join(f"{count} of {name}" for name, count in counts.items())
         raise MitsimError(f"{path}: frames are {told}, but FlatCam's planes are of one frame; use mat")
-    sides, variables = {}, colours_in(run, calibration)
+    sides, variables = {}, matlab.colours_in(run, calibration)
     for name, shots in run.lines.items():
-        sides[name] = tuple(factors_in_dn(calibration.lines[name], dn_per_rate(shots.manifest.digital)).values())
+        sides[name] = tuple(
+            matlab.factors_in_dn(calibration.lines[name], matlab.dn_per_rate(shots.manifest.digital)).values()
+        )
     rows, columns = (len(side) for side in sides[planes["r"]])
     meas = np.empty((2 * rows, 2 * columns, counts[planes["r"]]), order="F")
     for plane, name in planes.items():
         row, column = PLANES[plane]
         kind = _fill(meas[row::2, column::2], run.lines[name])
-        own = {"dn_class": kind, **of_folders(run.lines[name], calibration.lines[name])}
+        own = {"dn_class": kind, **matlab.of_folders(run.lines[name], calibration.lines[name])}
         variables.update({f"{key}{ends[name]}": values for key, values in own.items()})
     return {**variables, "meas": meas, **_planes({plane: sides[planes[plane]] for plane in PLANES})}
 
@@ -139,14 +124,14 @@ def load_mat(path: Path, channel: str | None) -> Iterator[Loaded]:
     if channel is not None:
         yield Loaded(None, flatcam_calibration(path, channel))
         return
-    variables = read_variables(path)
+    variables = matlab.read_variables(path)
     if "meas" not in variables:
-        run, calibration = folders_of(variables, path)
-    elif COLOURED not in variables:
+        run, calibration = matlab.folders_of(variables, path)
+    elif matlab.COLOURED not in variables:
         run, calibration = _folders_in(variables, _meas_in(variables, path), path)
     else:
         meas = _meas_in(variables, path)
-        colours = unpacked_colours(text_in(variables, COLOURED, path), RUN, path)
+        colours = unpacked_colours(matlab.text_in(variables, matlab.COLOURED, path), RUN, path)
         planes = {name: plane for plane, name in _lines_of_planes(colours, path).items()}
 
         def folders_in(name: str, own: Variables) -> tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]:
@@ -154,8 +139,8 @@ def load_mat(path: Path, channel: str | None) -> Iterator[Loaded]:
             row, column = PLANES[planes[name]]
             return _folders_in(own, meas[row::2, column::2], path)
 
-        run, calibration = lines_in(variables, folders_in, path)
-    yield Loaded(run, calibration, (ELECTRONS,))
+        run, calibration = matlab.lines_in(variables, folders_in, path)
+    yield Loaded(run, calibration, (matlab.ELECTRONS,))
 
 
 def flatcam_calibration(path: Path, channel: str) -> Packed[CalibrationManifest]:
@@ -179,13 +164,13 @@ def flatcam_calibration(path: Path, channel: str) -> Packed[CalibrationManifest]
         for a file without that plane.
     """
     check_channel(channel)
-    variables = read_variables(path)
+    variables = matlab.read_variables(path)
     found = {name: f"{stem}{channel}" for name, stem in zip(FACTORS, ("P1", "Q1"), strict=True)}
     sides = {
-        name: checked_channel(matrix_in(variables, variable, path).astype(np.float32), variable, path)
+        name: checked_channel(matlab.matrix_in(variables, variable, path).astype(np.float32), variable, path)
         for name, variable in found.items()
     }
-    angle = float(matrix_in({"angle": [[0.0]], **variables}, "angle", path)[0, 0])
+    angle = float(matlab.matrix_in({"angle": [[0.0]], **variables}, "angle", path)[0, 0])
     warnings = (
         (f"its frames were turned by {angle:g} degrees, and import turns none: turn them before, or shifts remain",)
         if angle
@@ -245,13 +230,13 @@ def _folders_in(
     variables: Variables, meas: npt.NDArray[Any], path: Path
 ) -> tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]:
     """Run and calibration of whose frames ``meas`` is."""
-    manifest = unpacked_run(text_in(variables, "run_manifest", path), path)
+    manifest = unpacked_run(matlab.text_in(variables, "run_manifest", path), path)
     captures = manifest.patterns.captures
-    frames = array_in({"meas": meas}, "meas", (*meas.shape[:2], len(captures)), path)
+    frames = matlab.array_in({"meas": meas}, "meas", (*meas.shape[:2], len(captures)), path)
     index = {shot.file: number for number, shot in enumerate(captures)}
 
     def frame(shot: ShotFile) -> Any:
         """The frame of a ``shot``, (rows, columns)."""
         return frames[:, :, index[shot.file]]
 
-    return run_in(variables, manifest, frame, path), calibration_in(variables, manifest.digital, path)
+    return matlab.run_in(variables, manifest, frame, path), matlab.calibration_in(variables, manifest.digital, path)

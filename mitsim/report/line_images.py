@@ -9,20 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from mitsim.core import spectral_manifests
 from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import output_folder
 from mitsim.core.runs import load_run
-from mitsim.core.spectral_manifests import (
-    COLOUR,
-    IMAGE,
-    ColourManifest,
-    is_mosaic,
-    read_colours,
-    same_lines,
-    write_colours,
-)
+from mitsim.core.spectral_manifests import ColourManifest
 from mitsim.devices.chart import ChartPlace
 from mitsim.metrics import truth_for
 from mitsim.reconstruct.colour import ColourModel
@@ -158,11 +151,15 @@ def reconstruct_colours(
         for folders of different lines, and as :func:`mitsim.report.quality.reconstruct`.
     """
     run, calibration = Path(run), Path(calibration)
-    if is_mosaic(run):
+    if spectral_manifests.is_mosaic(run):
         return reconstruct_mosaic(run, calibration, output, chart, overwrite, **options)
-    lines = same_lines(run, calibration)
-    earlier = (Path(output) / COLOUR).is_file() and read_colours(output, IMAGE).names == lines.names
-    with output_folder(output, overwrite=earlier or (overwrite and (Path(output) / COLOUR).is_file())) as folder:
+    lines = spectral_manifests.same_lines(run, calibration)
+    earlier = (Path(output) / spectral_manifests.COLOUR).is_file() and spectral_manifests.read_colours(
+        output, spectral_manifests.IMAGE
+    ).names == lines.names
+    with output_folder(
+        output, overwrite=earlier or (overwrite and (Path(output) / spectral_manifests.COLOUR).is_file())
+    ) as folder:
         images = {
             name: reconstruct(run / name, calibration / name, folder / name, overwrite=overwrite, **options)
             for name in lines.names
@@ -176,7 +173,7 @@ def reconstruct_colours(
         qualities = {name: judged.quality for name, judged in images.items()}
         write_page(folder / PAGE, found.colours, qualities, found.facts, found.warnings)
         parts = {key: value for key, value in found.summary().items() if key != "channels"}
-        write_colours(folder, ColourManifest(kind="colour-image", channels=lines.channels), **parts)
+        spectral_manifests.write_colours(folder, ColourManifest(kind="colour-image", channels=lines.channels), **parts)
     return found
 
 

@@ -21,24 +21,14 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
+from mitsim.core import spectral_manifests
 from mitsim.core.arrays import FloatArray
 from mitsim.core.exr import write_frame
 from mitsim.core.files import output_folder, read_json, whole_file
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.pictures import png
 from mitsim.core.runs import MosaicCapture, load_mosaic
-from mitsim.core.spectral_manifests import (
-    COLOUR,
-    DEMOSAIC,
-    HALF,
-    IMAGE,
-    JOINT,
-    ColourManifest,
-    check_lines,
-    check_way,
-    read_colours,
-    write_colours,
-)
+from mitsim.core.spectral_manifests import JOINT, ColourManifest, check_way
 from mitsim.devices.chart import ChartPlace
 from mitsim.metrics import Quality
 from mitsim.optics.separable import BestTerm, best_term
@@ -224,7 +214,7 @@ def fitting_factors(shots: MosaicCapture, calibration: Path) -> dict[str, Factor
 
     MitsimError for one of others.
     """
-    check_lines(shots.manifest, shots.shots.name, calibration)
+    spectral_manifests.check_lines(shots.manifest, shots.shots.name, calibration)
     found = {name: load_calibration(calibration / name) for name in shots.manifest.names}
     for factors in found.values():
         factors.check_fit(shots.shots)
@@ -302,11 +292,11 @@ def _may_replace(folder: Path, asked: Mapping[str, str | float], overwrite: bool
     """Whether a ``folder`` holds an image that may be replaced: ``overwrite``, or of the same inputs ``asked`` for.
 
     MitsimError where it holds one of others."""
-    if not (folder / COLOUR).is_file():
+    if not (folder / spectral_manifests.COLOUR).is_file():
         return False
-    read_colours(folder, IMAGE)
+    spectral_manifests.read_colours(folder, spectral_manifests.IMAGE)
     if not overwrite:
-        check_same_inputs(folder, read_json(folder / COLOUR), asked)
+        check_same_inputs(folder, read_json(folder / spectral_manifests.COLOUR), asked)
     return True
 
 
@@ -321,7 +311,7 @@ def _write(found: JudgedMosaic, folder: Path, asked: Mapping[str, str | float]) 
     found.colours.write(folder)
     write_page(folder / PAGE, found.colours, found.qualities, found.facts, found.warnings)
     parts = {key: value for key, value in found.summary().items() if key != "channels"}
-    write_colours(folder, found.colours.lines, inputs=dict(asked), **parts)
+    spectral_manifests.write_colours(folder, found.colours.lines, inputs=dict(asked), **parts)
 
 
 # -------- Measured frames behind colour filters and each line's factors in
@@ -441,7 +431,7 @@ def solver_of(way: str, camera: MosaicCamera, patterns: Patterns) -> Solver:
     """
     if check_way(way) == JOINT:
         return _Joint(camera, patterns)
-    return _Apart(camera, patterns, way == HALF)
+    return _Apart(camera, patterns, way == spectral_manifests.HALF)
 
 
 class _Apart:
@@ -520,7 +510,7 @@ def demosaiced(frame: FloatArray, mosaic: str) -> FloatArray:
 
     MitsimError without colour-demosaicing.
     """
-    check_way(DEMOSAIC)
+    check_way(spectral_manifests.DEMOSAIC)
     from colour_demosaicing import demosaicing_CFA_Bayer_Menon2007
 
     return np.asarray(demosaicing_CFA_Bayer_Menon2007(frame, mosaic), dtype=np.float64)

@@ -12,14 +12,7 @@ from matplotlib.figure import Figure
 from mitsim.report import EQUAL_PEAK, MODELS, label
 from mitsim.report.plots import curves
 from mitsim.report.table import Value
-from mitsim.studies.framework.claims import (
-    by_patterns,
-    by_print,
-    compared,
-    found,
-    images,
-    panels,
-)
+from mitsim.studies.framework import claims
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import Point
 from mitsim.studies.framework.studio import Image, Studio
@@ -50,7 +43,7 @@ def _measure(studio: Studio, point: Point) -> Found:
     # With fewer data than unknowns noise cannot be told, nor lambda chosen by it.
     image = Image.of(frames, frames.seconds(EQUAL_PEAK), "best", binning)
     pixels = frames.lit.bench.geometry.frame_shape[0] // binning
-    return found(point, image.image if point["patterns"] in _SHOWN else None, pixels=pixels, **image.row())
+    return claims.found(point, image.image if point["patterns"] in _SHOWN else None, pixels=pixels, **image.row())
 
 
 def _claims(results: Results) -> Sequence[Claim]:
@@ -61,21 +54,24 @@ def _claims(results: Results) -> Sequence[Claim]:
     stable = "49 dots are stable down to 64 x 64 pixels (3 dB lost at most)"
     better = "49 dots on 64 x 64 pixels are better than uniform light on 512 x 512"
     return [
-        compared(table, stable, "stable", many, many_coarse, lost, high=_STABLE_DB),
-        compared(table, "Uniform light degrades with fewer pixels", "degrades", few, few_coarse, lost),
-        compared(table, better, "better", many_coarse, few),
+        claims.compared(table, stable, "stable", many, many_coarse, lost, high=_STABLE_DB),
+        claims.compared(table, "Uniform light degrades with fewer pixels", "degrades", few, few_coarse, lost),
+        claims.compared(table, better, "better", many_coarse, few),
     ]
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:
     table = results.table
-    shown, title = panels(by_patterns(table), "pixels"), f"PSNR by the sensor's rows, exposure {EQUAL_PEAK}"
+    shown, title = (
+        claims.panels(claims.by_patterns(table), "pixels"),
+        f"PSNR by the sensor's rows, exposure {EQUAL_PEAK}",
+    )
     drawn = {"psnr.png": curves(shown, "rows of the sensor [pixel]", log=True, title=title)}
     pixels = table.distinct("pixels")
     for family in _SHOWN:
-        lines, title = by_print(table.where(patterns=family)), f"{label(family)}, {EQUAL_PEAK}, by sensor rows"
+        lines, title = claims.by_print(table.where(patterns=family)), f"{label(family)}, {EQUAL_PEAK}, by sensor rows"
         names = [f"{each} rows" for each in pixels]
-        drawn |= images(f"images_{family.replace(':', '')}.png", results, lines, "pixels", pixels, title, names)
+        drawn |= claims.images(f"images_{family.replace(':', '')}.png", results, lines, "pixels", pixels, title, names)
     return drawn
 
 

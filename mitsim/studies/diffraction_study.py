@@ -42,6 +42,7 @@ from mitsim.light.light import SampledLight
 from mitsim.metrics import Quality, psnr
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.reconstruct.solver import prepare
+from mitsim.report import plots
 from mitsim.report.lit_scene import (
     GEOMETRIC,
     LINE,
@@ -54,19 +55,6 @@ from mitsim.report.lit_scene import (
     peak_time,
     point_profiles,
     shadow_row,
-)
-from mitsim.report.plots import (
-    BLUE,
-    FONT,
-    GREEN,
-    LINK,
-    MARKERS,
-    VERMILION,
-    WIDTH,
-    figure_of,
-    label_axes,
-    legend_below,
-    line_style,
 )
 from mitsim.studies.ablation import reformed
 
@@ -281,18 +269,21 @@ def quality_by_factors(rows: Sequence[tuple[str, str, float]], message: str) -> 
     ``message`` above."""
     systems = list(dict.fromkeys(system for system, _, _ in rows))[::-1]
     factors = list(dict.fromkeys(name for _, name, _ in rows))
-    figure, axes = figure_of(1.3 + 0.46 * len(systems))
+    figure, axes = plots.figure_of(1.3 + 0.46 * len(systems))
     for place, system in enumerate(systems):
         values = [value for name, _, value in rows if name == system]
-        axes.plot([min(values), max(values)], [place, place], color=LINK, lw=2, zorder=1)
+        axes.plot([min(values), max(values)], [place, place], color=plots.LINK, lw=2, zorder=1)
     for index, name in enumerate(factors):
         points = [(value, systems.index(system)) for system, kind, value in rows if kind == name]
-        style = {"color": (VERMILION, BLUE, GREEN)[index % 3], "marker": MARKERS[index % len(MARKERS)]}
+        style = {
+            "color": (plots.VERMILION, plots.BLUE, plots.GREEN)[index % 3],
+            "marker": plots.MARKERS[index % len(plots.MARKERS)],
+        }
         axes.plot(*zip(*points, strict=True), ls="", ms=8, label=name, zorder=3, **style)
-    axes.set_yticks(range(len(systems)), systems, fontsize=FONT - 2)
-    label_axes(axes, "PSNR of the image [dB]", "", grid="x")
-    figure.suptitle(fill(message, _TITLE_LETTERS), fontsize=FONT)
-    legend_below(figure, len(factors), *axes.get_legend_handles_labels())
+    axes.set_yticks(range(len(systems)), systems, fontsize=plots.FONT - 2)
+    plots.label_axes(axes, "PSNR of the image [dB]", "", grid="x")
+    figure.suptitle(fill(message, _TITLE_LETTERS), fontsize=plots.FONT)
+    plots.legend_below(figure, len(factors), *axes.get_legend_handles_labels())
     return figure
 
 
@@ -308,14 +299,14 @@ def shadow_profiles(
     reach_mm, message
         how far from the middle of the ``position_mm`` is shown, and what is said above.
     """
-    figure, axes = figure_of(0.4 * WIDTH)
+    figure, axes = plots.figure_of(0.4 * plots.WIDTH)
     position = np.asarray(position_mm, dtype=np.float64)
     inside = np.abs(position - position.mean()) <= reach_mm
     for index, (name, values) in enumerate(profiles.items()):
-        axes.plot(position[inside], np.asarray(values)[inside], lw=1.8, label=name, **line_style(index))
-    axes.set_title(message, fontsize=FONT)
-    label_axes(axes, "position on the sensor [mm]", "irradiance, open sensor = 1 [1]")
-    axes.legend(fontsize=FONT - 1, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
+        axes.plot(position[inside], np.asarray(values)[inside], lw=1.8, label=name, **plots.line_style(index))
+    axes.set_title(message, fontsize=plots.FONT)
+    plots.label_axes(axes, "position on the sensor [mm]", "irradiance, open sensor = 1 [1]")
+    axes.legend(fontsize=plots.FONT - 1, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
     return figure
 
 

@@ -10,15 +10,7 @@ from collections.abc import Mapping, Sequence
 from matplotlib.figure import Figure
 
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, MODELS, label
-from mitsim.studies.framework.claims import (
-    by_exposure,
-    by_patterns,
-    by_print,
-    compared,
-    imaged,
-    images,
-    stated,
-)
+from mitsim.studies.framework import claims
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import Point
 from mitsim.studies.framework.studio import Studio
@@ -50,15 +42,15 @@ def _points(scope: Scope) -> Sequence[Point]:
 
 
 def _measure(studio: Studio, point: Point) -> Found:
-    return imaged(studio, point, _SHOWN)
+    return claims.imaged(studio, point, _SHOWN)
 
 
 def _claims(results: Results) -> Sequence[Claim]:
     near = results.table.where(mask_distance="0.75")
     return [
-        stated(near.where(patterns="uniform"), "At 750 um, uniform light gives 16.9 to 19 dB", _NEAR_UNIFORM),
-        stated(near.where(patterns="dots:7"), "At 750 um, 49 dots give 30 to 30.5 dB", _NEAR_DOTS),
-        compared(
+        claims.stated(near.where(patterns="uniform"), "At 750 um, uniform light gives 16.9 to 19 dB", _NEAR_UNIFORM),
+        claims.stated(near.where(patterns="dots:7"), "At 750 um, 49 dots give 30 to 30.5 dB", _NEAR_DOTS),
+        claims.compared(
             results.table,
             f"25 dots at 750 um are comparable to uniform light at 2000 um (within {_COMPARABLE_DB:g} dB)",
             "comparable",
@@ -73,13 +65,13 @@ def _claims(results: Results) -> Sequence[Claim]:
 
 def _figures(results: Results) -> Mapping[str, Figure]:
     table, title = results.table, "PSNR by the mask's distance"
-    drawn = dict(by_exposure(table, by_patterns, "mask_distance", "sensor to mask [mm]", title, log=True))
+    drawn = dict(claims.by_exposure(table, claims.by_patterns, "mask_distance", "sensor to mask [mm]", title, log=True))
     distances = table.distinct("mask_distance")
     names = [f"{float(each):g} mm" for each in distances]
     for family in _SHOWN:
-        shown = by_print(table.where(patterns=family, exposure=EQUAL_FRAME))
+        shown = claims.by_print(table.where(patterns=family, exposure=EQUAL_FRAME))
         file, title = f"images_{family.replace(':', '')}.png", f"{label(family)}, exposure {EQUAL_FRAME}"
-        drawn |= images(file, results, shown, "mask_distance", distances, title, names)
+        drawn |= claims.images(file, results, shown, "mask_distance", distances, title, names)
     return drawn
 
 

@@ -17,15 +17,7 @@ from mitsim.report import EQUAL_FRAME, IDEALISED, MODELS
 from mitsim.report.lit_scene import Unexposed
 from mitsim.report.plots import quality_bars
 from mitsim.report.table import Mean
-from mitsim.studies.framework.claims import (
-    bars,
-    by_print,
-    compared,
-    found,
-    images,
-    verdict,
-    within,
-)
+from mitsim.studies.framework import claims
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import Point
 from mitsim.studies.framework.studio import Image, Studio
@@ -58,7 +50,7 @@ def _measure(studio: Studio, point: Point) -> Found:
     if point["model"] == IDEALISED and point["patterns"] == DOTS:
         # Elsewhere the law's model is not that of the frames, or least squares magnifies rounding beyond any image.
         law = _law(frames, seconds)
-    return found(point, image.image, **image.row(), **law)
+    return claims.found(point, image.image, **image.row(), **law)
 
 
 def _law(frames: Unexposed, seconds: float) -> dict[str, float]:
@@ -75,12 +67,12 @@ def _claims(results: Results) -> Sequence[Claim]:
     ratio = np.divide(table.numbers("ser"), table.numbers("ser_law")).tolist()
     one, many, dots = ({"patterns": name} for name in SHARED)
     return [
-        compared(table, "49 dots beat 49 uniform frames of the same time", "higher", dots, many, said),
-        compared(table, "49 uniform frames are slightly better than one", "slightly higher", many, one, said),
+        claims.compared(table, "49 dots beat 49 uniform frames of the same time", "higher", dots, many, said),
+        claims.compared(table, "49 uniform frames are slightly better than one", "slightly higher", many, one, said),
         Claim(
             "Without regularisation, ||x|| / ||x - x'|| is SNR / rho (49 dots)", "equal",
             f"measured / law {min(ratio):.3f} to {max(ratio):.3f}", "not defined: factors are calibrated",
-            verdict(within(Mean.of_numbers(ratio, "ser"), 1 - _LAW_WITHIN, 1 + _LAW_WITHIN)),
+            claims.verdict(claims.within(Mean.of_numbers(ratio, "ser"), 1 - _LAW_WITHIN, 1 + _LAW_WITHIN)),
         ),
     ]  # fmt: skip
 
@@ -88,8 +80,8 @@ def _claims(results: Results) -> Sequence[Claim]:
 def _figures(results: Results) -> Mapping[str, Figure]:
     table, title = results.table, f"exposure {EQUAL_FRAME}"
     lines = {name: table.where(patterns=name) for name in SHARED}
-    psnr = {"psnr.png": quality_bars(bars(lines), title)}
-    return psnr | images("images.png", results, by_print(table), "patterns", SHARED, title)
+    psnr = {"psnr.png": quality_bars(claims.bars(lines), title)}
+    return psnr | claims.images("images.png", results, claims.by_print(table), "patterns", SHARED, title)
 
 
 EXPERIMENT = Experiment(

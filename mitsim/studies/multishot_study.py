@@ -43,19 +43,8 @@ from mitsim.reconstruct.solver import Solution, centred, centred_columns, prepar
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODELS, RENDERED
 from mitsim.report.lit_scene import IdealCamera, LitScene, Pair, Unexposed
 from mitsim.report.table import Table
-from mitsim.studies.framework.claims import (
-    Lines,
-    by_exposure,
-    by_print,
-    compared,
-    every,
-    images,
-    near,
-    sampled,
-    shown,
-    stated,
-    verdict,
-)
+from mitsim.studies.framework import claims
+from mitsim.studies.framework.claims import Lines, images, shown
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import QUICK_IMAGES, Point
 from mitsim.studies.framework.studio import Image, Studio, reason_of
@@ -145,21 +134,21 @@ def _spread(count: int, feature_mm: float) -> tuple[float, ...]:
 def _claims(results: Results) -> Sequence[Claim]:
     table = results.table
     many = table.where(frames=_FRAMES)
-    line = {each: sampled(many.where(patterns=LINE, exposure=each), "psnr_db") for each in EXPOSURES}
-    on_the_line = every(*(near(mean, _SWEPT_DB) for mean in line.values()))
+    line = {each: claims.sampled(many.where(patterns=LINE, exposure=each), "psnr_db") for each in EXPOSURES}
+    on_the_line = claims.every(*(claims.near(mean, _SWEPT_DB) for mean in line.values()))
     on_a_line = "; ".join(f"{exposure}: {mean} dB" for exposure, mean in line.items())
     still, swept, dots = ({"patterns": name} for name in (UNIFORM, SWEPT, DOTS))
     gained = "SweepCam's 49 frames beat 49 frames through a mask that rests"
     return [
-        stated(table.where(patterns=UNIFORM, frames=1), "One uniform frame gives 21.3 to 22.9 dB", (21.3, 22.9)),
-        stated(many.where(**swept), "SweepCam with 49 frames gives 24.9 to 26.8 dB, here on a grid", _SWEPT_DB),
+        claims.stated(table.where(patterns=UNIFORM, frames=1), "One uniform frame gives 21.3 to 22.9 dB", (21.3, 22.9)),
+        claims.stated(many.where(**swept), "SweepCam with 49 frames gives 24.9 to 26.8 dB, here on a grid", _SWEPT_DB),
         Claim(
             "The same on a line along the rows", "24.9 to 26.8 dB", on_a_line, "",
-            "confirmed only idealised" if on_the_line else verdict(on_the_line),
+            "confirmed only idealised" if on_the_line else claims.verdict(on_the_line),
         ),
-        stated(many.where(**dots), "49 shifting dots give 34 to 35.5 dB", (34.0, 35.5)),
-        compared(many, "49 dots beat SweepCam's 49 frames", "higher", dots, swept, low=_TELLS_DB),
-        compared(many, gained, "", swept, still, low=_TELLS_DB),
+        claims.stated(many.where(**dots), "49 shifting dots give 34 to 35.5 dB", (34.0, 35.5)),
+        claims.compared(many, "49 dots beat SweepCam's 49 frames", "higher", dots, swept, low=_TELLS_DB),
+        claims.compared(many, gained, "", swept, still, low=_TELLS_DB),
     ]  # fmt: skip
 
 
@@ -172,9 +161,9 @@ def _figures(results: Results) -> Mapping[str, Figure]:
         moved = {name: Table((*first, *rows.where(patterns=name).rows)) for name in (SWEPT, DOTS)}
         return {UNIFORM: rows.where(patterns=UNIFORM), **moved}
 
-    drawn = dict(by_exposure(table, lines, "frames", "frames", "PSNR by the number of frames", log=True))
+    drawn = dict(claims.by_exposure(table, lines, "frames", "frames", "PSNR by the number of frames", log=True))
     names = {UNIFORM: "49 uniform", SWEPT: "SweepCam, 49", DOTS: "49 dots"}
-    shown = by_print(table.where(exposure=EQUAL_FRAME, frames=_FRAMES))
+    shown = claims.by_print(table.where(exposure=EQUAL_FRAME, frames=_FRAMES))
     title = f"Images of 49 frames, exposure {EQUAL_FRAME}"
     return drawn | images("images.png", results, shown, "patterns", list(names), title, list(names.values()))
 

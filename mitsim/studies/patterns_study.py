@@ -14,15 +14,8 @@ from mitsim.report import CONVENTIONS, EQUAL_FRAME, MODELS, RENDERED, label
 from mitsim.report.lit_scene import DIM
 from mitsim.report.plots import singular_values
 from mitsim.report.table import Table
-from mitsim.studies.framework.claims import (
-    Lines,
-    by_exposure,
-    by_print,
-    compared,
-    imaged,
-    images,
-    stated,
-)
+from mitsim.studies.framework import claims
+from mitsim.studies.framework.claims import Lines
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import Point
 from mitsim.studies.framework.studio import Studio
@@ -53,7 +46,7 @@ def _points(scope: Scope) -> Sequence[Point]:
 
 def _measure(studio: Studio, point: Point) -> Found:
     frames = studio.frames(point.setup, point["model"], point["patterns"], int(point["seed"]))
-    made = imaged(studio, point, _SHOWN)
+    made = claims.imaged(studio, point, _SHOWN)
     count = frames.family.left.shape[1] * frames.family.right.shape[1]
     arrays = dict(made.arrays)
     if point["patterns"] in _SHOWN and point["model"] == RENDERED:
@@ -66,11 +59,11 @@ def _claims(results: Results) -> Sequence[Claim]:
     families = Table(tuple(row for row in table.rows if row["exposure"] != DIM))
 
     def better(claim: str, family: str, other: str) -> Claim:
-        return compared(families, claim, "higher", {"patterns": family}, {"patterns": other})
+        return claims.compared(families, claim, "higher", {"patterns": family}, {"patterns": other})
 
     return [
-        stated(table.where(patterns="uniform"), "One uniform pattern gives 21 to 23 dB", _STATED["uniform"]),
-        stated(table.where(patterns="dots:7"), "49 shifting dots give 34 to 35.5 dB", _STATED["dots:7"]),
+        claims.stated(table.where(patterns="uniform"), "One uniform pattern gives 21 to 23 dB", _STATED["uniform"]),
+        claims.stated(table.where(patterns="dots:7"), "49 shifting dots give 34 to 35.5 dB", _STATED["dots:7"]),
         better("More dots, better images (49 against 4)", "dots:7", "dots:2"),
         better("Orthogonal patterns outperform random ones (49 each)", "dots:7", "random:7"),
         better("Hadamard patterns perform best, for their light (64 each)", "hadamard:8", "dots:8"),
@@ -89,13 +82,13 @@ def _figures(results: Results) -> Mapping[str, Figure]:
         }
 
     known = Table(tuple(row for row in table.rows if row["exposure"] in CONVENTIONS))
-    drawn = dict(by_exposure(known, lines, "patterns_count", "patterns", "PSNR by the number of patterns"))
+    drawn = dict(claims.by_exposure(known, lines, "patterns_count", "patterns", "PSNR by the number of patterns"))
     spectra = {
         label(str(row["patterns"])): found for row in table.rows if (found := results.array(row, _SPECTRUM)) is not None
     }
     drawn["singular_values.png"] = singular_values(spectra)
-    shown, names = by_print(table.where(exposure=EQUAL_FRAME)), [label(family) for family in _SHOWN]
-    return drawn | images("images.png", results, shown, "patterns", _SHOWN, f"exposure {EQUAL_FRAME}", names)
+    shown, names = claims.by_print(table.where(exposure=EQUAL_FRAME)), [label(family) for family in _SHOWN]
+    return drawn | claims.images("images.png", results, shown, "patterns", _SHOWN, f"exposure {EQUAL_FRAME}", names)
 
 
 EXPERIMENT = Experiment(

@@ -18,17 +18,8 @@ from mitsim.report import EQUAL_FRAME, MODELS, in_text, label
 from mitsim.report.lit_scene import LAMBDAS
 from mitsim.report.plots import quality_bars
 from mitsim.report.table import Table
-from mitsim.studies.framework.claims import (
-    Holds,
-    bars,
-    by_print,
-    compared,
-    difference,
-    found,
-    images,
-    judged,
-    within,
-)
+from mitsim.studies.framework import claims
+from mitsim.studies.framework.claims import Holds
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import Point
 from mitsim.studies.framework.studio import Studio
@@ -75,18 +66,18 @@ def _measure(studio: Studio, point: Point) -> Found:
     tracemalloc.stop()
     best = max(psnr(each, truth) for each in (image, one, *others))
     measured = {"psnr_db": psnr(image, truth), "psnr_best_db": best, "seconds": seconds, "peak_mib": peak / 2**20}
-    return found(point, image if point["patterns"] in _SHOWN else None, **measured)
+    return claims.found(point, image if point["patterns"] in _SHOWN else None, **measured)
 
 
 def _claims(results: Results) -> Sequence[Claim]:
     def faster(rows: Table) -> tuple[str, Holds]:
         plain, tv = (rows.where(method=method) for method in METHODS)
         costs = [f"{each.mean('seconds').value:.2g} s, {each.mean('peak_mib').value:.2g} MiB" for each in (plain, tv)]
-        return " against ".join(costs), within(difference(plain, tv, "seconds"), high=0)
+        return " against ".join(costs), claims.within(claims.difference(plain, tv, "seconds"), high=0)
 
     table, plain, tv = results.table, {"method": TIKHONOV}, {"method": TV}
     alike = [
-        compared(
+        claims.compared(
             table.where(patterns=family),
             f"Total variation is as good (within {_VISIBLE_DB:g} dB), {in_text(family)}, {which} weight",
             "not visibly better", tv, plain, "Tikhonov {other} dB, total variation {one} dB: {gain:+} dB",
@@ -95,7 +86,7 @@ def _claims(results: Results) -> Sequence[Claim]:
         for column, which in _COLUMNS.items()
         for family in _SHOWN
     ]  # fmt: skip
-    return [*alike, judged(table, "The closed form takes less time than total variation", "less", faster)]
+    return [*alike, claims.judged(table, "The closed form takes less time than total variation", "less", faster)]
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:
@@ -107,12 +98,14 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     }
     for column, which in _COLUMNS.items():
         drawn[f"psnr_{which}.png"] = quality_bars(
-            bars(lines, column), f"PSNR by the regularisation, {which} weight, exposure {EQUAL_FRAME}"
+            claims.bars(lines, column), f"PSNR by the regularisation, {which} weight, exposure {EQUAL_FRAME}"
         )
     for family in _SHOWN:
-        shown = by_print(table.where(patterns=family))
+        shown = claims.by_print(table.where(patterns=family))
         title = f"{label(family)}, exposure {EQUAL_FRAME}, automatic weight"
-        drawn |= images(f"images_{family.replace(':', '')}.png", results, shown, "method", METHODS, title, _NAMES)
+        drawn |= claims.images(
+            f"images_{family.replace(':', '')}.png", results, shown, "method", METHODS, title, _NAMES
+        )
     return drawn
 
 

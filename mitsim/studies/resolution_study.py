@@ -21,18 +21,8 @@ from mitsim.report.lit_scene import LitScene
 from mitsim.report.plots import curves, image_grid
 from mitsim.report.table import Table
 from mitsim.studies.diffraction_study import contrast, modulation, slanted_edge
-from mitsim.studies.framework.claims import (
-    Holds,
-    by_patterns,
-    difference,
-    every,
-    judged,
-    panels,
-    pictured,
-    sampled,
-    shown,
-    within,
-)
+from mitsim.studies.framework import claims
+from mitsim.studies.framework.claims import Holds, shown
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import PRINT_MM, Point
 from mitsim.studies.framework.studio import Studio
@@ -105,27 +95,33 @@ def _claims(results: Results) -> Sequence[Claim]:
     table = results.table
 
     def rises(rows: Table) -> tuple[str, Holds]:
-        limits = {name: _limit(of_family) for name, of_family in by_patterns(rows).items()}
-        fine = by_patterns(rows.where(pairs_a_mm=_FINEST))
-        kept = {name: sampled(of_family, "contrast").value for name, of_family in fine.items()}
+        limits = {name: _limit(of_family) for name, of_family in claims.by_patterns(rows).items()}
+        fine = claims.by_patterns(rows.where(pairs_a_mm=_FINEST))
+        kept = {name: claims.sampled(of_family, "contrast").value for name, of_family in fine.items()}
         said = ", ".join(f"{name[:1].lower()}{name[1:]} {limits[name]:g} ({kept[name]:.2f})" for name in limits)
-        gains = [within(difference(more, fewer, "contrast"), low=0) for fewer, more in pairwise(fine.values())]
+        gains = [
+            claims.within(claims.difference(more, fewer, "contrast"), low=0) for fewer, more in pairwise(fine.values())
+        ]
         families = list(fine.values())
-        gain = within(difference(families[-1], families[0], "contrast"), low=0)
+        gain = claims.within(claims.difference(families[-1], families[0], "contrast"), low=0)
         return said, False if False in gains else gain
 
     def apart(rows: Table) -> tuple[str, Holds]:
         dots = rows.where(patterns="dots:7")
-        seen = {pairs: sampled(dots.where(pairs_a_mm=pairs), "contrast") for pairs in _bars(dots) if pairs <= _FINEST}
-        return f"contrast {seen[_FINEST].value:.2f}", every(*(within(each, low=_TOLD) for each in seen.values()))
+        seen = {
+            pairs: claims.sampled(dots.where(pairs_a_mm=pairs), "contrast") for pairs in _bars(dots) if pairs <= _FINEST
+        }
+        return f"contrast {seen[_FINEST].value:.2f}", claims.every(
+            *(claims.within(each, low=_TOLD) for each in seen.values())
+        )
 
     resolution = (
         f"Resolution rises with the number of patterns (finest bars of 10 % contrast, line pairs a mm; contrast at "
         f"{_FINEST})"
     )
     return [
-        judged(table, resolution, "rises", rises),
-        judged(table, f"49 patterns tell {_FINEST} line pairs a mm apart", "told apart", apart),
+        claims.judged(table, resolution, "rises", rises),
+        claims.judged(table, f"49 patterns tell {_FINEST} line pairs a mm apart", "told apart", apart),
     ]
 
 
@@ -133,7 +129,7 @@ def _limit(rows: Table) -> float:
     """Finest bars up to which all are told apart; 0 for none."""
     limit = 0.0
     for pairs in _bars(rows):
-        if sampled(rows.where(pairs_a_mm=pairs), "contrast").value < _TOLD:
+        if claims.sampled(rows.where(pairs_a_mm=pairs), "contrast").value < _TOLD:
             break
         limit = pairs
     return limit
@@ -145,17 +141,17 @@ def _bars(rows: Table) -> list[float]:
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:
-    table, drawn, lines = results.table, {}, by_patterns(results.table)
+    table, drawn, lines = results.table, {}, claims.by_patterns(results.table)
     for column, file, title in (
         ("contrast", "contrast", "Contrast of bars at their own frequency"),
         ("transfer", "edge", "Modulation transfer by a slanted edge (ISO 12233)"),
     ):
         axis = "spatial frequency on the print [line pairs/mm]"
-        shown = panels(lines, "pairs_a_mm", column)
+        shown = claims.panels(lines, "pairs_a_mm", column)
         drawn[f"{file}.png"] = curves(shown, axis, f"{column} [1]", ticks=False, title=title)
     names = [name for name in table.distinct("picture") if name.startswith("bars")]
     both = {f"{name}, {model}": rows.where(model=model) for name, rows in lines.items() for model in MODELS}
-    grid = pictured(results, both, "picture", names, "contrast {contrast:.2f}")
+    grid = claims.pictured(results, both, "picture", names, "contrast {contrast:.2f}")
     title = f"Bars by line pairs/mm of the print, exposure {EQUAL_FRAME}"
     drawn["images.png"] = image_grid(grid, [name.replace("bars ", "") for name in names], title)
     return drawn

@@ -46,20 +46,6 @@ from mitsim.reconstruct.sides import Method, Structure
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.report import plots
 from mitsim.report.html import typeset
-from mitsim.report.plots import (
-    BLUE,
-    FONT,
-    GREEN,
-    GREY,
-    MARKERS,
-    ORANGE,
-    VERMILION,
-    WIDTH,
-    label_axes,
-    legend_below,
-    log_ticks,
-    panels_of,
-)
 
 
 @dataclass(frozen=True)
@@ -350,32 +336,32 @@ _BEST = "best for its time"
 def solver_costs(rows: Sequence[SolverRow]) -> Figure:
     """Error of the image against seconds of the solver in ``rows``, a panel for each lambda, the best ringed."""
     lambdas = sorted({row.lambda_rel for row in rows}, reverse=True)
-    figure, (panels,) = panels_of(1, len(lambdas), 0.55 * WIDTH, sharex=True, sharey=True)
-    colours = (BLUE, ORANGE, VERMILION, GREEN)
+    figure, (panels,) = plots.panels_of(1, len(lambdas), 0.55 * plots.WIDTH, sharex=True, sharey=True)
+    colours = (plots.BLUE, plots.ORANGE, plots.VERMILION, plots.GREEN)
     precisions = list(dict.fromkeys(row.precision for row in rows))
     forms = list(dict.fromkeys((row.method, row.layout) for row in rows))
     for axes, lam in zip(panels, lambdas, strict=True):
         panel = [row for row in rows if row.lambda_rel == lam]
         for row in panel:
             colour = colours[precisions.index(row.precision)]
-            marker = MARKERS[forms.index((row.method, row.layout))]
+            marker = plots.MARKERS[forms.index((row.method, row.layout))]
             axes.plot([row.seconds], [row.error], marker, color=colour, ms=8, mec="white", mew=0.6, zorder=3)
         _draw_front(axes, [(row.seconds, row.error) for row in panel])
         axes.set(xscale="log", yscale="log")
-        log_ticks(axes)
-        axes.set_title(typeset(f"relative \N{GREEK SMALL LETTER LAMDA} {lam:.0e}"), fontsize=FONT)
-        label_axes(axes, "wall time [s]", "")
-    panels[0].set_ylabel("relative error of the image [1]", fontsize=FONT)
+        plots.log_ticks(axes)
+        axes.set_title(typeset(f"relative \N{GREEK SMALL LETTER LAMDA} {lam:.0e}"), fontsize=plots.FONT)
+        plots.label_axes(axes, "wall time [s]", "")
+    panels[0].set_ylabel("relative error of the image [1]", fontsize=plots.FONT)
     grey: dict[str, Any] = {"ls": "", "ms": 8, "color": "#9ca3af"}
     entries = [(Line2D([], [], ls="", ms=8, color=colours[i], marker="o"), name) for i, name in enumerate(precisions)]
     entries.append((panels[0].lines[-1], _BEST))
-    entries += [(Line2D([], [], **grey, marker=MARKERS[i]), ", ".join(form)) for i, form in enumerate(forms)]
-    legend_below(figure, 4, *zip(*entries, strict=True))
+    entries += [(Line2D([], [], **grey, marker=plots.MARKERS[i]), ", ".join(form)) for i, form in enumerate(forms)]
+    plots.legend_below(figure, 4, *zip(*entries, strict=True))
     return figure
 
 
 def _draw_front(axes: Axes, points: Sequence[plots.Point]) -> None:
     """Rings around the points that nothing beats, and the staircase that joins them."""
     seconds, error = zip(*plots.pareto_front(points), strict=True)
-    style: dict[str, Any] = {"color": GREY, "lw": 1.0, "ls": ":", "drawstyle": "steps-post", "zorder": 2}
-    axes.plot(seconds, error, "o", ms=13, mfc="none", mec=GREY, mew=1.3, label=_BEST, **style)
+    style: dict[str, Any] = {"color": plots.GREY, "lw": 1.0, "ls": ":", "drawstyle": "steps-post", "zorder": 2}
+    axes.plot(seconds, error, "o", ms=13, mfc="none", mec=plots.GREY, mew=1.3, label=_BEST, **style)
