@@ -390,7 +390,15 @@ def label_axes(axes: Axes, x: str, y: str, grid: Literal["both", "x", "y"] = "bo
 
 
 def legend_below(figure: Figure, columns: int, handles: Any, labels: Any) -> None:
-    """A legend below a ``figure``, in so many ``columns``, of matplotlib's ``handles`` by their ``labels``."""
+    """A legend below a figure.
+
+    Parameters
+    ----------
+    figure, columns
+        that it is of, and how many it has.
+    handles, labels
+        matplotlib's.
+    """
     figure.legend(handles, labels, fontsize=FONT - 1, frameon=False, loc="outside lower center", ncols=columns)
 
 

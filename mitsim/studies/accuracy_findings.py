@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 from mitsim.report.html import scientific
 from mitsim.report.plots import BLUE, FONT, GREY, LINK, VERMILION, WIDTH, label_axes, log_ticks, panels_of
+from mitsim.studies.framework.run import Findings
 
 SOLVER = "mitsim study solver"
 """Where the part that no scene changes is measured."""
@@ -158,7 +159,7 @@ class JudgeFacts:
 
 
 @dataclass(frozen=True)
-class AccuracyFindings:
+class AccuracyFindings(Findings):
     """All that was measured, and what did not fit in the time.
 
     Attributes

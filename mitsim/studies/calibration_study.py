@@ -52,6 +52,7 @@ from mitsim.studies.error_budget import (
     losses,
 )
 from mitsim.studies.framework.page import Part
+from mitsim.studies.framework.run import Findings
 
 _FORMED = frozenset({"diffraction", "mask-thickness", "black-level"})
 """Effects of which frames are formed again in the same light; for others light is traced again, by the same seed."""
@@ -343,7 +344,7 @@ class CauseRow:
 
 
 @dataclass(frozen=True, eq=False)
-class CalibrationFindings:
+class CalibrationFindings(Findings):
     """What a session came to.
 
     Attributes

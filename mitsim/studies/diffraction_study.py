@@ -57,6 +57,7 @@ from mitsim.report.lit_scene import (
     shadow_row,
 )
 from mitsim.studies.ablation import reformed
+from mitsim.studies.framework.run import Findings
 
 MASKS: tuple[CameraMask, ...] = ("separable", "flatcam")
 ASSUMED, SEPARABLE, CALIBRATED = "geometric factors", "best separable factors", "calibrated factors"
@@ -90,7 +91,7 @@ class QualityRow:
 
 
 @dataclass(frozen=True, eq=False)
-class DiffractionFindings:
+class DiffractionFindings(Findings):
     """All rows, and the difference in PSNR that each choice of factors makes; figures are of ``patterns``."""
 
     bench: Bench

@@ -54,11 +54,9 @@ def _claims(results: Results) -> Sequence[Claim]:
             results.table,
             f"25 dots at 750 um are comparable to uniform light at 2000 um (within {_COMPARABLE_DB:g} dB)",
             "comparable",
-            {"mask_distance": "0.75", "patterns": "dots:5"},
-            {"mask_distance": "2.0", "patterns": "uniform"},
+            ({"mask_distance": "0.75", "patterns": "dots:5"}, {"mask_distance": "2.0", "patterns": "uniform"}),
             "{one} against {other} dB: {gain:+} dB",
-            low=-_COMPARABLE_DB,
-            high=_COMPARABLE_DB,
+            (-_COMPARABLE_DB, _COMPARABLE_DB),
         ),
     ]
 

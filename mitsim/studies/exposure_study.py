@@ -67,8 +67,8 @@ def _claims(results: Results) -> Sequence[Claim]:
     ratio = np.divide(table.numbers("ser"), table.numbers("ser_law")).tolist()
     one, many, dots = ({"patterns": name} for name in SHARED)
     return [
-        claims.compared(table, "49 dots beat 49 uniform frames of the same time", "higher", dots, many, said),
-        claims.compared(table, "49 uniform frames are slightly better than one", "slightly higher", many, one, said),
+        claims.compared(table, "49 dots beat 49 uniform frames of the same time", "higher", (dots, many), said),
+        claims.compared(table, "49 uniform frames are slightly better than one", "slightly higher", (many, one), said),
         Claim(
             "Without regularisation, ||x|| / ||x - x'|| is SNR / rho (49 dots)", "equal",
             f"measured / law {min(ratio):.3f} to {max(ratio):.3f}", "not defined: factors are calibrated",

@@ -59,7 +59,7 @@ def _claims(results: Results) -> Sequence[Claim]:
     families = Table(tuple(row for row in table.rows if row["exposure"] != DIM))
 
     def better(claim: str, family: str, other: str) -> Claim:
-        return claims.compared(families, claim, "higher", {"patterns": family}, {"patterns": other})
+        return claims.compared(families, claim, "higher", ({"patterns": family}, {"patterns": other}))
 
     return [
         claims.stated(table.where(patterns="uniform"), "One uniform pattern gives 21 to 23 dB", _STATED["uniform"]),

@@ -80,8 +80,8 @@ def _claims(results: Results) -> Sequence[Claim]:
         claims.compared(
             table.where(patterns=family),
             f"Total variation is as good (within {_VISIBLE_DB:g} dB), {in_text(family)}, {which} weight",
-            "not visibly better", tv, plain, "Tikhonov {other} dB, total variation {one} dB: {gain:+} dB",
-            low=-_VISIBLE_DB, high=_VISIBLE_DB, column=column,
+            "not visibly better", (tv, plain), "Tikhonov {other} dB, total variation {one} dB: {gain:+} dB",
+            (-_VISIBLE_DB, _VISIBLE_DB), column,
         )
         for column, which in _COLUMNS.items()
         for family in _SHOWN

@@ -46,10 +46,11 @@ from mitsim.reconstruct.sides import Method, Structure
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.report import plots
 from mitsim.report.html import typeset
+from mitsim.studies.framework.run import Findings
 
 
 @dataclass(frozen=True)
-class SolverFindings:
+class SolverFindings(Findings):
     """Error and seconds of every form of the solution."""
 
     rows: tuple[SolverRow, ...]

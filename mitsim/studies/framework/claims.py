@@ -318,15 +318,12 @@ def compared(
     table: Table,
     claim: str,
     paper: str,
-    one: Mapping[str, Value],
-    other: Mapping[str, Value],
+    pair: tuple[Mapping[str, Value], Mapping[str, Value]],
     said: str = "{gain:+} dB",
-    *,
-    low: float | None = None,
-    high: float = math.inf,
+    between: tuple[float, float] = (0.0, math.inf),
     column: str = "psnr_db",
 ) -> Claim:
-    """A claim of what some images have over others; higher than 0 where no range is given.
+    """A claim of what some images have over others.
 
     Parameters
     ----------
@@ -334,20 +331,19 @@ def compared(
         rows of both.
     claim, paper
         what is claimed, and what the paper says.
-    one, other
-        values of their columns that choose the rows of either.
+    pair
+        values of columns that choose the rows of the ones, and of the others.
     said
         what is said of them: ``one`` and ``other`` are their means, ``gain`` that of the paired differences.
-    low, high, column
+    between, column
         range of the gain that the claim holds in, and what it is a gain of.
     """
-    least = low if low is not None else 0.0 if high == math.inf else -math.inf
 
     def judge(rows: Table) -> tuple[str, Holds]:
-        both = rows.where(**one), rows.where(**other)
-        gain = difference(*both, column)
-        means = dict(zip(("one", "other"), (sampled(each, column) for each in both), strict=True))
-        return said.format(gain=gain, **means), within(gain, least, high)
+        one, other = (rows.where(**chosen) for chosen in pair)
+        gain = difference(one, other, column)
+        text = said.format(gain=gain, one=sampled(one, column), other=sampled(other, column))
+        return text, within(gain, *between)
 
     return judged(table, claim, paper, judge)
 

@@ -13,7 +13,7 @@ from functools import partial
 from itertools import groupby
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from mitsim.bench.request import Request
 from mitsim.core.environment import versions
@@ -43,44 +43,36 @@ def write_figures(folder: Path, figures: Mapping[str, Figure]) -> None:
             figure.savefig(part, dpi=DPI, format="png")
 
 
-class Findings(Protocol):
-    """What a study measured."""
+class Findings:
+    """What a study of one bench measured, as its folder and the command line show it."""
+
+    title: ClassVar[str] = ""
+    """Of its page; without one it has none."""
 
     def payload(self) -> dict[str, Any]:
         """As JSON holds it."""
+        raise NotImplementedError
 
     def lines(self) -> list[str]:
         """For people."""
+        raise NotImplementedError
 
     def figures(self) -> Mapping[str, Figure]:
         """By file name."""
-
-
-@runtime_checkable
-class Tabled(Protocol):
-    """Findings with tables."""
+        raise NotImplementedError
 
     def tables(self) -> Mapping[str, Table]:
         """By file name."""
+        return {}
 
-
-@runtime_checkable
-class Warned(Protocol):
-    """Findings that may not be trusted."""
+    def parts(self) -> Sequence[Part]:
+        """Of its page."""
+        return ()
 
     @property
     def warnings(self) -> Sequence[str]:
-        """What is wrong, and what to do; empty where nothing is."""
-
-
-@runtime_checkable
-class Paged(Protocol):
-    """Findings with a page."""
-
-    title: str
-
-    def parts(self) -> Sequence[Part]:
-        """Of the page."""
+        """Why it may not be trusted, and what to do; empty where nothing is wrong."""
+        return ()
 
 
 @dataclass(frozen=True)
@@ -104,15 +96,12 @@ class StudyResult:
     @property
     def warnings(self) -> Sequence[str]:
         """Of the findings."""
-        return self.findings.warnings if isinstance(self.findings, Warned) else ()
-
-
-Measure = Callable[[Any, Request, Job], Findings]
+        return self.findings.warnings
 
 
 def run_study(
     name: str,
-    measure: Measure,
+    measure: Callable[[Any, Request, Job], Findings],
     bench: Bench | None,
     output: Path | str,
     request: Request | None = None,
@@ -140,7 +129,7 @@ def run_study(
         write_json(folder / f"{name}.json", {**result.payload(), **provenance})
         figures = findings.figures()
         write_figures(folder, figures)
-        if isinstance(findings, Paged):
+        if findings.title:
             from mitsim.studies.framework.page import build_findings
 
             where = f"Scene {bench.loaded.path.parent.name}, " if bench else ""
@@ -148,7 +137,7 @@ def run_study(
             page = build_findings(name, findings.title, where, findings.parts(), figures, result.warnings)
             with whole_file(folder / f"{name}.html") as part:
                 part.write_text(page, encoding="utf-8")
-        for file, table in findings.tables().items() if isinstance(findings, Tabled) else ():
+        for file, table in findings.tables().items():
             table.write(folder / file)
         return result
 

@@ -16,14 +16,14 @@ from mitsim.bench.request import Request
 from mitsim.core.errors import MitsimError
 from mitsim.report import plots
 from mitsim.studies import STUDIES
-from mitsim.studies.framework.run import StudyResult, find_study, run_study, study_folder
+from mitsim.studies.framework.run import Findings, StudyResult, find_study, run_study, study_folder
 from tests.unit.studies.test_colour_by_line import main
 
 BENCH: Any = SimpleNamespace(loaded=SimpleNamespace(path=Path("scene.xml")))
 
 
 @dataclass(frozen=True)
-class Toy:
+class Toy(Findings):
     """Findings of a study that measures nothing."""
 
     value: float
