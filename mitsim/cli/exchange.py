@@ -193,7 +193,7 @@ def patterns(
     check_root(seed)
     if family != "stripes":
         read_name(family, projector_pixels)  # refused before numpy is imported
-    from mitsim.exchange.png_files import SESSION, cells_told, draw_family, draw_stripes, session_of
+    from mitsim.exchange.png_files import SESSION, describe_cells, draw_family, draw_stripes, session_of
 
     if family != "stripes":
         refuse_unused(context, ["signed_capture"], "on patterns, whose signed ones are pairs; it is for stripes")
@@ -220,7 +220,7 @@ def patterns(
     where = payload["projector"]
     lines = [
         f"{payload['pictures']} pictures of {where['rows']}x{where['columns']}, {payload['n']}x{payload['n']} cells of "
-        f"{cells_told(where)}: {output}",
+        f"{describe_cells(where)}: {output}",
         after,
     ]
     return finish(as_json, payload, lines, ())

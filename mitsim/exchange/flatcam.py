@@ -31,11 +31,11 @@ from mitsim.exchange.packed import (
     Loaded,
     Packed,
     Run,
-    checked_channel,
+    as_channel,
     line_of,
     shots_of,
-    unpacked_colours,
-    unpacked_run,
+    unpack_colours,
+    unpack_run,
 )
 from mitsim.exchange.real_capture import PLANES, check_channel
 
@@ -131,7 +131,7 @@ def load_mat(path: Path, channel: str | None) -> Iterator[Loaded]:
         run, calibration = _folders_in(variables, _meas_in(variables, path), path)
     else:
         meas = _meas_in(variables, path)
-        colours = unpacked_colours(matlab.text_in(variables, matlab.COLOURED, path), RUN, path)
+        colours = unpack_colours(matlab.text_in(variables, matlab.COLOURED, path), RUN, path)
         planes = {name: plane for plane, name in _lines_of_planes(colours, path).items()}
 
         def folders_in(name: str, own: Variables) -> tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]:
@@ -167,7 +167,7 @@ def flatcam_calibration(path: Path, channel: str) -> Packed[CalibrationManifest]
     variables = matlab.read_variables(path)
     found = {name: f"{stem}{channel}" for name, stem in zip(FACTORS, ("P1", "Q1"), strict=True)}
     sides = {
-        name: checked_channel(matlab.matrix_in(variables, variable, path).astype(np.float32), variable, path)
+        name: as_channel(matlab.matrix_in(variables, variable, path).astype(np.float32), variable, path)
         for name, variable in found.items()
     }
     angle = float(matlab.matrix_in({"angle": [[0.0]], **variables}, "angle", path)[0, 0])
@@ -184,7 +184,7 @@ def flatcam_calibration(path: Path, channel: str) -> Packed[CalibrationManifest]
     return Packed(manifest, "", FACTORS, read, path)
 
 
-def _centred(factor: FloatArray) -> FloatArray:
+def _centre(factor: FloatArray) -> FloatArray:
     """A ``factor`` (pixels, n) of frames that lose the means of their rows and columns."""
     return np.asarray(factor - factor.mean(axis=0))
 
@@ -222,7 +222,7 @@ def _planes(factors: Mapping[str, tuple[FloatArray, ...]]) -> dict[str, Any]:
     variables: dict[str, Any] = {"angle": 0.0}
     for plane, (left, right) in factors.items():
         variables["cSize"] = np.array([[len(left), len(right)]], float)
-        variables.update({f"P1{plane}": _centred(left), f"Q1{plane}": _centred(right)})
+        variables.update({f"P1{plane}": _centre(left), f"Q1{plane}": _centre(right)})
     return variables
 
 
@@ -230,7 +230,7 @@ def _folders_in(
     variables: Variables, meas: npt.NDArray[Any], path: Path
 ) -> tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]:
     """Run and calibration of whose frames ``meas`` is."""
-    manifest = unpacked_run(matlab.text_in(variables, "run_manifest", path), path)
+    manifest = unpack_run(matlab.text_in(variables, "run_manifest", path), path)
     captures = manifest.patterns.captures
     frames = matlab.array_in({"meas": meas}, "meas", (*meas.shape[:2], len(captures)), path)
     index = {shot.file: number for number, shot in enumerate(captures)}

@@ -31,15 +31,15 @@ from mitsim.exchange.packed import (
     Loaded,
     Packed,
     Run,
-    checked_channel,
+    as_channel,
     line_of,
     manifest_text,
     run_parts,
     shots_of,
-    unpacked,
-    unpacked_colours,
-    unpacked_filters,
-    unpacked_run,
+    unpack,
+    unpack_colours,
+    unpack_filters,
+    unpack_run,
 )
 from mitsim.version import __version__
 
@@ -76,7 +76,7 @@ def write_hdf5(path: Path, run: Run, calibration: Calibration | None = None) -> 
     MitsimError
         for shots that differ in shape or channels, or a file that cannot be read or written.
     """
-    with _begun(path) as file:
+    with _begin_file(path) as file:
         if isinstance(run, Packed):
             _write_run(file, run)
             _write_calibration(file, line_of(calibration, ""))
@@ -155,10 +155,10 @@ def open_folders(path: Path | str) -> Iterator[tuple[Run, Calibration | None]]:
 
     path = Path(path)
     check_plain(path)
-    with _told(path):
+    with _in_one_line(path):
         file = h5py.File(path, "r")
     with file:
-        with _told(path):
+        with _in_one_line(path):
             layout = file.attrs.get("mitsim_exchange")
             if not isinstance(layout, (int, np.integer)) or not 1 <= layout <= LAYOUT:
                 raise MitsimError(
@@ -200,7 +200,7 @@ class _Lazily(Mapping[str, tuple[Channels, Metadata]]):
 
 
 @contextmanager
-def _begun(path: Path) -> Iterator[h5py.File]:
+def _begin_file(path: Path) -> Iterator[h5py.File]:
     """A file of this layout that takes its place at ``path`` when all is written."""
     with whole_hdf5(path) as file:
         file.attrs["mitsim_exchange"] = LAYOUT
@@ -267,11 +267,11 @@ def _strings() -> Any:
 
 
 def _of_lines(file: h5py.File, path: Path) -> tuple[Run, Calibration | None]:
-    group, run = _group(file, _LINES, path), _coloured(file, path) if RUN in file else _filtered(file, path)
+    group, run = _group(file, _LINES, path), _coloured_run(file, path) if RUN in file else _filtered_run(file, path)
     if CALIBRATION not in file:
         return run, None
     text = _text_in(file, CALIBRATION, path)
-    colours, calibrations = unpacked_colours(text, CALIBRATION, path), {}
+    colours, calibrations = unpack_colours(text, CALIBRATION, path), {}
     for name in colours.names:
         if name not in run.colours.names or "calibration" not in group[name]:
             raise MitsimError(f"{path}: has no calibration of {name}; export it again")
@@ -279,15 +279,15 @@ def _of_lines(file: h5py.File, path: Path) -> tuple[Run, Calibration | None]:
     return run, Coloured(colours, text, calibrations)
 
 
-def _coloured(file: h5py.File, path: Path) -> Coloured[RunManifest]:
+def _coloured_run(file: h5py.File, path: Path) -> Coloured[RunManifest]:
     text = _text_in(file, RUN, path)
-    colours = unpacked_colours(text, RUN, path)
+    colours = unpack_colours(text, RUN, path)
     return Coloured(colours, text, {name: _run(line, path) for name, line in _lines_of(file, colours, path).items()})
 
 
-def _filtered(file: h5py.File, path: Path) -> Filtered:
+def _filtered_run(file: h5py.File, path: Path) -> Filtered:
     text, shots = _text_in(file, MOSAIC, path), _run(file, path)
-    colours = unpacked_filters(text, shots, path)
+    colours = unpack_filters(text, shots, path)
     lines = _lines_of(file, colours, path)
     truths = {name: _frame(_group(line, "truth", path), path) for name, line in lines.items() if "truth" in line}
     return Filtered(colours, text, shots, truths)
@@ -302,7 +302,7 @@ def _lines_of(file: h5py.File, colours: ColourManifest, path: Path) -> dict[str,
 def _run(file: h5py.Group, path: Path) -> Packed[RunManifest]:
     group = _group(file, "run", path)
     text = _text_in(group, "manifest", path)
-    manifest = unpacked_run(text, path)
+    manifest = unpack_run(text, path)
     captures, ambient = manifest.patterns.captures, manifest.ambient_frame
     stacks = _group(group, "shots", path)
     channels = {name: _dataset(stacks, name, path) for name in stacks}
@@ -317,13 +317,11 @@ def _run(file: h5py.Group, path: Path) -> Packed[RunManifest]:
     others = ({ambient.file: "ambient"} if ambient else {}) | ({TRUTH: "truth"} if "truth" in group else {})
 
     def read(name: str) -> tuple[Channels, Metadata]:
-        with _told(path):
+        with _in_one_line(path):
             if name in others:
                 return _frame(_group(group, others[name], path), path)
             number = index[name]
-            frame = {
-                key: checked_channel(values[number], f"/run/shots/{key}", path) for key, values in channels.items()
-            }
+            frame = {key: as_channel(values[number], f"/run/shots/{key}", path) for key, values in channels.items()}
             return frame, _metadata(metadata, number, path)
 
     return Packed(manifest, text, (*(shot.file for shot in captures), *others), read, path)
@@ -334,10 +332,10 @@ def _calibration(file: h5py.Group, path: Path) -> Packed[CalibrationManifest]:
     text = _text_in(group, "manifest", path)
 
     def read(name: str) -> tuple[Channels, Metadata]:
-        with _told(path):
+        with _in_one_line(path):
             return _frame(_group(group, Path(name).stem, path), path)
 
-    return Packed(unpacked(text, CalibrationManifest, path), text, FACTORS, read, path)
+    return Packed(unpack(text, CalibrationManifest, path), text, FACTORS, read, path)
 
 
 def _text_in(group: h5py.Group, name: str, path: Path) -> str:
@@ -352,9 +350,7 @@ def _text_in(group: h5py.Group, name: str, path: Path) -> str:
 def _frame(group: h5py.Group, path: Path) -> tuple[Channels, Metadata]:
     names = [name for name in group if name != "metadata"]
     arrays = {name: _dataset(group, name, path) for name in names}
-    channels = {
-        name: checked_channel(_whole(array, path), f"{group.name}/{name}", path) for name, array in arrays.items()
-    }
+    channels = {name: as_channel(_whole(array, path), f"{group.name}/{name}", path) for name, array in arrays.items()}
     return channels, _metadata(_dataset(group, "metadata", path), 0, path)
 
 
@@ -426,7 +422,7 @@ def _inside(parent: h5py.Group, name: str, kind: Callable[..., Any], path: Path)
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
+def _in_one_line(path: Path) -> Iterator[None]:
     """What h5py finds wrong with a file, in one line."""
     try:
         yield

@@ -33,14 +33,14 @@ from mitsim.exchange.packed import (
     Filtered,
     Packed,
     Run,
-    checked_channel,
+    as_channel,
     line_of,
     manifest_text,
     shots_of,
-    unpacked,
-    unpacked_colours,
-    unpacked_filters,
-    unpacked_run,
+    unpack,
+    unpack_colours,
+    unpack_filters,
+    unpack_run,
 )
 
 ELECTRONS = "expected electrons of the frames"
@@ -101,7 +101,7 @@ def folders_of(variables: Variables, path: Path) -> tuple[Run, Calibration | Non
 
 def _filtered_in(variables: Variables, path: Path) -> tuple[Filtered, Coloured[CalibrationManifest] | None]:
     text, (shots, _) = text_in(variables, FILTERED, path), _folders_in(variables, path)
-    colours = unpacked_filters(text, shots, path)
+    colours = unpack_filters(text, shots, path)
     lines = by_line(variables, colours.names, path)
     truths = {name: truth_in(own, path) for name, own in lines.items() if "truth" in own}
     digital = shots.manifest.digital
@@ -114,7 +114,7 @@ def _variables(run: Packed[RunManifest], calibration: Packed[CalibrationManifest
 
 
 def _folders_in(variables: Variables, path: Path) -> tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]:
-    manifest = unpacked_run(text_in(variables, "run_manifest", path), path)
+    manifest = unpack_run(text_in(variables, "run_manifest", path), path)
     return _run(variables, manifest, path), calibration_in(variables, manifest.digital, path)
 
 
@@ -418,7 +418,7 @@ def lines_in(
         for a line that is missing, and as ``folders_in``.
     """
     text = text_in(variables, COLOURED, path)
-    colours = unpacked_colours(text, RUN, path)
+    colours = unpack_colours(text, RUN, path)
     held = {name: folders_in(name, own) for name, own in by_line(variables, colours.names, path).items()}
     run = Coloured(colours, text, {name: shots for name, (shots, _) in held.items()})
     return run, calibrations_in(variables, {name: calibration for name, (_, calibration) in held.items()}, path)
@@ -446,7 +446,7 @@ def calibrations_in(
     if _CALIBRATED not in variables:
         return None
     text = text_in(variables, _CALIBRATED, path)
-    colours = unpacked_colours(text, CALIBRATION, path)
+    colours = unpack_colours(text, CALIBRATION, path)
     lines = {name: calibration for name, calibration in held.items() if calibration is not None}
     if {*lines} != {*colours.names}:
         raise MitsimError(f"{path}: has calibrations of {', '.join(lines)}, not of {', '.join(colours.names)}")
@@ -573,7 +573,7 @@ def truth_in(variables: Variables, path: Path) -> tuple[Channels, Metadata]:
 
 def _image_in(variables: Variables, name: str, path: Path) -> Channel:
     """The image called ``name``, (rows, columns) float32."""
-    return checked_channel(matrix_in(variables, name, path).astype(np.float32), name, path)
+    return as_channel(matrix_in(variables, name, path).astype(np.float32), name, path)
 
 
 def dn_per_rate(digital: Digital) -> float:
@@ -617,7 +617,7 @@ def calibration_in(variables: Variables, digital: Digital, path: Path) -> Packed
     if "calibration_manifest" not in variables:
         return None
     text = text_in(variables, "calibration_manifest", path)
-    manifest = unpacked(text, CalibrationManifest, path)
+    manifest = unpack(text, CalibrationManifest, path)
     metadata: Metadata = {"unit": "sqrt(e-/s)"}
     if manifest.board_reflectance is not None:
         metadata = {**metadata, "reflectance": manifest.board_reflectance}
@@ -626,7 +626,7 @@ def calibration_in(variables: Variables, digital: Digital, path: Path) -> Packed
         variable = f"phi_{Path(name).stem}"
         factor = matrix_in(variables, variable, path) / math.sqrt(dn_per_rate(digital))
         # Rounding in double precision is far below half of the last digit in single: the number is the first one.
-        return {"factor": checked_channel(factor.astype(np.float32), variable, path)}, metadata
+        return {"factor": as_channel(factor.astype(np.float32), variable, path)}, metadata
 
     return Packed(manifest, text, FACTORS, read, path)
 
@@ -673,4 +673,4 @@ def _digital(values: npt.NDArray[Any], kind: Any, name: str, path: Path) -> Chan
         digital = np.asarray(values).astype(kind)
     if not np.array_equal(digital.astype(np.float64), values):
         raise MitsimError(f"{path}: {name} has numbers that are no {np.dtype(kind).name}; export it again")
-    return checked_channel(digital, name, path)
+    return as_channel(digital, name, path)

@@ -100,13 +100,13 @@ class Packed(Generic[Manifest]):
             write_manifest(folder, self.manifest.model_copy(update={"checksums": sums}))
 
 
-def packed_run(folder: Path) -> Packed[RunManifest]:
+def pack_run(folder: Path) -> Packed[RunManifest]:
     """The RUN ``folder``. MitsimError when it is not a complete one."""
     shots = load_run(folder)
     return Packed(shots.manifest, _text_of(folder), shots.files, shots.read, folder)
 
 
-def packed_calibration(folder: Path) -> Packed[CalibrationManifest]:
+def pack_calibration(folder: Path) -> Packed[CalibrationManifest]:
     """The CAL ``folder``. MitsimError when it is not a complete one."""
     manifest = read_manifest(folder, CalibrationManifest)
 
@@ -133,13 +133,13 @@ def shots_of(run: Packed[RunManifest]) -> Iterator[tuple[ShotFile, Channels, Met
         first = first or kinds
         if "DN" not in kinds or kinds != first:
             raise MitsimError(
-                f"{run.place / shot.file}: holds {_told(kinds)}, but the first frame {_told(first)}; frames of one "
-                "shape with the same channels, DN among them, can be exchanged"
+                f"{run.place / shot.file}: holds {_kinds_text(kinds)}, but the first frame {_kinds_text(first)}; "
+                "frames of one shape with the same channels, DN among them, can be exchanged"
             )
         yield shot, channels, metadata
 
 
-def unpacked(text: str, model: type[Manifest], place: Path) -> Manifest:
+def unpack(text: str, model: type[Manifest], place: Path) -> Manifest:
     """The manifest in the ``text`` that an exchanged file holds.
 
     Parameters
@@ -165,10 +165,10 @@ def unpacked(text: str, model: type[Manifest], place: Path) -> Manifest:
     return checked_manifest(data, model, place)
 
 
-def unpacked_run(text: str, place: Path) -> RunManifest:
+def unpack_run(text: str, place: Path) -> RunManifest:
     """The manifest of a run in the ``text`` that an exchanged file holds, found at ``place``; with names of frames that
-    a folder can have. MitsimError as for :func:`unpacked`."""
-    manifest = unpacked(text, RunManifest, place)
+    a folder can have. MitsimError as for :func:`unpack`."""
+    manifest = unpack(text, RunManifest, place)
     ambient = manifest.ambient_frame
     for name in (*(shot.file for shot in manifest.patterns.captures), *([ambient.file] if ambient else [])):
         if name in _OWN or not name.isprintable():
@@ -181,7 +181,7 @@ def manifest_text(manifest: RunManifest | CalibrationManifest, text: str) -> str
     return text or json_text(manifest)
 
 
-def checked_channel(values: object, name: str, place: Path) -> Channel:
+def as_channel(values: object, name: str, place: Path) -> Channel:
     """An array of an exchanged file as a channel of a frame.
 
     Parameters
@@ -210,7 +210,7 @@ def _text_of(folder: Path) -> str:
     return read_text(folder / MANIFEST, MOST_BYTES)
 
 
-def _told(kinds: Mapping[str, tuple[object, ...]]) -> str:
+def _kinds_text(kinds: Mapping[str, tuple[object, ...]]) -> str:
     return ", ".join(f"{name} ({' '.join(map(str, kind))})" for name, kind in kinds.items())
 
 
@@ -301,23 +301,23 @@ def any_run(folder: Path) -> Run:
         filters = read_mosaic(folder)
         files = {name: folder / name / TRUTH for name in filters.names}
         truths = {name: read_frame(path) for name, path in files.items() if path.is_file()}
-        return Filtered(filters, _colour_text_of(folder), packed_run(folder), truths)
+        return Filtered(filters, _colour_text_of(folder), pack_run(folder), truths)
     if not is_coloured(folder):
-        return packed_run(folder)
+        return pack_run(folder)
     colours = read_colours(folder, RUN)
-    return Coloured(colours, _colour_text_of(folder), {name: packed_run(folder / name) for name in colours.names})
+    return Coloured(colours, _colour_text_of(folder), {name: pack_run(folder / name) for name in colours.names})
 
 
 def any_calibration(folder: Path) -> Calibration:
     """The CAL ``folder``, coloured or not. MitsimError when it, or a line's folder, is not a complete one."""
     if not is_coloured(folder):
-        return packed_calibration(folder)
+        return pack_calibration(folder)
     colours = read_colours(folder, CALIBRATION)
-    lines = {name: packed_calibration(folder / name) for name in colours.names}
+    lines = {name: pack_calibration(folder / name) for name in colours.names}
     return Coloured(colours, _colour_text_of(folder), lines)
 
 
-def unpacked_colours(text: str, kind: str, place: Path) -> ColourManifest:
+def unpack_colours(text: str, kind: str, place: Path) -> ColourManifest:
     """The lines that an exchanged file has.
 
     Parameters
@@ -334,12 +334,12 @@ def unpacked_colours(text: str, kind: str, place: Path) -> ColourManifest:
     MitsimError
         when the text is not JSON, breaks a rule of its format, or names a folder that cannot be.
     """
-    colours = checked_colours(_parsed(text, place), kind, place)
+    colours = checked_colours(_parse(text, place), kind, place)
     _check_names(colours, place, (COLOUR, LOCK))
     return colours
 
 
-def unpacked_filters(text: str, shots: Packed[RunManifest], place: Path) -> MosaicManifest:
+def unpack_filters(text: str, shots: Packed[RunManifest], place: Path) -> MosaicManifest:
     """The lines and filters that an exchanged file has.
 
     Parameters
@@ -354,14 +354,14 @@ def unpacked_filters(text: str, shots: Packed[RunManifest], place: Path) -> Mosa
     Raises
     ------
     MitsimError
-        as :func:`unpacked_colours`.
+        as :func:`unpack_colours`.
     """
-    colours = checked_mosaic(_parsed(text, place), place)
+    colours = checked_mosaic(_parse(text, place), place)
     _check_names(colours, place, (COLOUR, LOCK, MANIFEST, *shots.names))
     return colours
 
 
-def _parsed(text: str, place: Path) -> Any:
+def _parse(text: str, place: Path) -> Any:
     try:
         return parse_json(text)
     except ValueError as error:

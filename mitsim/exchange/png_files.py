@@ -103,7 +103,7 @@ def draw_family(folder: Path, name: str, n: int, projector: str, seed: int = 0) 
     _check_cost(raster, len(names))
     with whole_folder(folder) as place:
         where = draw(place, light, raster, (n, n), f"projector {projector}")
-        write_json(place / PATTERNS, described(patterns, names, where))
+        write_json(place / PATTERNS, describe(patterns, names, where))
     return {"patterns": name, "n": n, "pictures": len(names), "projector": where, "output": str(folder)}
 
 
@@ -219,9 +219,9 @@ def draw(
     grid = grid_in(raster, sides, place)
     (folder / "patterns").mkdir()
     for index, shot in enumerate(light):
-        write_png(folder / picture_name(index), shown(shot, grid, raster))
+        write_png(folder / picture_name(index), draw_picture(shot, grid, raster))
     for name, level in (("black", 0), ("white", 1)):
-        write_png(folder / "patterns" / f"{name}.png", shown(np.full(sides, level), grid, raster))
+        write_png(folder / "patterns" / f"{name}.png", draw_picture(np.full(sides, level), grid, raster))
     return {"rows": raster.rows, "columns": raster.columns, **grid}
 
 
@@ -275,7 +275,7 @@ def grid_in(raster: Raster, sides: tuple[int, int], place: str) -> dict[str, Any
     }
 
 
-def cells_told(where: Mapping[str, Any]) -> str:
+def describe_cells(where: Mapping[str, Any]) -> str:
     """How large a cell is, and its shape on the scene, of the place ``where`` of a grid as of :func:`grid_in`."""
     rows, columns, shape = where["cell"], where["cell_columns"], where["cell_shape"]
     size = f"{rows} pixels a side" if rows == columns else f"{rows} x {columns} pixels"
@@ -284,7 +284,7 @@ def cells_told(where: Mapping[str, Any]) -> str:
     return size if rows == columns else f"{size}, square on the scene"
 
 
-def shown(light: npt.NDArray[Any], grid: Mapping[str, Any], raster: Raster) -> npt.NDArray[np.uint8]:
+def draw_picture(light: npt.NDArray[Any], grid: Mapping[str, Any], raster: Raster) -> npt.NDArray[np.uint8]:
     """A picture for the projector, (rows, columns), black around the grid.
 
     Parameters
@@ -329,7 +329,7 @@ def pictures_of(patterns: Patterns, place: str) -> Iterator[npt.NDArray[Any]]:
         yield light
 
 
-def described(patterns: Patterns, names: Sequence[str], where: Mapping[str, Any]) -> dict[str, Any]:
+def describe(patterns: Patterns, names: Sequence[str], where: Mapping[str, Any]) -> dict[str, Any]:
     """What `patterns.json` says of a family.
 
     Parameters
@@ -400,14 +400,14 @@ def write_pngs(
         raster = _raster(run, projector)
         with whole_folder(folder) as place:
             where = _fill(place, run, raster)
-        return _read_again(folder, "RUN", "CAL", run.manifest), f"Patterns in cells of {cells_told(where)}"
+        return _read_again(folder, "RUN", "CAL", run.manifest), f"Patterns in cells of {describe_cells(where)}"
     with whole_folder(folder) as place:
         for name, shots in run.lines.items():
             (place / name).mkdir()
             where = _fill(place / name, shots, _raster(shots, projector))
         write_text(place / COLOUR, run.text)
     again = (_read_again(folder / name, f"RUN/{name}", f"CAL/{name}", run.lines[name].manifest) for name in run.lines)
-    return f"Begin with: mkdir RUN; cp {folder / COLOUR} RUN", *again, f"Patterns in cells of {cells_told(where)}"
+    return f"Begin with: mkdir RUN; cp {folder / COLOUR} RUN", *again, f"Patterns in cells of {describe_cells(where)}"
 
 
 def _fill(place: Path, run: Packed[RunManifest], raster: Raster) -> dict[str, Any]:
@@ -430,7 +430,7 @@ def _fill(place: Path, run: Packed[RunManifest], raster: Raster) -> dict[str, An
     if manifest.ambient_frame is not None:
         with whole_file(place / "ambient.npy") as part, part.open("wb") as file:
             np.save(file, run.read(manifest.ambient_frame.file)[0]["DN"])
-    write_json(place / PATTERNS, described(manifest.patterns, names, where))
+    write_json(place / PATTERNS, describe(manifest.patterns, names, where))
     return where
 
 

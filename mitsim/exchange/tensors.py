@@ -62,7 +62,9 @@ def write_tensors(path: Path, run: Run, calibration: Calibration | None) -> tupl
     if isinstance(run, Packed):
         arrays = _arrays(run, line_of(calibration, ""))
     else:
-        arrays = _filtered(run, calibration) if isinstance(run, Filtered) else _joined(path, run, calibration)
+        arrays = (
+            _arrays_behind_filters(run, calibration) if isinstance(run, Filtered) else _join(path, run, calibration)
+        )
         arrays["wavelengths_nm"] = np.array(run.colours.wavelengths_nm)
     with whole_file(path) as part:
         torch.save({name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in arrays.items()}, part)
@@ -82,7 +84,7 @@ def write_deepinv(path: Path, run: Run, calibration: Calibration | None) -> tupl
     return (f"Read it by mitsim.exchange.tensors.load_physics({str(path)!r})",)
 
 
-def _joined(path: Path, run: Coloured[RunManifest], calibration: Calibration | None) -> dict[str, FloatArray]:
+def _join(path: Path, run: Coloured[RunManifest], calibration: Calibration | None) -> dict[str, FloatArray]:
     lines = {name: _arrays(run.lines[name], line_of(calibration, name)) for name in run.colours.names}
     first, *others = lines.values()
     for arrays in others:
@@ -99,7 +101,7 @@ def _joined(path: Path, run: Coloured[RunManifest], calibration: Calibration | N
 
 def _arrays(run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None) -> dict[str, FloatArray]:
     shots = Capture(run.manifest, None, {name: run.read(name) for name in dict.fromkeys(run.names)})
-    arrays = {"y": measured(shots), **dict(zip(_PATTERNS, shots.patterns, strict=True))}
+    arrays = {"y": measurements(shots), **dict(zip(_PATTERNS, shots.patterns, strict=True))}
     if shots.truth is not None:
         arrays["x"] = shots.truth[None]
     return arrays if calibration is None else {**arrays, **_sides(calibration)}
@@ -110,7 +112,7 @@ def _sides(calibration: Packed[CalibrationManifest]) -> dict[str, FloatArray]:
     return {side: np.asarray(factor, np.float64) for side, factor in factors.items()}
 
 
-def _filtered(run: Filtered, calibration: Calibration | None) -> dict[str, FloatArray]:
+def _arrays_behind_filters(run: Filtered, calibration: Calibration | None) -> dict[str, FloatArray]:
     names = run.colours.names
     # The truth of the frames is a mixture of the lines', which are given themselves.
     arrays = {key: values for key, values in _arrays(run.shots, None).items() if key != "x"}
@@ -123,7 +125,7 @@ def _filtered(run: Filtered, calibration: Calibration | None) -> dict[str, Float
     return arrays
 
 
-def measured(shots: Capture) -> FloatArray:
+def measurements(shots: Capture) -> FloatArray:
     """(K K', rows, columns) electrons a second of every pattern of ``shots``, row-major over (i, j): differences of
     signed pairs, others less the ambient frame. MitsimError for a frame that cannot be read."""
     columns = shots.patterns[1].shape[1]
@@ -153,7 +155,7 @@ class RunDataset:
         shots = load_run(self.runs[index].folder or Path())  # anew, so that no item stays in memory
         if shots.truth is None:
             raise MitsimError(f"{shots.name}: has no {TRUTH}")
-        pair = shots.truth[None].astype(np.float32), measured(shots).astype(np.float32)
+        pair = shots.truth[None].astype(np.float32), measurements(shots).astype(np.float32)
         return self._torch.from_numpy(pair[0]), self._torch.from_numpy(pair[1])
 
 

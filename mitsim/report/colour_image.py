@@ -23,7 +23,7 @@ from mitsim.devices.chart import ChartPlace
 from mitsim.metrics import Quality, psnr
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
 from mitsim.reconstruct.request import IMAGE_FILE
-from mitsim.report.html import rendered, shown_figure, write_html
+from mitsim.report.html import page_figure, render_page, write_html
 from mitsim.report.plots import BLUE, FONT, GREEN, VERMILION, WIDTH, figure_of, label_axes
 
 
@@ -244,7 +244,7 @@ def write_page(
     MitsimError
         when it cannot be written.
     """
-    text = rendered(
+    text = render_page(
         "colour.html",
         verdict=_verdict(image),
         pictures=_pictures(image),
@@ -311,7 +311,7 @@ def _figures(image: ColourImage) -> dict[str, tuple[str, int]]:
         drawn["by_patch"] = by_patch(names, [patch.floor for patch in image.patches], {"this image": found})
         title = "Left half: the patch's spectrum in D65. Right half: this image. Number: Delta E 2000"
         drawn["halves"] = halves(names, found, chart().xyz, image.chart.means(image.xyz), title)
-    return {name: shown_figure(figure) for name, figure in drawn.items()}
+    return {name: page_figure(figure) for name, figure in drawn.items()}
 
 
 def _means(patches: Sequence[Patch]) -> tuple[float, float, float | None]:

@@ -25,7 +25,7 @@ from mitsim.metrics import Quality
 from mitsim.reconstruct.misfit import shown
 from mitsim.reconstruct.result import Reconstruction
 from mitsim.report import plots
-from mitsim.report.html import DASH, figure_uri, reflectance, rendered, sentence, write_html
+from mitsim.report.html import DASH, figure_uri, reflectance, render_page, sentence, write_html
 from mitsim.report.plots import FONT, WIDTH, figure_of, panels_of
 from mitsim.report.table import Mean
 
@@ -163,7 +163,7 @@ def render_html(report: ReportData) -> str:
         "pattern": _pattern,
     }
     facts = {"figures": _figures(report), "best": _best(report.families), "pattern_corner": _PATTERN_CORNER}
-    return rendered("report.html", filters, report=report, **facts)
+    return render_page("report.html", filters, report=report, **facts)
 
 
 def _reflectance(image: npt.ArrayLike, name: str = "image") -> str:

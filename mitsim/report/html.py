@@ -19,7 +19,7 @@ _DPI, _SHOWN_DPI = 220, 110
 """Figures are 8.6 inches wide at most: 946 pixels of the page, in two dots each."""
 
 
-def rendered(template: str, filters: Mapping[str, Callable[..., str]] | None = None, **shown: Any) -> str:
+def render_page(template: str, filters: Mapping[str, Callable[..., str]] | None = None, **shown: Any) -> str:
     """A page as text.
 
     Parameters
@@ -65,7 +65,7 @@ def write_html(path: Path, text: str) -> Path:
     return path
 
 
-def shown_figure(figure: Figure) -> tuple[str, int]:
+def page_figure(figure: Figure) -> tuple[str, int]:
     """A figure for a page.
 
     Parameters
@@ -116,7 +116,7 @@ def scientific(value: float | None) -> str:
     return typeset(f"{value:.1e}")
 
 
-def rounded(value: float, error: float) -> str:
+def round_to_error(value: float, error: float) -> str:
     """A number to the second digit of its standard error.
 
     Parameters

@@ -168,7 +168,9 @@ def reconstruct_colours(
         truths = [truth_for(load_run(run / name), board) for name in lines.names]
         known = [truth for truth in truths if truth is not None]
         truth = np.stack(known, axis=-1) if len(known) == len(truths) else None
-        found = JudgedColours(lines, images, ColourImage.of(lines, stacked(images), board, truth, chart), str(folder))
+        found = JudgedColours(
+            lines, images, ColourImage.of(lines, stack_lines(images), board, truth, chart), str(folder)
+        )
         found.colours.write(folder)
         qualities = {name: judged.quality for name, judged in images.items()}
         write_page(folder / PAGE, found.colours, qualities, found.facts, found.warnings)
@@ -177,7 +179,7 @@ def reconstruct_colours(
     return found
 
 
-def stacked(images: Mapping[str, Judged]) -> FloatArray:
+def stack_lines(images: Mapping[str, Judged]) -> FloatArray:
     """(n, n', lines) the ``images`` of all lines; MitsimError where they differ in size."""
     shapes = {judged.reconstruction.image.shape for judged in images.values()}
     if len(shapes) > 1:

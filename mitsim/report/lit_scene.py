@@ -273,7 +273,7 @@ def peak_time(bench: Apparatus, expected: ExpectedFrames) -> float:
     return Exposure().choose(bench.rig, peak_irradiance(expected))
 
 
-def averaged(frame: FloatArray, binning: int) -> FloatArray:
+def bin_frame(frame: FloatArray, binning: int) -> FloatArray:
     """A ``frame`` (m, m') whose pixels are averaged ``binning`` x ``binning``, which divides both sides."""
     if binning == 1:
         return frame
@@ -297,7 +297,7 @@ def accumulate(
     with single_threaded_blas():
         ambient = taken_off(exposer, family, expected)
         for measurement, row, column in exposer.measurements(family, expected):
-            frame = averaged(measurement - ambient, binning)
+            frame = bin_frame(measurement - ambient, binning)
             for each in sums:
                 each.add(frame, row, column)
     return sums

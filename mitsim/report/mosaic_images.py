@@ -181,7 +181,7 @@ def reconstruct_mosaic(
             [(each.left, each.right) for each in factors.values()], shots.weights, shots.manifest.mosaic
         )
         solver = solver_of(way, camera, shots.shots.patterns)
-        sums = _added(solver, shots, (len(camera.lefts[0]), len(camera.rights[0])))
+        sums = _add_frames(solver, shots, (len(camera.lefts[0]), len(camera.rights[0])))
         added = time.perf_counter()
         solved = solver.images(lam)
         ended = time.perf_counter()
@@ -240,7 +240,7 @@ class _Energies:
         return float(np.sqrt(max(left, 0.0)))
 
 
-def _added(solver: Solver, shots: MosaicCapture, shape: tuple[int, int]) -> _Energies:
+def _add_frames(solver: Solver, shots: MosaicCapture, shape: tuple[int, int]) -> _Energies:
     """Every frame of ``shots`` (``shape``) added to a ``solver``."""
     data = noise = 0.0
     for each in shots.shots.measured(shape):
@@ -450,7 +450,7 @@ class _Apart:
         self._sums = [model.accumulator() for model in self.models]
 
     def add(self, frame: FloatArray, row: int, column: int) -> None:
-        parts = planes_of(frame) if self._half else np.moveaxis(demosaiced(frame, self._mosaic), -1, 0)
+        parts = planes_of(frame) if self._half else np.moveaxis(demosaic(frame, self._mosaic), -1, 0)
         for total, part in zip(self._sums, parts, strict=True):
             total.add(part, row, column)
 
@@ -505,7 +505,7 @@ def planes_of(frame: FloatArray) -> list[FloatArray]:
     return [frame[a::2, b::2] for a, b in PLANES]
 
 
-def demosaiced(frame: FloatArray, mosaic: str) -> FloatArray:
+def demosaic(frame: FloatArray, mosaic: str) -> FloatArray:
     """(m, m', 3) red, green and blue of a ``frame`` (m, m') behind a ``mosaic`` such as RGGB (Menon and others 2007).
 
     MitsimError without colour-demosaicing.

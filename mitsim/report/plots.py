@@ -144,7 +144,7 @@ def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Se
     return figure
 
 
-def paired(values: Mapping[str, tuple[Mean, Mean]], labels: tuple[str, str], x: str) -> Figure:
+def pair_chart(values: Mapping[str, tuple[Mean, Mean]], labels: tuple[str, str], x: str) -> Figure:
     """Two means of each thing beside each other, the first as a bar, the second as a dot, the largest on top.
 
     Parameters

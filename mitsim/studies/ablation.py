@@ -124,10 +124,10 @@ class Ablation:
         direct = self._traced(direct=True, off=moved) if moved or MIRRORS in self.effects else self.light
         flux = self._exact if RENDER_NOISE in off else self.light.flux
         by_pixel = np.divide(flux, direct.flux, out=np.ones_like(flux), where=direct.flux > 0)
-        groups = tuple(_scaled(group, np.append(by_pixel * self._brightness(off), 0.0)) for group in direct.groups)
+        groups = tuple(_scale(group, np.append(by_pixel * self._brightness(off), 0.0)) for group in direct.groups)
         if GLOSS in off:
             groups = tuple(replace(group, sharp=_even_lobes(group.sharp, direct.simulation)) for group in groups)
-        simulation = self._simulated(_formed(direct.simulation.settings, off, bench.loaded.glossy))
+        simulation = self._simulated(_form_settings(direct.simulation.settings, off, bench.loaded.glossy))
         own = {field.name: getattr(self.light, field.name) for field in fields(SampledLight)}
         own |= {"groups": groups, "simulation": simulation}
         return AblatedLight(**own, whole=self.light, rest=self._rest(off))
@@ -141,12 +141,10 @@ class Ablation:
         brightness = np.append(self._brightness(off), 1.0)
         if MIRRORS in self.effects:
             light = self._traced(direct=False, off=off & {MIRRORS})
-            groups = tuple(_scaled(group, brightness) for group in light.groups)
+            groups = tuple(_scale(group, brightness) for group in light.groups)
         else:
             lamps = np.append(np.zeros(len(brightness) - 1), 1.0)
-            groups = tuple(
-                replace(_scaled(group, brightness), fine=_weighted(group.fine, lamps)) for group in light.groups
-            )
+            groups = tuple(replace(_scale(group, brightness), fine=_weigh(group.fine, lamps)) for group in light.groups)
         plain = replace(settings, anchors=1, sharp=None, occluded=(), effects=effects)
         return replace(light, groups=groups, simulation=self._simulated(plain))
 
@@ -239,7 +237,7 @@ class _Place:
             return deposits
         row, column, inverse = deposits.row, deposits.column, deposits.inverse_depth
         on_plane = self._on_plane(row, inverse, self._row), self._on_plane(column, inverse, self._column)
-        straight = _projected(self._straight, *on_plane) if KEYSTONE in off else on_plane
+        straight = _project(self._straight, *on_plane) if KEYSTONE in off else on_plane
         if DEPTH in off:
             return replace(deposits, row=straight[0], column=straight[1], inverse_depth=np.full_like(row, self._plane))
         row, column = row + straight[0] - on_plane[0], column + straight[1] - on_plane[1]
@@ -261,7 +259,7 @@ class _Place:
         row, column = (np.asarray(places.ravel(), np.float64) for places in np.meshgrid(*lines, indexing="ij"))
         pixel = np.add.outer(part.astype(np.int64) * n, part.astype(np.int64)).ravel()
         if not straight:
-            row, column = _projected(np.asarray(np.linalg.inv(self._straight), np.float64), row, column)
+            row, column = _project(np.asarray(np.linalg.inv(self._straight), np.float64), row, column)
         value = np.bincount(deposits.pixel, deposits.value, n * n)[pixel] / side**2
         first = np.zeros_like(pixel)
         depth, kind = np.full_like(row, self._plane), np.full(len(pixel), DIRECT, dtype=np.int16)
@@ -279,7 +277,7 @@ class _Place:
         return np.asarray(slope * (1 - self._z * self._plane) + origin * self._plane)
 
 
-def _projected(homography: FloatArray, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _project(homography: FloatArray, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Points ``row``, ``column`` (m,) under a ``homography`` (3, 3)."""
     first, second, scale = homography @ np.stack([row, column, np.ones_like(row)])
     return first / scale, second / scale
@@ -315,7 +313,7 @@ def _off_plane(light: SampledLight) -> bool:
     return bool(aside.size and aside.max() > _IN_PLACE)
 
 
-def _formed(settings: Settings, off: frozenset[str], glossy: bool) -> Settings:
+def _form_settings(settings: Settings, off: frozenset[str], glossy: bool) -> Settings:
     """What frames of direct light are formed with."""
     absent = _FURTHER.union(*(REGISTERED.get(name, frozenset()) for name in off))
     anchors = 1 if (GLOSS if glossy else FALLOFF) in off else settings.anchors
@@ -345,12 +343,12 @@ def _even_lobes(sharp: sparse.csr_array, simulation: Simulation) -> sparse.csr_a
     return bundle.repeated(sparse.csr_array(sharp @ mean))
 
 
-def _scaled(light: FiledLight, by: FloatArray) -> FiledLight:
+def _scale(light: FiledLight, by: FloatArray) -> FiledLight:
     """``light`` whose rows are multiplied ``by`` (rows,)."""
-    return replace(light, **{name: _weighted(getattr(light, name), by) for name in TRAYS})
+    return replace(light, **{name: _weigh(getattr(light, name), by) for name in TRAYS})
 
 
-def _weighted(rows: sparse.csr_array, by: FloatArray) -> sparse.csr_array:
+def _weigh(rows: sparse.csr_array, by: FloatArray) -> sparse.csr_array:
     """``rows`` times ``by``, one number each; rows of zero hold nothing."""
     scaled = sparse.csr_array(sparse.diags_array(by) @ rows)
     scaled.eliminate_zeros()
@@ -360,7 +358,7 @@ def _weighted(rows: sparse.csr_array, by: FloatArray) -> sparse.csr_array:
 # -------- Effects that need no light to be traced anew, and settings without one of them
 
 
-def reformed(light: SampledLight, absent: frozenset[str]) -> SampledLight:
+def reform(light: SampledLight, absent: frozenset[str]) -> SampledLight:
     """The same ``light``, traced no further, whose frames are formed with the effects ``absent`` at their neutral
     values: of such as need no light to be traced anew."""
     simulation = light.simulation

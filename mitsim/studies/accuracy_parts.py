@@ -30,7 +30,7 @@ from mitsim.optics.frames import ExpectedFrames
 from mitsim.planner import pilot
 from mitsim.planner.choose import counted, predicted
 from mitsim.planner.explain import SceneFacts, decide
-from mitsim.studies.ablation import MOST, OfOrders, ablations, reformed
+from mitsim.studies.ablation import MOST, OfOrders, ablations, reform
 from mitsim.studies.accuracy_findings import Budget, JudgeFacts, PartCost, Row, Spread, Timed
 
 _LONGEST_S = 3.5
@@ -69,8 +69,8 @@ class Parts:
     def __init__(self, stand: Stand, judge: Judge) -> None:
         self._stand, self._judge = stand, judge
         self._plan = stand.plan(stand.accuracy)
-        full = _filled(self._plan.settings, stand.finest(self._plan).settings)
-        self.accuracy, self.seconds, settings = _sampled(stand, full)
+        full = _fill(self._plan.settings, stand.finest(self._plan).settings)
+        self.accuracy, self.seconds, settings = _choose_samples(stand, full)
         self.full = replace(self._plan, settings=settings)
         self._whole = self._timed(Trial("parts", "all", stand.bench, self.full, at_once))
         self._left = sorted(self._parts(settings), key=lambda part: -part.error.value)
@@ -121,7 +121,7 @@ class Parts:
             light = self._judge.light
             seen = replace(light, simulation=Simulation(mono, light.simulation.settings))
             shots = stand.few_shots
-            frames, _ = stacked(seen.frames(stand.family.lighting.shots(shots), self._judge.facts.seed))
+            frames, _ = stack_frames(seen.frames(stand.family.lighting.shots(shots), self._judge.facts.seed))
             error = relative_error(frames, self._judge.frames[shots])
             yield self._without(_LINES, Estimate(error, error), mono, self.full)
 
@@ -132,19 +132,19 @@ class Parts:
     def _timed(self, trial: Trial) -> Timed:
         """The light of a ``trial`` and its frames, with kernels compiled before the first time."""
         stand = self._stand
-        ready = warmed(stand, trial)
+        ready = warm_up(stand, trial)
 
         def again() -> float:
             """Seconds of transport and optics."""
             ready()
             started = time.perf_counter()
-            stacked(stand.trace(trial, stand.seed).frames(stand.family.lighting, stand.seed))
+            stack_frames(stand.trace(trial, stand.seed).frames(stand.family.lighting, stand.seed))
             return time.perf_counter() - started
 
         return Timed(again)
 
 
-def _filled(now: Settings, finer: Settings) -> Settings:
+def _fill(now: Settings, finer: Settings) -> Settings:
     """The settings ``now`` with what they leave out as ``finer`` ones have it."""
     return replace(
         now,
@@ -158,7 +158,7 @@ def _filled(now: Settings, finer: Settings) -> Settings:
     )
 
 
-def _sampled(stand: Stand, settings: Settings) -> tuple[float, float, Settings]:
+def _choose_samples(stand: Stand, settings: Settings) -> tuple[float, float, Settings]:
     """The finest accuracy whose samples take at most _LONGEST_S at fixed paces, these seconds, and the settings."""
     for accuracy in _ACCURACIES:
         choice = predicted(accuracy, stand.evidence, settings, {})
@@ -221,7 +221,7 @@ class Judge:
             finest, _ = _within(stand, plan, seconds)
         light = stand.trace(Trial("judge", "", stand.bench, finest), seed)
         expected = light.frames(stand.family.lighting, seed)
-        frames, mc_error = stacked(expected)
+        frames, mc_error = stack_frames(expected)
         facts = JudgeFacts(mc_error, stand.discretisation(finest.settings), time.perf_counter() - started, seed)
         return cls(stand, light, expected, frames, facts)
 
@@ -245,7 +245,7 @@ class Judge:
                 if not budget.allows(f"reference at {spp} spp", predicted_s, _SHARE):
                     return
                 if answer is None:
-                    answer, _ = stacked(self.of_reference().frames(lighting, self.facts.seed))
+                    answer, _ = stack_frames(self.of_reference().frames(lighting, self.facts.seed))
                 rendered = render(bench, "reference", spp, 1e-3, stand.seed, job=stand.job)
                 one, predicted_s = rendered.facts["seconds"], _GROWTH * rendered.facts["seconds"]
                 error = relative_error(rendered.mean.mean(axis=2), answer[0])
@@ -257,7 +257,7 @@ class Judge:
         """The same light without what the reference lacks; traced anew where that has shaped it."""
         stand, plan, absent = self.stand, self.light.plan, names(lambda effect: not effect.in_reference)
         if not any(EFFECTS[name].retraced(Physics.of(stand.bench)) for name in absent & plan.settings.effects):
-            return reformed(self.light, absent)
+            return reform(self.light, absent)
         plain = replace(plan, settings=replace(plan.settings, effects=plan.settings.effects - absent))
         return stand.trace(Trial("judge", "reference", stand.bench, plain), self.facts.seed)
 
@@ -420,7 +420,7 @@ def at_once(expected: ExpectedFrames) -> float:
     return float("inf")
 
 
-def sampled(settings: Settings, samples: int) -> Settings:
+def with_samples(settings: Settings, samples: int) -> Settings:
     """``settings`` whose first round takes so many ``samples`` of a projector pixel and of a cell in each group."""
     each = float(samples)
     return replace(
@@ -502,21 +502,21 @@ class Stand:
         return trace_light(trial.bench, trial.plan, self.family.lighting, seed, sampling, self.job.progress)
 
 
-def warmed(stand: Stand, trial: Trial) -> Callable[[], None]:
+def warm_up(stand: Stand, trial: Trial) -> Callable[[], None]:
     """What compiles the kernels of a ``trial`` at a ``stand`` by one sample, the first time that it is called."""
     done: list[bool] = []
 
     def ready() -> None:
         """Trace one sample, once."""
         if not done:
-            once = replace(trial.plan, settings=sampled(trial.plan.settings, 1))
+            once = replace(trial.plan, settings=with_samples(trial.plan.settings, 1))
             stand.trace(replace(trial, plan=once, target=at_once), stand.seed)
             done.append(True)
 
     return ready
 
 
-def stacked(expected: ExpectedFrames) -> tuple[FloatArray, float]:
+def stack_frames(expected: ExpectedFrames) -> tuple[FloatArray, float]:
     """All ``expected`` frames (shots, pixels, pixels) and their relative Monte Carlo error. MitsimError when all are
     dark."""
     formed = list(expected)

@@ -84,7 +84,7 @@ def measure(bench: Apparatus, request: Request, job: Job) -> AccuracyFindings:
     reference = list(judge.reference(budget))
     job.progress("repeats", 0.8)
     budget.repeat([*runs.timed, *parts.timed, *orders.timed])
-    rows = _fronted(runs.rows)
+    rows = _mark_front(runs.rows)
     quoted = next(row for row in rows if QUOTED in row.accuracies)
     slow = reference[-1] if reference else None
     return AccuracyFindings(
@@ -101,7 +101,7 @@ def measure(bench: Apparatus, request: Request, job: Job) -> AccuracyFindings:
     )
 
 
-def _fronted(rows: list[Row]) -> list[Row]:
+def _mark_front(rows: list[Row]) -> list[Row]:
     """Measured ``rows``, those marked that no other beats in both time and error."""
     front = plots.pareto_front([(row.spread.median, row.error) for row in rows])
     return [replace(row, on_front=(row.spread.median, row.error) in front) for row in rows]
@@ -157,7 +157,7 @@ class Runs:
             first = whatever_it_takes in group
             if known.intersection(group) or (whatever_it_takes is not None and not first):
                 continue
-            name = f"accuracy {_listed(group)}"
+            name = f"accuracy {_list(group)}"
             if first or budget.allows(name, budget.slower * predicted, share):
                 run = self._begun(group)
                 run.timed.seconds.append(run.timed.again())
@@ -176,7 +176,7 @@ class Runs:
             Row(
                 "factored",
                 "accuracy",
-                f"accuracy {_listed(run.accuracies)}",
+                f"accuracy {_list(run.accuracies)}",
                 run.timed.spread + self._opening,
                 *run.found[0],
                 accuracies=run.accuracies,
@@ -238,5 +238,5 @@ def _begun_with(settings: Settings) -> Settings:
     return replace(settings, **taken)
 
 
-def _listed(accuracies: Sequence[float]) -> str:
+def _list(accuracies: Sequence[float]) -> str:
     return ", ".join(f"{accuracy:g}" for accuracy in accuracies)

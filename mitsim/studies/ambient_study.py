@@ -16,7 +16,7 @@ from mitsim.report import EQUAL_PEAK, RENDERED, in_text
 from mitsim.report.lit_scene import Unexposed
 from mitsim.report.plots import curves
 from mitsim.report.table import Mean, Table, Value
-from mitsim.studies.framework.claims import by_patterns, difference, found, images, verdict, within
+from mitsim.studies.framework.claims import by_patterns, difference, finding, images, verdict, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import Point
 from mitsim.studies.framework.studio import Studio
@@ -46,7 +46,7 @@ def _measure(studio: Studio, point: Point) -> Found:
     image = studio.image(setup, RENDERED, patterns, seed)
     low, high = _range(studio.frames(setup, RENDERED, patterns, seed))
     ratio = _ratio(studio.frames(setup, RENDERED, "uniform", seed))
-    return found(point, image.image, ratio=ratio, range_low=low, range_high=high, **image.row())
+    return finding(point, image.image, ratio=ratio, range_low=low, range_high=high, **image.row())
 
 
 def _ratio(uniform: Unexposed) -> float:

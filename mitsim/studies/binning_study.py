@@ -44,7 +44,7 @@ def _measure(studio: Studio, point: Point) -> Found:
     # With fewer data than unknowns noise cannot be told, nor lambda chosen by it.
     image = Image.of(frames, frames.seconds(EQUAL_PEAK), "best", binning)
     pixels = frames.lit.bench.geometry.frame_shape[0] // binning
-    return claims.found(point, image.image if point["patterns"] in _SHOWN else None, pixels=pixels, **image.row())
+    return claims.finding(point, image.image if point["patterns"] in _SHOWN else None, pixels=pixels, **image.row())
 
 
 def _claims(results: Results) -> Sequence[Claim]:
@@ -55,9 +55,9 @@ def _claims(results: Results) -> Sequence[Claim]:
     stable = "49 dots are stable down to 64 x 64 pixels (3 dB lost at most)"
     better = "49 dots on 64 x 64 pixels are better than uniform light on 512 x 512"
     return [
-        claims.compared(table, stable, "stable", (many, many_coarse), lost, (-math.inf, _STABLE_DB)),
-        claims.compared(table, "Uniform light degrades with fewer pixels", "degrades", (few, few_coarse), lost),
-        claims.compared(table, better, "better", (many_coarse, few)),
+        claims.gain_claim(table, stable, "stable", (many, many_coarse), lost, (-math.inf, _STABLE_DB)),
+        claims.gain_claim(table, "Uniform light degrades with fewer pixels", "degrades", (few, few_coarse), lost),
+        claims.gain_claim(table, better, "better", (many_coarse, few)),
     ]
 
 

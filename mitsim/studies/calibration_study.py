@@ -38,7 +38,7 @@ from mitsim.report.html import with_error
 from mitsim.report.lit_scene import LitScene
 from mitsim.report.plots import bars
 from mitsim.report.table import Mean, Table
-from mitsim.studies.ablation import ablations, reformed
+from mitsim.studies.ablation import ablations, reform
 from mitsim.studies.drift_loss import SESSION, DriftStand, squared_error
 from mitsim.studies.error_budget import (
     CAPTURE,
@@ -89,7 +89,7 @@ def measure(bench: Bench, request: Request, job: Job, recipe: SessionRecipe | No
     plan = session.plan(request.accuracy, job)
     lit = session.lit(session.trace(plan, job), job)
     (noisy, clean), _ = estimates(lit, job, (NOISY, NOISE_FREE))
-    found = judged(lit, noisy, clean, tuple(_by_cause(lit, noisy, clean, job)))
+    found = judge_session(lit, noisy, clean, tuple(_by_cause(lit, noisy, clean, job)))
     scene = LitScene(bench.light(request.patterns, job, accuracy=request.accuracy, seed=request.seed))
     stand = DriftStand(scene, _factors(lit, noisy), recipe, family, request.seed)
     rows, refused = losses(stand, lit, _factors(lit, clean))
@@ -127,7 +127,9 @@ def _image(stand: DriftStand, told: float) -> dict[str, Any]:
 
 
 @single_threaded_blas()
-def judged(lit: LitSession, noisy: Estimate, clean: Estimate, causes: tuple[CauseRow, ...] = ()) -> CalibrationFindings:
+def judge_session(
+    lit: LitSession, noisy: Estimate, clean: Estimate, causes: tuple[CauseRow, ...] = ()
+) -> CalibrationFindings:
     """Errors of ``noisy`` factors of a session against ``clean`` ones, beside their prediction.
 
     Parameters
@@ -158,7 +160,7 @@ def judged(lit: LitSession, noisy: Estimate, clean: Estimate, causes: tuple[Caus
         causes,
         maps,
         (clean.separability_residual, noisy.separability_residual),
-        spent(lit),
+        session_cost(lit),
     )
 
 
@@ -225,7 +227,7 @@ def singular_rows(factor: str, exact: FloatArray, found: FloatArray, deviation: 
         )
 
 
-def spent(lit: LitSession) -> dict[str, float]:
+def session_cost(lit: LitSession) -> dict[str, float]:
     """Frames, seconds of exposure, expected photoelectrons and photons of a session ``lit``, without its read-out."""
     recipe, order = lit.session.recipe, len(lit.session.order)
     lit_s = sum(lit.exposures_s) * recipe.repeats
@@ -247,7 +249,7 @@ def _by_cause(lit: LitSession, noisy: Estimate, clean: Estimate, job: Job) -> It
     simulation, session = lit.light.simulation, lit.session
     for name, settings in ablations(simulation.settings, simulation.settings.effects):
         if name in _FORMED:
-            light = reformed(lit.light, frozenset({name}))
+            light = reform(lit.light, frozenset({name}))
         else:
             light = session.trace(replace(lit.light.plan, settings=settings), job)
         yield _row(name, residual, _residual(session, light, job))

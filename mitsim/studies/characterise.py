@@ -22,12 +22,12 @@ from mitsim.core.environment import versions
 from mitsim.core.files import write_json
 from mitsim.core.job import Job
 from mitsim.devices.sensor import SensorModel
-from mitsim.report.html import rounded, typeset
+from mitsim.report.html import round_to_error, typeset
 from mitsim.report.plots import BLACK, BLUE, FONT, GREY, ORANGE, VERMILION, WIDTH, figure_of, label_axes
 from mitsim.sensor.emva import LEAST_DARK, QUANTISATION, SPLIT, Session, figures
 from mitsim.sensor.specimen import mean_dark_current
 from mitsim.studies.emva_options import Procedure, capacity_of, efficiency_of
-from mitsim.studies.emva_procedure import Frames, drawn
+from mitsim.studies.emva_procedure import Frames, draw_sessions
 from mitsim.studies.framework.run import study_folder, write_figures
 
 UNITS: Mapping[str, tuple[str, str]] = {
@@ -155,8 +155,8 @@ class Characterisation:
             expected = "" if row.expected is None else f"{row.expected:.5g}"
             told.append(
                 f"{row.name:<26}{row.symbol:<18}{row.unit:<10}{row.set:>12.5g}{expected:>12}"
-                f"{rounded(row.found, row.standard_error):>12}"
-                f"{rounded(row.standard_error, row.standard_error):>12}{row.deviations:>8.1f}"
+                f"{round_to_error(row.found, row.standard_error):>12}"
+                f"{round_to_error(row.standard_error, row.standard_error):>12}{row.deviations:>8.1f}"
             )
         if any(row.expected is not None for row in self.rows):
             told.append(
@@ -196,9 +196,9 @@ def characterise(
     capacity = capacity_of(sensor)
     efficiency_of(sensor, procedure)
     if output is None:
-        return _characterised(sensor, procedure, capacity, job)
+        return _characterise(sensor, procedure, capacity, job)
     with study_folder(output, "characterise") as folder:
-        done = _characterised(sensor, procedure, capacity, job, str(folder))
+        done = _characterise(sensor, procedure, capacity, job, str(folder))
         results = folder / "characterise.json"  # last, so that a folder with it is whole
         results.unlink(missing_ok=True)
         write_figures(folder, done.figures())
@@ -206,12 +206,12 @@ def characterise(
     return done
 
 
-def _characterised(
+def _characterise(
     sensor: SensorModel, procedure: Procedure, capacity: float, job: Job, output: str | None = None
 ) -> Characterisation:
     frames = Frames.of(sensor, procedure, capacity)
     expected = frames.expected()
-    spread = figures(drawn(frames, expected))
+    spread = figures(draw_sessions(frames, expected))
     session = frames.measured(job)
     found = figures(session)
     # Without a quantum efficiency light is counted in electrons, and there is none to find.
@@ -303,7 +303,7 @@ def _photon_transfer(done: Characterisation) -> Figure:
     label = "fit to 70 % of saturation"
     axes.plot(line, session.dark.variance + gain * line, color=VERMILION, lw=2, ls="--", label=label)
     axes.axvline(full, color=ORANGE, lw=1.5, ls=":", label="largest variance: saturation")
-    axes.set_title(f"Photon transfer: the gain is {_found(done, 'system_gain')}", fontsize=FONT + 1)
+    axes.set_title(f"Photon transfer: the gain is {_figure_text(done, 'system_gain')}", fontsize=FONT + 1)
     label_axes(axes, "signal less dark signal [DN]", "temporal variance [DN$^2$]")
     axes.legend(fontsize=FONT - 1, frameon=False, loc="upper left")
     return figure
@@ -345,7 +345,7 @@ def _dark_current(done: Characterisation) -> Figure:
     ):
         dark = (session.dark_series.mean - done.sensor.superpixel_black_level_dn) / gain
         axes.plot(session.dark_times, dark, label=label, **style)
-    axes.set_title(f"The dark current is {_found(done, 'dark_current')}", fontsize=FONT + 1)
+    axes.set_title(f"The dark current is {_figure_text(done, 'dark_current')}", fontsize=FONT + 1)
     label_axes(axes, "exposure time [s]", "dark signal less black level [e$^-$]")
     axes.legend(fontsize=FONT - 1, frameon=False)
     return figure
@@ -356,12 +356,12 @@ def _figure(done: Characterisation, name: str) -> Row:
     return next(row for row in done.rows if row.name == name)
 
 
-def _found(done: Characterisation, name: str) -> str:
+def _figure_text(done: Characterisation, name: str) -> str:
     """A figure with its standard error and unit, and what the file sets."""
     row = _figure(done, name)
-    error = rounded(row.standard_error, row.standard_error)
+    error = round_to_error(row.standard_error, row.standard_error)
     unit = row.unit.replace("e-", "e\N{SUPERSCRIPT MINUS}")
-    return typeset(f"{rounded(row.found, row.standard_error)} +- {error} {unit}, set {row.set:g}")
+    return typeset(f"{round_to_error(row.found, row.standard_error)} +- {error} {unit}, set {row.set:g}")
 
 
 def _deviations(done: Characterisation) -> Figure:

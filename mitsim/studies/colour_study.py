@@ -31,11 +31,11 @@ from mitsim.report.plots import BLUE, FONT, VERMILION, figure_of, label_axes, pa
 from mitsim.report.table import Table, Value
 from mitsim.studies import daylight as by_lux
 from mitsim.studies.daylight import BY_LUX, GOAL, DaylitLine
-from mitsim.studies.framework.claims import difference, every, sampled, verdict, within
+from mitsim.studies.framework.claims import difference, every, sample_mean, verdict, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, PageTable, Results, Scope
 from mitsim.studies.framework.setup import Point
 from mitsim.studies.framework.studio import Studio
-from mitsim.studies.lit_lines import LitLine, daylit, installed, lit_lines, mosaic_shots, serving
+from mitsim.studies.lit_lines import LitLine, available_ways, daylight_frame, lit_lines, mosaic_shots, serving
 
 FAMILIES = ("uniform", "dots:7", "hadamard:8")
 OWN, ONE = "one line at a time", "one calibration for all lines"
@@ -52,7 +52,7 @@ def _points(scope: Scope) -> Sequence[Point]:
         OWN: FAMILIES,
         ONE: scope.chosen(FAMILIES, (_SHOWN,)),
         **{way: scope.chosen(FAMILIES, (_SHOWN,)) for way in DAYLIGHT},
-        **{f"mosaic, {way}": scope.chosen((_SHOWN, "hadamard:8"), (_SHOWN,)) for way in installed()},
+        **{f"mosaic, {way}": scope.chosen((_SHOWN, "hadamard:8"), (_SHOWN,)) for way in available_ways()},
     }
     points = [
         Point.of(setup, way=way, patterns=patterns, seed=seed)
@@ -70,20 +70,20 @@ def _measure(studio: Studio, point: Point) -> Found:
         shots = studio.once("mosaic", 1, (setup, patterns, seed), lambda: mosaic_shots(lines, patterns, seed))
         images = np.moveaxis(shots.images(way.removeprefix("mosaic, ")), 0, -1)
     elif way in (*DAYLIGHT, BY_LUX):
-        light = studio.once("daylight", 1, setup, lambda: daylit(setup, studio.folder("daylight")))
+        light = studio.once("daylight", 1, setup, lambda: daylight_frame(setup, studio.folder("daylight")))
         if way == BY_LUX:
-            return by_lux.measured(lines, light, point, _place(setup.scene))
+            return by_lux.measure_ladder(lines, light, point, _place(setup.scene))
         images = _under_daylight(lines, light, DAYLIGHT[way], patterns, seed)
     else:
         middle = lines[len(lines) // 2]
         factors = [line.factors if way == OWN else serving(line, middle) for line in lines]
-        images = np.stack([_solved(*pair, patterns, seed) for pair in zip(lines, factors, strict=True)], axis=-1)
+        images = np.stack([_solve(*pair, patterns, seed) for pair in zip(lines, factors, strict=True)], axis=-1)
     truth = np.stack([line.lit.truth for line in lines], axis=-1)
     board = lines[0].factors.manifest.board_reflectance or 1.0
-    return _judged(point, [line.wavelength_nm for line in lines], images * board, truth * board)
+    return _judge(point, [line.wavelength_nm for line in lines], images * board, truth * board)
 
 
-def _solved(line: LitLine, factors: Factors, patterns: str, seed: int) -> FloatArray:
+def _solve(line: LitLine, factors: Factors, patterns: str, seed: int) -> FloatArray:
     """(n, n) image of a line, as a user's own frames are exposed and reconstructed."""
     return reconstruct(expose(line.lit.light, patterns, seed=line.seed(seed)), factors).image
 
@@ -100,7 +100,7 @@ def _under_daylight(
     return np.stack(images, axis=-1)
 
 
-def _judged(point: Point, wavelengths: Sequence[float], images: FloatArray, truth: FloatArray) -> Found:
+def _judge(point: Point, wavelengths: Sequence[float], images: FloatArray, truth: FloatArray) -> Found:
     """Rows of all patches of the chart in ``images`` (n, n, lines), and its colours."""
     place, known, fixed = _place(point.setup.scene), chart(), ColourModel.of_lines(wavelengths)
     means = place.means(images)
@@ -143,7 +143,7 @@ def _claims(results: Results) -> Sequence[Claim]:
 
     def told(way: str) -> Claim:
         rows = table.where(way=way, patterns=_SHOWN)
-        floor, mean = rows.mean("floor").value, sampled(rows, "delta_e")
+        floor, mean = rows.mean("floor").value, sample_mean(rows, "delta_e")
         return Claim(
             f"49 dots add at most {GOAL:g} to the floor's mean Delta E 2000 ({way})",
             "", "", f"mean Delta E {mean}, floor {floor:.2f}", verdict(within(mean, high=floor + GOAL)),
@@ -165,7 +165,7 @@ def _claims(results: Results) -> Sequence[Claim]:
         Claim(
             f"Behind a mosaic, the joint solve has the most PSNR of {len(found)} (49 dots)", "", "",
             "; ".join(
-                f"{way}: {sampled(rows, 'psnr_db')} dB, Delta E {sampled(rows, 'delta_e')}"
+                f"{way}: {sample_mean(rows, 'psnr_db')} dB, Delta E {sample_mean(rows, 'delta_e')}"
                 for way, rows in found.items()
             ),
             verdict(every(*(within(difference(joint, other, "psnr_db"), low=0) for other in others))),

@@ -40,7 +40,7 @@ from mitsim.report.lit_scene import IdealCamera
 from mitsim.report.plots import curves, image_grid
 from mitsim.report.table import Mean, Table, Value
 from mitsim.sensor.chain import dn_to_electrons, electrons_from_irradiance, expose, exposure_for_peak
-from mitsim.studies.framework.claims import Holds, every, near, sampled, shown, verdict, verdict_at, within
+from mitsim.studies.framework.claims import Holds, every, image_array, near, sample_mean, verdict, verdict_at, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import QUICK_IMAGES, SIDE, Point, picture
 from mitsim.studies.framework.studio import Studio
@@ -114,7 +114,7 @@ def _measure(studio: Studio, point: Point) -> Found:
             solution, psnr_db = best_image(Classes(whole, k), shots, truth)
             rows.append(point.row(exposure=exposure, psnr_db=psnr_db, exposure_s=shots.exposure_s))
             if point.setup.picture in (*QUICK_IMAGES, None) and exposure == EQUAL_FRAME:
-                arrays = shown(solution.image)
+                arrays = image_array(solution.image)
     return Found(tuple(rows), arrays)
 
 
@@ -136,29 +136,29 @@ def _claims(results: Results) -> Sequence[Claim]:
     def directly(claim: str, sensor: str) -> list[Claim]:
         rows = dots.where(sensor=sensor)
         return (
-            [_judged(rows, claim, "no closed form", times(rows, "iterative_s", "direct_s", _GOAL))] if rows.rows else []
+            [_judge(rows, claim, "no closed form", times(rows, "iterative_s", "direct_s", _GOAL))] if rows.rows else []
         )
 
     return [
-        _stated(quality.where(patterns=1), "Uniform light", _UNIFORM_DB),
-        _stated(quality.where(patterns=49), "49 dots", _DOTS_DB),
-        _judged(
+        _psnr_claim(quality.where(patterns=1), "Uniform light", _UNIFORM_DB),
+        _psnr_claim(quality.where(patterns=49), "49 dots", _DOTS_DB),
+        _judge(
             speed, "Iterations take an order of magnitude longer than the separable closed form", "10 times as long",
             times(speed, "iterative_s", "separable_s", _MAGNITUDE),
         ),
         *directly("Dots can be solved directly, and iterations to equal error take ten times as long", WHOLE),
         *directly("The same where the sensor ends at the picture's edge, prepared once", CROPPED),
-        _judged(
+        _judge(
             speed, "Even so, it takes longer than the separable closed form", "",
             times(speed, "direct_s", "separable_s", 1.0),
         ),
     ]  # fmt: skip
 
 
-def _stated(rows: Table, name: str, band: tuple[float, float]) -> Claim:
+def _psnr_claim(rows: Table, name: str, band: tuple[float, float]) -> Claim:
     """A claim of PSNR within a ``band`` [dB] of what is called ``name``, at each way of exposing."""
     means = {
-        (psf, exposure): sampled(rows.where(psf=psf, exposure=exposure), "psnr_db")
+        (psf, exposure): sample_mean(rows.where(psf=psf, exposure=exposure), "psnr_db")
         for psf in rows.distinct("psf")
         for exposure in EXPOSURES
     }
@@ -170,11 +170,11 @@ def _stated(rows: Table, name: str, band: tuple[float, float]) -> Claim:
     def said(psf: str) -> tuple[str, Holds]:
         return "; ".join(f"{exposure}: {means[psf, exposure]} dB" for exposure in EXPOSURES), None
 
-    claim = _judged(rows, f"{name}: {band[0]:g} to {band[1]:g} dB", f"{band[0]:g} to {band[1]:g} dB", said)
+    claim = _judge(rows, f"{name}: {band[0]:g} to {band[1]:g} dB", f"{band[0]:g} to {band[1]:g} dB", said)
     return replace(claim, verdict=verdict_at(at))
 
 
-def _judged(rows: Table, claim: str, paper: str, judge: Judge) -> Claim:
+def _judge(rows: Table, claim: str, paper: str, judge: Judge) -> Claim:
     """A claim judged with each point spread function that was measured with; the measured one stands under "idealised".
 
     Parameters
@@ -432,8 +432,8 @@ def race(classes: Classes, whole: Classes, truth: FloatArray, sensor: SensorMode
     start = time.process_time()
     factorised = Classes(camera, classes.k).factorise(lam)
     prepare_s = time.process_time() - start
-    exact, direct_exact_s = _timed(factorised, frames, _TIGHT)
-    direct, direct_s = _timed(factorised, frames, _LOOSE)
+    exact, direct_exact_s = _time(factorised, frames, _TIGHT)
+    direct, direct_s = _time(factorised, frames, _LOOSE)
     marks = _Marks(exact.image, truth, time.process_time())
     iterative = solve_iteratively(camera, family, frames, lam, 0.0, _MOST_STEPS, marks)
     if len(marks.seconds) < len(("error", "answer")):
@@ -451,7 +451,7 @@ def race(classes: Classes, whole: Classes, truth: FloatArray, sensor: SensorMode
     }
 
 
-def _timed(factorised: FactorisedClasses, frames: FloatArray, tolerance: float) -> tuple[ConvolutionSolution, float]:
+def _time(factorised: FactorisedClasses, frames: FloatArray, tolerance: float) -> tuple[ConvolutionSolution, float]:
     """Solution of frames, and its CPU seconds."""
     start = time.process_time()
     solution = factorised.solve(factorised.classes.projected(frames), tolerance)

@@ -45,7 +45,7 @@ from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.studies.framework.claims import verdict, within
 from mitsim.studies.framework.experiment import Claim, Found, PageTable, Scope
 from mitsim.studies.framework.setup import Point, Setup
-from mitsim.studies.lit_lines import LitLine, exposed, peak_seconds
+from mitsim.studies.lit_lines import LitLine, expose_rates, peak_seconds
 
 LUMENS_A_WATT = 205.0
 """Of D65, 380 to 780 nm."""
@@ -144,7 +144,7 @@ class DaylitLine:
         off: FloatArray | float = 0.0
         for shot in range(shots):
             off = off + exposer.rate(exposer.digital(lamp * exposer.exposure_s, "ambient", shot)) / shots
-        for measured in exposed(exposer, self.family, [rate + lamp for rate in rates], off):
+        for measured in expose_rates(exposer, self.family, [rate + lamp for rate in rates], off):
             for each in sums:
                 each.add(*measured)
         return [model.solve(each, "auto").image for model, each in zip(models, sums, strict=True)]
@@ -183,7 +183,7 @@ def _weights(side: Side, first: int, end: int) -> tuple[float, float]:
     return float(a @ a), float(np.square(common_response(side) @ a).sum())
 
 
-def expected(means: FloatArray, variances: FloatArray, judged: Judge) -> float:
+def expected_delta_e(means: FloatArray, variances: FloatArray, judged: Judge) -> float:
     """Mean Delta E that patches come to whose means have independent normal errors.
 
     Parameters
@@ -251,7 +251,7 @@ def points_of(scope: Scope, setup: Setup) -> list[Point]:
     ]
 
 
-def measured(lines: Sequence[LitLine], light: tuple[FloatArray, float], point: Point, place: ChartPlace) -> Found:
+def measure_ladder(lines: Sequence[LitLine], light: tuple[FloatArray, float], point: Point, place: ChartPlace) -> Found:
     """A row for every exposure and method, and one of the least for every illuminance.
 
     Parameters
@@ -281,7 +281,7 @@ def measured(lines: Sequence[LitLine], light: tuple[FloatArray, float], point: P
 
     def least(lux: float, repeats: float = 1.0) -> float:
         variances = [each.least_variance(lux / FULL_LX, place) / repeats for each in lit]
-        return expected(truth, np.stack(variances, axis=-1), judged)
+        return expected_delta_e(truth, np.stack(variances, axis=-1), judged)
 
     def repeats(lux: float) -> float | None:
         part = most(lambda part: least(lux, 1 / part) <= goal, *_VARIANCES)

@@ -19,8 +19,17 @@ from mitsim.report import EQUAL_PEAK, IDEALISED, RENDERED, label
 from mitsim.report.lit_scene import Plane
 from mitsim.report.plots import curves
 from mitsim.report.table import Mean, Table, Value
-from mitsim.studies.framework.claims import by_patterns, difference, every, found, images, sampled, verdict, within
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope, grouped
+from mitsim.studies.framework.claims import (
+    by_patterns,
+    difference,
+    every,
+    finding,
+    images,
+    sample_mean,
+    verdict,
+    within,
+)
+from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope, group_by_setup
 from mitsim.studies.framework.setup import Point
 from mitsim.studies.framework.studio import Image, Studio
 
@@ -76,7 +85,7 @@ def _points(scope: Scope) -> Sequence[Point]:
         for focus in (NONE, MAP)
     ]
     # What takes longest first, so that no process is left with it at the end.
-    return grouped([*(deep if scope.setup.scene == "photograph" else []), *moved, *ideal])
+    return group_by_setup([*(deep if scope.setup.scene == "photograph" else []), *moved, *ideal])
 
 
 def _measure(studio: Studio, point: Point) -> Found:
@@ -93,7 +102,7 @@ def _measure(studio: Studio, point: Point) -> Found:
         focus = point["focus"] if point["focus"] in (AUTO, MAP) else None
         # Frames of the sheet elsewhere, factors of the rig as it was aligned.
         image = studio.image(setup, RENDERED, patterns, seed, focus=focus)
-    return found(point, image.image, scene=setup.scene, **image.row())
+    return finding(point, image.image, scene=setup.scene, **image.row())
 
 
 def _claims(results: Results) -> Sequence[Claim]:
@@ -137,15 +146,15 @@ def _claims(results: Results) -> Sequence[Claim]:
             verdict(every(*(within(gain, low=-_ROBUST_DB) for gain in gains.values()))),
         )
     )  # fmt: skip
-    return [*claims, *(_mapped(table.where(scene=scene), scene) for scene in DEEP if len(table.where(scene=scene)))]
+    return [*claims, *(_map_claim(table.where(scene=scene), scene) for scene in DEEP if len(table.where(scene=scene)))]
 
 
-def _mapped(rows: Table, scene: str) -> Claim:
+def _map_claim(rows: Table, scene: str) -> Claim:
     short, long = DEEP[scene]
     by_case = {
         (family, focus): rows.where(patterns=family, focus=focus) for family in (short, long) for focus in (NONE, MAP)
     }
-    means = {case: sampled(each, "psnr_db") for case, each in by_case.items()}
+    means = {case: sample_mean(each, "psnr_db") for case, each in by_case.items()}
     flagged = all(row["flagged"] for row in rows.where(patterns=short, focus=MAP).rows)
     gains = "; ".join(
         f"{label(name)} {means[name, NONE]} dB, with depths {means[name, MAP]} dB" for name in (short, long)

@@ -56,7 +56,7 @@ from mitsim.report.lit_scene import (
     point_profiles,
     shadow_row,
 )
-from mitsim.studies.ablation import reformed
+from mitsim.studies.ablation import reform
 from mitsim.studies.framework.run import Findings
 
 MASKS: tuple[CameraMask, ...] = ("separable", "flatcam")
@@ -217,8 +217,8 @@ class _Trials:
         board = session.trace(session.plan(accuracy, job), job)
         assumed = IdealCamera(bench, mask).calibrated(self.flux)
         for name, absent in ((PROJECTOR, frozenset[str]()), (GEOMETRIC, frozenset({"diffraction"}))):
-            scene = reformed(light, absent).merged()
-            fitted, _ = estimate(session.lit(reformed(board, absent), job), job)
+            scene = reform(light, absent).merged()
+            fitted, _ = estimate(session.lit(reform(board, absent), job), job)
             known = {ASSUMED: assumed, CALIBRATED: (fitted.left, fitted.right)}
             for family in self.families:
                 expected = scene.frames(family.lighting, self.seed)

@@ -42,15 +42,17 @@ def _points(scope: Scope) -> Sequence[Point]:
 
 
 def _measure(studio: Studio, point: Point) -> Found:
-    return claims.imaged(studio, point, _SHOWN)
+    return claims.measure_image(studio, point, _SHOWN)
 
 
 def _claims(results: Results) -> Sequence[Claim]:
     near = results.table.where(mask_distance="0.75")
     return [
-        claims.stated(near.where(patterns="uniform"), "At 750 um, uniform light gives 16.9 to 19 dB", _NEAR_UNIFORM),
-        claims.stated(near.where(patterns="dots:7"), "At 750 um, 49 dots give 30 to 30.5 dB", _NEAR_DOTS),
-        claims.compared(
+        claims.psnr_claim(
+            near.where(patterns="uniform"), "At 750 um, uniform light gives 16.9 to 19 dB", _NEAR_UNIFORM
+        ),
+        claims.psnr_claim(near.where(patterns="dots:7"), "At 750 um, 49 dots give 30 to 30.5 dB", _NEAR_DOTS),
+        claims.gain_claim(
             results.table,
             f"25 dots at 750 um are comparable to uniform light at 2000 um (within {_COMPARABLE_DB:g} dB)",
             "comparable",

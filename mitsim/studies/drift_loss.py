@@ -372,7 +372,7 @@ class DriftStand:
         found = self._shadow(projecting(drifted(bench, _at_rest(drift)), drift)) + _minus([best])
         if drift.vibration_um:
             parts = [(self._shifted(place * drift.vibration_um / 1e3), weight) for place, weight in _HERMITE]
-            found += _weighted(parts) + _minus(self._shadow(bench))
+            found += _weigh(parts) + _minus(self._shadow(bench))
         if drift.mask_rotation_mrad:
             found += self._turned(drift.mask_rotation_mrad / 1e3)
         rate = electrons_from_irradiance(
@@ -424,7 +424,7 @@ def _minus(terms: SeparableTerms) -> SeparableTerms:
     return [(-left, right) for left, right in terms]
 
 
-def _weighted(parts: list[tuple[SeparableTerms, float]]) -> SeparableTerms:
+def _weigh(parts: list[tuple[SeparableTerms, float]]) -> SeparableTerms:
     """Means of terms whose two factors vary on their own, factor by factor."""
     found: SeparableTerms = []
     for index in range(len(parts[0][0])):

@@ -24,11 +24,11 @@ from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import SessionRecipe, load_recipe
 from mitsim.reconstruct.factors import Factors
 from mitsim.report.lit_scene import LitScene
-from mitsim.report.plots import curves, paired
+from mitsim.report.plots import curves, pair_chart
 from mitsim.report.table import Mean, Table
 from mitsim.studies.drift_loss import DriftStand
 from mitsim.studies.framework.claims import difference, verdict, within
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope, grouped, number_of
+from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope, group_by_setup, number_of
 from mitsim.studies.framework.setup import TEST_IMAGES, Point, Setup
 from mitsim.studies.framework.studio import Studio
 
@@ -61,7 +61,7 @@ def _points(scope: Scope) -> Sequence[Point]:
         for kind, each in amounts.items()
         for amount in each
     ]  # fmt: skip
-    return grouped(found)
+    return group_by_setup(found)
 
 
 def _amounts(scope: Scope, drift: Drift) -> Mapping[str, Sequence[float]]:
@@ -100,7 +100,7 @@ def _measure(studio: Studio, point: Point) -> Found:
     session = _session(studio, point, recipe, drift) if kind.startswith("session") else None
     moved = None
     if kind.startswith("projector"):
-        moved = studio.once("moved projector", 6, (setup, drift), lambda: _moved(lit, drift))
+        moved = studio.once("moved projector", 6, (setup, drift), lambda: _move_projector(lit, drift))
     found = known.outcome(drift, session, moved)
     row = point.row(
         before_db=found.before_db,
@@ -126,7 +126,7 @@ def _session(studio: Studio, point: Point, recipe: SessionRecipe, drift: Drift) 
     )
 
 
-def _moved(lit: LitScene, drift: Drift) -> LitScene:
+def _move_projector(lit: LitScene, drift: Drift) -> LitScene:
     """The scene in light of a projector that moved, as coarse as its light before: another plan's errors would be in
     one image alone, and would pass for the drift's."""
     return LitScene(trace_request(projecting(lit.bench, drift), lit.light.plan))
@@ -153,8 +153,8 @@ def _both(rows: Table) -> tuple[Mean, Mean]:
 def _claims(results: Results) -> Sequence[Claim]:
     return [
         Claim(
-            f"{name}: loss predicted within {AGREE_DB:g} dB", "", f"{_said(predicted)} dB lost",
-            f"{_said(measured)} dB lost",
+            f"{name}: loss predicted within {AGREE_DB:g} dB", "", f"{_text(predicted)} dB lost",
+            f"{_text(measured)} dB lost",
             verdict(within(difference(rows, rows, "lost_db", "predicted_lost_db"), -AGREE_DB, AGREE_DB)),
         )
         for name, rows in _first_amounts(results.table).items()
@@ -162,7 +162,7 @@ def _claims(results: Results) -> Sequence[Claim]:
     ]  # fmt: skip
 
 
-def _said(mean: Mean) -> str:
+def _text(mean: Mean) -> str:
     known = not math.isnan(mean.error)
     return f"{mean.value:.2f} \N{PLUS-MINUS SIGN} {mean.error:.2f}" if known else f"{mean.value:.2f}"
 
@@ -170,7 +170,7 @@ def _said(mean: Mean) -> str:
 def _figures(results: Results) -> Mapping[str, Figure]:
     table = results.table
     drawn = {
-        "losses.png": paired(
+        "losses.png": pair_chart(
             {name: _both(rows) for name, rows in _first_amounts(table).items()}, _LINES, "PSNR lost [dB]"
         )
     }

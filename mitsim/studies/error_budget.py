@@ -122,11 +122,11 @@ def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> tuple[list[Los
     budget = _budget(stand, lit, clear)
     measured, told = squared_error(stand.before_db), sum(part.square for part in budget.parts.values())
     found = [
-        LossRow(of, source, "", *gained(part.square, measured, told, part.deviation), part.square, part.deviation)
+        LossRow(of, source, "", *gain_without(part.square, measured, told, part.deviation), part.square, part.deviation)
         for (of, source), part in budget.parts.items()
     ]
     pixels = budget.steady.size
-    found.append(_unexplained(measured, told, budget.scatter.deviation(budget.drawn, budget.steady) / pixels))
+    found.append(_unexplained_row(measured, told, budget.scatter.deviation(budget.drawn, budget.steady) / pixels))
     rows, refused = _drifts(stand, budget, measured)
     return found + rows, refused
 
@@ -160,7 +160,7 @@ def _drifts(stand: DriftStand, budget: _Budget, measured: float) -> tuple[list[L
     return found, refused
 
 
-def _unexplained(measured: float, told: float, chance: float) -> LossRow:
+def _unexplained_row(measured: float, told: float, chance: float) -> LossRow:
     """Squared error that is ``measured`` and not ``told``, which ``chance`` moves by so much."""
     left = measured - told
     lost = _decibels(left / measured)
@@ -174,7 +174,7 @@ def _budget(stand: DriftStand, lit: LitSession, clear: Factors) -> _Budget:
     exact = replace(stand.linear, left=clear.left, right=clear.right)
     sampled = sum((noise for (_, name), noise in noises.items() if name == RENDERING), Noise())
     drawn = sum(noises.values(), Noise()) - sampled
-    seen = dict(_seen(stand, clear))
+    seen = dict(_clear_images(stand, clear))
     whole = next(iter(seen.values()))
     steady = whole + sum(stand.fixed.values(), np.zeros_like(scene)) - scene
     scatter = Scatter(exact, scene)
@@ -191,7 +191,7 @@ def _budget(stand: DriftStand, lit: LitSession, clear: Factors) -> _Budget:
     return _Budget(found, scatter, drawn, off)
 
 
-def _seen(stand: DriftStand, clear: Factors) -> Iterator[tuple[str, FloatArray]]:
+def _clear_images(stand: DriftStand, clear: Factors) -> Iterator[tuple[str, FloatArray]]:
     """Images without noise of the scene's light, and of it without one cause after another."""
     scene_ablation, off = Ablation.of(stand.lit.light), frozenset[str]()
     yield "", stand.clear(clear, stand.lit.light)
@@ -230,7 +230,7 @@ def _square(error: FloatArray) -> float:
     return float(np.square(error).mean())
 
 
-def gained(part: float, measured: float, told: float, deviation: float = 0.0) -> tuple[float, float]:
+def gain_without(part: float, measured: float, told: float, deviation: float = 0.0) -> tuple[float, float]:
     """Decibels that an image would gain without a source, and how sure that is.
 
     Parameters

@@ -50,7 +50,7 @@ def _measure(studio: Studio, point: Point) -> Found:
     if point["model"] == IDEALISED and point["patterns"] == DOTS:
         # Elsewhere the law's model is not that of the frames, or least squares magnifies rounding beyond any image.
         law = _law(frames, seconds)
-    return claims.found(point, image.image, **image.row(), **law)
+    return claims.finding(point, image.image, **image.row(), **law)
 
 
 def _law(frames: Unexposed, seconds: float) -> dict[str, float]:
@@ -63,12 +63,12 @@ def _law(frames: Unexposed, seconds: float) -> dict[str, float]:
 
 
 def _claims(results: Results) -> Sequence[Claim]:
-    table, said = results.table, "{one} dB, {gain:+} dB"
+    slightly, table, text = "49 uniform frames are slightly better than one", results.table, "{one} dB, {gain:+} dB"
     ratio = np.divide(table.numbers("ser"), table.numbers("ser_law")).tolist()
     one, many, dots = ({"patterns": name} for name in SHARED)
     return [
-        claims.compared(table, "49 dots beat 49 uniform frames of the same time", "higher", (dots, many), said),
-        claims.compared(table, "49 uniform frames are slightly better than one", "slightly higher", (many, one), said),
+        claims.gain_claim(table, "49 dots beat 49 uniform frames of the same time", "higher", (dots, many), text),
+        claims.gain_claim(table, slightly, "slightly higher", (many, one), text),
         Claim(
             "Without regularisation, ||x|| / ||x - x'|| is SNR / rho (49 dots)", "equal",
             f"measured / law {min(ratio):.3f} to {max(ratio):.3f}", "not defined: factors are calibrated",

@@ -101,7 +101,7 @@ def lit_lines(setup: Setup, seed: int) -> tuple[LitLine, ...]:
     MitsimError
         as :meth:`mitsim.bench.bench.Bench.capture_lines`.
     """
-    colours = ColourBench.of(_opened(setup, locate(setup.scene, "scenes", "scene.xml")), RUN)
+    colours = ColourBench.of(_open(setup, locate(setup.scene, "scenes", "scene.xml")), RUN)
     request = Request.of(accuracy=setup.accuracy, seed=seed)
     plan = plan_request(colours.whole, request)
     lighting = colours.whole.family(request.patterns, seed).lighting
@@ -113,7 +113,7 @@ def lit_lines(setup: Setup, seed: int) -> tuple[LitLine, ...]:
     )
 
 
-def daylit(setup: Setup, folder: Path) -> tuple[FloatArray, float]:
+def daylight_frame(setup: Setup, folder: Path) -> tuple[FloatArray, float]:
     """What the camera sees of a scene in a lamp's daylight (D65) with the projector off.
 
     Its spectra count as D65's photons do, 380 to 780 nm, in a camera of equal efficiency for all of them.
@@ -135,19 +135,19 @@ def daylit(setup: Setup, folder: Path) -> tuple[FloatArray, float]:
         photons = daylight(at) * at
         return float((values * photons).sum() / photons.sum())
 
-    scene = respectred(setup.scene, folder / "daylight", weigh)
+    scene = replace_spectra(setup.scene, folder / "daylight", weigh)
     text = scene.read_text(encoding="utf-8")
     end = text.rindex("</scene>")
     scene.write_text(text[:end] + _LAMP.format(radiance=DAYLIGHT_RADIANCE), encoding="utf-8")
     wavelengths = np.arange(380.0, 781.0, 5.0)
     mean = float((daylight(wavelengths) * wavelengths).sum() / daylight(wavelengths).sum())
-    bench = _opened(setup, scene)
+    bench = _open(setup, scene)
     bench = replace(bench, rig=replace(bench.rig, projector=bench.projector.at(mean)))
     light = bench.light("uniform", accuracy=setup.accuracy)
     return light.merged().frames(bench.family("uniform").lighting, light.seed).projector_off.irradiance, mean
 
 
-def respectred(scene: str, folder: Path, weigh: Weigh) -> Path:
+def replace_spectra(scene: str, folder: Path, weigh: Weigh) -> Path:
     """A copy of a scene whose spectra are single numbers; its XML.
 
     Parameters
@@ -194,7 +194,7 @@ def serving(line: LitLine, other: LitLine) -> Factors:
     return replace(model, left=root * model.left, right=root * model.right, manifest=manifest, lacking=())
 
 
-def _opened(setup: Setup, scene: Path) -> Bench:
+def _open(setup: Setup, scene: Path) -> Bench:
     parameters: dict[str, Any] = dict(setup.parameters)
     variant = f"{setup.variant.rpartition('_')[0]}_spectral"
     return open_bench(scene, variant, setup.camera, setup.projector, setup.outside, **parameters)
@@ -212,7 +212,7 @@ _COARSE = tuple(float(relative) for relative in np.logspace(-9, -3, 7))
 Lines = Sequence[LitLine]
 
 
-def installed() -> tuple[str, ...]:
+def available_ways() -> tuple[str, ...]:
     """Those of :data:`WAYS` that are: demosaicing is an extra."""
     return tuple(name for name, way in WAYS.items() if way in spectral_manifests.installed_ways())
 
@@ -300,7 +300,7 @@ def mosaic_shots(lines: Lines, patterns: str, seed: int) -> MosaicShots:
         _behind_filters([unit.electrons(frame) for unit, frame in zip(one_second, shot, strict=True)], weights)
         for shot in zip(*expected, strict=True)
     ]
-    frames = exposed(Exposer(rig, peak_seconds(rig.sensor, rates), integer(seed, "mosaic")), family, rates)
+    frames = expose_rates(Exposer(rig, peak_seconds(rig.sensor, rates), integer(seed, "mosaic")), family, rates)
     return MosaicShots(lines, family, tuple(frames))
 
 
@@ -313,7 +313,7 @@ def peak_seconds(sensor: SensorModel, rates: Sequence[FloatArray]) -> float:
     return float(Exposure().fraction * sensor.superpixel_full_well_e / most)
 
 
-def exposed(
+def expose_rates(
     exposer: Exposer, family: PatternFamily, rates: Sequence[FloatArray], ambient: FloatArray | float = 0.0
 ) -> Iterator[tuple[FloatArray, int, int]]:
     """Noisy measurement (m, m') [electrons/s] of each pattern, and its indices.

@@ -26,7 +26,7 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.report import EQUAL_PEAK
 from mitsim.report.lit_scene import LitScene
 from mitsim.report.plots import curves
-from mitsim.studies.framework.claims import difference, found, sampled, verdict, within
+from mitsim.studies.framework.claims import difference, finding, sample_mean, verdict, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import Point, Setup
 from mitsim.studies.framework.studio import Image, Studio
@@ -92,14 +92,14 @@ def _measure(studio: Studio, point: Point) -> Found:
         frames = foreseen.by(recipe).session.shots
     else:
         session = foreseen.by(recipe)
-        factors = _modelled(bench, replace(session, session=replace(session.session, seed=seed)), point)
+        factors = _model_factors(bench, replace(session, session=replace(session.session, seed=seed)), point)
         frames = int(factors.manifest.result["frames"])
         numbers = factors.manifest.result["parameters"]
         told = {name: numbers[name]["value"] for name in ("mask_distance", "mask_shift_row", "mask_shift_column")}
         told["unexplained"] = factors.manifest.result["unexplained_residual"]
     exposed = lit.rendered(factors, lit.bench.family(PATTERNS), seed)
     image = Image.of(exposed, exposed.seconds(EQUAL_PEAK))
-    return found(point, None, **image.row(), frames=frames, **told)
+    return finding(point, None, **image.row(), frames=frames, **told)
 
 
 def _session(studio: Studio, setup: Setup, recipe: SessionRecipe) -> Foreseen:
@@ -116,7 +116,7 @@ def _session(studio: Studio, setup: Setup, recipe: SessionRecipe) -> Foreseen:
     return Foreseen(kept.by(recipe), kept.sums)
 
 
-def _modelled(bench: Bench, lit: LitSession, point: Point) -> Factors:
+def _model_factors(bench: Bench, lit: LitSession, point: Point) -> Factors:
     """Factors of a model of the ``bench`` as planned, fitted to frames of the session ``lit``."""
     shown, frames = simulated(lit, Modelling(point["factors"], int(point["wanted"])))
     camera = model_of(bench, point["factors"])
@@ -146,8 +146,8 @@ def _claims(results: Results) -> Sequence[Claim]:
                     f"A few frames suffice for the {model} model, brightest pixel at {fraction:g} of the full well",
                     "",
                     "",
-                    f"{sampled(own.where(frames=few), 'psnr_db')} dB with {few} frames; measured factors "
-                    f"{sampled(longest, 'psnr_db')} dB with {most}: {gains[few]:+} dB",
+                    f"{sample_mean(own.where(frames=few), 'psnr_db')} dB with {few} frames; measured factors "
+                    f"{sample_mean(longest, 'psnr_db')} dB with {most}: {gains[few]:+} dB",
                     verdict(holds),
                 )
             )

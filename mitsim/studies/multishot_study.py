@@ -45,7 +45,7 @@ from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODEL
 from mitsim.report.lit_scene import IdealCamera, LitScene, Pair, Unexposed
 from mitsim.report.table import Table
 from mitsim.studies.framework import claims
-from mitsim.studies.framework.claims import Lines, images, shown
+from mitsim.studies.framework.claims import Lines, image_array, images
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import QUICK_IMAGES, Point
 from mitsim.studies.framework.studio import Image, Studio, reason_of
@@ -81,7 +81,7 @@ def _measure(studio: Studio, point: Point) -> Found:
     images = _moved(studio, point, lit) if method in (SWEPT, LINE) else _still(studio, point, lit)
     rows = tuple(point.row(exposure=exposure, **image.row()) for exposure, image in images.items())
     kept = point.setup.picture in (*QUICK_IMAGES, None) and side in (1, 7) and method != LINE
-    return Found(rows, shown(images[EQUAL_FRAME].image) if kept else {})
+    return Found(rows, image_array(images[EQUAL_FRAME].image) if kept else {})
 
 
 def _still(studio: Studio, point: Point, lit: LitScene) -> dict[str, Image]:
@@ -135,22 +135,23 @@ def _spread(count: int, feature_mm: float) -> tuple[float, ...]:
 def _claims(results: Results) -> Sequence[Claim]:
     table = results.table
     many = table.where(frames=_FRAMES)
-    line = {each: claims.sampled(many.where(patterns=LINE, exposure=each), "psnr_db") for each in EXPOSURES}
+    line = {each: claims.sample_mean(many.where(patterns=LINE, exposure=each), "psnr_db") for each in EXPOSURES}
     on_the_line = claims.every(*(claims.near(mean, _SWEPT_DB) for mean in line.values()))
     on_a_line = "; ".join(f"{exposure}: {mean} dB" for exposure, mean in line.items())
     still, swept, dots = ({"patterns": name} for name in (UNIFORM, SWEPT, DOTS))
-    counts = _TELLS_DB, math.inf
+    counts, one = (_TELLS_DB, math.inf), table.where(patterns=UNIFORM, frames=1)
+    on_a_grid = "SweepCam with 49 frames gives 24.9 to 26.8 dB, here on a grid"
     gained = "SweepCam's 49 frames beat 49 frames through a mask that rests"
     return [
-        claims.stated(table.where(patterns=UNIFORM, frames=1), "One uniform frame gives 21.3 to 22.9 dB", (21.3, 22.9)),
-        claims.stated(many.where(**swept), "SweepCam with 49 frames gives 24.9 to 26.8 dB, here on a grid", _SWEPT_DB),
+        claims.psnr_claim(one, "One uniform frame gives 21.3 to 22.9 dB", (21.3, 22.9)),
+        claims.psnr_claim(many.where(**swept), on_a_grid, _SWEPT_DB),
         Claim(
             "The same on a line along the rows", "24.9 to 26.8 dB", on_a_line, "",
             "confirmed only idealised" if on_the_line else claims.verdict(on_the_line),
         ),
-        claims.stated(many.where(**dots), "49 shifting dots give 34 to 35.5 dB", (34.0, 35.5)),
-        claims.compared(many, "49 dots beat SweepCam's 49 frames", "higher", (dots, swept), between=counts),
-        claims.compared(many, gained, "", (swept, still), between=counts),
+        claims.psnr_claim(many.where(**dots), "49 shifting dots give 34 to 35.5 dB", (34.0, 35.5)),
+        claims.gain_claim(many, "49 dots beat SweepCam's 49 frames", "higher", (dots, swept), between=counts),
+        claims.gain_claim(many, gained, "", (swept, still), between=counts),
     ]  # fmt: skip
 
 
@@ -184,7 +185,7 @@ Places = Mapping[float, Pair]
 """Left and right factor, (pixels, n) each, of the camera with its mask moved so far [mm], along both axes."""
 
 
-def moved(bench: Apparatus, row_mm: float, column_mm: float) -> Apparatus:
+def move_mask(bench: Apparatus, row_mm: float, column_mm: float) -> Apparatus:
     """A bench with its mask elsewhere, for all that is made of traced light.
 
     Parameters
@@ -210,7 +211,7 @@ def ideal_places(bench: Apparatus, places_mm: Iterable[float], board_flux: float
     """
 
     def camera(row: float, column: float) -> IdealCamera:
-        return IdealCamera(moved(bench, row, column), bench.geometry.mask)
+        return IdealCamera(move_mask(bench, row, column), bench.geometry.mask)
 
     def white(row: float, column: float) -> Frame:
         (frame,) = camera(row, column).frames(bench.family("uniform"), np.full((bench.n, bench.n), board_flux))
@@ -240,12 +241,12 @@ def calibrated_places(bench: Apparatus, places_mm: Sequence[float], seed: int, a
     light = session.trace(session.plan(accuracy, job), job)
 
     def at(row: float, column: float) -> Session:
-        return Session(moved(bench, row, column), recipe, seed)
+        return Session(move_mask(bench, row, column), recipe, seed)
 
     def white(row: float, column: float) -> Frame:
         return at(row, column).lit(light.behind(at(row, column).board), Job()).white
 
-    return _consistent({place: _calibrated(at(place, place), light, place) for place in places_mm}, bench, white)
+    return _consistent({place: _calibrate_place(at(place, place), light, place) for place in places_mm}, bench, white)
 
 
 def _consistent(factors: Places, bench: Apparatus, white: Callable[[float, float], Frame]) -> Places:
@@ -272,7 +273,7 @@ def _consistent(factors: Places, bench: Apparatus, white: Callable[[float, float
     return found
 
 
-def _calibrated(session: Session, light: SampledLight, place: float) -> Pair:
+def _calibrate_place(session: Session, light: SampledLight, place: float) -> Pair:
     """Both factors of a ``session`` before the board's ``light``, its noise found by the ``place``."""
     lit = session.lit(light.behind(session.board), Job())
     clean, _ = estimate(lit, Job(), noise_free=True)
@@ -316,7 +317,7 @@ class MovedMask:
         """
         place = row_mm, column_mm
         if place not in self._formed:
-            bench = moved(self.lit.bench, *place)
+            bench = move_mask(self.lit.bench, *place)
             self._formed[place] = self.lit.expected(self.model, bench.family("uniform"), bench=bench)
         return self._formed[place]
 

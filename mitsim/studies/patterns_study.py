@@ -46,7 +46,7 @@ def _points(scope: Scope) -> Sequence[Point]:
 
 def _measure(studio: Studio, point: Point) -> Found:
     frames = studio.frames(point.setup, point["model"], point["patterns"], int(point["seed"]))
-    made = claims.imaged(studio, point, _SHOWN)
+    made = claims.measure_image(studio, point, _SHOWN)
     count = frames.family.left.shape[1] * frames.family.right.shape[1]
     arrays = dict(made.arrays)
     if point["patterns"] in _SHOWN and point["model"] == RENDERED:
@@ -59,11 +59,11 @@ def _claims(results: Results) -> Sequence[Claim]:
     families = Table(tuple(row for row in table.rows if row["exposure"] != DIM))
 
     def better(claim: str, family: str, other: str) -> Claim:
-        return claims.compared(families, claim, "higher", ({"patterns": family}, {"patterns": other}))
+        return claims.gain_claim(families, claim, "higher", ({"patterns": family}, {"patterns": other}))
 
     return [
-        claims.stated(table.where(patterns="uniform"), "One uniform pattern gives 21 to 23 dB", _STATED["uniform"]),
-        claims.stated(table.where(patterns="dots:7"), "49 shifting dots give 34 to 35.5 dB", _STATED["dots:7"]),
+        claims.psnr_claim(table.where(patterns="uniform"), "One uniform pattern gives 21 to 23 dB", _STATED["uniform"]),
+        claims.psnr_claim(table.where(patterns="dots:7"), "49 shifting dots give 34 to 35.5 dB", _STATED["dots:7"]),
         better("More dots, better images (49 against 4)", "dots:7", "dots:2"),
         better("Orthogonal patterns outperform random ones (49 each)", "dots:7", "random:7"),
         better("Hadamard patterns perform best, for their light (64 each)", "hadamard:8", "dots:8"),

@@ -39,7 +39,7 @@ from mitsim.report.lit_scene import LitScene, Unexposed, peak_time
 from mitsim.report.plots import curves, image_grid
 from mitsim.report.table import Mean, Table, Value
 from mitsim.sensor.moments import frame_moments
-from mitsim.studies.framework.claims import Holds, difference, every, sampled, single, verdict_at, within
+from mitsim.studies.framework.claims import Holds, difference, every, sample_mean, single_precision, verdict_at, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import Point, Setup
 from mitsim.studies.framework.studio import Studio
@@ -219,7 +219,7 @@ def _measure(studio: Studio, point: Point) -> Found:
             images[f"{label(name)}, {exposure}"] = image
             if (name, exposure) == _DRAWN:
                 images |= found.parts
-    return Found(tuple(rows), single(images))
+    return Found(tuple(rows), single_precision(images))
 
 
 def _factors(studio: Studio, setup: Setup, seed: int) -> Factors:
@@ -265,7 +265,7 @@ def _claims(results: Results) -> Sequence[Claim]:
 
 
 def _artefacts(rows: Table) -> Mean:
-    return sampled(rows, _ARTEFACTS)
+    return sample_mean(rows, _ARTEFACTS)
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:
@@ -281,7 +281,7 @@ def _figures(results: Results) -> Mapping[str, Figure]:
         name = f"{label(_DRAWN[0])}, {_DRAWN[1]}"
         for subject in swept:
             found = peak.where(subject=subject).rows
-            images = [_shown(results, row, name, "psnr_db") for row in found]
+            images = [_captioned(results, row, name, "psnr_db") for row in found]
             columns = [f"alpha {row['roughness']}" for row in found]
             drawn[f"images_{subject}.png"] = image_grid({subject: images}, columns, f"By roughness, {name}")
     rows = [row for row in peak.rows if row["subject"] not in swept]
@@ -289,7 +289,7 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     shown = [(*_truths(results, row), *_images(results, row, results.table)) for row in rows]
     titles = [*_TRUTHS, *(f"{label(name)}\n{exposure}" for exposure in EXPOSURES for name in FAMILIES)]
     drawn["images_shipped.png"] = image_grid(dict(zip(names, shown, strict=True)), titles, "Truths and images")
-    causes = [[_shown(results, row, cause, f"{cause}_db") for cause in CAUSES] for row in rows]
+    causes = [[_captioned(results, row, cause, f"{cause}_db") for cause in CAUSES] for row in rows]
     title = f"Errors against matt paint by cause, {label(_DRAWN[0])}, {_DRAWN[1]}: grey is no error"
     drawn["causes_shipped.png"] = image_grid(dict(zip(names, causes, strict=True)), list(_NAMES.values()), title)
     return drawn
@@ -302,17 +302,17 @@ def _curves(rows: Table) -> dict[str, dict[Value, Mean]]:
 
 
 def _truths(results: Results, row: Mapping[str, Value]) -> list[tuple[FloatArray, str]]:
-    return [_shown(results, row, name) for name in _TRUTHS]
+    return [_captioned(results, row, name) for name in _TRUTHS]
 
 
 def _images(results: Results, row: Mapping[str, Value], table: Table) -> list[tuple[FloatArray, str]]:
     """Of the point of a ``row``, by exposure and patterns."""
     cases = [(exposure, name) for exposure in EXPOSURES for name in FAMILIES]
     each = (table.where(point=row["point"], exposure=exposure, patterns=name).rows[0] for exposure, name in cases)
-    return [_shown(results, row, f"{label(str(row['patterns']))}, {row['exposure']}", "psnr_db") for row in each]
+    return [_captioned(results, row, f"{label(str(row['patterns']))}, {row['exposure']}", "psnr_db") for row in each]
 
 
-def _shown(results: Results, row: Mapping[str, Value], name: str, column: str = "") -> tuple[FloatArray, str]:
+def _captioned(results: Results, row: Mapping[str, Value], name: str, column: str = "") -> tuple[FloatArray, str]:
     """The array ``name`` of a ``row`` with its ``column`` for a caption; errors on grey."""
     image, level = results.array(row, name), row.get(column)
     if image is None:

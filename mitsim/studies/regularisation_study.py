@@ -66,7 +66,7 @@ def _measure(studio: Studio, point: Point) -> Found:
     tracemalloc.stop()
     best = max(psnr(each, truth) for each in (image, one, *others))
     measured = {"psnr_db": psnr(image, truth), "psnr_best_db": best, "seconds": seconds, "peak_mib": peak / 2**20}
-    return claims.found(point, image if point["patterns"] in _SHOWN else None, **measured)
+    return claims.finding(point, image if point["patterns"] in _SHOWN else None, **measured)
 
 
 def _claims(results: Results) -> Sequence[Claim]:
@@ -77,7 +77,7 @@ def _claims(results: Results) -> Sequence[Claim]:
 
     table, plain, tv = results.table, {"method": TIKHONOV}, {"method": TV}
     alike = [
-        claims.compared(
+        claims.gain_claim(
             table.where(patterns=family),
             f"Total variation is as good (within {_VISIBLE_DB:g} dB), {in_text(family)}, {which} weight",
             "not visibly better", (tv, plain), "Tikhonov {other} dB, total variation {one} dB: {gain:+} dB",
@@ -86,7 +86,7 @@ def _claims(results: Results) -> Sequence[Claim]:
         for column, which in _COLUMNS.items()
         for family in _SHOWN
     ]  # fmt: skip
-    return [*alike, claims.judged(table, "The closed form takes less time than total variation", "less", faster)]
+    return [*alike, claims.judge_claim(table, "The closed form takes less time than total variation", "less", faster)]
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:

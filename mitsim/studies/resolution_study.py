@@ -22,7 +22,7 @@ from mitsim.report.plots import curves, image_grid
 from mitsim.report.table import Table
 from mitsim.studies.diffraction_study import contrast, modulation, slanted_edge
 from mitsim.studies.framework import claims
-from mitsim.studies.framework.claims import Holds, shown
+from mitsim.studies.framework.claims import Holds, image_array
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import PRINT_MM, Point
 from mitsim.studies.framework.studio import Studio
@@ -70,7 +70,7 @@ def _measure(studio: Studio, point: Point) -> Found:
         )
     extremes = float(np.mean([contrast(*half) for half in _halves(image.image)]))
     row |= {"pairs_a_mm": float(frequency), "contrast": _contrast(image.image, own), "contrast_of_extremes": extremes}
-    return Found((row,), shown(image.image))
+    return Found((row,), image_array(image.image))
 
 
 def _pixel_mm(lit: LitScene) -> float:
@@ -97,7 +97,7 @@ def _claims(results: Results) -> Sequence[Claim]:
     def rises(rows: Table) -> tuple[str, Holds]:
         limits = {name: _limit(of_family) for name, of_family in claims.by_patterns(rows).items()}
         fine = claims.by_patterns(rows.where(pairs_a_mm=_FINEST))
-        kept = {name: claims.sampled(of_family, "contrast").value for name, of_family in fine.items()}
+        kept = {name: claims.sample_mean(of_family, "contrast").value for name, of_family in fine.items()}
         said = ", ".join(f"{name[:1].lower()}{name[1:]} {limits[name]:g} ({kept[name]:.2f})" for name in limits)
         gains = [
             claims.within(claims.difference(more, fewer, "contrast"), low=0) for fewer, more in pairwise(fine.values())
@@ -109,7 +109,9 @@ def _claims(results: Results) -> Sequence[Claim]:
     def apart(rows: Table) -> tuple[str, Holds]:
         dots = rows.where(patterns="dots:7")
         seen = {
-            pairs: claims.sampled(dots.where(pairs_a_mm=pairs), "contrast") for pairs in _bars(dots) if pairs <= _FINEST
+            pairs: claims.sample_mean(dots.where(pairs_a_mm=pairs), "contrast")
+            for pairs in _bars(dots)
+            if pairs <= _FINEST
         }
         return f"contrast {seen[_FINEST].value:.2f}", claims.every(
             *(claims.within(each, low=_TOLD) for each in seen.values())
@@ -120,8 +122,8 @@ def _claims(results: Results) -> Sequence[Claim]:
         f"{_FINEST})"
     )
     return [
-        claims.judged(table, resolution, "rises", rises),
-        claims.judged(table, f"49 patterns tell {_FINEST} line pairs a mm apart", "told apart", apart),
+        claims.judge_claim(table, resolution, "rises", rises),
+        claims.judge_claim(table, f"49 patterns tell {_FINEST} line pairs a mm apart", "told apart", apart),
     ]
 
 
@@ -129,7 +131,7 @@ def _limit(rows: Table) -> float:
     """Finest bars up to which all are told apart; 0 for none."""
     limit = 0.0
     for pairs in _bars(rows):
-        if claims.sampled(rows.where(pairs_a_mm=pairs), "contrast").value < _TOLD:
+        if claims.sample_mean(rows.where(pairs_a_mm=pairs), "contrast").value < _TOLD:
             break
         limit = pairs
     return limit
@@ -151,7 +153,7 @@ def _figures(results: Results) -> Mapping[str, Figure]:
         drawn[f"{file}.png"] = curves(shown, axis, f"{column} [1]", ticks=False, title=title)
     names = [name for name in table.distinct("picture") if name.startswith("bars")]
     both = {f"{name}, {model}": rows.where(model=model) for name, rows in lines.items() for model in MODELS}
-    grid = claims.pictured(results, both, "picture", names, "contrast {contrast:.2f}")
+    grid = claims.image_rows(results, both, "picture", names, "contrast {contrast:.2f}")
     title = f"Bars by line pairs/mm of the print, exposure {EQUAL_FRAME}"
     drawn["images.png"] = image_grid(grid, [name.replace("bars ", "") for name in names], title)
     return drawn

@@ -25,7 +25,7 @@ from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import LitScene, Unexposed
 from mitsim.report.plots import image_grid
-from mitsim.studies.framework.claims import every, sampled, single, verdict, within
+from mitsim.studies.framework.claims import every, sample_mean, single_precision, verdict, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import Point
 from mitsim.studies.framework.studio import Studio
@@ -78,7 +78,7 @@ def _measure(studio: Studio, point: Point) -> Found:
         gain = levels[f"{SEPARATED}_db"] - levels[f"{ALL}_db"]
         rows.append(point.row(depth=depth, gain_db=gain, told=told, **levels))
         arrays |= {f"{depth} {name}": image for name, image in images.items()}
-    return Found(tuple(rows), single(arrays))
+    return Found(tuple(rows), single_precision(arrays))
 
 
 def _images(
@@ -152,7 +152,8 @@ def _claims(results: Results) -> Sequence[Claim]:
     def claim(depth: str) -> Claim:
         rows = table.where(depth=depth)
         gains = {
-            name: sampled(rows.where(subject=name, patterns="dots:7"), "gain_db") for name in table.distinct("subject")
+            name: sample_mean(rows.where(subject=name, patterns="dots:7"), "gain_db")
+            for name in table.distinct("subject")
         }
         told = ", ".join(f"{name.replace('_', ' ')} {gain} dB" for name, gain in gains.items())
         gained = every(*(within(gain, low=0) for gain in gains.values()))

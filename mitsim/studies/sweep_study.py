@@ -12,7 +12,7 @@ from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.html import DASH, scientific
 from mitsim.report.plots import curves
 from mitsim.report.table import Table, Value
-from mitsim.studies.framework.claims import imaged
+from mitsim.studies.framework.claims import measure_image
 from mitsim.studies.framework.experiment import (
     KNOBS,
     MEASURES,
@@ -24,7 +24,7 @@ from mitsim.studies.framework.experiment import (
     Results,
     Scope,
     check_sweep,
-    grouped,
+    group_by_setup,
     number_of,
 )
 from mitsim.studies.framework.setup import Point, Setup
@@ -42,7 +42,7 @@ def _points(scope: Scope) -> Sequence[Point]:
             knobs: dict[str, Value] = {name: setting.get(name, other) for name, other in fixed.items()}
             light = {name: setting[name] for name in ("accuracy",) if name in setting}
             found.append(Point.of(setup, model=RENDERED, **{**knobs, "seed": int(str(knobs["seed"])), **light}))
-    return grouped(found)
+    return group_by_setup(found)
 
 
 def _setup(setup: Setup, setting: Mapping[str, str]) -> Setup:
@@ -82,14 +82,14 @@ def _tables(results: Results) -> Sequence[PageTable]:
     for values in product(*(table.distinct(name) for name in knobs)):
         chosen = table.where(**dict(zip(knobs, values, strict=True)))
         if chosen.rows:
-            told = [_told(chosen, MEASURES[name][0]) for name in results.measures]
+            told = [_mean_text(chosen, MEASURES[name][0]) for name in results.measures]
             count = sum(bool(row.get("flagged")) for row in chosen.rows)
             rows.append((", ".join(map(str, values)) or DASH, *told, f"{count} of {len(chosen)}"))
     heads = ", ".join(knobs), *(name.replace("_", "-") for name in results.measures), "flagged"
     return [PageTable("Measures by setting, PSNR in dB", heads, tuple(rows))]
 
 
-def _told(rows: Table, column: str) -> str:
+def _mean_text(rows: Table, column: str) -> str:
     """Mean of a ``column``; a dash where it has no number."""
     if not rows.numbers(column):
         return DASH
@@ -113,7 +113,7 @@ EXPERIMENT = Experiment(
     "sweep",
     f"Sweep of {KNOBS}",
     "What does it do to the image?",
-    _points, imaged, _claims, _figures, _tables,
+    _points, measure_image, _claims, _figures, _tables,
     about="Rendered frames with the sensor's noise, exposed at equal peak unless the exposure varies (the brightest "
     "pixel fills the same part of the full well), and the images that mitsim reconstruct makes of them, with "
     "factors calibrated by a session of the same camera. Parameters have the names and units of the scene file, "

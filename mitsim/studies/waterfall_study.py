@@ -49,7 +49,7 @@ from mitsim.report.plots import BLUE, FONT, GREEN, GREY, PALE, ROW, VERMILION, b
 from mitsim.report.table import Mean, Table
 from mitsim.studies import ablation
 from mitsim.studies.ablation import Ablation
-from mitsim.studies.framework.claims import TOLERANCE_DB, difference, single, verdict, within
+from mitsim.studies.framework.claims import TOLERANCE_DB, difference, single_precision, verdict, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import QUICK_IMAGES, Point
 from mitsim.studies.framework.studio import Studio
@@ -112,8 +112,8 @@ class Sessions:
         if not off & (self._effects | {ablation.BLACK_LEVEL}):
             return self.noisy
         noisy = self.noisy
-        left = _aligned(found.left, whole.left) + _aligned(noisy.left, whole.left) - whole.left
-        right = _aligned(found.right, whole.right) + _aligned(noisy.right, whole.right) - whole.right
+        left = _align(found.left, whole.left) + _align(noisy.left, whole.left) - whole.left
+        right = _align(found.right, whole.right) + _align(noisy.right, whole.right) - whole.right
         return replace(Factors.of(replace(found, left=left, right=right), self._manifest), manifest=noisy.manifest)
 
     def idealised(self, sides: tuple[FloatArray, FloatArray]) -> Factors:
@@ -227,7 +227,7 @@ def fills_well(sensor: SensorModel, speckle: float) -> bool:
     return speckle > 0 or peak + _SURE * noise > well
 
 
-def _aligned(side: FloatArray, like: FloatArray) -> FloatArray:
+def _align(side: FloatArray, like: FloatArray) -> FloatArray:
     """A ``side`` with the sign of one that it should be ``like``: both sides turned round are the same camera."""
     return side if np.vdot(side, like) >= 0 else -side
 
@@ -284,7 +284,7 @@ def _kept(
 ) -> dict[str, FloatArray]:
     """Images of the two ends, by model, as findings keep them."""
     ends_of = {EFFECTS[0]: without, EFFECTS[-1]: having} if way == IN_ORDER else {}
-    return single(ends_of.get(effect, {}))
+    return single_precision(ends_of.get(effect, {}))
 
 
 def ends(way: str, effect: str) -> tuple[frozenset[str], frozenset[str]]:
@@ -447,10 +447,10 @@ def _draw_fall(axes: Any, fall: Fall, large: Collection[str]) -> None:
         axes.barh(row, change, 0.66, left=level, color=VERMILION if change < 0 else GREEN, zorder=3)
         level += change
         place = max(level, level - change), row
-        axes.annotate(_signed(step.in_order), place, (5, 0), textcoords="offset points", **text)
+        axes.annotate(_sign(step.in_order), place, (5, 0), textcoords="offset points", **text)
         for points, mean in zip(_COLUMNS, (step.alone, step.left_out), strict=True):
             if mean:
-                beside(axes, row, points, _signed(mean), fontsize=FONT - 2, color=GREY)
+                beside(axes, row, points, _sign(mean), fontsize=FONT - 2, color=GREY)
     axes.plot([level, level], [last - 1, last], color=GREY, lw=0.8, zorder=1)
     for row, end, colour in ((0, fall.first, PALE), (last, fall.last, BLUE)):
         left = axes.get_xlim()[0]
@@ -465,7 +465,7 @@ def _draw_fall(axes: Any, fall: Fall, large: Collection[str]) -> None:
     axes.spines["left"].set_visible(False)
 
 
-def _signed(mean: Mean) -> str:
+def _sign(mean: Mean) -> str:
     """A change with its sign, and with its standard error."""
     text = f"{mean.value:+.1f}" if round(mean.value, 1) else "0.0"
     text = text.replace("-", "\N{MINUS SIGN}")

@@ -130,7 +130,7 @@ def run_experiment(
         for done, (point, found) in enumerate(where.measure(study, todo) if todo else (), start=1):
             store.save(point, found)
             left = (time.perf_counter() - started) / done * (len(todo) - done)
-            job.progress(f"{study}: {done} of {len(todo)} points, {_spoken(left)} left", done / len(todo))
+            job.progress(f"{study}: {done} of {len(todo)} points, {_duration_text(left)} left", done / len(todo))
         return campaign.finished(folder, store, time.perf_counter() - started)
 
 
@@ -158,7 +158,7 @@ def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | Non
             raise MitsimError(
                 f"study merge: {part} is of another study, scope or version than {parts[0]}; run it again"
             )
-    study, scope = _known(heads[0]["study"], parts[0], experiment), _scope(heads[0]["scope"], parts[0])
+    study, scope = _known_study(heads[0]["study"], parts[0], experiment), _scope(heads[0]["scope"], parts[0])
     if study == ALL:
         for part in parts:
             for name in PAPER:
@@ -275,7 +275,7 @@ def _head(folder: Path) -> dict[str, Any]:
     raise MitsimError(f"study merge: {folder} holds no part of a study; give folders that `mitsim study` wrote")
 
 
-def _known(study: Any, part: Path | str, experiment: str | None) -> str:
+def _known_study(study: Any, part: Path | str, experiment: str | None) -> str:
     """The name of a ``study`` as the file of a ``part`` has it, where it ships or was named as ``experiment`` too."""
     known = (*PAPER, *EXPERIMENTS, ALL) if experiment is None else (experiment, ALL)
     if not isinstance(study, str) or study not in known:
@@ -294,5 +294,5 @@ def _scope(found: Any, part: Path | str) -> Scope:
         raise MitsimError(f"study merge: {part}: its scope cannot be read ({error.errors()[0]['msg']})") from error
 
 
-def _spoken(seconds: float) -> str:
+def _duration_text(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"

@@ -32,7 +32,7 @@ Judge = Callable[[Table], tuple[str, Holds]]
 """From the rows of one model and exposure to what they say, and whether the claim holds for them."""
 
 
-def sampled(rows: Table, column: str) -> Mean:
+def sample_mean(rows: Table, column: str) -> Mean:
     """Mean of a ``column`` over prints, or over seeds of the noise where there is one print; MitsimError where the
     ``rows`` have no number."""
     return _mean(rows, rows, column, column, lambda one, _: one)
@@ -110,7 +110,7 @@ def verdict_at(places: Mapping[str, Holds]) -> str:
     return f"confirmed only at {' and '.join(holding)}{rest}"
 
 
-def judged(table: Table, claim: str, paper: str, judge: Judge) -> Claim:
+def judge_claim(table: Table, claim: str, paper: str, judge: Judge) -> Claim:
     """What becomes of a claim at each way of exposing, in each model.
 
     Parameters
@@ -151,7 +151,7 @@ Lines = Mapping[str, Table]
 """Rows of a table by what they are called in a figure."""
 
 
-def found(point: Point, image: FloatArray | None = None, **measured: Value) -> Found:
+def finding(point: Point, image: FloatArray | None = None, **measured: Value) -> Found:
     """What a point came to, in one row.
 
     Parameters
@@ -164,20 +164,20 @@ def found(point: Point, image: FloatArray | None = None, **measured: Value) -> F
         columns of the row.
     """
     kept = image is not None and point.setup.picture in (*QUICK_IMAGES, None)
-    return Found((point.row(**measured),), shown(image) if kept and image is not None else {})
+    return Found((point.row(**measured),), image_array(image) if kept and image is not None else {})
 
 
-def shown(image: FloatArray) -> dict[str, FloatArray]:
+def image_array(image: FloatArray) -> dict[str, FloatArray]:
     """An ``image`` as findings keep it: a page shows no more than single precision."""
-    return single({IMAGE: image})
+    return single_precision({IMAGE: image})
 
 
-def single(arrays: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+def single_precision(arrays: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
     """Named ``arrays`` as findings keep them, in single precision."""
     return {name: array.astype("float32") for name, array in arrays.items()}
 
 
-def imaged(studio: Studio, point: Point, shown: Collection[str] = ()) -> Found:
+def measure_image(studio: Studio, point: Point, shown: Collection[str] = ()) -> Found:
     """The image that a user gets at a point with model, patterns, exposure and seed.
 
     Parameters
@@ -190,7 +190,7 @@ def imaged(studio: Studio, point: Point, shown: Collection[str] = ()) -> Found:
     values = dict(point.values)
     patterns, exposure = str(values["patterns"]), str(values.get("exposure", EQUAL_PEAK))
     image = studio.image(point.setup, str(values["model"]), patterns, int(point["seed"]), exposure)
-    return found(point, image.image if patterns in shown else None, **image.row())
+    return finding(point, image.image if patterns in shown else None, **image.row())
 
 
 def by_patterns(table: Table, families: Collection[str] | None = None) -> Lines:
@@ -223,7 +223,7 @@ def by_print(table: Table) -> Lines:
     }
 
 
-def pictured(
+def image_rows(
     results: Results, lines: Lines, across: str, columns: Sequence[Value], caption: str = "{psnr_db:.1f} dB"
 ) -> dict[str, list[tuple[FloatArray, str]]]:
     """Rows of an image grid, those of which all images were kept.
@@ -266,11 +266,11 @@ def images(
     file, title
         of the figure.
     results, lines, across, columns
-        as for :func:`pictured`.
+        as for :func:`image_rows`.
     names
         of the columns; None: their values.
     """
-    grid = pictured(results, lines, across, columns)
+    grid = image_rows(results, lines, across, columns)
     return {file: image_grid(grid, names or [str(value) for value in columns], title)} if grid else {}
 
 
@@ -296,7 +296,7 @@ def by_exposure(
     }
 
 
-def stated(table: Table, claim: str, band: tuple[float, float]) -> Claim:
+def psnr_claim(table: Table, claim: str, band: tuple[float, float]) -> Claim:
     """A claim of PSNR within a band.
 
     Parameters
@@ -308,13 +308,13 @@ def stated(table: Table, claim: str, band: tuple[float, float]) -> Claim:
     """
 
     def judge(rows: Table) -> tuple[str, Holds]:
-        mean = sampled(rows, "psnr_db")
+        mean = sample_mean(rows, "psnr_db")
         return f"{mean} dB", near(mean, band)
 
-    return judged(table, claim, f"{band[0]:g} to {band[1]:g} dB", judge)
+    return judge_claim(table, claim, f"{band[0]:g} to {band[1]:g} dB", judge)
 
 
-def compared(
+def gain_claim(
     table: Table,
     claim: str,
     paper: str,
@@ -342,10 +342,10 @@ def compared(
     def judge(rows: Table) -> tuple[str, Holds]:
         one, other = (rows.where(**chosen) for chosen in pair)
         gain = difference(one, other, column)
-        text = said.format(gain=gain, one=sampled(one, column), other=sampled(other, column))
+        text = said.format(gain=gain, one=sample_mean(one, column), other=sample_mean(other, column))
         return text, within(gain, *between)
 
-    return judged(table, claim, paper, judge)
+    return judge_claim(table, claim, paper, judge)
 
 
 def near(psnr_db: Mean, band: tuple[float, float]) -> Holds:

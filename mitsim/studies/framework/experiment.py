@@ -189,7 +189,7 @@ class Experiment:
     traced: bool = True
 
 
-def grouped(points: Sequence[Point]) -> list[Point]:
+def group_by_setup(points: Sequence[Point]) -> list[Point]:
     """The ``points``, those of one setup together: they share its light."""
     order = {setup: index for index, setup in enumerate(dict.fromkeys(point.setup for point in points))}
     return sorted(points, key=lambda point: order[point.setup])

@@ -11,7 +11,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from mitsim.core.environment import versions
-from mitsim.report.html import rendered, shown_figure, write_html
+from mitsim.report.html import page_figure, render_page, write_html
 from mitsim.studies.framework.experiment import HEADS, KNOBS, Claim, Experiment, PageTable, Results, Scope
 from mitsim.studies.framework.setup import TEST_IMAGES, Setup
 
@@ -71,7 +71,7 @@ class Section:
             title=experiment.title.replace(KNOBS, " and ".join(name for name, _ in scope.sweep)),
             question=experiment.question,
             claims=tuple(claims),
-            pictures={name: shown_figure(figure) for name, figure in figures.items()},
+            pictures={name: page_figure(figure) for name, figure in figures.items()},
             count=f"{len(results.table)} measurements{of}{good}",
             command=" ".join(command),
             about=experiment.about,
@@ -79,7 +79,7 @@ class Section:
             tables=tuple(experiment.tables(results)),
             quick=scope.quick,
             note=experiment.note,
-            warnings=flagged(experiment.name, results),
+            warnings=flag_warnings(experiment.name, results),
             prints=len(prints),
         )
 
@@ -103,7 +103,7 @@ class Part:
         return tuple(any(cells) and all(not cell or _NUMBER.match(cell) for cell in cells) for cells in columns)
 
 
-def flagged(name: str, results: Results) -> tuple[str, ...]:
+def flag_warnings(name: str, results: Results) -> tuple[str, ...]:
     """That images of the study ``name`` are flagged in its ``results``, how many and what for; empty where none is."""
     # An image may have many rows, such as a transfer function's.
     rows = {
@@ -145,8 +145,8 @@ def build_findings(
     warnings
         why its findings may not be trusted, for its head.
     """
-    pictures = {file: shown_figure(figure) for file, figure in figures.items()}
-    return rendered(
+    pictures = {file: page_figure(figure) for file, figure in figures.items()}
+    return render_page(
         "findings.html",
         name=name,
         title=title,
@@ -170,7 +170,7 @@ def build_page(sections: Sequence[Section], path: Path, title: str) -> Path:
     path
         where.
     """
-    return write_html(path, rendered("study.html", title=title, sections=sections, versions=versions()))
+    return write_html(path, render_page("study.html", title=title, sections=sections, versions=versions()))
 
 
 def _options(scope: Scope) -> list[str]:

@@ -143,7 +143,7 @@ def test_tensors_have_an_axis_of_lines(coloured: Coloured, tmp_path: Path) -> No
     assert abs((seen * y).sum() - (x * physics.A_adjoint(y)).sum()) <= 1e-12 * seen.norm() * y.norm()
     for index, name in enumerate(LINES):
         shots, factors = ms.load_run(coloured.run / name), ms.load_calibration(coloured.calibration / name)
-        assert np.array_equal(held["y"][index].numpy(), tensors.measured(shots))
+        assert np.array_equal(held["y"][index].numpy(), tensors.measurements(shots))
         lit = np.outer(shots.patterns[0][:, 1], shots.patterns[1][:, 0]) * x[1, index].numpy()
         assert np.allclose(seen[1, index, 3].numpy(), factors.left @ lit @ factors.right.T, rtol=1e-12)
 

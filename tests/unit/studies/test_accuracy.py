@@ -20,9 +20,9 @@ from mitsim.planner.planner import make_plan
 from mitsim.report import plots
 from mitsim.studies import accuracy_parts
 from mitsim.studies import accuracy_study as accuracy
-from mitsim.studies.ablation import ablations, reformed
+from mitsim.studies.ablation import ablations, reform
 from mitsim.studies.accuracy_findings import AccuracyFindings, Budget, PartCost, Spread
-from mitsim.studies.accuracy_parts import Judge, Stand, at_once, one_line, sampled
+from mitsim.studies.accuracy_parts import Judge, Stand, at_once, one_line, with_samples
 from mitsim.studies.framework.run import StudyResult, find_study
 
 pytestmark = pytest.mark.usefixtures("kept_plans", "draft_figures")
@@ -202,7 +202,7 @@ def test_sampled_fixes_the_number_of_samples(bench: Bench) -> None:
     plan = make_plan(bench, lighting, 1e-3, SEED)
     plan = replace(plan, settings=replace(plan.settings, anchors=1, effects=frozenset()))
     for samples in (1, 8):
-        fixed = replace(plan, settings=sampled(plan.settings, samples))
+        fixed = replace(plan, settings=with_samples(plan.settings, samples))
         light = trace_light(bench, fixed, lighting, 0, Sampling(target=at_once))
         assert light.paths == GROUPS * samples * bench.n**2
 
@@ -263,7 +263,7 @@ def test_reformed_light_is_that_of_a_plan_without_the_effect(bench: Bench) -> No
     light = trace_light(bench, plan, lighting, SEED)
     plain = replace(plan, settings=replace(plan.settings, effects=plan.settings.effects - {"diffraction"}))
     for ours, theirs in zip(
-        reformed(light, frozenset({"diffraction"})).frames(lighting, SEED),
+        reform(light, frozenset({"diffraction"})).frames(lighting, SEED),
         trace_light(bench, plain, lighting, SEED).frames(lighting, SEED),
         strict=True,
     ):

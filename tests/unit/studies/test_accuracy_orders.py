@@ -11,7 +11,7 @@ from mitsim.core.job import Job
 from mitsim.light.settings import Part
 from mitsim.studies import accuracy_findings
 from mitsim.studies.accuracy_findings import Budget, PartCost, Spread
-from mitsim.studies.accuracy_parts import Judge, Orders, Stand, sampled
+from mitsim.studies.accuracy_parts import Judge, Orders, Stand, with_samples
 from mitsim.studies.accuracy_study import PARENT
 from tests.unit.transport.test_indirect import MATT, SPHERE
 
@@ -30,7 +30,7 @@ def test_each_surface_keeps_the_albedo_of_the_light(shared_scene: Callable[..., 
     stand = Stand(bench, bench.family("dots:2"), 5, Job(), 1e-2)
     plan = stand.plan(1e-2)
     judge = Judge.trace(stand, plan, 0.0)
-    full = SimpleNamespace(settings=sampled(plan.settings, 1024))
+    full = SimpleNamespace(settings=with_samples(plan.settings, 1024))
     orders = Orders(stand, judge, SimpleNamespace(full=full, seconds=0.0))
     assert not orders.costs
     orders.measure(Budget(600.0), 1.0)

@@ -80,10 +80,10 @@ def test_sampled_light_of_a_board_multiplies_columns() -> None:
 
 def test_what_is_not_explained_is_a_loss_of_its_own() -> None:
     """A quarter of an error is told: 6.02 dB are left, and 3.01 dB more if chance took half of what is told."""
-    row = error_budget._unexplained(4.0, 1.0, 0.5)
+    row = error_budget._unexplained_row(4.0, 1.0, 0.5)
     assert row == LossRow("unexplained", "not explained", "", row.lost_db, row.error_db, 3.0, 0.5)
     assert (row.lost_db, row.error_db) == pytest.approx((6.0206, 3.0103), abs=1e-4)
-    assert error_budget._unexplained(4.0, 4.0, 1.0).error_db == pytest.approx(1.2494, abs=1e-4)
+    assert error_budget._unexplained_row(4.0, 4.0, 1.0).error_db == pytest.approx(1.2494, abs=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ def test_causes_are_taken_out_one_after_another(monkeypatch: pytest.MonkeyPatch)
     scene_ablation = SimpleNamespace(effects=effects, without=lambda off: sorted(off))
     monkeypatch.setattr(error_budget.Ablation, "of", lambda light: scene_ablation)
     stand: Any = SimpleNamespace(lit=SimpleNamespace(light="all"), clear=lambda factors, light: (factors, light))
-    assert list(error_budget._seen(stand, "exact")) == [  # type: ignore[arg-type]
+    assert list(error_budget._clear_images(stand, "exact")) == [  # type: ignore[arg-type]
         ("", ("exact", "all")),
         (ablation.DETAIL, ("exact", [ablation.DETAIL])),
         (ablation.DEPTH, ("exact", sorted([ablation.DETAIL, ablation.DEPTH]))),
@@ -234,8 +234,8 @@ def test_rows_are_all_parts_then_what_is_left_then_drifts(monkeypatch: pytest.Mo
     assert refused == ["lamp: no"] and last is drift
     measured = pytest.approx(0.05)
     assert asked == [(stand, "session", "exact"), (whole.drawn, STEADY), (stand, whole, measured)]
-    assert (shot.lost_db, shot.error_db) == pytest.approx(error_budget.gained(0.04, 0.05, 0.06, 1e-3))
-    assert (depth.lost_db, depth.error_db) == pytest.approx(error_budget.gained(0.02, 0.05, 0.06))
+    assert (shot.lost_db, shot.error_db) == pytest.approx(error_budget.gain_without(0.04, 0.05, 0.06, 1e-3))
+    assert (depth.lost_db, depth.error_db) == pytest.approx(error_budget.gain_without(0.02, 0.05, 0.06))
     assert [(row.of, row.source, row.amount, row.deviation) for row in (shot, depth)] == [
         ("capture", "shot noise", "", 1e-3),
         ("scene", "depth", "", 0.0),
@@ -247,11 +247,11 @@ def test_rows_are_all_parts_then_what_is_left_then_drifts(monkeypatch: pytest.Mo
 
 def test_chance_is_in_how_sure_a_part_is() -> None:
     """A deviation as large as a part that is a quarter, 3.01 - 1.25 dB; with what is not explained as squares add."""
-    alone = error_budget.gained(1.0, 4.0, 4.0, 1.0)
+    alone = error_budget.gain_without(1.0, 4.0, 4.0, 1.0)
     assert alone == pytest.approx((1.2494, 3.0103 - 1.2494), abs=1e-4)
-    assert error_budget.gained(1.0, 4.0, 2.0, 1.0)[1] == pytest.approx(2**0.5 * alone[1])
-    more = error_budget.gained(1.0, 4.0, 8.0, 1.0)
+    assert error_budget.gain_without(1.0, 4.0, 2.0, 1.0)[1] == pytest.approx(2**0.5 * alone[1])
+    more = error_budget.gain_without(1.0, 4.0, 8.0, 1.0)
     assert more[1] == pytest.approx(math.hypot(1.2494 - 0.5799, 0.5799), abs=1e-4)
     # A quarter too much is told: it may all be this part's, of which half of the error is left.
-    assert error_budget.gained(3.0, 4.0, 5.0) == pytest.approx((3.9794, 3.9794 - 3.0103), abs=1e-4)
-    assert error_budget.gained(4.0, 4.0, 4.0)[0] == pytest.approx(90)
+    assert error_budget.gain_without(3.0, 4.0, 5.0) == pytest.approx((3.9794, 3.9794 - 3.0103), abs=1e-4)
+    assert error_budget.gain_without(4.0, 4.0, 4.0)[0] == pytest.approx(90)

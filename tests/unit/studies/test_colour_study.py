@@ -43,7 +43,7 @@ def results(**scales: float) -> Results:
         families = colour_study.FAMILIES if way == "own" else ("dots:7",)
         for family, seed in product(families, (0, 1)):
             point = Point.of(Setup("colour_checker"), way=named, patterns=family, seed=seed)
-            found = colour_study._judged(point, LINES, images(scale), images())
+            found = colour_study._judge(point, LINES, images(scale), images())
             rows += [{**row, "point": point.key} for row in found.rows]
             arrays |= {(point.key, name): array for name, array in found.arrays.items()}
     return Results(Table((*rows, *rows_of(2.0, 30.0).rows)), arrays)

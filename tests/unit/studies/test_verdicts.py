@@ -18,7 +18,7 @@ from mitsim.studies.framework.claims import (
     UNDECIDED,
     difference,
     every,
-    sampled,
+    sample_mean,
     verdict_at,
     within,
 )
@@ -315,9 +315,9 @@ def test_pairs_are_of_prints_or_of_seeds_of_one_print() -> None:
     one = [{"picture": name, "seed": seed, "x": value} for name, seed, value in
            (("a", 0, 10.0), ("a", 1, 12.0), ("b", 0, 20.0), ("b", 1, 22.0))]  # fmt: skip
     other = [{**row, "x": float(row["x"]) - 1.0 - (row["picture"] == "b")} for row in one]
-    assert sampled(Table(tuple(one)), "x") == Mean(16.0, pytest.approx(5.0), 2)
+    assert sample_mean(Table(tuple(one)), "x") == Mean(16.0, pytest.approx(5.0), 2)
     assert difference(Table(tuple(one)), Table(tuple(other)), "x") == Mean(1.5, pytest.approx(0.5), 2)
-    assert sampled(Table(tuple(one[:2])), "x") == Mean(11.0, pytest.approx(1.0), 2)
+    assert sample_mean(Table(tuple(one[:2])), "x") == Mean(11.0, pytest.approx(1.0), 2)
     with pytest.raises(MitsimError, match="nothing was measured of x"):
         difference(Table(tuple(one[:2])), Table(tuple(other[2:])), "x")
 
