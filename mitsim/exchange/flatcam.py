@@ -88,8 +88,8 @@ def _of_lines(path: Path, run: Coloured[RunManifest], calibration: Coloured[Cali
     ends, planes = matlab.endings(run.colours.names, path), _lines_of_planes(run.colours, path)
     counts = {name: len(run.lines[name].manifest.patterns.captures) for name in run.colours.names}
     if len({*counts.values()}) > 1:
-        told = ", ".join(f"{count} of {name}" for name, count in counts.items())
-        raise MitsimError(f"{path}: frames are {told}, but FlatCam's planes are of one frame; use mat")
+        reported = ", ".join(f"{count} of {name}" for name, count in counts.items())
+        raise MitsimError(f"{path}: frames are {reported}, but FlatCam's planes are of one frame; use mat")
     sides, variables = {}, matlab.colours_in(run, calibration)
     for name, shots in run.lines.items():
         sides[name] = tuple(

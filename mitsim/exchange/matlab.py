@@ -358,8 +358,8 @@ def array_in(variables: Variables, name: str, shape: tuple[int, ...], path: Path
     """
     array = np.asarray(variables.get(name))
     if array.dtype.kind not in "uif" or array.size != math.prod(shape):
-        told = f"is {array.dtype} of shape {array.shape}" if name in variables else "is missing"
-        raise MitsimError(f"{path}: {name} {told}; numbers of shape {shape} are needed")
+        reported = f"is {array.dtype} of shape {array.shape}" if name in variables else "is missing"
+        raise MitsimError(f"{path}: {name} {reported}; numbers of shape {shape} are needed")
     return array.reshape(shape, order="F")
 
 

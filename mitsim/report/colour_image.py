@@ -163,13 +163,13 @@ class ColourImage:
     @property
     def sentences(self) -> list[str]:
         """What the command line says of its colours."""
-        said = [f"colours by a matrix fitted on {self.model.fitted_on}"]
+        sentences = [f"colours by a matrix fitted on {self.model.fitted_on}"]
         if self.delta_e is not None:
-            said.append(f"Delta E 2000 of a pixel to the truth {self.delta_e.mean():.2f} in the mean")
+            sentences.append(f"Delta E 2000 of a pixel to the truth {self.delta_e.mean():.2f} in the mean")
         if self.patches:
             mean, floor = (mean_of(getattr(patch, name) for patch in self.patches) for name in ("delta_e", "floor"))
-            said.append(f"of {len(self.patches)} patches to their spectra {mean:.2f}, floor {floor:.2f}")
-        return said
+            sentences.append(f"of {len(self.patches)} patches to their spectra {mean:.2f}, floor {floor:.2f}")
+        return sentences
 
     def write(self, folder: Path) -> None:
         """Write image.exr and image.png to a ``folder``. MitsimError when they cannot be written."""

@@ -216,9 +216,9 @@ def _stages(seconds: Mapping[str, float]) -> dict[str, float]:
     """Seconds of each stage that is worth telling, and as "all else" what the total holds beside them."""
     stages = {name: value for name, value in seconds.items() if name != "total"}
     total = seconds.get("total", math.fsum(stages.values()))
-    told = {name: value for name, value in stages.items() if value >= _WORTH_TELLING * total}
-    rest = total - math.fsum(told.values())
-    return told | ({"all else": rest} if stages and rest > _WORTH_TELLING * total else {})
+    reported = {name: value for name, value in stages.items() if value >= _WORTH_TELLING * total}
+    rest = total - math.fsum(reported.values())
+    return reported | ({"all else": rest} if stages and rest > _WORTH_TELLING * total else {})
 
 
 def _best(families: tuple[FamilyResult, ...]) -> dict[str, str]:

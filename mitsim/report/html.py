@@ -145,9 +145,9 @@ def with_error(value: float, error: float, unit: str = "") -> str:
         in one unit, which stands behind both.
     """
     places = min(max(1 - math.floor(math.log10(error)), 0), 2) if error > 0 else 2
-    told = f" \N{PLUS-MINUS SIGN} {error:.{places}f}" if round(error, 2) else ""
+    deviation = f" \N{PLUS-MINUS SIGN} {error:.{places}f}" if round(error, 2) else ""
     # Zero has no sign.
-    return f"{value:z.{places}f}".replace("-", "\N{MINUS SIGN}") + told + unit
+    return f"{value:z.{places}f}".replace("-", "\N{MINUS SIGN}") + deviation + unit
 
 
 def sentence(text: str) -> str:

@@ -111,11 +111,11 @@ class JudgedMosaic:
         """What the command line says of it."""
         each = [f"{name}: {found or 'no truth to compare with'}" for name, found in self.qualities.items()]
         steps = "" if self.solved.joint is None else f", {self.solved.joint.steps} steps"
-        told = (
+        summary = (
             f"{self.way}: lambda {self.solved.lam:.3g}{steps}, residual {self.solved.residual:.1e}, "
             f"{self.unexplained:.1e} unexplained"
         )
-        return [*each, told, *self.colours.sentences]
+        return [*each, summary, *self.colours.sentences]
 
     @property
     def facts(self) -> dict[str, str]:
@@ -170,11 +170,11 @@ def reconstruct_mosaic(
     run, calibration = Path(run), Path(calibration)
     shots = load_mosaic(run)
     factors = fitting_factors(shots, calibration)
-    asked: dict[str, str | float] = {
+    options: dict[str, str | float] = {
         "run": shots.shots.fingerprint, "calibration": "-".join(each.fingerprint for each in factors.values()),
         "mosaic": way, "lambda": lam,
     }  # fmt: skip
-    replaces = _may_replace(Path(output), asked, overwrite)
+    replaces = _may_replace(Path(output), options, overwrite)
     with output_folder(output, overwrite=replaces) as folder:
         read = time.perf_counter()
         camera = MosaicCamera.of(
@@ -205,7 +205,7 @@ def reconstruct_mosaic(
             },
             output=str(folder),
         )
-        _write(found, folder, asked)
+        _write(found, folder, options)
     return found
 
 
@@ -231,12 +231,12 @@ class _Energies:
     def unexplained(self, residual: float, factors: list[Factors]) -> float:
         """Part of the data, rms, that a ``residual`` has beyond noise and the noise of ``factors``, lines' own."""
         own = [each.manifest.noise for each in factors]
-        told = 0.0
+        explained = 0.0
         for each, noise in zip(factors, own, strict=True):
             if noise is not None:
                 sides = (noise.left, each.left), (noise.right, each.right)
-                told = max(told, sum(s**2 * side.size / float(np.square(side).sum()) for s, side in sides))
-        left = residual**2 - (self.noise / self.data if self.data else 0.0) - told
+                explained = max(explained, sum(s**2 * side.size / float(np.square(side).sum()) for s, side in sides))
+        left = residual**2 - (self.noise / self.data if self.data else 0.0) - explained
         return float(np.sqrt(max(left, 0.0)))
 
 
@@ -268,27 +268,27 @@ def _qualities(
 def _warnings(
     shots: MosaicCapture, factors: Mapping[str, Factors], solved: LineImages, unexplained: float
 ) -> tuple[str, ...]:
-    said = []
+    warnings = []
     if solved.joint is not None and not solved.joint.converged:
-        said.append(
+        warnings.append(
             f"Not converged: {solved.joint.steps} steps leave {solved.joint.residual:.1e} of the normal equations; "
             "raise lambda."
         )
     if unexplained > UNEXPLAINED:
-        said.append(
+        warnings.append(
             f"Misfit: {unexplained:.1e} of the measurements are explained by no image of these lines, beyond noise; "
             "look for depth, light over several surfaces or another camera than was calibrated."
         )
-    said += [f"The capture was flagged: {text.rstrip('.')}." for text in shots.warnings]
-    said += [
+    warnings += [f"The capture was flagged: {text.rstrip('.')}." for text in shots.warnings]
+    warnings += [
         f"The calibration of {name} was flagged: {text.rstrip('.')}."
         for name, each in factors.items()
         for text in each.warnings
     ]
-    return tuple(said)
+    return tuple(warnings)
 
 
-def _may_replace(folder: Path, asked: Mapping[str, str | float], overwrite: bool) -> bool:
+def _may_replace(folder: Path, options: Mapping[str, str | float], overwrite: bool) -> bool:
     """Whether a ``folder`` holds an image that may be replaced: ``overwrite``, or of the same inputs ``asked`` for.
 
     MitsimError where it holds one of others."""
@@ -296,11 +296,11 @@ def _may_replace(folder: Path, asked: Mapping[str, str | float], overwrite: bool
         return False
     spectral_manifests.read_colours(folder, spectral_manifests.IMAGE)
     if not overwrite:
-        check_same_inputs(folder, read_json(folder / spectral_manifests.COLOUR), asked)
+        check_same_inputs(folder, read_json(folder / spectral_manifests.COLOUR), options)
     return True
 
 
-def _write(found: JudgedMosaic, folder: Path, asked: Mapping[str, str | float]) -> None:
+def _write(found: JudgedMosaic, folder: Path, options: Mapping[str, str | float]) -> None:
     """All files of an image, colour.json last."""
     for number, name in enumerate(found.colours.lines.names):
         place, image = folder / name, found.solved.images[number]
@@ -311,7 +311,7 @@ def _write(found: JudgedMosaic, folder: Path, asked: Mapping[str, str | float]) 
     found.colours.write(folder)
     write_page(folder / PAGE, found.colours, found.qualities, found.facts, found.warnings)
     parts = {key: value for key, value in found.summary().items() if key != "channels"}
-    spectral_manifests.write_colours(folder, found.colours.lines, inputs=dict(asked), **parts)
+    spectral_manifests.write_colours(folder, found.colours.lines, inputs=dict(options), **parts)
 
 
 # -------- Measured frames behind colour filters and each line's factors in

@@ -249,9 +249,9 @@ class Judge:
                 rendered = render(bench, "reference", spp, 1e-3, stand.seed, job=stand.job)
                 one, predicted_s = rendered.facts["seconds"], _GROWTH * rendered.facts["seconds"]
                 error = relative_error(rendered.mean.mean(axis=2), answer[0])
-                said = f"one of {len(shots)} frames was measured, {one:.2g} s" if len(shots) > 1 else ""
+                note = f"one of {len(shots)} frames was measured, {one:.2g} s" if len(shots) > 1 else ""
                 spread = Spread.of([one]) * len(shots)
-                yield Row("reference", "spp", f"{spp} spp", spread, error, rendered.mc_error, extrapolated=said)
+                yield Row("reference", "spp", f"{spp} spp", spread, error, rendered.mc_error, extrapolated=note)
 
     def of_reference(self) -> SampledLight:
         """The same light without what the reference lacks; traced anew where that has shaped it."""

@@ -77,7 +77,7 @@ def _claims(results: Results) -> Sequence[Claim]:
     least, most = ratios[0], ratios[-1]
     strong = next((ratio for ratio in ratios if ratio >= 1), most)
 
-    def told(family: str, ratio: float) -> str:
+    def psnr_text(family: str, ratio: float) -> str:
         return f"{in_text(family)} {table.mean('psnr_db', patterns=family, ratio=ratio)} dB"
 
     def spread(family: str) -> str:
@@ -103,14 +103,14 @@ def _claims(results: Results) -> Sequence[Claim]:
         ),
         Claim(
             "Hadamard patterns are better under strong ambient light", "better", "",
-            f"{where}; lamp {strong:g} times: {told('dots:8', strong)}, {told('hadamard:8', strong)}; "
-            f"lamp {most:g} times: {told('dots:8', most)}, {told('hadamard:8', most)}",
+            f"{where}; lamp {strong:g} times: {psnr_text('dots:8', strong)}, {psnr_text('hadamard:8', strong)}; "
+            f"lamp {most:g} times: {psnr_text('dots:8', most)}, {psnr_text('hadamard:8', most)}",
             "confirmed only at some ratios" if better and not beyond else
             verdict(True if better else None if None in holds.values() else False),
         ),
         Claim(
             "Dots are preferred when ambient light is not strong: they take half the frames", "preferred",
-            "", f"lamp {least:g} times: {told('dots:8', least)}, {told('hadamard:8', least)}",
+            "", f"lamp {least:g} times: {psnr_text('dots:8', least)}, {psnr_text('hadamard:8', least)}",
             verdict(within(gains[least], high=0)),
         ),
     ]  # fmt: skip
@@ -120,9 +120,9 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     table = _by_lamp(results.table)
     axis, lines = "lamp's light over the projector's [1]", by_patterns(table)
 
-    def panel(title: str, column: str, said: str) -> Figure:
+    def panel(title: str, column: str, y_axis: str) -> Figure:
         shown = {name: rows.means(column, "ratio") for name, rows in lines.items()}
-        return curves({"": shown}, axis, said, log=True, title=title)
+        return curves({"": shown}, axis, y_axis, log=True, title=title)
 
     drawn = {
         "psnr.png": panel("PSNR by the lamp's light, exposure equal peak", "psnr_db", "PSNR [dB]"),

@@ -89,12 +89,12 @@ def measure(bench: Bench, request: Request, job: Job, recipe: SessionRecipe | No
     plan = session.plan(request.accuracy, job)
     lit = session.lit(session.trace(plan, job), job)
     (noisy, clean), _ = estimates(lit, job, (NOISY, NOISE_FREE))
-    found = judge_session(lit, noisy, clean, tuple(_by_cause(lit, noisy, clean, job)))
+    found = judge_session(lit, noisy, clean, tuple(_by_source(lit, noisy, clean, job)))
     scene = LitScene(bench.light(request.patterns, job, accuracy=request.accuracy, seed=request.seed))
     stand = DriftStand(scene, _factors(lit, noisy), recipe, family, request.seed)
     rows, refused = losses(stand, lit, _factors(lit, clean))
-    told = sum(row.squared_error for row in rows if row.of != UNEXPLAINED)
-    return replace(found, image=_image(stand, told), losses=tuple(rows), not_predicted=tuple(refused))
+    explained = sum(row.squared_error for row in rows if row.of != UNEXPLAINED)
+    return replace(found, image=_image(stand, explained), losses=tuple(rows), not_predicted=tuple(refused))
 
 
 def _factors(lit: LitSession, estimate: Estimate) -> Factors:
@@ -110,7 +110,7 @@ def _factors(lit: LitSession, estimate: Estimate) -> Factors:
     return Factors.of(estimate, manifest)
 
 
-def _image(stand: DriftStand, told: float) -> dict[str, Any]:
+def _image(stand: DriftStand, explained: float) -> dict[str, Any]:
     """PSNR of the image without a drift, that of the squared error which is ``told`` of all sources, and what its
     capture takes."""
     frames = len(stand.family.shots)
@@ -118,7 +118,7 @@ def _image(stand: DriftStand, told: float) -> dict[str, Any]:
     return {
         "patterns": stand.family.name,
         "psnr_db": stand.before_db,
-        "predicted_psnr_db": -decibels(np.sqrt(told)),
+        "predicted_psnr_db": -decibels(np.sqrt(explained)),
         "frames": frames,
         "exposure_seconds": frames * stand.exposure_s,
         "photoelectrons": electrons,
@@ -128,7 +128,7 @@ def _image(stand: DriftStand, told: float) -> dict[str, Any]:
 
 @single_threaded_blas()
 def judge_session(
-    lit: LitSession, noisy: Estimate, clean: Estimate, causes: tuple[CauseRow, ...] = ()
+    lit: LitSession, noisy: Estimate, clean: Estimate, causes: tuple[ErrorSourceRow, ...] = ()
 ) -> CalibrationFindings:
     """Errors of ``noisy`` factors of a session against ``clean`` ones, beside their prediction.
 
@@ -242,7 +242,7 @@ def session_cost(lit: LitSession) -> dict[str, float]:
     }
 
 
-def _by_cause(lit: LitSession, noisy: Estimate, clean: Estimate, job: Job) -> Iterator[CauseRow]:
+def _by_source(lit: LitSession, noisy: Estimate, clean: Estimate, job: Job) -> Iterator[ErrorSourceRow]:
     """Residual of a session's expected frames without each cause, and what noise adds to it."""
     residual = clean.separability_residual
     yield _row("noise", noisy.separability_residual, residual)
@@ -262,9 +262,9 @@ def _residual(session: Session, light: SampledLight, job: Job) -> float:
     return estimate(session.lit(light, job), job, noise_free=True)[0].separability_residual
 
 
-def _row(cause: str, residual: float, left: float) -> CauseRow:
+def _row(cause: str, residual: float, left: float) -> ErrorSourceRow:
     less = residual**2 - left**2
-    return CauseRow(cause, left, float(np.copysign(np.sqrt(abs(less)), less)))
+    return ErrorSourceRow(cause, left, float(np.copysign(np.sqrt(abs(less)), less)))
 
 
 # -------- What a calibration session came to in
@@ -291,7 +291,7 @@ _LOSS_NOTES = (
     "has.",
 )
 """How the table of losses is to be read."""
-_CAUSES = {
+_ERROR_SOURCES = {
     "noise": "noise of the sensor",
     "black-level": "light that black pixels leak",
     "diffraction": "diffraction at the mask",
@@ -336,7 +336,7 @@ class SingularRow:
 
 
 @dataclass(frozen=True)
-class CauseRow:
+class ErrorSourceRow:
     """Separability residual without one cause; ``part`` is the root of what it takes away from the squared residual,
     below 0 where the residual grows without it."""
 
@@ -370,7 +370,7 @@ class CalibrationFindings(Findings):
 
     entries: tuple[EntryRow, ...]
     singular: tuple[SingularRow, ...]
-    causes: tuple[CauseRow, ...]
+    causes: tuple[ErrorSourceRow, ...]
     maps: dict[str, FloatArray]
     residual: tuple[float, float]
     session: dict[str, float]
@@ -540,11 +540,11 @@ class CalibrationFindings(Findings):
         ]
         small = ", ".join(row.name for row in ordered if abs(row.lost_db) < _SAID_DB)
         untold = "".join(f" Not predicted: {text}." for text in self.not_predicted)
-        said = "".join(f" {_judged(row).capitalize()}." for row in rest)
+        others = "".join(f" {_judged(row).capitalize()}." for row in rest)
         return Part(
             "What an image loses",
             f"The image of this scene under {image['patterns']} has a PSNR of {image['psnr_db']:.2f} dB with "
-            f"these factors; all sources together say {image['predicted_psnr_db']:.2f} dB.{said}"
+            f"these factors; all sources together say {image['predicted_psnr_db']:.2f} dB.{others}"
             + ("" if any(row.of == DRIFT for row in self.losses) else _NO_DRIFT)
             + untold,
             ("Where", "Source", "Amount", "PSNR lost [dB]", "Part of the error"),
@@ -587,6 +587,6 @@ def _judged(row: LossRow) -> str:
     return f"{size}: the sources do not make the image's error, and a cause is missing"
 
 
-def _cause(row: CauseRow) -> str:
+def _cause(row: ErrorSourceRow) -> str:
     """The cause of a ``row`` in words."""
-    return _CAUSES.get(row.cause, row.cause.replace("-", " "))
+    return _ERROR_SOURCES.get(row.cause, row.cause.replace("-", " "))

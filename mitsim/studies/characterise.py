@@ -146,25 +146,25 @@ class Characterisation:
         """For people."""
         names = ("set", "expected", "found", "std. error")
         head = f"{'figure':<26}{'symbol':<18}{'unit':<10}" + "".join(f"{name:>12}" for name in names) + f"{'off by':>8}"
-        told = [
+        lines = [
             f"{self.sensor.name}: {self.procedure.pixels} x {self.procedure.pixels} pixels, "
             f"{self.procedure.steps} steps of light"
         ]
-        told += [head]
+        lines += [head]
         for row in self.rows:
             expected = "" if row.expected is None else f"{row.expected:.5g}"
-            told.append(
+            lines.append(
                 f"{row.name:<26}{row.symbol:<18}{row.unit:<10}{row.set:>12.5g}{expected:>12}"
                 f"{round_to_error(row.found, row.standard_error):>12}"
                 f"{round_to_error(row.standard_error, row.standard_error):>12}{row.deviations:>8.1f}"
             )
         if any(row.expected is not None for row in self.rows):
-            told.append(
+            lines.append(
                 "expected: where the procedure finds another figure than the one set, at these steps and frames"
             )
         if self.output:
-            told.append(f"JSON and plots: {self.output}")
-        return told
+            lines.append(f"JSON and plots: {self.output}")
+        return lines
 
     def figures(self) -> Mapping[str, Figure]:
         """Plots by file name."""
@@ -375,8 +375,8 @@ def _deviations(done: Characterisation) -> Figure:
     names = [row.name.replace("_", " ").replace("dsnu", "DSNU").replace("prnu", "PRNU") for row in done.rows]
     axes.set_yticks(place, names, fontsize=FONT - 1)
     far = sum(not abs(row.deviations) <= MOST_OFF for row in done.rows)
-    said = f"{far} of {len(names)} figures are" if far else f"None of {len(names)} figures is"
-    axes.set_title(f"{said} more than {MOST_OFF:g} standard errors off", fontsize=FONT + 1)
+    verdict = f"{far} of {len(names)} figures are" if far else f"None of {len(names)} figures is"
+    axes.set_title(f"{verdict} more than {MOST_OFF:g} standard errors off", fontsize=FONT + 1)
     axes.set_xlim(-1.2 * max(MOST_OFF, float(np.abs(off).max())), 1.2 * max(MOST_OFF, float(np.abs(off).max())))
     label_axes(
         axes, f"found less set or expected [predicted standard errors]; shaded: within {MOST_OFF:g}", "", grid="x"

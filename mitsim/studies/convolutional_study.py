@@ -187,9 +187,9 @@ def _judge(rows: Table, claim: str, paper: str, judge: Judge) -> Claim:
         from a point spread function to what is said of it, and whether the claim holds for it.
     """
     said = {psf: judge(psf) for psf in rows.distinct("psf")}
-    told = {psf: f"{psf} PSF: {text}" for psf, (text, _) in said.items()}
+    texts = {psf: f"{psf} PSF: {text}" for psf, (text, _) in said.items()}
     holds = verdict(every(*(each for _, each in said.values())))
-    return Claim(claim, paper, told.get(MEASURED, ""), told[TRACED], holds)
+    return Claim(claim, paper, texts.get(MEASURED, ""), texts[TRACED], holds)
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:

@@ -295,8 +295,8 @@ def measure_ladder(lines: Sequence[LitLine], light: tuple[FloatArray, float], po
     ]
     for lux in ladder:
         power = lux / kept if kept else None
-        told = {"kept_lx": kept, "repeats": repeats(lux), "power": power}
-        rows.append(point.row(lux=lux, method=LEAST, mean_delta_e=least(lux), **told))
+        needed = {"kept_lx": kept, "repeats": repeats(lux), "power": power}
+        rows.append(point.row(lux=lux, method=LEAST, mean_delta_e=least(lux), **needed))
     return Found(tuple({**row, "goal_delta_e": goal} for row in rows))
 
 
@@ -365,7 +365,7 @@ def tables(rows: Table) -> tuple[PageTable, PageTable]:
     """Mean Delta E by illuminance, and what keeps the goal; ``rows`` of :data:`BY_LUX`."""
     families = [str(patterns) for patterns in rows.distinct("patterns")]
     pairs = list(product(families, METHODS))
-    asked = [lux for lux in rows.distinct("lux") if lux in _ASKED_LX]
+    chosen = [lux for lux in rows.distinct("lux") if lux in _ASKED_LX]
 
     def cell(lux: float, family: str, method: str) -> str:
         mean = rows.mean("mean_delta_e", lux=lux, patterns=family, method=method)
@@ -375,10 +375,10 @@ def tables(rows: Table) -> tuple[PageTable, PageTable]:
         least = rows.where(patterns=family, method=LEAST)
         by_lux = rows.where(patterns=family, method=MARKOV).means("mean_delta_e", "lux")
         kept = kept_lx(by_lux, least.mean("goal_delta_e").value), least.mean("kept_lx").value
-        told = [(least.numbers("repeats", lux=lux), least.numbers("power", lux=lux)) for lux in asked]
+        needed = [(least.numbers("repeats", lux=lux), least.numbers("power", lux=lux)) for lux in chosen]
         return (
             label(family), *map(_digits, kept),
-            *(f"{count[0]:g}; {_digits(max(power[0], 1))}" if count and power else "never" for count, power in told),
+            *(f"{count[0]:g}; {_digits(max(power[0], 1))}" if count and power else "never" for count, power in needed),
         )  # fmt: skip
 
     count = len(rows.where(method=MARKOV).distinct("draw"))
@@ -394,7 +394,7 @@ def tables(rows: Table) -> tuple[PageTable, PageTable]:
             "more light repeats of all exposures, or times the laser power (the same as a filter that lets through "
             "one over that part of D65), by the least noise without bias",
             ("Patterns", f"Most [lx], {MARKOV}", f"Most [lx], {LEAST}",
-             *(f"{lux:g} lx: repeats; power" for lux in asked)),
+             *(f"{lux:g} lx: repeats; power" for lux in chosen)),
             tuple(map(needs, families)),
         ),
     )  # fmt: skip

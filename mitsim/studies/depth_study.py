@@ -122,14 +122,14 @@ def _claims(results: Results) -> Sequence[Claim]:
     rendered = lost(table.where(model=RENDERED, patterns="dots:7", focus=NONE))
     holds = {baseline: within(loss, high=_ROBUST_DB) for baseline, loss in losses.items()}
     robust = [baseline for baseline, each in holds.items() if each]
-    told = ", ".join(f"{loss} dB at {baseline:g} mm" for baseline, loss in losses.items())
+    by_baseline = ", ".join(f"{loss} dB at {baseline:g} mm" for baseline, loss in losses.items())
     everywhere = every(within(rendered, high=_ROBUST_DB), *holds.values())
     apart = f"at most {max(robust):g} mm apart" if any(robust) else "co-located"
     only = f"confirmed only if camera and projector are {apart}"
     claims = [
         Claim(
             f"Robust to small variations in depth: 49 dots, {small:g} mm beside the calibrated distance", "robust",
-            f"lost by baseline: {told}", f"lost at 60 mm: {rendered} dB",
+            f"lost by baseline: {by_baseline}", f"lost at 60 mm: {rendered} dB",
             only if everywhere is False and robust else verdict(everywhere),
         )
     ]  # fmt: skip

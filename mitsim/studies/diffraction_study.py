@@ -135,10 +135,10 @@ class DiffractionFindings(Findings):
         """What idealised frames of the separable mask in the projector's light say, in one clause."""
         case = "idealised", MASKS[0], PROJECTOR, self.patterns
         wrong, right = (self.loss_db(self.row(*case, factors)) for factors in (ASSUMED, SEPARABLE))
-        told = "lose" if right > 0 else "gain"
+        verb = "lose" if right > 0 else "gain"
         return (
             f"Under {self.patterns}, against a mask that does not diffract: geometric factors lose {wrong:.1f} dB, "
-            f"factors of the true shadow {told} {abs(right):.1f} dB"
+            f"factors of the true shadow {verb} {abs(right):.1f} dB"
         )
 
     def figures(self) -> dict[str, Figure]:

@@ -52,7 +52,7 @@ _HERMITE = ((-(3**0.5), 1 / 6), (0.0, 2 / 3), (3**0.5, 1 / 6))
 
 
 @dataclass(frozen=True)
-class Foretold:
+class Prediction:
     """What a drift is predicted to cost.
 
     Attributes
@@ -84,7 +84,7 @@ class Foretold:
 
 
 @dataclass(frozen=True)
-class Outcome(Foretold):
+class Outcome(Prediction):
     """Images with and without a drift.
 
     Attributes
@@ -142,11 +142,13 @@ class DriftStand:
             the scene in light of the projector that moved; None: its light as it was.
         """
         after, auto = self.measured(drift, session, lit)
-        return Outcome(**vars(self.foretold(drift)), after_db=after, auto_db=auto)
+        return Outcome(**vars(self.predict(drift)), after_db=after, auto_db=auto)
 
-    def foretold(self, drift: Drift) -> Foretold:
+    def predict(self, drift: Drift) -> Prediction:
         """What a ``drift`` is predicted to do; MitsimError for one that the bench cannot have."""
-        return Foretold(self.before_db, *(self.told(each).psnr_db(self.lit.truth) for each in (Drift(), drift)))
+        return Prediction(
+            self.before_db, *(self.expected_image(each).psnr_db(self.lit.truth) for each in (Drift(), drift))
+        )
 
     @property
     def before_db(self) -> float:
@@ -233,8 +235,8 @@ class DriftStand:
 
     # ---- the prediction ----------------------------------------------------------------------------------------------
 
-    def told(self, drift: Drift) -> Expected:
-        """What the image is expected to be after a ``drift``, as the model has it; MitsimError as :meth:`foretold`."""
+    def expected_image(self, drift: Drift) -> Expected:
+        """What the image is expected to be after a ``drift``, as the model has it; MitsimError as :meth:`predict`."""
         image, changed = self.linear, self._changed(drift)
         if drift.session_ramp or drift.session_flicker:
             left, right = self.session_mixes(drift)

@@ -31,14 +31,14 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.report.lit_scene import SPECKLE
 from mitsim.studies import ablation
 from mitsim.studies.ablation import Ablation
-from mitsim.studies.drift_loss import AMBIENT, SESSION, DriftStand, Foretold, squared_error
+from mitsim.studies.drift_loss import AMBIENT, SESSION, DriftStand, Prediction, squared_error
 from mitsim.studies.perturbation import Noise, Scatter
 
 CAPTURE, SCENE, DRIFT, SOLVER, UNEXPLAINED = "capture", "scene", "drift", "solver", "unexplained"
 """Where a loss comes from, beside the session."""
 RENDERING, LAMBDA, REST = "rendering", "lambda and resolution", "all else"
 """Sampling of simulated light; what the solver takes away of the scene itself; and what no named cause has."""
-CAUSES = MappingProxyType(
+ERROR_SOURCES = MappingProxyType(
     {
         ablation.DETAIL: "detail inside projector pixels",
         ablation.DEPTH: "depth beside the board's",
@@ -120,13 +120,15 @@ def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> tuple[list[Los
         the session that its factors are of, and its factors without noise.
     """
     budget = _budget(stand, lit, clear)
-    measured, told = squared_error(stand.before_db), sum(part.square for part in budget.parts.values())
+    measured, explained = squared_error(stand.before_db), sum(part.square for part in budget.parts.values())
     found = [
-        LossRow(of, source, "", *gain_without(part.square, measured, told, part.deviation), part.square, part.deviation)
+        LossRow(
+            of, source, "", *gain_without(part.square, measured, explained, part.deviation), part.square, part.deviation
+        )
         for (of, source), part in budget.parts.items()
     ]
     pixels = budget.steady.size
-    found.append(_unexplained_row(measured, told, budget.scatter.deviation(budget.drawn, budget.steady) / pixels))
+    found.append(_unexplained_row(measured, explained, budget.scatter.deviation(budget.drawn, budget.steady) / pixels))
     rows, refused = _drifts(stand, budget, measured)
     return found + rows, refused
 
@@ -138,17 +140,17 @@ def _drifts(stand: DriftStand, budget: _Budget, measured: float) -> tuple[list[L
     it. But the model's drift does not move what the model leaves out of the scene's light, as the true one does: the
     uncertainty is all of what these have in common, and chance.
     """
-    still, found, refused = stand.told(Drift()), list[LossRow](), list[str]()
+    still, found, refused = stand.expected_image(Drift()), list[LossRow](), list[str]()
     target, scene, pixels = still.image - budget.steady, stand.lit.truth, budget.steady.size
     for kind in stand.recipe.drift.kinds:
         drift = stand.recipe.drift.alone(kind)
         try:
-            moved = stand.told(drift)
+            moved = stand.expected_image(drift)
         except MitsimError as error:
             refused.append(f"{kind}: {error}")
             continue
         lost, apart = (
-            Foretold(stand.before_db, still.psnr_db(truth), moved.psnr_db(truth)).predicted_lost_db
+            Prediction(stand.before_db, still.psnr_db(truth), moved.psnr_db(truth)).predicted_lost_db
             for truth in (target, scene)
         )
         # Noise that happens to look like what the drift does, and the draw of what drifts at random.
@@ -160,9 +162,9 @@ def _drifts(stand: DriftStand, budget: _Budget, measured: float) -> tuple[list[L
     return found, refused
 
 
-def _unexplained_row(measured: float, told: float, chance: float) -> LossRow:
+def _unexplained_row(measured: float, explained: float, chance: float) -> LossRow:
     """Squared error that is ``measured`` and not ``told``, which ``chance`` moves by so much."""
-    left = measured - told
+    left = measured - explained
     lost = _decibels(left / measured)
     error = abs(_decibels((left + chance) / measured) - lost)
     return LossRow(UNEXPLAINED, "not explained", "", lost, error, left, chance)
@@ -195,7 +197,7 @@ def _clear_images(stand: DriftStand, clear: Factors) -> Iterator[tuple[str, Floa
     """Images without noise of the scene's light, and of it without one cause after another."""
     scene_ablation, off = Ablation.of(stand.lit.light), frozenset[str]()
     yield "", stand.clear(clear, stand.lit.light)
-    for name in CAUSES:
+    for name in ERROR_SOURCES:
         if name in scene_ablation.effects:
             off |= {name}
             yield name, stand.clear(clear, scene_ablation.without(off))
@@ -213,11 +215,11 @@ def _of_scene(scatter: Scatter, seen: Mapping[str, FloatArray], sampled: Noise) 
     sampled
         noise of the light's rendering, which all of these have alike.
     """
-    exact, scene, found = scatter.solver, scatter.scene, {(SCENE, CAUSES[ablation.DETAIL]): _Part(0.0)}
+    exact, scene, found = scatter.solver, scatter.scene, {(SCENE, ERROR_SOURCES[ablation.DETAIL]): _Part(0.0)}
     (_, last), *others = seen.items()
     for name, image in others:
         moved = scatter.common(sampled, last - image) / scene.size
-        found[SCENE, CAUSES[name]] = _Part(_square(last - scene) - _square(image - scene), moved)
+        found[SCENE, ERROR_SOURCES[name]] = _Part(_square(last - scene) - _square(image - scene), moved)
         last = image
     bias = _square(exact.expected(scene).image - scene)
     rest = _square(last - scene) - bias - exact.variance(scene, sampled) / scene.size
@@ -230,25 +232,25 @@ def _square(error: FloatArray) -> float:
     return float(np.square(error).mean())
 
 
-def gain_without(part: float, measured: float, told: float, deviation: float = 0.0) -> tuple[float, float]:
+def gain_without(part: float, measured: float, explained: float, deviation: float = 0.0) -> tuple[float, float]:
     """Decibels that an image would gain without a source, and how sure that is.
 
     Parameters
     ----------
     part
         squared error that the source is predicted to have.
-    measured, told
+    measured, explained
         squared error of the image as it is, and as all sources together are predicted to make it.
     deviation
         by which chance moves the source's part.
     """
-    most = max(measured, told)
+    most = max(measured, explained)
     lost = _decibels(part / most)
     chance = abs(_decibels((part + deviation) / most) - lost)
-    if measured >= told:
-        return lost, math.hypot(chance, _decibels(part / told if told else 0.0) - lost)
+    if measured >= explained:
+        return lost, math.hypot(chance, _decibels(part / explained if explained else 0.0) - lost)
     # More is predicted than there is: at most, all of what is too much is this source's.
-    return lost, math.hypot(chance, _decibels(max(part - (told - measured), 0.0) / measured) - lost)
+    return lost, math.hypot(chance, _decibels(max(part - (explained - measured), 0.0) / measured) - lost)
 
 
 def _decibels(part: float) -> float:

@@ -86,7 +86,7 @@ def _measure(studio: Studio, point: Point) -> Found:
         "as built", 1, point.setup, lambda: LitScene(studio.lit(point.setup).light.behind(as_built(bench)))
     )
     foreseen = _session(studio, point.setup, recipe)
-    told: dict[str, Any] = {}
+    reported: dict[str, Any] = {}
     if point["factors"] == MEASURED:
         factors = foreseen.factors(recipe, seed)
         frames = foreseen.by(recipe).session.shots
@@ -95,11 +95,11 @@ def _measure(studio: Studio, point: Point) -> Found:
         factors = _model_factors(bench, replace(session, session=replace(session.session, seed=seed)), point)
         frames = int(factors.manifest.result["frames"])
         numbers = factors.manifest.result["parameters"]
-        told = {name: numbers[name]["value"] for name in ("mask_distance", "mask_shift_row", "mask_shift_column")}
-        told["unexplained"] = factors.manifest.result["unexplained_residual"]
+        reported = {name: numbers[name]["value"] for name in ("mask_distance", "mask_shift_row", "mask_shift_column")}
+        reported["unexplained"] = factors.manifest.result["unexplained_residual"]
     exposed = lit.rendered(factors, lit.bench.family(PATTERNS), seed)
     image = Image.of(exposed, exposed.seconds(EQUAL_PEAK))
-    return finding(point, None, **image.row(), frames=frames, **told)
+    return finding(point, None, **image.row(), frames=frames, **reported)
 
 
 def _session(studio: Studio, setup: Setup, recipe: SessionRecipe) -> Foreseen:
@@ -126,7 +126,7 @@ def _model_factors(bench: Bench, lit: LitSession, point: Point) -> Factors:
 
 
 def _claims(results: Results) -> Sequence[Claim]:
-    told = []
+    reported = []
     for fraction in results.table.distinct("exposure_fraction"):
         rows = results.table.where(exposure_fraction=fraction)
         measured = rows.where(factors=MEASURED)
@@ -141,7 +141,7 @@ def _claims(results: Results) -> Sequence[Claim]:
             suffices = {frames: within(gain, low=-_SUFFICES_DB) for frames, gain in gains.items()}
             few = next((frames for frames, holds in suffices.items() if holds), max(gains))
             holds = True if suffices[few] else None if None in suffices.values() else False
-            told.append(
+            reported.append(
                 Claim(
                     f"A few frames suffice for the {model} model, brightest pixel at {fraction:g} of the full well",
                     "",
@@ -151,7 +151,7 @@ def _claims(results: Results) -> Sequence[Claim]:
                     verdict(holds),
                 )
             )
-    return told
+    return reported
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:

@@ -264,11 +264,11 @@ def _consistent(factors: Places, bench: Apparatus, white: Callable[[float, float
     """
     first, found = next(iter(factors)), {}
     for place, (left, right) in factors.items():
-        told = np.outer(left.sum(axis=1), factors[first][1].sum(axis=1))
-        seen = Exposer(bench.rig, 1.0, 0).electrons(white(place, first))
+        modelled = np.outer(left.sum(axis=1), factors[first][1].sum(axis=1))
+        measured = Exposer(bench.rig, 1.0, 0).electrons(white(place, first))
         if bench.geometry.centred:
-            told, seen = centred(told), centred(seen)
-        share = float(np.vdot(told, seen) / np.vdot(seen, seen))
+            modelled, measured = centred(modelled), centred(measured)
+        share = float(np.vdot(modelled, measured) / np.vdot(measured, measured))
         found[place] = left / share, right * share
     return found
 

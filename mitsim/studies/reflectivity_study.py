@@ -46,7 +46,7 @@ from mitsim.studies.framework.studio import Studio
 
 # -------- Light of a glossy scene and of its matt twin in
 
-PIXELS, SENSOR, INTERREFLECTION, SATURATION, REST = CAUSES = (
+PIXELS, SENSOR, INTERREFLECTION, SATURATION, REST = ERROR_SOURCES = (
     "pixels", "sensor", "interreflection", "saturation", "rest",
 )  # fmt: skip
 _DARK = 1e-3
@@ -62,7 +62,7 @@ class Split:
     solution
         with the image (n, n).
     parts
-        (n, n) by :data:`CAUSES`; image and the twin's reflectance are their sum apart.
+        (n, n) by :data:`ERROR_SOURCES`; image and the twin's reflectance are their sum apart.
     """
 
     solution: Solution
@@ -241,14 +241,14 @@ def _claims(results: Results) -> Sequence[Claim]:
     if not {CARD, DISC} <= set(there):
         return []
     found = {exposure: {name: table.where(subject=name, exposure=exposure) for name in there} for exposure in EXPOSURES}
-    told = [
+    texts = [
         f"{exposure}: {', '.join(f'{name} {_artefacts(rows)} dB' for name, rows in by_name.items())}".replace("_", " ")
         for exposure, by_name in found.items()
     ]
 
     def claim(text: str, paper: str, holds: Callable[[Mapping[str, Table]], Holds]) -> Claim:
         decided = verdict_at({exposure: holds(by_name) for exposure, by_name in found.items()})
-        return Claim(f"{text} (artefacts of gloss, 49 dots)", paper, "", "; ".join(told), decided)
+        return Claim(f"{text} (artefacts of gloss, 49 dots)", paper, "", "; ".join(texts), decided)
 
     def well(by_name: Mapping[str, Table]) -> Holds:
         return every(*(within(_artefacts(rows), low=_PLAIN_DB) for name, rows in by_name.items() if name != DISC))
@@ -289,7 +289,7 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     shown = [(*_truths(results, row), *_images(results, row, results.table)) for row in rows]
     titles = [*_TRUTHS, *(f"{label(name)}\n{exposure}" for exposure in EXPOSURES for name in FAMILIES)]
     drawn["images_shipped.png"] = image_grid(dict(zip(names, shown, strict=True)), titles, "Truths and images")
-    causes = [[_captioned(results, row, cause, f"{cause}_db") for cause in CAUSES] for row in rows]
+    causes = [[_captioned(results, row, cause, f"{cause}_db") for cause in ERROR_SOURCES] for row in rows]
     title = f"Errors against matt paint by cause, {label(_DRAWN[0])}, {_DRAWN[1]}: grey is no error"
     drawn["causes_shipped.png"] = image_grid(dict(zip(names, causes, strict=True)), list(_NAMES.values()), title)
     return drawn
@@ -317,7 +317,7 @@ def _captioned(results: Results, row: Mapping[str, Value], name: str, column: st
     image, level = results.array(row, name), row.get(column)
     if image is None:
         raise MitsimError(f"study reflectivity: no {name} was kept of {row['subject']}; measure it again")
-    return image + (_GREY if name in CAUSES else 0.0), "" if level is None else f"{level:.1f} dB"
+    return image + (_GREY if name in ERROR_SOURCES else 0.0), "" if level is None else f"{level:.1f} dB"
 
 
 EXPERIMENT = Experiment(

@@ -98,13 +98,13 @@ def _claims(results: Results) -> Sequence[Claim]:
         limits = {name: _limit(of_family) for name, of_family in claims.by_patterns(rows).items()}
         fine = claims.by_patterns(rows.where(pairs_a_mm=_FINEST))
         kept = {name: claims.sample_mean(of_family, "contrast").value for name, of_family in fine.items()}
-        said = ", ".join(f"{name[:1].lower()}{name[1:]} {limits[name]:g} ({kept[name]:.2f})" for name in limits)
+        text = ", ".join(f"{name[:1].lower()}{name[1:]} {limits[name]:g} ({kept[name]:.2f})" for name in limits)
         gains = [
             claims.within(claims.difference(more, fewer, "contrast"), low=0) for fewer, more in pairwise(fine.values())
         ]
         families = list(fine.values())
         gain = claims.within(claims.difference(families[-1], families[0], "contrast"), low=0)
-        return said, False if False in gains else gain
+        return text, False if False in gains else gain
 
     def apart(rows: Table) -> tuple[str, Holds]:
         dots = rows.where(patterns="dots:7")

@@ -73,10 +73,10 @@ def _measure(studio: Studio, point: Point) -> Found:
     rows, arrays = [], {"direct, true": lit.truth, "global, true": known}
     for depth in DEPTHS:
         own = direct if depth == AS_IT_IS else [_modelled(frames, shot) for shot in frames.family.shots]
-        images, told = _images(frames, own, bounced, (left, right))
+        images, reported = _images(frames, own, bounced, (left, right))
         levels = {f"{name}_db": psnr(image, known if name == GLOBAL else lit.truth) for name, image in images.items()}
         gain = levels[f"{SEPARATED}_db"] - levels[f"{ALL}_db"]
-        rows.append(point.row(depth=depth, gain_db=gain, told=told, **levels))
+        rows.append(point.row(depth=depth, gain_db=gain, told=reported, **levels))
         arrays |= {f"{depth} {name}": image for name, image in images.items()}
     return Found(tuple(rows), single_precision(arrays))
 
@@ -155,10 +155,10 @@ def _claims(results: Results) -> Sequence[Claim]:
             name: sample_mean(rows.where(subject=name, patterns="dots:7"), "gain_db")
             for name in table.distinct("subject")
         }
-        told = ", ".join(f"{name.replace('_', ' ')} {gain} dB" for name, gain in gains.items())
+        reported = ", ".join(f"{name.replace('_', ' ')} {gain} dB" for name, gain in gains.items())
         gained = every(*(within(gain, low=0) for gain in gains.values()))
         text = f"49 dots tell global light apart in scenes {_DEPTHS[depth]}, and the image gains (Nayar et al. 2006)"
-        return Claim(text, "", "", told, verdict(gained))
+        return Claim(text, "", "", reported, verdict(gained))
 
     return [claim(depth) for depth in table.distinct("depth")]
 

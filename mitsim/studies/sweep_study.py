@@ -82,9 +82,9 @@ def _tables(results: Results) -> Sequence[PageTable]:
     for values in product(*(table.distinct(name) for name in knobs)):
         chosen = table.where(**dict(zip(knobs, values, strict=True)))
         if chosen.rows:
-            told = [_mean_text(chosen, MEASURES[name][0]) for name in results.measures]
+            means = [_mean_text(chosen, MEASURES[name][0]) for name in results.measures]
             count = sum(bool(row.get("flagged")) for row in chosen.rows)
-            rows.append((", ".join(map(str, values)) or DASH, *told, f"{count} of {len(chosen)}"))
+            rows.append((", ".join(map(str, values)) or DASH, *means, f"{count} of {len(chosen)}"))
     heads = ", ".join(knobs), *(name.replace("_", "-") for name in results.measures), "flagged"
     return [PageTable("Measures by setting, PSNR in dB", heads, tuple(rows))]
 

@@ -196,8 +196,8 @@ class Levels:
         bench = replace(light.bench, rig=replace(light.bench.rig, sensor=sensor))
         request = light.plan.request
         assert request is not None
-        asked = request.changed(patterns=self._patterns, seed=self._seed, exposure_fraction=fraction)
-        shots = capture(bench, asked, light=self._ablation.without(off))
+        options = request.changed(patterns=self._patterns, seed=self._seed, exposure_fraction=fraction)
+        shots = capture(bench, options, light=self._ablation.without(off))
         calibrated = self._sessions.factors(off, CALIBRATION_NOISE not in off)
         found = {}
         for model, factors in zip(MODELS, (self._assumed, calibrated), strict=True):
@@ -427,10 +427,10 @@ def waterfall(panels: Mapping[str, Fall], seen: float) -> Figure:
         label_axes(axes, "PSNR [dB]" if axes is places[-1] else "", "", grid="x")
     small = ", ".join(name for name in names if 0 < change[name] < seen)
     none = ", ".join(name for name in names if change[name] == 0)
-    said = ["Changes of PSNR [dB] by each effect: bars in order, beside them alone and on the whole without it."]
-    said += [f"Less than {seen:g} dB each, in the bar called others: {small}."] if small else []
-    said += [f"Nothing at all, as the scene does not call for them: {none}."] if none else []
-    lines = [line for sentence in said for line in wrap(sentence, _LETTERS)]
+    sentences = ["Changes of PSNR [dB] by each effect: bars in order, beside them alone and on the whole without it."]
+    sentences += [f"Less than {seen:g} dB each, in the bar called others: {small}."] if small else []
+    sentences += [f"Nothing at all, as the scene does not call for them: {none}."] if none else []
+    lines = [line for sentence in sentences for line in wrap(sentence, _LETTERS)]
     figure.supxlabel("\n".join(lines), fontsize=FONT - 2, color=GREY, x=0.01, ha="left")
     return figure
 

@@ -89,9 +89,9 @@ class CampaignResult:
                 "Join all parts with: mitsim study merge PART... -o FOLDER",
             ]
         heads = self.section.heads if self.section else HEADS
-        said = [f"{claim.verdict}: {claim.claim} ({claim.told(heads)})" for claim in self.claims]
-        said += self.section.warnings if self.section else ()
-        return [*said, f"{self.points} points in {self.seconds:.0f} s; table, figures and page: {self.output}"]
+        lines = [f"{claim.verdict}: {claim.claim} ({claim.figures_text(heads)})" for claim in self.claims]
+        lines += self.section.warnings if self.section else ()
+        return [*lines, f"{self.points} points in {self.seconds:.0f} s; table, figures and page: {self.output}"]
 
 
 def run_experiment(
@@ -279,9 +279,9 @@ def _known_study(study: Any, part: Path | str, experiment: str | None) -> str:
     """The name of a ``study`` as the file of a ``part`` has it, where it ships or was named as ``experiment`` too."""
     known = (*PAPER, *EXPERIMENTS, ALL) if experiment is None else (experiment, ALL)
     if not isinstance(study, str) or study not in known:
-        asked = "none that ships" if experiment is None else f"not {experiment}"
+        instead = "none that ships" if experiment is None else f"not {experiment}"
         raise MitsimError(
-            f"study merge: {part} is of the study {cut(str(study))!r}, {asked}; a study of your own is merged by its "
+            f"study merge: {part} is of the study {cut(str(study))!r}, {instead}; a study of your own is merged by its "
             "name, --experiment MODULE"
         )
     return study

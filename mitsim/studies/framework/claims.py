@@ -319,7 +319,7 @@ def gain_claim(
     claim: str,
     paper: str,
     pair: tuple[Mapping[str, Value], Mapping[str, Value]],
-    said: str = "{gain:+} dB",
+    text: str = "{gain:+} dB",
     between: tuple[float, float] = (0.0, math.inf),
     column: str = "psnr_db",
 ) -> Claim:
@@ -333,7 +333,7 @@ def gain_claim(
         what is claimed, and what the paper says.
     pair
         values of columns that choose the rows of the ones, and of the others.
-    said
+    text
         what is said of them: ``one`` and ``other`` are their means, ``gain`` that of the paired differences.
     between, column
         range of the gain that the claim holds in, and what it is a gain of.
@@ -342,8 +342,8 @@ def gain_claim(
     def judge(rows: Table) -> tuple[str, Holds]:
         one, other = (rows.where(**chosen) for chosen in pair)
         gain = difference(one, other, column)
-        text = said.format(gain=gain, one=sample_mean(one, column), other=sample_mean(other, column))
-        return text, within(gain, *between)
+        figures = text.format(gain=gain, one=sample_mean(one, column), other=sample_mean(other, column))
+        return figures, within(gain, *between)
 
     return judge_claim(table, claim, paper, judge)
 

@@ -57,7 +57,7 @@ class Claim:
     rendered: str
     verdict: str
 
-    def told(self, heads: tuple[str, str, str]) -> str:
+    def figures_text(self, heads: tuple[str, str, str]) -> str:
         """All of its figures on a line, each by its own of the ``heads``."""
         figures = zip((self.paper, self.idealised, self.rendered), heads, strict=True)
         return ", ".join(f"{head.lower()} {figure}" for figure, head in figures if figure)

@@ -64,8 +64,8 @@ class Section:
         setup = scope.setup
         command = ["mitsim study", study, *([] if any(scope.pictures) else [setup.scene]), *_options(scope)]
         accuracies = sorted({point.setup.accuracy for point in experiment.points(scope)} if experiment.traced else ())
-        asked = " or ".join(f"{each:g}" for each in accuracies)
-        good = f"; frames before noise asked to be good to {asked} (relative rms)" if accuracies else ""
+        named = " or ".join(f"{each:g}" for each in accuracies)
+        good = f"; frames before noise asked to be good to {named} (relative rms)" if accuracies else ""
         return cls(
             name=experiment.name,
             title=experiment.title.replace(KNOBS, " and ".join(name for name, _ in scope.sweep)),
@@ -115,10 +115,10 @@ def flag_warnings(name: str, results: Results) -> tuple[str, ...]:
     if not found:
         return ()
     reasons = Counter(reason for each in found for reason in each.split("; ") if reason)
-    told = "; ".join(f"{count} \N{MULTIPLICATION SIGN} {reason}" for reason, count in reasons.most_common())
+    counts = "; ".join(f"{count} \N{MULTIPLICATION SIGN} {reason}" for reason, count in reasons.most_common())
     return (
         f"{len(found)} of {len(rows)} images are flagged by the solver, their calibration or their capture, and "
-        f"count all the same (column flagged of {name}.csv){': ' if told else ''}{told}.",
+        f"count all the same (column flagged of {name}.csv){': ' if counts else ''}{counts}.",
     )
 
 

@@ -195,11 +195,11 @@ class Studio:
         seconds = "auto" if exposure == EQUAL_PEAK else frames.seconds(exposure)
         shots = expose(frames.lit.light, patterns, seed=seed, exposure=seconds)
         found = reconstruct(shots, self.factors(setup, seed), focus=focus)
-        misfit, told = found.misfit, found.uncertainty
+        misfit, uncertainty = found.misfit, found.uncertainty
         trust = {
             "misfit": misfit.unexplained if misfit else None,
             "chi_square": misfit.chi_square if misfit else None,
-            "uncertainty": None if told is None else float(np.sqrt(np.square(told).mean())),
+            "uncertainty": None if uncertainty is None else float(np.sqrt(np.square(uncertainty).mean())),
         }
         count, quality = len(frames.family.shots), frames.lit.quality(found.image)
         reason = reason_of(found.status, misfit)

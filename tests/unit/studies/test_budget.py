@@ -16,7 +16,7 @@ from mitsim.devices.patterns import parse_patterns, stripe_signs
 from mitsim.report.lit_scene import SPECKLE
 from mitsim.studies import ablation, error_budget
 from mitsim.studies.drift_loss import AMBIENT, SESSION
-from mitsim.studies.error_budget import CAUSES, LAMBDA, RENDERING, REST, LossRow
+from mitsim.studies.error_budget import ERROR_SOURCES, LAMBDA, RENDERING, REST, LossRow
 from mitsim.studies.perturbation import Expected, LinearImage, Noise
 
 N = 4
@@ -101,8 +101,8 @@ def test_a_row_is_named_by_where_it_comes_from(row: LossRow, name: str) -> None:
 
 
 def test_causes_are_taken_out_one_after_another(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the order of CAUSES, each beside those before it; what the white board's light has as well stays. (Planted:
-    each alone.)"""
+    """In the order of ERROR_SOURCES, each beside those before it; what the white board's light has as well stays.
+    (Planted: each alone.)"""
     effects = ("falloff", ablation.GLOSS, ablation.DETAIL, ablation.DEPTH)
     scene_ablation = SimpleNamespace(effects=effects, without=lambda off: sorted(off))
     monkeypatch.setattr(error_budget.Ablation, "of", lambda light: scene_ablation)
@@ -130,10 +130,10 @@ def test_a_cause_has_what_the_image_gains_without_it() -> None:
         scatter, dict(zip(("", ablation.DEPTH, ablation.GLOSS), images, strict=True)), sampled
     )
     squares, whole = [mean_square(image - SCENE) for image in images], float(np.abs(STEADY).sum()) / SCENE.size
-    depth, gloss = (found["scene", CAUSES[name]] for name in (ablation.DEPTH, ablation.GLOSS))
+    depth, gloss = (found["scene", ERROR_SOURCES[name]] for name in (ablation.DEPTH, ablation.GLOSS))
     assert (depth.square, depth.deviation) == pytest.approx((squares[0] - squares[1], 2 * whole))
     assert (gloss.square, gloss.deviation) == pytest.approx((squares[1] - squares[2], 2 * 1.5 * whole))
-    assert found["scene", CAUSES[ablation.DETAIL]] == error_budget._Part(0.0)
+    assert found["scene", ERROR_SOURCES[ablation.DETAIL]] == error_budget._Part(0.0)
     bias, rest = found["solver", LAMBDA], found["scene", REST]
     assert (bias.square, bias.deviation) == (pytest.approx(mean_square(0.1 * SCENE)), 0.0)
     assert rest.square == pytest.approx(squares[2] - bias.square - 2e-3 / SCENE.size)
@@ -152,7 +152,7 @@ def test_parts_of_an_image_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     }
     asked: list[Any] = []
     monkeypatch.setattr(error_budget, "_noises", lambda *given: asked.append(given) or noises)
-    monkeypatch.setattr(error_budget, "_seen", lambda *given: asked.append(given) or {"": SCENE + STEADY}.items())
+    monkeypatch.setattr(error_budget, "_clear_images", lambda *given: asked.append(given) or {"": SCENE + STEADY}.items())
     monkeypatch.setattr(error_budget, "_of_scene", lambda scatter, seen, sampled: {("scene", "light"): (seen, sampled)})
     left, right = RNG.standard_normal((6, N)) + 0.3, RNG.standard_normal((7, N)) + 0.3
     fixed = {"response": RNG.standard_normal((N, N)), "offsets": RNG.standard_normal((N, N))}
@@ -188,7 +188,7 @@ def test_a_drift_costs_what_it_adds_to_the_error_that_is_there() -> None:
     moved, noise = STEADY + 0.2, 0.3
     images = {"mask_rows_um": SCENE + moved, "power": SCENE + STEADY}
 
-    def told(drift: Drift) -> Expected:
+    def expected_image(drift: Drift) -> Expected:
         if not drift.kinds:
             return Expected(SCENE + 2 * STEADY, 0.1)
         if drift.kinds == ("exposure",):
@@ -197,7 +197,7 @@ def test_a_drift_costs_what_it_adds_to_the_error_that_is_there() -> None:
 
     measured = 0.05
     stand: Any = SimpleNamespace(
-        told=told,
+        expected_image=expected_image,
         lit=SimpleNamespace(truth=SCENE),
         recipe=SimpleNamespace(drift=Drift(mask_rows_um=0.4, exposure=0.2, power=0.1)),
         before_db=-10 * math.log10(measured),
