@@ -44,7 +44,7 @@ ALONG = {"columns": (0.0, -1.0), "rows": (-1.0, 0.0), "both": (-(0.5**0.5), -(0.
 """Unit vectors of the baseline; the shipped rig's is along the columns."""
 DEEP = {"cards": ("dots:7", "dots:7x14"), "cookie_bag": ("dots:7", "dots:7x16")}
 """Scenes of many depths, and patterns whose period is too short for them, and long enough."""
-NONE, AUTO, MAP, OWN = FOCUS = ("none", "auto", "map", "own calibration")
+NONE, AUTO, MAP, OWN = ("none", "auto", "map", "own calibration")
 _FOCUSED = {
     NONE: "factors as calibrated at 400 mm", AUTO: "depth found (--focus auto)", OWN: "calibrated at its own depth"
 }  # fmt: skip

@@ -147,7 +147,7 @@ def _image(
 
 # -------- Gloss
 
-CARD, BLADE, DISC = SHIPPED = ("gift_card", "metal_blade", "compact_disc")
+CARD, _, DISC = SHIPPED = ("gift_card", "metal_blade", "compact_disc")
 SHAPES = {"plate": {"shape": "rectangle", "z": "400"}, "ball": {"shape": "sphere", "z": "440"}}
 """Of the scene `highlight`."""
 ROUGHNESSES = (1.0, 0.3, 0.1, 0.03, 0.003, 0.001)
