@@ -88,7 +88,7 @@ class CampaignResult:
                 f"{self.points} points measured, {self.missing} of other parts are missing: {self.output}",
                 "Join all parts with: mitsim study merge PART... -o FOLDER",
             ]
-        heads = self.section.heads if self.section else HEADS
+        heads = self.section.experiment.heads if self.section else HEADS
         lines = [f"{claim.verdict}: {claim.claim} ({claim.figures_text(heads)})" for claim in self.claims]
         lines += self.section.warnings if self.section else ()
         return [*lines, f"{self.points} points in {self.seconds:.0f} s; table, figures and page: {self.output}"]

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from mitsim.core.environment import versions
 from mitsim.report.html import page_figure, render_page, write_html
-from mitsim.studies.framework.experiment import HEADS, KNOBS, Claim, Experiment, PageTable, Results, Scope
+from mitsim.studies.framework.experiment import KNOBS, Claim, Experiment, PageTable, Results, Scope
 from mitsim.studies.framework.setup import TEST_IMAGES, Setup
 
 _NUMBER = re.compile(r"[+-]?\d|nothing$")
@@ -21,24 +21,19 @@ _NUMBER = re.compile(r"[+-]?\d|nothing$")
 
 @dataclass(frozen=True)
 class Section:
-    """One study on a page; ``pictures`` are figures by file name: what holds each, and its width [pixels]; ``about``,
-    ``heads`` and ``note`` are the experiment's; ``quick``: of a few points alone; ``warnings`` are on what was
-    measured; ``prints``: over how many test images means are."""
+    """One study on a page; ``pictures`` are figures by file name: what holds each, and its width [pixels]; ``quick``:
+    of a few points alone; ``warnings`` are on what was measured; ``prints``: over how many test images means are."""
 
-    name: str
+    experiment: Experiment
     title: str
-    question: str
     claims: tuple[Claim, ...]
     pictures: Mapping[str, tuple[str, int]]
     count: str
     command: str
-    about: str = ""
-    heads: tuple[str, str, str] = HEADS
-    tables: tuple[PageTable, ...] = ()
-    quick: bool = False
-    note: str = ""
-    warnings: tuple[str, ...] = ()
-    prints: int = 1
+    tables: tuple[PageTable, ...]
+    quick: bool
+    warnings: tuple[str, ...]
+    prints: int
 
     @classmethod
     def of(
@@ -67,18 +62,14 @@ class Section:
         named = " or ".join(f"{each:g}" for each in accuracies)
         good = f"; frames before noise asked to be good to {named} (relative rms)" if accuracies else ""
         return cls(
-            name=experiment.name,
+            experiment=experiment,
             title=experiment.title.replace(KNOBS, " and ".join(name for name, _ in scope.sweep)),
-            question=experiment.question,
             claims=tuple(claims),
             pictures={name: page_figure(figure) for name, figure in figures.items()},
             count=f"{len(results.table)} measurements{of}{good}",
             command=" ".join(command),
-            about=experiment.about,
-            heads=experiment.heads,
             tables=tuple(experiment.tables(results)),
             quick=scope.quick,
-            note=experiment.note,
             warnings=flag_warnings(experiment.name, results),
             prints=len(prints),
         )
