@@ -63,10 +63,8 @@ def _claims(results: Results) -> Sequence[Claim]:
 
 def _figures(results: Results) -> Mapping[str, Figure]:
     table = results.table
-    shown, title = (
-        claims.panels(claims.by_patterns(table), "pixels"),
-        f"PSNR by the sensor's rows, exposure {EQUAL_PEAK}",
-    )
+    shown = claims.panels(claims.by_patterns(table), "pixels")
+    title = f"PSNR by the sensor's rows, exposure {EQUAL_PEAK}"
     drawn = {"psnr.png": curves(shown, "rows of the sensor [pixel]", log=True, title=title)}
     pixels = table.distinct("pixels")
     for family in _SHOWN:

@@ -274,6 +274,9 @@ def _row(frames: Frames, name: str, found: FloatArray, sessions: FloatArray) -> 
 
 # -------- A characterisation in, its plots out
 
+_CLOSED: dict[str, Any] = {"color": GREY, "lw": 1.5, "label": "closed form"}
+_PAIRS: dict[str, Any] = {"color": BLUE, "lw": 0, "marker": "o", "ms": 5, "label": "pairs of frames"}
+"""How what is expected and what was found are drawn."""
 MOST_OFF = 5.0
 """Standard errors from which a figure is off: one of twenty figures is so by chance in 1e5 characterisations."""
 
@@ -293,10 +296,8 @@ def _photon_transfer(done: Characterisation) -> Figure:
     figure, axes = figure_of(0.5 * WIDTH)
     session, expected = done.session, done.expected
     signal = session.ladder.mean - session.dark.mean
-    axes.plot(
-        expected.ladder.mean - expected.dark.mean, expected.ladder.variance, color=GREY, lw=1.5, label="closed form"
-    )
-    axes.plot(signal, session.ladder.variance, "o", color=BLUE, ms=5, label="pairs of frames")
+    axes.plot(expected.ladder.mean - expected.dark.mean, expected.ladder.variance, **_CLOSED)
+    axes.plot(signal, session.ladder.variance, **_PAIRS)
     gain = _figure(done, "system_gain").found
     full = float(signal[int(session.ladder.variance.argmax())])
     line = np.array([0.0, 0.7 * full])
@@ -312,16 +313,13 @@ def _photon_transfer(done: Characterisation) -> Figure:
 def _linearity(done: Characterisation) -> Figure:
     """Relative deviation of the signal from a line, over the photons."""
     figure, axes = figure_of(0.42 * WIDTH)
-    for session, style, label in (
-        (done.expected, {"color": GREY, "lw": 1.5}, "closed form"),
-        (done.session, {"color": BLUE, "lw": 0, "marker": "o", "ms": 5}, "pairs of frames"),
-    ):
+    for session, style in ((done.expected, _CLOSED), (done.session, _PAIRS)):
         signal = session.ladder.mean - session.dark.mean
         full = signal[int(session.ladder.variance.argmax())]
         used = (signal >= 0.05 * full) & (signal <= 0.95 * full)
         slope, start = np.polyfit(session.photons[used], signal[used], 1, w=1 / signal[used])
         line = start + slope * session.photons[used]
-        axes.plot(session.photons[used], 100 * (signal[used] / line - 1), label=label, **style)
+        axes.plot(session.photons[used], 100 * (signal[used] / line - 1), **style)
     axes.axhline(0, color=BLACK, lw=1)
     light = "photons on a pixel [1]" if done.sensor.states_efficiency else "photoelectrons of a pixel [e$^-$]"
     ends = [_figure(done, f"linearity_{end}").found for end in ("min", "max")]
@@ -339,12 +337,9 @@ def _dark_current(done: Characterisation) -> Figure:
     """Dark signal over exposure time."""
     figure, axes = figure_of(0.42 * WIDTH)
     gain = _figure(done, "system_gain").found
-    for session, style, label in (
-        (done.expected, {"color": GREY, "lw": 1.5}, "closed form"),
-        (done.session, {"color": BLUE, "lw": 0, "marker": "o", "ms": 5}, "pairs of frames"),
-    ):
+    for session, style in ((done.expected, _CLOSED), (done.session, _PAIRS)):
         dark = (session.dark_series.mean - done.sensor.superpixel_black_level_dn) / gain
-        axes.plot(session.dark_times, dark, label=label, **style)
+        axes.plot(session.dark_times, dark, **style)
     axes.set_title(f"The dark current is {_figure_text(done, 'dark_current')}", fontsize=FONT + 1)
     label_axes(axes, "exposure time [s]", "dark signal less black level [e$^-$]")
     axes.legend(fontsize=FONT - 1, frameon=False)

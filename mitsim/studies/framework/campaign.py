@@ -16,7 +16,7 @@ from pydantic import TypeAdapter, ValidationError
 from mitsim.bench.open import check_scene
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, cut
-from mitsim.core.files import read_json, write_json
+from mitsim.core.files import read_json, sweep, write_json
 from mitsim.core.job import Job
 from mitsim.core.resources import workers
 from mitsim.studies import ALL, EXPERIMENTS, PAPER
@@ -238,7 +238,7 @@ class _Campaign:
                 )
             (folder / POINTS).mkdir(exist_ok=True)
             store = Store(folder / POINTS)
-            store.tidy()
+            sweep(folder / POINTS)  # what killed processes left half-written
             self._write(folder, status="incomplete")
             yield folder, store
 

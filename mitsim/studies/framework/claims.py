@@ -193,10 +193,9 @@ def measure_image(studio: Studio, point: Point, shown: Collection[str] = ()) -> 
     return finding(point, image.image if patterns in shown else None, **image.row())
 
 
-def by_patterns(table: Table, families: Collection[str] | None = None) -> Lines:
-    """The rows of each pattern family in a ``table``, or of those of ``families``."""
-    there = table.distinct("patterns")
-    return {label(name): table.where(patterns=name) for name in there if families is None or name in families}
+def by_patterns(table: Table) -> Lines:
+    """The rows of each pattern family in a ``table``."""
+    return {label(name): table.where(patterns=name) for name in table.distinct("patterns")}
 
 
 def panels(lines: Lines, by: str, column: str = "psnr_db") -> Mapping[str, Mapping[str, Curve]]:

@@ -230,10 +230,6 @@ class Store:
         arrays = {(key, name): array for key, each in found.items() for name, array in each.arrays.items()}
         return Results(Table(rows), arrays)
 
-    def tidy(self) -> None:
-        """Remove what killed processes left half-written."""
-        sweep(self.folder)
-
     def _file(self, point: Point) -> Path:
         return self.folder / f"{point.key}.npz"
 
