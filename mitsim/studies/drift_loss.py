@@ -371,7 +371,8 @@ class DriftStand:
         """What a ``drift`` of mask or projector adds to the camera's operator, in the unit of its factors."""
         bench = self.lit.bench
         best = IdealCamera(bench, bench.geometry.mask, self._spectrum).factors
-        found = self._shadow(projecting(drifted(bench, _at_rest(drift)), drift)) + _minus([best])
+        at_rest = drift.model_copy(update={"mask_rotation_mrad": 0.0, "vibration_um": 0.0})
+        found = self._shadow(projecting(drifted(bench, at_rest), drift)) + _minus([best])
         if drift.vibration_um:
             parts = [(self._shifted(place * drift.vibration_um / 1e3), weight) for place, weight in _HERMITE]
             found += _weigh(parts) + _minus(self._shadow(bench))
@@ -415,11 +416,6 @@ class DriftStand:
 def squared_error(db: float) -> float:
     """Mean squared error of a PSNR ``db``, peak 1."""
     return float(10 ** (-db / 10))
-
-
-def _at_rest(drift: Drift) -> Drift:
-    """A ``drift`` whose mask neither turns nor shakes."""
-    return drift.model_copy(update={"mask_rotation_mrad": 0.0, "vibration_um": 0.0})
 
 
 def _minus(terms: SeparableTerms) -> SeparableTerms:

@@ -296,8 +296,9 @@ def mosaic_shots(lines: Lines, patterns: str, seed: int) -> MosaicShots:
     # Light, and what is noise of a shot, is of electrons: any time and wavelength between them.
     one_second = [Exposer(line.lit.bench.rig, 1.0, 0) for line in lines]
     expected = [line.lit.expected("rendered", family) for line in lines]
+    passed = behind(weights, rig.camera.frame_shape)
     rates = [
-        _behind_filters([unit.electrons(frame) for unit, frame in zip(one_second, shot, strict=True)], weights)
+        np.einsum("lij,lij->ij", passed, [unit.electrons(frame) for unit, frame in zip(one_second, shot, strict=True)])
         for shot in zip(*expected, strict=True)
     ]
     frames = expose_rates(Exposer(rig, peak_seconds(rig.sensor, rates), integer(seed, "mosaic")), family, rates)
@@ -349,8 +350,3 @@ def filter_weights(lines: Lines) -> FloatArray:
             for plane in ("R", "G", "G", "B")
         ]
     )
-
-
-def _behind_filters(rates: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
-    """(m, m') electrons a second of all lines together, each pixel behind its filter."""
-    return np.asarray(np.einsum("lij,lij->ij", behind(weights, rates[0].shape), np.stack(rates)))

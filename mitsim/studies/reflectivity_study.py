@@ -286,7 +286,9 @@ def _figures(results: Results) -> Mapping[str, Figure]:
             drawn[f"images_{subject}.png"] = image_grid({subject: images}, columns, f"By roughness, {name}")
     rows = [row for row in peak.rows if row["subject"] not in swept]
     names = [str(row["subject"]).replace("_", " ") for row in rows]
-    shown = [(*_truths(results, row), *_images(results, row, results.table)) for row in rows]
+    shown = [
+        (*(_captioned(results, row, name) for name in _TRUTHS), *_images(results, row, results.table)) for row in rows
+    ]
     titles = [*_TRUTHS, *(f"{label(name)}\n{exposure}" for exposure in EXPOSURES for name in FAMILIES)]
     drawn["images_shipped.png"] = image_grid(dict(zip(names, shown, strict=True)), titles, "Truths and images")
     causes = [[_captioned(results, row, cause, f"{cause}_db") for cause in ERROR_SOURCES] for row in rows]
@@ -301,15 +303,13 @@ def _curves(rows: Table) -> dict[str, dict[Value, Mean]]:
     return {name: rows.means(column, "roughness") for column, name in columns.items()}
 
 
-def _truths(results: Results, row: Mapping[str, Value]) -> list[tuple[FloatArray, str]]:
-    return [_captioned(results, row, name) for name in _TRUTHS]
-
-
 def _images(results: Results, row: Mapping[str, Value], table: Table) -> list[tuple[FloatArray, str]]:
-    """Of the point of a ``row``, by exposure and patterns."""
+    """Both truths of the point of a ``row``, and its images by exposure and patterns."""
+    truths = [_captioned(results, row, name) for name in _TRUTHS]
     cases = [(exposure, name) for exposure in EXPOSURES for name in FAMILIES]
     each = (table.where(point=row["point"], exposure=exposure, patterns=name).rows[0] for exposure, name in cases)
-    return [_captioned(results, row, f"{label(str(row['patterns']))}, {row['exposure']}", "psnr_db") for row in each]
+    shown = (_captioned(results, row, f"{label(str(row['patterns']))}, {row['exposure']}", "psnr_db") for row in each)
+    return [*truths, *shown]
 
 
 def _captioned(results: Results, row: Mapping[str, Value], name: str, column: str = "") -> tuple[FloatArray, str]:

@@ -18,7 +18,6 @@ from mitsim.studies.framework.experiment import (
     MEASURES,
     NO_SCENE,
     OTHERS,
-    Claim,
     Experiment,
     PageTable,
     Results,
@@ -50,10 +49,6 @@ def _setup(setup: Setup, setting: Mapping[str, str]) -> Setup:
     parameters = {name: value for name, value in setting.items() if name not in NO_SCENE}
     changed = setup.changed(**parameters)
     return replace(changed, accuracy=number_of("accuracy", setting["accuracy"])) if "accuracy" in setting else changed
-
-
-def _claims(_: Results) -> Sequence[Claim]:
-    return ()
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:
@@ -113,7 +108,7 @@ EXPERIMENT = Experiment(
     "sweep",
     f"Sweep of {KNOBS}",
     "What does it do to the image?",
-    _points, measure_image, _claims, _figures, _tables,
+    _points, measure_image, lambda results: (), _figures, _tables,
     about="Rendered frames with the sensor's noise, exposed at equal peak unless the exposure varies (the brightest "
     "pixel fills the same part of the full well), and the images that mitsim reconstruct makes of them, with "
     "factors calibrated by a session of the same camera. Parameters have the names and units of the scene file, "
