@@ -11,7 +11,7 @@ from mitsim.core.files import check_plain
 from mitsim.core.imagelist import Raw, Wanted, image_files
 from mitsim.core.manifests import CalibrationManifest, read_manifest
 from mitsim.core.seeds import check_root
-from mitsim.devices.families import read_name
+from mitsim.devices.patterns import read_name
 from mitsim.devices.sensor import check_exposure, load_sensor
 
 PLANES = {"r": (1, 1), "gb": (0, 1), "gr": (1, 0), "b": (0, 0)}

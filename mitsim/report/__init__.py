@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from mitsim.devices.patterns import FAMILIES
+
 EQUAL_PEAK, EQUAL_FRAME, EQUAL_TOTAL = CONVENTIONS = ("equal peak", "equal frame", "equal total")
 """Exposures: see :mod:`mitsim.report.lit_scene`."""
 IDEALISED, RENDERED = MODELS = ("idealised", "rendered")
@@ -12,7 +14,7 @@ def label(name: str) -> str:
     """What people call the patterns ``name``, such as "49 dots" for ``dots:7`` and "7 x 14 dots" for ``dots:7x14``."""
     kind, _, size = name.partition(":")
     count = size.replace("x", " x ") if "x" in size else size and str(int(size) ** 2)
-    return f"{count} {'Hadamard' if kind == 'hadamard' else kind}" if count else kind.capitalize()
+    return f"{count} {FAMILIES[kind].label}" if count else kind.capitalize()
 
 
 def in_text(name: str) -> str:

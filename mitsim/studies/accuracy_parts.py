@@ -21,10 +21,13 @@ from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.devices.patterns import PatternFamily
-from mitsim.light.light import SampledLight, Sampling, Target, first_samples, trace_light, traced_again
+from mitsim.light.light import SampledLight, Sampling, Target, trace_light, traced_again
+from mitsim.light.pass_table import PASSES
 from mitsim.light.passes import Simulation
+from mitsim.light.pilot_result import COUNTED, LOOKS, Changes, Evidence, Part
 from mitsim.light.plan import Plan
-from mitsim.light.settings import COUNTED, GROUPS, LOOKS, Changes, Estimate, Evidence, Part, Settings
+from mitsim.light.sampling import first_samples
+from mitsim.light.settings import GROUPS, Estimate, Settings
 from mitsim.metrics import relative_error
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.planner import pilot
@@ -381,7 +384,7 @@ class Orders:
         if last == 1:
             plain = replace(settings, effects=settings.effects - {PARENT})
             simulation = OfOrders(bench, plain, 0, MOST)
-            if not simulation.tracers():
+            if not simulation.passes:
                 return lambda: 0.0
             self._light(simulation, dict.fromkeys(self._samples, 1))  # compiles its kernels
         else:
@@ -422,17 +425,8 @@ def at_once(expected: ExpectedFrames) -> float:
 
 def with_samples(settings: Settings, samples: int) -> Settings:
     """``settings`` whose first round takes so many ``samples`` of a projector pixel and of a cell in each group."""
-    each = float(samples)
-    return replace(
-        settings,
-        direct_samples=each,
-        anchored_samples=each / 8,
-        indirect_samples=each,
-        from_camera_samples=each,
-        followed_samples=each / 8,
-        followed_from_camera_samples=each / 8,
-        occluded_samples=each / 8,
-    )
+    each = {name: samples / 8 if row.anchors else float(samples) for name, row in PASSES.items() if name != "sharp"}
+    return replace(settings, samples={**settings.samples, **each})
 
 
 def one_line(bench: Apparatus) -> Apparatus:

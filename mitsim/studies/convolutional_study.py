@@ -21,8 +21,8 @@ from functools import cache
 import numpy as np
 from matplotlib.figure import Figure
 
+from mitsim.acquire.reference import rendered_psf
 from mitsim.api.bench import Bench
-from mitsim.bench.diffuser import rendered_psf
 from mitsim.bench.request import Exposure
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
@@ -32,9 +32,9 @@ from mitsim.devices.mask_profile import load_psf
 from mitsim.devices.patterns import PatternFamily, parse_patterns
 from mitsim.devices.sensor import SensorModel
 from mitsim.metrics import psnr, relative_error
-from mitsim.reconstruct.convolution import ConvolutionalCamera, ConvolutionSolution, solve_iteratively
-from mitsim.reconstruct.dots import Classes, FactorisedClasses
+from mitsim.reconstruct.convolution import Classes, ConvolutionalCamera, FactorisedClasses, solve_iteratively
 from mitsim.reconstruct.solver import prepare
+from mitsim.reconstruct.status import Solution
 from mitsim.report import CONVENTIONS, EQUAL_FRAME, EQUAL_PEAK
 from mitsim.report.lit_scene import IdealCamera
 from mitsim.report.plots import curves, image_grid
@@ -335,9 +335,7 @@ def take(
     return DiffuserShots(frames, time, saturated / frames.size)
 
 
-def best_by_psnr(
-    solve: Callable[[float], ConvolutionSolution], truth: FloatArray, largest: float
-) -> tuple[ConvolutionSolution, float]:
+def best_by_psnr(solve: Callable[[float], Solution], truth: FloatArray, largest: float) -> tuple[Solution, float]:
     """The solution nearest to the truth over lambda, to a quarter of a decade, and its PSNR [dB].
 
     Parameters
@@ -365,7 +363,7 @@ def best_by_psnr(
     return best, psnr(best.image, truth)
 
 
-def best_image(classes: Classes, shots: DiffuserShots, truth: FloatArray) -> tuple[ConvolutionSolution, float]:
+def best_image(classes: Classes, shots: DiffuserShots, truth: FloatArray) -> tuple[Solution, float]:
     """The image that is nearest to the truth over lambda, as :func:`best_by_psnr`, and its PSNR [dB].
 
     Parameters
@@ -451,7 +449,7 @@ def race(classes: Classes, whole: Classes, truth: FloatArray, sensor: SensorMode
     }
 
 
-def _time(factorised: FactorisedClasses, frames: FloatArray, tolerance: float) -> tuple[ConvolutionSolution, float]:
+def _time(factorised: FactorisedClasses, frames: FloatArray, tolerance: float) -> tuple[Solution, float]:
     """Solution of frames, and its CPU seconds."""
     start = time.process_time()
     solution = factorised.solve(factorised.classes.projected(frames), tolerance)

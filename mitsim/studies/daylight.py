@@ -37,7 +37,6 @@ from mitsim.reconstruct.colour import ColourModel, chart, delta_e
 from mitsim.reconstruct.request import MARKOV, TIKHONOV
 from mitsim.reconstruct.sides import Side
 from mitsim.reconstruct.solver import Prepared, prepare
-from mitsim.reconstruct.uncertainty import common_response
 from mitsim.report import RENDERED, label
 from mitsim.report.plots import curves
 from mitsim.report.table import Mean, Table
@@ -180,7 +179,7 @@ def _weights(side: Side, first: int, end: int) -> tuple[float, float]:
     a = np.divide(
         side.basis[first:end].sum(axis=0), side.singular, out=np.zeros_like(side.singular), where=side.singular > 0
     )
-    return float(a @ a), float(np.square(common_response(side) @ a).sum())
+    return float(a @ a), float(np.square(side.common @ a).sum())
 
 
 def expected_delta_e(means: FloatArray, variances: FloatArray, judged: Judge) -> float:

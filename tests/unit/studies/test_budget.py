@@ -152,7 +152,9 @@ def test_parts_of_an_image_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     }
     asked: list[Any] = []
     monkeypatch.setattr(error_budget, "_noises", lambda *given: asked.append(given) or noises)
-    monkeypatch.setattr(error_budget, "_clear_images", lambda *given: asked.append(given) or {"": SCENE + STEADY}.items())
+    monkeypatch.setattr(
+        error_budget, "_clear_images", lambda *given: asked.append(given) or {"": SCENE + STEADY}.items()
+    )
     monkeypatch.setattr(error_budget, "_of_scene", lambda scatter, seen, sampled: {("scene", "light"): (seen, sampled)})
     left, right = RNG.standard_normal((6, N)) + 0.3, RNG.standard_normal((7, N)) + 0.3
     fixed = {"response": RNG.standard_normal((N, N)), "offsets": RNG.standard_normal((N, N))}
