@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from mitsim.report.exposures import CONVENTIONS
-from mitsim.studies.diffusercam import best_image, race, take
 
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
