@@ -16,8 +16,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError
 from mitsim.devices.session import CELLS, BoardShape
 from mitsim.scene.guard.estimators import Unfit
-from mitsim.transport.coordinates import turn_and_origin
-from mitsim.transport.plugins.base import per_lane
+from mitsim.transport.plugins.base import per_lane, turn_and_origin
 from mitsim.transport.projector import PinholeRays
 
 if TYPE_CHECKING:

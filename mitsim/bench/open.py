@@ -14,15 +14,14 @@ from mitsim.bench.bench import Apparatus
 from mitsim.core.configuration import DEFAULT_CAMERA, load_model, locate
 from mitsim.core.environment import DEFAULT_VARIANT, load_variant
 from mitsim.core.errors import MitsimError
-from mitsim.devices.families import read_name
-from mitsim.scene.guard.outline import Outline, SceneFiles
-from mitsim.scene.window import lit_side
+from mitsim.devices.patterns import read_name
+from mitsim.scene.guard.outline import Outline, SceneFiles, lit_side
 
 if TYPE_CHECKING:
     from mitsim.devices.mask_profile import MaskProfile
     from mitsim.devices.projector import ProjectorModel
     from mitsim.scene.load import LoadedScene
-    from mitsim.transport.contact import Contact
+    from mitsim.transport.transmission import Contact
 
 Opened = TypeVar("Opened", bound=Apparatus)
 _PITCH_TOLERANCE = 1e-3
@@ -154,11 +153,11 @@ def _load(variant: str, path: Path, defines: Mapping[str, str], **options: bool)
     """A scene in a variant that is set from then on, as :func:`mitsim.scene.load.load_scene` takes it."""
     mitsuba = load_variant(variant)
     from mitsim.scene.load import load_scene
-    from mitsim.transport.contact import contacts
-    from mitsim.transport.plugins import all
+    from mitsim.transport import plugins
+    from mitsim.transport.transmission import contacts
 
     mitsuba.set_log_level(mitsuba.LogLevel.Error)
-    all.register()
+    plugins.register()
     loaded = load_scene(path, defines, **options)
     of_factored, of_reference = contacts(loaded.scene)
     factored = _refusal_of(loaded, of_factored, "the factored estimator")

@@ -21,7 +21,7 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import check_plain
 from mitsim.core.job import Job
 from mitsim.core.seeds import check_root
-from mitsim.devices.families import NAMES, check_patterns
+from mitsim.devices.patterns import pattern_names, read_name
 from mitsim.devices.sensor import EXPOSURE_FRACTION, EXPOSURE_S, SensorModel
 
 if TYPE_CHECKING:
@@ -175,6 +175,11 @@ def check_untimed(seconds: float | None) -> None:
         )
 
 
+def _of_a_family(patterns: str) -> str:
+    read_name(patterns)
+    return patterns
+
+
 def _some_time(seconds: float) -> float:
     if not 0 < seconds <= LONGEST_S:
         raise ArgumentError("seconds", f"{seconds:g}: give a number above 0, at most {LONGEST_S:g}")
@@ -202,7 +207,7 @@ class Request(BaseModel):
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
-    patterns: Annotated[str, AfterValidator(check_patterns)] = Field("dots:7", description=NAMES)
+    patterns: Annotated[str, AfterValidator(_of_a_family)] = Field("dots:7", description=pattern_names())
     accuracy: Annotated[float, AfterValidator(check_accuracy)] = Field(
         1e-3, description="relative rms error of the expected frames"
     )

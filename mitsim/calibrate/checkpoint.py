@@ -26,8 +26,9 @@ from mitsim.core.files import PARTS, output_folder, plain, read_json, sweep, who
 from mitsim.core.manifests import MANIFEST, Digital, resumable
 from mitsim.devices.framelist import LISTS, DarkFile, FrameList, StripeFile
 from mitsim.devices.session import SIDES, Side
+from mitsim.light.grids import GRIDS, LightEstimate
 from mitsim.light.light import SampledLight
-from mitsim.light.passes import TRAYS, FiledLight, Simulation
+from mitsim.light.passes import Simulation
 from mitsim.light.plan import Plan
 from mitsim.reconstruct.estimate_factors import PairSeen, PairSums, StripeSums
 from mitsim.sensor.chain import Digital as DigitalNumbers
@@ -149,15 +150,15 @@ def kept_light(checkpoint: Checkpoint, session: Session, plan: Plan) -> SampledL
     arrays = checkpoint.load("light")
     if arrays is None:
         return None
-    trays = {
+    by_grid = {
         name: sparse.csr_array(
-            tuple(arrays[f"{name}_{part}"] for part in ("data", "indices", "indptr")),
-            shape=tuple(arrays[f"{name}_shape"]),
+            tuple(arrays[f"{row.key}_{part}"] for part in ("data", "indices", "indptr")),
+            shape=tuple(arrays[f"{row.key}_shape"]),
         )
-        for name in TRAYS
+        for name, row in GRIDS.items()
     }
     return SampledLight(
-        groups=(FiledLight(**trays, received=float(arrays["received"]), outside=float(arrays["outside"])),),
+        groups=(LightEstimate(by_grid, float(arrays["received"]), float(arrays["outside"])),),
         simulation=Simulation(session.board, plan.settings),
         plan=plan,
         seed=session.seed,
@@ -176,9 +177,9 @@ def keep_light(checkpoint: Checkpoint, light: SampledLight) -> None:
     own = ("labels", "flux", "flux_error", "paths", "sampling_error", "reached")
     facts = {name: getattr(light, name) for name in own}
     facts |= {name: getattr(group, name) for name in ("received", "outside")}
-    for name in TRAYS:
-        matrix = getattr(group, name)
-        facts |= {f"{name}_{part}": getattr(matrix, part) for part in ("data", "indices", "indptr", "shape")}
+    for name, row in GRIDS.items():
+        matrix = group[name]
+        facts |= {f"{row.key}_{part}": getattr(matrix, part) for part in ("data", "indices", "indptr", "shape")}
     checkpoint.save("light", facts)
 
 

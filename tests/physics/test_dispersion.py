@@ -24,8 +24,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.spectral_manifests import RUN
 from mitsim.light.lamps import lit_by_lamps
 from mitsim.transport.accumulator import Ledger
-from mitsim.transport.direct import DirectTracer
-from mitsim.transport.flux import FluxTracer
+from mitsim.transport.direct import DirectTracer, FluxTracer
 from mitsim.transport.from_camera import Counted, FromCameraTracer, LampTracer, Paths
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.path_reuse import NeighbourTracer

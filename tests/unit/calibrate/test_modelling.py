@@ -16,8 +16,7 @@ from mitsim.calibrate.placement import fit_placement
 from mitsim.calibrate.session import Session
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
-from mitsim.devices.model_fit import Modelling
-from mitsim.devices.session import load_recipe
+from mitsim.devices.session import Modelling, load_recipe
 from mitsim.studies.paper.models import OFF_MM, as_built
 from tests.real_session import RealSession, write_list
 
