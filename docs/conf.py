@@ -28,9 +28,9 @@ include_patterns = ["README.md", "CHANGELOG.md", "CONTRIBUTING.md", "docs/**"]
 exclude_patterns = [".*", "mitsim", "tests", "scenes", "docs/_build", "docs/conf.py", "docs/images", "**/.*"]
 
 nb_execution_mode = "off"
-myst_enable_extensions = ["substitution"]
+myst_enable_extensions = ["dollarmath", "substitution"]
 myst_heading_anchors = 3
-myst_fence_as_directive = ["mermaid"]
+myst_fence_as_directive = ["math", "mermaid"]
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"
@@ -47,6 +47,7 @@ CONTENTS = """
 docs/notebooks/index
 docs/architecture
 docs/physics
+docs/glossary
 docs/formats
 docs/exchange
 docs/bench
