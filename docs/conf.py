@@ -101,7 +101,7 @@ def gallery() -> str:
 
 def plugins() -> str:
     """Markdown that shows the manuals of mitsim's own Mitsuba plugins as they stand in their modules."""
-    sources = [ROOT / "mitsim" / "transport" / f"{name}.py" for name in ("lensless", "grating", "glass", "aperture")]
+    sources = [ROOT / "mitsim/transport/plugins" / f"{name}.py" for name in ("lensless", "grating", "glass", "lens")]
     manuals = [ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) for path in sources]
     return "\n\n".join(f"```text\n{manual}\n```" for manual in manuals)
 
