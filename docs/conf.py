@@ -29,7 +29,7 @@ exclude_patterns = [".*", "mitsim", "tests", "scenes", "docs/_build", "docs/conf
 
 nb_execution_mode = "off"
 myst_enable_extensions = ["dollarmath", "substitution"]
-myst_heading_anchors = 3
+myst_heading_anchors = 4
 myst_fence_as_directive = ["math", "mermaid"]
 
 autodoc_member_order = "bysource"
@@ -47,6 +47,8 @@ CONTENTS = """
 docs/notebooks/index
 docs/architecture
 docs/physics
+docs/rare_light
+docs/reconstruction
 docs/glossary
 docs/formats
 docs/exchange

@@ -53,7 +53,7 @@ class Stated:
         return value.removesuffix("%")
 
 
-PHYSICS, BENCH, STUDIES = "docs/physics.md", "docs/bench.md", "docs/studies.md"
+PHYSICS, IMAGES_PAGE, BENCH, STUDIES = "docs/physics.md", "docs/reconstruction.md", "docs/bench.md", "docs/studies.md"
 STATED = (
     Stated("README.md", "# {}, as above", "tour.psnr_db", ".2f"),
     Stated(BENCH, "captures and calibrates itself it is {} dB", "tour.psnr_db", ".1f"),
@@ -65,10 +65,10 @@ STATED = (
     Stated(PHYSICS, "(450 nm) to {} % (640 nm)", "closed.diffraction_640_nm", ".0%"),
     Stated(PHYSICS, "three lines has $C = {}$ lit at once", "closed.speckle_white", ".3f"),
     Stated(PHYSICS, "lit at once and {} with a beam of", "closed.speckle_white_beam", ".4f"),
-    Stated(PHYSICS, "| cookie_bag (`dots:7x16`) | {} dB |", "pictures.each_depth_psnr_db", ".1f"),
-    Stated(PHYSICS, "| {} dB | 27.2 dB | 0.3 mm |", "pictures.one_depth_psnr_db", ".1f"),
-    Stated(PHYSICS, "0.3/128)$, {} cells of the shipped", "closed.margin_cells", ".0f"),
-    Stated(PHYSICS, "pixels in tan-angle. {} pixels from 363", "closed.parallax_cookie_bag", ".1f"),
+    Stated(IMAGES_PAGE, "| cookie_bag (`dots:7x16`) | {} dB |", "pictures.each_depth_psnr_db", ".1f"),
+    Stated(IMAGES_PAGE, "| {} dB | 27.2 dB | 0.3 mm |", "pictures.one_depth_psnr_db", ".1f"),
+    Stated(IMAGES_PAGE, "0.3/128)$, {} cells of the shipped", "closed.margin_cells", ".0f"),
+    Stated(IMAGES_PAGE, "pixels in tan-angle. {} pixels from 363", "closed.parallax_cookie_bag", ".1f"),
 )
 """Every place whose figure is another place's, or follows from a closed form."""
 
