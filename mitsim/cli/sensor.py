@@ -35,7 +35,7 @@ def characterise(
     """Measure a camera after EMVA 1288 on simulated frames; figures found beside those that its file sets."""
     from mitsim.core.configuration import locate
     from mitsim.devices.sensor import load_sensor
-    from mitsim.studies.emva_procedure import Procedure, capacity_of, efficiency_of
+    from mitsim.studies.emva_options import Procedure, capacity_of, efficiency_of
     from mitsim.studies.framework.folder import check_study_folder
 
     sensor = load_sensor(locate(camera, "calibration", ".toml"))
