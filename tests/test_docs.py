@@ -29,6 +29,7 @@ from tests import prose
 from tests.conftest import write_small_scene
 from tests.exchanged import made
 from tests.robustness import Recorder, Row, page_of
+from tests.test_architecture import FLOORS
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(
@@ -48,7 +49,7 @@ ELSEWHERE_RUN = {"docs/bench.md"}
 NO_MODULES = {"mitsim.key"}
 """Names in the docs that only look like modules: metadata of OpenEXR files."""
 
-WORDS = "bench exchange formats glossary growth physics rare_light reconstruction studies"
+WORDS = "architecture bench exchange formats glossary growth physics rare_light reconstruction studies"
 REWRITTEN = ("README.md", *(f"docs/{name}.md" for name in WORDS.split()))
 """Pages that are held to short sentences and paragraphs."""
 
@@ -389,6 +390,16 @@ def resolves(dotted: str) -> bool:
             found = getattr(found, part, None)
         return found is not None
     return False
+
+
+def test_the_house_stands_on_its_page_as_it_is_tested() -> None:
+    """Floors and rooms of docs/architecture.md; files that stand by themselves are not in its tables."""
+    page, alone = text_of("docs/architecture.md"), {"version", "metrics", "mitsim", "__main__"}
+    floors = [set(re.findall(r"\w+", rooms)) for rooms in re.findall(r"^\| \d+ \| (.*) \|$", page, flags=re.M)]
+    assert floors == [rooms for floor in FLOORS if (rooms := set(floor.split()) - alone)]
+    assert re.findall(r"^\| `(\w+)` \|", page.split("## The way")[0], flags=re.M) == [
+        room for floor in FLOORS for room in floor.split() if room not in alone
+    ]
 
 
 def test_nothing_refers_to_a_page_that_is_not_there() -> None:
