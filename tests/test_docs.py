@@ -329,6 +329,19 @@ def test_sentences_and_paragraphs_are_short(page: str) -> None:
     assert max(found.paragraphs) <= MOST_WORDS["paragraph"], found.longest
 
 
+OLDER_WORDS = (
+    "tray ledger glint filed filing foretold foreseen foretell foretells lamplight anatomy lanes deposits".split()
+)
+"""Words that docs/glossary.md replaces, and that mean nothing else here."""
+
+
+@pytest.mark.parametrize("page", sorted(set(REWRITTEN) - {"docs/glossary.md"}))
+def test_pages_use_the_words_of_the_glossary(page: str) -> None:
+    """Outside of code, where keys and streams keep theirs."""
+    text = re.sub(r"`[^`\n]*`", "", prose_of(page)).lower()
+    assert not set(re.findall(r"[a-z]+", text)) & set(OLDER_WORDS)
+
+
 @pytest.mark.parametrize("page", REWRITTEN)
 def test_no_line_of_text_begins_as_a_comment_does(page: str) -> None:
     """The site leaves a line out that begins with a per cent sign."""
