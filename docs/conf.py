@@ -1,7 +1,7 @@
 """The site that `make docs` builds: pages in Markdown, the API from docstrings, notebooks as they are stored.
 
 The repository's root is the source folder, so that links lead to the same places here as on disk. Nothing is fetched
-and no notebook is run: a test does that.
+and no notebook is run: a test does that. A browser fetches MathJax to show the formulas.
 """
 
 import ast
