@@ -329,6 +329,20 @@ def test_sentences_and_paragraphs_are_short(page: str) -> None:
     assert max(found.paragraphs) <= MOST_WORDS["paragraph"], found.longest
 
 
+LABELS = ("What", "Why", "Formula", "Limit", "Check")
+"""What a section says, in this order; it may leave some out."""
+
+
+@pytest.mark.parametrize("page", ["docs/physics.md", "docs/rare_light.md", "docs/reconstruction.md"])
+def test_sections_say_what_why_formula_limit_and_check_in_this_order(page: str) -> None:
+    sections = re.split(r"^(?=#+ )", text_of(page), flags=re.M)
+    orders = [
+        [LABELS.index(label) for label in re.findall(rf"\*\*({'|'.join(LABELS)})\.\*\*", one)] for one in sections
+    ]
+    assert sum(len(order) > 2 for order in orders) >= 5
+    assert not [one.splitlines()[0] for one, order in zip(sections, orders, strict=True) if order != sorted(order)]
+
+
 OLDER_WORDS = {"anatomy", "deposits", "filed", "filing", "foreseen", "foretell", "foretells", "foretold", "glint"}
 OLDER_WORDS |= {"lamplight", "lanes", "ledger", "tray"}
 """Words that docs/glossary.md replaces, and that mean nothing else here."""
