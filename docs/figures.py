@@ -202,6 +202,34 @@ def last_digit(number: str) -> float:
     return math.pow(10, int(exponent or 0) - len(mantissa.partition(".")[2]))
 
 
+def planned(folder: Path) -> dict[str, tuple[str, str, str]]:
+    """State, reason and error of every row of README's plan, as its command gives them now."""
+    command, _ = printed("plan")
+    program = [sys.executable, "-m", "mitsim", *shlex.split(command), "--json", "--quiet"]
+    done = subprocess.run(program, cwd=folder, capture_output=True, text=True, check=True)
+    rows = json.loads(done.stdout)["effects"]
+    return {row["name"]: (row["state"], row["reason"], f"{row['error_if_off'] or 0:.1e}") for row in rows}
+
+
+def plan_lines(now: dict[str, tuple[str, str, str]]) -> dict[str, str]:
+    """README's lines of the plan that are not what the plan is ``now``, and what they should be.
+
+    A line has the first words of a reason. Its seconds are the machine's.
+    """
+    found = {}
+    for line in printed("plan")[1].splitlines():
+        cells = re.split(r"\s{2,}", line.strip())
+        name, *cells = re.split(r"\s+", cells[0], maxsplit=1) + cells[1:]
+        if name not in now:
+            continue
+        state, reason, error = cells[:3]
+        words = re.match(_NUMBER.sub("#", reason).replace("#", _NUMBER.pattern), now[name][1])
+        new = line.replace(f" {state} ", f" {now[name][0]} ").replace(f" {error} ", f" {now[name][2]} ")
+        new = new.replace(reason, words[0] if words else now[name][1])
+        found |= {} if new == line else {line: new}
+    return found
+
+
 def tour_figures() -> dict[str, float]:
     """What README prints under the tour's commands, as numbers."""
     text = " ".join(" ".join(printed(verb)[1] for verb in VERBS).split())
@@ -218,6 +246,9 @@ def tour_figures() -> dict[str, float]:
 
 def tour(work: Path) -> dict[str, float]:
     """The tour's commands run in ``work``; their outputs stand in README then."""
+    for line, now in plan_lines(planned(work)).items():
+        sys.stdout.write(f"plan: {line} -> {now}\n")
+        README.write_text(README.read_text(encoding="utf-8").replace(line, now), encoding="utf-8")
     for verb, now in outputs(work):
         for difference in differences(printed(verb)[1], now):
             sys.stdout.write(f"{verb}: {difference}\n")

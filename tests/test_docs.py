@@ -255,6 +255,27 @@ def test_the_figures_of_readmes_tour_are_what_its_commands_print(tmp_path: Path)
     assert not any(stale.values()), stale
 
 
+@pytest.mark.slow
+def test_the_plan_of_readmes_tour_is_what_its_command_gives(tmp_path: Path) -> None:
+    """To one of the last digit printed. (Seen: cells that left 2.0e-04, where the command gave 2.1e-04.)"""
+    stale = figures.plan_lines(figures.planned(tmp_path))
+    assert not [(line, now) for line, now in stale.items() if figures.differences(line, now)]
+
+
+def test_a_row_of_the_plan_that_differs_is_seen() -> None:
+    (line,) = [line for line in figures.printed("plan")[1].splitlines() if line.lstrip().startswith("layers")]
+    reason = "the light is seen from 364 to 450 mm; 3 layers leave 1.3e-05, one 5.4e-03"
+    assert not figures.plan_lines({"layers": ("approximate", reason, "5.4e-03")})
+    for row in (
+        ("exact", reason, "5.4e-03"),
+        ("approximate", reason, "5.5e-03"),
+        ("approximate", "no depth", "5.4e-03"),
+    ):
+        assert list(figures.plan_lines({"layers": row})) == [line]
+    (new,) = figures.plan_lines({"layers": ("approximate", reason.replace("450", "451"), "5.4e-03")}).values()
+    assert new == line.replace("450", "451")
+
+
 def test_pages_state_what_the_file_of_figures_has() -> None:
     """(Seen failing: README's 49.71 dB, where bench.md, studies.md and the picture had 50.8.)"""
     assert not figures.stale(figures.read()), "run: make figures"
