@@ -230,6 +230,19 @@ def plan_lines(now: dict[str, tuple[str, str, str]]) -> dict[str, str]:
     return found
 
 
+def statuses(folder: Path) -> dict[str, str]:
+    """Sentences in README's table of exit statuses whose figures differ, and what their commands say now."""
+    found = {}
+    rows = re.findall(r'^\| \d \|.*\| `mitsim ([^`]+)`: "([^"]+)" \|$', README.read_text(encoding="utf-8"), flags=re.M)
+    for command, sentence in rows:
+        program = [sys.executable, "-m", "mitsim", *shlex.split(command)]
+        done = subprocess.run(program, cwd=folder, capture_output=True, text=True, check=False)
+        words = re.escape(_NUMBER.sub("#", sentence)).replace(re.escape("#"), _NUMBER.pattern)
+        now = re.search(words, " ".join(done.stderr.split()))
+        found |= {sentence: now[0]} if now and now[0] != sentence else {}
+    return found
+
+
 def tour_figures() -> dict[str, float]:
     """What README prints under the tour's commands, as numbers."""
     text = " ".join(" ".join(printed(verb)[1] for verb in VERBS).split())
@@ -246,8 +259,8 @@ def tour_figures() -> dict[str, float]:
 
 def tour(work: Path) -> dict[str, float]:
     """The tour's commands run in ``work``; their outputs stand in README then."""
-    for line, now in plan_lines(planned(work)).items():
-        sys.stdout.write(f"plan: {line} -> {now}\n")
+    for line, now in (plan_lines(planned(work)) | statuses(work)).items():
+        sys.stdout.write(f"{line} -> {now}\n")
         README.write_text(README.read_text(encoding="utf-8").replace(line, now), encoding="utf-8")
     for verb, now in outputs(work):
         for difference in differences(printed(verb)[1], now):
@@ -301,7 +314,9 @@ def main() -> None:
                 "tour": lambda: tour(Path(folder)),
                 "pictures": lambda: pictures(Path(folder)),
             }[part]()
-    FIGURES.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    # Six digits: the last ones are the machine's BLAS's.
+    kept = {part: {name: float(f"{value:.6g}") for name, value in of.items()} for part, of in figures.items()}
+    FIGURES.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
     write_pages(figures)
 
 
