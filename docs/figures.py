@@ -1,10 +1,10 @@
 """Figures that the pages state: the commands and formulas that give them in, docs/figures.json and the pages out.
 
-    python docs/figures.py [closed] [tour] [pictures]        all three, unless some are named; `make figures`
+    python docs/figures.py [closed] [plan] [tour] [pictures]        all, unless some are named; `make figures`
 
-*closed*: closed forms, a second. *tour*: README's commands, a minute, with their outputs. *pictures*:
-docs/images/make.py and drawings.py, three minutes. Seconds and memory in README stay: they are an idle machine's.
-tests/test_docs.py compares pages with the file, closed forms with the file and, slow, the tour's commands with README.
+*closed*: closed forms, a second. *plan*: two plans of the photograph, seconds. *tour*: README's commands, a minute, with
+their outputs. *pictures*: docs/images/make.py and drawings.py, three minutes. Seconds and memory in README stay: they are
+an idle machine's. tests/test_docs.py compares pages with the file, closed forms with the file and, slow, the commands.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Stated:
         """The figure as this place states it."""
         part, name = self.name.split(".")
         value = f"{figures[part][name]:{self.form}}"
-        return value.removesuffix("%")
+        return value.removesuffix("%").replace("e-0", "e-")
 
 
 PHYSICS, IMAGES_PAGE, BENCH, STUDIES = "docs/physics.md", "docs/reconstruction.md", "docs/bench.md", "docs/studies.md"
@@ -63,6 +63,11 @@ STATED = (
     Stated(STUDIES, "three lines without a camera, is {} (red", "closed.delta_e_floor", ".2f"),
     Stated(PHYSICS, "from the geometric one by {} % (450 nm)", "closed.diffraction_450_nm", ".0%"),
     Stated(PHYSICS, "(450 nm) to {} % (640 nm)", "closed.diffraction_640_nm", ".0%"),
+    Stated(PHYSICS, "One anchor leaves {} on the photograph", "plan.anchors", ".1e"),
+    Stated(PHYSICS, "falls with $1/c^2$: {} for $c = 1$", "plan.cells", ".1e"),
+    Stated(PHYSICS, "Neutral: the geometric shadow, {} off for", "plan.diffraction", ".1e"),
+    Stated(PHYSICS, "photograph and `dots:7`, {} for `uniform`", "plan.diffraction_uniform", ".1e"),
+    Stated(PHYSICS, "infinite contrast ({} off for `dots:7`)", "plan.black_level", ".1e"),
     Stated(PHYSICS, "three lines has $C = {}$ lit at once", "closed.speckle_white", ".3f"),
     Stated(PHYSICS, "lit at once and {} with a beam of", "closed.speckle_white_beam", ".4f"),
     Stated(IMAGES_PAGE, "| cookie_bag (`dots:7x16`) | {} dB |", "pictures.each_depth_psnr_db", ".1f"),
@@ -280,6 +285,19 @@ def updated(page: str, verb: str, now: str) -> str:
     )
 
 
+def plan(work: Path) -> dict[str, float]:
+    """What the photograph's frames lose with one anchor, one cell a pixel, or an effect off, by its plans at 1e-3."""
+
+    def errors(patterns: str) -> dict[str, float]:
+        program = [sys.executable, "-m", "mitsim", "plan", "photograph", "--patterns", patterns, "--json", "--quiet"]
+        done = subprocess.run(program, cwd=work, capture_output=True, text=True, check=True)
+        return {row["name"].replace("-", "_"): row["error_if_off"] for row in json.loads(done.stdout)["effects"]}
+
+    dots, uniform = errors("dots:7"), errors("uniform")
+    names = ("anchors", "cells", "diffraction", "black_level")
+    return {name: dots[name] for name in names} | {"diffraction_uniform": uniform["diffraction"]}
+
+
 # ---- pictures --------------------------------------------------------------------------------------------------------
 
 
@@ -304,16 +322,15 @@ def pictures(work: Path) -> dict[str, float]:
     return picture_figures()
 
 
+WAYS = {"closed": lambda _: closed(), "plan": plan, "tour": tour, "pictures": pictures}
+
+
 def main() -> None:
-    parts = sys.argv[1:] or ["closed", "tour", "pictures"]
+    parts = sys.argv[1:] or list(WAYS)
     figures = read() if FIGURES.exists() else {}
     with tempfile.TemporaryDirectory() as folder:
         for part in parts:
-            figures[part] = {
-                "closed": closed,
-                "tour": lambda: tour(Path(folder)),
-                "pictures": lambda: pictures(Path(folder)),
-            }[part]()
+            figures[part] = WAYS[part](Path(folder))
     # Six digits: the last ones are the machine's BLAS's.
     kept = {part: {name: float(f"{value:.6g}") for name, value in of.items()} for part, of in figures.items()}
     FIGURES.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
