@@ -2,9 +2,9 @@
 
     python docs/figures.py [closed] [plan] [tour] [pictures]        all, unless some are named; `make figures`
 
-*closed*: closed forms, a second. *plan*: two plans of the photograph, seconds. *tour*: README's commands, a minute, with
-their outputs. *pictures*: docs/images/make.py and drawings.py, three minutes. Seconds and memory in README stay: they are
-an idle machine's. tests/test_docs.py compares pages with the file, closed forms with the file and, slow, the commands.
+*closed*: closed forms, a second. *plan*: two plans of the photograph, seconds. *tour*: README's commands, a minute, and
+their outputs. *pictures*: docs/images/make.py and drawings.py, three minutes. Seconds and memory in README stay: they
+are an idle machine's. tests/test_docs.py compares pages with the file, closed forms with the file and, slow, commands.
 """
 
 from __future__ import annotations
