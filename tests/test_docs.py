@@ -458,6 +458,13 @@ def test_the_house_stands_on_its_page_as_it_is_tested() -> None:
     ]
 
 
+def test_every_pass_of_light_stands_in_the_table_of_passes(variant: str) -> None:
+    passes = pytest.importorskip("mitsim.light.pass_table").PASSES
+    table = text_of("docs/architecture.md").split("## Passes of light")[1].split("## What is passed on")[0]
+    named = {name for row in re.findall(r"^\| ([a-z ,]+) \|", table, flags=re.M) for name in row.split(", ")}
+    assert named - {"pass", "specular chain"} == {name.replace("_", " ") for name in passes}
+
+
 def test_nothing_refers_to_a_page_that_is_not_there() -> None:
     modules = [path.relative_to(ROOT).as_posix() for path in (ROOT / "mitsim").rglob("*.py")]
     offenders = {name for name in [*PAGES, *modules] if re.search(r"\bDESIGN\b|design page", text_of(name))}
