@@ -1,4 +1,4 @@
-"""The drawings of docs/physics.md and docs/architecture.md: the shipped rig's numbers in, five PNG files out.
+"""The drawings of docs/physics.md and docs/architecture.md: the shipped rig's numbers in, six PNG files out.
 
     python docs/images/drawings.py [FOLDER]
 
@@ -82,6 +82,35 @@ def rig() -> Figure:
     )
     for spine in inset.spines.values():
         spine.set_color(GREY)
+    return figure
+
+
+def axes() -> Figure:
+    """Which way rows, columns and coordinates run in every image."""
+    figure, sheet = _sheet(8, 3.4)
+    sheet.add_patch(Rectangle((-3, -2), 6, 4, facecolor="#e8f0f7", edgecolor=BLUE, lw=1.5))
+    for k in range(1, 6):
+        sheet.plot([-3 + k, -3 + k], [-2, 2], color="white", lw=1)
+    for k in range(1, 4):
+        sheet.plot([-3, 3], [-2 + k, -2 + k], color="white", lw=1)
+    sheet.add_patch(Rectangle((-3, 1), 1, 1, color=ORANGE, alpha=0.8))
+    sheet.text(-2.5, 1.5, "0, 0", ha="center", va="center", color="white")
+    arrow = {"arrowstyle": "->", "lw": 1.6}
+    for end, start, words, place, color in (
+        ((3, 2.45), (-3, 2.45), "columns grow to the right:  $s = -x$", (0, 2.6), ORANGE),
+        ((-3.45, -2), (-3.45, 2), "rows grow\ndownwards:\n$s = -y$", (-3.65, 0), ORANGE),
+        ((0, 1.5), (0, 0), "$+y$", (0.12, 1.3), INK),
+        ((-1.5, 0), (0, 0), "$+x$", (-1.5, 0.12), INK),
+    ):
+        sheet.annotate("", end, start, arrowprops={**arrow, "color": color, "shrinkA": 0, "shrinkB": 0})
+        across = "right" if place[0] < -3 else "left" if place == (0.12, 1.3) else "center"
+        sheet.text(*place, words, color=color, ha=across, va="center" if across == "right" else "bottom")
+    sheet.plot(0, 0, "o", color=INK, ms=9, mfc="white")
+    sheet.plot(0, 0, "x", color=INK, ms=6)
+    sheet.text(0.2, -0.3, "$+z$, away from you,\nto the scene", va="top")
+    words = "Frame, mask, pattern, truth\nand image all show what\none sees who looks along $+z$\nfrom the sensor."
+    sheet.text(3.5, 0, words, va="center")
+    sheet.set(xlim=(-6.2, 8.2), ylim=(-2.6, 3.4))
     return figure
 
 
@@ -356,7 +385,7 @@ def _measure(
         )
 
 
-DRAWINGS = (rig, shadow, anchors, parallax, passes)
+DRAWINGS = (rig, axes, shadow, anchors, parallax, passes)
 
 
 def main() -> None:
