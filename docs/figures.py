@@ -64,6 +64,7 @@ STATED = (
     Stated(PHYSICS, "from the geometric one by {} % (450 nm)", "closed.diffraction_450_nm", ".0%"),
     Stated(PHYSICS, "(450 nm) to {} % (640 nm)", "closed.diffraction_640_nm", ".0%"),
     Stated(PHYSICS, "One anchor leaves {} on the photograph", "plan.anchors", ".1e"),
+    Stated(PHYSICS, "under `dots:7` and {} under uniform light", "plan.anchors_uniform", ".1e"),
     Stated(PHYSICS, "falls with $1/c^2$: {} for $c = 1$", "plan.cells", ".1e"),
     Stated(PHYSICS, "Neutral: the geometric shadow, {} off for", "plan.diffraction", ".1e"),
     Stated(PHYSICS, "photograph and `dots:7`, {} for `uniform`", "plan.diffraction_uniform", ".1e"),
@@ -295,7 +296,9 @@ def plan(work: Path) -> dict[str, float]:
 
     dots, uniform = errors("dots:7"), errors("uniform")
     names = ("anchors", "cells", "diffraction", "black_level")
-    return {name: dots[name] for name in names} | {"diffraction_uniform": uniform["diffraction"]}
+    return {name: dots[name] for name in names} | {
+        f"{name}_uniform": uniform[name] for name in ("anchors", "diffraction")
+    }
 
 
 # ---- pictures --------------------------------------------------------------------------------------------------------

@@ -255,8 +255,7 @@ def test_the_plan_of_readmes_tour_is_what_its_command_gives(tmp_path: Path) -> N
 
 @pytest.mark.slow
 def test_the_file_has_what_plans_of_the_photograph_say(tmp_path: Path) -> None:
-    """To 2e-2, a digit more than is printed: cells were stated at 3.3e-4 and one anchor at 7.6e-4, where plans give
-    3.2e-4 and 7.8e-4."""
+    """To 2e-2: figures are printed to two digits. (Seen: cells stated at 3.3e-4, where the plan gives 3.2e-4.)"""
     assert figures.read()["plan"] == {
         name: pytest.approx(value, rel=2e-2) for name, value in figures.plan(tmp_path).items()
     }
