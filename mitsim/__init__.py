@@ -20,18 +20,17 @@ from typing import TYPE_CHECKING
 from mitsim.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from mitsim.acquire.capture import Light
     from mitsim.acquire.reference import Rendered
     from mitsim.api.bench import Bench, open_bench
-    from mitsim.api.light import Light
     from mitsim.bench.request import Request
-    from mitsim.calibrate.model_fit import calibrate_model
+    from mitsim.calibrate.model import calibrate_model
     from mitsim.calibrate.plan import CalibrationPlan, plan_calibration
     from mitsim.core.errors import ArgumentError, MitsimError
     from mitsim.core.job import Clock, Job
     from mitsim.core.resources import Limits
     from mitsim.core.runs import Capture, MosaicCapture, load_mosaic, load_run
-    from mitsim.devices.model_fit import Modelling
-    from mitsim.devices.session import load_recipe
+    from mitsim.devices.session import Modelling, load_recipe
     from mitsim.light.plan import Plan
     from mitsim.metrics import psnr, ssim
     from mitsim.reconstruct.captured_session import calibrate_frames
@@ -47,7 +46,7 @@ _HOMES = {
     "load_calibration": "reconstruct.factors",
     "load_recipe": "devices.session",
     "calibrate_frames": "reconstruct.captured_session",
-    "calibrate_model": "calibrate.model_fit",
+    "calibrate_model": "calibrate.model",
     "plan_calibration": "calibrate.plan",
     "reconstruct": "reconstruct.reconstruct",
     "reconstruct_colours": "report.colour.by_line",
@@ -56,14 +55,14 @@ _HOMES = {
     "Bench": "api.bench",
     "Plan": "light.plan",
     "Request": "bench.request",
-    "Light": "api.light",
+    "Light": "acquire.capture",
     "Capture": "core.runs",
     "MosaicCapture": "core.runs",
     "CalibrationPlan": "calibrate.plan",
     "Factors": "reconstruct.factors",
     "Reconstruction": "reconstruct.result",
     "Rendered": "acquire.reference",
-    "Modelling": "devices.model_fit",
+    "Modelling": "devices.session",
     "Job": "core.job",
     "Clock": "core.job",
     "Limits": "core.resources",

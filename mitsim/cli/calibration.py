@@ -44,8 +44,7 @@ from mitsim.core.worker import RESUME, advise
 if TYPE_CHECKING:
     from mitsim.api.bench import Bench
     from mitsim.core.job import Job
-    from mitsim.devices.model_fit import Modelling
-    from mitsim.devices.session import SessionRecipe
+    from mitsim.devices.session import Modelling, SessionRecipe
 
 
 app = typer.Typer()
@@ -337,7 +336,7 @@ def modelling_of(model: str, frames_used: int | None, fit: str | None, accuracy:
     model, frames_used, fit, accuracy
         the options; None where not given.
     """
-    from mitsim.devices.model_fit import FITTED, Modelling
+    from mitsim.devices.session import FITTED, Modelling
 
     names = FITTED if fit is None else tuple(name.strip() for name in fit.split(","))
     words: Any = model  # checked there
@@ -381,7 +380,7 @@ def calibrate_model(context: typer.Context, modelling: Modelling, output: Path) 
     with job_of(asked["quiet"] or asked["as_json"], asked["max_seconds"], asked["max_memory"]) as job:
         with job.clock.stage("open scene"):
             bench = bench_of(*bench_words)
-        from mitsim.calibrate.model_fit import calibrate_model as fit_model
+        from mitsim.calibrate.model import calibrate_model as fit_model
 
         factors = fit_model(bench, modelling, frames, recipe, asked["seed"], output, job)
     result = factors.manifest.result

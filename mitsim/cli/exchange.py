@@ -35,7 +35,7 @@ from mitsim.cli.screen import finish
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.seeds import check_root
-from mitsim.devices.families import NAMES, read_name
+from mitsim.devices.patterns import pattern_names, read_name, takes_seed
 
 app = typer.Typer()
 
@@ -143,7 +143,7 @@ def import_(
         bare = any(path.suffix.lower() in BARE for path in (source, *(source.iterdir() if source.is_dir() else ())))
         if shape is None or not bare:
             refuse_unused(context, _OF_BARE, "on files that have a header, or without --shape")
-        if not patterns.startswith("random"):
+        if not takes_seed(patterns):
             refuse_unused(context, ["seed"], "on patterns that are not drawn at random")
         raw = None if shape is None else Raw.of(shape, bits, byte_order)
         more = calibration, projector_pixels, black_level, ambient_frame, ambient_shots, raw, channel, seed
@@ -168,7 +168,7 @@ def import_(
 def patterns(
     context: typer.Context,
     family: Annotated[
-        str, typer.Argument(help=f"{NAMES}; or stripes, those of a calibration", metavar="PATTERNS|stripes")
+        str, typer.Argument(help=f"{pattern_names()}; or stripes, those of a calibration", metavar="PATTERNS|stripes")
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="folder to make", metavar="DIR")],
     projector: Annotated[
@@ -197,7 +197,7 @@ def patterns(
 
     if family != "stripes":
         refuse_unused(context, ["signed_capture"], "on patterns, whose signed ones are pairs; it is for stripes")
-    if not family.startswith("random"):
+    if not takes_seed(family):
         refuse_unused(context, ["seed"], "on patterns that are not drawn at random")
     of_stripes = {"camera": camera, "exposure": exposure}
     if family == "stripes":

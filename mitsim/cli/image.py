@@ -75,7 +75,7 @@ def reconstruct(
     from mitsim.core.files import check_output
     from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
     from mitsim.core.spectral_manifests import JOINT, is_coloured, is_mosaic
-    from mitsim.reconstruct.request import IMAGE_FILE, check_asked, check_parallax
+    from mitsim.reconstruct.request import IMAGE_FILE, ImageRequest, check_parallax
 
     strength = number_of("lambda", lam)
     depth = None if focus is None else number_of("focus", focus, ("auto", "map"))
@@ -83,7 +83,7 @@ def reconstruct(
     place: dict[str, Any] = {"focus": depth, "margin": margin, "depth_range": limits}
     output = output or run / "reconstruction"
     if not is_mosaic(run):
-        check_asked(strength, method, depth, margin, limits)
+        ImageRequest(strength, method, depth, margin, limits)
     if is_coloured(run):
         options = {"lam": strength, "method": method, "overwrite": overwrite, **place}
         if is_mosaic(run):

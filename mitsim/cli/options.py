@@ -14,6 +14,7 @@ import typer
 import mitsim
 from mitsim.cli.screen import showing_progress
 from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.devices.patterns import pattern_names, read_name
 
 if TYPE_CHECKING:
     from mitsim.api.bench import Bench
@@ -41,7 +42,7 @@ Variant = Annotated[
         callback=lambda name: variant_of(name),
     ),
 ]
-Patterns = Annotated[str, typer.Option(help="uniform, dots:K, dots:RxC, hadamard:K or random:K")]
+Patterns = Annotated[str, typer.Option(help=pattern_names())]
 Accuracy = Annotated[float, typer.Option(help="relative rms error of the expected frames")]
 AccuracyOrSeconds = Annotated[
     float | None, typer.Option("--accuracy", help="relative rms error of the expected frames", show_default="0.001")
@@ -137,17 +138,16 @@ def swept(name: str, scope: Scope, patterns: str, over: Sequence[str], measure: 
     MitsimError
         for options that the study does not have, or that cannot be read.
     """
-    from mitsim.devices.families import read_name
     from mitsim.report.study_options import check_drifts, check_sweep, measures_of, values_of
 
     varied = tuple(values_of(text) for text in over)
     if name == "sweep":
         check_sweep(varied, len(scope.pictures))
-        read_name(patterns, None)
+        read_name(patterns)
         return replace(scope, sweep=varied, measures=measures_of(measure), patterns=patterns)
     if name == "drift" and measure == MAIN_MEASURE:
         check_drifts(varied)
-        read_name(patterns, None)
+        read_name(patterns)
         return replace(scope, sweep=varied, patterns=patterns)
     if over or patterns != MAIN_PATTERNS or measure != MAIN_MEASURE:
         others = "--measure is for sweep, --over and --patterns for drift and sweep"

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
+from mitsim.core.errors import reason_of
 from mitsim.core.files import whole_file
 from mitsim.core.resources import Cost, Limits
 
@@ -113,7 +114,7 @@ def read_npz(file: BinaryIO, name: Path | str) -> dict[str, npt.NDArray[Any]]:
                 arrays[part.filename.removesuffix(".npy")] = Npy.of(data, part.file_size).part(data)
             return arrays
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OverflowError) as error:
-        raise ValueError(" ".join(str(error).split()) or type(error).__name__) from error
+        raise ValueError(reason_of(error)) from error
 
 
 # -------- HDF5 files
@@ -128,7 +129,7 @@ def whole_hdf5(path: Path | str) -> Iterator[h5py.File]:
     import h5py  # here: it takes 50 ms to import, and most work writes none
 
     with whole_file(path) as part, open(part, "w+b", buffering=0) as disk:
-        kept = _Kept(disk)
+        kept = _FirstErrorFile(disk)
         try:
             with h5py.File(kept, "w", track_order=True) as file:
                 yield file
@@ -138,7 +139,7 @@ def whole_hdf5(path: Path | str) -> Iterator[h5py.File]:
             raise kept.error
 
 
-class _Kept:
+class _FirstErrorFile:
     """A file whose first error in writing is kept as ``error``: what follows is dropped, as if it were written."""
 
     def __init__(self, disk: FileIO) -> None:
@@ -148,11 +149,11 @@ class _Kept:
 
     def write(self, data: Any) -> int:
         """Write ``data``; returns its length."""
-        return self._tried(self._whole, memoryview(data).cast("B"), memoryview(data).nbytes)
+        return self._try(self._whole, memoryview(data).cast("B"), memoryview(data).nbytes)
 
     def truncate(self, size: int) -> int:
         """Make the file ``size`` bytes long; returns that."""
-        return self._tried(self._disk.truncate, size, size)
+        return self._try(self._disk.truncate, size, size)
 
     def flush(self) -> None:
         """Nothing waits: it is not buffered here."""
@@ -168,7 +169,7 @@ class _Kept:
         while view:
             view = view[self._disk.write(view) :]
 
-    def _tried(self, work: Any, argument: Any, result: int) -> int:
+    def _try(self, work: Any, argument: Any, result: int) -> int:
         try:
             if self.error is None:
                 work(argument)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -60,13 +60,12 @@ class Line(BaseModel):
 
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore")
 
-    name: Annotated[str, Field(pattern=r"^[\w.+-]+$", max_length=255)] = Field(
-        description="of the line, and of its folder"
-    )
-    wavelength_nm: float = Field(ge=1, le=1e6, allow_inf_nan=False, description="of the line's light [nm]")
-    radiant_share: float | None = Field(
-        None, ge=0, le=1, allow_inf_nan=False, description="part of the projector's power; none: not known"
-    )
+    name: Annotated[str, Field(pattern=r"^[\w.+-]+$", max_length=255)]
+    """Of the line, and of its folder."""
+    wavelength_nm: float = Field(ge=1, le=1e6, allow_inf_nan=False)
+    """Of the line's light [nm]."""
+    radiant_share: float | None = Field(default=None, ge=0, le=1, allow_inf_nan=False)
+    """Part of the projector's power; none: not known."""
 
     @field_validator("name")
     @classmethod
@@ -81,12 +80,10 @@ class ColourManifest(BaseModel):
 
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore")
 
-    kind: Literal["colour-run", "colour-calibration", "colour-image", "mosaic-run"] = Field(
-        description="what the folder is"
-    )
-    channels: Annotated[tuple[Line, ...], Field(strict=False, min_length=1, max_length=256)] = Field(
-        description="spectral lines, each in a folder of its name"
-    )
+    kind: Literal["colour-run", "colour-calibration", "colour-image", "mosaic-run"]
+    """What the folder is."""
+    channels: Annotated[tuple[Line, ...], Field(strict=False, min_length=1, max_length=256)]
+    """Spectral lines, each in a folder of its name."""
 
     @field_validator("channels")
     @classmethod
@@ -111,12 +108,12 @@ class ColourManifest(BaseModel):
 class MosaicManifest(ColourManifest):
     """What colour.json says of a run behind colour filters, beside its lines."""
 
-    mosaic: Literal["RGGB", "BGGR", "GRBG", "GBRG"] = Field(
-        description="filters of 2 x 2 pixels, row by row from the frame's first pixel"
-    )
+    mosaic: Literal["RGGB", "BGGR", "GRBG", "GBRG"]
+    """Filters of 2 x 2 pixels, row by row from the frame's first pixel."""
     weights: Annotated[
         tuple[Annotated[tuple[Weight, ...], Field(strict=False)], ...], Field(strict=False, min_length=4, max_length=4)
-    ] = Field(description="of each of these four pixels, electrons per photon of each line")
+    ]
+    """Of each of these four pixels, electrons per photon of each line."""
 
     @model_validator(mode="after")
     def _a_weight_for_each_line(self) -> MosaicManifest:
@@ -126,9 +123,6 @@ class MosaicManifest(ColourManifest):
                 f"pixels one for each of {len(self.channels)} lines"
             )
         return self
-
-
-Manifest = TypeVar("Manifest", bound=ColourManifest)
 
 
 def is_coloured(folder: Path | str) -> bool:
@@ -146,12 +140,12 @@ def read_colours(folder: Path | str, kind: str) -> ColourManifest:
 
     MitsimError when it has no colour.json, or one of another kind or that breaks a rule.
     """
-    return _read(Path(folder), kind, ColourManifest)
+    return checked_colours(_contents(Path(folder), kind), kind, Path(folder))
 
 
 def read_mosaic(folder: Path | str) -> MosaicManifest:
     """What colour.json says of a run behind colour filters in ``folder``. MitsimError as :func:`read_colours`."""
-    return _read(Path(folder), MOSAIC, MosaicManifest)
+    return checked_mosaic(_contents(Path(folder), MOSAIC), Path(folder))
 
 
 def check_lines(lines: ColourManifest, run: str, calibration: Path) -> None:
@@ -195,13 +189,13 @@ def checked_colours(data: Any, kind: str, place: Path) -> ColourManifest:
     MitsimError
         when it is of another kind or breaks a rule.
     """
-    return _checked(data, kind, place, ColourManifest)
+    return validated(ColourManifest, _of_kind(data, kind, place), f"{place}/{COLOUR}")
 
 
 def checked_mosaic(data: Any, place: Path) -> MosaicManifest:
     """What the ``data`` of a colour.json, found in ``place``, say of a run behind colour filters. MitsimError as
     :func:`checked_colours`."""
-    return _checked(data, MOSAIC, place, MosaicManifest)
+    return validated(MosaicManifest, _of_kind(data, MOSAIC, place), f"{place}/{COLOUR}")
 
 
 def same_lines(run: Path, calibration: Path) -> ColourManifest:
@@ -211,16 +205,16 @@ def same_lines(run: Path, calibration: Path) -> ColourManifest:
     return lines
 
 
-def _read(folder: Path, kind: str, model: type[Manifest]) -> Manifest:
+def _contents(folder: Path, kind: str) -> Any:
     if not is_coloured(folder):
         raise MitsimError(f"{folder}: holds no {COLOUR}; give a coloured folder, of `mitsim {_COMMANDS[kind]}`")
-    return _checked(read_json(folder / COLOUR), kind, folder, model)
+    return read_json(folder / COLOUR)
 
 
-def _checked(data: Any, kind: str, place: Path, model: type[Manifest]) -> Manifest:
+def _of_kind(data: Any, kind: str, place: Path) -> Any:
     if _kind(data) != kind:
         raise MitsimError(f"{place}: holds a {cut(_kind(data))}, not a {kind}; give the right folder")
-    return validated(model, data, f"{place}/{COLOUR}")
+    return data
 
 
 def _kind(data: Any) -> str:

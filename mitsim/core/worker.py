@@ -41,7 +41,7 @@ _LONGEST_ADVICE = 256
 
 
 class OutOfTime(BaseException):
-    """Raised in work whose time is over (:mod:`mitsim.core.deadline`); no Exception, so that nothing in it takes it for
+    """Raised in work whose time is over (:mod:`mitsim.core.job`); no Exception, so that nothing in it takes it for
     a failure that it may go on from."""
 
 
@@ -81,7 +81,7 @@ def enter_worker() -> None:
     # Signals stay blocked in this thread, so it is the main one that they interrupt.
     threading.Thread(target=_end_with_parent, args=(reading,), daemon=True).start()
     _insist_on_signals()
-    for number in _heeded():
+    for number in _signals_to_heed():
         signal.signal(number, _stop)
     signal.signal(signal.SIGALRM, _again)
     sys.unraisablehook = _unraisable
@@ -218,7 +218,7 @@ def _check_address_space() -> None:
         sys.exit(2)
 
 
-def _heeded() -> list[int]:
+def _signals_to_heed() -> list[int]:
     """Signals that are not ignored already, as nohup and background jobs of a shell have it."""
     return [number for number in _STOPS if signal.getsignal(number) is not signal.SIG_IGN]
 
@@ -226,7 +226,7 @@ def _heeded() -> list[int]:
 def _stop(number: int, _: FrameType | None) -> None:
     global _stopped_by
     _stopped_by = number
-    for heeded in _heeded():  # a terminal sends Control-C to both processes, and the parent passes it on
+    for heeded in _signals_to_heed():  # a terminal sends Control-C to both processes, and the parent passes it on
         signal.signal(heeded, signal.SIG_IGN)
     raise KeyboardInterrupt
 
@@ -256,7 +256,7 @@ def _again(_: int, __: FrameType | None) -> None:
 def _unraisable(lost: sys.UnraisableHookArgs) -> None:
     """An interrupt that fell into a callback or a destructor, where Python drops it with a traceback, comes again; what
     else goes wrong while the process is stopped is not told, as that a second signal came too late. Alarms of
-    :mod:`mitsim.core.deadline` come again of themselves."""
+    :mod:`mitsim.core.job` come again of themselves."""
     if lost.exc_type is OutOfTime:
         return
     if not stopped():
@@ -275,7 +275,7 @@ def _watch(child: int) -> NoReturn:
     asked: list[int] = []
     # Signals stay blocked and are waited for, the worker's end among them: a handler's call can be late by a wait.
     signal.signal(signal.SIGCHLD, lambda *_: None)  # some systems drop what is ignored, blocked or not
-    awaited = {*_heeded(), signal.SIGCHLD}
+    awaited = {*_signals_to_heed(), signal.SIGCHLD}
     while not (ended := os.waitpid(child, os.WNOHANG))[0]:
         number = signal.sigwait(awaited)
         if number != signal.SIGCHLD:

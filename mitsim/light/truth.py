@@ -19,7 +19,7 @@ from mitsim.core.seeds import integer
 from mitsim.devices.session import load_recipe
 from mitsim.light.cost_model import BOARD_SAMPLES, MOST_RAYS, MOST_SAMPLES, TRUTH_GROUPS, TRUTH_PART, TRUTH_SAMPLES
 from mitsim.light.settings import Settings
-from mitsim.transport.flux import FluxTracer, IntArray
+from mitsim.transport.direct import FluxTracer, IntArray
 
 _FINEST = 1e-4
 """Standard error below which the truth is not refined: 80 dB, where no image of a sensor with a full well comes."""
@@ -199,8 +199,8 @@ def _allotted(likely: FloatArray, samples: IntArray, first: int, part: float, mo
     gain, cost = (1 - 2.0**-_RATE) * left, samples[:, None] * 2.0**doublings
     best = np.argsort(-(gain / cost), axis=None, kind="stable")
     enough = int(np.searchsorted(np.cumsum(gain.ravel()[best]), (1 - part) * left[:, 0].sum())) + 1
-    affordable = int(np.searchsorted(np.cumsum(cost.ravel()[best]), most - samples.sum(), side="right"))
-    made = np.bincount(best[: min(enough, affordable)] // _DOUBLINGS, minlength=len(likely))
+    accuracy_for_time = int(np.searchsorted(np.cumsum(cost.ravel()[best]), most - samples.sum(), side="right"))
+    made = np.bincount(best[: min(enough, accuracy_for_time)] // _DOUBLINGS, minlength=len(likely))
     return np.asarray(samples << np.minimum(made, _AT_ONCE))
 
 

@@ -28,8 +28,7 @@ from scipy import fft
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask import Mask
-from mitsim.devices.mask_flaws import NO_FLAWS, Flaws
+from mitsim.devices.mask import NO_FLAWS, Flaws, Mask
 from mitsim.devices.plate import Plate
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.diffraction import EdgeWaves, grid_step, wave_profiles
@@ -93,12 +92,12 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
             "pixels, larger features, or a mask of one or two separable terms"
         )
     if mask.irradiance:
-        values = _resampled(mask, step, count)
+        values = _resample(mask, step, count)
     elif spectrum is None:
-        means = _turned if mask.flaws.turn_deg else _resampled
-        values = sharpened(means(mask, step, count))
+        means = _turned_means if mask.flaws.turn_deg else _resample
+        values = sharpen(means(mask, step, count))
     else:
-        values = sharpened(_waves(replace(shadow, mask=mask.amplitude), spectrum, step, count))
+        values = sharpen(_waves(replace(shadow, mask=mask.amplitude), spectrum, step, count))
     return Plate(step, values, mask.words, flaws=Flaws(mask.blur_mm if spectrum is None else 0.0), irradiance=True)
 
 
@@ -148,7 +147,7 @@ def cells_per_pixel(geometry: CameraGeometry) -> int:
     return geometry.mask_cells or _CELLS_PER_PIXEL
 
 
-def sharpened(values: FloatArray) -> FloatArray:
+def sharpen(values: FloatArray) -> FloatArray:
     """(n, n) means over cells, whose blur by the cells is taken back to second order along both axes of ``values``."""
     for _ in ("rows", "columns"):
         padded = np.pad(values, ((1, 1), (0, 0)))
@@ -156,7 +155,7 @@ def sharpened(values: FloatArray) -> FloatArray:
     return values
 
 
-def _turned(mask: Plate, step: float, count: int) -> FloatArray:
+def _turned_means(mask: Plate, step: float, count: int) -> FloatArray:
     """(count, count) mean transmissions of cells of a ``step`` [mm], at points of a lattice in each: no two of them lie
     in one row or column, and an edge that is turned by little is told to a part in so many."""
     corners = (np.arange(count) - count / 2) * step
@@ -172,7 +171,7 @@ def _turned(mask: Plate, step: float, count: int) -> FloatArray:
     return means
 
 
-def _resampled(mask: Plate, step: float, count: int) -> FloatArray:
+def _resample(mask: Plate, step: float, count: int) -> FloatArray:
     """(count, count) mean values of a mask that is not turned over cells of a ``step`` [mm]."""
     start = -count * step / 2
     along = np.stack(
@@ -194,14 +193,14 @@ def _waves(shadow: ShadowGeometry, spectrum: Spectrum, step: float, count: int) 
         # Waves turn with the mask.
         even = replace(shadow, mask=replace(mask, flaws=NO_FLAWS))
         whole = 2 * int(np.ceil(count / 2**0.5)) + _AROUND
-        return _turned_light(_waves(even, spectrum, step, whole), count, mask.flaws)
+        return _turn_light(_waves(even, spectrum, step, whole), count, mask.flaws)
     total = np.zeros((count, count))
     for wavelength, share in zip(spectrum.wavelengths_nm, spectrum.weights, strict=True):
         total += share * _intensity(*_fields(shadow, float(wavelength), step, count))
     return total
 
 
-def _turned_light(values: FloatArray, count: int, flaws: Flaws) -> FloatArray:
+def _turn_light(values: FloatArray, count: int, flaws: Flaws) -> FloatArray:
     """(count, count) cells of light (n, n) that is turned about its centre, between its cells by cubic splines."""
     # Imported here: most masks are not turned.
     from scipy import ndimage
@@ -232,13 +231,13 @@ def _fields(
     terms, lines = shadow.mask.terms, shadow.mask.lines
 
     def field(profile: FloatArray) -> npt.NDArray[np.complex64]:
-        return _at_points(waves.field(Steps.between(profile, lines), -half), between).astype(np.complex64)
+        return _means_at_points(waves.field(Steps.between(profile, lines), -half), between).astype(np.complex64)
 
     rows = np.stack([np.complex64(weight) * field(row) for weight, row, _ in terms], axis=1)
     return rows, np.stack([field(column) for *_, column in terms]), points
 
 
-def _at_points(field: npt.NDArray[np.complex128], between: int) -> npt.NDArray[np.complex128]:
+def _means_at_points(field: npt.NDArray[np.complex128], between: int) -> npt.NDArray[np.complex128]:
     """(n,) of a ``field`` (n * between,): its means from point to point, their blur taken back to second order.
 
     Fringes of far edges are finer than points are apart. Met at points, they add up wherever the code's lattice meets
@@ -361,8 +360,10 @@ def _part(values: FloatArray, first: int, count: int) -> FloatArray:
 
 # -------- A mask as functions that can be asked for means
 
-Sampler = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
-SeparableTerm = tuple[float, Sampler, Sampler]
+Sampler = Callable[[FloatArray, FloatArray], FloatArray]
+"""From places s and widths [mm], which broadcast, to means of a profile over [s - width/2, s + width/2]."""
+SampledTerm = tuple[float, Sampler, Sampler]
+"""Weight, and samplers of rows and of columns."""
 
 
 class ProfileSampler:
@@ -389,7 +390,7 @@ class ProfileSampler:
         self._feature, self._count = feature_mm, len(values)
         self._start = (-len(values) / 2 if start_mm is None else start_mm / feature_mm) + centre_mm / feature_mm
 
-    def __call__(self, s: FloatArray, width: FloatArray, tangent: FloatArray) -> FloatArray:
+    def __call__(self, s: FloatArray, width: FloatArray) -> FloatArray:
         """Mean over [s - width/2, s + width/2] for arrays that broadcast; at width 0 the value itself."""
         centre, half = s / self._feature - self._start, np.abs(width) / self._feature / 2
         low, high = centre - half, centre + half
@@ -406,7 +407,7 @@ class ProfileSampler:
 
 def wave_samplers(
     geometry: CameraGeometry, spectrum: Spectrum, depth: float, tau: tuple[float, float]
-) -> list[SeparableTerm]:
+) -> list[SampledTerm]:
     """A mask's wave-optical shadow of a (virtual) source, as samplers.
 
     Parameters
@@ -420,7 +421,7 @@ def wave_samplers(
         return _of_plate(raster(geometry, depth, spectrum), geometry.mask_offset)
     shadow = ShadowGeometry.of(geometry, depth)
     reach = geometry.half_width + geometry.mask_distance * geometry.tan_half_fov + max(geometry.pitches)
-    terms: list[SeparableTerm] = []
+    terms: list[SampledTerm] = []
     for wavelength, share in zip(spectrum.wavelengths_nm, spectrum.weights, strict=True):
 
         def axis(of: int, wavelength: float = float(wavelength)) -> list[tuple[float, ProfileSampler]]:
@@ -435,25 +436,21 @@ def wave_samplers(
     return terms
 
 
-def _steps_sampler(profile: Steps) -> Sampler:
-    """That of a ``profile`` whose features are not even, or blurred."""
-    return lambda s, width, tangent: profile.over(s, np.abs(width) / 2)
-
-
-def geometric_samplers(geometry: CameraGeometry) -> list[SeparableTerm]:
+def geometric_samplers(geometry: CameraGeometry) -> list[SampledTerm]:
     """The geometric shadow of the mask of ``geometry``, as samplers."""
     if geometry.drawn(waves=False):
         return _of_plate(raster(geometry, geometry.scene_distance), geometry.mask_offset)
     return _of_plate(geometry.build_mask(), geometry.mask_offset)
 
 
-def _of_plate(mask: Mask | Plate, centre: tuple[float, float]) -> list[SeparableTerm]:
+def _of_plate(mask: Mask | Plate, centre: tuple[float, float]) -> list[SampledTerm]:
     """The samplers of a ``mask`` with its ``centre`` off the axis [mm]."""
 
     def sampler(profile: FloatArray, at: float) -> Sampler:
         if mask.even:
             return ProfileSampler(profile, mask.feature_mm, centre_mm=at)
-        return _steps_sampler(Steps.between(profile, mask.lines + at, mask.blur_mm))
+        steps = Steps.between(profile, mask.lines + at, mask.blur_mm)
+        return lambda s, width: steps.over(s, np.abs(width) / 2)
 
     row, column = centre
     return [(weight, sampler(rows, row), sampler(columns, column)) for weight, rows, columns in mask.terms]

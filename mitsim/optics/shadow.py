@@ -19,7 +19,7 @@ A cell takes the clear profile of its centre.
 
 A mask whose centre is off the axis by o is a centred one seen from its own axis: u - o, and tau - o/z. One that is
 tilted along the axis, its distance d + a s + b, is met by a ray of slope t = tau - u/z at s + t (a s + b) / (1 - a t),
-times sqrt(1 + a^2) along it (:mod:`mitsim.optics.mask_defects`).
+times sqrt(1 + a^2) along it (:mod:`mitsim.optics.terms`).
 
 All coordinates are index coordinates, centred, in mm; tau is a pure number.
 """
@@ -74,7 +74,7 @@ class Directions(ByValue):
     @classmethod
     def cells(cls, edges: npt.ArrayLike) -> Directions:
         """The equal cells between ``edges`` (c + 1,); raises MitsimError for unequal ones."""
-        array = _checked_edges("cell edges", edges)
+        array = _check_edges("cell edges", edges)
         widths = np.diff(array)
         width = float(array[-1] - array[0]) / len(widths)
         if np.abs(widths - width).max() > 1e-6 * width:
@@ -302,8 +302,8 @@ def shadow_factor(
     _require_positive("mask feature size", feature_mm)
     _require_positive("distance from sensor to mask", mask_distance_mm)
     _require_beyond(depth_mm, mask_distance_mm)
-    pixels = _checked_edges("sensor pixel edges", pixel_edges_mm) * _shrink(mask_distance_mm, depth_mm) / feature_mm
-    cells = _checked_edges("cell edges", cell_edges_tan) * mask_distance_mm / feature_mm
+    pixels = _check_edges("sensor pixel edges", pixel_edges_mm) * _shrink(mask_distance_mm, depth_mm) / feature_mm
+    cells = _check_edges("cell edges", cell_edges_tan) * mask_distance_mm / feature_mm
     centre = (pixels[:-1] + pixels[1:])[:, None] / 2 + (cells[:-1] + cells[1:])[None, :] / 2
     return _trapezoid_mean(values, centre, np.diff(pixels)[:, None] / 2, np.diff(cells)[None, :] / 2)
 
@@ -363,6 +363,22 @@ def _trapezoid_cdf(x: FloatArray, half_a: FloatArray, half_b: FloatArray) -> Flo
     return np.asarray(np.where(x < 0, upper, 1 - upper))
 
 
+def nodes_between(places: FloatArray, count: int) -> FloatArray:
+    """(``count``,) Chebyshev's nodes between those of ``places`` that are farthest from 0; 0 for one."""
+    reach = float(np.abs(places).max())
+    return np.asarray(reach * np.cos(np.pi * (np.arange(count) + 0.5) / count) if count > 1 else np.zeros(1))
+
+
+def lagrange_weights(places: FloatArray, nodes: FloatArray) -> list[FloatArray]:
+    """At each of the ``places``, the polynomial that is 1 at each of the ``nodes`` and 0 at the others: weights that
+    interpolate between values at the nodes."""
+    weights = []
+    for node in nodes:
+        others = nodes[nodes != node]
+        weights.append(np.prod([(places - other) / (node - other) for other in others], axis=0) * np.ones_like(places))
+    return weights
+
+
 def _shrink(distance_mm: float, depth_mm: float) -> float:
     """1 - d/z as (z - d)/z: beside the scene the difference of two lengths keeps digits that 1 - d/z has lost."""
     return (depth_mm - distance_mm) / depth_mm if np.isfinite(depth_mm) else 1.0
@@ -373,7 +389,7 @@ def _require_beyond(depth_mm: float, mask_mm: float) -> None:
         raise MitsimError(f"scene depth is {depth_mm} mm; it must lie beyond the mask at {mask_mm} mm")
 
 
-def _checked_edges(name: str, edges: npt.ArrayLike) -> FloatArray:
+def _check_edges(name: str, edges: npt.ArrayLike) -> FloatArray:
     array = np.asarray(edges, dtype=np.float64)
     if array.ndim != 1 or array.size < 2 or not np.isfinite(array).all() or not (np.diff(array) > 0).all():
         raise MitsimError(f"{name} of shape {array.shape} are not at least 2 finite increasing numbers; sort them")

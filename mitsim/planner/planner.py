@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import replace
-from types import MappingProxyType
 
 import drjit as dr
 
@@ -16,13 +15,23 @@ from mitsim.core.arrays import Labels
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
-from mitsim.light.cost_model import FIXED, paces_of, tracing_seconds
-from mitsim.light.passes import AT_ANCHORS, Simulation, Stage
+from mitsim.light.cost_model import FIXED, tracing_seconds, unit_costs_of
+from mitsim.light.passes import Simulation
+from mitsim.light.pilot_result import LOOKS, Evidence, SampleCost
 from mitsim.light.plan import Plan
-from mitsim.light.settings import GROUPS, LOOKS, MOST_PATHS, Evidence, whole
+from mitsim.light.settings import GROUPS, MOST_PATHS
 from mitsim.optics.diffraction import check_openings
 from mitsim.planner import pilot
-from mitsim.planner.choose import FIRST_LOOK, Candidates, Choice, affordable, cheapest, doubt, predicted, told
+from mitsim.planner.choose import (
+    FIRST_ACCURACY,
+    Candidate,
+    Candidates,
+    accuracy_for_time,
+    cheapest,
+    predicted,
+    time_warnings,
+    value_of_refining,
+)
 from mitsim.planner.explain import SceneFacts, decide
 from mitsim.planner.memory import frame_seconds
 
@@ -32,12 +41,13 @@ _LONGER = 2.0
 """Seconds of a second, finer look over those of the first (photograph 1.0, corner 1.1, gift_card 1.3, cookie_bag 2.6 at
 a tenth of the accuracy)."""
 _REHEARSED = 2**16
-"""Paths that tell a tracer's pace at first: a tenth of a second or less."""
+"""Paths that tell a pass's unit cost at first: a tenth of a second or less."""
 _SELDOM = 3.0
 """What knowing for certain saves at most, over what a closer look may take for it: the look seldom turns out as hoped
 (corner and cookie_bag at 1e-3: four looks of 1 to 13 s, and no run was the faster for them)."""
 _MORE, _OF_ALL = 4, 0.1
-"""Times as many paths as before that tell a pace, or noise, next, and the part of all planned that they are at most."""
+"""Times as many paths as before that tell a unit cost, or noise, next, and the part of all planned that they are at
+most."""
 _LEAST_SLOPE = 0.25
 """Part of a path's seconds in a launch that are its own at least, whatever shorter launches seem to say."""
 _HEAVY_PATHS, _MOST_HEAVY_PATHS = 2**19, 2**23
@@ -48,19 +58,10 @@ _FEW, _FEWEST = 8.0, 4.0
 tell nothing of its samples: ten glossy balls of alpha 0.005 need a hundred times those planned, one time in ten."""
 _LEAST, _MOST = 0.7, 5.0
 """Times the planned work on heavy paths that a run takes in nine cases of ten where more are met: sampling begins with
-0.8 of it (:mod:`mitsim.light.light`), at a pace known to a tenth (93, 99, 100 and 95 % of 400 pilots and runs, drawn
-from 1.3e8 paths of balls of alpha 0.02, 0.05 and 0.1 and of a torus)."""
+0.8 of it (:mod:`mitsim.light.light`), at a unit cost known to a tenth (93, 99, 100 and 95 % of 400 pilots and runs,
+drawn from 1.3e8 paths of balls of alpha 0.02, 0.05 and 0.1 and of a torus)."""
 _HEAVIER = 1.25
 """Tracing that takes so many times as long as planned is planned anew; less is what predictions are good to."""
-
-_FIELDS = MappingProxyType(
-    {
-        "sharp": "sharp_light",
-        "occluded": "occluded_light",
-        **dict(zip(AT_ANCHORS, ("followed", "followed_from_camera"), strict=True)),
-    }
-)
-"""What evidence calls the light of a stage, where it is not the stage's name."""
 
 
 @single_threaded_blas()
@@ -85,7 +86,7 @@ def make_plan(
     switches
         effects that are switched on or off by name, whatever they are worth.
     lines
-        that share the paths, of which the bench shows one; what it takes is told of all.
+        that share the paths, of which the bench shows one; what it takes is time_warnings of all.
 
     Raises
     ------
@@ -95,15 +96,15 @@ def make_plan(
     check_accuracy(accuracy)
     _refuse_unfit(bench, switches or {})
     started = time.perf_counter()
-    look = pilot.Look(bench, lighting, accuracy, seed, lines)
+    runs = pilot.Look(bench, lighting, accuracy, seed, lines)
     while True:
-        evidence = look.evidence
-        worth, part = doubt(accuracy, evidence, switches or {})
-        stage = pilot.stage_of(part)
-        if _SELDOM * look.price(stage) > worth:
+        evidence = runs.evidence
+        worth, part = value_of_refining(accuracy, evidence, switches or {})
+        run = pilot.run_of(part)
+        if _SELDOM * runs.work(run) > worth:
             break
-        look.refine(stage)
-    return _decided(look, accuracy, switches or {}).taking(plan=time.perf_counter() - started)
+        runs.refine(run)
+    return _decided(runs, accuracy, switches or {}).taking(plan=time.perf_counter() - started)
 
 
 @single_threaded_blas()
@@ -112,7 +113,7 @@ def plan_within(
 ) -> Plan:
     """The plan of the finest accuracy whose run is predicted to end within so many seconds.
 
-    Predicted at fixed paces, looking and opening the scene included: the same seconds mean the same plan.
+    Predicted at fixed unit costs, looking and opening the scene included: the same seconds mean the same plan.
 
     Parameters
     ----------
@@ -129,21 +130,21 @@ def plan_within(
     started, switches = time.perf_counter(), switches or {}
     _refuse_unfit(bench, switches)
     around = OPENING_S + sum(frame_seconds(bench, len(lighting.weights)).values())
-    look = pilot.Look(bench, lighting, FIRST_LOOK, seed)
-    around += look.seconds
-    again = _LONGER * look.seconds
-    found = affordable(Candidates(look.evidence, switches), seconds - around, FIRST_LOOK)
+    runs = pilot.Look(bench, lighting, FIRST_ACCURACY, seed)
+    around += runs.seconds
+    again = _LONGER * runs.seconds
+    found = accuracy_for_time(Candidates(runs.evidence, switches), seconds - around, FIRST_ACCURACY)
     # What a look tells of finer accuracies than its own is their price, not whether they are kept.
-    aim = affordable(Candidates(look.evidence, switches), seconds - around - again, 0.0, kept=False)
-    if found.fits and aim.fits and aim.accuracy < FIRST_LOOK:
+    aim = accuracy_for_time(Candidates(runs.evidence, switches), seconds - around - again, 0.0, kept=False)
+    if found.fits and aim.fits and aim.accuracy < FIRST_ACCURACY:
         around += again
         closer = pilot.Look(bench, lighting, aim.accuracy, seed)
-        finer = affordable(Candidates(closer.evidence, switches), seconds - around, aim.accuracy)
+        finer = accuracy_for_time(Candidates(closer.evidence, switches), seconds - around, aim.accuracy)
         # It may say that no accuracy is kept at all, and then has the loosest.
         if finer.fits and finer.accuracy <= found.accuracy:
-            look, found = closer, finer
-    plan = _decided(look, found.accuracy, switches).taking(plan=time.perf_counter() - started)
-    return replace(plan, asked_seconds=seconds, warnings=(*told(found, seconds, around), *plan.warnings))
+            runs, found = closer, finer
+    plan = _decided(runs, found.accuracy, switches).taking(plan=time.perf_counter() - started)
+    return replace(plan, asked_seconds=seconds, warnings=(*time_warnings(found, seconds, around), *plan.warnings))
 
 
 def _refuse_unfit(bench: Apparatus, switches: Mapping[str, bool]) -> None:
@@ -154,14 +155,14 @@ def _refuse_unfit(bench: Apparatus, switches: Mapping[str, bool]) -> None:
         check_openings(bench.geometry.build_mask(), float(bench.spectrum.wavelengths_nm.max()))
 
 
-def _decided(look: pilot.Look, accuracy: float, switches: Mapping[str, bool]) -> Plan:
-    """The plan at an ``accuracy`` of what a ``look`` found, with the paces of its choice measured."""
-    evidence, bench = look.evidence, look.bench
+def _decided(runs: pilot.Look, accuracy: float, switches: Mapping[str, bool]) -> Plan:
+    """The plan at an ``accuracy`` of what ``runs`` found, with the unit costs of its choice measured."""
+    evidence, bench = runs.evidence, runs.bench
     chosen = cheapest(accuracy, evidence, switches)
     if evidence.sharp is not None and Simulation(bench, chosen.settings).from_camera is not None:
-        evidence, chosen = _with_heavy_paths(look, accuracy, chosen, switches)
+        evidence, chosen = _with_heavy_paths(runs, accuracy, chosen, switches)
     simulation = Simulation(bench, chosen.settings)
-    timed = _timed(evidence, simulation, look.lighting.labels, look.seed)
+    timed = _timed(evidence, simulation, runs.lighting.labels, runs.seed)
     plan = decide(accuracy, timed, SceneFacts.of(bench, switches), switches, chosen)
     plan = replace(plan, predicted_range=_range(timed, plan))
     if simulation.physics.mirrors:
@@ -171,102 +172,103 @@ def _decided(look: pilot.Look, accuracy: float, switches: Mapping[str, bool]) ->
 
 
 def _with_heavy_paths(
-    look: pilot.Look, accuracy: float, chosen: Choice, switches: Mapping[str, bool]
-) -> tuple[Evidence, Choice]:
-    """What a ``look`` found, and ``chosen`` with samples for rare paths over gloss where these make most of the noise.
+    runs: pilot.Look, accuracy: float, chosen: Candidate, switches: Mapping[str, bool]
+) -> tuple[Evidence, Candidate]:
+    """What ``runs`` found, and ``chosen`` with samples for rare paths over gloss where these make most of the noise.
 
     Whether the first samples of a run meet such paths is chance, and where they do not, nothing in it tells that their
     light is missing. So sampling begins with what looks of ever more paths ask for, the last of a part of the run's.
     """
-    plain = tracing_seconds(look.evidence, chosen.settings, FIXED)
+    plain = tracing_seconds(runs.evidence, chosen.settings, FIXED)
     paths = _HEAVY_PATHS
     while True:
-        found = look.heavy(max(1, paths // (LOOKS * look.evidence.from_camera.paths)))
+        known = runs.evidence.sample_costs
         heavier = {
-            name: replace(getattr(look.evidence, name), noise=effort.noise)
-            for name, effort in found.items()
-            if effort.variance > getattr(look.evidence, name).variance
+            name: replace(known[name], noise=sample_cost.noise)
+            for name, sample_cost in runs.heavy(max(1, paths // (LOOKS * known["from_camera"].paths))).items()
+            if sample_cost.variance > known[name].variance
         }
-        evidence = replace(look.evidence, **heavier)
+        evidence = runs.evidence.with_sample_costs(heavier)
         planned = predicted(accuracy, evidence, chosen.settings, switches)
         seconds = tracing_seconds(evidence, planned.settings, FIXED)
         if sum(seconds.values()) <= _HEAVIER * sum(plain.values()):
-            return look.evidence, chosen
+            return runs.evidence, chosen
         paths *= _MORE
-        asked = {name: seconds[name] / getattr(FIXED, name) for name in heavier}
-        few = any(getattr(evidence, name).noise.heavy < _FEW for name in heavier)
+        asked = {name: seconds[name] / FIXED.passes[name] for name in heavier}
+        few = any(sample_cost.noise.heavy < _FEW for sample_cost in heavier.values())
         if paths > (_MOST_HEAVY_PATHS if few else min(_MOST_HEAVY_PATHS, _OF_ALL * sum(asked.values()))):
             return evidence, _limited(planned, asked)
 
 
-def _limited(chosen: Choice, paths: Mapping[str, float]) -> Choice:
+def _limited(chosen: Candidate, paths: Mapping[str, float]) -> Candidate:
     """The choice with no more samples of light whose ``paths`` in a run are known than sampling stops at."""
-    samples = {f"{name}_samples": MOST_PATHS / count for name, count in paths.items() if count > MOST_PATHS}
-    less = {name: part * getattr(chosen.settings, name) for name, part in samples.items()}
-    return replace(chosen, settings=replace(chosen.settings, **less))
+    samples = dict(chosen.settings.samples)
+    samples |= {name: MOST_PATHS / count * samples[name] for name, count in paths.items() if count > MOST_PATHS}
+    return replace(chosen, settings=replace(chosen.settings, samples=samples))
 
 
 def _range(evidence: Evidence, plan: Plan) -> tuple[float, float] | None:
     """Seconds between which nine of ten runs of a ``plan`` end, where few heavy paths bring most of their noise; None
     where many bring it, whose samples are known."""
-    paces, least, most = paces_of(evidence), 0.0, 0.0
-    for name, seconds in tracing_seconds(evidence, plan.settings, paces).items():
-        heavy = getattr(evidence, _FIELDS.get(name, name)).noise.heavy
+    costs, least, most = unit_costs_of(evidence), 0.0, 0.0
+    for name, seconds in tracing_seconds(evidence, plan.settings, costs).items():
+        heavy = evidence.sample_costs[name].noise.heavy
         if seconds and math.isfinite(heavy):
-            limit = MOST_PATHS * getattr(paces, name)
+            limit = MOST_PATHS * costs.passes[name]
             least += (_LEAST - 1) * seconds
             most += max((min(_MOST * seconds, limit) if heavy >= _FEWEST else limit) - seconds, 0.0)
     total = plan.predicted_seconds
     return (total + least, total + most) if most else None
 
 
-def _seconds(stage: Stage, seed: int, labels: Labels, samples: int) -> float:
-    """What so many ``samples`` of a ``stage`` take to be traced and filed."""
-    ledgers = stage.ledgers(labels, 1)
+def _seconds(simulation: Simulation, name: str, seed: int, labels: Labels, samples: int) -> float:
+    """What so many ``samples`` of a pass take to be traced and accumulated."""
+    ledgers = simulation.ledgers(name, labels, 1)
     started = time.perf_counter()
-    stage.file(stage.trace(seed, 0, samples, ledgers), labels, samples)
-    # What is filed on the device is not waited for.
+    simulation.accumulate(name, simulation.passes[name].trace(seed, 0, samples, ledgers), labels, samples)
+    # What is added up on the device is not waited for.
     dr.sync_thread()
     return time.perf_counter() - started
 
 
 def _timed(evidence: Evidence, simulation: Simulation, labels: Labels, seed: int) -> Evidence:
-    """The ``evidence`` with the seconds that a path takes to be traced and filed in a ``simulation`` of the choice."""
-    own, found = integer(seed, "pilot", "paces"), {}
-    for name, stage in simulation.tracers().items():
-        seconds, longest = _pace(stage, simulation.paths_at_once, int(whole(name, stage.predicted)), labels, own)
-        field = _FIELDS.get(name, name)
-        effort = getattr(evidence, field)
+    """The ``evidence`` with the seconds that a path takes to be traced and accumulated in a ``simulation`` of the
+    choice."""
+    own, found, spread = integer(seed, "pilot", "paces"), {}, evidence.spread
+    for name, each in simulation.passes.items():
+        seconds, longest = _pace(simulation, name, labels, own)
+        sample_cost = evidence.sample_costs.get(name, SampleCost.none())
         # A path of shared light counts for several.
-        found[field] = replace(effort, seconds=seconds / (effort.paths if name == "indirect" else stage.tracer.lanes))
+        paths = sample_cost.paths if name == "indirect" else each.tracer.lanes
+        found[name] = replace(sample_cost, seconds=seconds / paths)
         if name == "direct":
-            found["spread"] = replace(evidence.spread, seconds=longest / stage.tracer.lanes)
-    return replace(evidence, **found)
+            spread = replace(spread, seconds=longest / paths)
+    return replace(evidence.with_sample_costs(found), spread=spread)
 
 
-def _pace(stage: Stage, at_once: int, planned: int, labels: Labels, seed: int) -> tuple[float, float]:
-    """Seconds of a sample of a ``stage`` in a run, and in the longest launches that were timed.
+def _pace(simulation: Simulation, name: str, labels: Labels, seed: int) -> tuple[float, float]:
+    """Seconds of a sample of a pass in a run, and in the longest launches that were timed.
 
     Launches of more and more paths, up to those of the run itself, tell what each launch takes besides its paths.
 
     Parameters
     ----------
-    stage, labels, seed
-        what is traced, how it is filed, and the root of its random numbers.
-    at_once
-        paths of a launch of the run.
-    planned
-        samples of a group of the run.
+    simulation, name
+        what is traced of it.
+    labels, seed
+        how it is accumulated, and the root of its random numbers.
     """
-
-    lanes, every = stage.tracer.lanes, GROUPS * planned
+    each, at_once = simulation.passes[name], simulation.paths_at_once
+    planned, lanes = each.whole, each.tracer.lanes
+    every = GROUPS * planned
 
     def once(samples: int) -> float:
-        seconds = _seconds(stage, seed, labels, samples)
+        seconds = _seconds(simulation, name, seed, labels, samples)
         # What disturbs a moment would be multiplied.
-        return min(seconds, _seconds(stage, seed, labels, samples)) if samples <= _OF_ALL * every else seconds
+        again = samples <= _OF_ALL * every
+        return min(seconds, _seconds(simulation, name, seed, labels, samples)) if again else seconds
 
-    _seconds(stage, seed, labels, 1)  # compiles the kernel
+    _seconds(simulation, name, seed, labels, 1)  # compiles the kernel
     launch, samples = once(1), max(1, _REHEARSED // lanes)
     longest = once(samples) if samples > 1 else launch
     least = longest / samples

@@ -4,6 +4,13 @@ In the basis of the factors the fit is diagonal: coefficient W_ij is kept by the
 sigma_ij^2 / (sigma_ij^2 + lambda), so any lambda costs n^2 operations, whatever the number of frames. Where the model
 explains the frames, lambda minimises an unbiased estimate of the image's error; where it does not, the image must also
 stand still when lambda changes. What was tried instead: docs/decisions/0004-lambda-by-halves.md.
+
+*Noise by halves of the sensor.* Where Y = U S X' + noise, with X' the image in the diagonal basis, the half W_0 = U_0^T
+Y of the sum over the sensor's rows is G W up to noise, G = U_0^T U_0: in W_0 - G W there is no image, and nothing else
+that both halves agree on. White noise gives its number i the variance G (I - G)_ii times its own, since G and I - G
+commute. An error E of the left factor that is independent from sensor row to row, as a calibration's noise is, shows
+too: U^T E X S' strikes all numbers of a column of W alike, by that column's light. Halves of the columns tell the same
+of the right factor.
 """
 
 from __future__ import annotations
@@ -247,10 +254,7 @@ def _least(score: Callable[[float], float], scale: float, exponents: FloatArray)
         return 0.0
     lower, upper = exponents[max(best - 1, 0)], exponents[min(best + 1, len(exponents) - 1)]
     refined = minimize_scalar(
-        lambda exponent: score(scale * 10.0**exponent),
-        bounds=(lower, upper),
-        method="bounded",
-        options={"xatol": 1e-3},
+        lambda exponent: score(scale * 10.0**exponent), bounds=(lower, upper), method="bounded", options={"xatol": 1e-3}
     )
     return float(scale * 10.0 ** float(refined.x))
 
@@ -287,7 +291,8 @@ class Halves:
     @cached_property
     def _squares(self) -> tuple[FloatArray, FloatArray]:
         """The squares of :attr:`differences` in units of a number's variance; NaN where halves cannot be told apart."""
-        rows, columns = (_told(half_spread(side.first_half)) for side in (self.left, self.right))
+        spreads = (half_spread(side.first_half) for side in (self.left, self.right))
+        rows, columns = (np.where(spread >= _LEAST_SPREAD, spread, np.nan) for spread in spreads)
         by_row, by_column = self.differences
         return np.square(by_row) / rows[:, None], np.square(by_column) / columns
 
@@ -310,11 +315,6 @@ class Halves:
 def half_spread(half: FloatArray) -> FloatArray:
     """(r,) variance of W_0 - G W for white noise of variance 1, G being ``half``: the diagonal of G (I - G)."""
     return np.asarray(np.diag(half) - np.einsum("ij,ji->i", half, half))
-
-
-def _told(spread: FloatArray) -> FloatArray:
-    """``spread`` where it is not too small; otherwise NaN."""
-    return np.where(spread >= _LEAST_SPREAD, spread, np.nan)
 
 
 def _medians(squares: FloatArray) -> FloatArray:

@@ -71,8 +71,8 @@ class Side:
         one a pattern index.
     projected
         True: slabs are rows of U. False (``gram``): slabs are Phi diag(p_i), and W is the paper's Q.
-    n_blocks, pattern_count, sensor_size, scene_size, data_rows
-        number of blocks; K; m; n; independent data rows, m K (less K once frames are centred).
+    pattern_count, sensor_size, scene_size, data_rows
+        K; m; n; independent data rows, m K (less K once frames are centred).
     dual
         (n, r) V' with B = U S V'^T; None: V' is the basis, which is orthonormal
         (:mod:`mitsim.reconstruct.solver` has others).
@@ -84,7 +84,6 @@ class Side:
     singular: FloatArray
     slabs: tuple[Slab, ...]
     projected: bool
-    n_blocks: int
     pattern_count: int
     sensor_size: int
     scene_size: int
@@ -95,7 +94,24 @@ class Side:
     @cached_property
     def response(self) -> FloatArray:
         """B^T U (n, r): what the coefficients see of light of each scene pixel."""
-        return _frozen((self.basis if self.dual is None else self.dual) * self.singular)
+        return _frozen(self.duals * self.singular)
+
+    @property
+    def duals(self) -> FloatArray:
+        """V' (n, r) of B = U S V'^T."""
+        return self.basis if self.dual is None else self.dual
+
+    @property
+    def common(self) -> FloatArray:
+        """(m, r) sum of all slabs: how each coefficient takes what is common to all frames."""
+        total = np.zeros((self.sensor_size, self.accumulated_size))
+        for slab in self.slabs:
+            total[:, slab.columns] += slab.matrix
+        return total
+
+    def columns(self, index: int) -> IndexArray:
+        """Places in W of what pattern ``index`` contributes."""
+        return np.arange(self.accumulated_size)[self.slabs[index].columns]
 
     @property
     def rank(self) -> int:
@@ -125,11 +141,10 @@ class Side:
     @cached_property
     def first_half(self) -> FloatArray:
         """G = U_0^T U_0 (r, r), with U_0 the rows of U in the first half of the sensor: what that half sees of W."""
-        size = self.accumulated_size
-        gram = np.zeros((size, size))
-        for slab in self.slabs:
+        gram = np.zeros((self.accumulated_size, self.accumulated_size))
+        for index, slab in enumerate(self.slabs):
             rows = np.concatenate([slab.matrix[strip] for strip in self.halves[0]])
-            columns = np.arange(size)[slab.columns]
+            columns = self.columns(index)
             gram[np.ix_(columns, columns)] += rows.T @ rows
         if self.projected:
             return gram
@@ -185,14 +200,13 @@ def factorise(
         whether frames lose row and column means.
     """
     sensor, scene = phi.shape
-    build = _projected if method == "svd" else _gram
+    build = _factorise_svd if method == "svd" else _factorise_gram
     basis, singular, slabs = build(phi, patterns, groups, structure)
     return Side(
         basis=_frozen(basis),
         singular=_frozen(singular),
         slabs=slabs,
         projected=method == "svd",
-        n_blocks=len(groups),
         pattern_count=patterns.shape[1],
         sensor_size=sensor,
         scene_size=scene,
@@ -200,7 +214,7 @@ def factorise(
     )
 
 
-def _projected(
+def _factorise_svd(
     phi: FloatArray, patterns: FloatArray, groups: tuple[Group, ...], structure: Structure
 ) -> tuple[FloatArray, FloatArray, tuple[Slab, ...]]:
     """SVD of B block by block: basis, singular values, slabs."""
@@ -231,7 +245,7 @@ def _block_svd(phi: FloatArray, group: Group) -> tuple[tuple[FloatArray, ...], F
         norm = float(np.linalg.norm(psi))
         left, singular, right = _svd(phi * weights)
         scale = psi / (norm or 1.0)
-        return tuple(_scaled(left, factor) for factor in scale), singular * norm, right
+        return tuple(_scale(left, factor) for factor in scale), singular * norm, right
     # Phi = Q R once: B = (I (x) Q) [R diag(p_1); R diag(p_2); ...] is then as short as R, and as accurate.
     q, small = np.linalg.qr(phi)
     stacked = np.concatenate([small * column for column in patterns.T])
@@ -239,7 +253,7 @@ def _block_svd(phi: FloatArray, group: Group) -> tuple[tuple[FloatArray, ...], F
     return tuple(q @ slab for slab in np.split(left, patterns.shape[1])), singular, right
 
 
-def _scaled(matrix: FloatArray, factor: float) -> FloatArray:
+def _scale(matrix: FloatArray, factor: float) -> FloatArray:
     """matrix * factor without the work for 1, and with no columns for 0: a dark block is never read."""
     if factor == 0.0:
         return matrix[:, :0]
@@ -267,7 +281,7 @@ def _svd(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return left, singular, right
 
 
-def _gram(
+def _factorise_gram(
     phi: FloatArray, patterns: FloatArray, groups: tuple[Group, ...], structure: Structure
 ) -> tuple[FloatArray, FloatArray, tuple[Slab, ...]]:
     """Eigen-decomposition of A block by block (the paper's way), and slabs Phi diag(p_i)."""

@@ -47,7 +47,7 @@ from mitsim.core.manifests import FactorNoise
 from mitsim.reconstruct.detail import PRINT, Model, disagreement
 from mitsim.reconstruct.misfit import Lack
 from mitsim.reconstruct.noise import FrameNoise
-from mitsim.reconstruct.regularisation import DiagonalProblem, Halves, coefficient_noise
+from mitsim.reconstruct.regularisation import DiagonalProblem, coefficient_noise
 from mitsim.reconstruct.sides import Side
 from mitsim.reconstruct.spectrum import scene_spectrum
 
@@ -205,7 +205,7 @@ class Propagation:
             (m,) and (m',) mean variance of its pixels by sensor row, and by sensor column.
         """
         sides = zip(self.model.sides, (rows, columns), strict=True)
-        left, right = (common_response(side) * np.sqrt(variance)[:, None] for side, variance in sides)
+        left, right = (side.common * np.sqrt(variance)[:, None] for side, variance in sides)
         mean = max(float(rows.mean()), float(columns.mean()))
         return np.asarray(self._taken(left, right) / (mean or 1.0))
 
@@ -255,10 +255,10 @@ class Propagation:
         energy = spectrum.energy * np.exp(spread / 2)  # the mean of what has a logarithm of that variance
         part = seen_part(energy)
         told = np.divide(part * detail, self._sigma, out=np.zeros_like(power), where=power > 0)
-        squares = self._seen(np.square(lost) * (np.square(told) + energy * (1 - part)))
+        squares = self._pixel_variance(np.square(lost) * (np.square(told) + energy * (1 - part)))
         of_mean = (spectrum.mean**2 + spectrum.mean_variance) * np.square(image(lost * spectrum.even))
         seen = gaussian_filter(np.square(image(lost * told)), _NEAR, mode="nearest")
-        usual = gaussian_filter(self._seen(np.square(lost) * energy * part), _NEAR, mode="nearest")
+        usual = gaussian_filter(self._pixel_variance(np.square(lost) * energy * part), _NEAR, mode="nearest")
         doubt = max(_UNSURE * float(usual.mean()), 1e-300)
         near = (seen + doubt) / (usual + doubt)
         placed = squares * near
@@ -288,31 +288,18 @@ class Propagation:
             (np.square(self.model.prepared.image(self.gain * each)) for each in seen), np.zeros_like(image)
         )
 
-    def of_disagreement(self, halves: Halves, rows: FloatArray, columns: FloatArray) -> FloatArray:
-        """(n, n') variance of the image by what ``halves`` of the sensor disagree on beyond chance.
-
-        Parameters
-        ----------
-        halves
-            of the image's data.
-        rows, columns
-            (n, n') variances of the image by known errors that change from sensor row to row, and column to column.
-        """
-        return disagreement(self.model, self.gain, halves, (rows, columns))
-
     def _spread(self, variances: FloatArray) -> FloatArray:
         """(n, n') variance of the image, that of each coefficient of W being ``variances`` (r, r')."""
-        return self._seen(np.square(self.gain) * variances)
+        return self._pixel_variance(np.square(self.gain) * variances)
 
-    def _seen(self, variances: FloatArray) -> FloatArray:
+    def _pixel_variance(self, variances: FloatArray) -> FloatArray:
         """(n, n') variance of the image, that of each of its coefficients being ``variances`` (r, r')."""
         left, right = (np.square(side.basis) for side in self.model.sides)
         return np.asarray(left @ variances @ right.T)
 
     @cached_property
     def _sigma(self) -> FloatArray:
-        """(r, r') singular values of the whole model."""
-        return np.outer(*(side.singular for side in self.model.sides))
+        return self.model.prepared.sigma
 
 
 def uncertainty(
@@ -346,7 +333,9 @@ def uncertainty(
     zero, data = np.zeros_like(image), problem.data_count
     frames = propagation.of_frames(noise.rows, noise.columns)
     left, right = propagation.of_factors(factors, image) if factors else (zero, zero)
-    told = propagation.of_disagreement(problem.halves, frames + left, frames + right) if problem.halves else zero
+    known, told = (frames + left, frames + right), zero
+    if problem.halves:
+        told = disagreement(propagation.model, propagation.gain, problem.halves, known)
     lost, factor = propagation.of_regularisation(problem, float(noise.variance.mean()))
     variances = {
         "frame_noise": frames,
@@ -359,14 +348,6 @@ def uncertainty(
         "regularisation_bias": lost,
     }
     return Uncertainty({name: np.sqrt(np.maximum(each, 0.0)) for name, each in variances.items()}, factor)
-
-
-def common_response(side: Side) -> FloatArray:
-    """(m, r) sum of all slabs of a ``side``: how each coefficient takes what is common to all frames."""
-    total = np.zeros((side.sensor_size, len(side.singular)))
-    for slab in side.slabs:
-        total[:, slab.columns] += slab.matrix
-    return total
 
 
 def _of_factor(

@@ -16,10 +16,8 @@ from mitsim.scene.guard.check import check_file, looking_beside
 from mitsim.scene.guard.estimators import Unfit
 from mitsim.scene.guard.limits import Range
 from mitsim.scene.guard.outline import Tag
-from mitsim.scene.mesh_lamps import emit_by_faces
-from mitsim.scene.origin import check_meshes, move_to_camera
 from mitsim.scene.projector import ProjectorGrid, locate_projector
-from mitsim.scene.thin import with_thin_shapes_as_meshes
+from mitsim.scene.tree import check_meshes, emit_by_faces, move_to_camera, with_thin_shapes_as_meshes
 
 SENSOR_PLUGIN = "mitsim_lensless"
 _SMALL_LAMPS = ("DirectionalEmitter", "PointLight", "SpotLight")
@@ -118,26 +116,27 @@ def load_scene(
         except MitsimError:
             if needs_projector:
                 raise
-    shapes = checked.shapes if len(checked.shapes) == len(scene.shapes()) else ()
     small = [emitter for emitter in emitters if emitter.class_name() in _SMALL_LAMPS]
-    lit = tuple(zip(small, checked.small_lamps, strict=True))
-    facts = (
-        *_polished(scene, checked.unfit),
+    return LoadedScene(
+        path,
+        checked.files,
+        scene,
+        cameras[0],
+        projectors[0] if grid else None,
+        grid,
+        tuple(emitter for emitter in emitters if grid is None or emitter.class_name() != "Projector"),
+        *_mirrors_and_gloss(scene, checked.unfit),
         checked.unfit,
-        shapes,
-        lit,
+        checked.shapes if len(checked.shapes) == len(scene.shapes()) else (),
+        tuple(zip(small, checked.small_lamps, strict=True)),
         checked.coloured,
         checked.parting,
         checked.samples,
         notes,
     )
-    if grid is None:
-        return LoadedScene(path, checked.files, scene, cameras[0], None, None, tuple(emitters), *facts)
-    lamps = tuple(emitter for emitter in emitters if emitter.class_name() != "Projector")
-    return LoadedScene(path, checked.files, scene, cameras[0], projectors[0], grid, lamps, *facts)
 
 
-def _polished(scene: mi.Scene, unfit: Unfit) -> tuple[bool, bool]:
+def _mirrors_and_gloss(scene: mi.Scene, unfit: Unfit) -> tuple[bool, bool]:
     """Whether a surface of the scene is a mirror or bends light, and whether one has a glossy component.
 
     An instance hides its materials: what is glossy there is looked for by rays, so it may be.
@@ -188,12 +187,12 @@ def check_texels(path: Path, scene: mi.Scene, limits: Mapping[str, Range]) -> No
             limit = limits.get(file[1] if file else last) or limits.get(name.rpartition(".")[2], _ANY)
             wrong = ~np.isfinite(values) | (values < limit.low) | (values > limit.high + _ROUNDING)
             if wrong.any():
-                place = _place(key, values, wrong, file[1] if file else key)
+                place = _place_of_wrong(key, values, wrong, file[1] if file else key)
                 words = f" of {limit.low:g} to {limit.high:g}{limit.hint}" if limit is not _ANY else ""
                 raise MitsimError(f"{path}: {place}; allowed are finite numbers{words}")
 
 
-def _place(key: str, values: npt.NDArray[np.float32], wrong: npt.NDArray[np.bool_], file: str) -> str:
+def _place_of_wrong(key: str, values: npt.NDArray[np.float32], wrong: npt.NDArray[np.bool_], file: str) -> str:
     """What holds the first wrong number, and where."""
     at = np.argwhere(wrong)[0]
     name, _, last = key.rpartition(".")

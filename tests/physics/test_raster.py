@@ -125,7 +125,7 @@ def test_sharpened_cells_are_read_half_as_blurred() -> None:
     x = np.arange(-5, 6.0)
     means = np.add.outer(x**2, 2 * x**2) + 3 / 12
     inner = slice(1, -1)
-    got = rasters.sharpened(means)[inner, inner]
+    got = rasters.sharpen(means)[inner, inner]
     np.testing.assert_allclose(got, (np.add.outer(x**2, 2 * x**2) - 3 / 12)[inner, inner], rtol=0, atol=1e-12)
 
 

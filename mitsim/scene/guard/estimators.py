@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import mitsuba as mi
 
 from mitsim.core.errors import MitsimError
-from mitsim.scene.guard.limits import PLUGINS
+from mitsim.scene.guard.limits import PLUGINS, references
 
 if TYPE_CHECKING:
     from mitsim.scene.guard.outline import Outline
@@ -57,7 +57,7 @@ class Unfit:
         tree = _References(nodes)
         medium = next(tree.to(PLUGINS["medium"].split()), None)
         if medium is None:
-            factored = _blurred(outline, tree)
+            factored = _blended_picture(outline, tree)
         else:
             node, name = medium
             rule = (
@@ -89,7 +89,7 @@ def _caustics(outline: Outline, tree: _References, lights: Sequence[str], estima
     return str(outline.tag(light).refusal("light", repr(str(light.props.plugin_name())), rule))
 
 
-def _blurred(outline: Outline, tree: _References) -> MitsimError | None:
+def _blended_picture(outline: Outline, tree: _References) -> MitsimError | None:
     """The refusal of a projector whose picture blends its texels: the factored estimator takes pixels for even."""
     for node in tree.nodes:
         picture = tree.child(node, "irradiance") if node.props.plugin_name() == "projector" else None
@@ -174,12 +174,10 @@ class _References:
 
     def below(self, node: mi.parser.SceneNode, plugins: Sequence[str]) -> Iterator[mi.parser.SceneNode]:
         """Nodes of one of the ``plugins`` that a ``node`` refers to, itself or by others."""
-        for name in node.props.keys():  # noqa: SIM118 - Properties is no dict
-            if node.props.type(name) == mi.Properties.Type.ResolvedReference:
-                other = self.nodes[node.props[name].index()]
-                if other.props.plugin_name() in plugins:
-                    yield other
-                yield from self.below(other, plugins)
+        for other in (self.nodes[index] for index in references(node.props)):
+            if other.props.plugin_name() in plugins:
+                yield other
+            yield from self.below(other, plugins)
 
     def child(self, node: mi.parser.SceneNode, name: str) -> mi.parser.SceneNode | None:
         """What the property refers to; None unless there is one, and an object."""

@@ -159,7 +159,7 @@ class Outline:
             if self._elements > MOST_ELEMENTS:
                 raise refuse(f"over {MOST_ELEMENTS} elements with all includes; make the scene smaller")
             tag = Tag(path, parser.CurrentLineNumber, name, attributes)
-            texts = {key: self._resolved(tag, text) for key, text in attributes.items()}
+            texts = {key: self._with_parameters(tag, text) for key, text in attributes.items()}
             if texts.get("name") == "" and name != "default":
                 raise tag.refusal("name", "''", "give a name; only objects may go without the attribute")
             if not open_tags:
@@ -201,7 +201,7 @@ class Outline:
         except ValueError as error:  # an encoding that Python does not know
             raise MitsimError(f"{path}:1: not well-formed XML ({error}); write the scene in UTF-8") from None
 
-    def _resolved(self, tag: Tag, text: str) -> str:
+    def _with_parameters(self, tag: Tag, text: str) -> str:
         """The text with its parameters put in."""
         if "\\" in text:
             raise tag.refusal("text", repr(text), "backslashes are not allowed")
@@ -375,3 +375,26 @@ def _check_native(scene: Path, folder: Path) -> None:
     for library in sorted(libraries):
         if library.suffix.lower() in _NATIVE:
             raise MitsimError(f"{scene}: {library} would run native code; move it away from the scene")
+
+
+# -------- How many pixels a side a projector's picture lights, where that is known without the renderer
+
+_MODES_OF_PIXELS = ("1", "L", "RGB")
+"""Of pictures whose dark texels are 0 in every channel, and nothing else is."""
+_MOST_TEXELS = 1 << 24
+"""A picture of 4096 x 4096, decoded in 0.1 s."""
+
+
+def lit_side(picture: Path) -> int | None:
+    """Rows and columns of the lit square in the PNG file ``picture``; None where it is no such picture: what is wrong
+    with it, :func:`mitsim.scene.projector.locate_projector` says."""
+    from PIL.PngImagePlugin import PngImageFile
+
+    try:
+        with PngImageFile(picture) as image:
+            if image.mode not in _MODES_OF_PIXELS or image.width * image.height > _MOST_TEXELS:
+                return None
+            left, top, right, bottom = image.getbbox() or (0, 0, 0, 0)
+    except (SyntaxError, OSError, ValueError):
+        return None
+    return right - left if right - left == bottom - top > 0 else None

@@ -8,14 +8,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from mitsim.calibrate.model_fit import Fitted, Shown, fit_placement
+from mitsim.calibrate.placement import Fitted, Shown, fit_placement
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import mls_mask
-from mitsim.devices.model_fit import FITTED, UNITS, Modelling, frames_of
 from mitsim.devices.patterns import stripe_signs
 from mitsim.devices.projector import Spectrum
+from mitsim.devices.session import FITTED, UNITS, Modelling, frames_of
 from mitsim.optics.camera_model import ModelledCamera, Placement
 
 N = 16

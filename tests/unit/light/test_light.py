@@ -21,11 +21,12 @@ from mitsim.devices.patterns import Lighting, parse_patterns
 from mitsim.light import light as module
 from mitsim.light.light import SampledLight, Sampling, trace_light
 from mitsim.light.passes import Simulation
+from mitsim.light.pilot_result import Evidence
 from mitsim.light.plan import Plan
-from mitsim.light.settings import GROUPS, Evidence, Settings
+from mitsim.light.settings import GROUPS, Settings
 from mitsim.optics.frames import ExpectedFrames, monte_carlo_error
 from mitsim.planner import choose, memory, planner
-from mitsim.planner.choose import Choice
+from mitsim.planner.choose import Candidate
 from mitsim.planner.explain import SceneFacts
 from mitsim.planner.planner import make_plan
 from tests.unit.planner.invented_evidence import EVIDENCE
@@ -58,7 +59,7 @@ def stacked(frames: ExpectedFrames) -> np.ndarray:
 
 def test_by_pixel_and_by_class_are_the_same_light(bench: Bench, plan: Plan, family: Lighting) -> None:
     pixel, group = (trace_light(bench, plan, family, 3, Sampling(by_pixel=by_pixel)) for by_pixel in (True, False))
-    assert pixel.groups[0].fine.shape[0] == N * N + 1 and group.groups[0].fine.shape[0] == 16 + 1
+    assert pixel.groups[0].rows == N * N + 1 and group.groups[0].rows == 16 + 1
     assert np.allclose(stacked(pixel.frames(family, 0)), stacked(group.frames(family, 0)), rtol=1e-9)
     assert pixel.sampling_error == pytest.approx(group.sampling_error, rel=1e-6)
     assert np.allclose(pixel.flux, group.flux) and pixel.paths == group.paths
@@ -167,12 +168,13 @@ def test_light_that_needs_less_than_a_sample_takes_one_and_every_round_grows(
         return (1.1 * target, 1.2 * target) if len(looks) < 3 else (0.0, 0.0)
 
     monkeypatch.setattr(ExpectedFrames, "sampling_error", told)
-    settings = replace(plan.settings, effects=frozenset(FAR), direct_samples=0.1, indirect_samples=3.0)
-    settings = replace(settings, followed_anchors=2, followed_samples=0.5, followed_from_camera_samples=0.02)
-    wanted, kept = [], module._trace
-    monkeypatch.setattr(module, "_trace", lambda groups, samples: wanted.append(samples) or kept(groups, samples))
+    samples = {"direct": 0.1, "indirect": 3.0, "indirect_residual": 0.5, "camera_residual": 0.02}
+    samples = {**plan.settings.samples, **samples}
+    settings = replace(plan.settings, effects=frozenset(FAR), followed_anchors=2, samples=samples)
+    wanted, kept = [], module.trace_groups
+    monkeypatch.setattr(module, "trace_groups", lambda groups, samples: wanted.append(samples) or kept(groups, samples))
     assert trace_light(bench, replace(plan, settings=settings), family, 3).reached
-    assert wanted[0] == {"direct": 1, "indirect": 3, "indirect at anchors": 1}
+    assert wanted[0] == {"direct": 1, "indirect": 3, "indirect_residual": 1}
     for before, after in pairwise(wanted):
         assert after != before and all(after[name] >= count for name, count in before.items())
 
@@ -222,7 +224,7 @@ def test_a_round_does_not_hold_the_light_of_the_one_before(
 ) -> None:
     """Of corner in three lines that was 0.4 GB. (Planted: each of the names that are dropped, kept.)"""
     made, held = list[Any](), list[int]()  # of arrays, which copies of a light share
-    line_of, trace = module._line_of, module._trace
+    line_of, trace = module._line_of, module.trace_groups
 
     def watched(*parts: Any) -> SampledLight:
         light = line_of(*parts)
@@ -234,7 +236,7 @@ def test_a_round_does_not_hold_the_light_of_the_one_before(
         trace(*parts)
 
     monkeypatch.setattr(module, "_line_of", watched)
-    monkeypatch.setattr(module, "_trace", counted)
+    monkeypatch.setattr(module, "trace_groups", counted)
     target = trace_light(bench, plan, family, 3).sampling_error
     trace_light(bench, replace(plan, sampling_target=target / 2), family, 3)
     assert len(held) > 2 and not any(held)
@@ -244,11 +246,11 @@ def test_light_that_is_divided_lies_where_it_lay(bench: Bench, plan: Plan) -> No
     """Bit for bit SciPy's own quotient. (Planted: copied places; light over the count, which is not SciPy's.)"""
     simulation = Simulation(bench, plan.settings)
     labels = np.arange(N * N) % 5
-    light = simulation.file_direct(simulation.direct.trace(3, 0, 16), labels, 16)
+    light = simulation.accumulate("direct", simulation.direct.trace(3, 0, 16), labels, 16)
     divided = light / 3
-    np.testing.assert_array_equal(divided.fine.toarray(), (light.fine / 3).toarray())
-    assert np.shares_memory(divided.fine.indices, light.fine.indices)
-    assert np.shares_memory(divided.fine.indptr, light.fine.indptr)
+    np.testing.assert_array_equal(divided["fine"].toarray(), (light["fine"] / 3).toarray())
+    assert np.shares_memory(divided["fine"].indices, light["fine"].indices)
+    assert np.shares_memory(divided["fine"].indptr, light["fine"].indptr)
     assert divided.received == light.received / 3
 
 
@@ -261,11 +263,11 @@ def test_lines_are_looked_at_from_the_noisiest_until_one_is_not_good_enough(
     """Noise of 2, 1 and 3 in 4 of their light, and a dark line; 2 is enough. (Planted: no end; the quietest first.)"""
     lines: list[Any] = [SimpleNamespace(flux=np.full(3, 4.0), flux_error=np.full(3, noise)) for noise in (2, 1, 3)]
     lines.append(SimpleNamespace(flux=np.zeros(3), flux_error=np.zeros(3)))
-    monkeypatch.setattr(module, "_looked", lambda light, line, *_: module._Look(light, bounds[line], {}))
-    seen = module._looks(lines, lambda line: line, Lighting.uniform(1), False, 2.0)
+    monkeypatch.setattr(module, "_check", lambda light, line, *_: module._Check(light, bounds[line], {}))
+    seen = module._checks(lines, lambda line: line, Lighting.uniform(1), False, 2.0)
     assert list(seen) == looked
     assert all(seen[line].light is lines[line] and seen[line].bound == bounds[line] for line in looked)
-    assert len(module._looks(lines, lambda line: line, Lighting.uniform(1), False, math.inf)) == 4
+    assert len(module._checks(lines, lambda line: line, Lighting.uniform(1), False, math.inf)) == 4
 
 
 def test_a_plan_of_several_lines_is_priced_for_all(
@@ -277,7 +279,7 @@ def test_a_plan_of_several_lines_is_priced_for_all(
     """
     seen: list[int] = []
 
-    def cheapest(accuracy: float, evidence: Evidence, switches: Mapping[str, bool]) -> Choice:
+    def cheapest(accuracy: float, evidence: Evidence, switches: Mapping[str, bool]) -> Candidate:
         seen.append(evidence.forming.lines)
         return choose.cheapest(accuracy, evidence, switches)
 
@@ -380,9 +382,12 @@ def test_a_heavy_path_in_a_shot_that_is_not_checked_is_seen() -> None:
 def test_paces_are_measured_of_what_was_chosen_alone(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """Direct light and its anchors, of a machine that takes 0.1 us a path; other kinds keep what they had. (Planted:
     seconds of a sample, not of a path.)"""
-    monkeypatch.setattr(planner, "_seconds", lambda stage, seed, labels, samples: 1e-7 * stage.tracer.lanes * samples)
+    monkeypatch.setattr(
+        planner, "_seconds", lambda made, name, seed, labels, samples: 1e-7 * made.passes[name].tracer.lanes * samples
+    )
     simulation = Simulation(bench, Settings(depth=400.0, anchors=2))
     timed = planner._timed(EVIDENCE, simulation, np.arange(bench.n**2), 0)
-    for name in ("direct", "anchored"):
-        assert getattr(timed, name).seconds == pytest.approx(1e-7)
-    assert timed.indirect == EVIDENCE.indirect and timed.followed == EVIDENCE.followed
+    for name in ("direct", "anchor_residual"):
+        assert timed.sample_costs[name].seconds == pytest.approx(1e-7)
+    for name in ("indirect", "indirect_residual"):
+        assert timed.sample_costs[name] == EVIDENCE.sample_costs[name]

@@ -81,9 +81,10 @@ def frames(bench: Bench, settings: Settings, samples: int = 32) -> np.ndarray:
     """(shots, pixels, pixels) of four shots, from the same points whatever the anchors."""
     lighting = parse_patterns("dots:3", N).lighting.shots([0, 4])
     made, light = Simulation(bench, settings), None
-    for name, stage in made.tracers().items():
+    for name, each in made.passes.items():
         count = samples if name == "direct" else samples // 8
-        filed = stage.file(stage.tracer.trace(integer(5, stage.stream == "direct"), 0, count), lighting.labels, count)
+        seen = each.tracer.trace(integer(5, each.row.stream == "direct"), 0, count)
+        filed = made.accumulate(name, seen, lighting.labels, count)
         light = filed if light is None else light + filed
     return np.stack([frame.irradiance for frame in made.expected([light], np.arange(9), lighting, 0)])
 
@@ -144,6 +145,6 @@ def test_pixels_that_are_traced_apart_are_no_occluded_ones(bench: Bench, monkeyp
 def test_a_longer_look_has_an_end(pixels: int) -> None:
     """Whatever certainty is worth: a look at one pixel grew until 20 GB were full. (Planted: no limit.)"""
     sample = Sample.of(parse_patterns("dots:3", N).lighting, (64, 64), mirrors=False)
-    counts = [replace(sample, effort=4**looks).occluded(pixels) for looks in range(12)]
+    counts = [replace(sample, sample_cost=4**looks).occluded(pixels) for looks in range(12)]
     assert counts == sorted(counts) and counts[0] >= 4 and counts[-1] == counts[5]
     assert counts[-1] * pixels <= max(2**11, 4 * pixels)
