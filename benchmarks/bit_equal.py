@@ -76,7 +76,7 @@ def digest(path: Path) -> str:
 def machine(python: str) -> dict[str, str]:
     """What the last bits may depend on."""
     program = (
-        "import importlib.metadata as m; from mitsim.core.llvm import find_llvm;"
+        "import importlib.metadata as m; from mitsim.core.environment import find_llvm;"
         "print(m.version('mitsuba'), m.version('numpy'), m.version('scipy'), find_llvm().name)"
     )
     done = subprocess.run([python, "-c", program], capture_output=True, text=True, check=True)

@@ -4,8 +4,8 @@
         [--sensor whole cropped] [--periods 1 2 3 5 7]
 
 PICTURE shows the point spread function, such as `psf_sample.tif` of the repository Waller-Lab/DiffuserCam-Tutorial (BSD
-3-Clause); ``rendered`` takes that of a diffuser that Mitsuba traces (mitsim.transport.plugins.diffuser). A scene of 128 x 128
-pixels; the sensor is as large as the picture (cropped), or gets all light (whole); electronics of
+3-Clause); ``rendered`` takes that of a diffuser that Mitsuba traces (mitsim.transport.plugins.diffuser). A scene of 128
+x 128 pixels; the sensor is as large as the picture (cropped), or gets all light (whole); electronics of
 calibration/imx249.toml.
 
 Quality: PSNR at the best lambda to a quarter of a decade, peak 1, no gain or offset fit; under equal peak and equal

@@ -5,7 +5,7 @@
 
 Shipped prints, and shades of noise, lie 400 mm before a small camera of 64 x 64 sensor and n x n scene pixels. What
 print within a pixel does is the same in all sessions of a print, so each session takes the next of ``--places`` ways to
-lay it: a part of 7/8 anywhere, turned. SampledLight of board and prints is traced once. RESULT.json holds, by print and
+lay it: a part of 7/8 anywhere, turned. Light of board and prints is traced once. RESULT.json holds, by print and
 family, the part of all pixels of all sessions that are within 1.96 standard uncertainties of the truth, and the rms of
 error over uncertainty; an interrupted run goes on where it was. 200 sessions of four prints and five families take 12
 minutes on two cores.

@@ -33,7 +33,7 @@ import mitsim as ms
 from mitsim.capture import exposer
 from mitsim.core import framefile, recorders
 from mitsim.core.resources import workers
-from mitsim.optics.closed_form import _Block
+from mitsim.optics.image_formation import _Block
 
 spent, lock = dict.fromkeys(("products", "noise", "files"), 0.0), threading.Lock()
 

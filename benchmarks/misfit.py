@@ -3,11 +3,11 @@
     python benchmarks/misfit.py RESULT.json [--seeds 4] [--families ...] [--offsets -2 2 ...] [--prints ...]
 
 The photograph's sheet stands beside the calibrated 400 mm by each of the offsets [mm]; prints of ``--prints`` stand at
-it. SampledLight is traced once for each, and calibration once; the noise of a run is that of its seed. RESULT.json holds, for
-each print, offset and family, an entry a seed: chi-square, the unexplained part of the measurements, its largest by
-tile, their limits, whether the image is flagged, the likely cause, and what the image is off by, rms. An interrupted
-run goes on where it was. 4 seeds of four families, two offsets and three prints are 80 images of 512 x 512 pixels.
-"""
+it. Light is traced once for each, and calibration once; the noise of a run is that of its seed. RESULT.json
+holds, for each print, offset and family, an entry a seed: chi-square, the unexplained part of the measurements, its
+largest by tile, their limits, whether the image is flagged, the likely cause, and what the image is off by, rms. An
+interrupted run goes on where it was. 4 seeds of four families, two offsets and three prints are 80 images of 512 x 512
+pixels."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ DISTANCE = 400.0
 
 
 def light(name: str, offset: float) -> SampledLight:
-    """SampledLight of a shipped scene whose sheet is moved by ``offset`` [mm]."""
+    """Light of a shipped scene whose sheet is moved by ``offset`` [mm]."""
     scene = ROOT / "scenes" / name / "scene.xml"
     bench = open_bench(scene, sheet_z=f"{DISTANCE + offset:g}") if offset else open_bench(scene)
     return bench.light(accuracy=1e-3)

@@ -3,12 +3,12 @@
     python benchmarks/session_faults.py RESULT.json [--sessions 20] [--clean 200] [--faults ...] [--seed 0] [--n 64 128]
 
 Sessions of ideal cameras in numpy (a mask's geometric shadow, light that falls off, Poisson and read noise, rounding),
-written as files and read by :func:`mitsim.reconstruct.captured_session.calibrate_frames`. Each has a camera of its own by its
-seed: 64 or 128 projector pixels, a separable, FlatCam or MURA mask, sensor, read noise, ambient light, repeats, and an
-exposure that leaves 1 to 10 times the anchor calibration's factor error, ``NOISE``. ``--sessions`` of each fault are
-taken, and ``--clean`` of none. RESULT.json has counts with their binomial errors, and quantiles of the actual factor
-error over the stated one, after what is wrong is left out. 200 clean and 20 of each of 10 faults take ten minutes.
-"""
+written as files and read by :func:`mitsim.reconstruct.captured_session.calibrate_frames`. Each has a camera of its own
+by its seed: 64 or 128 projector pixels, a separable, FlatCam or MURA mask, sensor, read noise, ambient light, repeats,
+and an exposure that leaves 1 to 10 times the anchor calibration's factor error, ``NOISE``. ``--sessions`` of each fault
+are taken, and ``--clean`` of none. RESULT.json has counts with their binomial errors, and quantiles of the actual
+factor error over the stated one, after what is wrong is left out. 200 clean and 20 of each of 10 faults take ten
+minutes."""
 
 from __future__ import annotations
 

@@ -36,6 +36,6 @@ echo "setup: installing mitsim into $venv" >&2
 # Byte code is written when a module is first used; writing it all here costs 150 MB.
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile -e '.[test]'
 
-llvm() { "$venv/bin/python" -c 'from mitsim.core.llvm import find_llvm; find_llvm()' 2>/dev/null; }
+llvm() { "$venv/bin/python" -c 'from mitsim.core.environment import find_llvm; find_llvm()' 2>/dev/null; }
 llvm || need "no LLVM library of version 17 or newer works here" libllvm19
 llvm || stop "the LLVM library still does not work" "$venv/bin/mitsim doctor"

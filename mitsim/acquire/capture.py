@@ -108,7 +108,15 @@ def trace_request(bench: Apparatus, plan: Plan, job: Job | None = None) -> Sampl
 def expose(
     light: SampledLight, patterns: str, output: Path | str | None = None, job: Job | None = None, **request: Any
 ) -> Capture:
-    """One noisy frame for each shot of a family in a ``light``; see :meth:`mitsim.api.Light.expose`."""
+    """One noisy frame for each shot of a family in given light.
+
+    Parameters
+    ----------
+    light
+        that the family is shown in.
+    patterns, output, job, request
+        as for :meth:`mitsim.api.light.Light.expose`, which has the errors raised as well.
+    """
     own = replace(light.plan, request=request_of(light.plan, {}).changed(patterns=patterns))
     return capture(light.bench, request_of(own, request), job, output, light=light)
 

@@ -1,7 +1,7 @@
 """A camera under a mosaic of colour filters: a bench of several lines in; a run of all, and factors of each, out.
 
-Lines are traced as for sequential colour (:mod:`mitsim.acquire.spectral`). With w_pl the electrons that a pixel of plane
-p of the 2 x 2 filters makes of a photon of line l, its expected electrons are
+Lines are traced as for sequential colour (:mod:`mitsim.acquire.spectral`). With w_pl the electrons that a pixel of
+plane p of the 2 x 2 filters makes of a photon of line l, its expected electrons are
 
     e_p = t A sum_l w_pl E_l lambda_l / (h c),
 
@@ -345,7 +345,8 @@ def _usable(place: Path | None, resume: bool) -> Iterator[None]:
 
 
 def mosaic_manifest(whole: MosaicBench, colours: ColourBench) -> MosaicManifest:
-    """What colour.json says of a run. MitsimError for a line that the filters' curves do not hold."""
+    """What colour.json says of a run of the ``whole`` rig with its ``colours``. MitsimError for a line that the
+    filters' curves do not hold."""
     weights = whole.mosaic.planes(colours.manifest.wavelengths_nm)
     assert whole.mosaic.mosaic is not None, "checked before"
     lines = colours.manifest.channels

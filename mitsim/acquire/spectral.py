@@ -304,7 +304,8 @@ class Coloured(Generic[Opened]):
 
 
 def choose_colour(bench: Opened, request: Request) -> Coloured[Opened]:
-    """The cheapest of mono, bands and lines that is predicted to keep the accuracy; see :meth:`mitsim.api.bench.Bench.choose_colour`.
+    """The cheapest of mono, bands and lines that is predicted to keep the accuracy; see
+    :meth:`mitsim.api.bench.Bench.choose_colour`.
 
     Parameters
     ----------

@@ -30,7 +30,15 @@ _INSIDE = 1e-3
 def before_board(
     bench: Opened, reflectance: float, shape: BoardShape | None = None, depth: float | None = None
 ) -> Opened:
-    """The rig of a ``bench`` before a diffuse board; see :meth:`mitsim.api.bench.Bench.with_board`."""
+    """The devices of a bench before a diffuse board.
+
+    Parameters
+    ----------
+    bench
+        whose scene is replaced.
+    reflectance, shape, depth
+        as for :meth:`mitsim.api.bench.Bench.with_board`, which has the errors raised as well.
+    """
     if not 0 <= reflectance <= 1:
         raise ArgumentError("reflectance", f"{reflectance:g}: give a number from 0 to 1")
     where = bench.geometry.scene_distance if depth is None else check_depth(depth)

@@ -37,7 +37,7 @@ def check_scene(
     Parameters
     ----------
     scene
-        as of :func:`mitsim.api.open_bench`.
+        as of :func:`mitsim.api.bench.open_bench`.
     defines
         values of its parameters by name.
     outside
@@ -60,7 +60,8 @@ def check_scene(
 
 
 def check_devices(camera: Path | str | None, projector: Path | str | None) -> tuple[Path, Path]:
-    """Files of a ``camera`` and a ``projector``, as of :func:`mitsim.api.open_bench`; MitsimError for one that there is not."""
+    """Files of a ``camera`` and a ``projector``, as of :func:`mitsim.api.bench.open_bench`; MitsimError for one that
+    there is not."""
     found = ((camera, DEFAULT_CAMERA), (projector, "mp_cl1"))
     first, second = (locate(default if name is None else name, "calibration", ".toml") for name, default in found)
     return first, second
@@ -75,7 +76,13 @@ def open_apparatus(
     for_render: bool = False,
     **parameters: object,
 ) -> Apparatus:
-    """What :func:`mitsim.api.open_bench` opens, with its arguments; MitsimError as there."""
+    """Scene, camera and projector, loaded.
+
+    Parameters
+    ----------
+    scene, variant, camera, projector, allow_outside_files, for_render, **parameters
+        as for :func:`mitsim.api.bench.open_bench`, which has the errors raised as well.
+    """
     defines = {name: _text(value) for name, value in parameters.items()}
     path = check_scene(scene, defines, allow_outside_files)
     sensor_path, projector_path = check_devices(camera, projector)
@@ -118,7 +125,8 @@ def open_apparatus(
 
 
 def reopened(bench: Opened, variant: str) -> Opened:
-    """The ``bench`` loaded anew into a ``variant``, which is set from then on. MitsimError as :func:`mitsim.api.open_bench`."""
+    """The ``bench`` loaded anew into a ``variant``, which is set from then on. MitsimError as
+    :func:`mitsim.api.bench.open_bench`."""
     from mitsim.devices.mask_profile import load_mask
 
     camera = Path(bench.rig.camera_file)

@@ -763,7 +763,7 @@ def session_cost(board: Apparatus, count: int, settings: Settings, seconds: floa
     return Cost(seconds=seconds, memory_bytes=light_bytes(board, n * n, settings) + memory_bytes)
 
 
-# -------- SampledLight by projector pixel and a side's stripes in
+# -------- Light by projector pixel and a side's stripes in
 
 _LINES_BYTES = 7 * 2**28
 """Frames of lines that are held at most, as of classes that are mixed."""

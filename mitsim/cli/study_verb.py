@@ -165,7 +165,7 @@ def scope_of(name: str, scope: Scope, patterns: str, over: Sequence[str], measur
         for options that the study does not have, or that cannot be read.
     """
     from mitsim.devices.families import read_name
-    from mitsim.report.exposures import check_drifts, check_sweep, measures_of, values_of
+    from mitsim.report.study_options import check_drifts, check_sweep, measures_of, values_of
 
     varied = tuple(values_of(text) for text in over)
     if name == "sweep":
@@ -189,7 +189,7 @@ def _check_setup(scope: Scope, scene: str | None) -> None:
     from mitsim.bench.request import Exposure
     from mitsim.core.configuration import load_model
     from mitsim.devices.sensor import load_sensor
-    from mitsim.report.exposures import NO_SCENE
+    from mitsim.report.study_options import NO_SCENE
 
     camera, projector = check_devices(scope.setup.camera, scope.setup.projector)
     # A study in colour may see through colour filters; all fill a part of the full well.

@@ -275,9 +275,9 @@ class CameraGeometry(BaseModel):
         return self.tan_half_fov * self.mask_reach * sum(map(abs, self.mask_tilt))
 
     def tilt_nodes(self, waves: bool) -> tuple[int, int] | None:
-        """Nodes of rows and of columns from which the shadow of a tilted mask is formed (:mod:`mitsim.optics.mask_defects`),
-        with ``waves`` or without; None where it is not: of an even mask, one that is drawn on a raster, and one that
-        would take too many terms."""
+        """Nodes of rows and of columns from which the shadow of a tilted mask is formed
+        (:mod:`mitsim.optics.mask_defects`), with ``waves`` or without; None where it is not: of an even mask, one that
+        is drawn on a raster, and one that would take too many terms."""
         if not any(self.mask_tilt) or self.drawn(waves):
             return None
         farthest = self.tan_half_fov * self.mask_reach / min(self.pitches)

@@ -19,7 +19,8 @@ from mitsim.core.seeds import stream
 _REACH = 8.3
 """Standard deviations beyond which a Gaussian holds less than rounding, 1e-16."""
 _LINES = 16
-"""Lines that cross a disc of dust: what they leave of its edge is 1e-3 of its shadow (tests/unit/devices/test_flaws.py)."""
+"""Lines that cross a disc of dust: what they leave of its edge is 1e-3 of its shadow
+(tests/unit/devices/test_flaws.py)."""
 _CHORDS = 16
 """Chords a cell that a disc's part of it is summed from: 1e-4 of its area."""
 _MOST_DISCS = 100

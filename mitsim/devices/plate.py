@@ -2,9 +2,8 @@
 
 What is separable, as the product of two maximum length sequences is, has one term, FlatCam's and a MURA two, and these
 are exact: crosses of the matrix (Bebendorf, Numerische Mathematik 86, 565, 2000), 0 and 1 where the mask's are. Any
-other mask is the sum of its singular vectors. Coordinates are those of :mod:`mitsim.devices.mask`. What goes wrong when it
-is made and mounted is in :mod:`mitsim.devices.mask_flaws`.
-"""
+other mask is the sum of its singular vectors. Coordinates are those of :mod:`mitsim.devices.mask`. What goes wrong when
+it is made and mounted is in :mod:`mitsim.devices.mask_flaws`."""
 
 from __future__ import annotations
 
@@ -218,8 +217,8 @@ class Plate(ByValue):
 
     @cached_property
     def grids(self) -> tuple[tuple[BoolArray, BoolArray], ...] | None:
-        """What is open as grids that do not overlap, as :attr:`mitsim.devices.mask.Mask.openings`; None where over 4, and
-        for a mask that has no even features."""
+        """What is open as grids that do not overlap, as :attr:`mitsim.devices.mask.Mask.openings`; None where over 4,
+        and for a mask that has no even features."""
         if not self.binary or not self.plain:
             return None
         patterns, which = np.unique(self.values[self.values.any(axis=1)], axis=0, return_inverse=True)

@@ -190,7 +190,7 @@ class SampledLight:
     def frames(self, lighting: Lighting, seed: int, leaking: bool = True) -> ExpectedFrames:
         """Expected frames of some shots.
 
-        SampledLight by pixel serves every family; light by class only families that never split one of its classes.
+        Light by pixel serves every family; light by class only families that never split one of its classes.
 
         Parameters
         ----------

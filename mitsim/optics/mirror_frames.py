@@ -5,10 +5,9 @@ known, its four corner rays say where it lands, and between them all is bilinear
 at most half a sensor pixel, and each box gives every pixel that it overlaps its part of the flux times the mask's mean
 over the part. Boxes tile what the beam lights, and flux is conserved whatever their shape.
 
-The mask enters as separable terms of samplers (:mod:`mitsim.optics.fft_shadow`); a wave-optical one needs the distance of
-the virtual source, :attr:`Beams.inverse_depth`. Coordinates are index coordinates (s_row = -y, s_col = -x), centred, in
-mm.
-"""
+The mask enters as separable terms of samplers (:mod:`mitsim.optics.fft_shadow`); a wave-optical one needs the distance
+of the virtual source, :attr:`Beams.inverse_depth`. Coordinates are index coordinates (s_row = -y, s_col = -x), centred,
+in mm."""
 
 from __future__ import annotations
 

@@ -97,9 +97,9 @@ def lacking(terms: SeparableTerms, left: FloatArray, right: FloatArray) -> Lacki
 
 
 def _of_stripes(terms: SeparableTerms) -> SeparableTerm:
-    """The factors that stripes give of an operator (:mod:`mitsim.reconstruct.estimate_factors`): with its uniform response
-    sum_k (L_k 1) (R_k 1)^T split into a v^T, stripes h 1^T into u v^T with u = sum_k L_k h <R_k 1, v> / |v|^2, so the
-    left factor is the sum of L_k with these weights; and the right one likewise."""
+    """The factors that stripes give of an operator (:mod:`mitsim.reconstruct.estimate_factors`): with its uniform
+    response sum_k (L_k 1) (R_k 1)^T split into a v^T, stripes h 1^T into u v^T with u = sum_k L_k h <R_k 1, v> / |v|^2,
+    so the left factor is the sum of L_k with these weights; and the right one likewise."""
     uniform = best_term([(a.sum(axis=1, keepdims=True), b.sum(axis=1, keepdims=True)) for a, b in terms])
     split = uniform.left[:, 0], uniform.right[:, 0]
     return (

@@ -422,7 +422,7 @@ def _fixed(facts: SceneFacts) -> tuple[PlanRow, ...]:
     )
 
 
-# -------- SampledLight that frames are known to lack, whatever the plan
+# -------- Light that frames are known to lack, whatever the plan
 
 
 _PATHS = 2**15

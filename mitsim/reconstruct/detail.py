@@ -3,11 +3,11 @@
 Print that changes within a projector pixel has its light a dipole d beside the centre, which moves the frames by Phi_L
 (P_ij o d) Phi_R'^T, Phi_R' being the slope of Phi_R along its columns, and by the same of rows. The image tells the
 dipole of its ramp, g / 12, but not of finer print; frames do. A slope is another vector for every pixel, so halves of
-the sensor's columns take it for different images: W_0 - G W of :mod:`mitsim.reconstruct.regularisation` holds sum_j (U_0j -
-U_j G)^T Phi_R' diag(p_j) d^T, as known as the sum_j U_j^T Phi_R' diag(p_j) d^T that strikes the image. For independent
-dipoles one energy is in closed form a multiple of the other, and turns the disagreement that noise does not explain
-into an error of the image, place by place. A surface beside the calibrated distance moves light alike, and is told too.
-"""
+the sensor's columns take it for different images: W_0 - G W of :mod:`mitsim.reconstruct.regularisation` holds sum_j
+(U_0j - U_j G)^T Phi_R' diag(p_j) d^T, as known as the sum_j U_j^T Phi_R' diag(p_j) d^T that strikes the image. For
+independent dipoles one energy is in closed form a multiple of the other, and turns the disagreement that noise does not
+explain into an error of the image, place by place. A surface beside the calibrated distance moves light alike, and is
+told too."""
 
 from __future__ import annotations
 

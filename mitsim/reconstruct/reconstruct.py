@@ -16,6 +16,7 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import Capture, Measurement
 from mitsim.reconstruct.causes import Cause, Evidence
+from mitsim.reconstruct.cost import BYTES_A_NUMBER, is_kept, predicted, slab_numbers
 from mitsim.reconstruct.depth import Depth, best_depth
 from mitsim.reconstruct.depth_map import DepthMap, depth_map
 from mitsim.reconstruct.detail import Model, print_energy
@@ -26,16 +27,7 @@ from mitsim.reconstruct.framefault import FrameFault
 from mitsim.reconstruct.margin import Margin
 from mitsim.reconstruct.misfit import Lack, Misfit, faulty_frames, judge
 from mitsim.reconstruct.noise import FrameNoise, factor_energy
-from mitsim.reconstruct.request import (
-    BYTES_A_NUMBER,
-    MARKOV,
-    TIKHONOV,
-    TV,
-    check_asked,
-    is_kept,
-    predicted,
-    slab_numbers,
-)
+from mitsim.reconstruct.request import MARKOV, TIKHONOV, TV, check_asked
 from mitsim.reconstruct.result import Reconstruction
 from mitsim.reconstruct.solver import Accumulator, Prepared, Solution, prepare
 from mitsim.reconstruct.status import Verdict

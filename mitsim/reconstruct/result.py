@@ -15,10 +15,11 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.files import output_folder, plain, read_json, whole_file, write_json
 from mitsim.core.pictures import card, png, scaled, span
+from mitsim.reconstruct.cost import Predicted
 from mitsim.reconstruct.depth import Depth
 from mitsim.reconstruct.depth_map import DepthMap
 from mitsim.reconstruct.misfit import Misfit
-from mitsim.reconstruct.request import IMAGE_FILE, Predicted
+from mitsim.reconstruct.request import IMAGE_FILE
 from mitsim.reconstruct.status import Status
 from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Uncertainty
 

@@ -116,8 +116,8 @@ class Side:
 
     @cached_property
     def halves(self) -> StripHalves:
-        """Sensor rows of the two halves that :mod:`mitsim.reconstruct.regularisation` holds against each other, as strips: an
-        array of them would copy each frame that it picks from."""
+        """Sensor rows of the two halves that :mod:`mitsim.reconstruct.regularisation` holds against each other, as
+        strips: an array of them would copy each frame that it picks from."""
         width = -(-self.sensor_size // _STRIPS)
         strips = tuple(slice(first, first + width) for first in range(0, self.sensor_size, width))
         return strips[::2], strips[1::2]

@@ -146,8 +146,8 @@ class Prepared:
         )
 
     def correlated(self) -> Prepared:
-        """The same model for images whose neighbouring pixels are alike (:mod:`mitsim.reconstruct.solver`); frames go to
-        its own accumulator. MitsimError for the Gram method."""
+        """The same model for images whose neighbouring pixels are alike (:mod:`mitsim.reconstruct.solver`); frames go
+        to its own accumulator. MitsimError for the Gram method."""
         with single_threaded_blas():
             left = correlated(self.left)
             return replace(self, left=left, right=left if self.right is self.left else correlated(self.right))

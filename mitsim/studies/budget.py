@@ -1,12 +1,12 @@
 """A scene, a calibrated camera and patterns in; the decibels that each source of noise and each drift costs, out.
 
 Beside one image that is measured, its squared error E is told by its parts V, which add up. Of noise they are expected,
-a perturbation of the solver with its lambda fixed (:mod:`mitsim.studies.drift.perturbation`). What the scene's light has
-that factors, measured on an even white board, do not hold - detail inside projector pixels, depth, light over several
-surfaces - is found from frames without noise of the light that was traced, solved with factors without noise: of the
-same with one cause after another taken out of the light (:mod:`mitsim.studies.accuracy.partial_light`), and less what lambda alone
-takes away. What is left of E is not explained. Noise is drawn once, so every V and what is left scatter by chance, as
-:mod:`mitsim.studies.scatter` states.
+a perturbation of the solver with its lambda fixed (:mod:`mitsim.studies.drift.perturbation`). What the scene's light
+has that factors, measured on an even white board, do not hold - detail inside projector pixels, depth, light over
+several surfaces - is found from frames without noise of the light that was traced, solved with factors without noise:
+of the same with one cause after another taken out of the light (:mod:`mitsim.studies.accuracy.partial_light`), and less
+what lambda alone takes away. What is left of E is not explained. Noise is drawn once, so every V and what is left
+scatter by chance, as :mod:`mitsim.studies.scatter` states.
 
 A source costs ``10 log10(E / (E - V))``: what the image would gain without it. These decibels do not add up. A drift
 that adds the squared error A costs ``10 log10((E + A) / E)``. Of what is not explained any share may belong to any

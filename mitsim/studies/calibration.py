@@ -269,7 +269,7 @@ _LOSS_NOTES = (
     "part of the squared error. These parts add up to the whole, decibels do not. Below 0: the image would be worse "
     "without it.",
     "Drift between calibration and capture, by the amounts of the recipe: what the image would lose, each alone.",
-    "Noise and drift are predicted in closed form with lambda as it is. SampledLight of the scene is what factors, measured "
+    "Noise and drift are predicted in closed form with lambda as it is. Light of the scene is what factors, measured "
     "on an even white board, do not hold of it, found from frames without noise.",
     "The uncertainty is one standard error: noise is drawn once, and the part that is not explained may belong to "
     "any source; none is told where it is below 0.005.",
@@ -547,7 +547,7 @@ class CalibrationFindings:
             (where, *(f"{facts[name]:.4g}" for name in names)) for where, facts in columns.items() if "frames" in facts
         ]
         return Part(
-            "SampledLight and time",
+            "Light and time",
             "Frames, their exposure without read-out, and what the whole sensor gets in all of them. How much a wanted "
             "PSNR needs: mitsim calibrate SCENE --plan --psnr DB.",
             ("", "Frames", "Exposure [s]", "Photoelectrons", "Photons"),

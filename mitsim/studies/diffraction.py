@@ -6,11 +6,10 @@ Three questions, for both masks and for light of one line, the projector's lines
 * How far is it from one separable term, all that a calibration can find and a separable solver can use?
 * What does an image lose whose solver assumes the geometric mask, and what one with factors of the true shadow?
 
-The last is asked of idealised frames (an evenly lit plane without falloff, as in :mod:`mitsim.report.exposures`), so that
-only diffraction differs from the model, and once of rendered ones: the scene's own mask, the projector's lines, a
-rendered calibration session. Every family is exposed at equal peak, with the camera's noise. SampledLight of the scene and of
-the session's board is traced once, and formed with either shadow.
-"""
+The last is asked of idealised frames (an evenly lit plane without falloff, as in :mod:`mitsim.report.exposures`), so
+that only diffraction differs from the model, and once of rendered ones: the scene's own mask, the projector's lines, a
+rendered calibration session. Every family is exposed at equal peak, with the camera's noise. Light of the scene
+and of the session's board is traced once, and formed with either shadow."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mitsim.acquire.sense import check_wavelength
+from mitsim.acquire.sense_options import check_wavelength
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Job

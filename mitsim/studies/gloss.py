@@ -1,4 +1,4 @@
-"""SampledLight of a glossy scene and of its matt twin in; out comes an image, and its error split by cause.
+"""Light of a glossy scene and of its matt twin in; out comes an image, and its error split by cause.
 
 At one lambda an image R(Y) is linear in the frames Y, so its error against the reflectance L of the matt twin is a sum
 of differences that leaves nothing over. With t the apparent reflectance of the glossy scene, its mean over the sensor,

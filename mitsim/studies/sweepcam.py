@@ -7,9 +7,8 @@ side by side are one frame of a separable camera whose factors are those of the 
 
     [Y_ab]_ab = [Phi_L(a)]_a X [Phi_R(b)]_b^T,
 
-so :mod:`mitsim.reconstruct.solver` solves them exactly, as it does one frame. SampledLight is traced up to the mask, so one
-scene's light serves all places.
-"""
+so :mod:`mitsim.reconstruct.solver` solves them exactly, as it does one frame. Light is traced up to the mask, so
+one scene's light serves all places."""
 
 from __future__ import annotations
 

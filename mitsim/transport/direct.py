@@ -1,10 +1,9 @@
 """Direct light: every projector pixel's rays, followed to the first surface and on to each anchor of the sensor.
 
-A ray meets a surface at P, and P is connected to every anchor (:mod:`mitsim.transport.connect`), or to one random
-point of the sensor; those are as even as the places in the projector's pixels, and together with them. All anchors see
-the same points. Where surfaces let light pass (:mod:`mitsim.transport.transmission`), so does the ray: of the points that it
-meets one is handed out, drawn in proportion to its light.
-"""
+A ray meets a surface at P, and P is connected to every anchor (:mod:`mitsim.transport.connect`), or to one random point
+of the sensor; those are as even as the places in the projector's pixels, and together with them. All anchors see the
+same points. Where surfaces let light pass (:mod:`mitsim.transport.transmission`), so does the ray: of the points that
+it meets one is handed out, drawn in proportion to its light."""
 
 from __future__ import annotations
 

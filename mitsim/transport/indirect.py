@@ -6,7 +6,8 @@ every path that meets a second surface counts, and it counts for its own pixel. 
 anchor, one is handed out, drawn in proportion to its light, and it carries the light of all.
 
 Where the last surface turns light sharply, connections rarely meet the lobe; there the camera's side
-(:mod:`mitsim.transport.from_camera`) finds the light instead. :func:`mitsim.transport.integrator.camera_part` divides it.
+(:mod:`mitsim.transport.from_camera`) finds the light instead. :func:`mitsim.transport.integrator.camera_part` divides
+it.
 
 Light that only mirrors have turned before the last surface (a caustic) is direct light; the camera's side has no part
 in it. Paths end at random (Russian roulette) with a probability that keeps the estimate unbiased.
@@ -176,8 +177,8 @@ class IndirectWalk(Walk):
         return [Deposits.fetched(caustics, DIRECT, self.anchor)] if caustics else []
 
     def vertex(self, first: bool) -> None:
-        """Find, connect and leave the next surface, as :meth:`mitsim.transport.integrator.Walk.vertex` does; ``first`` is
-        not connected."""
+        """Find, connect and leave the next surface, as :meth:`mitsim.transport.integrator.Walk.vertex` does; ``first``
+        is not connected."""
         # To the first surface rays of neighbouring pixels go side by side, which take half the time of others.
         si = self.scene.ray_intersect(self.ray, mi.RayFlags.All, first, self.active)
         self.active &= si.is_valid()

@@ -196,9 +196,8 @@ class Walk(ABC):
 
     Of each kind of light one connection a path is kept. ``STATE`` names the attributes that change on the way; the
     first tells which paths still go on. ``straight`` are those that have only passed surfaces so far
-    (:mod:`mitsim.transport.transmission`): their light is direct light's own. ``anchor`` is the row and the column of that
-    which each path is followed to.
-    """
+    (:mod:`mitsim.transport.transmission`): their light is direct light's own. ``anchor`` is the row and the column of
+    that which each path is followed to."""
 
     STATE: ClassVar[tuple[str, ...]]
 

@@ -9,9 +9,8 @@ So do paths over one mirror and one sharp lobe. Connections may meet such a lobe
 the lobe to the sensor, of the camera's side from the lobe, seen in a mirror, to the projector. With x the light of a
 path that runs into the lens and I that of the connection along the same way, E[x I] is a connection's second moment, so
 a sample of connections sees the light L of a shape's lobes as ``L^2 / E[x I]`` equal hits would
-(:mod:`mitsim.transport.sharp_lobes`). Whether that is enough, whoever asks knows: lobes of curved surfaces are met seldom
-however broad they are.
-"""
+(:mod:`mitsim.transport.sharp_lobes`). Whether that is enough, whoever asks knows: lobes of curved surfaces are met
+seldom however broad they are."""
 
 from __future__ import annotations
 

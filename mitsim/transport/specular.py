@@ -1,10 +1,10 @@
 """Glint: from a scene and a pinhole projector to beams of rays that reach the sensor over perfect mirrors alone.
 
 A path projector - mirror - sensor has a delta at both ends, so no path from the camera finds it: it is traced from the
-projector instead (:mod:`mitsim.transport.specular_rays`). Rays go through a grid of points of each projector pixel. Four
-neighbours that met the same surfaces in the same way (the same *chain*) bound a beam; beams near the sensor are divided
-until the map from the projector's window to the sensor is bilinear over each. :mod:`mitsim.optics.mirror_frames` turns beams
-into frames.
+projector instead (:mod:`mitsim.transport.specular_rays`). Rays go through a grid of points of each projector pixel.
+Four neighbours that met the same surfaces in the same way (the same *chain*) bound a beam; beams near the sensor are
+divided until the map from the projector's window to the sensor is bilinear over each.
+:mod:`mitsim.optics.mirror_frames` turns beams into frames.
 
 Flux: the stock projector's irradiance on the plane at unit distance is pi x scale x texture, the same everywhere on it,
 so a beam holds that times its area on this plane.

@@ -12,8 +12,8 @@ pytestmark = pytest.mark.robustness("Faults")
 PROGRAM = """
 import sys
 from pathlib import Path
-from mitsim.capture.opening import open_bench
-from mitsim.capture.cost import frames_cost
+from mitsim.api.bench import open_bench
+from mitsim.planner.memory import frames_cost
 from mitsim.core.configuration import shipped
 
 def used():

@@ -39,7 +39,7 @@ LAMP_AND_BOX = """
 CHILD = """
 import sys
 import drjit as dr
-from mitsim.capture.opening import open_bench
+from mitsim.api.bench import open_bench
 from mitsim.core import parallel
 dr.set_thread_count(3)
 parallel.workers = lambda: 3

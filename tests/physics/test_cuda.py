@@ -28,7 +28,7 @@ PROGRAM = """
 import sys
 from pathlib import Path
 import numpy as np
-from mitsim.capture.opening import open_bench
+from mitsim.api.bench import open_bench
 variant, seed, target = sys.argv[1], int(sys.argv[2]), sys.argv[3]
 found = {}
 for path in map(Path, sys.argv[4:]):

@@ -343,7 +343,7 @@ class NothingInTheWay:
 
 
 def without_occlusion(pair: Pair) -> np.ndarray:
-    """SampledLight as if the camera saw the far card through the near one."""
+    """Light as if the camera saw the far card through the near one."""
     loaded = replace(pair.bench.loaded, scene=NothingInTheWay(pair.bench.loaded.scene))
     return frame_of(replace(pair.bench, loaded=loaded), pair.plan, pair.shown)[0]
 

@@ -125,7 +125,7 @@ ONE_VARIANT = """
 import json, sys
 import numpy as np
 from pathlib import Path
-from mitsim.capture.opening import open_bench
+from mitsim.api.bench import open_bench
 bench = open_bench(Path(sys.argv[2]), sys.argv[1])
 import mitsuba as mi
 from mitsim.transport.direct import DirectTracer

@@ -111,8 +111,8 @@ def test_glint_sees_the_same_flaws() -> None:
 @pytest.mark.parametrize("kind", ["turned", "dusty", "both"])
 def test_a_frame_equals_rays_counted_through_a_turned_or_dusty_mask(kind: str) -> None:
     """A point source: its rays to 30 x 30 points of each pixel. Of a disc the mask's own cells are asked, whose area
-    tests/unit/devices/test_flaws.py tells. (Planted: turned the other way; rows for columns; dust on the sensor's side of
-    the offset.)"""
+    tests/unit/devices/test_flaws.py tells. (Planted: turned the other way; rows for columns; dust on the sensor's side
+    of the offset.)"""
     flaws = {
         "turned": {"rotation_deg": 3.0},
         "dusty": {"dust_per_mm2": 6.0, "dust_radius_um": 30.0, "dust_opacity": 0.8},

@@ -25,7 +25,7 @@ ALONE = {"interreflection": False, "diffraction": False}
 
 @pytest.fixture
 def traced(small_scene: Callable[..., Path], variant: str) -> Callable[..., SampledLight]:
-    """SampledLight of a scene under uniform light on an open sensor of 6.4 mm."""
+    """Light of a scene under uniform light on an open sensor of 6.4 mm."""
 
     def trace(accuracy: float, seed: int = 0, **numbers: object) -> SampledLight:
         path = small_scene("lobes", n=N, mask="open", pitch=0.1, **{"sheet_z": -500, **numbers})

@@ -150,8 +150,8 @@ def reconstruct_colours(
     overwrite
         whether an earlier image of other inputs may be replaced.
     **options
-        of :func:`mitsim.report.quality.reconstruct`, for every line; of a run behind colour filters, ``way`` and ``lam``
-        as for :func:`mitsim.report.colour.mosaic.reconstruct_mosaic`.
+        of :func:`mitsim.report.quality.reconstruct`, for every line; of a run behind colour filters, ``way`` and
+        ``lam`` as for :func:`mitsim.report.colour.mosaic.reconstruct_mosaic`.
 
     Raises
     ------

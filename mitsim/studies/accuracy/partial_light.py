@@ -1,4 +1,4 @@
-"""SampledLight of a scene and names of its effects in; the light as it would be without these, out.
+"""Light of a scene and names of its effects in; the light as it would be without these, out.
 
 Without any of them it is the paper's idealised model: an evenly lit sheet at the aligned distance that shows the truth,
 under the geometric shadow of the mask. Between that and the light itself nothing is changed but what is taken out:
@@ -118,7 +118,7 @@ class Anatomy:
         if not off:
             return self.light
         bench, moved = self.light.bench, off & _MOVED
-        # SampledLight over mirrors lies among direct light, and only tracing tells one from the other.
+        # Light over mirrors lies among direct light, and only tracing tells one from the other.
         direct = self._traced(direct=True, off=moved) if moved or MIRRORS in self.effects else self.light
         flux = self._exact if RENDER_NOISE in off else self.light.flux
         by_pixel = np.divide(flux, direct.flux, out=np.ones_like(flux), where=direct.flux > 0)
@@ -362,8 +362,8 @@ MOST = ANY
 
 
 class OfOrders(Simulation):
-    """Followed light of the orders ``fewest`` to ``most`` (:class:`mitsim.transport.integrator.FollowingTracer`) alone: no
-    direct light, no glint."""
+    """Followed light of the orders ``fewest`` to ``most`` (:class:`mitsim.transport.integrator.FollowingTracer`) alone:
+    no direct light, no glint."""
 
     def __init__(self, bench: Apparatus, settings: Settings, fewest: int, most: int) -> None:
         """What is followed.

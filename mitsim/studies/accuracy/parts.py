@@ -278,7 +278,7 @@ def _within(stand: Stand, plan: Plan, seconds: float) -> tuple[Plan, float]:
         accuracy *= _STEP
 
 
-# -------- SampledLight over two, three, four and more surfaces
+# -------- Light over two, three, four and more surfaces
 
 PARENT = "interreflection"
 """The effect that this light is a share of."""
@@ -291,7 +291,7 @@ itself, as an order is traced alone."""
 
 
 class Orders:
-    """SampledLight by the number of surfaces that turn it, mirrors not counted, where the plan follows it.
+    """Light by the number of surfaces that turn it, mirrors not counted, where the plan follows it.
 
     What an order changes is told by light of that order alone, in independent looks; what it takes, by following light
     to that order over following it to the one before, frames of followed light included.

@@ -1,9 +1,10 @@
 """A scene, its camera and names of effects in; the image that comes out with these effects alone, out.
 
-The scene's own effects are taken out of its light (:mod:`mitsim.studies.accuracy.partial_light`). Besides there are three of the
-camera: *saturation*, the full well and the end of the ADC; *quantisation*, its steps and its first number; and
-*calibration noise*, what the noise of a session's frames leaves in the factors. Shot noise, read noise and dark current
-are never off: the paper's model has such noise as well. A frame's exposure is that of equal peak with the effects on.
+The scene's own effects are taken out of its light (:mod:`mitsim.studies.accuracy.partial_light`). Besides there are
+three of the camera: *saturation*, the full well and the end of the ADC; *quantisation*, its steps and its first number;
+and *calibration noise*, what the noise of a session's frames leaves in the factors. Shot noise, read noise and dark
+current are never off: the paper's model has such noise as well. A frame's exposure is that of equal peak with the
+effects on.
 
 Images are made with the *model assumed*, the exact factors of the idealised camera, and with the *model calibrated*:
 factors that a session before a white board is expected to give with the same effects, and calibration noise as that of
@@ -43,9 +44,10 @@ from mitsim.studies.accuracy.partial_light import Anatomy
 
 SATURATION, QUANTISATION, CALIBRATION_NOISE = "saturation", "quantisation", "calibration noise"
 EFFECTS = (
-    partial_light.FALLOFF, partial_light.DIFFRACTION, partial_light.KEYSTONE, partial_light.DEPTH, partial_light.OCCLUSION, partial_light.DETAIL,
-    partial_light.INTERREFLECTION, partial_light.MIRRORS, partial_light.GLOSS, partial_light.AMBIENT, partial_light.BLACK_LEVEL, partial_light.DEFOCUS,
-    partial_light.SPECKLE, SATURATION, CALIBRATION_NOISE, QUANTISATION, partial_light.RENDER_NOISE,
+    partial_light.FALLOFF, partial_light.DIFFRACTION, partial_light.KEYSTONE, partial_light.DEPTH,
+    partial_light.OCCLUSION, partial_light.DETAIL, partial_light.INTERREFLECTION, partial_light.MIRRORS,
+    partial_light.GLOSS, partial_light.AMBIENT, partial_light.BLACK_LEVEL, partial_light.DEFOCUS, partial_light.SPECKLE,
+    SATURATION, CALIBRATION_NOISE, QUANTISATION, partial_light.RENDER_NOISE,
 )  # fmt: skip
 """In the order in which they are added: of the rig, of the scene, of light, of the camera, of the simulation."""
 ASSUMED, CALIBRATED = MODELS = ("assumed", "calibrated")

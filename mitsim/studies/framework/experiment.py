@@ -38,8 +38,8 @@ class Claim:
     """A claim of the paper, its number there, in the idealised model and rendered, and what becomes of it.
 
     ``verdict`` is "confirmed", "confirmed only if ...", "not confirmed", or "not decided at this size"
-    (:mod:`mitsim.studies.framework.verdicts`); what the paper does not say, or the idealised model does not have, is empty.
-    """
+    (:mod:`mitsim.studies.framework.verdicts`); what the paper does not say, or the idealised model does not have, is
+    empty."""
 
     claim: str
     paper: str

@@ -144,7 +144,7 @@ class Stand:
         return self.evidence.error(*(Part(*both) for both in zip(COUNTED, counted(settings), strict=True))).value
 
     def trace(self, trial: Trial, seed: int) -> SampledLight:
-        """SampledLight of a ``trial``, by the family's classes, from a ``seed``."""
+        """Light of a ``trial``, by the family's classes, from a ``seed``."""
         sampling = Sampling(by_pixel=False, target=trial.target)
         return trace_light(trial.bench, trial.plan, self.family.lighting, seed, sampling, self.job.progress)
 

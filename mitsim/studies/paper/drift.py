@@ -24,7 +24,8 @@ from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import SessionRecipe, load_recipe
 from mitsim.reconstruct.factors import Factors
 from mitsim.report.charts import curves, paired
-from mitsim.report.exposures import LitScene, number_of
+from mitsim.report.exposures import LitScene
+from mitsim.report.study_options import number_of
 from mitsim.report.table import Mean, Table
 from mitsim.studies.drift.drift import DriftStand
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope, grouped
@@ -83,7 +84,8 @@ def _setup(scope: Scope, kind: str) -> Setup:
 
 
 def recipe_of(path: str | None) -> SessionRecipe:
-    """The recipe at ``path``, or the shipped one with a drift; MitsimError as :func:`mitsim.devices.session.load_recipe`."""
+    """The recipe at ``path``, or the shipped one with a drift; MitsimError as
+    :func:`mitsim.devices.session.load_recipe`."""
     return load_recipe(shipped("calibration", "drift.toml") if path is None else Path(path))
 
 

@@ -9,8 +9,9 @@ from itertools import product
 from matplotlib.figure import Figure
 
 from mitsim.report.charts import curves
-from mitsim.report.exposures import EQUAL_PEAK, MEASURES, NO_SCENE, OTHERS, RENDERED, check_sweep, number_of
+from mitsim.report.exposures import EQUAL_PEAK, RENDERED
 from mitsim.report.html import DASH, scientific
+from mitsim.report.study_options import MEASURES, NO_SCENE, OTHERS, check_sweep, number_of
 from mitsim.report.table import Table, Value
 from mitsim.studies.framework.experiment import KNOBS, Claim, Experiment, PageTable, Results, Scope, grouped
 from mitsim.studies.framework.setup import Point, Setup

@@ -6,17 +6,17 @@ Irradiance at sensor point u, in the units of the scene's radiance times steradi
 
     E(u) = integral of  L(u, t) M(u + d t) M(u + (d + h) t) cos^n(theta) (1 + |t|^2)^-2  dt
 
-over t = (x/z, y/z) inside the field stop; M is the mask's transmission, d its distance, h its thickness (both
-faces count, a thin mask has one), cos^n a pixel's angular response, and the last factor is
-cos(theta) d omega written in t. A sample draws u inside its pixel's active square and a place where the mask's near
-face is open, evenly among all that the field stop shows from u (:mod:`mitsim.transport.plugins.lensless`), which makes t. It
-traces the ray from u and returns weight p M(u + (d + h) t) cos^n (1 + |t|^2)^-2 (2 T)^2 times the fill factor, with T =
-tan(fov / 2) and p the part of the field stop that is open: irradiance is per pixel area. With t drawn over the whole
-field stop three of four rays would end at a separable mask. Where a plate is not open in a few grids, the place is
-drawn from a rectangle that holds all that is open, and M(u + d t) is one more factor of the weight; a tilted mask is
-met where the ray crosses its plane, a blurred one at a place moved at random by a normal deviate. The mask is a
-factor, not geometry: thin geometry suffers from Mitsuba's ray epsilon and blocks connections to delta lights.
-Diffraction is the factored estimator's: here light travels along rays.
+over t = (x/z, y/z) inside the field stop; M is the mask's transmission, d its distance, h its thickness (both faces
+count, a thin mask has one), cos^n a pixel's angular response, and the last factor is cos(theta) d omega written in t. A
+sample draws u inside its pixel's active square and a place where the mask's near face is open, evenly among all that
+the field stop shows from u (:mod:`mitsim.transport.plugins.lensless`), which makes t. It traces the ray from u and
+returns weight p M(u + (d + h) t) cos^n (1 + |t|^2)^-2 (2 T)^2 times the fill factor, with T = tan(fov / 2) and p the
+part of the field stop that is open: irradiance is per pixel area. With t drawn over the whole field stop three of four
+rays would end at a separable mask. Where a plate is not open in a few grids, the place is drawn from a rectangle that
+holds all that is open, and M(u + d t) is one more factor of the weight; a tilted mask is met where the ray crosses its
+plane, a blurred one at a place moved at random by a normal deviate. The mask is a factor, not geometry: thin geometry
+suffers from Mitsuba's ray epsilon and blocks connections to delta lights. Diffraction is the factored estimator's: here
+light travels along rays.
 
 The local frame is Mitsuba's: origin at the sensor's centre, +z to the scene, +y up, +x to the left of one who looks
 along +z. Image row 0 is at +y and column 0 at +x, so a frame shows the scene as one sees it looking along +z.

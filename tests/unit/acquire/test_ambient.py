@@ -108,7 +108,7 @@ def test_it_holds_the_lamps_light_alone(captured: Capture, light: SampledLight) 
     exposer = Exposer(light.bench.rig, captured.exposure_s, 0)
     electrons = read_frame(captured.folder / "ambient.exr")[0]["electrons"]
     assert electrons == pytest.approx(exposer.electrons(expected.projector_off), rel=1e-6)
-    # SampledLight is linear: all dots together are uniform light, and 15 times what black pixels leak; ambient light once.
+    # Light is linear: all dots together are uniform light, and 15 times what black pixels leak; ambient light once.
     white = next(iter(light.frames(parse_patterns("uniform", N).lighting, 2))).irradiance
     together = off + (1 + 15 * light.simulation.physics.black_level) * (white - off)
     assert shown.sum(axis=0) - 15 * off == pytest.approx(together, rel=1e-6)

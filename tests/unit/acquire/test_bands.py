@@ -30,7 +30,7 @@ def bench(coloured: bool = True, lines: Lines = LASERS, curve: object = None) ->
         loaded=SimpleNamespace(coloured=("a tag",) if coloured else (), parting=()),
         sensor=SimpleNamespace(quantum_efficiency_curve=curve),
     )  # fmt: skip
-    found.in_variant = lambda name: SimpleNamespace(
+    found.reopened = lambda name: SimpleNamespace(
         words=(name,), in_bands=lambda count: SimpleNamespace(words=(name, count))
     )
     return found  # type: ignore[return-value]
@@ -55,6 +55,7 @@ def chosen(monkeypatch: pytest.MonkeyPatch) -> Callable[..., bands.Coloured]:
 
         monkeypatch.setattr(bands._Look, "__init__", looking)
         monkeypatch.setattr(bands._Look, "errors", found)
+        monkeypatch.setattr(bands, "reopened", lambda of, variant: of.reopened(variant))
         monkeypatch.setattr(bands, "plan_request", planned)
         monkeypatch.setattr(bands, "plan_lines", planned)
         monkeypatch.setattr(bands.ColourBench, "of", lambda whole, kind: {RUN: whole}[kind])
@@ -165,9 +166,6 @@ class OfLines:
     def projector(self) -> Any:
         return SimpleNamespace(lines=self.own, effective_wavelength_nm=self.own.wavelengths_nm[0])
 
-    def in_variant(self, name: str) -> "OfLines":
-        return replace(self, variant=name)
-
 
 def light(line: Lines) -> Any:
     """(1, 2, 1) of a single line: even in one pixel, and rising with the wavelength in the other."""
@@ -201,6 +199,7 @@ def test_a_look_finds_what_bands_leave_of_all_lines(
     monkeypatch.setattr(bands._Look, "__init__", lambda self, whole: setattr(self, "_bench", whole))
     monkeypatch.setattr(bands._Look, "_deposits", deposits)
     monkeypatch.setattr(bands._Look, "_electrons", electrons)
+    monkeypatch.setattr(bands, "reopened", lambda of, variant: replace(of, variant=variant))
     monkeypatch.setattr(bands, "line_alone", lambda of, line: replace(of, alone=line))
     look: Any = bands._Look
     found = look(OfLines(own=lines)).errors(["lines", "bands:1", "bands:2", "mono"])

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mitsim.acquire.sense import check_ending, irradiance_behind_lens, read_image, sense
+from mitsim.acquire.sense import irradiance_behind_lens, read_image, sense
+from mitsim.acquire.sense_options import check_ending
 from mitsim.bench.request import Exposure
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError

@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from mitsim.bench import open
+from mitsim.api.bench import open_bench
+from mitsim.bench import open as opening
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
 from mitsim.devices import mask_profile
@@ -40,7 +41,7 @@ class Loader:
 @pytest.fixture
 def loader(monkeypatch: pytest.MonkeyPatch) -> Iterator[Loader]:
     found = Loader()
-    monkeypatch.setattr(open, "_loaded", found.loaded)
+    monkeypatch.setattr(opening, "_loaded", found.loaded)
     monkeypatch.setattr(mask_profile, "load_mask", lambda path: found.mask)
     yield found
 
@@ -72,42 +73,42 @@ def test_files_outside_a_scenes_folder_are_refused_unless_allowed(tmp_path: Path
     path.parent.mkdir()
     path.write_text("<scene version='3.0.0'><include filename='../more.xml'/></scene>")
     (tmp_path / "more.xml").write_text(SMALL)
-    assert open.check_scene(path, {}, True) == path
+    assert opening.check_scene(path, {}, True) == path
     with pytest.raises(MitsimError, match=r"more\.xml"):
-        open.check_scene(path, {})
+        opening.check_scene(path, {})
 
 
 def test_devices_are_camera_and_projector(tmp_path: Path) -> None:
     """By name, by file, and the shipped ones. (Planted: one for the other.)"""
-    usual = open.check_devices(None, None)
+    usual = opening.check_devices(None, None)
     assert [path.name for path in usual] == ["imx249.toml", "mp_cl1.toml"]
     own = tmp_path / "own.toml"
     own.write_text("")
-    assert open.check_devices(own, None) == (own, usual[1]) and open.check_devices(None, own) == (usual[0], own)
+    assert opening.check_devices(own, None) == (own, usual[1]) and opening.check_devices(None, own) == (usual[0], own)
     for devices in (("none", None), (None, "none")):
         with pytest.raises(MitsimError, match="none"):
-            open.check_devices(*devices)
+            opening.check_devices(*devices)
 
 
 def test_a_bench_is_what_its_files_say(loader: Loader, scene: Path) -> None:
     """Parameters as a scene spells them; no file outside unless allowed; a scene to render needs no projector."""
-    bench = open.open_bench(scene, "llvm_ad_mono", albedo=0.25, mask=True)
+    bench = open_bench(scene, "llvm_ad_mono", albedo=0.25, mask=True)
     assert bench.variant == "llvm_ad_mono" and dict(bench.defines) == {"albedo": "0.25", "mask": "true"}
     assert bench.rig.camera is bench.loaded.camera.geometry and "IMX249" in bench.sensor.name
     assert (
         "MP-CL1" in bench.projector.name
-        and bench.rig.camera_file == str(open.check_devices(None, None)[0])
+        and bench.rig.camera_file == str(opening.check_devices(None, None)[0])
         and not loader.worn
     )
-    open.open_bench(scene, "llvm_ad_rgb", allow_outside_files=True, for_render=True)
+    open_bench(scene, "llvm_ad_rgb", allow_outside_files=True, for_render=True)
     assert loader.asked == [
         ("llvm_ad_mono", scene, dict(bench.defines), {"needs_projector": True, "outside": False}),
         ("llvm_ad_rgb", scene, {}, {"needs_projector": False, "outside": True}),
     ]
     with pytest.raises(MitsimError, match="roughness"):
-        open.open_bench(scene, roughness=0.1)
+        open_bench(scene, roughness=0.1)
     with pytest.raises(MitsimError, match="nowhere"):
-        open.open_bench(scene.with_name("nowhere.xml"))
+        open_bench(scene.with_name("nowhere.xml"))
     assert len(loader.asked) == 2, "neither was loaded"
 
 
@@ -125,22 +126,22 @@ def test_pitches_are_the_scenes_to_a_thousandth(
     """Along columns and down the rows. (Planted: one for the other; a shorter pitch let pass.)"""
     loader.pitches = pitches
     if said is None:
-        open.open_bench(scene)
+        open_bench(scene)
         return
     with pytest.raises(MitsimError, match=said):
-        open.open_bench(scene)
-    open.open_bench(scene, for_render=True)
+        open_bench(scene)
+    open_bench(scene, for_render=True)
 
 
 def test_tall_pixels_are_binned_down_the_rows_as_well(loader: Loader, scene: Path, camera: Callable[..., Path]) -> None:
     """(Planted: the pitch of single rows; that of columns for both.)"""
     tall = camera(row_pitch_um="7.0")
     loader.pitches = 0.014, 0.01172
-    open.open_bench(scene, camera=tall)
+    open_bench(scene, camera=tall)
     for pitches in ((0.007, 0.01172), (0.01172, 0.01172)):
         loader.pitches = pitches
         with pytest.raises(MitsimError, match="row pitch is 14 um"):
-            open.open_bench(scene, camera=tall)
+            open_bench(scene, camera=tall)
 
 
 def test_a_camera_that_is_blind_to_the_projector_is_refused(
@@ -150,32 +151,32 @@ def test_a_camera_that_is_blind_to_the_projector_is_refused(
     these are told apart. (Planted: filters refused in a variant that tells lines apart; taken in one that does not.)"""
     plain = camera(quantum_efficiency="")
     with pytest.raises(MitsimError, match=r"camera .*own\.toml: .*efficiency"):
-        open.open_bench(scene, camera=plain)
+        open_bench(scene, camera=plain)
     assert not loader.asked
-    open.open_bench(scene, camera=plain, for_render=True)
+    open_bench(scene, camera=plain, for_render=True)
     filters = camera(quantum_efficiency="", mosaic='"RGGB"', binning="1")
     curves = "".join(
         f"\n[mosaic_curves.{name}]\nwavelengths_nm = [400.0, 700.0]\nefficiency = [0.5, 0.5]\n" for name in "RGB"
     )
     filters.write_text(filters.read_text() + curves)
     loader.pitches = 0.00586, 0.00586
-    open.open_bench(scene, "llvm_ad_spectral", filters)
+    open_bench(scene, "llvm_ad_spectral", filters)
     with pytest.raises(MitsimError, match="mosaic"):
-        open.open_bench(scene, "llvm_ad_mono", filters)
+        open_bench(scene, "llvm_ad_mono", filters)
     with pytest.raises(MitsimError, match="efficiency"):
-        open.open_bench(scene, "llvm_ad_spectral", camera(quantum_efficiency=""))
+        open_bench(scene, "llvm_ad_spectral", camera(quantum_efficiency=""))
 
 
 def test_a_mask_of_the_camera_is_worn_and_is_the_only_one(loader: Loader, scene: Path) -> None:
     """(Planted: the mask left off when a bench is opened anew; both taken.)"""
     seen: list[Any] = []
     loader.mask = SimpleNamespace(worn=lambda geometry, folder: seen.append((geometry.pitches, folder)) or "mask")
-    bench = open.open_bench(scene, albedo=0.25)
-    folder = open.check_devices(None, None)[0].parent
+    bench = open_bench(scene, albedo=0.25)
+    folder = opening.check_devices(None, None)[0].parent
     assert loader.worn == ["mask"] and seen == [(PITCHES, folder)]
     with pytest.raises(MitsimError, match="was set to 'mura' as well; give one of the two"):
-        open.open_bench(scene, mask="mura")
-    other = open.reopened(bench, "llvm_ad_rgb")
+        open_bench(scene, mask="mura")
+    other = opening.reopened(bench, "llvm_ad_rgb")
     assert loader.worn == ["mask", "mask"] and other.variant == "llvm_ad_rgb" and other.rig is bench.rig
     assert loader.asked[-1] == ("llvm_ad_rgb", scene, {"albedo": "0.25"}, {"outside": True})
     assert other.loaded is not bench.loaded

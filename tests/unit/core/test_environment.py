@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from mitsim.core import environment
-from mitsim.core import environment as llvm
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 
@@ -35,9 +34,9 @@ def test_an_unknown_variant_is_refused_with_the_known_ones() -> None:
 def test_without_a_gpu_a_cuda_variant_is_refused_in_one_line() -> None:
     """In a child, in which no LLVM is looked for: the cuda variants need none."""
     done = in_child(
-        "from mitsim.core import environment, llvm\n"
+        "from mitsim.core import environment\n"
         "environment.has_gpu = lambda: False\n"
-        "llvm.select_llvm = lambda: 1 / 0\n"
+        "environment.select_llvm = lambda: 1 / 0\n"
         "try: environment.load_variant('cuda_ad_rgb')\n"
         "except Exception as error: print(type(error).__name__, error)"
     )
@@ -70,7 +69,7 @@ def test_an_old_llvm_never_reaches_mitsuba() -> None:
         "from mitsim.core.errors import MitsimError\n"
         "try: load_variant('llvm_ad_mono')\n"
         "except MitsimError as error: print(error)",
-        **{llvm.VARIABLE: str(old)},
+        **{environment.VARIABLE: str(old)},
     )
     assert done.returncode == 0 and "LLVM 15, but Dr.Jit needs 17 or newer" in done.stdout
 
@@ -78,7 +77,7 @@ def test_an_old_llvm_never_reaches_mitsuba() -> None:
 def test_the_doctor_names_one_command_for_all_that_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / ".drjit").touch()  # a file where the cache folder should be
     monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.setenv(llvm.VARIABLE, "/nowhere/libLLVM.so.19.1")
+    monkeypatch.setenv(environment.VARIABLE, "/nowhere/libLLVM.so.19.1")
     monkeypatch.setattr(environment, "_RENDER", "import sys; sys.exit('{name} is broken')")
     monkeypatch.setattr(environment, "_FIGURE", "import os; os.abort()")
     checks = {check.name: check for check in environment.doctor()}
@@ -87,7 +86,7 @@ def test_the_doctor_names_one_command_for_all_that_fails(monkeypatch: pytest.Mon
     for name in broken:
         assert not checks[name].ok, name
         assert checks[name].remedy and "\n" not in checks[name].remedy + checks[name].detail
-    assert checks["llvm"].remedy == f"unset {llvm.VARIABLE}"
+    assert checks["llvm"].remedy == f"unset {environment.VARIABLE}"
     assert "llvm_ad_rgb is broken" in checks["render llvm_ad_rgb"].detail
     assert "signal 6" in checks["matplotlib"].detail
     assert set(broken) | {"python", "openexr", "mitsuba"} == set(checks)

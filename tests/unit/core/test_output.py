@@ -94,7 +94,7 @@ def test_a_folder_in_use_is_refused_and_free_again_afterwards(tmp_path: Path) ->
 
 HOLD = """
 import sys, time
-from mitsim.core.output import output_folder
+from mitsim.core.files import output_folder
 with output_folder(sys.argv[1]):
     print("held", flush=True)
     time.sleep(60)

@@ -1,4 +1,5 @@
-"""SampledLight for a family: stopped at its target, by pixel or by class, and only for the families that it was meant for."""
+"""Light for a family: stopped at its target, by pixel or by class, and only for the families that it was meant
+for."""
 
 import math
 import warnings

@@ -1,4 +1,5 @@
-"""SampledLight of near surfaces at the edge of the view: the cells hold it, and what they do not hold is counted and said.
+"""Light of near surfaces at the edge of the view: the cells hold it, and what they do not hold is counted and
+said.
 
 A card at 150 mm stands before a camera whose rig is aligned to 400 mm. Through the field stop the sensor's edge sees
 the card at tan-angles (from the centre) that no surface at 400 mm has. Judge: an integral over the card.

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mitsim.reconstruct.request import Predicted, is_kept, predicted, slab_numbers
+from mitsim.reconstruct.cost import Predicted, is_kept, predicted, slab_numbers
 
 
 def made(rows: tuple[int, int], lines: tuple[int, int], patterns: tuple[int, int], shots: int = 24) -> tuple:

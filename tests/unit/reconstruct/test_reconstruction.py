@@ -17,9 +17,10 @@ from mitsim.core.manifests import CalibrationManifest, Digital, Patterns, RunHea
 from mitsim.core.resources import Cost
 from mitsim.core.runs import Capture, RunMemory, frame_name, load_run
 from mitsim.devices.patterns import parse_patterns
+from mitsim.reconstruct.cost import Predicted, predicted
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import accumulated, reconstruct
-from mitsim.reconstruct.request import METHODS, Predicted, predicted
+from mitsim.reconstruct.request import METHODS
 from mitsim.reconstruct.result import may_replace
 from mitsim.reconstruct.status import Status, Verdict
 from mitsim.report.quality import reconstruct as reconstruct_folders

@@ -130,7 +130,7 @@ def test_an_error_of_nothing_has_no_dot() -> None:
 
 def test_no_pyplot_is_loaded() -> None:
     program = (
-        "import sys, numpy; from mitsim.study import plots; plots.frame(numpy.ones((4, 4)));"
+        "import sys, numpy; from mitsim.report import plots; plots.frame(numpy.ones((4, 4)));"
         "sys.exit('matplotlib.pyplot' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

@@ -52,7 +52,7 @@ def result(bench: Bench, folder: Path) -> StudyResult:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(accuracy, "ACCURACIES", TRIED)
         patch.setattr(accuracy, "QUOTED", QUOTED)
-        patch.setattr(accuracy.parts, "_LONGEST_S", 0.0)
+        patch.setattr(parts, "_LONGEST_S", 0.0)
         patch.setattr(accuracy, "_JUDGE_PART", 0.02)
         patch.setattr("mitsim.studies.framework.spreads.ROUNDS", ROUNDS)
         request = Request.of(patterns=PATTERNS, seed=SEED)

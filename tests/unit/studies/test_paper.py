@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.report.exposures import MODELS, measures_of, values_of
+from mitsim.report.exposures import MODELS
+from mitsim.report.study_options import measures_of, values_of
 from mitsim.report.table import Table
 from mitsim.studies import find_experiment
 from mitsim.studies.framework.campaign import Where, run_experiment

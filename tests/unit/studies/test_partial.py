@@ -212,7 +212,8 @@ def test_gloss_is_what_the_sensor_sees_beyond_its_mean(shared_scene: Callable[..
 
 
 def test_lobes_are_averaged_over_anchors_with_their_weights(far: SampledLight) -> None:
-    """SampledLight of one anchor alone comes to all, times its weight in the mean over it. (Planted: its row's twice.)"""
+    """Light of one anchor alone comes to all, times its weight in the mean over it. (Planted: its row's
+    twice.)"""
     sharp = SharpPixels((5,), 3, (-0.05, 0.05, -0.05, 0.05))
     simulation = Simulation(far.bench, replace(far.simulation.settings, sharp=sharp))
     one, zero = np.ones(1), np.zeros(1, np.int64)

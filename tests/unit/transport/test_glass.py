@@ -10,7 +10,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsim.api.bench import open_bench, reopened
+from mitsim.api.bench import open_bench
+from mitsim.bench.open import reopened
 from mitsim.core.errors import MitsimError
 from mitsim.devices.projector import Lines
 from mitsim.transport.plugins.glass import GlassModel, is_glass, tune

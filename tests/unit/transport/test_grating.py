@@ -241,8 +241,8 @@ from mitsim.core.environment import load_variant
 mi = load_variant({other!r})
 mi.set_log_level(mi.LogLevel.Error)
 import drjit as dr, numpy as np
-from mitsim.transport import plugins
-plugins.register()
+from mitsim.transport.plugins import all
+all.register()
 bsdf = mi.load_dict({{"type": "mitsim_grating", "efficiencies": "0, 0.5", "negative_efficiencies": "0"}})
 si = dr.zeros(mi.SurfaceInteraction3f, 1)
 si.sh_frame = mi.Frame3f(mi.Vector3f(0, 0, 1))
@@ -411,6 +411,6 @@ def test_orders_are_symmetric_unless_both_sides_are_given() -> None:
 
 
 def test_registering_needs_a_variant() -> None:
-    program = "from mitsim.transport import grating; grating.register()"
+    program = "from mitsim.transport.plugins import grating; grating.register()"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 1 and "MitsimError: no Mitsuba variant is selected" in done.stderr

@@ -165,7 +165,7 @@ def test_registering_twice_does_nothing() -> None:
 
 
 def test_registering_needs_a_variant() -> None:
-    program = "from mitsim.transport import lensless; lensless.register()"
+    program = "from mitsim.transport.plugins import lensless; lensless.register()"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 1 and "MitsimError: no Mitsuba variant is selected" in done.stderr
 

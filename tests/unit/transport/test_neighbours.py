@@ -205,10 +205,10 @@ def test_light_that_is_not_a_number_is_refused(small_scene: Callable[..., Path])
 
 _PRINT = """
 import hashlib, sys, drjit as dr, numpy as np
-from mitsim.capture.opening import open_bench
-from mitsim.transport.cells import aligned_grid
-from mitsim.transport.histogram import Bundle
-from mitsim.transport.ledger import Ledger
+from mitsim.api.bench import open_bench
+from mitsim.transport.records import aligned_grid
+from mitsim.transport.records import Bundle
+from mitsim.transport.accumulator import Ledger
 from tests.unit.transport.test_neighbours import tracers
 bench = open_bench(sys.argv[1])
 dr.set_thread_count(int(sys.argv[2]))
