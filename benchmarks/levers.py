@@ -33,7 +33,8 @@ import numpy as np
 import mitsim as ms
 from mitsim.api.bench import Bench
 from mitsim.devices.patterns import PatternFamily, parse_patterns
-from mitsim.light.passes import FiledLight, Simulation, Stage
+from mitsim.light.light_estimate import LightEstimate
+from mitsim.light.passes import Simulation
 from mitsim.transport.accumulator import fetched
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.indirect import block_moments, chosen_repeats
@@ -85,13 +86,14 @@ def repeats_of(simulation: Simulation, samples: int) -> tuple[int, ...]:
     return tuple(int(count) for count in chosen_repeats(block_moments(light.pixel, light.value, pixels)).ravel())
 
 
-def traced(stage: Stage, labels: np.ndarray, seed: int, samples: int, device: bool) -> FiledLight:
+def traced(
+    simulation: Simulation, name: str, labels: np.ndarray, seed: int, samples: int, device: bool
+) -> LightEstimate:
     """Light of one group, per sample."""
-    ledgers = stage.ledgers(labels, 1) if device else ()
-    light = stage.file(stage.trace(seed, 0, samples, ledgers), labels, samples)
-    if stage.file_ledger and ledgers:
-        for ledger, counted in zip(ledgers, fetched(ledgers), strict=True):
-            light = light + stage.file_ledger(ledger, counted, labels, samples)
+    ledgers = simulation.ledgers(name, labels, 1) if device else ()
+    light = simulation.accumulate(name, simulation.passes[name].trace(seed, 0, samples, ledgers), labels, samples)
+    for sums in fetched(ledgers) if ledgers else ():
+        light = light + simulation.accumulate(name, sums, labels, samples)
     dr.sync_thread()
     return light
 
@@ -118,9 +120,9 @@ def measured(
                 samples = max(1, round(options.samples * way.part))
                 points = DirectTracer._sensor if way.even else plain_points
                 with mock.patch.object(DirectTracer, "_sensor", points):
-                    stage = simulations[name].tracers()[kind]
+                    assert kind in simulations[name].passes, "prepared before the clock starts"
                     started = time.perf_counter()
-                    light = traced(stage, labels, group, samples, way.device)
+                    light = traced(simulations[name], kind, labels, group, samples, way.device)
                 if turn >= 0:
                     seconds[name][turn] += time.perf_counter() - started
                 else:
@@ -164,11 +166,10 @@ def main() -> None:
         family = parse_patterns("dots:7", bench.n)
         simulation = Simulation(bench, bench.plan("dots:7", accuracy=1e-3).settings)
         repeats = repeats_of(simulation, options.samples) if simulation.indirect else (1,)
-        stages = simulation.tracers()
         results["scenes"][name] = {
             kind: measured(bench, family, kind, found, options)
             for kind, found in ways(repeats).items()
-            if kind in stages and (kind != "direct" or simulation.settings.anchors > 1)
+            if kind in simulation.passes and (kind != "direct" or simulation.settings.anchors > 1)
         }
         options.json.write_text(json.dumps(results, indent=1) + "\n")
     print(table(results))

@@ -188,7 +188,7 @@ def _lamps_alone(light: SampledLight, bands: slice, seed: int) -> ExpectedFrames
     """One frame of lamps of a ``light``, of some ``bands`` of theirs; a ``seed`` of its probes."""
     lamplight = light.bench.lamplight
     assert lamplight is not None, "asked before"
-    filed = light.simulation.of_lamps(light.groups, light.groups[0].fine.shape[0] - len(lamplight.bands), bands)
+    filed = light.simulation.of_lamps(light.groups, light.groups[0].rows - len(lamplight.bands), bands)
     return ExpectedFrames(filed, Lighting(np.zeros(1, np.int64), np.ones((1, 1))), seed)
 
 

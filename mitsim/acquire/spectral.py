@@ -461,7 +461,7 @@ class _Look(Generic[Opened]):
     def _electrons(self, bench: Apparatus, deposits: Deposits) -> FloatArray:
         """(shots, rows, columns) of the light in ``deposits``, by the photons and the efficiency of a ``bench``."""
         simulation, lighting = Simulation(bench, self._settings), self._lighting
-        filed = simulation.file_direct(deposits, lighting.labels, _RAYS_OF_BANDS)
+        filed = simulation.accumulate("direct", deposits, lighting.labels, _RAYS_OF_BANDS)
         rows = np.arange(lighting.weights.shape[1])
         frames = simulation.expected([filed], rows, lighting, self._seed, leaking=False)
         wavelength = bench.projector.effective_wavelength_nm

@@ -32,8 +32,10 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.resources import Cost, Limits
 from mitsim.core.seeds import integer
 from mitsim.devices.session import SIDES, SessionRecipe, load_recipe
+from mitsim.light.grids import GRIDS
 from mitsim.light.light import SampledLight
-from mitsim.light.passes import TRAYS, FiledLight, Simulation
+from mitsim.light.light_estimate import LightEstimate
+from mitsim.light.passes import Simulation
 from mitsim.light.plan import Plan
 from mitsim.optics.frames import Frame
 from mitsim.optics.separable import Lacking, lacking
@@ -372,15 +374,15 @@ def _light(session: Session, plan: Plan, checkpoint: Checkpoint, job: Job) -> Sa
     """The board's light, from the checkpoint if it is there."""
     arrays = checkpoint.load("light")
     if arrays is not None:
-        trays = {
+        by_grid = {
             name: sparse.csr_array(
-                tuple(arrays[f"{name}_{part}"] for part in ("data", "indices", "indptr")),
-                shape=tuple(arrays[f"{name}_shape"]),
+                tuple(arrays[f"{row.key}_{part}"] for part in ("data", "indices", "indptr")),
+                shape=tuple(arrays[f"{row.key}_shape"]),
             )
-            for name in TRAYS
+            for name, row in GRIDS.items()
         }
         return SampledLight(
-            groups=(FiledLight(**trays, received=float(arrays["received"]), outside=float(arrays["outside"])),),
+            groups=(LightEstimate(by_grid, float(arrays["received"]), float(arrays["outside"])),),
             simulation=Simulation(session.board, plan.settings),
             plan=plan,
             seed=session.seed,
@@ -396,9 +398,9 @@ def _light(session: Session, plan: Plan, checkpoint: Checkpoint, job: Job) -> Sa
         name: getattr(light, name) for name in ("labels", "flux", "flux_error", "paths", "sampling_error", "reached")
     }
     facts |= {name: getattr(light.groups[0], name) for name in ("received", "outside")}
-    for name in TRAYS:
-        matrix = getattr(light.groups[0], name)
-        facts |= {f"{name}_{part}": getattr(matrix, part) for part in ("data", "indices", "indptr", "shape")}
+    for name, row in GRIDS.items():
+        matrix = light.groups[0][name]
+        facts |= {f"{row.key}_{part}": getattr(matrix, part) for part in ("data", "indices", "indptr", "shape")}
     checkpoint.save("light", facts)
     return light
 

@@ -37,8 +37,9 @@ from mitsim.devices.session import SIDES, UNIFORM, BoardShape, Half, SessionReci
 from mitsim.light.cost_model import FIXED, Numbers, forming_seconds
 from mitsim.light.light import SampledLight, Sampling, trace_lines
 from mitsim.light.passes import Simulation
+from mitsim.light.pilot_result import Forming
 from mitsim.light.plan import Plan
-from mitsim.light.settings import Forming, Settings
+from mitsim.light.settings import Settings
 from mitsim.optics.frames import Frame, at_once, mixes
 from mitsim.optics.separable import best_term, centred
 from mitsim.optics.shadow import Directions, SeparableTerms
@@ -723,7 +724,7 @@ def session_seconds(board: Apparatus, count: int, shots: int, settings: Settings
         what is simulated.
     """
     n, pixels = board.n, board.geometry.frame_side
-    cells = max(Simulation(board, settings).fine.bundle.cells)
+    cells = max(Simulation(board, settings).grids["fine"].bundle.cells)
     mixed = lines_held(n, count, pixels)
     forming = Forming(
         pixels=pixels,

@@ -1,26 +1,24 @@
-"""What simulating takes: from settings, what the pilot found and paces to seconds of each stage.
+"""What simulating takes: from settings, what the pilot found and unit costs to seconds of each stage.
 
-The plan compares its choices at :data:`FIXED` paces, not at those of this machine and moment: the same seed must mean
-the same settings. What the pilot measured only scales the prediction that people read.
+The plan compares its choices at :data:`FIXED` unit costs, not at those of this machine and moment: the same seed must
+mean the same settings. What the pilot measured only scales the prediction that people read.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import cast
 
 import numpy as np
 
 from mitsim.bench.effects import names
 from mitsim.core.arrays import FloatArray
-from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.plate import FEW, Plate
-from mitsim.devices.projector import Spectrum
-from mitsim.light.settings import GROUPS, Effort, Evidence, Forming, Number, Settings, whole
-from mitsim.optics.fft_shadow import cells_a_side, cells_per_pixel, points_per_cell
+from mitsim.devices.plate import FEW
+from mitsim.light.pass_table import PASSES
+from mitsim.light.pilot_result import Effort, Evidence, Forming
+from mitsim.light.settings import GROUPS, Number, Settings
 from mitsim.optics.frames import PROBES, formed_frames, mixes
 from mitsim.transport.accumulator import MOST_PLACES
 
@@ -39,15 +37,6 @@ MIXING = "black-level"
 _SPLIT, _EDGES = 2.0, 2.0
 """Layers, at most, that share the light of one depth; and how many times the cells of a pixel its light lies in, at
 most, where it lies across an edge or at another depth than the cells are aligned at (measured: 1.6)."""
-ANCHORS_OF = MappingProxyType(
-    {
-        "anchored": "anchors",
-        "followed": "followed_anchors",
-        "followed_from_camera": "followed_anchors",
-        "occluded": "occluded_anchors",
-    }
-)
-"""What counts the anchors of each kind of light that has several."""
 _GEOMETRIC_ENTRIES = 0.03
 """An entry of a geometric shadow over one of a wave-optical one: a sum over features against samples of a field."""
 
@@ -69,19 +58,24 @@ gift_card 0.3)."""
 
 
 @dataclass(frozen=True)
-class Paces:
-    """Seconds of a path or connection of each kind, of a frame and of a multiplication in forming it, of an entry of a
-    wave-optical shadow and of one of filed light, of a ray of the truth, and of a pixel of a shot that is looked
-    through for its brightest and its energy."""
+class UnitCosts:
+    """Seconds of single things.
 
-    direct: float
-    anchored: float
-    indirect: float
-    from_camera: float
-    followed: float
-    followed_from_camera: float
-    occluded: float
-    sharp: float
+    Attributes
+    ----------
+    passes
+        a path, or a connection, of each pass by its name.
+    frame, product
+        a frame, and a multiplication in forming it.
+    entry, filed
+        an entry of a wave-optical shadow, and one of accumulated light.
+    ray
+        a ray of the truth.
+    pixel
+        a pixel of a shot that is looked through for its brightest and its energy.
+    """
+
+    passes: Mapping[str, float]
     frame: float
     product: float
     entry: float
@@ -90,15 +84,8 @@ class Paces:
     pixel: float = 0.0
 
 
-FIXED = Paces(
-    direct=1.8e-7,
-    anchored=1.6e-7,
-    indirect=1.2e-7,
-    from_camera=2e-7,
-    followed=1.3e-7,
-    followed_from_camera=1.3e-7,
-    occluded=5e-7,
-    sharp=3e-7,
+FIXED = UnitCosts(
+    passes={name: row.unit_cost for name, row in PASSES.items()},
     frame=2.2e-3,
     product=2.1e-11,
     entry=3.5e-8,
@@ -106,8 +93,7 @@ FIXED = Paces(
     ray=1e-7,
     pixel=3e-8,
 )
-"""Chosen near what was measured of eight shipped scenes on two cores (plans at 1e-3, November 2026); only their ratios
-decide. Direct light takes half as much where one cell a pixel holds it, and more in many fine ones."""
+"""Chosen near what was measured, as the table's; only their ratios decide."""
 
 
 _CORRELATION = 125.0
@@ -128,23 +114,29 @@ SHARED_COST = 6
 
 @dataclass(frozen=True)
 class Numbers:
-    """The numbers of settings that cost depends on, one choice or (m,) of them at once."""
+    """The numbers of settings that cost depends on, one choice or (m,) of them at once; the first eight are chosen."""
 
     anchors: Number
     layers: Number
     cells: Number
-    coarse_cells: Number
-    coarse_layers: Number
     followed_anchors: Number
+    occluded_anchors: Number
     followed_width: Number
-    waves: Number
-    indirect: Number
-    mixed: Number
-    occluded: Number = 0.0
+    coarse_cells: Number
+    all_layers: Number
+    """Whether coarse light has all layers, or one."""
+    waves: float = 1.0
+    indirect: float = 0.0
+    mixed: float = 0.0
+    occluded: float = 0.0
     """Pixels of their own anchors."""
-    occluded_anchors: Number = 1.0
     raster_cells: float = 0.0
     """Along a pixel, where frames are correlations by choice; 0: sums, or as few cells as a raster has."""
+
+    @property
+    def coarse_layers(self) -> FloatArray:
+        """Layers of coarse light."""
+        return np.where(np.asarray(self.all_layers) > 0, self.layers, 1.0)
 
     @property
     def of_followed(self) -> tuple[FloatArray, FloatArray]:
@@ -155,30 +147,55 @@ class Numbers:
     @classmethod
     def coarsest(cls) -> Numbers:
         """One of everything, and a wave-optical shadow."""
-        return cls(1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0)
+        return cls(*[1.0] * 8)
+
+    @classmethod
+    def chosen(
+        cls, counts: Sequence[Number], effects: frozenset[str], occluded: int = 0, raster_cells: int = 0
+    ) -> Numbers:
+        """Those of the eight that are chosen, with ``effects``.
+
+        Parameters
+        ----------
+        counts
+            the first eight numbers.
+        effects
+            that are on.
+        occluded, raster_cells
+            as above.
+        """
+        anchors, layers, cells, followed, occluded_anchors, width, coarse_cells, all_layers = counts
+        return cls(
+            anchors,
+            layers,
+            cells,
+            followed,
+            occluded_anchors,
+            width,
+            coarse_cells,
+            all_layers,
+            waves=float(in_waves(effects)),
+            indirect=float("interreflection" in effects),
+            mixed=float(MIXING in effects),
+            occluded=float(occluded),
+            raster_cells=float(raster_cells),
+        )
 
     @classmethod
     def of(cls, settings: Settings) -> Numbers:
         """Those of ``settings``."""
-        layers = float(len(settings.depths))
-        return cls(
-            anchors=float(settings.anchors),
-            layers=layers,
-            cells=float(settings.subdivision),
-            coarse_cells=float(settings.coarse_cells),
-            coarse_layers=layers if settings.coarse_layers else 1.0,
-            followed_anchors=float(settings.followed_anchors),
-            followed_width=float(settings.followed_width),
-            waves=float(bool(settings.effects & names(lambda effect: effect.in_shadow))),
-            indirect=float("interreflection" in settings.effects),
-            mixed=float(MIXING in settings.effects),
-            occluded=float(len(settings.with_own_anchors)),
-            occluded_anchors=float(settings.occluded_anchors),
-            raster_cells=float(settings.raster_cells),
-        )
+        of_direct = settings.anchors, len(settings.depths), settings.subdivision
+        of_few = settings.followed_anchors, settings.occluded_anchors, settings.followed_width
+        counts = [float(each) for each in (*of_direct, *of_few, settings.coarse_cells, settings.coarse_layers)]
+        return cls.chosen(counts, settings.effects, len(settings.with_own_anchors), settings.raster_cells)
 
 
-def paces_of(evidence: Evidence) -> Paces:
+def in_waves(effects: frozenset[str]) -> bool:
+    """Whether the mask's shadow is wave-optical with these ``effects``."""
+    return bool(effects & names(lambda effect: effect.in_shadow))
+
+
+def unit_costs_of(evidence: Evidence) -> UnitCosts:
     """Those that the ``evidence`` measured, where it measured any."""
     forming = evidence.forming
     products = float(_products(forming, Numbers.coarsest(), (forming.lit, forming.lit), 1.0, 1.0, 1.0))
@@ -186,20 +203,14 @@ def paces_of(evidence: Evidence) -> Paces:
     product = forming.product or slower * FIXED.product
     # The frame that the pilot forms is small: beside its products there is what every frame takes.
     frame = max(forming.seconds - product * products, 0.0) if forming.product else slower * FIXED.frame
-    return Paces(
-        direct=evidence.direct.seconds or FIXED.direct,
-        anchored=evidence.anchored.seconds or FIXED.anchored,
-        indirect=evidence.indirect.seconds or FIXED.indirect,
-        from_camera=evidence.from_camera.seconds or FIXED.from_camera,
-        followed=evidence.followed.seconds or FIXED.followed,
-        followed_from_camera=evidence.followed_from_camera.seconds or FIXED.followed_from_camera,
-        occluded=evidence.occluded_light.seconds or FIXED.occluded,
-        sharp=evidence.sharp_light.seconds or FIXED.sharp,
+    measured = {name: effort.seconds for name, effort in evidence.efforts.items() if effort.seconds}
+    return UnitCosts(
+        passes={**FIXED.passes, **measured},
         frame=float(frame),
         product=float(product),
         entry=float(product / FIXED.product * FIXED.entry),
         filed=float(product / FIXED.product * FIXED.filed),
-        ray=evidence.spread.seconds * FIXED.ray / FIXED.direct or FIXED.ray,
+        ray=evidence.spread.seconds * FIXED.ray / FIXED.passes["direct"] or FIXED.ray,
         pixel=float(product / FIXED.product * FIXED.pixel),
     )
 
@@ -210,32 +221,9 @@ def priced() -> frozenset[str]:
 
 
 def efforts(evidence: Evidence, effects: frozenset[str]) -> dict[str, Effort]:
-    """What each kind of light that ``effects`` call for takes by the ``evidence``; connections to anchors: to one."""
-    found = {"direct": evidence.direct, "anchored": evidence.anchored}
-    if evidence.occluded:
-        found["occluded"] = evidence.occluded_light
-    if evidence.sharp:
-        found["sharp"] = evidence.sharp_light
-    if effects & names(lambda effect: effect.followed):
-        found |= {"indirect": evidence.indirect, "from_camera": evidence.from_camera, "followed": evidence.followed}
-        found["followed_from_camera"] = evidence.followed_from_camera
-    return found
-
-
-def connections(name: str, numbers: Numbers) -> Number:
-    """Connections of each path of the light ``name``; 0 for what anchors see beyond their mean where there is one.
-
-    Parameters
-    ----------
-    name
-        as in :func:`efforts`.
-    numbers
-        of the settings.
-    """
-    if name not in ANCHORS_OF:
-        return 1.0 + 0 * numbers.anchors
-    count = np.asarray(getattr(numbers, ANCHORS_OF[name]), dtype=np.float64)
-    return cast(Number, count**2 * (count > 1))
+    """What each pass that ``effects`` call for takes by the ``evidence``; connections to anchors: to one."""
+    found = ((name, evidence.efforts[name]) for name in PASSES if name in evidence.efforts)
+    return {name: effort for name, effort in found if PASSES[name].called_for(effects)}
 
 
 def _by_fft(forming: Forming, numbers: Numbers) -> bool:
@@ -293,7 +281,7 @@ def _lit_by_occluded(forming: Forming, numbers: Numbers) -> tuple[Number, Number
     return rows, columns
 
 
-def forming_seconds(forming: Forming, numbers: Numbers, frames: Number, paces: Paces) -> Number:
+def forming_seconds(forming: Forming, numbers: Numbers, frames: Number, costs: UnitCosts) -> Number:
     """Seconds of forming so many ``frames`` of each line.
 
     Parameters
@@ -302,7 +290,7 @@ def forming_seconds(forming: Forming, numbers: Numbers, frames: Number, paces: P
         what it depends on.
     frames
         to be formed of a line.
-    paces
+    costs
         of this machine, or the fixed ones.
     """
     several = np.asarray(numbers.anchors) > 1
@@ -319,43 +307,43 @@ def forming_seconds(forming: Forming, numbers: Numbers, frames: Number, paces: P
     )
     if mixes(forming.classes, forming.shots, forming.pixels):
         products = products + numbers.mixed * forming.classes * forming.pixels**2
-    return cast(Number, forming.lines * frames * (paces.frame + paces.product * products))
+    return cast(Number, forming.lines * frames * (costs.frame + costs.product * products))
 
 
-def optics_seconds(forming: Forming, numbers: Numbers, paces: Paces) -> Number:
+def optics_seconds(forming: Forming, numbers: Numbers, costs: UnitCosts) -> Number:
     """Seconds of all frames of the family, with the shadows that form them.
 
     Parameters
     ----------
-    forming, numbers, paces
+    forming, numbers, costs
         as for :func:`forming_seconds`.
     """
-    shadows = paces.entry * _entries(forming, numbers)
+    shadows = costs.entry * _entries(forming, numbers)
     if _by_fft(forming, numbers):
-        drawing = forming.drawing[bool(numbers.waves)] * paces.product / FIXED.product
+        drawing = forming.drawing[bool(numbers.waves)] * costs.product / FIXED.product
         if not numbers.waves:  # Waves are squared at as many points whatever the cells.
             drawing *= _phases(forming, numbers) / forming.phases
         # Coarse light of several layers is seen at a depth of its own.
         shadows = cast(Number, shadows + drawing * (numbers.layers + (np.asarray(numbers.layers) > 1)))
     frames = formed_frames(forming.classes, forming.shots, forming.pixels)
-    seen = paces.pixel * forming.shots * forming.pixels**2
-    return forming.lines * (shadows + seen) + forming_seconds(forming, numbers, frames, paces)
+    seen = costs.pixel * forming.shots * forming.pixels**2
+    return forming.lines * (shadows + seen) + forming_seconds(forming, numbers, frames, costs)
 
 
-def checking_seconds(forming: Forming, numbers: Numbers, paces: Paces) -> Number:
+def checking_seconds(forming: Forming, numbers: Numbers, costs: UnitCosts) -> Number:
     """Seconds of seeing how large the Monte Carlo error is, while light is traced.
 
     Parameters
     ----------
-    forming, numbers, paces
+    forming, numbers, costs
         as for :func:`forming_seconds`.
     """
     rounds = ROUNDS + numbers.indirect
     if tells_all(forming.classes, forming.shots, forming.pixels):
         # The last look takes its part of forming the frames over.
-        return forming_seconds(forming, numbers, _LOOK * (rounds - 1) * forming.classes, paces)
+        return forming_seconds(forming, numbers, _LOOK * (rounds - 1) * forming.classes, costs)
     few, many = (min(shots, forming.shots) for shots in (CHECKED_SHOTS, MOST_CHECKED))
-    return forming_seconds(forming, numbers, _LOOK * rounds * (few + numbers.indirect * (many - few)), paces)
+    return forming_seconds(forming, numbers, _LOOK * rounds * (few + numbers.indirect * (many - few)), costs)
 
 
 def tells_all(classes: int, shots: int, pixels: float) -> bool:
@@ -369,7 +357,7 @@ def tells_all(classes: int, shots: int, pixels: float) -> bool:
     return classes <= MOST_CHECKED and mixes(classes, shots, pixels)
 
 
-def tracing_seconds(evidence: Evidence, settings: Settings, paces: Paces) -> dict[str, float]:
+def tracing_seconds(evidence: Evidence, settings: Settings, costs: UnitCosts) -> dict[str, float]:
     """Seconds of tracing the samples in ``settings``, by kind of light.
 
     Parameters
@@ -378,16 +366,16 @@ def tracing_seconds(evidence: Evidence, settings: Settings, paces: Paces) -> dic
         paths in a sample.
     settings
         the samples.
-    paces
+    costs
         as for :func:`forming_seconds`.
     """
     return {
         name: traced_for(evidence.forming.lines, evidence.forming.parted)
         * GROUPS
-        * float(whole(name, getattr(settings, f"{name}_samples")))
+        * float(PASSES[name].whole(PASSES[name].predicted(settings)))
         * effort.paths
-        * getattr(paces, name)
-        * float(connections(name, Numbers.of(settings)))
+        * costs.passes[name]
+        * float(PASSES[name].connections(settings))
         for name, effort in efforts(evidence, settings.effects).items()
     }
 
@@ -426,17 +414,18 @@ def entries(pixels: int, classes: int, numbers: Numbers, samples: Settings | Map
     """
 
     def of(name: str) -> Number:
-        return whole(name, getattr(samples, f"{name}_samples") if isinstance(samples, Settings) else samples[name])
+        row = PASSES[name]
+        return row.whole(row.predicted(samples) if isinstance(samples, Settings) else samples.get(name, 1.0))
 
     coarse, layers = np.square(numbers.coarse_cells), np.minimum(numbers.coarse_layers, _SPLIT)
     several, followed = (np.asarray(count) > 1 for count in (numbers.anchors, numbers.followed_anchors))
     found = np.minimum(of("direct"), _EDGES * np.square(numbers.cells)) * np.minimum(numbers.layers, _SPLIT)
     if np.any(several):
-        seen = _EDGES * np.minimum(of("anchored"), coarse) * layers
+        seen = _EDGES * np.minimum(of("anchor_residual"), coarse) * layers
         found = found + several * _EDGES * np.square(numbers.anchors) * seen
     beyond = numbers.occluded / pixels * (np.asarray(numbers.occluded_anchors) > 1)
     if np.any(beyond):
-        seen = _EDGES * np.minimum(of("occluded"), coarse) * layers
+        seen = _EDGES * np.minimum(of("penumbra"), coarse) * layers
         found = found + beyond * _EDGES * np.square(numbers.occluded_anchors) * seen
     # Pixels of the projector, not of all cells: light from beyond its window is a small part.
     places = classes * coarse * numbers.coarse_layers
@@ -444,109 +433,39 @@ def entries(pixels: int, classes: int, numbers: Numbers, samples: Settings | Map
         found = found + numbers.indirect * np.minimum(_SPLIT * of("indirect"), places)
     if np.any(followed):
         cells, seen_in = numbers.of_followed
-        most = np.maximum(of("followed"), of("followed_from_camera"))
+        most = np.maximum(of("indirect_residual"), of("camera_residual"))
         seen = np.minimum(_SPLIT * most, classes * np.square(cells) * seen_in)
         found = found + followed * _EDGES * np.square(numbers.followed_anchors) * seen
     return cast(Number, pixels * found)
 
 
-def filing_seconds(forming: Forming, numbers: Numbers, filed: Number, paces: Paces) -> Number:
+def filing_seconds(forming: Forming, numbers: Numbers, filed: Number, costs: UnitCosts) -> Number:
     """Seconds of filing the light of each line.
 
     Parameters
     ----------
-    forming, numbers, paces
+    forming, numbers, costs
         as for :func:`forming_seconds`.
     filed
         entries of one group's light.
     """
     ledger = forming.classes * np.square(forming.cells * numbers.coarse_cells) * numbers.coarse_layers
     passed = numbers.indirect * _PASSED * np.where(ledger < MOST_PLACES, ledger, 0.0)
-    return cast(Number, forming.lines * GROUPS * paces.filed * (filed + passed))
+    return cast(Number, forming.lines * GROUPS * costs.filed * (filed + passed))
 
 
-def truth_seconds(evidence: Evidence, settings: Settings, paces: Paces) -> float:
+def truth_seconds(evidence: Evidence, settings: Settings, costs: UnitCosts) -> float:
     """Seconds of tracing what a perfect image would show.
 
     Parameters
     ----------
-    evidence, settings, paces
+    evidence, settings, costs
         as for :func:`tracing_seconds`.
     """
-    direct = evidence.spread if settings.anchors > 1 else evidence.direct
-    rate = direct.noise.rate
+    row, direct = PASSES["direct"], evidence.efforts["direct"]
+    rate = (evidence.spread if settings.anchors > 1 else direct).noise.rate
     return (
         traced_for(evidence.forming.lines, evidence.forming.parted)
-        * paces.ray
-        * predicted_rays(evidence.direct.paths, float(whole("direct", settings.direct_samples)), rate)
+        * costs.ray
+        * predicted_rays(direct.paths, float(row.whole(row.predicted(settings))), rate)
     )
-
-
-# -------- What drawing a mask's shadow on a raster takes (
-
-_MEANS_S, _TURNED_S = 8e-8, 5e-7
-"""A cell of a shadow without diffraction, of a mask that is straight and of one that is turned; here and below 0.7 of
-the processor seconds of 2310 to 3466 cells a side on a busy core (benchmarks/masks.py)."""
-_POINT_S, _TERM_S = 9e-9, 8e-11
-"""A point at which waves are squared, and a term of their field there."""
-_AROUND = 2.0
-"""Cells of the light that is turned over those of its turned square."""
-_HELD, _AT_WORK, _BLOCK_BYTES = 10, 14, 1.2e8
-"""Numbers of 8 bytes that are held for each cell, of the 8 shadows that are kept and of their spectra; that are worked
-on while another is made or a frame formed; and what points that are asked for at a time take."""
-_FINER = (4 / 3, 2)
-"""Times the fewest cells: 8 and 12 for 6."""
-_MOST_BYTES = 2.0**32
-"""Memory that more cells than the fewest are chosen for: twice as many of 320 pixels a side, 4 / 3 of 512."""
-
-
-def cells_to_choose(geometry: CameraGeometry, spectrum: Spectrum | None) -> tuple[int, ...]:
-    """Raster cells a pixel, fewest first, that a plan may choose for a camera whose mask is drawn.
-
-    Parameters
-    ----------
-    geometry, spectrum
-        as for :func:`drawing_seconds`.
-    """
-    fewest = cells_per_pixel(geometry)
-
-    def held(cells: int) -> bool:
-        return raster_bytes(geometry.model_copy(update={"mask_cells": cells}), spectrum) <= _MOST_BYTES
-
-    return fewest, *filter(held, (math.ceil(by * fewest) for by in _FINER))
-
-
-def drawing_seconds(geometry: CameraGeometry, spectrum: Spectrum | None) -> float:
-    """Seconds of drawing the shadow of one depth; 0 for a mask that is never drawn.
-
-    Parameters
-    ----------
-    geometry
-        the camera.
-    spectrum
-        lines of the light; None: without diffraction.
-    """
-    mask = geometry.mask_plate
-    waves = spectrum is not None
-    if mask is None or not (geometry.drawn(waves) or geometry.may_be_drawn(waves)):
-        return 0.0
-    cells, turned = float(cells_a_side(geometry, spectrum)) ** 2, bool(mask.flaws.turn_deg)
-    if spectrum is None or mask.irradiance:
-        return cells * (_TURNED_S if turned else _MEANS_S)
-    seen = geometry.build_mask()
-    assert isinstance(seen, Plate)
-    step = geometry.pixel_pitch / cells_per_pixel(geometry)
-    points = (points_per_cell(float(line), geometry.mask_distance, step) for line in spectrum.wavelengths_nm)
-    each = _POINT_S + _TERM_S * len(seen.amplitude.terms)
-    return cells * (_AROUND if turned else 1.0) * each * sum(count**2 for count in points)
-
-
-def raster_bytes(geometry: CameraGeometry, spectrum: Spectrum | None) -> float:
-    """Memory of shadows on rasters behind a camera whose mask is drawn [bytes].
-
-    Parameters
-    ----------
-    geometry, spectrum
-        as for :func:`drawing_seconds`.
-    """
-    return 8.0 * (_HELD + _AT_WORK) * cells_a_side(geometry, spectrum) ** 2 + _BLOCK_BYTES

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial, reduce
-from itertools import product
 from operator import add
 from typing import Any
 
@@ -17,18 +16,18 @@ from mitsim.bench.board import before_board
 from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.job import Progress, silent
-from mitsim.core.parallel import Behind, single_threaded_blas
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting, PatternFamily
-from mitsim.light.cost_model import CHECKED_SHOTS, FIXED, MOST_CHECKED, SHARED_COST, tells_all
-from mitsim.light.passes import AT_ANCHORS, TRAYS, FiledLight, Simulation, Stage, expected_of
+from mitsim.light.cost_model import CHECKED_SHOTS, MOST_CHECKED, tells_all
+from mitsim.light.groups import Group, trace_groups
+from mitsim.light.light_estimate import LightEstimate
+from mitsim.light.passes import Simulation, expected_of
 from mitsim.light.plan import Plan
-from mitsim.light.settings import EVEN, GROUPS, LANES_AT_ONCE, MOST_PATHS, Estimate, Settings, even, whole
+from mitsim.light.rounds import first_samples, next_samples
+from mitsim.light.settings import GROUPS, MOST_PATHS, Estimate, Settings
 from mitsim.light.truth import Truth, trace_truth
 from mitsim.optics.frames import ExpectedFrames, bound_of, shares_of_bound
-from mitsim.transport.accumulator import Ledger, LitSums, fetched
-from mitsim.transport.path_reuse import NeighbourTracer
-from mitsim.transport.records import Deposits
 
 Target = Callable[[ExpectedFrames], float]
 """The relative Monte Carlo error to stop at, from the frames seen so far."""
@@ -84,7 +83,7 @@ class Looked:
         of its :class:`ExpectedFrames`.
     """
 
-    groups: tuple[FiledLight, ...]
+    groups: tuple[LightEstimate, ...]
     simulation: Simulation
     rows: Labels
     probed: FloatArray
@@ -126,14 +125,14 @@ class SampledLight:
     sampling_error
         relative Monte Carlo error of the frames that were checked; ``reached`` tells whether it met the target.
     samples
-        of each group, by the name of what was traced; empty where nobody kept them.
+        of each group, by the name of the pass; empty where nobody kept them.
     looked
         what the last look at its error found.
     known_truth
         :attr:`apparent`, where it was traced with that of other lines.
     """
 
-    groups: tuple[FiledLight, ...]
+    groups: tuple[LightEstimate, ...]
     simulation: Simulation
     plan: Plan
     seed: int
@@ -224,7 +223,7 @@ class SampledLight:
         return {
             "n": self.bench.n,
             "shape": list(self.bench.geometry.frame_shape),
-            "entries": sum(getattr(group, tray).nnz for group in self.groups for tray in TRAYS),
+            "entries": sum(light.nnz for group in self.groups for light in group.light.values()),
             "accuracy": self.plan.accuracy,
             "mc_error": self.sampling_error,
             "total_error_bound": self.error_bound,
@@ -320,12 +319,11 @@ def trace_lines(
     for each in own[1:]:
         each.by_band = own[0].by_band  # lamps' light diffracts beside each line alike: its optics are prepared once
     labels = np.arange(bench.n**2) if sampling.by_pixel else lighting.labels
-    followed = bool(simulation.indirect or simulation.from_camera)
-    streams = [integer(seed, "transport", sampling.purpose, group) for group in range(GROUPS)]
-    groups = [_Group(simulation, labels, stream, len(benches)) for stream in streams]
+    followed = any(not each.row.even for each in simulation.passes.values())
+    groups = Group.all_of(simulation, labels, seed, sampling.purpose, len(benches))
     samples = first_samples(simulation)
     while True:
-        _trace(groups, samples)
+        trace_groups(groups, samples)
         lines = [_line_of(groups, line, each, plan, seed) for line, each in enumerate(own)]
         last = lines[0].paths >= MOST_PATHS
         enough = math.inf if last or sampling.excess or sampling.target else plan.sampling_target
@@ -354,7 +352,7 @@ def trace_lines(
 
 @single_threaded_blas()
 def traced_again(light: SampledLight, simulation: Simulation, purpose: str = "scene") -> SampledLight:
-    """The same paths of a light, as far as another simulation has their tracers, filed as that does.
+    """The same paths of a light, as far as another simulation has their tracers, accumulated as that does.
 
     Parameters
     ----------
@@ -365,18 +363,18 @@ def traced_again(light: SampledLight, simulation: Simulation, purpose: str = "sc
     purpose
         of the light, which names its random streams.
     """
-    streams = [integer(light.seed, "transport", purpose, group) for group in range(GROUPS)]
-    groups = [_Group(simulation, light.labels, stream) for stream in streams]
-    _trace(groups, light.samples)
-    flux = np.mean([group.flux() for group in groups], axis=0)
-    return replace(light, groups=tuple(group.light() for group in groups), simulation=simulation, flux=flux)
+    groups = Group.all_of(simulation, light.labels, light.seed, purpose)
+    trace_groups(groups, light.samples)
+    estimates = tuple(group.light() for group in groups)
+    return replace(light, groups=estimates, simulation=simulation, flux=np.mean(_flux(estimates, light.flux), axis=0))
 
 
-def _line_of(groups: Sequence[_Group], line: int, simulation: Simulation, plan: Plan, seed: int) -> SampledLight:
+def _line_of(groups: Sequence[Group], line: int, simulation: Simulation, plan: Plan, seed: int) -> SampledLight:
     """What groups know of the light of a ``line``, whose frames a ``simulation`` forms; its error is not known yet."""
-    flux = [group.flux(line) for group in groups]
+    estimates = tuple(group.light(line) for group in groups)
+    flux = _flux(estimates, np.zeros(simulation.bench.n**2))
     return SampledLight(
-        groups=tuple(group.light(line) for group in groups),
+        groups=estimates,
         simulation=simulation,
         plan=plan,
         seed=seed,
@@ -390,21 +388,26 @@ def _line_of(groups: Sequence[_Group], line: int, simulation: Simulation, plan: 
     )
 
 
+def _flux(estimates: Sequence[LightEstimate], like: FloatArray) -> list[FloatArray]:
+    """Of each estimate; none, in an array ``like`` that, where no pass tells it."""
+    return [np.zeros_like(like) if each.flux is None else each.flux for each in estimates]
+
+
 @dataclass(frozen=True)
 class _Look:
     """A ``light`` with the Monte Carlo error of the frames, what that is below at 95 %, and what each part of the light
-    brings to the square of the latter, by the name of what was traced, up to one factor."""
+    brings to the square of the latter, by the name of the pass, up to one factor."""
 
     light: SampledLight
     bound: float
     variances: Mapping[str, float]
 
 
-Parts = Mapping[str, Sequence[FiledLight]]
-"""Groups of each part of a light, by the name of what was traced."""
+Parts = Mapping[str, Sequence[LightEstimate]]
+"""Groups of each part of a light, by the name of the pass."""
 
 
-def _parts(groups: Sequence[_Group], line: int) -> Parts:
+def _parts(groups: Sequence[Group], line: int) -> Parts:
     """Those of a ``line`` in ``groups``."""
     return {name: [group.part(name, line) for group in groups] for name in groups[0].done}
 
@@ -485,98 +488,6 @@ def _unchecked(light: SampledLight, lighting: Lighting, checked: Lighting) -> tu
     return error, bound
 
 
-Filing = Callable[[], None]
-"""Adds light of one line to what a group has."""
-
-
-def _trace(groups: Sequence[_Group], wanted: Mapping[str, int]) -> None:
-    """Trace until every group has so many samples as are ``wanted`` of each stage by its name, and file all of it."""
-    with Behind[Filing](lambda file: file()) as filing:
-        for group in groups:
-            group.trace(wanted, filing)
-        filing.wait()
-
-
-class _Group:
-    """One independent estimate of the light, by line and stage: the mean over its samples so far."""
-
-    def __init__(self, simulation: Simulation, labels: Labels, seed: int, lines: int = 1) -> None:
-        self.simulation, self.labels = simulation, labels
-        self.seed, self._lines = seed, lines
-        self.done: dict[str, int] = {}
-        self.paths = 0
-        self._means: list[dict[str, FiledLight]] = [{} for _ in range(lines)]
-        self._flux = [{name: np.zeros(simulation.bench.n**2) for name in ("direct", "sharp")} for _ in range(lines)]
-
-    def trace(self, wanted: Mapping[str, int], filing: Behind[Filing]) -> None:
-        """Trace until so many samples as are ``wanted`` of each stage by its name are done.
-
-        Parameters
-        ----------
-        wanted
-            samples.
-        filing
-            what light is filed by while the next is traced: filing takes one processor, and a tracer waits for its last
-            paths. All is there when it has been waited for.
-        """
-        at_once = min(LANES_AT_ONCE, self.simulation.paths_at_once)
-        for name, stage in self.simulation.tracers().items():
-            samples = wanted.get(name, 0)
-            if self.done.get(name, 0) >= samples:
-                continue
-            seed, ledgers = integer(self.seed, stage.stream), stage.ledgers(self.labels, self._lines)
-            if name in self.done:
-                filing.wait()
-                self._spread(name, samples / self.done[name])
-            while (done := self.done.get(name, 0)) < samples:
-                count = min(max(1, at_once // stage.tracer.lanes), samples - done)
-                deposits = stage.trace(seed, done, count, ledgers)
-                lights = enumerate(deposits.by_line(self._lines))
-                filing.give([partial(self._file, name, stage, light, line, samples) for line, light in lights])
-                self.done[name] = done + count
-                self.paths += count * stage.tracer.lanes
-            if ledgers:
-                held = [(*each, samples) for each in zip(ledgers, fetched(ledgers), strict=True)]
-                filing.give([partial(self._file_ledger, name, stage, each, line) for line, each in enumerate(held)])
-
-    def _spread(self, name: str, growth: float) -> None:
-        """Make the light of a stage the mean over so many times the samples, of which no others are filed yet."""
-        for means, fluxes in zip(self._means, self._flux, strict=True):
-            means[name] /= growth
-            if name in fluxes:
-                fluxes[name] /= growth
-
-    def _file(self, name: str, stage: Stage, deposits: Deposits, line: int, samples: int) -> None:
-        """Add light of a stage and a line, and the flux of each pixel where it is direct light."""
-        if name in self._flux[line]:
-            self._flux[line][name] += self.simulation.flux(deposits, samples)
-        self._add(name, stage.file(deposits, self.labels, samples), line)
-
-    def _file_ledger(self, name: str, stage: Stage, held: tuple[Ledger, LitSums, int], line: int) -> None:
-        """Add light of a stage and a line that its ledger ``held``, of so many samples."""
-        assert stage.file_ledger is not None
-        ledger, counted, samples = held
-        if name in self._flux[line]:
-            self._flux[line][name] += self.simulation.sharp_flux(ledger, counted, samples)
-        self._add(name, stage.file_ledger(ledger, counted, self.labels, samples), line)
-
-    def _add(self, name: str, light: FiledLight, line: int) -> None:
-        means = self._means[line]
-        means[name] = means[name] + light if name in means else light
-
-    def light(self, line: int = 0) -> FiledLight:
-        """Mean over the samples, of a ``line``."""
-        return reduce(add, self._means[line].values())
-
-    def part(self, name: str, line: int = 0) -> FiledLight:
-        """The same of one stage by its ``name``."""
-        return self._means[line][name]
-
-    def flux(self, line: int = 0) -> FloatArray:
-        """(n^2,) mean over the samples, of a ``line``."""
-        return np.asarray(sum(self._flux[line].values()))
-
-
 def pinhole_view(bench: Apparatus, board_reflectance: float, seed: int) -> FloatArray:
     """(rows, columns) apparent reflectance seen from the sensor's centre under uniform light, for people to look at.
 
@@ -594,148 +505,8 @@ def pinhole_view(bench: Apparatus, board_reflectance: float, seed: int) -> Float
     def view(which: Apparatus) -> FloatArray:
         simulation = Simulation(which, settings, pixels=2 * bench.n)
         deposits = simulation.direct.trace(integer(seed, "view"), 0, _VIEW_SAMPLES)
-        light = simulation.file_direct(deposits, np.zeros(bench.n**2, dtype=np.int64), 1).fine[[0]].toarray()
-        return np.asarray(light).reshape(simulation.fine.bundle.cells)
+        light = simulation.accumulate("direct", deposits, np.zeros(bench.n**2, dtype=np.int64), 1)["fine"]
+        return np.asarray(light[[0]].toarray()).reshape(simulation.grids["fine"].bundle.cells)
 
     scene, board = view(bench), view(before_board(bench, board_reflectance))
     return np.asarray(np.divide(scene, board, out=np.zeros(scene.shape), where=board > 0))
-
-
-# -------- Rounds of sampling
-
-_LARGEST_GROWTH = 8
-"""Most that samples of even numbers grow by in one round."""
-_LEAST_LESS, _MOST_LESS = 1.1, 6.0
-"""By how much a round lowers the variance, as a ratio: least, as each costs a look; and most, because the first rounds
-know their error badly."""
-_BEYOND = 1.05
-"""Variance that the error asks for over what is aimed at, so that another round is rare."""
-_DIRECT_RATE, _UNEVEN = 1.5, 1.2
-"""Power of the samples that the variance of direct light falls with, and variance of 3 * 2^k of them over what that of
-2^k says: 24 to 32 samples left 0.49 to 0.58, 32 to 48 0.64 to 0.70, 32 to 64 0.36 (cookie_bag, metal_blade)."""
-_FIRST = 0.8
-"""Part of the samples that the plan predicts with which sampling begins where most paths are of followed light: the
-prediction is safe. At 0.7 the corner needed a second round for the last tenth, by each of three seeds, which costs a
-look more: 4 to 17 % of its processor seconds and of the cookie bag's."""
-_PACES = dict(zip(AT_ANCHORS, ("followed", "followed_from_camera"), strict=True))
-"""What prices call the light of a stage, where it is not the stage's name."""
-
-
-def first_samples(simulation: Simulation) -> dict[str, int]:
-    """Samples of a group with which sampling begins in a ``simulation``, by the name of what is traced."""
-    part = _FIRST if _mostly_followed(simulation) else 1.0
-    return {name: int(whole(name, part * stage.predicted)) for name, stage in simulation.tracers().items()}
-
-
-def next_samples(
-    simulation: Simulation, done: Mapping[str, int], variances: Mapping[str, float], excess: float
-) -> dict[str, int]:
-    """Samples of a group after the next round, by the name of what is traced.
-
-    Parameters
-    ----------
-    simulation
-        whose light is traced.
-    done
-        samples so far.
-    variances
-        of the frames by each light, or what it brings to their bound, up to one factor.
-    excess
-        by how much the error is to be lowered, as a ratio.
-    """
-    work = _work(simulation)
-    lights = [_Sampled(name, count, variances[name], work[name]) for name, count in done.items()]
-    # A target that was set very low would overflow the square.
-    less = max(_BEYOND * min(excess, _MOST_LESS) ** 2, _LEAST_LESS)
-    return cheapest_samples(lights, sum(variances.values()) / min(less, _MOST_LESS))
-
-
-@dataclass(frozen=True)
-class _Sampled:
-    """A light by ``name``: samples ``done``, the variance that they leave, and the work of one."""
-
-    name: str
-    done: int
-    variance: float
-    work: float
-
-    def left(self, samples: int) -> float:
-        """Variance of so many ``samples``."""
-        if self.name != "direct":
-            return self.variance * self.done / samples
-        return self.variance * _of_direct(samples) / _of_direct(self.done)
-
-    @property
-    def gain(self) -> float:
-        """By how much a sample more lowers the variance, for its work."""
-        return self.variance / (self.done * self.work)
-
-    @property
-    def steps(self) -> list[int]:
-        """Even numbers of samples from those done to as many as a round may come to."""
-        found = [self.done]
-        while (following := int(even(found[-1] + 1.0))) <= _LARGEST_GROWTH * self.done:
-            found.append(following)
-        return found
-
-
-def cheapest_samples(lights: Sequence[_Sampled], allowed: float) -> dict[str, int]:
-    """Samples of ``lights`` by name that leave the ``allowed`` variance together with the least work, none fewer than
-    are done; all that a round may take where nothing leaves so little."""
-    stepped = [light for light in lights if light.name in EVEN]
-    others = [light for light in lights if light.name not in EVEN]
-    best, least = {light.name: light.steps[-1] for light in stepped}, math.inf
-    best |= {light.name: _LARGEST_GROWTH * light.done for light in others}
-    for counts in product(*(light.steps for light in stepped)):
-        left = allowed - sum(light.left(count) for light, count in zip(stepped, counts, strict=True))
-        shared = _shared_out(others, left)
-        if shared is None:
-            continue
-        found = {light.name: count for light, count in zip(stepped, counts, strict=True)} | shared
-        work = sum(light.work * (found[light.name] - light.done) for light in lights)
-        if work < least:
-            best, least = found, work
-    return {light.name: best[light.name] for light in lights}
-
-
-def _shared_out(lights: Sequence[_Sampled], allowed: float) -> dict[str, int] | None:
-    """As :func:`cheapest_samples`, where any number of samples serves; None where nothing leaves so little.
-
-    Samples of those that grow go with sqrt(variance of one / work of one), by Lagrange; a light whose next sample gains
-    less for its work than theirs rests.
-    """
-    found = {light.name: light.done for light in lights}
-    if sum(light.variance for light in lights) <= allowed:
-        return found
-    resting, growing = sorted(lights, key=lambda light: light.gain), list[_Sampled]()
-    while resting:
-        growing.append(resting.pop())
-        left = allowed - sum(light.variance for light in resting)
-        if left <= 0:
-            continue
-        scale = sum(math.sqrt(light.variance * light.done * light.work) for light in growing) / left
-        if not resting or scale**2 * resting[-1].gain <= 1:
-            return found | {light.name: math.ceil(scale * math.sqrt(light.gain) * light.done) for light in growing}
-    return None
-
-
-def _of_direct(samples: int) -> float:
-    """Variance of direct light of so many ``samples``, to any scale."""
-    return float(samples**-_DIRECT_RATE) * (1.0 if samples & (samples - 1) == 0 else _UNEVEN)
-
-
-def _work(simulation: Simulation) -> dict[str, float]:
-    """Seconds at fixed paces of a sample of each light."""
-    return {
-        name: getattr(FIXED, _PACES.get(name, name))
-        * stage.tracer.lanes
-        * (SHARED_COST if isinstance(stage.tracer, NeighbourTracer) else 1)
-        for name, stage in simulation.tracers().items()
-    }
-
-
-def _mostly_followed(simulation: Simulation) -> bool:
-    """Whether most paths that a plan predicts are of light over several surfaces."""
-    tracers = simulation.tracers()
-    paths = {name: int(whole(name, stage.predicted)) * stage.tracer.lanes for name, stage in tracers.items()}
-    return sum(count for name, count in paths.items() if name not in EVEN) > sum(paths.values()) / 2

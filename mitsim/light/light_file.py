@@ -18,8 +18,8 @@ from scipy import sparse
 from mitsim.core.arrayfile import whole_hdf5
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.light.grids import GRIDS, Grid
 from mitsim.light.light import SampledLight
-from mitsim.light.passes import TRAYS, Tray
 from mitsim.optics.image_formation import anchor_positions, anchor_weights
 from mitsim.optics.terms import shadow_terms
 from mitsim.sensor.chain import electrons_from_irradiance
@@ -58,13 +58,13 @@ def write_light(path: Path, light: SampledLight) -> None:
     glint = _glint(path, light)
     with whole_hdf5(path) as file:
         file.attrs.update(_facts(light))
-        trays = file.create_group("light", track_order=True)
-        for name in TRAYS:
-            groups = [getattr(group, name)[:count] for group in light.groups]
+        grids = file.create_group("light", track_order=True)
+        for name, row in GRIDS.items():
+            groups = [group[name][:count] for group in light.groups]
             if any(group.nnz for group in groups):
-                place = trays.create_group(name, track_order=True)
+                place = grids.create_group(row.key, track_order=True)
                 _write_matrix(place, sparse.csr_array(sparse.vstack(groups, format="csr")))
-                _write_shadow(place, getattr(light.simulation, name))
+                _write_shadow(place, light.simulation.grids[name])
         if light.simulation.physics.lamps:
             file.create_dataset("ambient", data=_ambient(light).astype(np.float32), **_PACKED)
         if glint is not None:
@@ -105,9 +105,9 @@ def _write_matrix(group: h5py.Group, matrix: sparse.csr_array) -> None:
         group.create_dataset(name, data=getattr(matrix, name).astype(kind), **_PACKED)
 
 
-def _write_shadow(group: h5py.Group, tray: Tray) -> None:
-    """What makes frames of light in the cells of a ``tray``."""
-    bundle, geometry, spectrum, _ = tray.key
+def _write_shadow(group: h5py.Group, grid: Grid) -> None:
+    """What makes frames of light in the cells of a ``grid``."""
+    bundle, geometry, spectrum, _ = grid.key
     layers = [shadow_terms(geometry, bundle.rows, bundle.columns, depth, spectrum) for depth in bundle.depths]
     for side, name in enumerate(("left", "right")):
         factors = np.stack([[term[side] for term in terms] for terms in layers])

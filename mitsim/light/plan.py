@@ -12,6 +12,7 @@ from mitsim.core.arguments import checked
 from mitsim.core.errors import MitsimError
 from mitsim.core.pictures import table
 from mitsim.core.spectral_manifests import MONO
+from mitsim.light.pass_table import PASSES
 from mitsim.light.settings import Estimate, Settings
 
 if TYPE_CHECKING:
@@ -170,7 +171,9 @@ class Plan:
 
     def block(self) -> dict[str, Any]:
         """The plan as JSON holds it."""
-        settings = {**asdict(self.settings), "effects": sorted(self.settings.effects)}
+        samples = {f"{row.key}_samples": row.predicted(self.settings) for row in PASSES.values()}
+        settings = {**asdict(replace(self.settings, samples={})), "effects": sorted(self.settings.effects), **samples}
+        del settings["samples"]
         own = replace(self, request=None, cost=None, colour=self.colour or self._uncoloured)
         return {**{name: value for name, value in asdict(own).items() if value is not None}, "settings": settings}
 

@@ -1,44 +1,28 @@
-"""What is simulated, and what a short look at a scene measured: what pilot, plan and tracers have in common."""
+"""What is simulated, and how finely: what pilot, plan and passes have in common."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import NamedTuple
 
-import numpy as np
-
 from mitsim.core.arrays import FloatArray
-from mitsim.core.parallel import single_threaded_blas
 
 Number = float | FloatArray
-COUNTED = ("anchors", "layers", "cells", "followed_anchors", "occluded_anchors", "followed_width")
-"""What a plan counts: points of the sensor a side for direct light, depths, cells a side of a projector pixel, points
-of the sensor a side for light that is followed over several surfaces or from the camera, and for direct light of
-occluded pixels, and projector pixels a side of a cell for what the former see beyond their mean."""
-COARSE = ("anchored", "occluded", "indirect")
-"""Light that is filed in coarse cells: direct light's differences between anchors, those of occluded pixels, and
-indirect light."""
-EVEN = ("direct", "anchored", "occluded", "sharp")
-"""Light whose points come from a Sobol sequence alone, so that the number of samples matters."""
-_FEWEST_SAMPLES = 1e-3
-"""Samples of light without noise: next to none, and above 0 because costs are ratios."""
 GROUPS = 4
 """Independent estimates of the light, whose spread is the Monte Carlo error: of light of many paths, whose noise is of
-many kinds, four tell it as well as more (docs/physics.md), and each takes its own filing, forming and probing."""
+many kinds, four tell it as well as more (docs/physics.md), and each takes its own accumulating, forming and probing."""
 LANES_AT_ONCE = 2**21
 """Paths whose light is held in memory at a time."""
 MOST_PATHS = 2**32
 """Limit of one light's paths: half an hour on two cores, at which sampling stops and says so."""
-LOOKS = 4
-"""Independent looks of the pilot, the fewest whose spread tells a standard error worth its name."""
-SURE = 2.35
-"""Standard errors from an estimate to its 95 % bound: Student's distribution with ``LOOKS`` - 1 degrees of freedom."""
-RASTER_RATE = 1.5
-"""Power of a raster's cells along a pixel that its error falls with: from 6 to 12 cells, in frames of dots, 1.4 (a
-picture of light) to 2.9 (a mask turned by 0.3 degrees)."""
+
+
+class Estimate(NamedTuple):
+    """A relative error: the best ``value`` for it, and the ``bound`` that it stays below at 95 %."""
+
+    value: float
+    bound: float
 
 
 @dataclass(frozen=True)
@@ -79,14 +63,14 @@ class Settings:
         cells a side of a projector pixel.
     effects
         names of those that are simulated (:mod:`mitsim.bench.effects`).
-    direct_samples, anchored_samples, indirect_samples, from_camera_samples
-        samples that each group is predicted to need: a projector pixel of direct light, of its differences between
-        anchors, and of indirect light; a cell of what is followed from the camera. Below 1, one is traced.
-    followed_anchors, followed_samples, followed_from_camera_samples
-        points a side of the sensor that light over several surfaces, or in mirrors, is followed to, and samples that
-        each group is predicted to need of what they see beyond their mean, from the projector's side and the camera's.
+    samples
+        that each group is predicted to need, by the name of the pass (:mod:`mitsim.light.pass_table`): of a projector
+        pixel, or of a cell of what is followed from the camera. Below 1, one is traced; so it is where nothing is said.
+    followed_anchors
+        points a side of the sensor that light over several surfaces, or in mirrors, is followed to.
     followed_width
-        projector pixels a side of a cell of that, in one layer; 1: as ``coarse_cells`` and ``coarse_layers`` say.
+        projector pixels a side of a cell for what they see beyond their mean, in one layer; 1: as ``coarse_cells`` and
+        ``coarse_layers`` say.
     coarse_cells, coarse_layers
         cells a side of a projector pixel for what anchors see beyond their mean and for indirect light, and whether
         they have all layers or one.
@@ -98,16 +82,15 @@ class Settings:
     reach
         largest tan-angle, seen from the sensor's centre, at which light of near surfaces is received; None: no more
         than of light at ``depth``.
-    sharp, sharp_samples
-        pixels whose direct light is traced apart, and samples that each group is predicted to need of it.
+    sharp
+        pixels whose direct light is traced apart.
+    occluded, occluded_anchors
+        projector pixels whose light is hidden from part of the sensor, increasing, and points a side from which what
+        the sensor sees of them beyond the mean is evaluated. With one point they are pixels like the others.
     raster
         whether frames are correlations with a mask's shadow on a raster, by FFT, and not sums of separable terms.
     raster_cells
         cells of that raster along a pixel; 0: as few as a raster has.
-    occluded, occluded_anchors, occluded_samples
-        projector pixels whose light is hidden from part of the sensor, increasing, points a side from which what the
-        sensor sees of them beyond the mean is evaluated, and samples of it that each group is predicted to need. With
-        one point they are pixels like the others.
     """
 
     depth: float
@@ -115,13 +98,8 @@ class Settings:
     layers: tuple[float, ...] = ()
     subdivision: int = 1
     effects: frozenset[str] = frozenset()
-    direct_samples: float = 1.0
-    anchored_samples: float = 1.0
-    indirect_samples: float = 1.0
-    from_camera_samples: float = 1.0
+    samples: Mapping[str, float] = field(default_factory=dict, hash=False)
     followed_anchors: int = 1
-    followed_samples: float = 1.0
-    followed_from_camera_samples: float = 1.0
     followed_width: int = 1
     coarse_cells: int = 1
     coarse_layers: bool = False
@@ -129,10 +107,8 @@ class Settings:
     repeats: tuple[int, ...] = ()
     reach: float | None = None
     sharp: SharpPixels | None = None
-    sharp_samples: float = 1.0
     occluded: tuple[int, ...] = ()
     occluded_anchors: int = 1
-    occluded_samples: float = 1.0
     raster: bool = False
     raster_cells: int = 0
 
@@ -145,304 +121,3 @@ class Settings:
     def with_own_anchors(self) -> tuple[int, ...]:
         """Occluded pixels, where they have anchors of their own."""
         return self.occluded if self.occluded_anchors > 1 else ()
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Monte Carlo error of one estimate: ``error`` at ``samples`` a cell, falling with samples^-rate; ``spread`` is the
-    relative variance of its square among estimates, 0 where many paths make it; ``heavy`` the number of equal paths
-    that would make it as unevenly, infinite where nobody counted them."""
-
-    error: float
-    samples: float
-    rate: float
-    spread: float = 0.0
-    heavy: float = math.inf
-
-    @classmethod
-    def among(cls, seen: FloatArray, light: float, samples: int, paths: FloatArray) -> Noise:
-        """Of one of several looks, by random paths of which few may be heavy.
-
-        Parameters
-        ----------
-        seen
-            (looks, ...) frames.
-        light
-            norm of the frames of all light, which the error is relative to.
-        samples
-            of a look.
-        paths
-            light that each path of all looks brought.
-        """
-        energies = np.square(seen - seen.mean(axis=0)).reshape(len(seen), -1).sum(axis=1)
-        mean = float(energies.mean())
-        spread = float(energies.var(ddof=1)) / mean**2 if mean else 0.0
-        squares = np.square(paths)
-        heavy = float(squares.sum()) ** 2 / float(np.square(squares).sum() or 1.0)
-        return cls(math.sqrt(float(energies.sum()) / (len(seen) - 1)) / light, samples, 0.5, spread, heavy)
-
-    def samples_for(self, target: Number) -> Number:
-        """Samples a cell at which the error is ``target``."""
-        if self.error <= 0:
-            return _FEWEST_SAMPLES + 0 * target
-        return self.samples * (self.error / target) ** (1 / self.rate)
-
-    def left(self, samples: Number) -> Number:
-        """The error at so many ``samples`` a cell."""
-        return self.error * (samples / self.samples) ** -self.rate
-
-
-def even(samples: Number) -> Number:
-    """The least 2^k or 3 * 2^k from ``samples`` on: so many points of a Sobol sequence are spread evenly."""
-    power = np.exp2(np.floor(np.log2(np.maximum(samples, 1.0))))
-    found = np.where(samples <= power, power, np.where((samples <= 1.5 * power) & (power > 1), 1.5 * power, 2 * power))
-    return found if isinstance(samples, np.ndarray) else float(found)
-
-
-def whole(name: str, samples: Number) -> Number:
-    """Samples of the light ``name`` that are traced where so many ``samples`` are needed: one at least, and whole."""
-    least = np.maximum(samples, 1.0)
-    return even(least) if name in EVEN else np.ceil(least)
-
-
-@dataclass(frozen=True)
-class Effort:
-    """What one kind of light takes: its noise relative to all light, paths in a sample, and seconds to trace and file a
-    path, 0 where nobody has timed it."""
-
-    noise: Noise
-    paths: int
-    seconds: float = 0.0
-
-    @classmethod
-    def none(cls) -> Effort:
-        """Of light that there is none of."""
-        return cls(Noise(0.0, 1, 0.5), 0)
-
-    @property
-    def variance(self) -> float:
-        """Relative variance of one sample, where the error falls with the square root of their number."""
-        return self.noise.samples * self.noise.error**2
-
-
-@dataclass(frozen=True, order=True)
-class Part:
-    """What a plan may leave out (an effect; ``count`` 0), or a number that it may choose (anchors, layers, cells)."""
-
-    name: str
-    count: int = 0
-
-
-class Estimate(NamedTuple):
-    """A relative error: the best ``value`` for it, and the ``bound`` that it stays below at 95 %."""
-
-    value: float
-    bound: float
-
-
-@dataclass(frozen=True, eq=False)
-class Changes:
-    """What each part changes in the frames, as inner products between independent looks: the sum of any of them, with
-    its signs, without the looks' noise.
-
-    Attributes
-    ----------
-    parts
-        what was changed.
-    products
-        (looks, looks, parts, parts) inner products of the changes, relative to the squared norm of all light; those of
-        a look with itself hold its noise, and are not used.
-    """
-
-    parts: tuple[Part, ...]
-    products: FloatArray
-
-    @classmethod
-    def between(cls, seen: Mapping[Part, FloatArray], energy: float) -> Changes:
-        """Of changes (looks, ...) that were ``seen`` of frames whose squared norm is ``energy``."""
-        flat = np.array([change.reshape(LOOKS, -1) for change in seen.values()]).reshape(len(seen) * LOOKS, -1)
-        with single_threaded_blas():  # sums of several threads depend on their number in the last bits
-            pairs = (flat @ flat.T).reshape(len(seen), LOOKS, len(seen), LOOKS)
-        products = np.ascontiguousarray(pairs.transpose(1, 3, 0, 2))
-        return cls(tuple(seen), products / energy if energy > 0 else products)
-
-    def squared(self, chosen: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(m,) squared changes by m sums of parts and their standard errors, from ``chosen`` (m, parts) weights.
-
-        The mean product of two different looks, and its jackknife over looks.
-        """
-        looks = len(self.products)
-        pairs = np.zeros((looks, looks, len(chosen)))
-        for i, j in zip(*np.triu_indices(looks, 1), strict=True):
-            pairs[i, j] = np.einsum("mp,mp->m", chosen @ self.products[i, j], chosen)
-        total, kept = pairs.sum(axis=(0, 1)), looks * (looks - 1) / 2
-        of_look = pairs.sum(axis=0) + pairs.sum(axis=1)
-        without = (total - of_look) / (kept - looks + 1)
-        spread = np.sqrt((looks - 1) * np.square(without - without.mean(axis=0)).mean(axis=0))
-        return total / kept, spread
-
-    def estimate(self, parts: Collection[Part]) -> Estimate:
-        """Relative change of the frames by all ``parts`` together; parts that were not measured change nothing."""
-        chosen = np.array([[part in parts for part in self.parts]], dtype=np.float64)
-        squared, spread = (float(values[0]) for values in self.squared(chosen))
-        least = max(squared, 0.0)
-        return Estimate(math.sqrt(least), math.sqrt(least + SURE * spread))
-
-
-@dataclass(frozen=True)
-class Forming:
-    """What forming frames depends on besides settings.
-
-    Attributes
-    ----------
-    pixels, cells
-        a side of the sensor, and of the grid with one cell a projector pixel.
-    lit
-        part of the rows of cells that hold light in a frame.
-    terms, geometric_terms
-        of the wave-optical shadow, and of the geometric one.
-    shots, classes
-        of the family.
-    seconds
-        that the pilot measured for a frame of one anchor, layer and cell a pixel, with a wave-optical shadow.
-    product
-        seconds of a multiplication in a large product of matrices, on all processors; 0 where nobody has timed it.
-    correlated
-        whether frames without diffraction, and with it, are always correlations with a shadow on a raster, and never
-        sums of separable terms.
-    phases
-        raster cells that a pixel has at least, where a shadow is drawn on one.
-    drawing
-        seconds of drawing a shadow on as few, without diffraction and with it, for each layer.
-    lines
-        each with frames of its own.
-    parted
-        whether glass sends each line its own way, so that they share no paths.
-    occluded
-        parts of the projector's rows and of its columns that occluded pixels lie in.
-    """
-
-    pixels: float
-    cells: int
-    lit: float
-    terms: float
-    shots: int
-    classes: int
-    seconds: float = 0.0
-    product: float = 0.0
-    geometric_terms: float = 1.0
-    correlated: tuple[bool, bool] = (False, False)
-    phases: float = 16.0
-    drawing: tuple[float, float] = (0.0, 0.0)
-    lines: int = 1
-    parted: bool = False
-    occluded: tuple[float, float] = (1.0, 1.0)
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """A mask's shadow on a raster: what that leaves of the frames, None where it is none to choose, whether there is no
-    other way, and numbers of raster cells along a pixel, of which the first leaves that."""
-
-    error: Estimate | None = None
-    needed: bool = False
-    cells: tuple[int, ...] = (4,)
-
-    def left(self, cells: int) -> Estimate | None:
-        """What a raster of so many ``cells`` a pixel leaves; 0: the fewest."""
-        finer = (cells or self.cells[0]) / self.cells[0]
-        return self.error and Estimate(*(error * finer**-RASTER_RATE for error in self.error))
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """What a short look at the scene measured (:mod:`mitsim.planner.pilot`); all errors are relative.
-
-    Attributes
-    ----------
-    depth, layers
-        depth of the light [mm]; candidates for the layers' depths, by their number.
-    changes
-        of the frames by each effect that the bench has when it is left out, by each number of anchors, layers and
-        cells that was tried, and by one coarse cell a pixel, or one layer, for light of each of ``COARSE``.
-    direct, spread, anchored, indirect, from_camera
-        what direct light takes from the sensor's centre, and from random points of the sensor, its differences between
-        anchors (paths: to one of them), light over several surfaces, and what is followed from the camera.
-    forming
-        how frames are formed.
-    apart
-        effects that are no part of the expected frames, with the independent error of leaving each out.
-    unresolved
-        part of the direct light in lobes that sampling would miss (:mod:`mitsim.transport.sharp_lobes`).
-    shared, repeats
-        as in :class:`Settings`, where that takes less for as little noise; ``indirect`` is then what that takes.
-    left_out
-        light that no tracer finds, over that and what is found (:mod:`mitsim.transport.missed`).
-    glint
-        light over mirrors alone whose place on the sensor is not known, over all light.
-    mirror
-        place, among the scene's shapes, of what most of that comes over.
-    reach, sharp, occluded
-        as in :class:`Settings`.
-    sharp_light, occluded_light
-        what that light takes (paths of the latter: to one anchor).
-    followed, followed_from_camera
-        what is followed takes at several anchors beyond its mean, from either side (paths: to one of them).
-    raster
-        what a shadow on a raster leaves of the frames, without diffraction and with it (:class:`Drawn`).
-    hits
-        rays that bring all direct light if each projector pixel sends one, where these are few; else infinite.
-    """
-
-    depth: float
-    layers: Mapping[int, tuple[float, ...]]
-    changes: Changes
-    direct: Effort
-    spread: Effort
-    anchored: Effort
-    indirect: Effort
-    from_camera: Effort
-    forming: Forming
-    apart: Mapping[str, float] = field(default_factory=dict)
-    unresolved: float = 0.0
-    left_out: float = 0.0
-    glint: float = 0.0
-    mirror: int | None = None
-    shared: bool = False
-    repeats: tuple[int, ...] = ()
-    reach: float | None = None
-    sharp: SharpPixels | None = None
-    sharp_light: Effort = field(default_factory=lambda: Effort.none())
-    followed: Effort = field(default_factory=lambda: Effort.none())
-    followed_from_camera: Effort = field(default_factory=lambda: Effort.none())
-    occluded: tuple[int, ...] = ()
-    occluded_light: Effort = field(default_factory=lambda: Effort.none())
-    raster: tuple[Drawn, Drawn] = (Drawn(), Drawn())
-    hits: float = math.inf
-
-    def forms(self, waves: bool) -> tuple[int, ...]:
-        """Raster cells along a pixel that frames may be formed of, 0 for a sum of terms; with ``waves`` or not."""
-        drawn = self.raster[waves]
-        if drawn.error is None:
-            return (drawn.cells[0] if drawn.needed else 0,)
-        return drawn.cells if drawn.needed else (0, *drawn.cells)
-
-    def error(self, *parts: Part) -> Estimate:
-        """Relative change of the frames by all ``parts`` together."""
-        apart = sum(self.apart.get(part.name, 0.0) ** 2 for part in parts)
-        value, bound = self.changes.estimate(parts)
-        return Estimate(math.hypot(value, math.sqrt(apart)), math.hypot(bound, math.sqrt(apart)))
-
-    @cached_property
-    def effects(self) -> dict[str, Estimate]:
-        """Error of leaving out each effect that the bench has."""
-        measured = [part.name for part in self.changes.parts if part.count == 0]
-        return {name: self.error(Part(name)) for name in (*measured, *self.apart)}
-
-    @cached_property
-    def ladders(self) -> dict[str, dict[int, Estimate]]:
-        """Error of each number of anchors, layers and cells that was tried, fewest first."""
-        found: dict[str, dict[int, Estimate]] = {name: {} for name in COUNTED}
-        for part in sorted(part for part in self.changes.parts if part.name in COUNTED):
-            found[part.name][part.count] = self.error(part)
-        return {name: errors or {1: Estimate(0.0, 0.0)} for name, errors in found.items()}

@@ -10,34 +10,33 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import chain, combinations, product
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.bench.effects import EFFECTS, names
+from mitsim.bench.effects import EFFECTS
 from mitsim.bench.request import HIGHEST_ACCURACY
 from mitsim.core.arrays import FloatArray
 from mitsim.light.cost_model import (
-    ANCHORS_OF,
     FIXED,
-    MIXING,
     Numbers,
     checking_seconds,
-    connections,
     efforts,
     entries,
     filing_seconds,
+    in_waves,
     optics_seconds,
     priced,
     tells_all,
     traced_for,
     truth_seconds,
 )
-from mitsim.light.settings import COUNTED, GROUPS, SURE, Effort, Estimate, Evidence, Number, Part, Settings, whole
+from mitsim.light.pass_table import FOLLOWED, PASSES
+from mitsim.light.pilot_result import COUNTED, SURE, Effort, Evidence, Part
+from mitsim.light.settings import GROUPS, Estimate, Number, Settings
 from mitsim.optics.frames import bound_over_error
 
 _MARGIN = 0.95
@@ -148,7 +147,7 @@ class Candidates:
         self._tables = [
             _Table(math.nan, evidence, (effects, cells), rows, given, sure)
             for effects in _subsets(evidence, switches)
-            for cells in evidence.forms(_in_waves(effects))
+            for cells in evidence.forms(in_waves(effects))
         ]
 
     def best(self, accuracy: float) -> tuple[_Table, int]:
@@ -183,7 +182,7 @@ def _table_of(
 ) -> _Table:
     """Predictions of ``settings`` alone; all else as for :func:`cheapest`."""
     row = np.array([[*counted(settings), settings.coarse_cells, settings.coarse_layers]], dtype=np.float64)
-    drawn = evidence.raster[_in_waves(settings.effects)]
+    drawn = evidence.raster[in_waves(settings.effects)]
     cells = (settings.raster_cells or drawn.cells[0]) if settings.raster or drawn.needed else 0
     return _Table(accuracy, evidence, (settings.effects, cells), row, _given(switches), sure)
 
@@ -230,31 +229,10 @@ class _Table:
         given: frozenset[Part],
         sure: float,
     ) -> None:
-        effects, self.raster_cells = form
-        self.effects = effects
+        self.effects, self.raster_cells = form
         self.accuracy, self.evidence, self.rows = accuracy, evidence, rows
         self.given, self.sure = given, sure
-        self.anchors, self.layers, self.cells, self.followed_anchors, self.occluded_anchors = rows.T[:5]
-        self.followed_width, self.coarse, self._all_layers = rows.T[5:]
-        indirect = float("interreflection" in effects)
-        waves = float(_in_waves(effects))
-        layered = np.where(self._all_layers > 0, self.layers, 1.0)
-        self.numbers = Numbers(
-            anchors=self.anchors,
-            layers=self.layers,
-            cells=self.cells,
-            coarse_cells=self.coarse,
-            coarse_layers=layered,
-            followed_anchors=self.followed_anchors,
-            followed_width=self.followed_width,
-            waves=waves,
-            indirect=indirect,
-            mixed=float(MIXING in effects),
-            occluded=float(len(evidence.occluded)),
-            occluded_anchors=self.occluded_anchors,
-            raster_cells=float(self.raster_cells),
-        )
-        self._follows = bool(effects & names(lambda effect: effect.followed))
+        self.numbers = Numbers.chosen([*rows.T], self.effects, len(evidence.occluded), self.raster_cells)
 
     def at(self, accuracy: float) -> _Table:
         """The same combinations at an ``accuracy``: what does not depend on it is shared.
@@ -286,12 +264,13 @@ class _Table:
         """The settings of a row."""
         numbers = (int(number) for number in self.rows[index])
         anchors, layers, cells, followed, occluded, width, coarse, all_layers = numbers
-        settings = Settings(
+        return Settings(
             depth=self.evidence.depth,
             anchors=anchors,
             layers=self.evidence.layers[layers] if layers > 1 else (),
             subdivision=cells,
             effects=self.effects,
+            samples={name: float(count[index]) for name, count in self.needed.items()},
             followed_anchors=followed,
             followed_width=width,
             coarse_cells=coarse,
@@ -305,8 +284,6 @@ class _Table:
             raster=self.raster_cells > 0,
             raster_cells=self.raster_cells,
         )
-        samples: dict[str, Any] = {f"{name}_samples": float(count[index]) for name, count in self.needed.items()}
-        return replace(settings, **samples)
 
     def choice(self, index: int) -> Choice:
         """The choice of a row."""
@@ -353,7 +330,7 @@ class _Table:
         drawn = [size**2 for name, size in apart.items() if name not in self.effects and Part(name) not in ignored]
         drawn += [self.evidence.sharp.left**2] if self.evidence.sharp else []
         cells = self.raster_cells
-        of_raster = self.evidence.raster[_in_waves(self.effects)].left(cells) if cells else None
+        of_raster = self.evidence.raster[in_waves(self.effects)].left(cells) if cells else None
         drawn += [of_raster[sure > 0] ** 2] if of_raster else []
         squared, spread = changes.squared(chosen)
         return np.asarray(np.sqrt(np.maximum(np.maximum(squared, 0) + sure * spread, 0) + sum(drawn)))
@@ -361,16 +338,18 @@ class _Table:
     def _weight(self, part: Part) -> FloatArray:
         """(m,) how much of a part's change each row leaves."""
         light, _, what = part.name.rpartition(" ")
+        numbers, finer_cells = self.numbers, np.square(1 / self.numbers.coarse_cells)
         if not part.count:
             return np.full(len(self.rows), float(part.name not in self.effects))
         if not light:
-            left = float(self._follows or not part.name.startswith("followed"))
+            left = np.asarray(float(bool(self.effects & FOLLOWED) or not part.name.startswith("followed")))
             if part.name == "followed_width":
-                left = left * (self.followed_anchors > 1) * (np.square(1 / self.coarse) if part.count == 1 else 1.0)
-            return np.asarray((getattr(self, part.name) == part.count) * left, dtype=np.float64)
-        filed = self.numbers.indirect > 0 if light == "indirect" else getattr(self, ANCHORS_OF[light]) > 1
+                left = left * (numbers.followed_anchors > 1) * (finer_cells if part.count == 1 else 1.0)
+            return np.asarray((getattr(numbers, part.name) == part.count) * left, dtype=np.float64)
+        row = PASSES[light]
+        lit = row.connections(numbers) > 0 if row.anchors else numbers.indirect > 0
         # Even cells are of second order; several layers leave as much of one layer's error as they do of direct light.
-        return np.asarray(filed * (np.square(1 / self.coarse) if what == "cells" else self._left_by_layers))
+        return np.asarray(lit * (finer_cells if what == "cells" else self._left_by_layers))
 
     @cached_property
     def _left_by_layers(self) -> FloatArray:
@@ -379,7 +358,7 @@ class _Table:
         parts = np.zeros(max(ladder) + 1)
         for count, error in ladder.items():
             parts[count] = min(error.bound / ladder[1].bound, 1.0) if ladder[1].bound else 0.0
-        return np.where(self._all_layers > 0, parts[self.layers.astype(int)], 1.0)
+        return np.where(self.rows[:, 7] > 0, parts[self.rows[:, 1].astype(int)], 1.0)
 
     # ---- samples and work
 
@@ -402,18 +381,18 @@ class _Table:
         )
 
     @cached_property
-    def _prices(self) -> dict[str, FloatArray]:
+    def _prices(self) -> dict[str, Number]:
         """(m,) work of one sample in every group, by kind of light."""
         lines = traced_for(self.evidence.forming.lines, self.evidence.forming.parted)
         return {
-            name: lines * GROUPS * getattr(FIXED, name) * effort.paths * connections(name, self.numbers)
+            name: lines * GROUPS * FIXED.passes[name] * effort.paths * PASSES[name].connections(self.numbers)
             for name, effort in efforts(self.evidence, self.effects).items()
         }
 
     @cached_property
     def samples(self) -> dict[str, FloatArray]:
         """(m,) samples of a group by kind of light, as they are traced."""
-        return {name: np.asarray(whole(name, count)) for name, count in self.needed.items()}
+        return {name: np.asarray(PASSES[name].whole(count)) for name, count in self.needed.items()}
 
     @cached_property
     def needed(self) -> dict[str, FloatArray]:
@@ -429,7 +408,7 @@ class _Table:
             if name == "direct":
                 needed = np.maximum(needed, 1 / (self.evidence.hits * _ONE_HIT * self.target))
             # What needs no whole sample does not take two when all others grow.
-            found[name] = np.where(needed < 1, needed, whole(name, needed))
+            found[name] = np.where(needed < 1, needed, PASSES[name].whole(needed))
         return found
 
     @cached_property
@@ -438,7 +417,7 @@ class _Table:
         total = np.zeros(len(self.rows))
         for name, count in self.samples.items():
             left = self._by_row(name, partial(_left, samples=count))
-            total = total + (connections(name, self.numbers) > 0) * np.square(left) / GROUPS
+            total = total + (PASSES[name].connections(self.numbers) > 0) * np.square(left) / GROUPS
         return np.sqrt(total)
 
     def _by_row(self, name: str, of: Callable[[Effort], Number]) -> FloatArray:
@@ -446,16 +425,14 @@ class _Table:
         of the sensor."""
         found = of(efforts(self.evidence, self.effects)[name]) + np.zeros(len(self.rows))
         if name == "direct":
-            found = np.where(self.anchors > 1, of(self.evidence.spread), found)
+            found = np.where(self.rows[:, 0] > 1, of(self.evidence.spread), found)
         return np.asarray(found)
 
     @cached_property
     def _entries(self) -> FloatArray:
         """(m,) of one group's filed light."""
-        evidence, samples = self.evidence, {**self.samples}
-        for name in ("indirect", "followed", "followed_from_camera", "occluded"):
-            samples.setdefault(name, np.ones(len(self.rows)))
-        found = entries(evidence.direct.paths, evidence.forming.classes, self.numbers, samples)
+        pixels, classes = self.evidence.efforts["direct"].paths, self.evidence.forming.classes
+        found = entries(pixels, classes, self.numbers, self.samples)
         return np.asarray(found) + np.zeros(len(self.rows))
 
     @cached_property
@@ -488,15 +465,10 @@ def _left(kind: Effort, samples: Number) -> Number:
     return kind.noise.left(samples)
 
 
-def _in_waves(effects: frozenset[str]) -> bool:
-    """Whether the shadow is wave-optical."""
-    return bool(effects & names(lambda effect: effect.in_shadow))
-
-
-def counted(settings: Settings) -> tuple[int, int, int, int, int, int]:
+def counted(settings: Settings) -> tuple[int, ...]:
     """The numbers in ``settings`` that :data:`COUNTED` names."""
-    apart = settings.followed_anchors, settings.occluded_anchors, settings.followed_width
-    return settings.anchors, len(settings.depths), settings.subdivision, *apart
+    numbers = Numbers.of(settings)
+    return tuple(int(getattr(numbers, name)) for name in COUNTED)
 
 
 def _counts(evidence: Evidence, name: str) -> list[int]:

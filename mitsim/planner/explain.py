@@ -17,18 +17,19 @@ from mitsim.bench.effects import EFFECTS, Effect
 from mitsim.bench.request import check_accuracy
 from mitsim.light.cost_model import (
     Numbers,
-    Paces,
+    UnitCosts,
     checking_seconds,
     entries,
     filing_seconds,
     optics_seconds,
-    paces_of,
     priced,
     tracing_seconds,
     truth_seconds,
+    unit_costs_of,
 )
+from mitsim.light.pilot_result import Evidence
 from mitsim.light.plan import Plan, PlanRow, State
-from mitsim.light.settings import Estimate, Evidence, Settings
+from mitsim.light.settings import Estimate, Settings
 from mitsim.planner.choose import Choice, cheapest, predicted
 from mitsim.transport.missed import polished_shapes
 
@@ -146,7 +147,7 @@ def decide(
     switches = switches or {}
     chosen = chosen or cheapest(accuracy, evidence, switches)
     words = _Words(accuracy, evidence, chosen, facts, switches)
-    stages = _stages(evidence, chosen.settings, paces_of(evidence))
+    stages = _stages(evidence, chosen.settings, unit_costs_of(evidence))
     return Plan(
         accuracy=accuracy,
         effects=words.rows,
@@ -160,17 +161,17 @@ def decide(
     )
 
 
-def _stages(evidence: Evidence, settings: Settings, paces: Paces) -> dict[str, float]:
+def _stages(evidence: Evidence, settings: Settings, costs: UnitCosts) -> dict[str, float]:
     """Seconds of transport, truth and optics."""
     forming, numbers = evidence.forming, Numbers.of(settings)
-    tracing = tracing_seconds(evidence, settings, paces)
-    filed = entries(evidence.direct.paths, forming.classes, numbers, settings)
+    tracing = tracing_seconds(evidence, settings, costs)
+    filed = entries(evidence.efforts["direct"].paths, forming.classes, numbers, settings)
     return {
         "transport": sum(tracing.values())
-        + float(filing_seconds(forming, numbers, filed, paces))
-        + float(checking_seconds(forming, numbers, paces)),
-        "truth": truth_seconds(evidence, settings, paces),
-        "optics": float(optics_seconds(forming, numbers, paces)),
+        + float(filing_seconds(forming, numbers, filed, costs))
+        + float(checking_seconds(forming, numbers, costs)),
+        "truth": truth_seconds(evidence, settings, costs),
+        "optics": float(optics_seconds(forming, numbers, costs)),
     }
 
 
@@ -259,8 +260,8 @@ class _Words:
 
     def _seconds(self, **changes: Any) -> float:
         """What the settings take beyond those with ``changes``."""
-        settings, paces = self.chosen.settings, paces_of(self.evidence)
-        both = (sum(_stages(self.evidence, each, paces).values()) for each in (settings, replace(settings, **changes)))
+        settings, costs = self.chosen.settings, unit_costs_of(self.evidence)
+        both = (sum(_stages(self.evidence, each, costs).values()) for each in (settings, replace(settings, **changes)))
         with_it, without = both
         return max(with_it - without, 0.0)
 
@@ -343,11 +344,11 @@ class _Words:
         left, settings, forming = self._of_raster, self.chosen.settings, self.evidence.forming
         if left is None:
             return ()
-        drawn, paces = self.evidence.raster[self._waves], paces_of(self.evidence)
+        drawn, costs = self.evidence.raster[self._waves], unit_costs_of(self.evidence)
 
         def seconds(cells: int) -> float:
             formed = replace(settings, raster=cells > 0, raster_cells=cells)
-            return _stages(self.evidence, formed, paces)["optics"]
+            return _stages(self.evidence, formed, costs)["optics"]
 
         fewest = drawn.cells[0]
         cells = settings.raster_cells or fewest

@@ -9,7 +9,8 @@ from mitsim.bench.effects import names
 from mitsim.core.resources import Cost, workers
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.plate import FEW
-from mitsim.light.cost_model import Numbers, entries, raster_bytes
+from mitsim.light.cost_model import Numbers, entries
+from mitsim.light.drawing_cost import raster_bytes
 from mitsim.light.passes import Simulation
 from mitsim.light.settings import GROUPS, Settings
 from mitsim.optics.frames import PROBES, frames_in_memory

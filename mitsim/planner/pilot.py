@@ -18,8 +18,10 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.light.cost_model import FIXED, Numbers, forming_seconds
+from mitsim.light.pass_table import PASSES
 from mitsim.light.passes import Simulation
-from mitsim.light.settings import LOOKS, Changes, Drawn, Effort, Evidence, Forming, Part, Settings
+from mitsim.light.pilot_result import LOOKS, Changes, Drawn, Effort, Evidence, Forming, Part
+from mitsim.light.settings import Settings
 from mitsim.planner.pilot_direct import SMOOTH, AnchoredLight, FineLight, OccludedLight, occluded_pixels, sharp_pixels
 from mitsim.planner.pilot_indirect import FollowedLight, SwitchedEffects
 from mitsim.planner.pilot_samples import GOOD_ENOUGH, Sample
@@ -32,17 +34,12 @@ STAGES = ("cells", "effects", "anchors", "followed", "occluded")
 """What is looked at apart: cells and layers of direct light, effects switched off, anchors, those of followed light,
 and of occluded pixels."""
 _STAGE_OF = {
-    "cells": "cells",
     "layers": "cells",
-    "anchors": "anchors",
-    "anchored cells": "anchors",
-    "anchored layers": "anchors",
-    "followed_anchors": "followed",
+    "cells": "cells",
     "followed_width": "followed",
-    "occluded_anchors": "occluded",
-    "occluded cells": "occluded",
-    "occluded layers": "occluded",
+    **{row.anchors: row.pilot for row in PASSES.values() if row.anchors},
 }
+"""What tells the error of the numbers that a plan chooses."""
 FINER = 4
 """Samples of a stage over those of the look before: standard errors are halved at least."""
 _ROUGH = 0.5
@@ -152,30 +149,31 @@ class Look:
         now, finer = self.samples[stage], self._finer(stage)
         if (finer.fine, finer.direct) == (now.fine, now.direct):
             return math.inf
-        one, changes = forming_seconds(self.forming, Numbers.coarsest(), _FRAMES_AS_MANY, FIXED), 0
+        costs, changes = FIXED.passes, 0
+        one = forming_seconds(self.forming, Numbers.coarsest(), _FRAMES_AS_MANY, FIXED)
         pixels, shown = self.bench.n**2, len(finer.shown)
         if stage == "cells":
-            paths, changes = FIXED.direct * shown * finer.fine, len(self.fine.changes)
+            paths, changes = costs["direct"] * shown * finer.fine, len(self.fine.changes)
         elif stage == "anchors":
             connections = sum(part.count**2 for part in self.anchored.changes if part.name == stage)
-            paths, changes = FIXED.anchored * shown * finer.anchored * connections, len(self.anchored.changes)
+            paths = costs["anchor_residual"] * shown * finer.anchored * connections
+            changes = len(self.anchored.changes)
         elif stage == "occluded":
             count = len(self.occluded.pixels) if self.occluded else 0
             if self.occluded is None or finer.occluded(count) == now.occluded(count):
                 return math.inf
             connections = sum(part.count**2 for part in self.occluded.changes if " " not in part.name)
-            paths = FIXED.occluded * FINER * self.occluded.paths / LOOKS * connections
+            paths = costs["penumbra"] * FINER * self.occluded.paths / LOOKS * connections
             changes = len(self.occluded.changes)
         elif stage == "followed":
             connections = sum(part.count**2 for part in self.followed.changes if part.name == "followed_anchors")
             lanes = sum(self.switched.lanes.values())
-            paths, changes = FIXED.followed * lanes * finer.followed * connections, len(self.followed.changes)
+            paths = costs["indirect_residual"] * lanes * finer.followed * connections
+            changes = len(self.followed.changes)
         else:
-            followed = sum(getattr(FIXED, name) * lanes for name, lanes in self.switched.lanes.items())
-            paths, changes = (
-                FIXED.direct * pixels * finer.direct + followed * finer.followed,
-                _OF_EFFECTS * len(self.present),
-            )
+            followed = sum(costs[name] * lanes for name, lanes in self.switched.lanes.items())
+            paths = costs["direct"] * pixels * finer.direct + followed * finer.followed
+            changes = _OF_EFFECTS * len(self.present)
         return LOOKS * paths + changes * float(one)
 
     @property
@@ -191,11 +189,11 @@ class Look:
         return few.bound > _ROUGH * self.accuracy
 
     def heavy(self, samples: int) -> dict[str, Effort]:
-        """What is followed from the camera takes, by its name in the evidence, as looks of more ``samples`` see it: a
-        lobe that is met in one of a million paths, and brings most of the noise, is in none of the short ones."""
+        """What passes from the camera take, by name, as looks of more ``samples`` see it: a lobe that is met in one of
+        a million paths, and brings most of the noise, is in none of the short ones."""
         found = {
             "from_camera": self.switched.with_more(samples),
-            "followed_from_camera": self.followed.with_more(self.switched.light, samples),
+            "camera_residual": self.followed.with_more(self.switched.light, samples),
         }
         return {name: effort for name, effort in found.items() if effort.noise.error}
 
@@ -279,7 +277,15 @@ class Look:
         light, sharp, apart = switched.light, self._sharp, self._base.sharp
         samples = self.samples["effects"].followed * LOOKS
         indirect, shared, repeats = switched.indirect_effort()
-        followed, from_camera = self.followed.efforts(light)
+        efforts = {
+            **switched.efforts,
+            **self.followed.efforts(light),
+            "direct": fine.effort(light),
+            "anchor_residual": anchored.effort(light),
+            "indirect": indirect,
+        }
+        if self.occluded:
+            efforts["penumbra"] = self.occluded.effort(light)
         left_out, mirror = self._left_out.unseen(_FEWEST_HITS / samples, _FEWEST_MET / samples)
         found = self._light + sharp.irradiance + switched.received
         few = not apart and sharp.hits * self.samples["cells"].fine * LOOKS < _FEWEST_HITS
@@ -289,13 +295,10 @@ class Look:
             depth=self._base.depth,
             layers=fine.layers,
             changes=Changes.between(seen, light**2),
-            direct=fine.effort(light),
+            efforts=efforts,
             spread=fine.spread(light),
-            anchored=anchored.effort(light),
-            indirect=indirect,
             shared=shared,
             repeats=repeats,
-            from_camera=switched.effort("from_camera"),
             forming=replace(self.forming, lines=self._lines, occluded=self._rows_and_columns(self._base.occluded)),
             apart=switched.apart,
             unresolved=unresolved / (self._light + sharp.irradiance + unmet) if unresolved else 0.0,
@@ -304,11 +307,7 @@ class Look:
             mirror=mirror,
             reach=self._base.reach,
             sharp=apart,
-            sharp_light=switched.sharp_effort(),
-            followed=followed,
-            followed_from_camera=from_camera,
             occluded=self._base.occluded,
-            occluded_light=self.occluded.effort(light) if self.occluded else Effort.none(),
             raster=self._raster,
             hits=self._hits,
         )
@@ -327,6 +326,9 @@ def measure(bench: Apparatus, lighting: Lighting, accuracy: float, seed: int) ->
 
 def stage_of(part: Part) -> str:
     """The stage that tells the error of a ``part``."""
+    light, _, _ = part.name.rpartition(" ")
+    if light:
+        return PASSES[light].pilot if PASSES[light].anchors else "effects"
     return _STAGE_OF.get(part.name, "effects")
 
 

@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -18,9 +19,12 @@ from mitsim.core.resources import workers
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum
-from mitsim.light.cost_model import cells_to_choose, drawing_seconds
-from mitsim.light.passes import Simulation, Tray, emitted
-from mitsim.light.settings import GROUPS, LOOKS, Drawn, Effort, Estimate, Forming, Noise, Part, Settings, SharpPixels
+from mitsim.light.drawing_cost import cells_to_choose, drawing_seconds
+from mitsim.light.grids import Grid
+from mitsim.light.pass_table import PASSES
+from mitsim.light.passes import Simulation, emitted
+from mitsim.light.pilot_result import LOOKS, Drawn, Effort, Forming, Noise, Part
+from mitsim.light.settings import GROUPS, Estimate, Settings, SharpPixels
 from mitsim.optics.fft_shadow import cells_per_pixel
 from mitsim.optics.frames import ExpectedFrames, Filed
 from mitsim.optics.image_formation import raster_error
@@ -79,7 +83,7 @@ class FineLight:
         self._simulation = simulation = sample.simulation(bench, base)
         self._tracer = _tracer(simulation, _shown(base, sample), base.anchors)
         self._deposits = self._tracer.trace_looks(self._seeds, sample.fine)
-        apart, samples = simulation.apart, sample.sharp(simulation)
+        apart, samples = simulation.sharp, sample.sharp(simulation)
         self._sharp = apart.trace_looks(self._seeds, samples) if apart else []
 
     @property
@@ -162,12 +166,13 @@ class FineLight:
         """What forming frames of a ``family`` takes; timed with one cell a pixel, its optics prepared."""
         simulation = Simulation(self.bench, self.base)
         rows, weights = self.sample.rows, self.sample.lighting.weights
-        light = simulation.fine.file(self._deposits[0], self.sample.lighting.labels, self.sample.fine)
-        filed, timed = Filed(simulation.fine.optics, (light[: len(rows)],) * GROUPS), weights[: workers()]
+        fine = simulation.grids["fine"]
+        light = fine.bundle.file(self._deposits[0], self.sample.lighting.labels, self.sample.fine)
+        filed, timed = Filed(fine.optics, (light[: len(rows)],) * GROUPS), weights[: workers()]
         started = time.perf_counter()
         list(ExpectedFrames([filed], Lighting(rows, timed), 0))
         seconds = (time.perf_counter() - started) / len(timed)
-        cells = max(simulation.fine.bundle.cells)
+        cells = max(fine.bundle.cells)
         geometry = self.bench.geometry
         waves = self.bench.waves
         return Forming(
@@ -189,8 +194,8 @@ class FineLight:
     def raster(self) -> tuple[Drawn, Drawn]:
         """What a shadow on a raster leaves of a frame, without diffraction and with it."""
         simulation = Simulation(self.bench, self.base)
-        bundle, geometry = simulation.fine.bundle, self.bench.geometry
-        filed = simulation.fine.file(self._deposits[0], self.sample.lighting.labels, self.sample.fine)
+        bundle, geometry = simulation.grids["fine"].bundle, self.bench.geometry
+        filed = bundle.file(self._deposits[0], self.sample.lighting.labels, self.sample.fine)
         shot = sparse.csr_array(self.sample.lighting.weights[:1]) @ filed[: self.sample.lighting.weights.shape[1]]
         light = shot.toarray().reshape(bundle.anchors, bundle.cells[0], bundle.anchors, bundle.cells[1])
 
@@ -209,7 +214,7 @@ class FineLight:
     def _lit(self, simulation: Simulation, light: sparse.csr_array) -> float:
         """Rows of cells that hold light in a shot, their mean."""
         shots = (self.sample.lighting.weights @ (light[: len(self.sample.rows)] != 0)) != 0
-        width = simulation.fine.bundle.cells[1]
+        width = simulation.grids["fine"].bundle.cells[1]
         places = [np.flatnonzero(shot) if isinstance(shot, np.ndarray) else shot.indices for shot in shots]
         return max(1.0, float(np.mean([len(np.unique(place // width)) for place in places])))
 
@@ -222,8 +227,9 @@ class FineLight:
         self, simulation: Simulation, deposits: list[Deposits], samples: int, sharp: Sequence[Deposits] = ()
     ) -> FloatArray:
         sample, light = self.sample, emitted(simulation.physics, self.sample.lighting)
-        frames = sample.frames(simulation.fine, deposits, samples, light)
-        return frames + sample.frames(simulation.sharp, sharp, sample.sharp(simulation), light) if sharp else frames
+        grids = simulation.grids
+        frames = sample.frames(grids["fine"], deposits, samples, light)
+        return frames + sample.frames(grids["sharp"], sharp, sample.sharp(simulation), light) if sharp else frames
 
 
 def _product_seconds() -> float:
@@ -254,7 +260,7 @@ class AnchoredLight:
     """
 
     _ladder: tuple[int, ...] = ANCHOR_LADDER
-    _part, _name, _few_anchors = "anchors", "anchored", _FEW_ANCHORS
+    _pass, _few_anchors = PASSES["anchor_residual"], _FEW_ANCHORS
 
     def __init__(
         self,
@@ -282,7 +288,7 @@ class AnchoredLight:
     @cached_property
     def changes(self) -> dict[Part, FloatArray]:
         """Change of the frames by every number of anchors that was tried, and by coarse cells for what they see."""
-        coarse = coarsened(self._name, self._beyond, self.layers)
+        coarse = coarsened(self._pass.name, self._beyond, self.layers)
         return {**self._until(self.tolerance), **coarse}
 
     @property
@@ -292,7 +298,7 @@ class AnchoredLight:
 
     def _until(self, tolerance: float) -> dict[Part, FloatArray]:
         found = ladder(self._ladder, self._frames, _FIRST_JUDGES["anchors"], tolerance)
-        return {Part(self._part, count): change for count, change in found.items()}
+        return {Part(self._pass.anchors, count): change for count, change in found.items()}
 
     def effort(self, light: float) -> Effort:
         """Monte Carlo error of one estimate of what a few anchors see beyond their mean, relative to all ``light``."""
@@ -312,10 +318,10 @@ class AnchoredLight:
         """Frames of what a few anchors see beyond their mean, in coarse cells and layers."""
         coarse = replace(self.base, coarse_cells=cells, coarse_layers=bool(layers), layers=layers)
         simulation = self._simulation(self._few_anchors, coarse)
-        tray, weights = self._tray(simulation), simulation.mean_weights(self._few_anchors)
+        grid, weights = self._grid(simulation), simulation.mean_weights(self._few_anchors)
         mean = [look.averaged(weights) for look in self._few]
-        frames = self._frames(self._few_anchors) if coarse == self.base else self._formed(tray, self._few)
-        return frames - self._formed(tray.of_mean, mean)
+        frames = self._frames(self._few_anchors) if coarse == self.base else self._formed(grid, self._few)
+        return frames - self._formed(grid.of_mean, mean)
 
     @cached_property
     def _few(self) -> list[Deposits]:
@@ -325,31 +331,32 @@ class AnchoredLight:
     def _frames(self, anchors: int) -> FloatArray:
         simulation = self._simulation(anchors, self.base)
         traced = self._few if anchors == self._few_anchors else self._traced(simulation)
-        return self._formed(self._tray(simulation), traced)
+        return self._formed(self._grid(simulation), traced)
 
     def _simulation(self, anchors: int, settings: Settings) -> Simulation:
-        return self.sample.simulation(self.bench, replace(settings, anchors=anchors), one_line=True)
+        several: dict[str, Any] = {self._pass.anchors: anchors}
+        return self.sample.simulation(self.bench, replace(settings, **several), one_line=True)
 
-    def _tray(self, simulation: Simulation) -> Tray:
-        """Where light of these pixels is filed."""
-        return simulation.coarse
+    def _grid(self, simulation: Simulation) -> Grid:
+        """Where light of these pixels is accumulated."""
+        return simulation.grids[self._pass.grid]
 
     def _traced(self, simulation: Simulation) -> list[Deposits]:
         """Light to every anchor, look by look."""
-        anchors = self._tray(simulation).bundle.anchors
+        anchors = self._grid(simulation).bundle.anchors
         tracer = _tracer(simulation, self.pixels, anchors)
         return tracer.trace_looks(self._seeds, self._samples)
 
-    def _formed(self, tray: Tray, looks: list[Deposits]) -> FloatArray:
-        """(looks, shots, places, places) frames of light in a ``tray``."""
-        return self.sample.frames(tray, looks, self._samples)
+    def _formed(self, grid: Grid, looks: list[Deposits]) -> FloatArray:
+        """(looks, shots, places, places) frames of light in a ``grid``."""
+        return self.sample.frames(grid, looks, self._samples)
 
 
 class OccludedLight(AnchoredLight):
     """The same of occluded pixels, which many anchors see."""
 
     _ladder = OCCLUDED_LADDER
-    _part, _name, _few_anchors = "occluded_anchors", "occluded", _FEW_OCCLUDED
+    _pass, _few_anchors = PASSES["penumbra"], _FEW_OCCLUDED
 
     def _of(self, sample: Sample) -> tuple[Labels, int]:
         pixels = np.intersect1d(_shown(self.base, sample), self.base.occluded)
@@ -358,12 +365,6 @@ class OccludedLight(AnchoredLight):
     @property
     def _lanes(self) -> int:
         return len(self.base.occluded)
-
-    def _simulation(self, anchors: int, settings: Settings) -> Simulation:
-        return self.sample.simulation(self.bench, replace(settings, occluded_anchors=anchors), one_line=True)
-
-    def _tray(self, simulation: Simulation) -> Tray:
-        return simulation.occluded
 
 
 def _shown(settings: Settings, sample: Sample) -> Labels:
@@ -552,7 +553,7 @@ def _connections(simulation: Simulation, chosen: SharpPixels, accuracy: float, s
     """Connections that light of ``chosen`` pixels takes to be known to the ``accuracy``, by a short trial."""
     if len(chosen.pixels) * chosen.anchors**2 > _AFFORDABLE:
         return math.inf
-    tracer = Simulation(simulation.bench, replace(simulation.settings, sharp=chosen)).apart
+    tracer = Simulation(simulation.bench, replace(simulation.settings, sharp=chosen)).sharp
     assert tracer is not None
     samples = min(max(_LARGEST_TRIAL // tracer.lanes, 2), _TRIAL)
     seen = [tracer.trace(integer(seed, half), 0, samples) for half in range(2)]

@@ -16,8 +16,11 @@ from mitsim.bench.effects import DIRECT, EFFECTS, FOLLOWED, Effect
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
 from mitsim.light.cost_model import SHARED_COST
-from mitsim.light.passes import Simulation, Tray, emitted
-from mitsim.light.settings import LOOKS, Changes, Effort, Noise, Part, Settings
+from mitsim.light.grids import Grid
+from mitsim.light.pass_table import PASSES
+from mitsim.light.passes import Simulation, emitted
+from mitsim.light.pilot_result import LOOKS, Changes, Effort, Noise, Part
+from mitsim.light.settings import Settings
 from mitsim.planner.pilot_direct import SHARP_RATE
 from mitsim.planner.pilot_samples import EVEN_CELLS, Known, Sample, coarsened, heavy_paths, known, ladder, noise, norm
 from mitsim.transport import records
@@ -38,6 +41,8 @@ _FIRST_JUDGE = 1
 """Index of the number that judges at first."""
 _FEW_ANCHORS = 2
 """Anchors whose noise is measured."""
+_RESIDUALS = ("indirect_residual", "camera_residual")
+"""Passes to every anchor, from either side."""
 
 
 class FollowedLight:
@@ -85,12 +90,12 @@ class FollowedLight:
         # Where the judge was never judged, few anchors serve, and their light is held in any cells.
         return {**anchors, **self._widths} if len(found) > _FIRST_JUDGE + 1 else anchors
 
-    def efforts(self, light: float) -> tuple[Effort, Effort]:
-        """Monte Carlo error of one estimate of what a few anchors see beyond their mean, relative to all ``light``, of
-        indirect light from the projector's side, and of what is followed from the camera."""
+    def efforts(self, light: float) -> dict[str, Effort]:
+        """Monte Carlo error of one estimate of what a few anchors see beyond their mean, relative to all ``light``, by
+        pass: of indirect light from the projector's side, and of what is followed from the camera."""
         tracers = self._simulation().at_anchors
         if not self.changes:
-            return Effort.none(), Effort.none()
+            return dict.fromkeys(_RESIDUALS, Effort.none())
         every = self._beyond_mean()
         if None in tracers:
             seen = every, every
@@ -99,11 +104,10 @@ class FollowedLight:
             from_camera = self._beyond(simulation, self._few_by_tracer[1])
             seen = every - from_camera, from_camera
         errors = (noise(each) / light if light else 0.0 for each in seen)
-        indirect, camera = (
-            Effort(Noise(error, self.sample.followed, 0.5), tracer.lanes) if tracer else Effort.none()
-            for error, tracer in zip(errors, tracers, strict=True)
-        )
-        return indirect, camera
+        return {
+            name: Effort(Noise(error, self.sample.followed, 0.5), tracer.lanes) if tracer else Effort.none()
+            for name, error, tracer in zip(_RESIDUALS, errors, tracers, strict=True)
+        }
 
     def with_more(self, light: float, samples: int) -> Effort:
         """That of what is followed from the camera, by looks of so many ``samples``; ``light`` as for those."""
@@ -142,9 +146,9 @@ class FollowedLight:
         """Frames of light to a few anchors beyond its mean, in a ``simulation``; of all of it, where they are known."""
         weights = simulation.mean_weights(_FEW_ANCHORS)
         mean = [look.averaged(weights) for look in looks]
-        trays = simulation.followed, simulation.followed_ambient
-        frames = self._formed(trays, looks, samples) if frames is None else frames
-        return frames - self._formed((trays[0].of_mean, trays[1].of_mean), mean, samples)
+        grids = _residual_grids(simulation)
+        frames = self._formed(grids, looks, samples) if frames is None else frames
+        return frames - self._formed((grids[0].of_mean, grids[1].of_mean), mean, samples)
 
     @cached_property
     def _few(self) -> list[Deposits]:
@@ -168,10 +172,9 @@ class FollowedLight:
         tracers = self._tracers(simulation)
         each = max(1, _AT_ONCE // sum(tracer.lanes for tracer in tracers))
         parts = [(first, min(each, samples - first)) for first in range(0, samples, each)]
-
-        trays = simulation.followed, simulation.followed_ambient
+        grids = _residual_grids(simulation)
         if anchors == _FEW_ANCHORS:
-            return self._formed(trays, self._few)
+            return self._formed(grids, self._few)
         found = []
         for part in parts:
             first, some = part
@@ -181,7 +184,7 @@ class FollowedLight:
                 else [tracer.trace(seed, first, some) for seed in self._seeds]
                 for tracer in tracers
             ]
-            found.append(self._formed(trays, self._joined(traced)))
+            found.append(self._formed(grids, self._joined(traced)))
         return np.asarray(sum(found))
 
     def _simulation(self, **numbers: Any) -> Simulation:
@@ -191,17 +194,23 @@ class FollowedLight:
     def _tracers(simulation: Simulation) -> list[Tracer | Together]:
         return [tracer for tracer in simulation.at_anchors if tracer is not None]
 
-    def _formed(self, trays: tuple[Tray, Tray], looks: list[Deposits], samples: int | None = None) -> FloatArray:
-        """(looks, shots, places, places) frames of the projector's light, and lamps', in ``trays``; of so many
+    def _formed(self, grids: tuple[Grid, Grid], looks: list[Deposits], samples: int | None = None) -> FloatArray:
+        """(looks, shots, places, places) frames of the projector's light, and lamps', in ``grids``; of so many
         ``samples``, if not of as many as others."""
         samples = samples or self.sample.followed
-        frames = self.sample.frames(trays[0], looks, samples)
-        return frames + self.sample.lamps(trays[1], looks, samples) if self.bench.loaded.lamps else frames
+        frames = self.sample.frames(grids[0], looks, samples)
+        return frames + self.sample.lamps(grids[1], looks, samples) if self.bench.loaded.lamps else frames
+
+
+def _residual_grids(simulation: Simulation) -> tuple[Grid, Grid]:
+    """Of what anchors see of followed light, and of lamps' light there."""
+    return simulation.grids["indirect_residual"], simulation.ambient["indirect_residual"]
 
 
 # -------- All effects at once, and each of them switched off
 
-_TRACERS = ("indirect", "from_camera")
+_FOLLOWED = tuple(name for name, row in PASSES.items() if not (row.even or row.anchors))
+"""Passes of light that is followed to one point of the sensor."""
 _WORTH_REPEATING = 0.85
 """Variance times paths, over that of even ones, below which blocks are followed unevenly: short looks tell it so
 well."""
@@ -242,7 +251,7 @@ class SwitchedEffects:
         self.seeds = [integer(seed, "pilot", "effects", look) for look in range(LOOKS)]
         self.simulation = sample.simulation(bench, everything)
         self.direct = self._direct(self.simulation)
-        self.followed = {name: self._follow(self.simulation, name) for name in _TRACERS}
+        self.followed = {name: self._follow(self.simulation, name) for name in _FOLLOWED}
         self.sharp = self._sharp(self.simulation)
         self._known: Known = {}
         self._kinds = self._by_kind(self.followed)
@@ -313,7 +322,7 @@ class SwitchedEffects:
         return {name: lanes for name, (_, _, lanes) in self._noise.items()}
 
     def effort(self, name: str) -> Effort:
-        """Monte Carlo error of one estimate by the tracer ``name``, relative to all light, and its paths."""
+        """Monte Carlo error of one estimate by the pass ``name``, relative to all light, and its paths."""
         if name not in self._noise:
             return Effort.none()
         error, samples, lanes = self._noise[name]
@@ -370,26 +379,30 @@ class SwitchedEffects:
     def _sharing(self) -> Simulation:
         return self.sample.simulation(self.bench, replace(self.everything, shared=True))
 
-    def sharp_effort(self) -> Effort:
-        """The same of pixels that are traced apart, their rate being that of stratified rays."""
-        tracer = self.simulation.apart
-        if tracer is None:
-            return Effort.none()
+    @property
+    def efforts(self) -> dict[str, Effort]:
+        """That of every pass that is followed to one point of the sensor, and of sharp pixels where there are any."""
+        found = {name: self.effort(name) for name in _FOLLOWED}
+        tracer = self.simulation.sharp
+        return {**found, "sharp": self._sharp_effort(tracer.lanes)} if tracer else found
+
+    def _sharp_effort(self, lanes: int) -> Effort:
+        """That of pixels that are traced apart, their rate being that of stratified rays."""
         samples = self.sample.sharp(self.simulation)
         error = noise(self._form(self.simulation, sharp=self.sharp))
         relative = error / self.light if self.light else 0.0
-        return Effort(Noise(relative, samples, SHARP_RATE), tracer.lanes)
+        return Effort(Noise(relative, samples, SHARP_RATE), lanes)
 
     @cached_property
     def _noise(self) -> dict[str, tuple[float, int, int]]:
         """Error of a look by each tracer, the look's samples, and paths of one."""
         found = {}
-        for name, stage in self.simulation.tracers().items():
-            if name in _TRACERS:
+        for name, each in self.simulation.passes.items():
+            if name in _FOLLOWED:
                 first = self.followed[name], self.sample.followed
                 looks, samples = self._closer if name == "indirect" else first
                 frames = self._form(self.simulation, followed=self._by_kind({name: looks}), samples=samples)
-                found[name] = noise(frames), samples, stage.tracer.lanes
+                found[name] = noise(frames), samples, each.tracer.lanes
         return found
 
     def _without(self, effect: Effect) -> FloatArray:
@@ -400,7 +413,7 @@ class SwitchedEffects:
         if DIRECT in retraced:
             direct, sharp = self._direct(simulation), self._sharp(simulation)
         if FOLLOWED in retraced:
-            followed = self._by_kind({name: self._follow(simulation, name) for name in _TRACERS})
+            followed = self._by_kind({name: self._follow(simulation, name) for name in _FOLLOWED})
         else:
             followed = {kind: light for kind, light in self._kinds.items() if kind != effect.kind}
         return self._form(simulation, direct, followed, sharp)
@@ -409,12 +422,11 @@ class SwitchedEffects:
         return simulation.direct.trace_looks(self.seeds, self.sample.direct)
 
     def _follow(self, simulation: Simulation, name: str) -> list[Deposits]:
-        """Light of the tracer ``name``, look by look."""
-        tracer = getattr(simulation, name)
+        """Light of the pass ``name``, look by look."""
+        tracer = PASSES[name].tracer(simulation)
         if tracer is None:
             return [Deposits.none()] * LOOKS
-        looks: list[Deposits] = tracer.trace_looks([integer(seed, name) for seed in self.seeds], self.sample.followed)
-        return looks
+        return tracer.trace_looks([integer(seed, name) for seed in self.seeds], self.sample.followed)
 
     @staticmethod
     def _by_kind(followed: dict[str, list[Deposits]]) -> dict[str, list[Deposits]]:
@@ -424,7 +436,7 @@ class SwitchedEffects:
 
     def _sharp(self, simulation: Simulation) -> list[Deposits]:
         """Light of pixels that are traced apart, look by look."""
-        tracer, samples = simulation.apart, self.sample.sharp(simulation)
+        tracer, samples = simulation.sharp, self.sample.sharp(simulation)
         if tracer is None:
             return []
         return tracer.trace_looks([integer(seed, "sharp") for seed in self.seeds], samples)
@@ -440,17 +452,18 @@ class SwitchedEffects:
         """Frames of light look by look, where there is any; ``samples`` of followed light, if not as many as of all."""
         sample, known, physics = self.sample, self._known, simulation.physics
         light, few = emitted(physics, sample.lighting), samples or sample.followed
-        parts = [(simulation.fine, direct, sample.direct), (simulation.fine, followed.get("direct", ()), few)]
-        parts.append((simulation.sharp, sharp, sample.sharp(simulation)))
+        grids = simulation.grids
+        parts = [(grids["fine"], direct, sample.direct), (grids["fine"], followed.get("direct", ()), few)]
+        parts.append((grids["sharp"], sharp, sample.sharp(simulation)))
         if physics.interreflection:
-            parts.append((simulation.smooth, followed.get("indirect", ()), few))
+            parts.append((grids["indirect"], followed.get("indirect", ()), few))
         frames = np.zeros((LOOKS, len(light), *sample.shape))
-        for tray, looks, count in parts:
+        for grid, looks, count in parts:
             if any(look.value.size for look in looks):
-                frames += sample.frames(tray, looks, count, light, known)
+                frames += sample.frames(grid, looks, count, light, known)
         lamps = followed.get("ambient", ())
         if physics.lamps and lamps:
-            frames += sample.lamps(simulation.ambient, lamps, few, known)
+            frames += sample.lamps(simulation.ambient["fine"], lamps, few, known)
         glint = simulation.glint_frames(sample.lighting.labels)
         return frames if glint is None else frames + np.tensordot(light[:, glint.classes], glint.irradiance, 1)
 

@@ -17,8 +17,10 @@ from mitsim.bench.bench import Apparatus
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.parallel import in_threads
 from mitsim.devices.patterns import Lighting
-from mitsim.light.passes import Simulation, Tray
-from mitsim.light.settings import Part, Settings
+from mitsim.light.grids import Grid
+from mitsim.light.passes import Simulation
+from mitsim.light.pilot_result import Part
+from mitsim.light.settings import Settings
 from mitsim.optics.image_formation import Entries
 from mitsim.optics.shadow import Places
 from mitsim.transport.from_camera import FromCameraTracer, Together
@@ -154,7 +156,7 @@ class Sample:
 
     def sharp(self, simulation: Simulation) -> int:
         """Samples of each pixel that a ``simulation`` traces apart, in each look."""
-        paths = simulation.apart.lanes if simulation.apart else 1
+        paths = simulation.sharp.lanes if simulation.sharp else 1
         return min(max(_SHARP_PATHS // paths, 4), _MOST_SHARP)
 
     def _within(self, samples: int, pixels: int) -> int:
@@ -166,13 +168,13 @@ class Sample:
         Parameters
         ----------
         bench, settings, one_line
-            as for :class:`mitsim.light.passes.Trays`.
+            as for :class:`mitsim.light.grids.Grids`.
         """
         return Simulation(bench, settings, one_line=one_line, places=self.places)
 
     def frames(
         self,
-        tray: Tray,
+        grid: Grid,
         looks: Sequence[Deposits],
         samples: int,
         emitted: FloatArray | None = None,
@@ -184,8 +186,8 @@ class Sample:
 
         Parameters
         ----------
-        tray
-            where the light is filed.
+        grid
+            where the light is accumulated.
         looks
             light of each.
         samples
@@ -199,36 +201,36 @@ class Sample:
         least, most = emitted.min(axis=1), emitted.max(axis=1)
         span = np.where(most > least, most - least, 1.0)
         pattern = (emitted - least[:, None]) / span[:, None]
-        frames = span[:, None, None] * self._lit(tray, looks, pattern, known)
+        frames = span[:, None, None] * self._lit(grid, looks, pattern, known)
         if least.any():
-            frames += least[:, None, None] * self._lit(tray, looks, np.ones((1, emitted.shape[1])), known)
+            frames += least[:, None, None] * self._lit(grid, looks, np.ones((1, emitted.shape[1])), known)
         return frames / samples
 
-    def lamps(self, tray: Tray, looks: Sequence[Deposits], samples: int, known: Known | None = None) -> FloatArray:
+    def lamps(self, grid: Grid, looks: Sequence[Deposits], samples: int, known: Known | None = None) -> FloatArray:
         """(looks, 1, places, places) frames of lamps' light in each look.
 
         Parameters
         ----------
-        tray, looks, samples, known
+        grid, looks, samples, known
             as for :meth:`frames`.
         """
         pattern = np.zeros((1, self.lighting.weights.shape[1] + 1))
         pattern[:, -1] = 1
-        return self._lit(tray, looks, pattern, known) / samples
+        return self._lit(grid, looks, pattern, known) / samples
 
-    def _lit(self, tray: Tray, looks: Sequence[Deposits], patterns: FloatArray, known: Known | None) -> FloatArray:
+    def _lit(self, grid: Grid, looks: Sequence[Deposits], patterns: FloatArray, known: Known | None) -> FloatArray:
         """(looks, patterns, rows, columns) frames of classes that are lit in ``patterns`` (patterns, classes), where
         lamps are the last class; else as for :meth:`frames`."""
         known = {} if known is None else known
         classes = self.lighting.weights.shape[1]
         patterns = np.pad(patterns, ((0, 0), (0, classes + 1 - patterns.shape[1])))
-        light = tray.key, *map(id, looks)
+        light = grid.key, *map(id, looks)
         keys = [(*light, np.round(row, _DIGITS).tobytes()) for row in patterns]
         missing = [place for place, key in enumerate(keys) if key not in known]
-        classes_of = np.append(self.lighting.labels, [classes] * tray.bundle.lamps)
-        size = tray.bundle.size
-        entries = [tray.bundle.entries(look) for look in looks] if missing else []
-        optics = tray.optics if any(len(place) for place, *_ in entries) else None
+        classes_of = np.append(self.lighting.labels, [classes] * grid.bundle.lamps)
+        size = grid.bundle.size
+        entries = [grid.bundle.entries(look) for look in looks] if missing else []
+        optics = grid.optics if any(len(place) for place, *_ in entries) else None
 
         def form(row: int) -> None:
             frames = np.zeros((len(looks), *self.shape))

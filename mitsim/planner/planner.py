@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import replace
-from types import MappingProxyType
 
 import drjit as dr
 
@@ -16,10 +15,11 @@ from mitsim.core.arrays import Labels
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
-from mitsim.light.cost_model import FIXED, paces_of, tracing_seconds
-from mitsim.light.passes import AT_ANCHORS, Simulation, Stage
+from mitsim.light.cost_model import FIXED, tracing_seconds, unit_costs_of
+from mitsim.light.passes import Simulation
+from mitsim.light.pilot_result import LOOKS, Effort, Evidence
 from mitsim.light.plan import Plan
-from mitsim.light.settings import GROUPS, LOOKS, MOST_PATHS, Evidence, whole
+from mitsim.light.settings import GROUPS, MOST_PATHS
 from mitsim.optics.diffraction import check_openings
 from mitsim.planner import pilot
 from mitsim.planner.choose import FIRST_LOOK, Candidates, Choice, affordable, cheapest, doubt, predicted, told
@@ -52,15 +52,6 @@ _LEAST, _MOST = 0.7, 5.0
 from 1.3e8 paths of balls of alpha 0.02, 0.05 and 0.1 and of a torus)."""
 _HEAVIER = 1.25
 """Tracing that takes so many times as long as planned is planned anew; less is what predictions are good to."""
-
-_FIELDS = MappingProxyType(
-    {
-        "sharp": "sharp_light",
-        "occluded": "occluded_light",
-        **dict(zip(AT_ANCHORS, ("followed", "followed_from_camera"), strict=True)),
-    }
-)
-"""What evidence calls the light of a stage, where it is not the stage's name."""
 
 
 @single_threaded_blas()
@@ -181,92 +172,93 @@ def _with_heavy_paths(
     plain = tracing_seconds(look.evidence, chosen.settings, FIXED)
     paths = _HEAVY_PATHS
     while True:
-        found = look.heavy(max(1, paths // (LOOKS * look.evidence.from_camera.paths)))
+        known = look.evidence.efforts
         heavier = {
-            name: replace(getattr(look.evidence, name), noise=effort.noise)
-            for name, effort in found.items()
-            if effort.variance > getattr(look.evidence, name).variance
+            name: replace(known[name], noise=effort.noise)
+            for name, effort in look.heavy(max(1, paths // (LOOKS * known["from_camera"].paths))).items()
+            if effort.variance > known[name].variance
         }
-        evidence = replace(look.evidence, **heavier)
+        evidence = look.evidence.with_efforts(heavier)
         planned = predicted(accuracy, evidence, chosen.settings, switches)
         seconds = tracing_seconds(evidence, planned.settings, FIXED)
         if sum(seconds.values()) <= _HEAVIER * sum(plain.values()):
             return look.evidence, chosen
         paths *= _MORE
-        asked = {name: seconds[name] / getattr(FIXED, name) for name in heavier}
-        few = any(getattr(evidence, name).noise.heavy < _FEW for name in heavier)
+        asked = {name: seconds[name] / FIXED.passes[name] for name in heavier}
+        few = any(effort.noise.heavy < _FEW for effort in heavier.values())
         if paths > (_MOST_HEAVY_PATHS if few else min(_MOST_HEAVY_PATHS, _OF_ALL * sum(asked.values()))):
             return evidence, _limited(planned, asked)
 
 
 def _limited(chosen: Choice, paths: Mapping[str, float]) -> Choice:
     """The choice with no more samples of light whose ``paths`` in a run are known than sampling stops at."""
-    samples = {f"{name}_samples": MOST_PATHS / count for name, count in paths.items() if count > MOST_PATHS}
-    less = {name: part * getattr(chosen.settings, name) for name, part in samples.items()}
-    return replace(chosen, settings=replace(chosen.settings, **less))
+    samples = dict(chosen.settings.samples)
+    samples |= {name: MOST_PATHS / count * samples[name] for name, count in paths.items() if count > MOST_PATHS}
+    return replace(chosen, settings=replace(chosen.settings, samples=samples))
 
 
 def _range(evidence: Evidence, plan: Plan) -> tuple[float, float] | None:
     """Seconds between which nine of ten runs of a ``plan`` end, where few heavy paths bring most of their noise; None
     where many bring it, whose samples are known."""
-    paces, least, most = paces_of(evidence), 0.0, 0.0
-    for name, seconds in tracing_seconds(evidence, plan.settings, paces).items():
-        heavy = getattr(evidence, _FIELDS.get(name, name)).noise.heavy
+    costs, least, most = unit_costs_of(evidence), 0.0, 0.0
+    for name, seconds in tracing_seconds(evidence, plan.settings, costs).items():
+        heavy = evidence.efforts[name].noise.heavy
         if seconds and math.isfinite(heavy):
-            limit = MOST_PATHS * getattr(paces, name)
+            limit = MOST_PATHS * costs.passes[name]
             least += (_LEAST - 1) * seconds
             most += max((min(_MOST * seconds, limit) if heavy >= _FEWEST else limit) - seconds, 0.0)
     total = plan.predicted_seconds
     return (total + least, total + most) if most else None
 
 
-def _seconds(stage: Stage, seed: int, labels: Labels, samples: int) -> float:
-    """What so many ``samples`` of a ``stage`` take to be traced and filed."""
-    ledgers = stage.ledgers(labels, 1)
+def _seconds(simulation: Simulation, name: str, seed: int, labels: Labels, samples: int) -> float:
+    """What so many ``samples`` of a pass take to be traced and accumulated."""
+    ledgers = simulation.ledgers(name, labels, 1)
     started = time.perf_counter()
-    stage.file(stage.trace(seed, 0, samples, ledgers), labels, samples)
-    # What is filed on the device is not waited for.
+    simulation.accumulate(name, simulation.passes[name].trace(seed, 0, samples, ledgers), labels, samples)
+    # What is added up on the device is not waited for.
     dr.sync_thread()
     return time.perf_counter() - started
 
 
 def _timed(evidence: Evidence, simulation: Simulation, labels: Labels, seed: int) -> Evidence:
-    """The ``evidence`` with the seconds that a path takes to be traced and filed in a ``simulation`` of the choice."""
-    own, found = integer(seed, "pilot", "paces"), {}
-    for name, stage in simulation.tracers().items():
-        seconds, longest = _pace(stage, simulation.paths_at_once, int(whole(name, stage.predicted)), labels, own)
-        field = _FIELDS.get(name, name)
-        effort = getattr(evidence, field)
+    """The ``evidence`` with the seconds that a path takes to be traced and accumulated in a ``simulation`` of the
+    choice."""
+    own, found, spread = integer(seed, "pilot", "paces"), {}, evidence.spread
+    for name, each in simulation.passes.items():
+        seconds, longest = _pace(simulation, name, labels, own)
+        effort = evidence.efforts.get(name, Effort.none())
         # A path of shared light counts for several.
-        found[field] = replace(effort, seconds=seconds / (effort.paths if name == "indirect" else stage.tracer.lanes))
+        paths = effort.paths if name == "indirect" else each.tracer.lanes
+        found[name] = replace(effort, seconds=seconds / paths)
         if name == "direct":
-            found["spread"] = replace(evidence.spread, seconds=longest / stage.tracer.lanes)
-    return replace(evidence, **found)
+            spread = replace(spread, seconds=longest / paths)
+    return replace(evidence.with_efforts(found), spread=spread)
 
 
-def _pace(stage: Stage, at_once: int, planned: int, labels: Labels, seed: int) -> tuple[float, float]:
-    """Seconds of a sample of a ``stage`` in a run, and in the longest launches that were timed.
+def _pace(simulation: Simulation, name: str, labels: Labels, seed: int) -> tuple[float, float]:
+    """Seconds of a sample of a pass in a run, and in the longest launches that were timed.
 
     Launches of more and more paths, up to those of the run itself, tell what each launch takes besides its paths.
 
     Parameters
     ----------
-    stage, labels, seed
-        what is traced, how it is filed, and the root of its random numbers.
-    at_once
-        paths of a launch of the run.
-    planned
-        samples of a group of the run.
+    simulation, name
+        what is traced of it.
+    labels, seed
+        how it is accumulated, and the root of its random numbers.
     """
-
-    lanes, every = stage.tracer.lanes, GROUPS * planned
+    each, at_once = simulation.passes[name], simulation.paths_at_once
+    planned, lanes = each.whole, each.tracer.lanes
+    every = GROUPS * planned
 
     def once(samples: int) -> float:
-        seconds = _seconds(stage, seed, labels, samples)
+        seconds = _seconds(simulation, name, seed, labels, samples)
         # What disturbs a moment would be multiplied.
-        return min(seconds, _seconds(stage, seed, labels, samples)) if samples <= _OF_ALL * every else seconds
+        again = samples <= _OF_ALL * every
+        return min(seconds, _seconds(simulation, name, seed, labels, samples)) if again else seconds
 
-    _seconds(stage, seed, labels, 1)  # compiles the kernel
+    _seconds(simulation, name, seed, labels, 1)  # compiles the kernel
     launch, samples = once(1), max(1, _REHEARSED // lanes)
     longest = once(samples) if samples > 1 else launch
     least = longest / samples

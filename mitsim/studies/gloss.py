@@ -23,7 +23,7 @@ from scipy import sparse
 from mitsim.core.arrays import FloatArray
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.light.light import SampledLight
-from mitsim.light.passes import TRAYS, FiledLight
+from mitsim.light.light_estimate import LightEstimate
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.reconstruct.solver import Prepared, Solution
 from mitsim.report.exposures import RENDERED, LitScene, Unexposed
@@ -96,9 +96,8 @@ def split(frames: Unexposed, twin: LitScene, seconds: float) -> Split:
 def direct_of(light: SampledLight) -> SampledLight:
     """A ``light`` without what was followed over several surfaces."""
 
-    def without(part: FiledLight) -> FiledLight:
-        dark = {name: sparse.csr_array(getattr(part, name).shape) for name in ("smooth", "followed")}
-        return replace(part, **dark)
+    def without(part: LightEstimate) -> LightEstimate:
+        return part.with_light({name: sparse.csr_array(part[name].shape) for name in ("indirect", "indirect_residual")})
 
     return replace(light, groups=tuple(without(group) for group in light.groups))
 
@@ -113,7 +112,8 @@ def as_bright(matt: SampledLight, glossy: SampledLight) -> SampledLight:
     rows = sparse.diags_array(np.append(ratio, 1.0))  # the last row is ambient light
     matt = direct_of(matt)
     groups = (
-        replace(each, **{tray: sparse.csr_array(rows @ getattr(each, tray)) for tray in TRAYS}) for each in matt.groups
+        each.with_light({grid: sparse.csr_array(rows @ light) for grid, light in each.light.items()})
+        for each in matt.groups
     )
     return replace(matt, groups=tuple(groups))
 

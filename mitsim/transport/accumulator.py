@@ -80,10 +80,6 @@ class Lit:
         return sparse.csr_array((light[layout.data], layout.indices, layout.indptr), shape=layout.shape)
 
 
-LitSums = tuple[Lit, npt.NDArray[np.uint64]]
-"""Which sums of a ledger hold light, and these: of corner, a tenth of its ledger's memory."""
-
-
 class _Held:
     """Sums on the device of so many ``lines``, those of an entry side by side: a path brings light of every line to one
     entry, and memory that is not at hand is fetched once for all of them."""
@@ -276,47 +272,63 @@ class Ledger:
         amount = dr.select(fits, mi.UInt64(dr.round(units)), mi.UInt64(1))
         dr.scatter_reduce(dr.ReduceOp.Add, self.sums, amount, index, active, mode=dr.ReduceMode.Direct)
 
-    def filed(self, counted: LitSums | None = None, samples: int = 1) -> tuple[sparse.csr_array, float, float]:
+    def filed(self, samples: int = 1) -> tuple[sparse.csr_array, float, float]:
+        """As :meth:`DeviceSums.light` of so many ``samples``, of the sums that are there, which are fetched."""
+        return fetched((self,))[0].light(samples)
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceSums:
+    """Sums of one ledger on the host: what a pass brought in all its samples.
+
+    Attributes
+    ----------
+    ledger
+        that held them.
+    lit
+        which of its sums hold light: of corner, a tenth of its ledger's memory.
+    units
+        these sums.
+    """
+
+    ledger: Ledger
+    lit: Lit
+    units: npt.NDArray[np.uint64]
+
+    def light(self, samples: int = 1) -> tuple[sparse.csr_array, float, float]:
         """(rows + lamps, places) light per sample, the last rows empty; all that was received, and what lay outside
         [W m^-2].
 
         Parameters
         ----------
-        counted
-            sums that were :func:`fetched`; None: those that are there, which are fetched.
         samples
-            that they are of.
+            that the sums are of.
 
         Raises
         ------
         MitsimError
-            where light is NaN, infinite, or four million times ``one``.
+            where light is NaN, infinite, or four million times what is bright.
         """
-        lit, units = counted or fetched((self,))[0]
-        if len(lit.numbers) and lit.numbers[-1] == self._rows * self._width and units[-1]:
+        lit, units, ledger = self.lit, self.units, self.ledger
+        if len(lit.numbers) and lit.numbers[-1] == ledger._rows * ledger._width and units[-1]:
             raise MitsimError(
                 "the scene reflects NaN, infinite or boundless light toward the camera; check its materials"
             )
-        light = units.astype(np.float64) * (self._unit / samples)
+        light = units.astype(np.float64) * (ledger._unit / samples)
         return lit.matrix(light), float(light.sum()), float(light[lit.inside :].sum())
 
-    def beyond(self, counted: LitSums, samples: int = 1) -> FloatArray:
-        """(rows, anchors, anchors) light from beyond all cells per sample [W m^-2].
-
-        Parameters
-        ----------
-        counted, samples
-            as for :meth:`filed`.
-        """
-        (lit, units), anchors = counted, self._bundle.anchors
+    def beyond(self, samples: int = 1) -> FloatArray:
+        """(rows, anchors, anchors) light from beyond all cells per sample, of so many ``samples`` [W m^-2]."""
+        lit, ledger = self.lit, self.ledger
+        rows, anchors = ledger._rows, ledger._bundle.anchors
         # Its last one counts what is no light.
-        found = np.zeros(self._rows * anchors**2 + 1)
-        found[lit.numbers[lit.inside :] - np.uint32(self._rows * self._bundle.size)] = units[lit.inside :]
-        by_row = np.moveaxis(found[:-1].reshape(anchors, anchors, self._rows), 2, 0)
-        return np.asarray(by_row * (self._unit / samples))
+        found = np.zeros(rows * anchors**2 + 1)
+        found[lit.numbers[lit.inside :] - np.uint32(rows * ledger._bundle.size)] = self.units[lit.inside :]
+        by_row = np.moveaxis(found[:-1].reshape(anchors, anchors, rows), 2, 0)
+        return np.asarray(by_row * (ledger._unit / samples))
 
 
-def fetched(ledgers: Sequence[Ledger]) -> list[LitSums]:
+def fetched(ledgers: Sequence[Ledger]) -> list[DeviceSums]:
     """The sums of ``ledgers`` of one kind, one for each line, on the host; they are empty then.
 
     Which sums hold light is told of all together, as it is nearly the same of each.
@@ -328,4 +340,4 @@ def fetched(ledgers: Sequence[Ledger]) -> list[LitSums]:
     for ledger in ledgers:
         ledger._held.empty()
     found = Lit(np.array(lit), first._rows, first._bundle.size, first._bundle.lamps)
-    return [(found, np.array(each)) for each in units]
+    return [DeviceSums(ledger, found, np.array(each)) for ledger, each in zip(ledgers, units, strict=True)]

@@ -49,8 +49,8 @@ def frame_at(write: Callable[..., Path], scale: float) -> np.ndarray:
     bench = open_bench(scaled_scene(write, scale), for_render=True)
     simulation = Simulation(bench, replace(SCALED, depth=Z * scale))
     uniform = Lighting.uniform(N)
-    found = simulation.file_direct(simulation.direct.trace(1, 0, 64), uniform.labels, 64)
-    found = found + simulation.file_followed(simulation.follow(1, 64), uniform.labels, 64)
+    found = simulation.accumulate("direct", simulation.direct.trace(1, 0, 64), uniform.labels, 64)
+    found = found + simulation.accumulate("indirect", simulation.follow(1, 64), uniform.labels, 64)
     return next(iter(simulation.expected([found], np.arange(1), uniform, 0))).irradiance
 
 

@@ -21,7 +21,8 @@ from mitsim.core import parallel
 from mitsim.core.exr import read_frame
 from mitsim.light import light
 from mitsim.light.light import trace_light
-from mitsim.light.settings import GROUPS, LOOKS, Changes, Part, Settings
+from mitsim.light.pilot_result import LOOKS, Changes, Part
+from mitsim.light.settings import GROUPS, Settings
 from mitsim.optics import frames
 from mitsim.planner import pilot_direct, pilot_samples
 from mitsim.planner.planner import make_plan
@@ -178,7 +179,7 @@ def test_light_does_not_depend_on_how_many_paths_are_held_at_once(
     bench = open_bench(small_scene("chunks"), for_render=True)
     lighting = bench.family("dots:2").lighting
     plan = make_plan(bench, lighting, 5e-2, 3, {"diffraction": False})
-    plan = replace(plan, settings=Settings(plan.settings.depth, direct_samples=16), sampling_target=1e9)
+    plan = replace(plan, settings=Settings(plan.settings.depth, samples={"direct": 16}), sampling_target=1e9)
     found, trace, counts = [], DirectTracer.trace, list[int]()
     monkeypatch.setattr(
         DirectTracer, "trace", lambda self, seed, first, count: counts.append(count) or trace(self, seed, first, count)

@@ -62,7 +62,7 @@ def answer(bench: Bench, shots: Lighting, depth: float, seed: int, effort: Effor
     for group in range(GROUPS):
         parts = [
             stage.file(stage.tracer.trace(integer(seed, name, group), 0, count), shots.labels, count)
-            for name, stage in simulation.tracers().items()
+            for name, stage in simulation.passes.items()
             for count in [counts.get(name, effort.other)]
         ]
         groups.append(sum(parts[1:], parts[0]))

@@ -57,7 +57,7 @@ def ambient_frame(bench: Bench, samples: int = 8, anchors: int = 3, interreflect
     settings = Settings(depth=400.0, anchors=anchors, effects=frozenset(on))
     simulation = Simulation(bench, settings)
     uniform = Lighting.uniform(bench.n)
-    light = simulation.file_followed(simulation.from_camera.trace(5, 0, samples), uniform.labels, samples)
+    light = simulation.accumulate("indirect", simulation.from_camera.trace(5, 0, samples), uniform.labels, samples)
     dark = Lighting(uniform.labels, 0 * uniform.weights)
     return next(iter(simulation.expected([light], np.zeros(1, np.int64), dark, 0))).irradiance
 

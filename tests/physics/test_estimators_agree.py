@@ -68,9 +68,9 @@ class Pair:
         simulation = self.light.simulation
         groups = self.light.groups
         kinds = (
-            (simulation.fine.optics, [group.fine for group in groups]),
-            (simulation.coarse.optics, [group.coarse for group in groups]),
-            (simulation.smooth.optics, [group.smooth for group in groups]),
+            (simulation.grids["fine"].optics, [group["fine"] for group in groups]),
+            (simulation.grids["anchor_residual"].optics, [group["anchor_residual"] for group in groups]),
+            (simulation.grids["indirect"].optics, [group["indirect"] for group in groups]),
         )
         total = np.zeros_like(self.factored)
         for optics, parts in kinds:

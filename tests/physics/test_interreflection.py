@@ -97,7 +97,7 @@ def factored(scene: Path, spp: int, seed: int) -> Measured:
         one, more = (
             [
                 stage.file(stage.tracer.trace(own, 0, count), lighting.labels, count)
-                for name, stage in simulation.tracers().items()
+                for name, stage in simulation.passes.items()
                 if name in names
             ]
             for names, count in ((("direct", "anchored"), samples), (("indirect",), 64 * samples))

@@ -187,7 +187,7 @@ def factored_frame(path: Path, light: np.ndarray) -> np.ndarray:
 
     simulation = Simulation(open_bench(path), Settings(depth=Z, subdivision=4))
     labels = np.arange(light.size)
-    groups = [simulation.file_direct(simulation.direct.trace(seed, 0, 16), labels, 16) for seed in range(4)]
+    groups = [simulation.accumulate("direct", simulation.direct.trace(seed, 0, 16), labels, 16) for seed in range(4)]
     lighting = Lighting(labels, light.reshape(1, -1))
     return next(iter(simulation.expected(groups, labels, lighting, 0))).irradiance
 

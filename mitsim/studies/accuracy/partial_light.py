@@ -25,6 +25,7 @@ the mask); light of sharp lobes is not moved, and indirect light stays where it 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from types import MappingProxyType
@@ -37,11 +38,14 @@ from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.light.light import SampledLight, traced_again
-from mitsim.light.passes import TRAYS, FiledLight, Simulation, Stage, Tray, expected_of
+from mitsim.light.light_estimate import LightEstimate
+from mitsim.light.pass_table import PASSES
+from mitsim.light.passes import Simulation, TracedPass, expected_of
 from mitsim.light.settings import Settings
 from mitsim.light.truth import Truth
 from mitsim.optics.frames import ClassFrames, ExpectedFrames
 from mitsim.scene.projector import straightening
+from mitsim.transport.accumulator import DeviceSums
 from mitsim.transport.coordinates import rows_columns, turn_and_origin
 from mitsim.transport.integrator import ANY, FollowingTracer
 from mitsim.transport.projector import CanvasMap
@@ -67,8 +71,6 @@ REGISTERED = MappingProxyType(
 """Effects of :data:`mitsim.bench.effects.EFFECTS` that a name stands for."""
 _MOVED = frozenset({KEYSTONE, DEPTH, DETAIL, DEFOCUS})
 """Effects on where light lies, for which it is filed anew."""
-_DIRECT = ("direct", "anchored", "occluded", "sharp")
-"""Stages of direct light; all others follow it further."""
 _FURTHER = frozenset({"interreflection", "mirrors", "ambient"})
 _WHOLE = "pixels that are lit all over"
 """Beside :data:`DETAIL`, where nothing moves or hides a pixel's points."""
@@ -124,7 +126,8 @@ class Anatomy:
         by_pixel = np.divide(flux, direct.flux, out=np.ones_like(flux), where=direct.flux > 0)
         groups = tuple(_scaled(group, np.append(by_pixel * self._brightness(off), 0.0)) for group in direct.groups)
         if GLOSS in off:
-            groups = tuple(replace(group, sharp=_even_lobes(group.sharp, direct.simulation)) for group in groups)
+            sharp = (_even_lobes(group["sharp"], direct.simulation) for group in groups)
+            groups = tuple(group.with_light({"sharp": own}) for group, own in zip(groups, sharp, strict=True))
         simulation = self._simulated(_formed(direct.simulation.settings, off, bench.loaded.glossy))
         own = {field.name: getattr(self.light, field.name) for field in fields(SampledLight)}
         own |= {"groups": groups, "simulation": simulation}
@@ -143,7 +146,8 @@ class Anatomy:
         else:
             lamps = np.append(np.zeros(len(brightness) - 1), 1.0)
             groups = tuple(
-                replace(_scaled(group, brightness), fine=_weighted(group.fine, lamps)) for group in light.groups
+                _scaled(group, brightness).with_light({"fine": _weighted(group["fine"], lamps)})
+                for group in light.groups
             )
         plain = replace(settings, anchors=1, sharp=None, occluded=(), effects=effects)
         return replace(light, groups=groups, simulation=self._simulated(plain))
@@ -202,19 +206,21 @@ class _Filing(Simulation):
         super().__init__(bench, settings)
         self._only_direct, self._off, self._place = direct, off, _Place(bench)
 
-    def tracers(self) -> dict[str, Stage]:
-        return {name: stage for name, stage in super().tracers().items() if (name in _DIRECT) == self._only_direct}
+    @cached_property
+    def passes(self) -> Mapping[str, TracedPass]:
+        return {name: each for name, each in super().passes.items() if each.row.even == self._only_direct}
 
-    def file_direct(self, deposits: Deposits, labels: Labels, samples: int) -> FiledLight:
+    def accumulate(self, name: str, found: Deposits | DeviceSums, labels: Labels, samples: int) -> LightEstimate:
+        if isinstance(found, DeviceSums) or not (name == "direct" or PASSES[name].anchors):
+            return super().accumulate(name, found, labels, samples)
+        if name != "direct":
+            return super().accumulate(name, self._place.moved(found, self._off), labels, samples)
         if _WHOLE in self._off:
-            side = _POINTS * self.settings.subdivision
-            return super().file_direct(self._place.whole(deposits, side, KEYSTONE in self._off), labels, samples)
-        if DETAIL in self._off:
-            deposits = _even(deposits, self.bench.n**2)
-        return super().file_direct(self._place.moved(deposits, self._off), labels, samples)
-
-    def _beyond_mean(self, tray: Tray, deposits: Deposits, labels: Labels, samples: int) -> sparse.csr_array:
-        return super()._beyond_mean(tray, self._place.moved(deposits, self._off), labels, samples)
+            seen = self._place.whole(found, _POINTS * self.settings.subdivision, KEYSTONE in self._off)
+        else:
+            even = _even(found, self.bench.n**2) if DETAIL in self._off else found
+            seen = self._place.moved(even, self._off)
+        return replace(super().accumulate(name, seen, labels, samples), flux=self.flux(found, samples))
 
 
 class _Place:
@@ -293,7 +299,7 @@ def _present(light: SampledLight) -> dict[str, bool]:
         DEPTH: _off_plane(light),
         OCCLUSION: bool(settings.with_own_anchors),
         DETAIL: settings.subdivision > 1,
-        INTERREFLECTION: physics.interreflection and any(group.smooth.nnz for group in light.groups),
+        INTERREFLECTION: physics.interreflection and any(group["indirect"].nnz for group in light.groups),
         MIRRORS: physics.mirrors,
         GLOSS: bench.loaded.glossy and (settings.anchors > 1 or settings.sharp is not None),
         AMBIENT: bool(physics.lamps),
@@ -332,7 +338,8 @@ def _even_lobes(sharp: sparse.csr_array, simulation: Simulation) -> sparse.csr_a
     """``sharp`` light that every anchor of a ``simulation`` sees as in the mean over the sensor."""
     if simulation.settings.sharp is None:
         return sharp
-    bundle, weights = simulation.sharp.bundle, simulation.sharp_weights
+    bundle = simulation.grids["sharp"].bundle
+    weights = simulation.mean_weights(bundle.anchors)
     rows, columns = bundle.cells
     layer, place = np.divmod(np.arange(bundle.size), bundle.anchors**2 * rows * columns)
     line, spot = np.divmod(place, bundle.anchors * columns)
@@ -343,9 +350,9 @@ def _even_lobes(sharp: sparse.csr_array, simulation: Simulation) -> sparse.csr_a
     return bundle.repeated(sparse.csr_array(sharp @ mean))
 
 
-def _scaled(light: FiledLight, by: FloatArray) -> FiledLight:
+def _scaled(light: LightEstimate, by: FloatArray) -> LightEstimate:
     """``light`` whose rows are multiplied ``by`` (rows,)."""
-    return replace(light, **{name: _weighted(getattr(light, name), by) for name in TRAYS})
+    return light.with_light({name: _weighted(each, by) for name, each in light.light.items()})
 
 
 def _weighted(rows: sparse.csr_array, by: FloatArray) -> sparse.csr_array:
@@ -378,12 +385,13 @@ class OfOrders(Simulation):
         super().__init__(bench, settings)
         self._orders = fewest, most
 
-    def tracers(self) -> dict[str, Stage]:
-        """Those that follow light, by the name of their stage."""
+    @cached_property
+    def passes(self) -> Mapping[str, TracedPass]:
+        """Those that follow light, by name."""
         found = {}
-        for name, stage in super().tracers().items():
-            if isinstance(stage.tracer, FollowingTracer):
-                found[name] = replace(stage, tracer=stage.tracer.of_orders(*self._orders))
+        for name, each in super().passes.items():
+            if isinstance(each.tracer, FollowingTracer):
+                found[name] = replace(each, tracer=each.tracer.of_orders(*self._orders))
         return found
 
     def glint_frames(self, labels: Labels) -> ClassFrames | None:

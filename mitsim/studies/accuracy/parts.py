@@ -18,10 +18,12 @@ from mitsim.bench.bench import Apparatus
 from mitsim.bench.effects import EFFECTS, Physics, names, present
 from mitsim.bench.request import Exposure
 from mitsim.core.arrays import FloatArray
-from mitsim.light.light import SampledLight, first_samples, traced_again
+from mitsim.light.light import SampledLight, traced_again
 from mitsim.light.passes import Simulation
+from mitsim.light.pilot_result import LOOKS, Changes, Part
 from mitsim.light.plan import Plan
-from mitsim.light.settings import GROUPS, LOOKS, Changes, Estimate, Part, Settings
+from mitsim.light.rounds import first_samples
+from mitsim.light.settings import GROUPS, Estimate, Settings
 from mitsim.metrics import relative_error
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.planner.choose import predicted
@@ -378,7 +380,7 @@ class Orders:
         if last == 1:
             plain = replace(settings, effects=settings.effects - {PARENT})
             simulation = OfOrders(bench, plain, 0, MOST)
-            if not simulation.tracers():
+            if not simulation.passes:
                 return lambda: 0.0
             self._light(simulation, dict.fromkeys(self._samples, 1))  # compiles its kernels
         else:

@@ -18,11 +18,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 
@@ -33,7 +32,8 @@ from mitsim.bench.request import Request
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.core.runs import Capture
-from mitsim.light.settings import Settings, whole
+from mitsim.light.pass_table import PASSES
+from mitsim.light.settings import Settings
 from mitsim.planner.memory import frame_seconds
 from mitsim.report import plots
 from mitsim.sensor.chain import electrons_from_irradiance
@@ -234,10 +234,7 @@ class Runs:
 
 def _begun_with(settings: Settings) -> Settings:
     """The same ``settings`` with the samples that are taken: parts of one are as good as a whole one."""
-    end = "_samples"
-    named = (each.name for each in fields(settings) if each.name.endswith(end))
-    taken: dict[str, Any] = {name: float(whole(name.removesuffix(end), getattr(settings, name))) for name in named}
-    return replace(settings, **taken)
+    return replace(settings, samples={row.name: float(row.whole(row.predicted(settings))) for row in PASSES.values()})
 
 
 def _listed(accuracies: Sequence[float]) -> str:

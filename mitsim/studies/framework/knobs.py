@@ -15,9 +15,11 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.devices.patterns import PatternFamily
 from mitsim.light.light import SampledLight, Sampling, Target, trace_light
+from mitsim.light.pass_table import PASSES
 from mitsim.light.passes import Simulation
+from mitsim.light.pilot_result import COUNTED, Evidence, Part
 from mitsim.light.plan import Plan
-from mitsim.light.settings import COUNTED, Evidence, Part, Settings
+from mitsim.light.settings import Settings
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.planner import pilot
 from mitsim.planner.choose import counted
@@ -46,17 +48,8 @@ def at_once(expected: ExpectedFrames) -> float:
 
 def sampled(settings: Settings, samples: int) -> Settings:
     """``settings`` whose first round takes so many ``samples`` of a projector pixel and of a cell in each group."""
-    each = float(samples)
-    return replace(
-        settings,
-        direct_samples=each,
-        anchored_samples=each / 8,
-        indirect_samples=each,
-        from_camera_samples=each,
-        followed_samples=each / 8,
-        followed_from_camera_samples=each / 8,
-        occluded_samples=each / 8,
-    )
+    each = {name: samples / 8 if row.anchors else float(samples) for name, row in PASSES.items() if name != "sharp"}
+    return replace(settings, samples={**settings.samples, **each})
 
 
 def reformed(light: SampledLight, absent: frozenset[str]) -> SampledLight:

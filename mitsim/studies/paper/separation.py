@@ -133,14 +133,14 @@ def _weights(model: Prepared, measured: Measured) -> Accumulator:
 def global_truth(light: SampledLight) -> FloatArray:
     """(n, n) what a ``light`` that bounced looks like under uniform light: in each direction that the calibrated window
     has a pixel in, over the board's light there."""
-    bench, tray = light.bench, light.simulation.smooth.bundle
-    cells = np.asarray(sum(group.smooth.sum(axis=0) for group in light.groups)) / len(light.groups)
-    shape = len(tray.rows.centres), len(tray.columns.centres)
-    density = cells.reshape(-1, *shape).sum(axis=0) / (tray.rows.width * tray.columns.width)
+    bench, grid = light.bench, light.simulation.grids["indirect"].bundle
+    cells = np.asarray(sum(group["indirect"].sum(axis=0) for group in light.groups)) / len(light.groups)
+    shape = len(grid.rows.centres), len(grid.columns.centres)
+    density = cells.reshape(-1, *shape).sum(axis=0) / (grid.rows.width * grid.columns.width)
     windows = [np.linspace(*edges, bench.n + 1) for edges in bench.windows]
     rows, columns = ((edges[1:] + edges[:-1]) / 2 for edges in windows)
     seen = RegularGridInterpolator(
-        (tray.rows.centres, tray.columns.centres), density, bounds_error=False, fill_value=None
+        (grid.rows.centres, grid.columns.centres), density, bounds_error=False, fill_value=None
     )(np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1))
     area = np.outer(*(np.diff(edges) for edges in windows))
     return np.asarray(seen * area / light.apparent.board_flux.reshape(bench.n, bench.n))

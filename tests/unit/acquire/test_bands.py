@@ -239,11 +239,11 @@ def test_a_look_is_at_few_rays_of_four_shots(monkeypatch: pytest.MonkeyPatch) ->
             asked.update(rows=list(rows), lighting=lighting, leaking=leaking)
             return [SimpleNamespace(irradiance=np.full((2, 2), float(number))) for number in range(2)]
 
-        def file(found: Any, of_labels: Any, rays: int) -> Any:
+        def accumulate(name: str, found: Any, of_labels: Any, rays: int) -> Any:
             asked.update(filed=(found, rays), labels=of_labels)
             return "filed"
 
-        return SimpleNamespace(direct=SimpleNamespace(trace=trace), file_direct=file, expected=expected)
+        return SimpleNamespace(direct=SimpleNamespace(trace=trace), accumulate=accumulate, expected=expected)
 
     monkeypatch.setattr(bands, "Simulation", simulation)
     of: Any = SimpleNamespace(

@@ -23,8 +23,9 @@ from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum
 from mitsim.devices.sensor import EfficiencyCurve, MosaicCurves
 from mitsim.devices.session import load_recipe
+from mitsim.light.grids import Grid
 from mitsim.light.light import SampledLight
-from mitsim.light.passes import Simulation, Tray
+from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
 from mitsim.light.truth import Truth
 from mitsim.optics.frames import Frame
@@ -181,7 +182,7 @@ def test_lamps_are_seen_by_each_pixel_through_its_filter(shared_scene: Callable[
             none[:1], none[:1], none[:1], place[3:4], place[5:6], place[:1] * 0 + 0.0025, np.array([unit]),
             np.full(1, DIRECT, np.int16),
         )  # fmt: skip
-        filed = simulation.file_followed(Deposits.joined([lamps, spot]), none[:1].repeat(n**2), 1)
+        filed = simulation.accumulate("indirect", Deposits.joined([lamps, spot]), none[:1].repeat(n**2), 1)
         plan: Any = SimpleNamespace(settings=settings)
         zeros = np.zeros(n**2)
         truth = Truth(np.zeros((n, n)), np.zeros((n, n)), np.ones(n**2), 1)
@@ -191,8 +192,10 @@ def test_lamps_are_seen_by_each_pixel_through_its_filter(shared_scene: Callable[
     lighting = Lighting(none[:1].repeat(n**2), np.ones((1, 1)))
     expected = np.zeros(seen.geometry.frame_shape)
     for band, spectrum in enumerate(spectra):
-        row = lights[0].groups[0].fine[[1 + band]].tocsr()
-        alone = Tray(lights[0].simulation.fine.bundle, seen.geometry, spectrum).optics.frame(row.indices, row.data)
+        row = lights[0].groups[0]["fine"][[1 + band]].tocsr()
+        alone = Grid(lights[0].simulation.grids["fine"].bundle, seen.geometry, spectrum).optics.frame(
+            row.indices, row.data
+        )
         for a, b in [divmod(plane, 2) for plane in responses[band // 4].planes]:
             # Of unit irradiance of the first line, one electron a photon of the projector's wavelength.
             scale = 1 / (units[0][1] * parts[band] * seen.projector.effective_wavelength_nm)

@@ -415,7 +415,9 @@ def test_sampling_stops_at_its_target(bench: Bench) -> None:
     for light, target in zip((loose, tight), targets, strict=True):
         assert light.reached and len(light.groups) == GROUPS
         assert target / 4 < light.sampling_error <= target
-        assert all((a.fine != b.fine).nnz for a, b in combinations(light.groups, 2)), "groups have to be independent"
+        assert all((a["fine"] != b["fine"]).nnz for a, b in combinations(light.groups, 2)), (
+            "groups have to be independent"
+        )
     # The error falls at least with the square root of the paths, and not faster than with the paths themselves.
     gain, cost = loose.sampling_error / tight.sampling_error, tight.paths / loose.paths
     assert 0.7 * gain < cost < 1.5 * gain**2

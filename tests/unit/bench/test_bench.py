@@ -76,7 +76,7 @@ def test_the_board_faces_the_camera_wherever_it_stands(small_scene: Callable[...
 
     def light(which: Bench) -> np.ndarray:
         simulation = Simulation(which, Settings(depth=400.0, subdivision=2))
-        return simulation.file_direct(simulation.direct.trace(4, 0, 4), np.arange(16**2), 4).fine.toarray()
+        return simulation.accumulate("direct", simulation.direct.trace(4, 0, 4), np.arange(16**2), 4)["fine"].toarray()
 
     board, known = light(bench.with_board(0.9)), light(sheet)
     assert known.sum() > 0

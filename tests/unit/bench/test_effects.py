@@ -64,8 +64,8 @@ def frame(bench: Bench, *names: str) -> np.ndarray:
     """A half-bright shot of direct and followed light, by the same paths whatever effects are on."""
     simulation = Simulation(bench, Settings(depth=Z, effects=frozenset(names)))
     labels = np.zeros(N * N, dtype=np.int64)
-    light = simulation.file_direct(simulation.direct.trace(3, 0, 8), labels, 8)
-    light = light + simulation.file_followed(simulation.follow(3, 4), labels, 4)
+    light = simulation.accumulate("direct", simulation.direct.trace(3, 0, 8), labels, 8)
+    light = light + simulation.accumulate("indirect", simulation.follow(3, 4), labels, 4)
     (shot,) = simulation.expected([light], np.zeros(1, dtype=np.int64), Lighting(labels, np.array([[0.5]])), 0)
     return shot.irradiance
 

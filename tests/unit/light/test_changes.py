@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mitsim.light.settings import LOOKS, Changes, Noise, Part, even
+from mitsim.light.pass_table import even
+from mitsim.light.pilot_result import LOOKS, Changes, Noise, Part
 from tests.unit.planner.invented_evidence import EVIDENCE, SIZES, changes, plan, rows
 
 

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.light.passes import FiledLight, Simulation
+from mitsim.light.light_estimate import LightEstimate
+from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings, SharpPixels
 from mitsim.transport.accumulator import fetched
 
@@ -26,10 +27,9 @@ SETTINGS = Settings(
     layers=(400.0, 350.0, 310.0),
     coarse_layers=True,
     subdivision=2,
-    anchored_samples=SAMPLES,
     # A window that holds most of the light of these pixels, and not all.
     sharp=SharpPixels(tuple(range(50, 200, 7)), 3, (-0.03, 0.05, -0.03, 0.05)),
-    sharp_samples=1000.0,
+    samples={"anchor_residual": SAMPLES, "sharp": 1000.0},
 )
 
 
@@ -39,48 +39,42 @@ def bench(shared_scene: Callable[..., Path], variant: str) -> Bench:
     return open_bench(shared_scene("ball", n=N, pitch=0.1, extra=BALL), variant, for_render=True)
 
 
-def both(simulation: Simulation, name: str, labels: np.ndarray) -> tuple[FiledLight, FiledLight, list[np.ndarray]]:
-    """Light of a stage by the host and by the device, and the flux of its pixels by both."""
-    stage = simulation.tracers()[name]
-    deposits = stage.trace(3, 0, SAMPLES)
-    (ledger,) = stage.ledgers(labels, 1)
-    rest = stage.trace(3, 0, SAMPLES, (ledger,))
+def both(simulation: Simulation, name: str, labels: np.ndarray) -> tuple[LightEstimate, LightEstimate]:
+    """Light of a pass by the host and by the device."""
+    each = simulation.passes[name]
+    deposits, ledgers = each.trace(3, 0, SAMPLES), simulation.ledgers(name, labels, 1)
+    rest = each.trace(3, 0, SAMPLES, ledgers)
     assert not len(rest.value) and len(deposits.value) > 1000
-    (counted,) = fetched((ledger,))
-    assert stage.file_ledger is not None
-    device = stage.file_ledger(ledger, counted, labels, SAMPLES)
-    flux = [simulation.flux(deposits, SAMPLES)]
-    if name == "sharp":
-        flux.append(simulation.sharp_flux(ledger, counted, SAMPLES))
-    return stage.file(deposits, labels, SAMPLES), device, flux
+    (sums,) = fetched(ledgers)
+    host, device = (simulation.accumulate(name, found, labels, SAMPLES) for found in (deposits, sums))
+    return host, device
 
 
-@pytest.mark.parametrize(("name", "tray"), [("anchored", "coarse"), ("sharp", "sharp")])
-def test_the_device_files_what_the_host_does(bench: Bench, name: str, tray: str) -> None:
+@pytest.mark.parametrize("name", ["anchor_residual", "sharp"])
+def test_the_device_adds_up_what_the_host_does(bench: Bench, name: str) -> None:
     """Light between layers and between cells is split, not drawn. (Planted: rows and columns of anchors exchanged; the
     nearer layer's part for the farther; the first cell of two alone; what lies outside filed as the first anchor's;
     pixels' rows for classes'.)"""
     labels = np.random.default_rng(1).integers(0, 5, N * N)
-    host, device, flux = both(Simulation(bench, SETTINGS), name, labels)
-    expected, found = (getattr(light, tray).toarray() for light in (host, device))
+    host, device = both(Simulation(bench, SETTINGS), name, labels)
+    expected, found = (light[name].toarray() for light in (host, device))
     assert found.shape == expected.shape and np.count_nonzero(expected) > 500
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=2e-5 * np.abs(expected).max())
     assert np.abs(found - expected).sum() < 2e-5 * np.abs(expected).sum()
     if name == "sharp":
         assert 0 < host.outside < 0.5 * host.received
         assert (device.received, device.outside) == pytest.approx((host.received, host.outside), rel=1e-5)
-        np.testing.assert_allclose(flux[1], flux[0], rtol=1e-5, atol=1e-7 * flux[0].max())
+        np.testing.assert_allclose(device.flux, host.flux, rtol=1e-5, atol=1e-7 * host.flux.max())
 
 
 def test_few_paths_for_many_cells_are_left_to_the_host(bench: Bench) -> None:
     """A ledger would be mostly empty. (Planted: always a ledger.)"""
     labels = np.arange(N * N) % 49
-    few = replace(SETTINGS, anchored_samples=1.0, sharp_samples=1.0)
-    stages = Simulation(bench, few).tracers()
-    assert stages["anchored"].ledgers(labels, 1) == () == stages["sharp"].ledgers(labels, 1)
-    many = replace(SETTINGS, anchored_samples=1000.0, sharp_samples=1000.0)
-    stages = Simulation(bench, many).tracers()
-    assert len(stages["anchored"].ledgers(labels, 3)) == 3 == len(stages["sharp"].ledgers(labels, 3))
+    names = "anchor_residual", "sharp"
+    few = Simulation(bench, replace(SETTINGS, samples=dict.fromkeys(names, 1.0)))
+    many = Simulation(bench, replace(SETTINGS, samples=dict.fromkeys(names, 1000.0)))
+    assert all(few.ledgers(name, labels, 1) == () for name in names)
+    assert all(len(many.ledgers(name, labels, 3)) == 3 for name in names)
 
 
 def test_the_middle_of_the_sharpest_lobe_is_light(bench: Bench, variant: str) -> None:
@@ -95,7 +89,7 @@ def test_the_middle_of_the_sharpest_lobe_is_light(bench: Bench, variant: str) ->
     brightest = math.pi * float(np.max(np.array(lobe.eval(mi.BSDFContext(), square, mi.Vector3f(0, 0, 1)))))
     assert brightest > 2e7
     board = tracer.receiver.of_board(tracer.rays)
-    (ledger,) = simulation.coarse_ledgers(np.zeros(N * N, dtype=np.int64), 1)
+    (ledger,) = simulation.ledgers("anchor_residual", np.zeros(N * N, dtype=np.int64), 1)
     for place, light in enumerate([10 * brightest * board, 1e-5 * board]):
         ledger.add(mi.Float(light), mi.UInt32(0), mi.UInt32(place), mi.Bool(True))
     filed, *_ = ledger.filed()

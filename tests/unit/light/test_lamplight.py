@@ -30,7 +30,8 @@ from mitsim.core.spectral_manifests import MOSAIC, RUN
 from mitsim.devices.lamps import SPECTRA_NM, Lamplight, Response
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum
-from mitsim.light.passes import Simulation, Tray
+from mitsim.light.grids import Grid
+from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
 from mitsim.transport.from_camera import FromCameraTracer, LampTracer, Paths, Together
 from mitsim.transport.records import Deposits
@@ -128,7 +129,7 @@ def traced(folder: str) -> list[dict[str, Any]]:
         mirrored = Together(FromCameraTracer(*parts, Paths(mirrors=True)), simulation.from_camera)
         both = mirrored.trace(0, 0, SAMPLES).by_line(len(LINES)) if lamp == "flat" else []
         labels = np.zeros(whole.n**2, dtype=np.int64)
-        filed = [simulation.file_followed(look.by_line(3)[2], labels, SAMPLES).fine for look in looks[:1]]
+        filed = [simulation.accumulate("indirect", look.by_line(3)[2], labels, SAMPLES)["fine"] for look in looks[:1]]
         found.append(
             {
                 "lines": np.array(lines).tolist(),
@@ -279,11 +280,11 @@ def test_the_mask_diffracts_each_band_by_its_own_wavelengths(small_scene: Callab
         spot = Deposits(
             none + bench.n**2 + band, none, none, place, place, place / 8, np.ones(1), none.astype(np.int16)
         )
-        light = simulation.file_followed(spot, labels, 1)
+        light = simulation.accumulate("indirect", spot, labels, 1)
         expected = simulation.expected([light], labels[:1], Lighting.uniform(bench.n).shots([0]), 0)
-        alone = Tray(simulation.fine.bundle, bench.geometry, spectrum).optics
+        alone = Grid(simulation.grids["fine"].bundle, bench.geometry, spectrum).optics
         found = expected.projector_off.irradiance
-        row = light.fine[[1 + band]].tocsr()
+        row = light["fine"][[1 + band]].tocsr()
         assert np.allclose(found, alone.frame(row.indices, row.data), rtol=1e-12, atol=1e-15 * found.max())
         frames.append(found)
     assert np.linalg.norm(frames[0] - frames[3]) > 0.05 * np.linalg.norm(frames[0])

@@ -21,8 +21,9 @@ from mitsim.devices.patterns import Lighting, parse_patterns
 from mitsim.light import light as module
 from mitsim.light.light import SampledLight, Sampling, trace_light
 from mitsim.light.passes import Simulation
+from mitsim.light.pilot_result import Evidence
 from mitsim.light.plan import Plan
-from mitsim.light.settings import GROUPS, Evidence, Settings
+from mitsim.light.settings import GROUPS, Settings
 from mitsim.optics.frames import ExpectedFrames, monte_carlo_error
 from mitsim.planner import choose, memory, planner
 from mitsim.planner.choose import Choice
@@ -58,7 +59,7 @@ def stacked(frames: ExpectedFrames) -> np.ndarray:
 
 def test_by_pixel_and_by_class_are_the_same_light(bench: Bench, plan: Plan, family: Lighting) -> None:
     pixel, group = (trace_light(bench, plan, family, 3, Sampling(by_pixel=by_pixel)) for by_pixel in (True, False))
-    assert pixel.groups[0].fine.shape[0] == N * N + 1 and group.groups[0].fine.shape[0] == 16 + 1
+    assert pixel.groups[0].rows == N * N + 1 and group.groups[0].rows == 16 + 1
     assert np.allclose(stacked(pixel.frames(family, 0)), stacked(group.frames(family, 0)), rtol=1e-9)
     assert pixel.sampling_error == pytest.approx(group.sampling_error, rel=1e-6)
     assert np.allclose(pixel.flux, group.flux) and pixel.paths == group.paths
@@ -167,8 +168,9 @@ def test_light_that_needs_less_than_a_sample_takes_one_and_every_round_grows(
         return (1.1 * target, 1.2 * target) if len(looks) < 3 else (0.0, 0.0)
 
     monkeypatch.setattr(ExpectedFrames, "sampling_error", told)
-    settings = replace(plan.settings, effects=frozenset(FAR), direct_samples=0.1, indirect_samples=3.0)
-    settings = replace(settings, followed_anchors=2, followed_samples=0.5, followed_from_camera_samples=0.02)
+    samples = {"direct": 0.1, "indirect": 3.0, "indirect_residual": 0.5, "camera_residual": 0.02}
+    samples = {**plan.settings.samples, **samples}
+    settings = replace(plan.settings, effects=frozenset(FAR), followed_anchors=2, samples=samples)
     wanted, kept = [], module._trace
     monkeypatch.setattr(module, "_trace", lambda groups, samples: wanted.append(samples) or kept(groups, samples))
     assert trace_light(bench, replace(plan, settings=settings), family, 3).reached
@@ -244,11 +246,11 @@ def test_light_that_is_divided_lies_where_it_lay(bench: Bench, plan: Plan) -> No
     """Bit for bit SciPy's own quotient. (Planted: copied places; light over the count, which is not SciPy's.)"""
     simulation = Simulation(bench, plan.settings)
     labels = np.arange(N * N) % 5
-    light = simulation.file_direct(simulation.direct.trace(3, 0, 16), labels, 16)
+    light = simulation.accumulate("direct", simulation.direct.trace(3, 0, 16), labels, 16)
     divided = light / 3
-    np.testing.assert_array_equal(divided.fine.toarray(), (light.fine / 3).toarray())
-    assert np.shares_memory(divided.fine.indices, light.fine.indices)
-    assert np.shares_memory(divided.fine.indptr, light.fine.indptr)
+    np.testing.assert_array_equal(divided["fine"].toarray(), (light["fine"] / 3).toarray())
+    assert np.shares_memory(divided["fine"].indices, light["fine"].indices)
+    assert np.shares_memory(divided["fine"].indptr, light["fine"].indptr)
     assert divided.received == light.received / 3
 
 
@@ -380,9 +382,12 @@ def test_a_heavy_path_in_a_shot_that_is_not_checked_is_seen() -> None:
 def test_paces_are_measured_of_what_was_chosen_alone(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """Direct light and its anchors, of a machine that takes 0.1 us a path; other kinds keep what they had. (Planted:
     seconds of a sample, not of a path.)"""
-    monkeypatch.setattr(planner, "_seconds", lambda stage, seed, labels, samples: 1e-7 * stage.tracer.lanes * samples)
+    monkeypatch.setattr(
+        planner, "_seconds", lambda made, name, seed, labels, samples: 1e-7 * made.passes[name].tracer.lanes * samples
+    )
     simulation = Simulation(bench, Settings(depth=400.0, anchors=2))
     timed = planner._timed(EVIDENCE, simulation, np.arange(bench.n**2), 0)
-    for name in ("direct", "anchored"):
-        assert getattr(timed, name).seconds == pytest.approx(1e-7)
-    assert timed.indirect == EVIDENCE.indirect and timed.followed == EVIDENCE.followed
+    for name in ("direct", "anchor_residual"):
+        assert timed.efforts[name].seconds == pytest.approx(1e-7)
+    for name in ("indirect", "indirect_residual"):
+        assert timed.efforts[name] == EVIDENCE.efforts[name]

@@ -16,9 +16,11 @@ from mitsim.api.light import Light
 from mitsim.bench.effects import EFFECTS
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import Lighting
+from mitsim.light.grids import GRIDS
 from mitsim.light.light import Sampling, trace_light
+from mitsim.light.light_estimate import LightEstimate
 from mitsim.light.light_file import write_light
-from mitsim.light.passes import TRAYS, FiledLight, Simulation
+from mitsim.light.passes import Simulation
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Settings, SharpPixels
 from mitsim.planner.planner import make_plan
@@ -64,12 +66,12 @@ def some_light(bench: Bench) -> Light:
         occluded_anchors=4,
     )
     simulation, rng = Simulation(bench, settings), np.random.default_rng(11)
-    sizes = {name: getattr(simulation, name).bundle.size for name in TRAYS}
+    sizes = {name: grid.bundle.size for name, grid in simulation.grids.items()}
 
     def some(size: int) -> sparse.csr_array:
         return sparse.random_array((N**2 + 1, size), density=3 / size, format="csr", rng=rng)
 
-    groups = tuple(FiledLight(**{name: some(size) for name, size in sizes.items()}) for _ in range(GROUPS))
+    groups = tuple(LightEstimate({name: some(size) for name, size in sizes.items()}) for _ in range(GROUPS))
     plan = Plan(0.1, (), 1.0, settings, 0.1, 0.0, 0.0, ())
     return Light(groups, simulation, plan, 4, np.arange(N**2), np.ones(N**2), np.ones(N**2), 1, 0.02, True)
 
@@ -91,7 +93,7 @@ def test_a_file_gives_the_frame_of_any_pattern(light: Light, tmp_path: Path) -> 
     of_groups = np.sqrt(np.square(alone).sum(axis=0) / (GROUPS * (GROUPS - 1)))
     assert np.abs(error - of_groups).max() < 1e-5 * of_groups.max()
     with h5py.File(path) as file:
-        assert set(file) == {"light", "ambient", "glint"} and set(file["light"]) == set(TRAYS)
+        assert set(file) == {"light", "ambient", "glint"} and set(file["light"]) == {row.key for row in GRIDS.values()}
         assert (file.attrs["n"], file.attrs["pixels"], file.attrs["groups"]) == (N, 64, GROUPS)
         assert file.attrs["black_level"] == pytest.approx(1 / 50)
         assert file["glint"].attrs["shape"].tolist() == [N**2, 64**2] and len(file["glint/data"]) > 100

@@ -9,8 +9,9 @@ import pytest
 from mitsim.bench.effects import EFFECTS, SWITCHES
 from mitsim.bench.request import check_accuracy
 from mitsim.core.errors import MitsimError
+from mitsim.light.pilot_result import Drawn, Part
 from mitsim.light.plan import Plan
-from mitsim.light.settings import Drawn, Estimate, Part
+from mitsim.light.settings import Estimate
 from tests.unit.planner.invented_evidence import ACCURACIES, EVIDENCE, FACTS, ONE_CLASS, SIZES, changes, plan, rows
 
 

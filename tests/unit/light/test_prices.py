@@ -1,30 +1,31 @@
 """What simulating is predicted to take: multiplications counted by hand, and the pilot's own frame found again."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 
 from mitsim.light.cost_model import (
     FIXED,
     Numbers,
-    Paces,
+    UnitCosts,
     checking_seconds,
     entries,
     filing_seconds,
     forming_seconds,
     optics_seconds,
-    paces_of,
     tracing_seconds,
     truth_seconds,
+    unit_costs_of,
 )
-from mitsim.light.settings import GROUPS, Effort, Forming, Noise, Settings
+from mitsim.light.pilot_result import Effort, Forming, Noise
+from mitsim.light.settings import GROUPS, Settings
 from mitsim.optics.frames import PROBES
 from tests.unit.planner.invented_evidence import EVIDENCE, plan
 
 FORMING = Forming(pixels=50, cells=10, lit=0.5, terms=3.0, shots=4, classes=4)
 ONE = Numbers.coarsest()
-COUNTED = Paces(**{**{pace.name: 0.0 for pace in fields(Paces)}, "product": 1.0})
-"""Paces at which seconds are multiplications of forming frames."""
+COUNTED = UnitCosts(dict.fromkeys(FIXED.passes, 0.0), frame=0.0, product=1.0, entry=0.0, filed=0.0, ray=0.0)
+"""Unit costs at which seconds are multiplications of forming frames."""
 
 
 def products(rows: float, terms: float = 1.0) -> float:
@@ -35,19 +36,24 @@ def products(rows: float, terms: float = 1.0) -> float:
 
 def test_the_frame_that_the_pilot_measured_takes_what_it_took() -> None:
     measured = replace(EVIDENCE, forming=replace(EVIDENCE.forming, seconds=0.125))
-    assert forming_seconds(measured.forming, ONE, 1.0, paces_of(measured)) == pytest.approx(0.125, rel=1e-12)
+    assert forming_seconds(measured.forming, ONE, 1.0, unit_costs_of(measured)) == pytest.approx(0.125, rel=1e-12)
     none = replace(
-        EVIDENCE, direct=replace(EVIDENCE.direct, seconds=0.0), forming=replace(EVIDENCE.forming, seconds=0.0)
+        EVIDENCE.with_efforts({"direct": replace(EVIDENCE.efforts["direct"], seconds=0.0)}),
+        forming=replace(EVIDENCE.forming, seconds=0.0),
     )
-    assert paces_of(none).direct == FIXED.direct and paces_of(none).product == FIXED.product
-    slower = {name: getattr(paces_of(measured), name) / getattr(FIXED, name) for name in ("frame", "entry", "filed")}
-    assert slower == pytest.approx(dict.fromkeys(slower, paces_of(measured).product / FIXED.product))
+    assert (
+        unit_costs_of(none).passes["direct"] == FIXED.passes["direct"] and unit_costs_of(none).product == FIXED.product
+    )
+    slower = {
+        name: getattr(unit_costs_of(measured), name) / getattr(FIXED, name) for name in ("frame", "entry", "filed")
+    }
+    assert slower == pytest.approx(dict.fromkeys(slower, unit_costs_of(measured).product / FIXED.product))
     timed = replace(measured, forming=replace(measured.forming, product=FIXED.product / 6))
-    assert forming_seconds(timed.forming, ONE, 1.0, paces_of(timed)) == pytest.approx(0.125, rel=1e-12)
-    assert paces_of(timed).product == FIXED.product / 6, "large products are not slower because small frames are"
-    assert paces_of(timed).entry == pytest.approx(FIXED.entry / 6)
-    other = replace(EVIDENCE, direct=replace(EVIDENCE.direct, seconds=5e-6))
-    assert paces_of(other).direct == 5e-6
+    assert forming_seconds(timed.forming, ONE, 1.0, unit_costs_of(timed)) == pytest.approx(0.125, rel=1e-12)
+    assert unit_costs_of(timed).product == FIXED.product / 6, "large products are not slower because small frames are"
+    assert unit_costs_of(timed).entry == pytest.approx(FIXED.entry / 6)
+    other = EVIDENCE.with_efforts({"direct": replace(EVIDENCE.efforts["direct"], seconds=5e-6)})
+    assert unit_costs_of(other).passes["direct"] == 5e-6
 
 
 @pytest.mark.parametrize(
@@ -58,10 +64,10 @@ def test_the_frame_that_the_pilot_measured_takes_what_it_took() -> None:
         ({"layers": 2.0}, 2 * products(5, 3)),
         ({"cells": 4.0}, products(20, 3)),
         ({"anchors": 2.0, "coarse_cells": 2.0}, products(5, 3) + products(20, 3)),
-        ({"anchors": 2.0, "layers": 3.0, "coarse_layers": 3.0}, 3 * products(5, 3) + 3 * products(10, 3)),
+        ({"anchors": 2.0, "layers": 3.0, "all_layers": 1.0}, 3 * products(5, 3) + 3 * products(10, 3)),
         ({"indirect": 1.0, "coarse_cells": 2.0}, products(5, 3) + products(20, 3)),
         ({"followed_anchors": 3.0, "coarse_cells": 2.0}, products(5, 3) + products(60, 3)),
-        ({"followed_anchors": 3.0, "followed_width": 2.0, "coarse_layers": 3.0}, products(5, 3) + products(15, 3)),
+        ({"followed_anchors": 3.0, "followed_width": 2.0, "all_layers": 1.0}, products(5, 3) + products(15, 3)),
         ({"occluded": 1.0, "occluded_anchors": 4.0}, products(5, 3) + products(2, 3)),
         ({"occluded": 90.0, "occluded_anchors": 4.0, "coarse_cells": 2.0}, products(5, 3) + products(40, 3)),
         ({"mixed": 1.0}, products(5, 3) + 4 * 50**2),
@@ -104,30 +110,31 @@ def test_shadows_take_entries_of_waves_or_a_thirtieth_of_one_without() -> None:
         ({"cells": 2.0, "layers": 2.0}, 4 * 3 * one),
         ({"anchors": 2.0, "coarse_cells": 2.0}, (1 + 2) * 3 * one),
         ({"anchors": 2.0, "indirect": 1.0}, (1 + 2) * 3 * one),
-        ({"followed_anchors": 2.0, "followed_width": 4.0, "coarse_layers": 3.0}, (1 + 0.25) * 3 * one),
+        ({"followed_anchors": 2.0, "followed_width": 4.0, "all_layers": 1.0}, (1 + 0.25) * 3 * one),
     ):
         assert optics_seconds(FORMING, replace(ONE, **change), entries) == pytest.approx(count), change
 
 
 def test_tracing_takes_a_path_of_every_sample_in_every_group_and_connections_to_all_anchors() -> None:
     """Samples are whole; differences between 3 x 3 anchors take nine connections each, and one anchor has none."""
-    settings = replace(plan().settings, direct_samples=2.5, anchored_samples=4.0)
-    paces, paths = replace(COUNTED, direct=1.0, anchored=1.0), EVIDENCE.direct.paths
-    several, one = (tracing_seconds(EVIDENCE, replace(settings, anchors=count), paces) for count in (3, 1))
+    settings = replace(plan().settings, samples={"direct": 2.5, "anchor_residual": 4.0})
+    costs, paths = replace(COUNTED, passes=dict.fromkeys(FIXED.passes, 1.0)), EVIDENCE.efforts["direct"].paths
+    several, one = (tracing_seconds(EVIDENCE, replace(settings, anchors=count), costs) for count in (3, 1))
     assert several["direct"] == one["direct"] == GROUPS * 3 * paths
-    assert several["anchored"] == 9 * GROUPS * 4 * EVIDENCE.anchored.paths and one["anchored"] == 0
-    occluded = replace(EVIDENCE, occluded=(3, 4, 5), occluded_light=Effort(Noise(1e-3, 4, 0.5), 3))
-    own = replace(settings, occluded=(3, 4, 5), occluded_anchors=8, occluded_samples=2.0)
-    assert tracing_seconds(occluded, own, replace(COUNTED, occluded=1.0))["occluded"] == 64 * GROUPS * 2 * 3
-    assert tracing_seconds(occluded, settings, replace(COUNTED, occluded=1.0))["occluded"] == 0
+    anchored = 9 * GROUPS * 4 * EVIDENCE.efforts["anchor_residual"].paths
+    assert several["anchor_residual"] == anchored and one["anchor_residual"] == 0
+    light = Effort(Noise(1e-3, 4, 0.5), 3)
+    occluded = replace(EVIDENCE, occluded=(3, 4, 5)).with_efforts({"penumbra": light})
+    own = replace(settings, occluded=(3, 4, 5), occluded_anchors=8, samples={"penumbra": 2.0})
+    assert tracing_seconds(occluded, own, costs)["penumbra"] == 64 * GROUPS * 2 * 3
+    assert tracing_seconds(occluded, settings, costs)["penumbra"] == 0
 
 
 def test_light_lies_in_the_cells_that_its_samples_reach() -> None:
     """100 pixels, 7 classes. Direct light: a pixel's own cells and as many beyond its edge, in two layers at most; what
     several anchors see, and twice of it: of each and their mean; followed light: all cells of each class."""
-    settings = Settings(
-        depth=400.0, direct_samples=3.0, anchored_samples=50.0, indirect_samples=1e3, followed_samples=20.0
-    )
+    samples = {"direct": 3.0, "anchor_residual": 50.0, "indirect": 1e3, "indirect_residual": 20.0}
+    settings = Settings(depth=400.0, samples=samples)
     for numbers, found in (
         (ONE, 2),
         (replace(ONE, cells=2.0), 3),
@@ -135,7 +142,7 @@ def test_light_lies_in_the_cells_that_its_samples_reach() -> None:
         (replace(ONE, anchors=2.0, coarse_cells=2.0), 2 + 2 * 2**2 * 2 * 4),
         (replace(ONE, indirect=1.0, coarse_cells=2.0), 2 + 7 * 2**2),
         (replace(ONE, followed_anchors=2.0, coarse_cells=4.0), 2 + 2 * 2**2 * 2 * 20),
-        (replace(ONE, followed_anchors=4.0, followed_width=2.0, coarse_layers=3.0), 2 + 2 * 4**2 * 7 / 2**2),
+        (replace(ONE, followed_anchors=4.0, followed_width=2.0, all_layers=1.0), 2 + 2 * 4**2 * 7 / 2**2),
     ):
         assert entries(100, 7, numbers, settings) == 100 * found, numbers
 
@@ -170,7 +177,7 @@ def test_lines_share_paths_and_form_and_file_each_its_own() -> None:
 
 def test_a_ledger_is_emptied_and_looked_through_where_it_has_room() -> None:
     """4 classes of 20 x 20 cells in two layers, where light is followed over several surfaces."""
-    numbers = replace(ONE, indirect=1.0, coarse_cells=2.0, coarse_layers=2.0)
+    numbers = replace(ONE, indirect=1.0, coarse_cells=2.0, layers=2.0)
     places = 4 * 20**2 * 2
     entry = GROUPS * FIXED.filed
     assert filing_seconds(FORMING, numbers, 1000.0, FIXED) == pytest.approx(entry * (1000 + 0.4 * places))

@@ -8,19 +8,19 @@ from typing import Any
 import pytest
 
 from mitsim.light.cost_model import FIXED, SHARED_COST
-from mitsim.light.light import _Sampled, cheapest_samples, first_samples, next_samples
-from mitsim.light.settings import EVEN, even
+from mitsim.light.pass_table import EVEN, even
+from mitsim.light.rounds import SampledPass, cheapest_samples, first_samples, next_samples
 from mitsim.transport.path_reuse import NeighbourTracer
 
 LIGHTS = (
-    _Sampled("direct", 24, 0.165, 3.0),
-    _Sampled("anchored", 1, 0.015, 8.0),
-    _Sampled("indirect", 59, 0.5, 2.0),
-    _Sampled("indirect at anchors", 3, 0.23, 15.0),
+    SampledPass("direct", 24, 0.165, 3.0),
+    SampledPass("anchor_residual", 1, 0.015, 8.0),
+    SampledPass("indirect", 59, 0.5, 2.0),
+    SampledPass("indirect_residual", 3, 0.23, 15.0),
 )
 
 
-def left(light: _Sampled, samples: int) -> float:
+def left(light: SampledPass, samples: int) -> float:
     """By hand: 1 / N, but for direct light, whose 2^k samples are better than 3 * 2^k."""
     if light.name != "direct":
         return light.variance * light.done / samples
@@ -56,23 +56,23 @@ def test_a_heavy_path_makes_its_own_light_grow() -> None:
 
     (Planted: each given its part by Lagrange, though it has more.)
     """
-    shares = ("direct", 32, 0.03, 20.0), ("indirect", 57, 0.95, 2.0), ("occluded", 6, 0.02, 20.0)
-    more = ("from_camera", 9, 0.0, 20.0), ("indirect at anchors", 9, 0.0001, 20.0)
-    lights = [_Sampled(*share) for share in (*shares, *more)]
+    shares = ("direct", 32, 0.03, 20.0), ("indirect", 57, 0.95, 2.0), ("penumbra", 6, 0.02, 20.0)
+    more = ("from_camera", 9, 0.0, 20.0), ("indirect_residual", 9, 0.0001, 20.0)
+    lights = [SampledPass(*share) for share in (*shares, *more)]
     found = cheapest_samples(lights, 1 / 6)
     grown = math.ceil(57 * 0.95 / (1 / 6 - 0.0501))
-    assert found == {"direct": 32, "indirect": grown, "occluded": 6, "from_camera": 9, "indirect at anchors": 9}
+    assert found == {"direct": 32, "indirect": grown, "penumbra": 6, "from_camera": 9, "indirect_residual": 9}
 
 
 def test_where_nothing_is_enough_all_grow_as_far_as_they_may() -> None:
-    lights = [_Sampled("direct", 24, 0.5, 3.0), _Sampled("indirect", 10, 0.5, 2.0)]
+    lights = [SampledPass("direct", 24, 0.5, 3.0), SampledPass("indirect", 10, 0.5, 2.0)]
     assert cheapest_samples(lights, 0.0) == {"direct": 192, "indirect": 80}
 
 
 def simulated(**tracers: tuple[Any, float]) -> Any:
     """A simulation of these tracers, with predicted samples."""
-    stages = {name: SimpleNamespace(tracer=tracer, predicted=count) for name, (tracer, count) in tracers.items()}
-    return SimpleNamespace(tracers=lambda: stages)
+    passes = {name: SimpleNamespace(tracer=tracer, predicted=count) for name, (tracer, count) in tracers.items()}
+    return SimpleNamespace(passes=passes)
 
 
 def of_lanes(lanes: int) -> Any:
@@ -107,15 +107,13 @@ def test_work_is_that_of_paths_at_fixed_paces() -> None:
     the one of less work grows. (Planted: one pace for all, shared light counted once.)"""
     shared = NeighbourTracer.__new__(NeighbourTracer)
     shared.turns, shared.projector = None, SimpleNamespace(n=8)  # type: ignore[assignment]
-    cheap, dear = shared.lanes * SHARED_COST * FIXED.indirect, 100 * FIXED.from_camera
+    cheap, dear = shared.lanes * SHARED_COST * FIXED.passes["indirect"], 100 * FIXED.passes["from_camera"]
     simulation = simulated(indirect=(shared, 1.0), from_camera=(of_lanes(100), 1.0))
     found = next_samples(
         simulation, dict.fromkeys(("indirect", "from_camera"), 1000), {"indirect": 1, "from_camera": 1}, 1.5
     )
     assert found["indirect"] / found["from_camera"] == pytest.approx(math.sqrt(dear / cheap), rel=2e-3)
-    simulation = simulated(**{"from camera at anchors": (of_lanes(100), 1.0), "from_camera": (of_lanes(100), 1.0)})
-    found = next_samples(
-        simulation, dict.fromkeys(simulation.tracers(), 1000), dict.fromkeys(simulation.tracers(), 1), 1.5
-    )
-    ratio = math.sqrt(FIXED.from_camera / FIXED.followed_from_camera)
-    assert found["from camera at anchors"] / found["from_camera"] == pytest.approx(ratio, rel=2e-3)
+    simulation = simulated(**{"camera_residual": (of_lanes(100), 1.0), "from_camera": (of_lanes(100), 1.0)})
+    found = next_samples(simulation, dict.fromkeys(simulation.passes, 1000), dict.fromkeys(simulation.passes, 1), 1.5)
+    ratio = math.sqrt(FIXED.passes["from_camera"] / FIXED.passes["camera_residual"])
+    assert found["camera_residual"] / found["from_camera"] == pytest.approx(ratio, rel=2e-3)

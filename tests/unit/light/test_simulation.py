@@ -10,7 +10,7 @@ import pytest
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.effects import EFFECTS
 from mitsim.devices.patterns import Lighting
-from mitsim.light.passes import AT_ANCHORS, Simulation
+from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions
@@ -56,8 +56,8 @@ def simulation(bench: Bench, *effects: str, **settings: object) -> Simulation:
 def uniform(made: Simulation, samples: int = 8, weight: float = 1.0) -> np.ndarray:
     """The frame of one capture with every pixel alike."""
     labels = np.zeros(N * N, dtype=np.int64)
-    light = made.file_direct(made.direct.trace(3, 0, samples), labels, samples)
-    light = light + made.file_followed(made.follow(3, 4), labels, 4)
+    light = made.accumulate("direct", made.direct.trace(3, 0, samples), labels, samples)
+    light = light + made.accumulate("indirect", made.follow(3, 4), labels, 4)
     (frame,) = made.expected([light], np.zeros(1, dtype=np.int64), Lighting(labels, np.array([[weight]])), 0)
     return frame.irradiance
 
@@ -91,7 +91,7 @@ def test_neutral_parts(bench: Bench) -> None:
         and off.physics.spectrum is None
         and off.glint_frames(np.zeros(N * N, dtype=np.int64)) is None
     )
-    assert set(off.tracers()) == {"direct"}
+    assert set(off.passes) == {"direct"}
 
 
 def test_a_plan_says_how_large_the_spots_of_a_lens_are(bench: Bench) -> None:
@@ -143,20 +143,21 @@ def test_ambient_light_is_in_a_dark_capture(bench: Bench) -> None:
 
 def test_indirect_light_goes_to_its_own_cells(bench: Bench) -> None:
     made = simulation(bench, "interreflection", "ambient", subdivision=2, coarse_cells=1)
-    assert made.fine.bundle.cells == (2 * made.smooth.bundle.cells[0], 2 * made.smooth.bundle.cells[1])
+    assert made.grids["fine"].bundle.cells == tuple(2 * count for count in made.grids["indirect"].bundle.cells)
     labels = np.zeros(N * N, dtype=np.int64)
     found = made.follow(1, 64)
-    light = made.file_followed(found, labels, 64)
+    light = made.accumulate("indirect", found, labels, 64)
     kinds = {kind: found.value[found.kind == kind].sum() / 64 for kind in (0, 2)}
-    assert light.fine[[1]].sum() == pytest.approx(kinds[0], rel=0.02) and not light.fine[[0]].nnz
-    assert light.smooth.sum() == pytest.approx(kinds[2], rel=0.02) and not light.coarse.nnz
+    assert light["fine"][[1]].sum() == pytest.approx(kinds[0], rel=0.02) and not light["fine"][[0]].nnz
+    assert light["indirect"].sum() == pytest.approx(kinds[2], rel=0.02) and not light["anchor_residual"].nnz
 
 
 def test_anchors_file_only_what_differs_from_the_mean(bench: Bench) -> None:
     """Weighed by the mean anchor weights, what is filed for single anchors adds up to nothing."""
     made = simulation(bench, anchors=2)
-    light = made.file_anchored(made.anchored.trace(2, 0, 4), np.zeros(N * N, dtype=np.int64), 4).coarse
-    rows, columns = made.coarse.bundle.cells
+    seen = made.anchored.trace(2, 0, 4)
+    light = made.accumulate("anchor_residual", seen, np.zeros(N * N, dtype=np.int64), 4)["anchor_residual"]
+    rows, columns = made.grids["anchor_residual"].bundle.cells
     found = light[[0]].toarray().reshape(2, rows, 2, columns)
     weights = [0.5, 0.5]  # linear interpolation, over the sensor
     assert np.abs(np.einsum("a,b,aybx->yx", weights, weights, found)).max() < 1e-12 and np.abs(found).max() > 1e-12
@@ -165,22 +166,23 @@ def test_anchors_file_only_what_differs_from_the_mean(bench: Bench) -> None:
 def test_followed_lights_mean_and_its_anchors_make_one_frame(bench: Bench) -> None:
     """With the same light at all anchors nothing is left beyond the mean; ambient light is seen from random points."""
     made = simulation(bench, "interreflection", "mirrors", "ambient", followed_anchors=2)
-    stages = made.tracers()
-    assert set(stages) == {"direct", "indirect", "from_camera", *AT_ANCHORS}
+    residuals = "indirect_residual", "camera_residual"
+    assert set(made.passes) == {"direct", "indirect", "from_camera", *residuals}
     labels = np.zeros(N * N, dtype=np.int64)
-    assert (stages[AT_ANCHORS[1]].tracer.trace(1, 0, 16).kind == AMBIENT).any()
+    assert (made.passes[residuals[1]].tracer.trace(1, 0, 16).kind == AMBIENT).any()
     rng = np.random.default_rng(1)
     number, place = rng.integers(0, 2, (3, 200)), rng.uniform(-0.14, 0.14, (2, 200))
     found = Deposits(0 * number[0], *number[:2], *place, np.full(200, 1 / Z), rng.random(200), 1 + number[2])
-    light = made.file_at_anchors(found, labels, 16).followed[[0]].toarray()
-    rows, columns = made.followed.bundle.cells
+    light = made.accumulate("indirect_residual", found, labels, 16)["indirect_residual"][[0]].toarray()
+    rows, columns = made.grids["indirect_residual"].bundle.cells
     weights = [0.5, 0.5]
     assert np.abs(np.einsum("a,b,aybx->yx", weights, weights, light.reshape(2, rows, 2, columns))).max() < 1e-12
     one = found.where((found.anchor_row == 0) & (found.anchor_column == 0))
     same = [
         replace(one, anchor_row=one.anchor_row + a, anchor_column=one.anchor_column + b) for a, b in np.ndindex(2, 2)
     ]
-    assert np.abs(made.file_at_anchors(Deposits.joined(same), labels, 16).followed.data).max(initial=0) < 1e-15
+    light = made.accumulate("indirect_residual", Deposits.joined(same), labels, 16)["indirect_residual"]
+    assert np.abs(light.data).max(initial=0) < 1e-15
     ambient = [made.from_camera.trace(seed, 0, 64) for seed in range(2)]
     assert all((one.kind == AMBIENT).any() for one in ambient)
 

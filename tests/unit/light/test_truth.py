@@ -159,7 +159,7 @@ def test_it_shares_no_error_with_the_frames(bench: Bench, printed: np.ndarray) -
     """Correlation over 256 pixels, with as many samples of each, below 4 / 16. (Planted: the frames' streams.)"""
     lighting = parse_patterns("dots:4", N).lighting
     plan = make_plan(bench, lighting, 1e-2, 0, dict.fromkeys(EFFECTS, False))
-    plan = replace(plan, settings=replace(plan.settings, direct_samples=float(module.TRUTH_SAMPLES)))
+    plan = replace(plan, settings=replace(plan.settings, samples={"direct": float(module.TRUTH_SAMPLES)}))
     light = trace_light(bench, plan, lighting, 3, Sampling(by_pixel=False, target=lambda _: np.inf))
     assert light.paths == GROUPS * N**2 * module.TRUTH_SAMPLES, "the first round is what was predicted"
     found, answer = trace_truth(bench, plan.settings, 3, np.full(N * N, np.inf)), exact(printed / 255)

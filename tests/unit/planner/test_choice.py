@@ -8,7 +8,8 @@ import pytest
 
 from mitsim.bench.effects import parse_switches
 from mitsim.light.cost_model import FIXED, Numbers, entries
-from mitsim.light.settings import GROUPS, LOOKS, Changes, Effort, Evidence, Noise, Part, Settings, SharpPixels
+from mitsim.light.pilot_result import LOOKS, Changes, Effort, Evidence, Noise, Part
+from mitsim.light.settings import GROUPS, Settings, SharpPixels
 from mitsim.planner.choose import cheapest, doubt, parts_of, predicted
 from mitsim.planner.pilot import stage_of
 from tests.unit.planner.invented_evidence import (
@@ -151,17 +152,21 @@ def test_nothing_is_worth_knowing_where_no_luck_would_keep_the_accuracy() -> Non
 @pytest.mark.parametrize("accuracy", [1e-3, 1e-4, 1e-6])
 def test_no_light_is_asked_for_that_cannot_be_held(accuracy: float) -> None:
     """Of 49 classes indirect light lies in all cells of each: 2^25 entries a group are 12 GB. (Planted: no limit.)"""
-    settings, pixels = cheapest(accuracy, EVIDENCE, {}).settings, EVIDENCE.direct.paths
+    settings, pixels = cheapest(accuracy, EVIDENCE, {}).settings, EVIDENCE.efforts["direct"].paths
     assert entries(pixels, 49, Numbers.of(settings), settings) <= 2**25
-    finest = replace(settings, followed_anchors=3, coarse_cells=8, indirect_samples=1e5, followed_samples=1e5)
+    samples = {**settings.samples, "indirect": 1e5, "indirect_residual": 1e5}
+    finest = replace(settings, followed_anchors=3, coarse_cells=8, samples=samples)
     assert entries(pixels, 49, Numbers.of(finest), finest) > 2**28
 
 
 def test_occluded_pixels_count_with_their_anchors() -> None:
     """Each of 100 pixels lights four places of its own for each of 16 x 16 anchors, in two layers twice as many; with
     one anchor it is a pixel like the others."""
-    pixels, few = EVIDENCE.direct.paths, replace(cheapest(1e-2, EVIDENCE, {}).settings, layers=(), coarse_layers=False)
-    own = replace(few, occluded=tuple(range(100)), occluded_anchors=16, occluded_samples=9.0)
+    pixels, few = (
+        EVIDENCE.efforts["direct"].paths,
+        replace(cheapest(1e-2, EVIDENCE, {}).settings, layers=(), coarse_layers=False),
+    )
+    own = replace(few, occluded=tuple(range(100)), occluded_anchors=16, samples={**few.samples, "penumbra": 9.0})
 
     def more(settings: Settings) -> float:
         return float(entries(pixels, 49, Numbers.of(settings), settings)) - plain
@@ -200,7 +205,7 @@ def test_light_to_random_points_of_the_sensor_has_its_own_noise() -> None:
         if factor == 1:
             assert loud == quiet
         else:
-            assert loud.settings.direct_samples > 8 * quiet.settings.direct_samples
+            assert loud.settings.samples["direct"] > 8 * quiet.settings.samples["direct"]
             assert 0.3 * loud.target < loud.noise < loud.target
 
 
@@ -222,14 +227,17 @@ def test_samples_take_the_least_work_for_the_target() -> None:
 
     N is in proportion to sqrt(v / price): the least sum of prices. Whole numbers make both a little better.
     """
-    noises = {name: Noise(0.0, 1, 0.5) for name in ("direct", "spread", "anchored", "followed")}
+    noises = {name: Noise(0.0, 1, 0.5) for name in ("direct", "anchor_residual", "indirect_residual")}
     noises["from_camera"] = Noise(3e-2, 2, 0.5)
-    evidence = replace(EVIDENCE, **{name: replace(getattr(EVIDENCE, name), noise=n) for name, n in noises.items()})
+    evidence = replace(
+        EVIDENCE.with_efforts({name: replace(EVIDENCE.efforts[name], noise=n) for name, n in noises.items()}),
+        spread=replace(EVIDENCE.spread, noise=Noise(0.0, 1, 0.5)),
+    )
     found = cheapest(1e-3, evidence, parse_switches("+interreflection"))
     settings = found.settings
-    counts = settings.indirect_samples, settings.from_camera_samples
-    variances = evidence.indirect.variance, evidence.from_camera.variance
-    prices = 16_384 * FIXED.indirect, 20_000 * FIXED.from_camera
+    counts = settings.samples["indirect"], settings.samples["from_camera"]
+    variances = evidence.efforts["indirect"].variance, evidence.efforts["from_camera"].variance
+    prices = 16_384 * FIXED.passes["indirect"], 20_000 * FIXED.passes["from_camera"]
     kinds = list(zip(variances, counts, prices, strict=True))
     assert math.sqrt(sum(v / n for v, n, _ in kinds) / GROUPS) == pytest.approx(found.target / 1.1, rel=0.01)
     assert math.sqrt(sum(v / n for v, n, _ in kinds) / GROUPS) < found.target / 1.1
@@ -244,12 +252,15 @@ def test_wide_cells_hold_light_of_many_anchors() -> None:
     wide = {Part("followed_width", width): size for width, size in {1: 0.0, 2: 5e-5, 4: 4e-4}.items()}
     followed = Effort(Noise(2e-2, 2, 0.5), 36_384)
     sizes = {part: size for part, size in SIZES.items() if part.name != "followed_anchors"} | many
-    without, found = (replace(EVIDENCE, changes=changes(each), followed=followed) for each in (sizes, sizes | wide))
+    without, found = (
+        replace(EVIDENCE, changes=changes(each)).with_efforts({"indirect_residual": followed})
+        for each in (sizes, sizes | wide)
+    )
     assert not cheapest(5e-4, without, {}).fits
     chosen = cheapest(5e-4, found, {})
     settings = chosen.settings
     assert chosen.fits and (settings.followed_anchors, settings.followed_width) == (8, 2)
-    assert entries(EVIDENCE.direct.paths, 49, Numbers.of(settings), settings) <= 2**25
+    assert entries(EVIDENCE.efforts["direct"].paths, 49, Numbers.of(settings), settings) <= 2**25
     narrow = predicted(5e-4, without, replace(settings, followed_width=1), {}).systematic.value
     assert chosen.systematic.value == pytest.approx(math.hypot(narrow, 5e-5), rel=1e-6)
     assert cheapest(1e-2, found, {}).settings.followed_width == 1, "one anchor sees nothing beyond its mean"
@@ -272,7 +283,9 @@ def test_what_interpolation_leaves_of_sharp_light_counts() -> None:
     """Points for sharp lobes leave 6e-4 of the light between them. (Planted: nothing left.)"""
     sharp = SharpPixels((3, 4), 7, (-0.1, 0.1, -0.1, 0.1), 6e-4)
     light = Effort(Noise(1e-4, 4, 0.75), 98)
-    found, exact = (replace(ONE_CLASS, sharp=each, sharp_light=light) for each in (sharp, replace(sharp, left=0.0)))
+    found, exact = (
+        replace(ONE_CLASS, sharp=each).with_efforts({"sharp": light}) for each in (sharp, replace(sharp, left=0.0))
+    )
     chosen = cheapest(1e-3, found, {})
     without = predicted(1e-3, exact, replace(chosen.settings, sharp=exact.sharp), {})
     assert chosen.fits and chosen.systematic.value == pytest.approx(math.hypot(without.systematic.value, 6e-4))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import open_bench
-from mitsim.light.light import _Group, _trace
+from mitsim.light.groups import Group, trace_groups
 from mitsim.light.passes import Simulation
 from mitsim.light.settings import LANES_AT_ONCE, Settings, SharpPixels
 from mitsim.planner.memory import deposit_bytes
@@ -54,12 +54,12 @@ def test_a_block_takes_no_more_than_is_counted(between: bool, layers: tuple[floa
 def test_rounds_beyond_the_plan_trace_no_larger_blocks_than_are_counted(
     shared_scene: Callable[..., Path], variant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    simulation = Simulation(open_bench(shared_scene("light"), variant), Settings(depth=400.0, direct_samples=2.0))
+    simulation = Simulation(open_bench(shared_scene("light"), variant), Settings(depth=400.0, samples={"direct": 2.0}))
     assert simulation.paths_at_once < LANES_AT_ONCE
     tracer, blocks = type(simulation.direct), list[int]()
     traced = tracer.trace
     monkeypatch.setattr(tracer, "trace", lambda self, *args: blocks.append(args[2]) or traced(self, *args))
     wanted = 3 * simulation.paths_at_once // simulation.direct.lanes
-    _trace([_Group(simulation, np.zeros(simulation.bench.n**2, dtype=np.int64), 3)], {"direct": wanted})
+    trace_groups([Group(simulation, np.zeros(simulation.bench.n**2, dtype=np.int64), 3)], {"direct": wanted})
     assert sum(blocks) == wanted
     assert max(blocks) * simulation.direct.lanes <= simulation.paths_at_once

@@ -81,9 +81,10 @@ def frames(bench: Bench, settings: Settings, samples: int = 32) -> np.ndarray:
     """(shots, pixels, pixels) of four shots, from the same points whatever the anchors."""
     lighting = parse_patterns("dots:3", N).lighting.shots([0, 4])
     made, light = Simulation(bench, settings), None
-    for name, stage in made.tracers().items():
+    for name, each in made.passes.items():
         count = samples if name == "direct" else samples // 8
-        filed = stage.file(stage.tracer.trace(integer(5, stage.stream == "direct"), 0, count), lighting.labels, count)
+        seen = each.tracer.trace(integer(5, each.row.stream == "direct"), 0, count)
+        filed = made.accumulate(name, seen, lighting.labels, count)
         light = filed if light is None else light + filed
     return np.stack([frame.irradiance for frame in made.expected([light], np.arange(9), lighting, 0)])
 

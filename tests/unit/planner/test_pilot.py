@@ -18,8 +18,9 @@ from mitsim.bench.effects import EFFECTS
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import parse_patterns
-from mitsim.light.passes import AT_ANCHORS, Simulation
-from mitsim.light.settings import LOOKS, Changes, Evidence, Part, Settings
+from mitsim.light.passes import Simulation
+from mitsim.light.pilot_result import LOOKS, Changes, Evidence, Part
+from mitsim.light.settings import Settings
 from mitsim.optics.frames import monte_carlo_error
 from mitsim.planner import pilot, pilot_direct, pilot_indirect, pilot_samples
 from mitsim.planner.pilot_indirect import SwitchedEffects
@@ -61,12 +62,12 @@ def frames(bench: Bench, settings: Settings, many: int = 64, other: int = 24) ->
     labels = lighting.labels
     made, counts = (
         Simulation(bench, settings),
-        {"direct": many, "anchored": many // 4, "indirect": 8 * other, "from_camera": other}
-        | dict.fromkeys(AT_ANCHORS, other),
+        {"direct": many, "anchor_residual": many // 4, "indirect": 8 * other, "from_camera": other}
+        | dict.fromkeys(("indirect_residual", "camera_residual"), other),
     )
     parts = [
-        stage.file(stage.tracer.trace(integer(77, name), 0, counts[name]), labels, counts[name])
-        for name, stage in made.tracers().items()
+        made.accumulate(name, each.tracer.trace(integer(77, each.row.stream), 0, counts[name]), labels, counts[name])
+        for name, each in made.passes.items()
     ]
     light = sum(parts[1:], parts[0])
     expected = made.expected([light], np.arange(16), lighting, 0)
@@ -98,9 +99,14 @@ def test_what_is_measured(bench: Bench, evidence: Evidence) -> None:
     assert tuple(widths) == pilot_indirect.WIDTHS and widths[1].value < widths[2].value < widths[4].value
     assert {1, 2} <= set(ladders["followed_anchors"]) <= set(pilot_indirect.FOLLOWED_LADDER)
     assert 0 < evidence.forming.seconds < 1
-    assert evidence.direct.paths == evidence.indirect.paths == N * N < evidence.from_camera.paths
-    assert evidence.followed.paths == evidence.indirect.paths
-    assert evidence.followed_from_camera.paths == evidence.from_camera.paths
+    assert (
+        evidence.efforts["direct"].paths
+        == evidence.efforts["indirect"].paths
+        == N * N
+        < evidence.efforts["from_camera"].paths
+    )
+    assert evidence.efforts["indirect_residual"].paths == evidence.efforts["indirect"].paths
+    assert evidence.efforts["camera_residual"].paths == evidence.efforts["from_camera"].paths
     assert evidence.forming.terms == len(bench.spectrum.weights)
 
 
@@ -114,7 +120,7 @@ def test_gloss_makes_noise_at_random_points_of_the_sensor(small_scene: Callable[
     bench = open_bench(small_scene(extra=gloss, pitch=0.375), variant, for_render=True)
     found, lighting = measured(bench, 1), parse_patterns("dots:4", N).lighting.shots(SHOWN)
     made = Simulation(bench, Settings(depth=found.depth, anchors=2))
-    groups = [made.file_direct(made.direct.trace(seed, 0, 16), lighting.labels, 16) for seed in range(8)]
+    groups = [made.accumulate("direct", made.direct.trace(seed, 0, 16), lighting.labels, 16) for seed in range(8)]
     actual = monte_carlo_error(made.expected(groups, np.arange(16), lighting, 0)) * 8**0.5
     assert promised(float(found.spread.noise.left(16)), actual)
     assert found.spread.noise.left(16) > 10 * found.direct.noise.left(16)
@@ -176,7 +182,9 @@ def test_wide_cells_of_followed_light_come_true(bench: Bench, evidence: Evidence
     judge = frames(bench, replace(base, coarse_cells=2, coarse_layers=True))
     wide = replace(base, coarse_cells=2, coarse_layers=True, followed_width=width)
     filed = Simulation(bench, wide)
-    assert filed.followed.bundle.grid.rows.size == pytest.approx(2 * width * filed.smooth.bundle.grid.rows.size)
+    assert filed.grids["indirect_residual"].bundle.grid.rows.size == pytest.approx(
+        2 * width * filed.grids["indirect"].bundle.grid.rows.size
+    )
     actual = change(frames(bench, wide), judge)
     assert actual > 1e-3, "the scene has to call for it"
     assert promised(evidence.ladders["followed_width"][width].value, actual)
@@ -188,7 +196,11 @@ def test_light_to_many_anchors_is_traced_in_parts(
 ) -> None:
     """All of it at once takes gigabytes. Parts of two samples make the same ladder but for the order of sums.
     (Planted: every part from the first sample on.)"""
-    monkeypatch.setattr(pilot_indirect, "_AT_ONCE", 2 * 9 * (evidence.followed.paths + evidence.from_camera.paths))
+    monkeypatch.setattr(
+        pilot_indirect,
+        "_AT_ONCE",
+        2 * 9 * (evidence.efforts["indirect_residual"].paths + evidence.efforts["from_camera"].paths),
+    )
     again = measured(bench, seed=3).ladders["followed_anchors"]
     for count, error in evidence.ladders["followed_anchors"].items():
         assert again[count] == pytest.approx(error, rel=1e-6)
@@ -234,10 +246,10 @@ def test_noise_comes_true(bench: Bench, evidence: Evidence) -> None:
     everything = frames(bench, Settings(depth=evidence.depth, subdivision=2, effects=every))
     for kind in switched:
         made = Simulation(bench, Settings(depth=evidence.depth, subdivision=2, effects=switched[kind]))
-        stage, noise = made.tracers()[kind], getattr(evidence, kind).noise
+        each, noise = made.passes[kind], evidence.efforts[kind].noise
         samples = int(noise.samples)
-        traced = [stage.tracer.trace(integer(9, kind, index), 0, samples) for index in range(6)]
-        groups = [stage.file(found, labels, samples) for found in traced]
+        traced = [each.tracer.trace(integer(9, kind, index), 0, samples) for index in range(6)]
+        groups = [made.accumulate(kind, found, labels, samples) for found in traced]
         found = [
             np.stack([frame.irradiance for frame in made.expected([light], np.arange(16), lighting, 0)])
             for light in groups
@@ -262,8 +274,8 @@ def test_frames_of_looks_are_those_that_a_capture_forms(bench: Bench, monkeypatc
     found = SwitchedEffects(bench, everything, sample, 5)
     made = Simulation(bench, everything)
     filed = [
-        made.file_direct(pilot_direct, lighting.labels, sample.direct)
-        + made.file_followed(Deposits.joined(list(pilot_indirect)), lighting.labels, sample.followed)
+        made.accumulate("direct", pilot_direct, lighting.labels, sample.direct)
+        + made.accumulate("indirect", Deposits.joined(list(pilot_indirect)), lighting.labels, sample.followed)
         for pilot_direct, *pilot_indirect in zip(found.direct, *found.followed.values(), strict=True)
     ]
     assert made.physics.lamps and made.physics.black_level and sample.shape == (5, 4) and bench.geometry.pixels > 5
@@ -279,7 +291,7 @@ def test_followed_light_of_either_side_has_its_own_noise(bench: Bench) -> None:
     sample = pilot_samples.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
     everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
     found = pilot_indirect.FollowedLight(bench, everything, sample, 0.0, 5)
-    indirect, camera = found.efforts(1.0)
+    indirect, camera = found.efforts(1.0).values()
     alone, nothing = pilot_indirect.FollowedLight(bench, everything, sample, 0.0, 5), [Deposits.none()] * LOOKS
     vars(alone)["_few_by_tracer"] = [found._few_by_tracer[0], nothing]
     assert indirect.noise.error == pytest.approx(pilot_samples.noise(alone._beyond_mean()), rel=1e-9)

@@ -9,8 +9,9 @@ import pytest
 
 from mitsim.api.bench import Bench
 from mitsim.bench.effects import EFFECTS
-from mitsim.light.cost_model import paces_of
-from mitsim.light.settings import Evidence, Part, Settings
+from mitsim.light.cost_model import unit_costs_of
+from mitsim.light.pilot_result import Evidence, Part
+from mitsim.light.settings import Settings
 from mitsim.planner.explain import SceneFacts, decide
 from mitsim.scene.guard.estimators import Unfit
 from mitsim.scene.guard.outline import Tag
@@ -125,12 +126,12 @@ FOLLOWS = replace(EVIDENCE, changes=changes(SIZES | {Part("ambient"): 5e-2}))
 
 
 def seconds(settings: Settings, evidence: Evidence = FOLLOWS) -> float:
-    return sum(stages(evidence, settings, paces_of(evidence)).values())
+    return sum(stages(evidence, settings, unit_costs_of(evidence)).values())
 
 
 def test_seconds_are_those_of_every_stage_once() -> None:
     found = plan(evidence=FOLLOWS)
-    expected = stages(FOLLOWS, found.settings, paces_of(FOLLOWS))
+    expected = stages(FOLLOWS, found.settings, unit_costs_of(FOLLOWS))
     assert found.predicted == pytest.approx(expected) and min(expected.values()) > 0
     assert found.predicted_seconds == pytest.approx(seconds(found.settings))
 

@@ -14,8 +14,9 @@ import pytest
 
 from mitsim.devices.patterns import Lighting
 from mitsim.light.cost_model import FIXED
+from mitsim.light.pilot_result import LOOKS, Effort, Noise
 from mitsim.light.plan import Plan
-from mitsim.light.settings import GROUPS, LOOKS, MOST_PATHS, Effort, Noise
+from mitsim.light.settings import GROUPS, MOST_PATHS
 from mitsim.optics.frames import bound_of
 from mitsim.planner import pilot, planner
 from mitsim.planner.choose import _BOUND_OVER_ERROR, FIRST_LOOK, Choice, _needed, cheapest
@@ -165,8 +166,9 @@ def test_paces_are_those_of_launches_as_the_run_has_them(
     a second. (Planted: the pace of the first launch alone, 4 times too slow; the slower of two launches.)"""
     at_once, machine = 2**21, Machine(disturbed)
     monkeypatch.setattr(planner, "_seconds", machine.seconds)
-    stage: Any = SimpleNamespace(tracer=SimpleNamespace(lanes=lanes))
-    pace, longest = planner._pace(stage, at_once, planned, None, SEED)  # type: ignore[arg-type]
+    each = SimpleNamespace(tracer=SimpleNamespace(lanes=lanes), whole=planned)
+    simulation: Any = SimpleNamespace(passes={"direct": each}, paths_at_once=at_once)
+    pace, longest = planner._pace(simulation, "direct", None, SEED)  # type: ignore[arg-type]
     launches = math.ceil(planned / (at_once // lanes))
     taken = GROUPS * (launches * LAUNCH_S + planned * lanes * PATH_S)
     if disturbed < 0 or taken > 1.0:
@@ -179,13 +181,14 @@ class Heavy:
     """A look at evidence whose light from the camera turns out to have noise of such a variance in a sample."""
 
     def __init__(self, variance: float, spread: float = 0.0, paths: float = 50.0) -> None:
-        self.evidence = replace(ONE_CLASS, followed_from_camera=replace(ONE_CLASS.followed, seconds=0.0))
+        residual = replace(ONE_CLASS.efforts["indirect_residual"], seconds=0.0)
+        self.evidence = ONE_CLASS.with_efforts({"camera_residual": residual})
         self.variance, self.spread, self.paths, self.looked = variance, spread, paths, list[int]()
 
     def heavy(self, samples: int) -> dict[str, Effort]:
         self.looked.append(samples)
         noise = Noise(math.sqrt(self.variance / samples), samples, 0.5, self.spread, self.paths)
-        return {"from_camera": Effort(noise, self.evidence.from_camera.paths)}
+        return {"from_camera": Effort(noise, self.evidence.efforts["from_camera"].paths)}
 
 
 def planned_with(look: Any, accuracy: float = 3e-3) -> tuple[Choice, Choice]:
@@ -198,30 +201,35 @@ def planned_with(look: Any, accuracy: float = 3e-3) -> tuple[Choice, Choice]:
 def test_rare_heavy_paths_are_sampled_from_the_first() -> None:
     """The run begins with the samples that looks at more paths ask for. (Planted: the settings stay as they were, and
     a run that meets none of these paths ends without them.)"""
-    plain = ONE_CLASS.from_camera.variance
+    plain = ONE_CLASS.efforts["from_camera"].variance
     same, unchanged = planned_with(Heavy(1.01 * plain))
     assert unchanged is same
     look = Heavy(400 * plain)
     before, after = planned_with(look)
     target = after.target
-    left = math.sqrt(look.variance / after.settings.from_camera_samples / GROUPS)
-    assert after.settings.from_camera_samples > 20 * before.settings.from_camera_samples and left < target
-    assert look.looked == sorted(look.looked) and look.looked[-1] * LOOKS * look.evidence.from_camera.paths <= 2**23
+    left = math.sqrt(look.variance / after.settings.samples["from_camera"] / GROUPS)
+    assert after.settings.samples["from_camera"] > 20 * before.settings.samples["from_camera"] and left < target
+    assert (
+        look.looked == sorted(look.looked)
+        and look.looked[-1] * LOOKS * look.evidence.efforts["from_camera"].paths <= 2**23
+    )
     _, more = planned_with(Heavy(400 * plain, spread=4.0))
-    assert more.settings.from_camera_samples > 1.02 * after.settings.from_camera_samples
+    assert more.settings.samples["from_camera"] > 1.02 * after.settings.samples["from_camera"]
     _, most = planned_with(Heavy(1e9 * plain))
-    assert most.settings.from_camera_samples * GROUPS * ONE_CLASS.from_camera.paths == pytest.approx(MOST_PATHS)
+    assert most.settings.samples["from_camera"] * GROUPS * ONE_CLASS.efforts["from_camera"].paths == pytest.approx(
+        MOST_PATHS
+    )
 
 
 def test_looks_go_on_while_few_heavy_paths_are_met() -> None:
     """To the most, whatever they say that the run takes: 5 equal paths tell little of that; 50 end them at a tenth of
     it. (Planted: looks end at a tenth whatever they met.)"""
-    plain = ONE_CLASS.from_camera.variance
+    plain = ONE_CLASS.efforts["from_camera"].variance
     many, few = Heavy(3 * plain, paths=50.0), Heavy(3 * plain, paths=5.0)
     planned_with(many)
     planned_with(few)
     assert many.looked == few.looked[: len(many.looked)] and len(few.looked) > len(many.looked)
-    assert few.looked[-1] * LOOKS * ONE_CLASS.from_camera.paths == pytest.approx(2**23, rel=0.01)
+    assert few.looked[-1] * LOOKS * ONE_CLASS.efforts["from_camera"].paths == pytest.approx(2**23, rel=0.01)
 
 
 def test_a_run_of_heavy_paths_has_a_range_of_seconds() -> None:
@@ -229,16 +237,16 @@ def test_a_run_of_heavy_paths_has_a_range_of_seconds() -> None:
     what it takes; of fewer than four, what sampling stops at. (Planted: the rest grows too; a stage that is added is
     in none of the ends.)"""
     evidence, settings = ONE_CLASS, plan(3e-3, ONE_CLASS).settings
-    settings = replace(settings, from_camera_samples=100.0)
+    settings = replace(settings, samples={**settings.samples, "from_camera": 100.0})
     planned = replace(plan(3e-3, ONE_CLASS), settings=settings)
     assert planner._range(evidence, planned) is None and planned.range_words == ""
-    pace, total = evidence.from_camera.seconds or FIXED.from_camera, planned.predicted_seconds
-    work = GROUPS * 100 * evidence.from_camera.paths * pace
+    pace, total = evidence.efforts["from_camera"].seconds or FIXED.passes["from_camera"], planned.predicted_seconds
+    work = GROUPS * 100 * evidence.efforts["from_camera"].paths * pace
 
     def ends(paths: float) -> tuple[float, float] | None:
-        light = evidence.from_camera
+        light = evidence.efforts["from_camera"]
         return planner._range(
-            replace(evidence, from_camera=replace(light, noise=replace(light.noise, heavy=paths))), planned
+            evidence.with_efforts({"from_camera": replace(light, noise=replace(light.noise, heavy=paths))}), planned
         )
 
     assert ends(20.0) == pytest.approx((total - 0.3 * work, total + 4 * work))

@@ -57,8 +57,8 @@ def filed(bench: Bench, reach: float | None, samples: int = 64) -> tuple[float, 
     """Irradiance that is filed, and that which is not."""
     made = Simulation(bench, Settings(depth=Z, anchors=3, reach=reach))
     labels = np.zeros(N * N, dtype=np.int64)
-    light = made.file_direct(made.direct.trace(5, 0, samples), labels, samples)
-    return float(light.fine.sum()), light.outside
+    light = made.accumulate("direct", made.direct.trace(5, 0, samples), labels, samples)
+    return float(light["fine"].sum()), light.outside
 
 
 def test_the_cells_hold_what_the_sensors_edge_sees_of_a_near_card(scene: Callable[..., Bench]) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from mitsim.api.bench import open_bench
 from mitsim.core.job import Job
-from mitsim.light.settings import Part
+from mitsim.light.pilot_result import Part
 from mitsim.studies.accuracy import findings
 from mitsim.studies.accuracy.findings import PartCost
 from mitsim.studies.accuracy.parts import Judge, Orders

@@ -9,8 +9,9 @@ import pytest
 
 import mitsim as ms
 from mitsim.core.arrays import FloatArray
+from mitsim.light.grids import GRIDS
 from mitsim.light.light import SampledLight, traced_again
-from mitsim.light.passes import TRAYS, Simulation
+from mitsim.light.passes import Simulation
 from mitsim.light.settings import SharpPixels
 from mitsim.report.exposures import IDEALISED, LitScene
 from mitsim.studies.accuracy import partial_light
@@ -78,8 +79,8 @@ def test_the_same_paths_are_traced_again(far: SampledLight) -> None:
     """To the renderer's float32. (Planted: another purpose's streams.)"""
     again = traced_again(far, partial_light._Filing(far.bench, far.simulation.settings, True, frozenset()))
     for own, other in zip(far.groups, again.groups, strict=True):
-        for tray in TRAYS:
-            assert abs(getattr(own, tray) - getattr(other, tray)).sum() <= 1e-6 * own.fine.sum()
+        for grid in GRIDS:
+            assert abs(own[grid] - other[grid]).sum() <= 1e-6 * own["fine"].sum()
     assert np.allclose(again.flux, far.flux, rtol=1e-6)
 
 
@@ -174,13 +175,13 @@ def test_detail_is_what_cells_of_a_pixel_differ_in(far: SampledLight) -> None:
     anatomy = Anatomy.of(far)
     off = frozenset({partial_light.DETAIL, partial_light.DEFOCUS, partial_light.DEPTH})
     even = anatomy.without(off)
-    cells = sum(group.fine for group in even.groups)[:-1]
+    cells = sum(group["fine"] for group in even.groups)[:-1]
     per_pixel = even.simulation.settings.subdivision**2
     assert per_pixel > 1
     for pixel in (0, 37, 255):
         lit = np.sort(cells[[pixel]].toarray()[0])[::-1][:per_pixel]
         assert lit.min() > 0.9 * lit.max() and lit.sum() > 0.999 * cells[[pixel]].sum()
-    uneven = sum(group.fine for group in anatomy.without(off - {partial_light.DETAIL}).groups)[:-1]
+    uneven = sum(group["fine"] for group in anatomy.without(off - {partial_light.DETAIL}).groups)[:-1]
     assert np.allclose(uneven.sum(axis=1), cells.sum(axis=1), rtol=1e-9)
     spread = [np.ptp(np.sort(light[[37]].toarray()[0])[::-1][:per_pixel]) for light in (cells, uneven)]
     assert spread[1] > 10 * spread[0]
@@ -219,11 +220,10 @@ def test_lobes_are_averaged_over_anchors_with_their_weights(far: SampledLight) -
     one, zero = np.ones(1), np.zeros(1, np.int64)
     deposits = Deposits(zero + 5, zero + 2, zero + 1, 0 * one, 0 * one, one / 400, one, np.full(1, DIRECT, np.int16))
     labels = np.arange(far.bench.n**2)
-    filed = simulation.sharp.file(deposits, labels, 1)
+    bundle = simulation.grids["sharp"].bundle
+    filed, weights = bundle.file(deposits, labels, 1), simulation.mean_weights(bundle.anchors)
     mean = partial_light._even_lobes(filed, simulation)
-    weight = simulation.sharp_weights[2] * simulation.sharp_weights[1]
-    again = simulation.sharp.bundle.repeated(
-        replace(simulation.sharp.bundle, anchors=1).file(deposits.averaged(simulation.sharp_weights), labels, 1)
-    )
+    weight = weights[2] * weights[1]
+    again = bundle.repeated(replace(bundle, anchors=1).file(deposits.averaged(weights), labels, 1))
     assert abs(mean - again).max() < 1e-12 and mean.sum() == pytest.approx(9 * weight)
     assert partial_light._even_lobes(filed, far.simulation) is filed, "nothing to average where nothing is sharp"

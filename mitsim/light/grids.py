@@ -1,0 +1,262 @@
+"""The grids that light of a bench is accumulated in: cells, anchors and layers, and the optics that form their frames.
+
+:data:`GRIDS` is the table of them, in the order in which their frames are added up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from types import MappingProxyType
+
+import numpy as np
+
+from mitsim.bench.bench import Apparatus
+from mitsim.bench.effects import Physics
+from mitsim.core.arrays import FloatArray
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.projector import Spectrum
+from mitsim.light.settings import Settings
+from mitsim.optics.image_formation import FrameOptics, anchor_positions, anchor_weights
+from mitsim.optics.shadow import Places
+from mitsim.transport.records import Bundle, CellGrid, aligned_grid
+
+_AMBIENT_NM, _AMBIENT_BANDS = (400.0, 700.0), 13
+"""Ambient light: a flat spectrum of photons over what a camera with a usual filter sees, in bands of 23 nm, over which
+a shadow's fringes hardly move."""
+_MOST_ROWS = 2**12
+"""Rows of anchors times cells of sharp light: a class that lights them all is a matrix of 128 MiB."""
+
+
+class Grid:
+    """Cells that light is accumulated in, and the optics that form its frames; the optics are prepared on first use.
+
+    Parameters
+    ----------
+    bundle
+        cells, anchors and layers.
+    geometry
+        the camera.
+    spectrum
+        light whose diffraction is simulated; None: the mask's shadow is geometric.
+    places
+        rows and columns whose frames are formed; None: all.
+    """
+
+    def __init__(
+        self, bundle: Bundle, geometry: CameraGeometry, spectrum: Spectrum | None, places: Places | None = None
+    ) -> None:
+        self.bundle, self._geometry, self._spectrum, self._places = bundle, geometry, spectrum, places
+
+    @property
+    def key(self) -> tuple[Bundle, CameraGeometry, Spectrum | None, Places | None]:
+        """Equal for grids that form the same light alike."""
+        return self.bundle, self._geometry, self._spectrum, self._places
+
+    @property
+    def of_mean(self) -> Grid:
+        """The same cells for what the sensor sees on average: with one anchor."""
+        return Grid(replace(self.bundle, anchors=1), *self.key[1:])
+
+    @cached_property
+    def optics(self) -> FrameOptics:
+        """From light in these cells to frames."""
+        bundle = self.bundle
+        parts = bundle.rows, bundle.columns, bundle.depths, bundle.anchors
+        return FrameOptics(self._geometry, *parts, self._spectrum, self._places)
+
+
+@dataclass(frozen=True)
+class GridRow:
+    """One grid.
+
+    Attributes
+    ----------
+    name
+        of the grid.
+    key
+        in files of light.
+    bundle
+        its cells, anchors and layers.
+    formed
+        whether it holds light under some settings and physics.
+    lamps
+        whether it holds light of lamps too.
+    """
+
+    name: str
+    key: str
+    bundle: Callable[[Grids], Bundle]
+    formed: Callable[[Settings, Physics], bool]
+    lamps: bool = False
+
+
+class Grids:
+    """What light of a bench with settings is accumulated in; optics are prepared when they are first asked for.
+
+    Parameters
+    ----------
+    bench, settings
+        what is simulated, and how finely.
+    pixels
+        cells a side of the projector's window, instead of one a pixel.
+    one_line
+        whether diffraction is that of the light's mean wavelength alone: for what hardly hangs on it, in a third of the
+        time.
+    places
+        rows and columns whose frames are formed; None: all.
+
+    Attributes
+    ----------
+    physics
+        what is simulated of the bench.
+    grids
+        by name, as :data:`GRIDS` has them.
+    ambient
+        those of all light of lamps.
+    by_band
+        of each row of lamps' light, such grids.
+    """
+
+    def __init__(
+        self,
+        bench: Apparatus,
+        settings: Settings,
+        pixels: int | None = None,
+        one_line: bool = False,
+        places: Places | None = None,
+    ) -> None:
+        self.bench, self.settings, self.places = bench, settings, places
+        self.physics = Physics.simulated(bench, settings.effects)
+        if settings.raster:
+            by_fft = self.physics.geometry.model_copy(update={"mask_fft": True, "mask_cells": settings.raster_cells})
+            self.physics = replace(self.physics, geometry=by_fft)
+        if one_line and self.physics.spectrum:
+            self.physics = replace(self.physics, spectrum=self.physics.spectrum.mean)
+        self._pixels = pixels or bench.n
+        lamplight = bench.lamplight if self.physics.lamps else None
+        self.lamp_rows = len(lamplight.bands) if lamplight else 1
+        # The sensor's centre sees nothing beyond the field stop, so near surfaces ask for no more directions.
+        self.aim = self.cells(1, reach=None)
+        self.grids = {row.name: self._grid(row) for row in GRIDS.values()}
+        self.ambient = self._of_lamps(lamplight.whole if lamplight else _bands(*_AMBIENT_NM, _AMBIENT_BANDS))
+        bands = lamplight.spectra if lamplight else ()
+        self.by_band = tuple(map(self._of_lamps, bands)) or (self.ambient,)
+
+    def _of_lamps(self, light: Spectrum) -> Mapping[str, Grid]:
+        return {row.name: self._grid(row, light) for row in GRIDS.values() if row.lamps}
+
+    def _grid(self, row: GridRow, light: Spectrum | None = None) -> Grid:
+        """``light`` None: the projector's. All light diffracts or none."""
+        spectrum = self.physics.spectrum
+        return Grid(row.bundle(self), self.physics.geometry, (light or spectrum) if spectrum else None, self.places)
+
+    @property
+    def reach(self) -> float:
+        """Largest tan-angle, from the sensor's centre, of what its edge sees at the light's depth."""
+        return self.physics.geometry.reach(self.settings.depth)
+
+    def cells(self, subdivision: int = 1, width: int = 1, reach: float | None = None) -> CellGrid:
+        """Cells as far as the sensor's edge sees through the field stop, or to ``reach`` if that is farther.
+
+        The same for any number of anchors and layers, so that their light can be compared.
+
+        Parameters
+        ----------
+        subdivision, width
+            cells a side of a pixel, or pixels a side of a cell.
+        reach
+            tan-angle from the sensor's centre.
+        """
+        depth, farthest = self.settings.depth, max(self.reach, reach or 0.0)
+        return aligned_grid(*self.bench.windows_at(depth), -(-self._pixels // width), subdivision, farthest)
+
+    def mean_weights(self, anchors: int) -> FloatArray:
+        """(anchors,) weight of each of so many ``anchors`` in the mean over the sensor."""
+        edges = self.physics.geometry.pixel_edges
+        positions = anchor_positions(anchors, self.physics.geometry.half_width)
+        return np.asarray(anchor_weights(positions, (edges[:-1] + edges[1:]) / 2).mean(axis=0))
+
+
+# ---- The table
+
+
+def _fine(made: Grids) -> Bundle:
+    settings = made.settings
+    return Bundle(made.cells(settings.subdivision, reach=settings.reach), 1, settings.depths, lamps=made.lamp_rows)
+
+
+def _coarse(made: Grids, anchors: int) -> Bundle:
+    settings = made.settings
+    depths = settings.depths if settings.coarse_layers else (settings.depth,)
+    return Bundle(made.cells(settings.coarse_cells, reach=settings.reach), anchors, depths, lamps=made.lamp_rows)
+
+
+def _wide(made: Grids) -> Bundle:
+    """Coarse cells, or cells of several pixels in one layer."""
+    settings, width = made.settings, made.settings.followed_width
+    if width == 1:
+        return _coarse(made, settings.followed_anchors)
+    cells = made.cells(1, width, settings.reach)
+    return Bundle(cells, settings.followed_anchors, (settings.depth,), lamps=made.lamp_rows)
+
+
+def _sharp(made: Grids) -> Bundle:
+    """The sharp pixels' part of the fine cells, or of coarser ones where the anchors are too many."""
+    settings, sharp = made.settings, made.settings.sharp
+    if sharp is None:
+        return Bundle(made.aim, 1, (settings.depth,), lamps=made.lamp_rows)
+
+    def part(subdivision: int) -> CellGrid:
+        whole, window = made.cells(subdivision, reach=settings.reach), sharp.window
+        return CellGrid(whole.rows.part(*window[:2]), whole.columns.part(*window[2:]))
+
+    most = max(1, _MOST_ROWS // (sharp.anchors * max(part(1).shape)))
+    cells = part(min(settings.subdivision, most))
+    return Bundle(cells, sharp.anchors, settings.depths, between=True, lamps=made.lamp_rows)
+
+
+GRIDS: Mapping[str, GridRow] = MappingProxyType(
+    {
+        row.name: row
+        for row in (
+            # What the sensor sees on average of direct light, caustics and lamps.
+            GridRow("fine", "fine", _fine, lambda settings, physics: True, lamps=True),
+            # What each anchor sees of direct light beyond that; and of light that is hidden from part of the sensor.
+            GridRow(
+                "anchor_residual",
+                "coarse",
+                lambda made: _coarse(made, made.settings.anchors),
+                lambda settings, physics: settings.anchors > 1,
+            ),
+            GridRow(
+                "penumbra",
+                "occluded",
+                lambda made: _coarse(made, made.settings.occluded_anchors),
+                lambda settings, physics: bool(settings.with_own_anchors),
+            ),
+            # Direct light over sharp lobes, of the pixels that are traced apart.
+            GridRow("sharp", "sharp", _sharp, lambda settings, physics: settings.sharp is not None),
+            # What each anchor sees of light over several surfaces, mirrors' and lamps' beyond its mean; and that mean,
+            # of light over several surfaces: smooth or small, so coarse cells hold them well.
+            GridRow(
+                "indirect_residual",
+                "followed",
+                _wide,
+                lambda settings, physics: settings.followed_anchors > 1,
+                lamps=True,
+            ),
+            GridRow(
+                "indirect", "smooth", lambda made: _coarse(made, 1), lambda settings, physics: physics.interreflection
+            ),
+        )
+    }
+)
+"""The grids by name."""
+
+
+def _bands(low_nm: float, high_nm: float, count: int) -> Spectrum:
+    """Equal photons in ``count`` bands between two wavelengths, each taken at its centre."""
+    edges = np.linspace(low_nm, high_nm, count + 1)
+    return Spectrum((edges[:-1] + edges[1:]) / 2, np.full(count, 1 / count))
