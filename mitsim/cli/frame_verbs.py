@@ -225,13 +225,13 @@ def characterise(
     """Measure a camera after EMVA 1288 on simulated frames; figures found beside those that its file sets."""
     from mitsim.core.configuration import locate
     from mitsim.devices.sensor import load_sensor
-    from mitsim.studies import emva_procedure
+    from mitsim.studies import emva_options
     from mitsim.studies.framework.folder import check_study_folder
 
     sensor = load_sensor(locate(camera, "calibration", ".toml"))
-    procedure = emva_procedure.Procedure(asked.pixels, asked.steps, asked.frames, asked.seed, asked.wavelength)
-    emva_procedure.capacity_of(sensor)
-    emva_procedure.efficiency_of(sensor, procedure)
+    procedure = emva_options.Procedure(asked.pixels, asked.steps, asked.frames, asked.seed, asked.wavelength)
+    emva_options.capacity_of(sensor)
+    emva_options.efficiency_of(sensor, procedure)
     if sensor.quantum_efficiency_curve is None:
         refuse_unused(context, ["wavelength"], f"on {camera}, whose file has no curve of quantum efficiency")
     check_study_folder(output, "characterise")

@@ -26,7 +26,8 @@ from mitsim.report.html import rounded, typeset
 from mitsim.report.plots import BLACK, BLUE, FONT, GREY, ORANGE, VERMILION, WIDTH, figure_of, label_axes
 from mitsim.sensor.emva import LEAST_DARK, QUANTISATION, SPLIT, Session, figures
 from mitsim.sensor.specimen import mean_dark_current
-from mitsim.studies.emva_procedure import Frames, Procedure, capacity_of, drawn, efficiency_of
+from mitsim.studies.emva_options import Procedure, capacity_of, efficiency_of
+from mitsim.studies.emva_procedure import Frames, drawn
 from mitsim.studies.framework.folder import study_folder
 from mitsim.studies.framework.run import write_figures
 

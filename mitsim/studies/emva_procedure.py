@@ -12,17 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mitsim.acquire.sense_options import check_wavelength
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Job
 from mitsim.core.parallel import in_threads
-from mitsim.core.seeds import check_root, stream
+from mitsim.core.seeds import stream
 from mitsim.devices.sensor import EXPOSURE_S, SensorModel
 from mitsim.sensor.chain import expose
 from mitsim.sensor.emva import SPLIT, Pair, Session, Stack, pair_of, pairs_of, stack_of
 from mitsim.sensor.moments import frame_moments
 from mitsim.sensor.specimen import dark_current_variance, mean_dark_current, response_variance
+from mitsim.studies.emva_options import Procedure, efficiency_of
 
 _TO = 1.15
 """Light of the brightest step over what saturates: 7 steps of 50 are saturated, so the largest variance is inside."""
@@ -284,63 +283,3 @@ def _products(freedom: int, count: int, rng: np.random.Generator) -> FloatArray:
     products = (products + products.transpose(1, 0, 2)) / math.sqrt(2)
     products[np.arange(count), np.arange(count)] = rng.chisquare(freedom, (count, _SESSIONS)) / freedom
     return np.asarray(products)
-
-
-# -------- A camera and the sizes of a characterisation in
-
-_PIXELS, _STEPS, _FRAMES = (32, 4096), (20, 1000), (2, 10_000)
-"""Least and most. Below 32 rows a row's part is known to a quarter; 50 steps and 16 frames are EMVA's own least."""
-
-
-@dataclass(frozen=True)
-class Procedure:
-    """How a camera is characterised.
-
-    Attributes
-    ----------
-    pixels
-        rows and columns of the frames, of binned pixels.
-    steps
-        of the light.
-    frames
-        of each stack.
-    seed
-        root of every draw; the camera's fixed pattern has its own.
-    wavelength_nm
-        of the light, where the camera has a curve of quantum efficiency.
-    """
-
-    pixels: int = 256
-    steps: int = 50
-    frames: int = 100
-    seed: int = 0
-    wavelength_nm: float = 550.0
-
-    def __post_init__(self) -> None:
-        for name, (least, most) in (("pixels", _PIXELS), ("steps", _STEPS), ("frames", _FRAMES)):
-            value = getattr(self, name)
-            if not least <= value <= most:
-                raise ArgumentError(name, f"{value}: give a whole number from {least} to {most}")
-        check_root(self.seed)
-        check_wavelength(self.wavelength_nm)
-
-
-def efficiency_of(sensor: SensorModel, procedure: Procedure) -> float:
-    """Electrons per photon of a ``sensor`` at the ``procedure``'s wavelength.
-
-    1 where the camera states none, or has colour filters: light is counted in electrons.
-    """
-    return sensor.efficiency(procedure.wavelength_nm) if sensor.states_efficiency else 1.0
-
-
-def capacity_of(sensor: SensorModel) -> float:
-    """Electrons that saturate a pixel of a ``sensor``: its full well, or the ADC's end; MitsimError without either."""
-    full = sensor.superpixel_full_well_e
-    if sensor.largest_dn is not None:
-        full = min(full, (sensor.largest_dn - sensor.superpixel_black_level_dn) / sensor.gain_dn_per_e)
-    if not math.isfinite(full):
-        raise MitsimError(
-            f"camera {sensor.name!r}: has neither a full well nor an ADC, so no light saturates it; "
-            "give full_well_e or bits"
-        )
-    return full
