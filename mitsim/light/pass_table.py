@@ -27,8 +27,8 @@ class Pass:
 
     Attributes
     ----------
-    name, key
-        of the pass; its samples are ``key`` and ``_samples`` in plans.
+    name
+        of the pass.
     stream
         name of its random numbers: a seed, so that the same seed gives the same frames as in earlier versions.
     tracer
@@ -54,10 +54,11 @@ class Pass:
         paths are many for its cells; none: on the host.
     pilot
         run of the pilot that measures its noise (:mod:`mitsim.planner.pilot`).
+    key
+        of its samples in plans, where that is not its name.
     """
 
     name: str
-    key: str
     stream: str
     tracer: Callable[[Tracers], PassTracer | None]
     unit_cost: float
@@ -70,6 +71,12 @@ class Pass:
     flux: bool = False
     device: Literal["", "room", "pays"] = ""
     pilot: str = "effects"
+    key: str = ""
+
+    @property
+    def samples_key(self) -> str:
+        """Of its samples in plans."""
+        return f"{self.key or self.name}_samples"
 
     @property
     def grids(self) -> tuple[str, ...]:
@@ -105,105 +112,110 @@ def even(samples: Number) -> Number:
     return found if isinstance(samples, np.ndarray) else float(found)
 
 
-PASSES: Mapping[str, Pass] = MappingProxyType(
-    {
-        row.name: row
-        for row in (
-            Pass(
-                "direct",
-                "direct",
-                stream="direct",
-                tracer=lambda made: made.direct,
-                unit_cost=1.8e-7,
-                grid="fine",
-                even=True,
-                variance_rate=1.5,
-                flux=True,
-                pilot="cells",
-            ),
-            Pass(
-                "anchor_residual",
-                "anchored",
-                stream="anchored",
-                tracer=lambda made: made.anchored,
-                unit_cost=1.6e-7,
-                grid="anchor_residual",
-                anchors="anchors",
-                even=True,
-                device="pays",
-                pilot="anchors",
-            ),
-            Pass(
-                "penumbra",
-                "occluded",
-                stream="occluded",
-                tracer=lambda made: made.anchored_occluded,
-                unit_cost=5e-7,
-                grid="penumbra",
-                anchors="occluded_anchors",
-                even=True,
-                pilot="occluded",
-            ),
-            Pass(
-                "sharp",
-                "sharp",
-                stream="sharp",
-                tracer=lambda made: made.sharp,
-                unit_cost=3e-7,
-                grid="sharp",
-                even=True,
-                flux=True,
-                device="pays",
-            ),
-            Pass(
-                "indirect",
-                "indirect",
-                stream="indirect",
-                tracer=lambda made: made.indirect,
-                unit_cost=1.2e-7,
-                grid="fine",
-                indirect_grid="indirect",
-                effects=FOLLOWED,
-                device="room",
-            ),
-            Pass(
-                "from_camera",
-                "from_camera",
-                stream="other",
-                tracer=lambda made: made.from_camera,
-                unit_cost=2e-7,
-                grid="fine",
-                indirect_grid="indirect",
-                effects=FOLLOWED,
-            ),
-            Pass(
-                "indirect_residual",
-                "followed",
-                stream="indirect at anchors",
-                tracer=lambda made: made.at_anchors[0],
-                unit_cost=1.3e-7,
-                grid="indirect_residual",
-                anchors="followed_anchors",
-                effects=FOLLOWED,
-                device="room",
-                pilot="followed",
-            ),
-            Pass(
-                "camera_residual",
-                "followed_from_camera",
-                stream="from camera at anchors",
-                tracer=lambda made: made.at_anchors[1],
-                unit_cost=1.3e-7,
-                grid="indirect_residual",
-                anchors="followed_anchors",
-                effects=FOLLOWED,
-                pilot="followed",
-            ),
-        )
-    }
+_ROWS = (
+    Pass(
+        name="direct",
+        stream="direct",
+        tracer=lambda made: made.direct,
+        unit_cost=1.8e-7,
+        grid="fine",
+        even=True,
+        variance_rate=1.5,
+        flux=True,
+        pilot="cells",
+    ),
+    Pass(
+        name="anchor_residual",
+        key="anchored",
+        stream="anchored",
+        tracer=lambda made: made.anchored,
+        unit_cost=1.6e-7,
+        grid="anchor_residual",
+        anchors="anchors",
+        even=True,
+        device="pays",
+        pilot="anchors",
+    ),
+    Pass(
+        name="penumbra",
+        key="occluded",
+        stream="occluded",
+        tracer=lambda made: made.anchored_occluded,
+        unit_cost=5e-7,
+        grid="penumbra",
+        anchors="occluded_anchors",
+        even=True,
+        pilot="occluded",
+    ),
+    Pass(
+        name="sharp",
+        stream="sharp",
+        tracer=lambda made: made.sharp,
+        unit_cost=3e-7,
+        grid="sharp",
+        even=True,
+        flux=True,
+        device="pays",
+    ),
+    Pass(
+        name="indirect",
+        stream="indirect",
+        tracer=lambda made: made.indirect,
+        unit_cost=1.2e-7,
+        grid="fine",
+        indirect_grid="indirect",
+        effects=FOLLOWED,
+        device="room",
+    ),
+    Pass(
+        name="from_camera",
+        stream="other",
+        tracer=lambda made: made.from_camera,
+        unit_cost=2e-7,
+        grid="fine",
+        indirect_grid="indirect",
+        effects=FOLLOWED,
+    ),
+    Pass(
+        name="indirect_residual",
+        key="followed",
+        stream="indirect at anchors",
+        tracer=lambda made: made.at_anchors[0],
+        unit_cost=1.3e-7,
+        grid="indirect_residual",
+        anchors="followed_anchors",
+        effects=FOLLOWED,
+        device="room",
+        pilot="followed",
+    ),
+    Pass(
+        name="camera_residual",
+        key="followed_from_camera",
+        stream="from camera at anchors",
+        tracer=lambda made: made.at_anchors[1],
+        unit_cost=1.3e-7,
+        grid="indirect_residual",
+        anchors="followed_anchors",
+        effects=FOLLOWED,
+        pilot="followed",
+    ),
 )
-"""All passes by name, in the order in which they are traced and their light is added up. Unit costs were chosen near
-what was measured of eight shipped scenes on two cores (plans at 1e-3, November 2026); only their ratios decide. Direct
-light takes half as much where one cell a pixel holds it, and more in many fine ones."""
+"""In the order in which they are traced and their light is added up. Unit costs were chosen near what was measured of
+eight shipped scenes on two cores (plans at 1e-3, November 2026); only their ratios decide. Direct light takes half as
+much where one cell a pixel holds it, and more in many fine ones."""
+
+
+def table_of(*rows: Pass) -> Mapping[str, Pass]:
+    """The ``rows`` by name, which is theirs alone, as is their stream."""
+    for what in ("name", "stream"):
+        values = [getattr(row, what) for row in rows]
+        twice = next((value for value in values if values.count(value) > 1), None)
+        if twice is not None:
+            raise ValueError(f"two passes have the {what} {twice!r}")
+    return MappingProxyType({row.name: row for row in rows})
+
+
+PASSES = table_of(*_ROWS)
+"""All passes by name."""
 EVEN = frozenset(row.name for row in PASSES.values() if row.even)
 """Passes of direct light; all others follow it further."""

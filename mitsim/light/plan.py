@@ -171,7 +171,7 @@ class Plan:
 
     def block(self) -> dict[str, Any]:
         """The plan as JSON holds it."""
-        samples = {f"{row.key}_samples": row.predicted(self.settings) for row in PASSES.values()}
+        samples = {row.samples_key: row.predicted(self.settings) for row in PASSES.values()}
         settings = {**asdict(replace(self.settings, samples={})), "effects": sorted(self.settings.effects), **samples}
         del settings["samples"]
         own = replace(self, request=None, cost=None, colour=self.colour or self._uncoloured)

@@ -171,10 +171,10 @@ def test_light_that_needs_less_than_a_sample_takes_one_and_every_round_grows(
     samples = {"direct": 0.1, "indirect": 3.0, "indirect_residual": 0.5, "camera_residual": 0.02}
     samples = {**plan.settings.samples, **samples}
     settings = replace(plan.settings, effects=frozenset(FAR), followed_anchors=2, samples=samples)
-    wanted, kept = [], module._trace
-    monkeypatch.setattr(module, "_trace", lambda groups, samples: wanted.append(samples) or kept(groups, samples))
+    wanted, kept = [], module.trace_groups
+    monkeypatch.setattr(module, "trace_groups", lambda groups, samples: wanted.append(samples) or kept(groups, samples))
     assert trace_light(bench, replace(plan, settings=settings), family, 3).reached
-    assert wanted[0] == {"direct": 1, "indirect": 3, "indirect at anchors": 1}
+    assert wanted[0] == {"direct": 1, "indirect": 3, "indirect_residual": 1}
     for before, after in pairwise(wanted):
         assert after != before and all(after[name] >= count for name, count in before.items())
 
@@ -224,7 +224,7 @@ def test_a_round_does_not_hold_the_light_of_the_one_before(
 ) -> None:
     """Of corner in three lines that was 0.4 GB. (Planted: each of the names that are dropped, kept.)"""
     made, held = list[Any](), list[int]()  # of arrays, which copies of a light share
-    line_of, trace = module._line_of, module._trace
+    line_of, trace = module._line_of, module.trace_groups
 
     def watched(*parts: Any) -> SampledLight:
         light = line_of(*parts)
@@ -236,7 +236,7 @@ def test_a_round_does_not_hold_the_light_of_the_one_before(
         trace(*parts)
 
     monkeypatch.setattr(module, "_line_of", watched)
-    monkeypatch.setattr(module, "_trace", counted)
+    monkeypatch.setattr(module, "trace_groups", counted)
     target = trace_light(bench, plan, family, 3).sampling_error
     trace_light(bench, replace(plan, sampling_target=target / 2), family, 3)
     assert len(held) > 2 and not any(held)

@@ -32,7 +32,7 @@ SIZES = {
     **{Part(name): size for name, size in {"interreflection": 2e-2, "diffraction": 0.3, "ambient": 5e-4}.items()},
     **{Part("followed_anchors", count): size for count, size in {1: 7e-4, 2: 9e-5, 3: 1e-5}.items()},
     Part("blur"): 1e-3,
-    Part("anchored cells", 1): 2e-4,
+    Part("anchor_residual cells", 1): 2e-4,
     Part("indirect cells", 1): 4e-4,
     Part("indirect layers", 1): 3e-4,
 }

@@ -35,11 +35,12 @@ def random_evidence(seed: int) -> Evidence:
     mixed = rng.normal(size=(len(sizes), 6))
     mixed *= (np.array(list(sizes.values())) / np.linalg.norm(mixed, axis=1))[:, None]
     looks = mixed[:, None] + 3e-5 * rng.normal(size=(len(sizes), LOOKS, 6))
-    efforts = {
-        name: replace(getattr(EVIDENCE, name), noise=Noise(10 ** rng.uniform(-4, -1.5), 4, 0.5))
-        for name in ("direct", "spread", "anchored", "indirect", "from_camera", "followed")
-    }
-    return replace(EVIDENCE, changes=Changes.between(dict(zip(sizes, looks, strict=True)), 1.0), **efforts)
+    names = "direct", "spread", "anchor_residual", "indirect", "from_camera", "indirect_residual"
+    noises = {name: Noise(10 ** rng.uniform(-4, -1.5), 4, 0.5) for name in names}
+    spread = replace(EVIDENCE.spread, noise=noises.pop("spread"))
+    efforts = {name: replace(EVIDENCE.efforts[name], noise=noise) for name, noise in noises.items()}
+    found = Changes.between(dict(zip(sizes, looks, strict=True)), 1.0)
+    return replace(EVIDENCE, changes=found, spread=spread).with_efforts(efforts)
 
 
 @pytest.mark.parametrize("seed", range(12))

@@ -123,7 +123,7 @@ def test_gloss_makes_noise_at_random_points_of_the_sensor(small_scene: Callable[
     groups = [made.accumulate("direct", made.direct.trace(seed, 0, 16), lighting.labels, 16) for seed in range(8)]
     actual = monte_carlo_error(made.expected(groups, np.arange(16), lighting, 0)) * 8**0.5
     assert promised(float(found.spread.noise.left(16)), actual)
-    assert found.spread.noise.left(16) > 10 * found.direct.noise.left(16)
+    assert found.spread.noise.left(16) > 10 * found.efforts["direct"].noise.left(16)
 
 
 def test_depth_and_layers(bench: Bench, evidence: Evidence) -> None:

@@ -145,14 +145,14 @@ LAUNCH_S, PATH_S = 0.02, 1e-7
 
 @dataclass
 class Machine:
-    """Stands in for a stage's launches; one of them, by its number, takes ten times as long as it should."""
+    """Stands in for a pass's launches; one of them, by its number, takes ten times as long as it should."""
 
     disturbed: int = -1
     launches: list[int] = field(default_factory=list)
 
-    def seconds(self, stage: Any, seed: int, labels: object, samples: int) -> float:
+    def seconds(self, simulation: Any, name: str, seed: int, labels: object, samples: int) -> float:
         self.launches.append(samples)
-        taken = LAUNCH_S + PATH_S * samples * stage.tracer.lanes
+        taken = LAUNCH_S + PATH_S * samples * simulation.passes[name].tracer.lanes
         return 10 * taken if len(self.launches) - 1 == self.disturbed else taken
 
 
