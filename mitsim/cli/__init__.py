@@ -1,7 +1,7 @@
 """The command line: parse, call the Python face, print. No physics; heavy imports happen in the verb that needs them.
 
 Options that make up a request come from :class:`mitsim.bench.request.Request`, so that they are the same in Python.
-Errors of the library speak of arguments; :func:`~mitsim.cli.options.spoken` writes them as options.
+Errors of the library speak of arguments; :func:`~mitsim.cli.options.message_of` writes them as options.
 """
 
 from __future__ import annotations
