@@ -33,7 +33,7 @@ import mitsim as ms
 from mitsim.capture import exposer
 from mitsim.core import framefile, recorders
 from mitsim.core.resources import workers
-from mitsim.optics.image_formation import _Block
+from mitsim.optics.image_formation import _Terms
 
 spent, lock = dict.fromkeys(("products", "noise", "files"), 0.0), threading.Lock()
 
@@ -48,8 +48,8 @@ def timed(home, name, kind):
                 spent[kind] += time.thread_time() - begun
     setattr(home, name, inside)
 
-timed(_Block, "frame", "products")
-timed(_Block, "probe", "products")
+timed(_Terms, "frame", "products")
+timed(_Terms, "probe", "products")
 timed(exposer, "expose", "noise")
 timed(recorders, "write_frame", "files")
 timed(recorders, "checksum", "files")

@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from mitsim.core.job import Clock, Job
     from mitsim.core.resources import Limits
     from mitsim.core.runs import Capture, MosaicCapture, load_mosaic, load_run
-    from mitsim.devices.model_fit import Modelling
-    from mitsim.devices.session import load_recipe
+    from mitsim.devices.session import Modelling, load_recipe
     from mitsim.light.plan import Plan
     from mitsim.metrics import psnr, ssim
     from mitsim.reconstruct.captured_session import calibrate_frames
@@ -63,7 +62,7 @@ _HOMES = {
     "Factors": "reconstruct.factors",
     "Reconstruction": "reconstruct.result",
     "Rendered": "acquire.reference",
-    "Modelling": "devices.model_fit",
+    "Modelling": "devices.session",
     "Job": "core.job",
     "Clock": "core.job",
     "Limits": "core.resources",

@@ -190,7 +190,7 @@ def test_the_rules_catch_a_planted_violation(module: str, source: str) -> None:
     [
         ("mitsim.transport.direct", "import mitsuba\nfrom mitsim.optics import shadow"),
         ("mitsim.core.environment", "import mitsuba"),
-        ("mitsim.sensor.chain", "from . import moments\nfrom ..core import units"),
+        ("mitsim.sensor.chain", "from . import moments\nfrom ..core import arrays"),
         ("mitsim.reconstruct.factors", "from mitsim.devices.patterns import PatternFamily"),
         ("mitsim.cli", "import mitsim\ndef f():\n    from mitsim.studies.demo import demo"),
         ("mitsim", "if TYPE_CHECKING:\n    from mitsim.api.bench import Bench"),

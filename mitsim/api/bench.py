@@ -83,7 +83,7 @@ class Bench(Apparatus):
         Parameters
         ----------
         patterns
-            ``uniform``, ``dots:K``, ``dots:RxC``, ``hadamard:K`` or ``random:K``.
+            of a family (:func:`mitsim.devices.patterns.parse_patterns`).
         **request
             other fields of :class:`mitsim.bench.request.Request`, such as ``accuracy`` or ``effects``.
 

@@ -10,7 +10,7 @@ import numpy as np
 from mitsim.core.arrays import Labels
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Spectrum
-from mitsim.optics.fft_shadow import SeparableTerm, geometric_samplers, wave_samplers
+from mitsim.optics.fft_shadow import SampledTerm, geometric_samplers, wave_samplers
 from mitsim.optics.frames import ClassFrames
 from mitsim.optics.mirror_frames import Beams, glint_frames
 
@@ -75,7 +75,7 @@ class Glint:
         self.seconds = time.perf_counter() - started
         return found
 
-    def _terms(self, geometry: CameraGeometry, spectrum: Spectrum | None) -> list[SeparableTerm]:
+    def _terms(self, geometry: CameraGeometry, spectrum: Spectrum | None) -> list[SampledTerm]:
         """The mask for a virtual source at the beams' mean depth and direction."""
         if spectrum is None:
             return geometric_samplers(geometry)

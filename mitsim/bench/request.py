@@ -13,7 +13,7 @@ from mitsim.bench.effects import check_switches, parse_switches
 from mitsim.core.configuration import refusal, validated
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.seeds import check_root
-from mitsim.devices.families import NAMES, check_patterns
+from mitsim.devices.patterns import pattern_names, read_name
 from mitsim.devices.sensor import EXPOSURE_FRACTION, EXPOSURE_S, SensorModel
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ class Request(BaseModel):
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
-    patterns: str = Field("dots:7", description=NAMES)
+    patterns: str = Field("dots:7", description=pattern_names())
     accuracy: float = Field(1e-3, description="relative rms error of the expected frames")
     seconds: float | None = Field(None, description="take the finest accuracy that a run of so many seconds buys")
     seed: int = Field(0, description="root of every random stream")
@@ -158,7 +158,8 @@ class Request(BaseModel):
     @field_validator("patterns")
     @classmethod
     def _of_a_family(cls, patterns: str) -> str:
-        return check_patterns(patterns)
+        read_name(patterns)
+        return patterns
 
     @field_validator("accuracy")
     @classmethod

@@ -27,9 +27,8 @@ from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, Digital, FactorNoise, FittedNumber, ModelledFactors
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.framelist import SessionFrames, load_frames
-from mitsim.devices.model_fit import UNITS, Model, Modelling, frames_of
 from mitsim.devices.patterns import Lighting, stripe_signs
-from mitsim.devices.session import SIDES, SessionRecipe, Side, load_recipe
+from mitsim.devices.session import SIDES, UNITS, Model, Modelling, SessionRecipe, Side, frames_of, load_recipe
 from mitsim.optics.camera_model import ModelledCamera, Placement
 from mitsim.optics.frames import Frame
 from mitsim.optics.separable import best_term

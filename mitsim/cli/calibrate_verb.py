@@ -32,7 +32,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.worker import RESUME, advise
 
 if TYPE_CHECKING:
-    from mitsim.devices.model_fit import Modelling
+    from mitsim.devices.session import Modelling
 
 _OF_FRAMES = {"frames", "camera", "output", "as_json", "quiet"}
 """Options of `mitsim calibrate` that go with --frames."""
@@ -88,7 +88,7 @@ class Modelled:
 
     def modelling(self, accuracy: float) -> Modelling:
         """The fit, of light of an ``accuracy``; MitsimError for words that it does not know."""
-        from mitsim.devices.model_fit import FITTED, Modelling
+        from mitsim.devices.session import FITTED, Modelling
 
         names = FITTED if self.fit is None else tuple(name.strip() for name in self.fit.split(","))
         model: Any = self.model  # checked there

@@ -26,7 +26,7 @@ from mitsim.cli.options import (
 from mitsim.cli.screen import finish
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.seeds import check_root
-from mitsim.devices.families import NAMES, read_name
+from mitsim.devices.patterns import pattern_names, read_name, takes_seed
 
 _OF_BARE = ("shape", "bits", "byte_order")
 """Options of `mitsim import` for files without a header."""
@@ -133,7 +133,7 @@ def _import_frames(context: typer.Context, source: Path, output: Path, frames: F
     bare = any(path.suffix.lower() in BARE for path in (source, *(source.iterdir() if source.is_dir() else ())))
     if frames.shape is None or not bare:
         refuse_unused(context, _OF_BARE, "on files that have a header, or without --shape")
-    if not frames.patterns.startswith("random"):
+    if not takes_seed(frames.patterns):
         refuse_unused(context, ["seed"], "on patterns that are not drawn at random")
     known = RealCapture(
         frames.patterns,
@@ -178,7 +178,7 @@ def patterns(
     *,
     context: typer.Context,
     family: Annotated[
-        str, typer.Argument(help=f"{NAMES}; or stripes, those of a calibration", metavar="PATTERNS|stripes")
+        str, typer.Argument(help=f"{pattern_names()}; or stripes, those of a calibration", metavar="PATTERNS|stripes")
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="folder to make", metavar="DIR")],
     screen: Screen,
@@ -207,7 +207,7 @@ def patterns(
         from mitsim.exchange.pictures import draw_family
 
         refuse_unused(context, ["signed_capture"], "on patterns, whose signed ones are pairs; it is for stripes")
-        if not family.startswith("random"):
+        if not takes_seed(family):
             refuse_unused(context, ["seed"], "on patterns that are not drawn at random")
         for name, value in given.items():
             if value is not None:

@@ -22,7 +22,7 @@ from mitsim.cli.screen import showing_progress
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.resources import Limits, running_seconds
-from mitsim.devices.families import NAMES
+from mitsim.devices.patterns import pattern_names
 
 if TYPE_CHECKING:
     from mitsim.api.bench import Bench
@@ -41,7 +41,7 @@ _SPELLED = {
 _BENCH_ARGUMENTS = ("scene", "variant", "camera", "projector", "allow_outside_files", "for_render")
 
 Scene = Annotated[str, typer.Argument(help="scene XML, or the name of a shipped scene", metavar="SCENE")]
-Patterns = Annotated[str, typer.Option(help=NAMES)]
+Patterns = Annotated[str, typer.Option(help=pattern_names())]
 Accuracy = Annotated[float, typer.Option(help="relative rms error of the expected frames")]
 Seed = Annotated[int, typer.Option(help="root of every random stream")]
 Effects = Annotated[str, typer.Option("--effects", help="override the plan: +NAME,-NAME", metavar="+NAME,-NAME")]

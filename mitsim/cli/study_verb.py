@@ -164,17 +164,17 @@ def scope_of(name: str, scope: Scope, patterns: str, over: Sequence[str], measur
     MitsimError
         for options that the study does not have, or that cannot be read.
     """
-    from mitsim.devices.families import read_name
+    from mitsim.devices.patterns import read_name
     from mitsim.report.study_options import check_drifts, check_sweep, measures_of, values_of
 
     varied = tuple(values_of(text) for text in over)
     if name == "sweep":
         check_sweep(varied, len(scope.pictures))
-        read_name(patterns, None)
+        read_name(patterns)
         return replace(scope, sweep=varied, measures=measures_of(measure), patterns=patterns)
     if name == "drift" and measure == _MAIN_MEASURE:
         check_drifts(varied)
-        read_name(patterns, None)
+        read_name(patterns)
         return replace(scope, sweep=varied, patterns=patterns)
     if over or patterns != _MAIN_PATTERNS or measure != _MAIN_MEASURE:
         others = "--measure is for sweep, --over and --patterns for drift and sweep"

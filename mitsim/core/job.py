@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from types import FrameType
 
 from mitsim.core.arguments import checked, checked_fields
-from mitsim.core.deadline import within
 from mitsim.core.errors import ArgumentError, MitsimError, cut
 from mitsim.core.resources import Limits
-from mitsim.core.worker import OutOfTime
+from mitsim.core.worker import OutOfTime, stopped
 
 Progress = Callable[[str, float], None]
 """Called with a stage's name and its finished part, 0 to 1."""
@@ -98,3 +100,54 @@ class Job:
                 f"{what}: was not planned within the {self.limits.seconds:.3g} s that are allowed; ask for less "
                 "accuracy or fewer frames, or raise max_seconds"
             ) from None
+
+
+# ---- A time at which work ends wherever it is ----
+#
+# Work that is made of many steps of unknown length - looks at a scene, a search for light in small mirrors, a drawing's
+# shadow - would need a check in each of them. An alarm (SIGALRM) interrupts whatever the main thread does; what takes
+# long in native code is interrupted after its call.
+
+_AGAIN_S = 1.0
+"""After which the alarm comes again: an exception that fell into a callback of native code is dropped there."""
+
+
+@contextmanager
+def within(seconds: float) -> Iterator[None]:
+    """Interrupt the block by :class:`mitsim.core.worker.OutOfTime` once so many wall ``seconds`` are over.
+
+    Where there are no alarms (Windows, other threads than the main one), or somebody else has set one, the block runs
+    to its own end.
+    """
+    if seconds <= 0:
+        raise OutOfTime
+    if (
+        not hasattr(signal, "setitimer")
+        or threading.current_thread() is not threading.main_thread()
+        or signal.getitimer(signal.ITIMER_REAL)[0]
+    ):
+        yield
+        return
+    before = signal.signal(signal.SIGALRM, _ring)
+    signal.setitimer(signal.ITIMER_REAL, seconds, _AGAIN_S)
+    try:
+        yield
+    finally:
+        _silence(before)
+
+
+def _ring(_: int, __: FrameType | None) -> None:
+    if stopped():  # by a signal, whose interrupt was lost: see mitsim.core.worker
+        raise KeyboardInterrupt
+    raise OutOfTime
+
+
+def _silence(before: object) -> None:
+    """Take the alarm back, also where it rings meanwhile."""
+    while True:
+        try:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            signal.signal(signal.SIGALRM, before)  # type: ignore[arg-type]
+            return
+        except OutOfTime:
+            continue

@@ -7,10 +7,9 @@ import math
 import shutil
 import threading
 import zlib
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -234,19 +233,10 @@ class Capture:
         """What the command line reports; fields of a real camera's capture that nobody knows are None."""
         manifest = self.manifest
         known = (
-            "mc_error",
-            "total_error",
-            "total_error_bound",
-            "total_error_of_projector",
-            "mc_to_sensor_noise",
-            "sensor_noise",
-            "heaviest_group",
-            "truth_error",
-            "lost_light",
-            "seconds",
-            "predicted_memory_bytes",
-            "warnings",
-        )
+            "mc_error", "total_error", "total_error_bound", "total_error_of_projector",
+            "mc_to_sensor_noise", "sensor_noise", "heaviest_group", "truth_error", "lost_light",
+            "seconds", "predicted_memory_bytes", "warnings",
+        )  # fmt: skip
         return {
             "frames": len(manifest.patterns.captures),
             "shape": self._channel(manifest.patterns.captures[0].file, "DN").shape,
@@ -443,11 +433,9 @@ class Measurement:
 
     def __add__(self, other: Measurement) -> Measurement:
         """Both halves of a signed pattern as one measurement."""
-        shots, saturated = self.shots + other.shots, self.saturated + other.saturated
-        light, factor = self.light + other.light, math.gcd(self.factor, other.factor)
-        frame, digests = self.frame + other.frame, self.digests + other.digests
-        clipped = self.clipped + other.clipped
-        return Measurement(frame, self.row, self.column, light, shots, saturated, factor, digests, clipped)
+        summed = ("frame", "light", "shots", "saturated", "digests", "clipped")
+        sums = {name: getattr(self, name) + getattr(other, name) for name in summed}
+        return replace(self, **sums, factor=math.gcd(self.factor, other.factor))
 
     @property
     def power(self) -> float:
@@ -574,8 +562,8 @@ def frame_name(index: int) -> str:
     return f"frame_{index:05d}.exr"
 
 
-class Recorder(ABC):
-    """Keeps what a run writes, file by file, from any thread.
+class Recorder:
+    """Keeps what a run writes, file by file, from any thread: in memory, or, as :class:`RunFolder`, on disk.
 
     Attributes
     ----------
@@ -590,13 +578,12 @@ class Recorder(ABC):
     def __init__(self) -> None:
         self.files: dict[str, tuple[Channels, Metadata]] = {}
 
-    @abstractmethod
     def begin(self) -> None:
         """Begin to write: all input has been checked."""
 
-    @abstractmethod
     def keeps(self, index: int) -> bool:
-        """Whether shot number ``index`` is there already; it then counts as written."""
+        """Whether shot number ``index`` is there already; it then counts as written. Never in memory."""
+        return False
 
     def write(self, name: str, channels: Channels, metadata: Metadata) -> None:
         """Write a file of the run, whole or not at all.
@@ -608,7 +595,7 @@ class Recorder(ABC):
         channels, metadata
             of it, (rows, columns) each.
         """
-        self._write(name, channels, metadata)
+        self.files[name] = channels, metadata
 
     def write_frame(self, index: int, channels: Channels, metadata: Metadata) -> None:
         """Write one shot.
@@ -632,39 +619,20 @@ class Recorder(ABC):
         standard_error
             (n, n) of it, where known.
         """
-        channels: dict[str, Channel] = {"reflectance": reflectance.astype(np.float32)}
-        if standard_error is not None:
-            channels["standard_error"] = standard_error.astype(np.float32)
+        known = {"reflectance": reflectance, "standard_error": standard_error}
+        channels = {name: values.astype(np.float32) for name, values in known.items() if values is not None}
         self.write(TRUTH, channels, {"board_reflectance": board})
 
-    @abstractmethod
     def finish(self, manifest: RunManifest) -> RunManifest:
         """The ``manifest`` of the finished run, with what only the recorder knows."""
-
-    @abstractmethod
-    def _write(self, name: str, channels: Channels, metadata: Metadata) -> None: ...
+        return manifest
 
     def _identity(self, index: int, channels: Channels) -> dict[str, Value]:
         """What tells a frame on disk from others; nothing in memory."""
         return {}
 
 
-class RunMemory(Recorder):
-    """Keeps a run in memory."""
-
-    def begin(self) -> None:
-        """Nothing is there yet."""
-
-    def keeps(self, index: int) -> bool:
-        """Whether shot number ``index`` is there already: never."""
-        return False
-
-    def finish(self, manifest: RunManifest) -> RunManifest:
-        """The ``manifest`` as it is."""
-        return manifest
-
-    def _write(self, name: str, channels: Channels, metadata: Metadata) -> None:
-        self.files[name] = channels, metadata
+RunMemory = Recorder  # until all call sites have its name
 
 
 class RunFolder(Recorder):
@@ -716,7 +684,14 @@ class RunFolder(Recorder):
         write_manifest(self.folder, manifest)
         return manifest
 
-    def _write(self, name: str, channels: Channels, metadata: Metadata) -> None:
+    def write(self, name: str, channels: Channels, metadata: Metadata) -> None:
+        """Write a file of the run, whole or not at all.
+
+        Parameters
+        ----------
+        name, channels, metadata
+            as for :meth:`Recorder.write`.
+        """
         write_frame(self.folder / name, channels, metadata)
         self._note(name, checksum(self.folder / name))
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -128,9 +128,6 @@ class MosaicManifest(ColourManifest):
         return self
 
 
-Manifest = TypeVar("Manifest", bound=ColourManifest)
-
-
 def is_coloured(folder: Path | str) -> bool:
     """Whether ``folder`` has a colour.json."""
     return (Path(folder) / COLOUR).is_file()
@@ -146,12 +143,12 @@ def read_colours(folder: Path | str, kind: str) -> ColourManifest:
 
     MitsimError when it has no colour.json, or one of another kind or that breaks a rule.
     """
-    return _read(Path(folder), kind, ColourManifest)
+    return checked_colours(_contents(Path(folder), kind), kind, Path(folder))
 
 
 def read_mosaic(folder: Path | str) -> MosaicManifest:
     """What colour.json says of a run behind colour filters in ``folder``. MitsimError as :func:`read_colours`."""
-    return _read(Path(folder), MOSAIC, MosaicManifest)
+    return checked_mosaic(_contents(Path(folder), MOSAIC), Path(folder))
 
 
 def check_lines(lines: ColourManifest, run: str, calibration: Path) -> None:
@@ -195,13 +192,13 @@ def checked_colours(data: Any, kind: str, place: Path) -> ColourManifest:
     MitsimError
         when it is of another kind or breaks a rule.
     """
-    return _checked(data, kind, place, ColourManifest)
+    return validated(ColourManifest, _of_kind(data, kind, place), f"{place}/{COLOUR}")
 
 
 def checked_mosaic(data: Any, place: Path) -> MosaicManifest:
     """What the ``data`` of a colour.json, found in ``place``, say of a run behind colour filters. MitsimError as
     :func:`checked_colours`."""
-    return _checked(data, MOSAIC, place, MosaicManifest)
+    return validated(MosaicManifest, _of_kind(data, MOSAIC, place), f"{place}/{COLOUR}")
 
 
 def same_lines(run: Path, calibration: Path) -> ColourManifest:
@@ -211,16 +208,16 @@ def same_lines(run: Path, calibration: Path) -> ColourManifest:
     return lines
 
 
-def _read(folder: Path, kind: str, model: type[Manifest]) -> Manifest:
+def _contents(folder: Path, kind: str) -> Any:
     if not is_coloured(folder):
         raise MitsimError(f"{folder}: holds no {COLOUR}; give a coloured folder, of `mitsim {_COMMANDS[kind]}`")
-    return _checked(read_json(folder / COLOUR), kind, folder, model)
+    return read_json(folder / COLOUR)
 
 
-def _checked(data: Any, kind: str, place: Path, model: type[Manifest]) -> Manifest:
+def _of_kind(data: Any, kind: str, place: Path) -> Any:
     if _kind(data) != kind:
         raise MitsimError(f"{place}: holds a {cut(_kind(data))}, not a {kind}; give the right folder")
-    return validated(model, data, f"{place}/{COLOUR}")
+    return data
 
 
 def _kind(data: Any) -> str:

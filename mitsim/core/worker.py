@@ -41,7 +41,7 @@ _LONGEST_ADVICE = 256
 
 
 class OutOfTime(BaseException):
-    """Raised in work whose time is over (:mod:`mitsim.core.deadline`); no Exception, so that nothing in it takes it for
+    """Raised in work whose time is over (:mod:`mitsim.core.job`); no Exception, so that nothing in it takes it for
     a failure that it may go on from."""
 
 
@@ -256,7 +256,7 @@ def _again(_: int, __: FrameType | None) -> None:
 def _unraisable(lost: sys.UnraisableHookArgs) -> None:
     """An interrupt that fell into a callback or a destructor, where Python drops it with a traceback, comes again; what
     else goes wrong while the process is stopped is not told, as that a second signal came too late. Alarms of
-    :mod:`mitsim.core.deadline` come again of themselves."""
+    :mod:`mitsim.core.job` come again of themselves."""
     if lost.exc_type is OutOfTime:
         return
     if not stopped():

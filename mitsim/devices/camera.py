@@ -30,17 +30,9 @@ mrad at the paper's geometry (benchmarks/masks.py)."""
 _MOST_TILTED_TERMS = 64
 """Separable terms that a tilted mask is formed of: 0.8 GB at 512 pixels and as many cells a side."""
 _NOT_KNOWN_BEFORE = (
-    "mask_offset",
-    "mask_plate",
-    "mask_motion",
-    "mask_lean",
-    "mask_fft",
-    "mask_cells",
-    "rows",
-    "columns",
-    "row_pitch",
-    "roi",
-)
+    "mask_offset", "mask_plate", "mask_motion", "mask_lean", "mask_fft", "mask_cells", "rows", "columns",
+    "row_pitch", "roi",
+)  # fmt: skip
 """Beginnings of the names of fields that calibrations of 0.4 do not know."""
 
 
@@ -275,9 +267,9 @@ class CameraGeometry(BaseModel):
         return self.tan_half_fov * self.mask_reach * sum(map(abs, self.mask_tilt))
 
     def tilt_nodes(self, waves: bool) -> tuple[int, int] | None:
-        """Nodes of rows and of columns from which the shadow of a tilted mask is formed
-        (:mod:`mitsim.optics.mask_defects`), with ``waves`` or without; None where it is not: of an even mask, one that
-        is drawn on a raster, and one that would take too many terms."""
+        """Nodes of rows and of columns from which the shadow of a tilted mask is formed (:mod:`mitsim.optics.terms`),
+        with ``waves`` or without; None where it is not: of an even mask, one that is drawn on a raster, and one that
+        would take too many terms."""
         if not any(self.mask_tilt) or self.drawn(waves):
             return None
         farthest = self.tan_half_fov * self.mask_reach / min(self.pitches)

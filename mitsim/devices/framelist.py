@@ -19,7 +19,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.files import read_json
 from mitsim.core.imagelist import Raw, Wanted, image_files
 from mitsim.core.manifests import MOST_PIXELS, MOST_SHOTS, Digital, FileName, Parallax, Plain
-from mitsim.devices.hadamard import stripe_count
+from mitsim.devices.patterns import stripe_count
 from mitsim.devices.session import MOST_REPEATS, MOST_RUNGS, UNIFORM, Exposures, Half, Merge, Side, taken
 
 LISTS = ("session.toml", "session.json")

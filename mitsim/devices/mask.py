@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import ByValue, FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.core.seeds import stream
 
 MaskKind = Literal["separable", "flatcam", "open"]
 """How a plate is made from a code; see :class:`Mask`."""
@@ -172,3 +173,199 @@ def mls_mask(kind: MaskKind = "separable", feature_mm: float = 0.06, order: int 
         2 to 16: the mask has 2**order - 1 features a side.
     """
     return Mask(kind, feature_mm, mls_code(order))
+
+
+# ---- What goes wrong when a mask is made and mounted ----
+#
+# Flaws and a drawn mask in, its lines and transmissions out.
+# Over-etching moves the edges of all openings outward and under-etching inward, corners staying square. Edge blur is a
+# Gaussian over the transmission of power. Dust lies on the mask as discs that let less light through. Then the mask is
+# turned in its plane, and tilted to the sensor.
+
+_REACH = 8.3
+"""Standard deviations beyond which a Gaussian holds less than rounding, 1e-16."""
+_LINES = 16
+"""Lines that cross a disc of dust: what they leave of its edge is 1e-3 of its shadow
+(tests/unit/devices/test_flaws.py)."""
+_CHORDS = 16
+"""Chords a cell that a disc's part of it is summed from: 1e-4 of its area."""
+_MOST_DISCS = 100
+"""Discs in sight: each adds 34 lines, and a mask of 4000 lines takes 128 MiB."""
+
+
+@dataclass(frozen=True, eq=False)
+class Dust(ByValue):
+    """Discs on a mask.
+
+    Attributes
+    ----------
+    centres_mm
+        (k, 2) rows and columns of their centres.
+    radius_mm, opacity
+        of each; the part of the light that it takes, where discs overlap each its own.
+    """
+
+    centres_mm: FloatArray
+    radius_mm: float
+    opacity: float
+
+    def __post_init__(self) -> None:
+        self._hold(centres_mm=np.array(self.centres_mm, dtype=np.float64))
+
+    @classmethod
+    def scattered(cls, per_mm2: float, radius_mm: float, opacity: float, extent_mm: float, seed: int) -> Dust:
+        """Dust drawn at random over a square mask: as many discs as Poisson's law gives, evenly.
+
+        Parameters
+        ----------
+        per_mm2, radius_mm, opacity
+            mean number, and of each disc.
+        extent_mm
+            side of the mask.
+        seed
+            which of all such dusts.
+        """
+        draws = stream(seed, "dust")
+        count = int(draws.poisson(per_mm2 * extent_mm**2))
+        return cls((draws.random((count, 2)) - 0.5) * extent_mm, radius_mm, opacity)
+
+    def turned(self, quarters: int) -> Dust:
+        """The same on a mask turned by so many ``quarters`` of a turn, as ``numpy.rot90`` turns its features."""
+        row, column = self.centres_mm.T
+        for _ in range(quarters % 4):
+            row, column = -column, row
+        return Dust(np.stack((row, column), axis=1), self.radius_mm, self.opacity)
+
+
+@dataclass(frozen=True)
+class Flaws:
+    """What is wrong with a mask, besides its lines.
+
+    Attributes
+    ----------
+    blur_mm
+        standard deviation of its edges [mm].
+    turn_deg
+        angle in its plane, from the rows' direction to the columns' [degrees].
+    tilt_mrad
+        how its distance grows along rows and along columns.
+    dust
+        on it.
+    """
+
+    blur_mm: float = 0.0
+    turn_deg: float = 0.0
+    tilt_mrad: tuple[float, float] = (0.0, 0.0)
+    dust: Dust | None = None
+
+    @property
+    def clean(self) -> Flaws:
+        """The others, without dust."""
+        return Flaws(self.blur_mm, self.turn_deg, self.tilt_mrad)
+
+    @property
+    def margin_mm(self) -> float:
+        """How far its blur reaches [mm]."""
+        return _REACH * self.blur_mm
+
+    def reach(self, extent_mm: float) -> float:
+        """Side [mm] of a square that holds a mask of side ``extent_mm`` as it is mounted."""
+        angle = np.radians(self.turn_deg)
+        # A tilted mask meets a ray beside where an even one does, by less than the tangent of its tilt.
+        tilt = 1 + sum(abs(angle) for angle in self.tilt_mrad) * 1e-3
+        return float(extent_mm * (abs(np.cos(angle)) + abs(np.sin(angle))) * tilt**2 + 2 * self.margin_mm)
+
+    def turned_back(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Coordinates on the mask itself of points (``row``, ``column``) of its plane."""
+        if not self.turn_deg:
+            return row, column
+        cosine, sine = np.cos(np.radians(self.turn_deg)), np.sin(np.radians(self.turn_deg))
+        return cosine * row + sine * column, cosine * column - sine * row
+
+
+NO_FLAWS = Flaws()
+"""A mask as it is drawn."""
+
+
+def etched(values: FloatArray, feature_mm: float, grow_mm: float) -> tuple[FloatArray, FloatArray]:
+    """Lines (2 N + 2,) and transmissions (2 N + 1, 2 N + 1) of a mask whose openings have grown on each side.
+
+    Every place gets the greatest transmission within a square of half-side ``grow_mm``, or the least where that is
+    below 0; beyond the mask it is opaque.
+
+    Parameters
+    ----------
+    values
+        (N, N) transmissions.
+    feature_mm, grow_mm
+        their size, and how far edges move outward.
+    """
+    count = len(values)
+    even = (np.arange(count + 1) - count / 2) * feature_mm
+    lines = np.unique(np.concatenate((even - abs(grow_mm), even + abs(grow_mm))))
+    middles, reach = (lines[1:] + lines[:-1]) / 2 / feature_mm + count / 2, abs(grow_mm) / feature_mm
+    first = np.floor(middles - reach).astype(np.intp)
+    last = np.ceil(middles + reach).astype(np.intp) - 1
+    choose = np.maximum if grow_mm > 0 else np.minimum
+    for _ in ("rows", "columns"):
+        padded = np.concatenate((np.zeros((1, values.shape[1])), values, np.zeros((1, values.shape[1]))))
+        found = padded[np.clip(first + 1, 0, count + 1)]
+        for further in range(1, int((last - first).max()) + 1):
+            found = choose(found, padded[np.clip(np.minimum(first + further, last) + 1, 0, count + 1)])
+        values = found.T
+    return lines, values
+
+
+def dusted(lines: FloatArray, values: FloatArray, dust: Dust, reach_mm: float) -> tuple[FloatArray, FloatArray]:
+    """A mask's lines and transmissions with dust on it.
+
+    Parameters
+    ----------
+    lines, values
+        (N + 1,) and (N, N) of the clean mask.
+    dust
+        of which what touches the square within ``reach_mm`` of the centre is drawn.
+    reach_mm
+        half that square's side.
+
+    Raises
+    ------
+    MitsimError
+        for more dust in sight than is drawn.
+    """
+    centres = dust.centres_mm[(np.abs(dust.centres_mm) < reach_mm + dust.radius_mm).all(axis=1)]
+    if len(centres) > _MOST_DISCS:
+        raise MitsimError(
+            f"mask: {len(centres)} discs of dust are in sight, and at most {_MOST_DISCS} are drawn; set a lower "
+            "dust_per_mm2, or fewer pixels"
+        )
+    if not len(centres):
+        return lines, values
+    across = dust.radius_mm * -np.cos(np.linspace(0, np.pi, _LINES + 1))  # closer where a disc's edge is steep
+    finer = np.unique(np.concatenate((lines, (centres.ravel()[:, None] + across).ravel())))
+    finer = finer[(finer >= lines[0]) & (finer <= lines[-1])]
+    place = np.searchsorted(lines, (finer[1:] + finer[:-1]) / 2) - 1
+    result = np.asarray(values[np.ix_(place, place)])
+    for centre in centres:
+        rows, columns = (_met(finer - at, dust.radius_mm) for at in centre)
+        part = _disc_part(
+            finer[rows.start : rows.stop + 1] - centre[0],
+            finer[columns.start : columns.stop + 1] - centre[1],
+            dust.radius_mm,
+        )
+        result[rows, columns] *= 1 - dust.opacity * part
+    return finer, result
+
+
+def _met(lines: FloatArray, radius: float) -> slice:
+    """The cells between ``lines`` that a disc of that ``radius`` about 0 meets."""
+    return slice(max(int(np.searchsorted(lines, -radius, side="right")) - 1, 0), int(np.searchsorted(lines, radius)))
+
+
+def _disc_part(rows: FloatArray, columns: FloatArray, radius: float) -> FloatArray:
+    """(r, c) part of each cell between lines ``rows`` (r + 1,) and ``columns`` (c + 1,) within a ``radius`` of 0."""
+    width = np.diff(rows)
+    at = rows[:-1, None] + width[:, None] * ((np.arange(_CHORDS) + 0.5) / _CHORDS)
+    half = np.sqrt(np.maximum(radius**2 - at**2, 0))[:, :, None]
+    within: npt.NDArray[np.float64] = np.diff(np.clip(columns, -half, half), axis=2).mean(axis=1)
+    return np.asarray(np.minimum(within / np.diff(columns), 1))

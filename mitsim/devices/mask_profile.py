@@ -16,8 +16,7 @@ from mitsim.core.images import image_size, read_image
 from mitsim.core.resources import Cost, Limits
 from mitsim.core.seeds import stream
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask import MaskKind, mls_mask
-from mitsim.devices.mask_flaws import Dust, Flaws, etched
+from mitsim.devices.mask import Dust, Flaws, MaskKind, etched, mls_mask
 from mitsim.devices.plate import LARGEST, Plate, read_drawing, squared
 
 _OWN = {

@@ -1,28 +1,40 @@
-"""Pattern families: from a name such as ``dots:7`` to the factors P_L, P_R and the shots that show every pattern.
+"""Pattern families: from a text such as ``dots:7`` to the factors P_L, P_R and the shots that show every pattern.
 
 Pattern (i, j) is ``P_L[:, i] P_R[:, j]^T`` over the projector's n x n pixels (paper, section III-B). A family with
 values +-1 cannot be projected as it is: each of its patterns is shown twice, as (1 + P)/2 and (1 - P)/2, and the
 measurement is the difference.
+
+A family is a function with the decorator :func:`pattern_family`, which is all that the command line's parsing and help,
+the checks of requests and the documents know of it. Requests are checked here: numpy is imported where patterns are
+made.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
+from typing import TYPE_CHECKING, Literal
 
-import numpy as np
-import numpy.typing as npt
-
-from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.errors import MitsimError
-from mitsim.core.manifests import MOST_SHOTS
 from mitsim.core.seeds import stream
-from mitsim.devices.families import read_name, shot_count
-from mitsim.devices.hadamard import stripe_count, way_to
 
-PatternFactor = npt.NDArray[np.int8]
-"""(n, K) of 0/1 or +-1: one side of K separable patterns."""
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from mitsim.core.arrays import FloatArray, Labels
+
+    PatternFactor = npt.NDArray[np.int8]
+    """(n, K) of 0/1 or +-1: one side of K separable patterns."""
+
+
+_MOST_DIGITS = 9
+"""Digits of K that are read; no projector has 1e9 pixels a side."""
+_MOST_CHECKED = 4096
+"""K that a family's own check is asked about before the projector's pixels are known; patterns have no more a side."""
+
+# ---- What is projected ----
 
 
 @dataclass(frozen=True)
@@ -57,6 +69,8 @@ class Lighting:
     @classmethod
     def uniform(cls, n: int) -> Lighting:
         """One shot with each of ``n`` x ``n`` projector pixels fully lit."""
+        import numpy as np
+
         return cls(np.zeros(n * n, dtype=np.int64), np.ones((1, 1)))
 
     def shots(self, chosen: list[int] | npt.NDArray[np.int64]) -> Lighting:
@@ -100,12 +114,16 @@ class PatternFamily:
 
     def light(self, shot: Shot) -> FloatArray:
         """(n, n) fraction 0..1 of full power that each projector pixel emits in one ``shot``."""
+        import numpy as np
+
         pattern = np.outer(self.left[:, shot.row], self.right[:, shot.column]).astype(np.float64)
         return np.asarray(pattern if shot.sign == 0 else (1 + shot.sign * pattern) / 2)
 
     @cached_property
     def lighting(self) -> Lighting:
         """The finest partition of the pixels whose members are always lit alike, and every shot's light of it."""
+        import numpy as np
+
         _, row = np.unique(self.left, axis=0, return_inverse=True)
         _, column = np.unique(self.right, axis=0, return_inverse=True)
         label = (row.reshape(-1, 1) * (int(column.max()) + 1) + column.reshape(1, -1)).ravel()
@@ -119,43 +137,78 @@ class PatternFamily:
         return Lighting(labels, np.where(sign == 0, pattern, (1 + sign * pattern) / 2))
 
 
-def _shifting_dots(n: int, k: int) -> PatternFactor:
-    """(n, k) of 0/1: column i lights every ``k``-th of ``n`` pixels from i on; n need not be a multiple of k."""
-    return np.asarray(np.arange(n)[:, None] % k == np.arange(k)[None, :], dtype=np.int8)
+# ---- Hadamard matrices ----
+#
+# Sylvester's doubling, Paley's two constructions over prime fields (R. Paley, 1933), and Kronecker products of these:
+# every multiple of 4 up to 48, then gaps.
+
+Way = tuple[Literal["doubled", "skew", "symmetric", "product"], int]
+"""How a matrix is built, and its order, its conference matrix's prime, or the order of its left factor."""
 
 
-def _repeated_hadamard(n: int, k: int) -> PatternFactor:
-    """(n, k) of +-1: the rows of the Hadamard matrix of order ``k``, repeated down ``n`` pixels."""
-    return np.asarray(hadamard_matrix(k)[np.arange(n) % k])
+def way_to(order: int) -> Way:
+    """How the matrix of that ``order`` is built.
+
+    MitsimError for an order that no construction here reaches, with the nearest ones that are reached.
+    """
+    way = _way(order)
+    if way is None:
+        below = max((o for o in hadamard_orders(order) if o < order), default=1)
+        above = next(o for o in range(order + 1, 4 * order + 5) if _way(o))
+        raise MitsimError(f"no Hadamard matrix of order {order} is available; use {below} or {above}")
+    return way
 
 
-def _random_binary(n: int, k: int, seed: int, side: str) -> PatternFactor:
-    """(n, k) fair coin flips, each pixel lit by at least one column: the union must cover the scene."""
-    rng = stream(seed, "patterns", "random", side)
-    bits = rng.integers(0, 2, size=(n, k), dtype=np.int8)
-    dark = np.flatnonzero(~bits.any(axis=1))
-    bits[dark, rng.integers(0, k, size=dark.size)] = 1
-    return bits
+def hadamard_orders(limit: int) -> list[int]:
+    """Orders up to ``limit`` that :func:`hadamard_matrix` can build."""
+    return [order for order in range(1, limit + 1) if _way(order)]
+
+
+def stripe_count(n: int) -> int:
+    """N, the stripe patterns of a side for ``n`` projector pixels: the smallest order of at least n.
+
+    MitsimError where no order up to 2 n is reached.
+    """
+    for order in range(n, 2 * n + 1):  # with a power of two among them
+        if _way(order):
+            return order
+    raise MitsimError(f"no Hadamard matrix for {n} projector pixels; use another number of pixels")
+
+
+@cache
+def _way(order: int) -> Way | None:
+    if order < 1 or (order > 2 and order % 4):
+        return None
+    if order & (order - 1) == 0:
+        return "doubled", order
+    if _is_prime(order - 1) and (order - 1) % 4 == 3:
+        return "skew", order - 1
+    half = order // 2
+    if _is_prime(half - 1) and (half - 1) % 4 == 1:
+        return "symmetric", half - 1
+    factors = (factor for factor in range(2, half + 1) if order % factor == 0)
+    found = next((factor for factor in factors if _way(factor) and _way(order // factor)), None)
+    return None if found is None else ("product", found)
+
+
+def _is_prime(value: int) -> bool:
+    return value > 1 and all(value % factor for factor in range(2, int(value**0.5) + 1))
 
 
 def hadamard_matrix(order: int) -> PatternFactor:
     """(``order``, ``order``) matrix H of +-1 with H H^T = order I, first column all ones.
 
-    Built as :mod:`mitsim.devices.hadamard` says, whose errors it raises.
+    MitsimError as :func:`way_to`.
     """
+    import numpy as np
+
     matrix = _built(order)
     return (matrix * matrix[:, :1]).astype(np.int8)
 
 
-def stripe_signs(n: int) -> PatternFactor:
-    """(``n``, N) first rows of the smallest Hadamard matrix that has them; column 0 is all +1.
-
-    The +-1 patterns of a calibration's stripes. MitsimError as :func:`mitsim.devices.hadamard.stripe_count`.
-    """
-    return hadamard_matrix(stripe_count(n))[:n]
-
-
 def _built(order: int) -> npt.NDArray[np.int64]:
+    import numpy as np
+
     how, number = way_to(order)
     if how == "doubled":
         # Not scipy.linalg.hadamard: importing it takes longer than all else that a refusal needs.
@@ -173,6 +226,8 @@ def _built(order: int) -> npt.NDArray[np.int64]:
 
 def _conference(q: int) -> npt.NDArray[np.int64]:
     """(q + 1, q + 1) Paley conference matrix of the prime q: skew for q = 3 mod 4, symmetric for q = 1 mod 4."""
+    import numpy as np
+
     squares = set((np.arange(1, q) ** 2 % q).tolist())
     character = np.array([0] + [1 if value in squares else -1 for value in range(1, q)])
     jacobsthal = character[(np.arange(q)[:, None] - np.arange(q)[None, :]) % q]
@@ -183,37 +238,208 @@ def _conference(q: int) -> npt.NDArray[np.int64]:
     return matrix
 
 
-_SAME_BOTH_SIDES: dict[str, Callable[[int, int], PatternFactor]] = {
-    "uniform": lambda n, k: np.ones((n, 1), dtype=np.int8),
-    "dots": _shifting_dots,
-    "hadamard": _repeated_hadamard,
-}
-"""Families whose rows and columns show alike: from n and K to (n, K)."""
+def stripe_signs(n: int) -> PatternFactor:
+    """(``n``, N) first rows of the smallest Hadamard matrix that has them; column 0 is all +1.
+
+    The +-1 patterns of a calibration's stripes. MitsimError as :func:`mitsim.devices.patterns.stripe_count`.
+    """
+    return hadamard_matrix(stripe_count(n))[:n]
+
+
+# ---- Families ----
+
+
+@dataclass(frozen=True)
+class PatternAxis:
+    """One axis of a family's patterns: what its factor is made from.
+
+    Attributes
+    ----------
+    n
+        projector pixels along it.
+    k
+        the number in the family's name; 1 of a family without one.
+    name
+        ``left`` of rows, ``right`` of columns: the two have random streams of their own.
+    seed
+        of random streams.
+    """
+
+    n: int
+    k: int
+    name: Literal["left", "right"]
+    seed: int
+
+
+@dataclass(frozen=True)
+class Family:
+    """What is known of a pattern family before patterns are made; see :func:`pattern_family`."""
+
+    name: str
+    forms: tuple[str, ...]
+    factor: Callable[[PatternAxis], PatternFactor]
+    label: str
+    random: bool
+    signed: Callable[[int], bool]
+    check: Callable[[int], object] | None
+
+
+FAMILIES: dict[str, Family] = {}
+"""Every pattern family by its name."""
+
+
+def pattern_family(
+    *forms: str,
+    label: str = "",
+    random: bool = False,
+    signed: Callable[[int], bool] = lambda k: False,
+    check: Callable[[int], object] | None = None,
+) -> Callable[[Callable[[PatternAxis], PatternFactor]], Callable[[PatternAxis], PatternFactor]]:
+    """Register a function from a :class:`PatternAxis` to its (n, K) factor of 0/1 or +-1 as a pattern family.
+
+    Parameters
+    ----------
+    *forms
+        how it is called: ``NAME``, or ``NAME:K``, and ``NAME:RxC`` as well where rows and columns may differ.
+    label
+        its name in reports; the name itself if not given.
+    random
+        whether it takes a seed.
+    signed
+        whether patterns of a K take the value -1.
+    check
+        raises MitsimError for a K that it does not have.
+
+    Raises
+    ------
+    ValueError
+        for a name that is taken.
+    """
+    name = forms[0].partition(":")[0]
+    if name in FAMILIES:
+        raise ValueError(f"pattern_family: {name!r} is there already; known are {', '.join(FAMILIES)}")
+
+    def register(factor: Callable[[PatternAxis], PatternFactor]) -> Callable[[PatternAxis], PatternFactor]:
+        FAMILIES[name] = Family(name, forms, factor, label or name, random, signed, check)
+        return factor
+
+    return register
+
+
+@pattern_family("uniform")
+def uniform(axis: PatternAxis) -> PatternFactor:
+    """All pixels of an ``axis``, in one shot."""
+    import numpy as np
+
+    return np.ones((axis.n, 1), dtype=np.int8)
+
+
+@pattern_family("dots:K", "dots:RxC")
+def shifting_dots(axis: PatternAxis) -> PatternFactor:
+    """Column i lights every K-th pixel of an ``axis`` from i on; their number need not be a multiple of K."""
+    import numpy as np
+
+    return np.asarray(np.arange(axis.n)[:, None] % axis.k == np.arange(axis.k)[None, :], dtype=np.int8)
+
+
+@pattern_family("hadamard:K", label="Hadamard", signed=lambda k: k > 1, check=way_to)
+def repeated_hadamard(axis: PatternAxis) -> PatternFactor:
+    """The rows of the Hadamard matrix of order K, repeated down the pixels of an ``axis``; +-1."""
+    import numpy as np
+
+    return np.asarray(hadamard_matrix(axis.k)[np.arange(axis.n) % axis.k])
+
+
+@pattern_family("random:K", random=True)
+def random_binary(axis: PatternAxis) -> PatternFactor:
+    """Fair coin flips, each pixel of an ``axis`` lit by at least one column: the union must cover the scene."""
+    import numpy as np
+
+    rng = stream(axis.seed, "patterns", "random", axis.name)
+    bits = rng.integers(0, 2, size=(axis.n, axis.k), dtype=np.int8)
+    dark = np.flatnonzero(~bits.any(axis=1))
+    bits[dark, rng.integers(0, axis.k, size=dark.size)] = 1
+    return bits
+
+
+# ---- Names of families, as requests have them ----
+
+
+def pattern_names() -> str:
+    """How all families are called, for help and messages: "uniform, dots:K, dots:RxC, hadamard:K or random:K"."""
+    *most, last = (form for family in FAMILIES.values() for form in family.forms)
+    return f"{', '.join(most)} or {last}"
+
+
+def read_name(text: str, n: int | None = None) -> tuple[Family, list[int]]:
+    """Family and periods (one, or those of rows and of columns) of the patterns ``text``, for ``n`` projector pixels a
+    side; None: any number.
+
+    Raises
+    ------
+    MitsimError
+        for an unknown family, a K that is not a whole number, or K outside 1..n, and a Hadamard matrix of an order
+        that is not known.
+    """
+    name, colon, size = text.partition(":")
+    family = FAMILIES.get(name)
+    form = f"{name}:K" if colon else name
+    if family is None or form not in family.forms or bool(colon) != bool(size):
+        raise MitsimError(f"patterns {text!r}: use {pattern_names()}")
+    rows, _, columns = size.partition("x")
+    both = [rows, columns] if f"{name}:RxC" in family.forms and rows and columns else [size or "1"]
+    periods = [_period(text, period, n) for period in both]
+    for period in periods:
+        if family.check is not None and period <= _MOST_CHECKED:
+            family.check(period)
+    return family, periods
+
+
+def takes_seed(text: str) -> bool:
+    """Whether the patterns ``text`` are drawn at random."""
+    name = text.partition(":")[0]
+    return name in FAMILIES and FAMILIES[name].random
+
+
+def shot_count(text: str) -> int:
+    """How many shots the patterns ``text`` take, two of each with the value -1. MitsimError as :func:`read_name`."""
+    family, periods = read_name(text)
+    return periods[0] * periods[-1] * (2 if any(map(family.signed, periods)) else 1)
+
+
+def _period(text: str, size: str, n: int | None) -> int:
+    """K of the patterns ``text``, written as ``size``, for ``n`` projector pixels a side, or any number of them."""
+    if not (size.isascii() and size.isdigit() and len(size) <= _MOST_DIGITS):
+        most = "the projector's pixels a side" if n is None else n
+        raise MitsimError(f"patterns {text!r}: K is {size!r}; give a whole number from 1 to {most}")
+    k = int(size)
+    if k < 1 or (n is not None and k > n):
+        most = "the projector's pixels a side" if n is None else f"{n}, the projector's pixels a side"
+        raise MitsimError(f"patterns {text!r}: K is {k}; give 1 to {most}")
+    return k
 
 
 def parse_patterns(text: str, n: int, seed: int = 0) -> PatternFamily:
-    """The family of a name.
+    """The patterns of a name.
 
     Parameters
     ----------
     text
-        ``uniform``, ``dots:K``, ``dots:RxC`` (periods of rows and of columns), ``hadamard:K`` or ``random:K``.
+        one of :func:`pattern_names`, K a number: patterns a side. R and C are those of rows and of columns.
     n
         projector pixels a side.
     seed
-        of the random family.
+        of random families.
 
     Raises
     ------
     MitsimError
         for an unknown family, a K that is not a whole number, K outside 1..n, or more shots than a run has.
     """
-    name, periods = read_name(text, n)
+    from mitsim.core.manifests import MOST_SHOTS  # here: it takes 7 ms to import, and most requests make no patterns
+
+    family, periods = read_name(text, n)
     if (count := shot_count(text)) > MOST_SHOTS:
         raise MitsimError(f"patterns {text!r}: are {count} shots; a run has at most {MOST_SHOTS}, give a smaller K")
-    if name == "random":
-        return PatternFamily(text, *(_random_binary(n, periods[0], seed, side) for side in ("left", "right")))
-    if len(periods) == 2:
-        return PatternFamily(text, *(_shifting_dots(n, period) for period in periods))
-    factor = _SAME_BOTH_SIDES[name](n, periods[0])
-    return PatternFamily(text, factor, factor)
+    left = family.factor(PatternAxis(n, periods[0], "left", seed))
+    return PatternFamily(text, left, family.factor(PatternAxis(n, periods[-1], "right", seed)))

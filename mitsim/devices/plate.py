@@ -2,8 +2,9 @@
 
 What is separable, as the product of two maximum length sequences is, has one term, FlatCam's and a MURA two, and these
 are exact: crosses of the matrix (Bebendorf, Numerische Mathematik 86, 565, 2000), 0 and 1 where the mask's are. Any
-other mask is the sum of its singular vectors. Coordinates are those of :mod:`mitsim.devices.mask`. What goes wrong when
-it is made and mounted is in :mod:`mitsim.devices.mask_flaws`."""
+other mask is the sum of its singular vectors. Coordinates, and what goes wrong when it is made and mounted, are
+those of :mod:`mitsim.devices.mask`.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +20,7 @@ from mitsim.core.arrays import ByValue, FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.imagelist import Wanted
 from mitsim.core.images import image_size, own_end, read_image
-from mitsim.devices.mask import BoolArray, Term, mean_opening
-from mitsim.devices.mask_flaws import NO_FLAWS, Flaws, dusted
+from mitsim.devices.mask import NO_FLAWS, BoolArray, Flaws, Term, dusted, mean_opening
 
 LEFT_OUT = 1e-7
 """Part of a transmission, rms, that singular vectors may leave: a tenth of the finest accuracy that a plan takes."""

@@ -23,7 +23,7 @@ from mitsim.core.spectral_manifests import (
     read_mosaic,
     same_lines,
 )
-from mitsim.devices.families import read_name
+from mitsim.devices.patterns import read_name
 from mitsim.devices.sensor import check_exposure, load_sensor
 from mitsim.exchange.planes import check_channel
 

@@ -39,8 +39,14 @@ from mitsim.devices.mask import Mask
 from mitsim.devices.plate import FEW, Plate
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.edge_profile import Steps, smooth_box_means
-from mitsim.optics.mask_defects import nodes_between, polynomials
-from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, both_axes
+from mitsim.optics.shadow import (
+    Directions,
+    SeparableTerms,
+    ShadowGeometry,
+    both_axes,
+    lagrange_weights,
+    nodes_between,
+)
 
 ComplexArray = npt.NDArray[np.complex128]
 _STEP_MM = 2.5e-4
@@ -221,7 +227,9 @@ def _thin_means(
     at_nodes = (
         _thin_means_at(beyond + growth * float(node), shadow, profiles, directions, wavelength_nm) for node in nodes
     )
-    return np.asarray(sum(weight * means for weight, means in zip(polynomials(even, nodes), at_nodes, strict=True)))
+    return np.asarray(
+        sum(weight * means for weight, means in zip(lagrange_weights(even, nodes), at_nodes, strict=True))
+    )
 
 
 def _thin_means_at(

@@ -28,8 +28,7 @@ from scipy import fft
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask import Mask
-from mitsim.devices.mask_flaws import NO_FLAWS, Flaws
+from mitsim.devices.mask import NO_FLAWS, Flaws, Mask
 from mitsim.devices.plate import Plate
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.diffraction import EdgeWaves, grid_step, wave_profiles
@@ -361,8 +360,10 @@ def _part(values: FloatArray, first: int, count: int) -> FloatArray:
 
 # -------- A mask as functions that can be asked for means
 
-Sampler = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
-SeparableTerm = tuple[float, Sampler, Sampler]
+Sampler = Callable[[FloatArray, FloatArray], FloatArray]
+"""From places s and widths [mm], which broadcast, to means of a profile over [s - width/2, s + width/2]."""
+SampledTerm = tuple[float, Sampler, Sampler]
+"""Weight, and samplers of rows and of columns."""
 
 
 class ProfileSampler:
@@ -389,7 +390,7 @@ class ProfileSampler:
         self._feature, self._count = feature_mm, len(values)
         self._start = (-len(values) / 2 if start_mm is None else start_mm / feature_mm) + centre_mm / feature_mm
 
-    def __call__(self, s: FloatArray, width: FloatArray, tangent: FloatArray) -> FloatArray:
+    def __call__(self, s: FloatArray, width: FloatArray) -> FloatArray:
         """Mean over [s - width/2, s + width/2] for arrays that broadcast; at width 0 the value itself."""
         centre, half = s / self._feature - self._start, np.abs(width) / self._feature / 2
         low, high = centre - half, centre + half
@@ -406,7 +407,7 @@ class ProfileSampler:
 
 def wave_samplers(
     geometry: CameraGeometry, spectrum: Spectrum, depth: float, tau: tuple[float, float]
-) -> list[SeparableTerm]:
+) -> list[SampledTerm]:
     """A mask's wave-optical shadow of a (virtual) source, as samplers.
 
     Parameters
@@ -420,7 +421,7 @@ def wave_samplers(
         return _of_plate(raster(geometry, depth, spectrum), geometry.mask_offset)
     shadow = ShadowGeometry.of(geometry, depth)
     reach = geometry.half_width + geometry.mask_distance * geometry.tan_half_fov + max(geometry.pitches)
-    terms: list[SeparableTerm] = []
+    terms: list[SampledTerm] = []
     for wavelength, share in zip(spectrum.wavelengths_nm, spectrum.weights, strict=True):
 
         def axis(of: int, wavelength: float = float(wavelength)) -> list[tuple[float, ProfileSampler]]:
@@ -435,25 +436,21 @@ def wave_samplers(
     return terms
 
 
-def _steps_sampler(profile: Steps) -> Sampler:
-    """That of a ``profile`` whose features are not even, or blurred."""
-    return lambda s, width, tangent: profile.over(s, np.abs(width) / 2)
-
-
-def geometric_samplers(geometry: CameraGeometry) -> list[SeparableTerm]:
+def geometric_samplers(geometry: CameraGeometry) -> list[SampledTerm]:
     """The geometric shadow of the mask of ``geometry``, as samplers."""
     if geometry.drawn(waves=False):
         return _of_plate(raster(geometry, geometry.scene_distance), geometry.mask_offset)
     return _of_plate(geometry.build_mask(), geometry.mask_offset)
 
 
-def _of_plate(mask: Mask | Plate, centre: tuple[float, float]) -> list[SeparableTerm]:
+def _of_plate(mask: Mask | Plate, centre: tuple[float, float]) -> list[SampledTerm]:
     """The samplers of a ``mask`` with its ``centre`` off the axis [mm]."""
 
     def sampler(profile: FloatArray, at: float) -> Sampler:
         if mask.even:
             return ProfileSampler(profile, mask.feature_mm, centre_mm=at)
-        return _steps_sampler(Steps.between(profile, mask.lines + at, mask.blur_mm))
+        steps = Steps.between(profile, mask.lines + at, mask.blur_mm)
+        return lambda s, width: steps.over(s, np.abs(width) / 2)
 
     row, column = centre
     return [(weight, sampler(rows, row), sampler(columns, column)) for weight, rows, columns in mask.terms]

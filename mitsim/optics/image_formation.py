@@ -24,7 +24,7 @@ from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.plate import FEW
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.fft_shadow import Correlation, cells_per_pixel, raster
-from mitsim.optics.shadow import Directions, Places, SeparableTerms, ShadowGeometry
+from mitsim.optics.shadow import Directions, Places, SeparableTerms, ShadowGeometry, lagrange_weights
 from mitsim.optics.terms import shadow_terms
 
 IntArray = npt.NDArray[np.integer]
@@ -32,8 +32,6 @@ Entries = tuple[IntArray, FloatArray]
 """Increasing indices into (layers, rows, columns), and the light [W m^-2] at each."""
 _FILLED = 1 / 8
 """Part of all places from which light is laid out whole: of places at random, an eighth lights every row and column."""
-_HELD = 8
-"""Anchors whose stacked factors are held: those of 48 and a mask's three wavelengths would be gigabytes."""
 _kept_shadow = lru_cache(maxsize=24)(shadow_terms)
 """The last shadows, a few MiB each: a plan asks for some ten of them again and again."""
 _KEPT_RASTERS = 8
@@ -46,78 +44,71 @@ _FINER = 2
 
 
 @dataclass(frozen=True, eq=False)
-class _Block:
-    """Light of one layer in the rows and columns that any of several estimates lights, seen by separable terms.
+class _Lit:
+    """Light of one layer in the rows and columns that any of several estimates lights.
 
     Attributes
     ----------
-    factors
-        by term, (r, m) and (c, m') on frames (m, m'): the shadow's factors of the lit rows and columns.
-    lights
-        (estimates, r, c) light of each.
-    """
-
-    factors: Sequence[tuple[FloatArray, FloatArray]]
-    lights: FloatArray
-
-    def frame(self, out: FloatArray | None = None) -> FloatArray:
-        """(m, m') irradiance of the estimates' mean, in ``out`` where that is given.
-
-        One product over the rows, or columns, of all terms: those of single terms would go over the frame once each.
-        """
-        mean = self.lights[0] if len(self.lights) == 1 else self.lights.mean(axis=0)
-        lefts, rights = zip(*self.factors, strict=True)
-        # The cheaper order of the two products: fewer lit rows or fewer lit columns next to the sensor's side.
-        if len(lefts[0]) < len(rights[0]):
-            return np.matmul(_stacked(lefts).T, _stacked([mean @ right for right in rights]), out=out)
-        return np.matmul(_stacked([mean.T @ left for left in lefts]).T, _stacked(rights), out=out)
-
-    def probe(self, vectors: FloatArray | None) -> FloatArray:
-        """(m, estimates * probes) products of each estimate's frame with ``vectors`` (m', probes); without them the
-        frames themselves, side by side."""
-        count, rows, columns = self.lights.shape
-        flat, total = self.lights.reshape(count * rows, columns), np.zeros(())
-        for left, right in self.factors:
-            seen = (flat @ (right if vectors is None else right @ vectors)).reshape(count, rows, -1)
-            total = total + left.T @ np.moveaxis(seen, 0, 1).reshape(rows, -1)
-        return total
-
-
-@dataclass(frozen=True, eq=False)
-class _RasterBlock:
-    """The same, seen by a raster.
-
-    Attributes
-    ----------
-    layer
-        the raster, and what pixels it is for.
     rows, columns
-        (r,) and (c,) places in (anchor, cell) of the lights' rows and columns.
+        (r,) and (c,) places in (anchor, cell).
     lights
         (estimates, r, c) light of each.
     """
 
-    layer: _RasterLayer
     rows: IntArray
     columns: IntArray
     lights: FloatArray
 
-    def frame(self, out: FloatArray | None = None) -> FloatArray:
-        """As :meth:`_Block.frame`."""
-        seen = self.layer.image(self.lights.mean(axis=0), self.rows, self.columns)
-        if out is None:
-            return seen
-        out[...] = seen
-        return out
-
-    def probe(self, vectors: FloatArray | None) -> FloatArray:
-        """As :meth:`_Block.probe`."""
-        seen = [self.layer.image(light, self.rows, self.columns) for light in self.lights]
-        return np.concatenate([frame if vectors is None else frame @ vectors for frame in seen], axis=1)
+    @property
+    def mean(self) -> FloatArray:
+        """(r, c) of the estimates."""
+        return np.asarray(self.lights[0] if len(self.lights) == 1 else self.lights.mean(axis=0))
 
 
 @dataclass(frozen=True, eq=False)
-class _RasterLayer:
+class _Terms:
+    """One layer behind a mask of separable terms: the shadow's factors (m, cells) and (m', cells) by term, and the
+    anchors' weights (m, anchors) and (m', anchors)."""
+
+    terms: SeparableTerms
+    weights: tuple[FloatArray, FloatArray]
+
+    def frame(self, lit: _Lit, out: FloatArray | None = None) -> FloatArray:
+        """(m, m') irradiance of the estimates' mean, in ``out`` where that is given.
+
+        One product over the rows, or columns, of all terms: those of single terms would go over the frame once each.
+        """
+        lefts, rights = zip(*self._factors(lit), strict=True)
+        # The cheaper order of the two products: fewer lit rows or fewer lit columns next to the sensor's side.
+        if len(lefts[0]) < len(rights[0]):
+            return np.matmul(_stacked(lefts).T, _stacked([lit.mean @ right for right in rights]), out=out)
+        return np.matmul(_stacked([lit.mean.T @ left for left in lefts]).T, _stacked(rights), out=out)
+
+    def probe(self, lit: _Lit, vectors: FloatArray | None) -> FloatArray:
+        """(m, estimates * probes) products of each estimate's frame with ``vectors`` (m', probes); without them the
+        frames themselves, side by side."""
+        count, rows, columns = lit.lights.shape
+        flat, total = lit.lights.reshape(count * rows, columns), np.zeros(())
+        for left, right in self._factors(lit):
+            seen = (flat @ (right if vectors is None else right @ vectors)).reshape(count, rows, -1)
+            total = total + left.T @ np.moveaxis(seen, 0, 1).reshape(rows, -1)
+        return total
+
+    def _factors(self, lit: _Lit) -> list[tuple[FloatArray, FloatArray]]:
+        """By term (r, m) and (c, m'): the factors of the lit rows and columns, each by its anchor's weights."""
+        places = lit.rows, lit.columns
+        return [
+            tuple(  # type: ignore[misc]
+                self.weights[axis].T[anchor] * factor.T[cell]
+                for axis, factor in enumerate(term)
+                for anchor, cell in [np.divmod(places[axis], factor.shape[1])]
+            )
+            for term in self.terms
+        ]
+
+
+@dataclass(frozen=True, eq=False)
+class _Raster:
     """One layer behind a mask on a raster: its correlation, the anchors' weights (m, anchors) and (m', anchors), and
     rows and columns of a frame, None for all."""
 
@@ -126,14 +117,19 @@ class _RasterLayer:
     places: Places | None
     cells: tuple[int, int]
 
-    def block(self, rows: IntArray, columns: IntArray, lights: FloatArray) -> _RasterBlock:
-        """The layer with ``lights`` (estimates, r, c) in these ``rows`` and ``columns``."""
-        return _RasterBlock(self, rows, columns, lights)
+    def frame(self, lit: _Lit, out: FloatArray | None = None) -> FloatArray:
+        """As :meth:`_Terms.frame`."""
+        return np.positive(self._image(lit, lit.mean), out=out)
 
-    def image(self, light: FloatArray, rows: IntArray, columns: IntArray) -> FloatArray:
-        """(m, m') irradiance of a ``light`` (r, c) in these ``rows`` and ``columns``."""
+    def probe(self, lit: _Lit, vectors: FloatArray | None) -> FloatArray:
+        """As :meth:`_Terms.probe`."""
+        seen = [self._image(lit, light) for light in lit.lights]
+        return np.concatenate([frame if vectors is None else frame @ vectors for frame in seen], axis=1)
+
+    def _image(self, lit: _Lit, light: FloatArray) -> FloatArray:
+        """(m, m') irradiance of a ``light`` (r, c)."""
         (row_anchor, row), (column_anchor, column) = (
-            np.divmod(places, cells) for places, cells in zip((rows, columns), self.cells, strict=True)
+            np.divmod(places, cells) for places, cells in zip((lit.rows, lit.columns), self.cells, strict=True)
         )
         by_row, by_column = self.weights
         total = np.zeros((len(by_row), len(by_column)))
@@ -148,17 +144,6 @@ class _RasterLayer:
                     seen = seen[np.ix_(*self.places)]
                 total += by_row[:, first, None] * seen * by_column[:, second]
         return total
-
-
-@dataclass(frozen=True, eq=False)
-class _TermsLayer:
-    """One layer behind a mask of separable terms: by term, (anchors * cells, m) factors of rows and of columns."""
-
-    terms: Sequence[tuple[Any, Any]]
-
-    def block(self, rows: IntArray, columns: IntArray, lights: FloatArray) -> _Block:
-        """The layer with ``lights`` (estimates, r, c) in these ``rows`` and ``columns``."""
-        return _Block([(_picked(left, rows), _picked(right, columns)) for left, right in self.terms], lights)
 
 
 class FrameOptics:
@@ -194,28 +179,19 @@ class FrameOptics:
         centres = [geometry.centres(axis) for axis in (0, 1)]
         if places is not None:
             centres = [own[np.asarray(chosen)] for own, chosen in zip(centres, places, strict=True)]
-        by_row, by_column = (anchor_weights(positions, own) for own in centres)
+        weights = anchor_weights(positions, centres[0]), anchor_weights(positions, centres[1])
         self.anchors = anchors
         self.frame_shape = len(centres[0]), len(centres[1])
         self.cells = (len(rows.centres), len(columns.centres))
         self.shape = (anchors * self.cells[0], anchors * self.cells[1])
-        if geometry.correlated(spectrum is not None):
-            seen = [_correlation(geometry, rows, columns, depth, spectrum) for depth in depths]
-            self._layers: Sequence[_RasterLayer | _TermsLayer] = [
-                _RasterLayer(correlation, (by_row, by_column), places, self.cells) for correlation in seen
-            ]
-            return
-        # Stored with the light's index first, so that picking lit rows copies contiguous memory.
-        stack = _Stack if anchors > _HELD else _stack
-        self._layers = [
-            _TermsLayer(
-                [
-                    (stack(left, by_row), stack(right, by_column))
-                    for left, right in _shadow(geometry, rows, columns, depth, spectrum, places)
-                ]
-            )
-            for depth in depths
-        ]
+
+        def layer(depth: float) -> _Raster | _Terms:
+            if geometry.correlated(spectrum is not None):
+                correlation = _correlation(geometry, rows, columns, depth, spectrum)
+                return _Raster(correlation, weights, places, self.cells)
+            return _Terms(_shadow(geometry, rows, columns, depth, spectrum, places), weights)
+
+        self._layers = [layer(depth) for depth in depths]
 
     def frame(self, flat: IntArray, light: FloatArray) -> FloatArray:
         """(m, m') irradiance of ``light`` [W m^-2] at increasing indices ``flat`` into (layers, *shape)."""
@@ -228,8 +204,8 @@ class FrameOptics:
         """
         rows, columns = self.frame_shape
         total = np.zeros((rows, len(estimates) * (columns if vectors is None else vectors.shape[1])))
-        for block in self._blocks(estimates):
-            total += block.probe(vectors)
+        for layer, lit in self._lit_layers(estimates):
+            total += layer.probe(lit, vectors)
         return total
 
     def seen(
@@ -252,15 +228,17 @@ class FrameOptics:
         """
         probes = 0 if vectors is None else vectors.shape[1]
         frame, probed = None, np.zeros((self.frame_shape[0], len(estimates) * probes))
-        for block in self._blocks(estimates, together=vectors is None):
-            frame = block.frame(out) if frame is None else np.add(frame, block.frame(), out=frame)
+        for layer, lit in self._lit_layers(estimates, together=vectors is None):
+            frame = layer.frame(lit, out) if frame is None else np.add(frame, layer.frame(lit), out=frame)
             if vectors is not None:
-                probed += block.probe(vectors)
+                probed += layer.probe(lit, vectors)
         if frame is None:
             frame = np.zeros(self.frame_shape) if out is None else out
         return frame, probed
 
-    def _blocks(self, estimates: Sequence[Entries], together: bool = False) -> Iterator[_Block | _RasterBlock]:
+    def _lit_layers(
+        self, estimates: Sequence[Entries], together: bool = False
+    ) -> Iterator[tuple[_Raster | _Terms, _Lit]]:
         """The light of each layer that holds any, of each estimate or of their mean ``together``."""
         split = [self._split(*entries) for entries in estimates]
         for of_depth, of_layer in zip(self._layers, zip(*split, strict=True), strict=True):
@@ -280,7 +258,7 @@ class FrameOptics:
                     lights[number][place] = values
             if together:
                 lights /= len(parts)
-            yield of_depth.block(rows, columns, lights.reshape(-1, len(rows), len(columns)))
+            yield of_depth, _Lit(rows, columns, lights.reshape(-1, len(rows), len(columns)))
 
     def _lit(self, parts: Sequence[Entries]) -> tuple[IntArray, IntArray, list[Entries]]:
         """Rows and columns that any of some ``parts`` lights, and the parts by places among these alone."""
@@ -369,29 +347,6 @@ def _stacked(parts: Sequence[FloatArray]) -> FloatArray:
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
-def _picked(factor: FloatArray | _Stack, rows: IntArray) -> FloatArray:
-    """The ``rows`` of a factor; the factor itself where they are all."""
-    whole = isinstance(factor, np.ndarray) and len(rows) == len(factor)
-    return factor if whole else factor[rows]  # type: ignore[return-value]
-
-
-class _Stack:
-    """The same as :func:`_stack`, whose rows are made when they are asked for."""
-
-    def __init__(self, factor: FloatArray, weights: FloatArray) -> None:
-        self._factor, self._weights = np.ascontiguousarray(factor.T), np.ascontiguousarray(weights.T)
-
-    def __getitem__(self, rows: IntArray) -> FloatArray:
-        anchor, cell = np.divmod(rows, len(self._factor))
-        return np.asarray(self._weights[anchor] * self._factor[cell])
-
-
-def _stack(factor: FloatArray, weights: FloatArray) -> FloatArray:
-    """(anchors * cells, pixels): the factor (pixels, cells) once for each anchor, scaled by the anchor's weight."""
-    scaled = weights.T[:, None, :] * factor.T[None, :, :]
-    return np.ascontiguousarray(scaled.reshape(-1, factor.shape[0]))
-
-
 # -------- Points of the sensor from which radiance is evaluated, and the weights that interpolate between them
 
 
@@ -408,9 +363,4 @@ def anchor_positions(count: int, half_width: float) -> FloatArray:
 
 def anchor_weights(anchors: Sequence[float] | FloatArray, at: FloatArray) -> FloatArray:
     """(len(at), len(anchors)) Lagrange weights that interpolate values known at ``anchors`` to the points ``at``."""
-    nodes = np.asarray(anchors, dtype=np.float64)
-    weights = np.ones((len(at), len(nodes)))
-    for j, node in enumerate(nodes):
-        for zero in np.delete(nodes, j):
-            weights[:, j] *= (at - zero) / (node - zero)
-    return weights
+    return np.stack(lagrange_weights(at, np.asarray(anchors, dtype=np.float64)), axis=1)

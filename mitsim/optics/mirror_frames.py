@@ -6,8 +6,9 @@ at most half a sensor pixel, and each box gives every pixel that it overlaps its
 over the part. Boxes tile what the beam lights, and flux is conserved whatever their shape.
 
 The mask enters as separable terms of samplers (:mod:`mitsim.optics.fft_shadow`); a wave-optical one needs the distance
-of the virtual source, :attr:`Beams.inverse_depth`. Coordinates are index coordinates (s_row = -y, s_col = -x), centred,
-in mm."""
+of the virtual source, :attr:`Beams.inverse_depth`. Coordinates are index coordinates (s_row = -y, s_col = -x),
+centred, in mm.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
-from mitsim.optics.fft_shadow import SeparableTerm
+from mitsim.optics.fft_shadow import SampledTerm
 from mitsim.optics.frames import ClassFrames
 from mitsim.optics.image_formation import IntArray
 
@@ -106,7 +107,7 @@ class GlintFrames(ClassFrames):
 def glint_frames(
     beams: Beams,
     geometry: CameraGeometry,
-    terms: Sequence[SeparableTerm],
+    terms: Sequence[SampledTerm],
     labels: IntArray,
     boxes_per_pixel: int = 2,
 ) -> GlintFrames:
@@ -241,7 +242,7 @@ def _deposit(
     slot: IntArray,
     boxes: _Boxes,
     geometry: CameraGeometry,
-    terms: Sequence[SeparableTerm],
+    terms: Sequence[SampledTerm],
     active_part: float,
 ) -> float:
     """Add the boxes' flux behind the mask to ``frames`` [.. mm^2]; the sum of their flux on the sensor without it.
@@ -272,11 +273,11 @@ def _deposit(
 
 def _pieces(
     boxes: _Boxes, axis: int, step: int, geometry: CameraGeometry, active_part: float
-) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
     """The part of each box in its first (step 0) or second pixel along an axis.
 
     Pixel index, share of the box (0 outside the sensor), then what a sampler takes: centre and width of the part's
-    shadow in the mask plane [mm], tan-angle.
+    shadow in the mask plane [mm].
     """
     pitch, first = geometry.pitches[axis], 0 if geometry.roi is None else geometry.roi[axis]
     place = boxes.place[:, axis] / pitch + geometry.shape[axis] / 2 - first
@@ -287,10 +288,10 @@ def _pieces(
     high = np.minimum(high, pixel + (1 + active_part) / 2)
     share = np.maximum(high - low, 0) / extent
     share[(pixel < 0) | (pixel >= geometry.frame_shape[axis])] = 0
-    magnification, tangent = boxes.magnification[:, axis], boxes.tangent[:, axis]
+    magnification = boxes.magnification[:, axis]
     offset = ((low + high) / 2 - place) * pitch
-    shadow = boxes.place[:, axis] + geometry.mask_distance * tangent + magnification * offset
-    return pixel, share, shadow, np.abs(magnification) * share * extent * pitch, tangent
+    shadow = boxes.place[:, axis] + geometry.mask_distance * boxes.tangent[:, axis] + magnification * offset
+    return pixel, share, shadow, np.abs(magnification) * share * extent * pitch
 
 
 def _bilinear(corners: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:

@@ -19,7 +19,7 @@ A cell takes the clear profile of its centre.
 
 A mask whose centre is off the axis by o is a centred one seen from its own axis: u - o, and tau - o/z. One that is
 tilted along the axis, its distance d + a s + b, is met by a ray of slope t = tau - u/z at s + t (a s + b) / (1 - a t),
-times sqrt(1 + a^2) along it (:mod:`mitsim.optics.mask_defects`).
+times sqrt(1 + a^2) along it (:mod:`mitsim.optics.terms`).
 
 All coordinates are index coordinates, centred, in mm; tau is a pure number.
 """
@@ -361,6 +361,22 @@ def _trapezoid_cdf(x: FloatArray, half_a: FloatArray, half_b: FloatArray) -> Flo
     centre = 0.5 - distance / (2 * long)
     upper = np.where(distance <= long - short, centre, tail)
     return np.asarray(np.where(x < 0, upper, 1 - upper))
+
+
+def nodes_between(places: FloatArray, count: int) -> FloatArray:
+    """(``count``,) Chebyshev's nodes between those of ``places`` that are farthest from 0; 0 for one."""
+    reach = float(np.abs(places).max())
+    return np.asarray(reach * np.cos(np.pi * (np.arange(count) + 0.5) / count) if count > 1 else np.zeros(1))
+
+
+def lagrange_weights(places: FloatArray, nodes: FloatArray) -> list[FloatArray]:
+    """At each of the ``places``, the polynomial that is 1 at each of the ``nodes`` and 0 at the others: weights that
+    interpolate between values at the nodes."""
+    weights = []
+    for node in nodes:
+        others = nodes[nodes != node]
+        weights.append(np.prod([(places - other) / (node - other) for other in others], axis=0) * np.ones_like(places))
+    return weights
 
 
 def _shrink(distance_mm: float, depth_mm: float) -> float:

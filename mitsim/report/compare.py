@@ -9,6 +9,7 @@ import numpy as np
 
 from mitsim.acquire.capture import expose
 from mitsim.core.runs import Capture
+from mitsim.devices.patterns import FAMILIES
 from mitsim.light.light import SampledLight
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
@@ -90,7 +91,7 @@ def label(name: str) -> str:
     """What people call the patterns ``name``, such as "49 dots" for ``dots:7`` and "7 x 14 dots" for ``dots:7x14``."""
     kind, _, size = name.partition(":")
     count = size.replace("x", " x ") if "x" in size else size and str(int(size) ** 2)
-    return f"{count} {'Hadamard' if kind == 'hadamard' else kind}" if count else kind.capitalize()
+    return f"{count} {FAMILIES[kind].label}" if count else kind.capitalize()
 
 
 def in_text(name: str) -> str:

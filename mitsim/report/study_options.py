@@ -10,7 +10,7 @@ from math import prod
 from mitsim.bench.request import Request
 from mitsim.core.errors import MitsimError
 from mitsim.devices.drift import Drift
-from mitsim.devices.families import read_name
+from mitsim.devices.patterns import read_name
 
 MEASURES = {
     "psnr": ("psnr_db", "PSNR [dB]"),
@@ -86,7 +86,7 @@ def check_sweep(sweep: Sweep, pictures: int) -> None:
         if text not in CONVENTIONS:
             raise MitsimError(f"--over exposure={text}: use {', '.join(CONVENTIONS)}")
     for text in knobs.get("patterns", ()):
-        read_name(text, None)
+        read_name(text)
     for name, kind in (("seed", int), ("accuracy", float)):
         for text in knobs.get(name, ()):
             Request.of(**{name: number_of(name, text, kind)})

@@ -16,10 +16,8 @@ from mitsim.scene.guard.check import check_file, looking_beside
 from mitsim.scene.guard.estimators import Unfit
 from mitsim.scene.guard.limits import Range
 from mitsim.scene.guard.outline import Tag
-from mitsim.scene.mesh_lamps import emit_by_faces
-from mitsim.scene.origin import check_meshes, move_to_camera
 from mitsim.scene.projector import ProjectorGrid, locate_projector
-from mitsim.scene.thin import with_thin_shapes_as_meshes
+from mitsim.scene.tree import check_meshes, emit_by_faces, move_to_camera, with_thin_shapes_as_meshes
 
 SENSOR_PLUGIN = "mitsim_lensless"
 _SMALL_LAMPS = ("DirectionalEmitter", "PointLight", "SpotLight")
@@ -118,23 +116,24 @@ def load_scene(
         except MitsimError:
             if needs_projector:
                 raise
-    shapes = checked.shapes if len(checked.shapes) == len(scene.shapes()) else ()
     small = [emitter for emitter in emitters if emitter.class_name() in _SMALL_LAMPS]
-    lit = tuple(zip(small, checked.small_lamps, strict=True))
-    facts = (
+    return LoadedScene(
+        path,
+        checked.files,
+        scene,
+        cameras[0],
+        projectors[0] if grid else None,
+        grid,
+        tuple(emitter for emitter in emitters if grid is None or emitter.class_name() != "Projector"),
         *_polished(scene, checked.unfit),
         checked.unfit,
-        shapes,
-        lit,
+        checked.shapes if len(checked.shapes) == len(scene.shapes()) else (),
+        tuple(zip(small, checked.small_lamps, strict=True)),
         checked.coloured,
         checked.parting,
         checked.samples,
         notes,
     )
-    if grid is None:
-        return LoadedScene(path, checked.files, scene, cameras[0], None, None, tuple(emitters), *facts)
-    lamps = tuple(emitter for emitter in emitters if emitter.class_name() != "Projector")
-    return LoadedScene(path, checked.files, scene, cameras[0], projectors[0], grid, lamps, *facts)
 
 
 def _polished(scene: mi.Scene, unfit: Unfit) -> tuple[bool, bool]:

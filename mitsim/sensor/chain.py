@@ -21,7 +21,6 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import compiled_arrays
 from mitsim.core.errors import MitsimError
-from mitsim.core.units import photon_energy
 from mitsim.devices.sensor import SensorModel
 from mitsim.sensor.specimen import neighbours, specimen
 
@@ -482,3 +481,19 @@ def ripple_level(response: npt.NDArray[np.complex128], amplitude: float, phase: 
         c and phi [radians]; an amplitude of at most 1, so that no level is below 0.
     """
     return np.asarray(1 + amplitude * (response * np.exp(1j * phase)).real[:, None])
+
+
+# ---- Energy of a photon ----
+
+PLANCK = 6.62607015e-34
+"""Planck constant, J s (exact, SI 2019)."""
+LIGHT_SPEED = 299_792_458.0
+"""Speed of light in vacuum, m/s (exact, SI 2019)."""
+
+
+def photon_energy(wavelength_nm: float) -> float:
+    """Energy of one photon [J], E = h c / lambda, at a vacuum wavelength ``wavelength_nm`` [nm]; ValueError unless that
+    is above 0."""
+    if not wavelength_nm > 0:
+        raise ValueError(f"photon_energy: wavelength_nm is {wavelength_nm}; it must be above 0")
+    return PLANCK * LIGHT_SPEED / (wavelength_nm * 1e-9)

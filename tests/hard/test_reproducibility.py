@@ -23,7 +23,7 @@ from mitsim.light import light
 from mitsim.light.light import trace_light
 from mitsim.light.pilot_result import LOOKS, Changes, Part
 from mitsim.light.settings import GROUPS, Settings
-from mitsim.optics import frames
+from mitsim.optics import forming
 from mitsim.planner import pilot_direct, pilot_samples
 from mitsim.planner.planner import make_plan
 from mitsim.transport.direct import DirectTracer
@@ -140,7 +140,7 @@ def test_mixing_does_not_depend_on_threads(monkeypatch: pytest.MonkeyPatch, colu
     found = set()
     for count in (*THREADS, 5, 7):
         monkeypatch.setattr(parallel, "workers", lambda count=count: count)
-        found.add(frames._mix(weights, basis).tobytes())
+        found.add(forming.mix_frames(weights, basis).tobytes())
     assert len(found) == 1
     assert np.allclose(np.frombuffer(found.pop()), (weights @ basis).ravel(), rtol=1e-13, atol=0)
 

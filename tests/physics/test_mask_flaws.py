@@ -12,13 +12,11 @@ import pytest
 from scipy import ndimage, special
 
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask import mls_mask
-from mitsim.devices.mask_flaws import NO_FLAWS
+from mitsim.devices.mask import NO_FLAWS, mls_mask
 from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.plate import Plate
 from mitsim.devices.projector import Spectrum
-from mitsim.optics.fft_shadow import geometric_samplers, wave_samplers
-from mitsim.optics.mirror_frames import SeparableTerm
+from mitsim.optics.fft_shadow import SampledTerm, geometric_samplers, wave_samplers
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
 
@@ -80,8 +78,8 @@ def test_waves_behind_a_blurred_edge_are_those_of_the_root_of_its_transmission()
     assert np.abs(got - whole(made(), 400.0, LINES)).max() > 0.02
 
 
-def mean_over(terms: list[SeparableTerm], s: np.ndarray, width: float) -> np.ndarray:
-    axes = [[side(s, np.asarray(width), np.zeros_like(s)) for side in sides] for _, *sides in terms]
+def mean_over(terms: list[SampledTerm], s: np.ndarray, width: float) -> np.ndarray:
+    axes = [[side(s, np.asarray(width)) for side in sides] for _, *sides in terms]
     return sum(weight * np.outer(*axis) for (weight, *_), axis in zip(terms, axes, strict=True))
 
 

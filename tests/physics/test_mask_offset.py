@@ -18,7 +18,7 @@ from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import Mask
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.diffraction import wave_terms
-from mitsim.optics.fft_shadow import SeparableTerm, geometric_samplers, wave_samplers
+from mitsim.optics.fft_shadow import SampledTerm, geometric_samplers, wave_samplers
 from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, geometric_terms
 from mitsim.optics.terms import shadow_terms
 from tests.physics.slopes import slope_of_reference
@@ -92,16 +92,16 @@ def test_samplers_of_a_moved_mask_are_a_centred_ones_asked_elsewhere(spectrum: S
     """As far as both reach. (Planted: the centre added to the places, or to the ends of the profile.)"""
     camera = CAMERA.model_copy(update={"mask_offset_row": 0.131, "mask_offset_column": -0.077})
 
-    def samplers(of: CameraGeometry) -> list[SeparableTerm]:
+    def samplers(of: CameraGeometry) -> list[SampledTerm]:
         return geometric_samplers(of) if spectrum is None else wave_samplers(of, spectrum, 400.0, (0.0, 0.1))
 
-    s, width, tangent = np.linspace(-0.5, 0.5, 61), np.full(61, 0.02), np.zeros(61)
+    s, width = np.linspace(-0.5, 0.5, 61), np.full(61, 0.02)
     for (weight, *moved), (other, *centred) in zip(samplers(camera), samplers(CAMERA), strict=True):
         assert weight == other
         for sampler, own, offset in zip(moved, centred, (0.131, -0.077), strict=True):
-            found, expected = sampler(s, width, tangent), own(s - offset, width, tangent)
+            found, expected = sampler(s, width), own(s - offset, width)
             np.testing.assert_allclose(found, expected, atol=1e-12 if spectrum is None else 2e-3 * expected.max())
-            assert np.abs(found - own(s, width, tangent)).max() > 0.1 * found.max()
+            assert np.abs(found - own(s, width)).max() > 0.1 * found.max()
 
 
 @pytest.mark.slow

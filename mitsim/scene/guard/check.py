@@ -3,8 +3,8 @@ silently accept.
 
 Making objects of a scene can run native code and read any file, and it takes NaN, negative light or a reflectance of 2
 without a word. So :mod:`mitsim.scene.guard.outline` looks at the bytes, ``mitsuba.parser`` reads them (which loads no
-plugin and needs no variant), and what it read is checked here: ``vocabulary`` knows the plugins, ``limits`` the
-numbers, ``files`` and ``headers`` the files. :func:`mitsim.scene.load.load_scene` makes objects of that same tree.
+plugin and needs no variant), and what it read is checked here: ``limits`` knows the plugins and the
+numbers, ``headers`` the files. :func:`mitsim.scene.load.load_scene` makes objects of that same tree.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from mitsim.devices.camera import CameraGeometry
 from mitsim.scene.guard import limits
 from mitsim.scene.guard.estimators import SMALL_LAMPS, Unfit
 from mitsim.scene.guard.headers import MOST_TEXELS, check_image, check_obj, check_ply, is_grey
-from mitsim.scene.guard.limits import PLUGINS, Range, check_plugin, check_variant
+from mitsim.scene.guard.limits import PLUGINS, Range, check_plugin, check_variant, references
 from mitsim.scene.guard.outline import DEEPEST, MOST_ELEMENTS, Outline, SceneFiles, Tag
 
 _IMAGES = ("bitmap", "envmap")
@@ -106,15 +106,11 @@ def check_file(
         mi.parser.transform_all(config, state)
     tree = _Tree(outline, files, variant, [mi.parser.SceneNode(node) for node in state.nodes])
     tree.check()
-    unfit = Unfit.of(outline, tree.nodes)
     # Groups are in the scene by their instances alone.
     shapes = [plugin for plugin in PLUGINS["shape"].split() if plugin != "shapegroup"]
-    listed = (tuple(tree.listed(plugins)) for plugins in (shapes, SMALL_LAMPS))
-    facts = tuple(files.used), tree.limits, unfit
-    shown, small = listed
-    return CheckedScene(
-        outline, config, state, *facts, shown, small, tuple(tree.coloured), tuple(tree.parting), tree.samples
-    )
+    facts = tuple(files.used), tree.limits, Unfit.of(outline, tree.nodes)
+    listed = tuple(tree.listed(shapes)), tuple(tree.listed(SMALL_LAMPS)), tuple(tree.coloured), tuple(tree.parting)
+    return CheckedScene(outline, config, state, *facts, *listed, tree.samples)
 
 
 @contextmanager
@@ -167,12 +163,9 @@ class _Tree:
 
     def listed(self, plugins: Sequence[str]) -> Iterator[Tag]:
         """Tags of the root's own objects that are one of the ``plugins``."""
-        root = self.nodes[0]
-        for name in root.props.keys():  # noqa: SIM118 - Properties is no dict
-            if root.props.type(name) == _Type.ResolvedReference:
-                child = self._child(root, name)
-                if child.props.plugin_name() in plugins:
-                    yield self.outline.tag(child)
+        for child in (self.nodes[index] for index in references(self.nodes[0].props)):
+            if child.props.plugin_name() in plugins:
+                yield self.outline.tag(child)
 
     def _check_property(self, node: mi.parser.SceneNode, name: str) -> None:
         tag, kind, plugin = self.outline.tag(node, name), node.props.type(name), node.props.plugin_name()
@@ -245,7 +238,7 @@ class _Tree:
             raise tag.refusal("texels", self.texels, f"all bitmaps together may have {MOST_TEXELS}")
 
     def _check_camera(self, node: mi.parser.SceneNode) -> None:
-        for below in self._below(node):
+        for below in references(node.props):
             props = self.nodes[below].props
             if props.plugin_name() in PLUGINS["sampler"].split() and "sample_count" in props:
                 self.samples = int(props["sample_count"])
@@ -267,7 +260,7 @@ class _Tree:
             """Levels and objects from the node downwards, references followed."""
             node = self.nodes[index]
             if index not in known and depth <= DEEPEST:
-                parts = [unfold(below, depth + 1) for below in self._below(node)]
+                parts = [unfold(below, depth + 1) for below in references(node.props)]
                 sides = 2 if node.props.plugin_name() == "twosided" else 1  # each side is a copy
                 deepest = max((levels for levels, _ in parts), default=0)
                 known[index] = 1 + deepest, 1 + sides * sum(size for _, size in parts)
@@ -280,10 +273,6 @@ class _Tree:
             return levels, size
 
         unfold(0, 0)
-
-    def _below(self, node: mi.parser.SceneNode) -> list[int]:
-        props = node.props
-        return [props[name].index() for name in props.keys() if props.type(name) == _Type.ResolvedReference]  # noqa: SIM118
 
     def _child(self, node: mi.parser.SceneNode, name: str) -> mi.parser.SceneNode:
         return self.nodes[node.props[name].index()]

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import mitsuba as mi
 
 from mitsim.core.errors import MitsimError
-from mitsim.scene.guard.limits import PLUGINS
+from mitsim.scene.guard.limits import PLUGINS, references
 
 if TYPE_CHECKING:
     from mitsim.scene.guard.outline import Outline
@@ -174,12 +174,10 @@ class _References:
 
     def below(self, node: mi.parser.SceneNode, plugins: Sequence[str]) -> Iterator[mi.parser.SceneNode]:
         """Nodes of one of the ``plugins`` that a ``node`` refers to, itself or by others."""
-        for name in node.props.keys():  # noqa: SIM118 - Properties is no dict
-            if node.props.type(name) == mi.Properties.Type.ResolvedReference:
-                other = self.nodes[node.props[name].index()]
-                if other.props.plugin_name() in plugins:
-                    yield other
-                yield from self.below(other, plugins)
+        for other in (self.nodes[index] for index in references(node.props)):
+            if other.props.plugin_name() in plugins:
+                yield other
+            yield from self.below(other, plugins)
 
     def child(self, node: mi.parser.SceneNode, name: str) -> mi.parser.SceneNode | None:
         """What the property refers to; None unless there is one, and an object."""

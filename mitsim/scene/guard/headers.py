@@ -30,23 +30,11 @@ _HEADER = 1 << 16
 _GREY = ("1", "L", "LA", "I", "I;16")
 """What Pillow calls pictures without colours."""
 _PLY_TYPES = {
-    "char": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "ushort": "u2",
-    "int": "i4",
-    "uint": "u4",
-    "int8": "i1",
-    "uint8": "u1",
-    "int16": "i2",
-    "uint16": "u2",
-    "int32": "i4",
-    "uint32": "u4",
-    "float": "f4",
-    "double": "f8",
-    "float32": "f4",
-    "float64": "f8",
-}
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "float32": "f4", "float64": "f8",
+}  # fmt: skip
+"""NumPy's name of each type in a header."""
 _CORNERS, _INDICES = "corner count", "corner indices"
 """A triangle's list as fields of an array: names with a blank, which no property has."""
 _MOST_TEXT = 64 << 20

@@ -6,6 +6,7 @@ import difflib
 from collections.abc import Container, Iterable
 from dataclasses import dataclass
 
+import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
@@ -168,6 +169,12 @@ _LACKED = {
 }
 """Plugins of Mitsuba 3.9.1 that its variants without wavelengths lack, and what to do. Textures are loaded there, and
 end the run when light meets them."""
+
+
+def references(props: mi.Properties) -> list[int]:
+    """Numbers of the nodes that an object's ``props`` refer to."""
+    resolved = mi.Properties.Type.ResolvedReference
+    return [props[name].index() for name in props.keys() if props.type(name) == resolved]  # noqa: SIM118 - no dict
 
 
 def check_plugin(tag: Tag, plugin: str) -> None:

@@ -19,7 +19,7 @@ from mitsim.acquire.drift import projecting
 from mitsim.core.configuration import DEFAULT_CAMERA, locate, shipped
 from mitsim.core.errors import MitsimError
 from mitsim.devices.drift import UNITS, WORDS, Drift, amount_in_words
-from mitsim.devices.families import check_patterns
+from mitsim.devices.patterns import read_name
 from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import SessionRecipe, load_recipe
 from mitsim.reconstruct.factors import Factors
@@ -48,7 +48,7 @@ AGREE_DB = 0.5
 
 def _points(scope: Scope) -> Sequence[Point]:
     drift, first = recipe_of(scope.recipe).drift, scope.seeds[0]
-    check_patterns(scope.patterns)
+    read_name(scope.patterns)
     amounts = _amounts(scope, drift)
     if not amounts:
         raise MitsimError(f"study drift: the table [drift] of {scope.recipe} moves nothing; give amounts in it")

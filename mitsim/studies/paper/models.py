@@ -20,8 +20,7 @@ from mitsim.calibrate.predict import Foreseen
 from mitsim.calibrate.session import LitSession, Session
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
-from mitsim.devices.model_fit import Modelling
-from mitsim.devices.session import SessionRecipe, load_recipe
+from mitsim.devices.session import Modelling, SessionRecipe, load_recipe
 from mitsim.reconstruct.factors import Factors
 from mitsim.report.charts import curves
 from mitsim.report.exposures import EQUAL_PEAK, LitScene

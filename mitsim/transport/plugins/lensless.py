@@ -66,8 +66,7 @@ import numpy as np
 
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask import BoolArray, Mask
-from mitsim.devices.mask_flaws import Flaws
+from mitsim.devices.mask import BoolArray, Flaws, Mask
 from mitsim.devices.plate import Plate
 from mitsim.transport.coordinates import RIGID, rigidity_error, rows_columns, turn_and_origin, x_y
 from mitsim.transport.plugins.base import register_once

@@ -57,10 +57,10 @@ def test_a_file_that_cannot_be_written_ends_the_shooting(monkeypatch: pytest.Mon
     for bad in ("frame_00000.exr", "frame_00024.exr"):
 
         class Full(RunMemory):
-            def _write(self, name, channels, metadata, bad=bad) -> None:
+            def write(self, name, channels, metadata, bad=bad) -> None:
                 if name == bad:
                     raise MitsimError(f"file {name}: cannot be written (No space left on device)")
-                super()._write(name, channels, metadata)
+                super().write(name, channels, metadata)
 
         recorder = Full()
         with pytest.raises(MitsimError, match=f"^file {bad}: cannot be written"):
@@ -83,7 +83,7 @@ def test_frames_take_as_much_memory_as_is_predicted(mixed: bool, monkeypatch: py
     weights = np.random.default_rng(3).random((shots, classes))
 
     class Nowhere(RunMemory):
-        def _write(self, name, channels, metadata) -> None:
+        def write(self, name, channels, metadata) -> None:
             """Kept by nobody."""
 
     expected = expected_frames(small_optics(pixels), random_groups(GROUPS, 7), labels, weights, 0)

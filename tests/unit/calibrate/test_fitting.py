@@ -13,9 +13,9 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import mls_mask
-from mitsim.devices.model_fit import FITTED, UNITS, Modelling, frames_of
 from mitsim.devices.patterns import stripe_signs
 from mitsim.devices.projector import Spectrum
+from mitsim.devices.session import FITTED, UNITS, Modelling, frames_of
 from mitsim.optics.camera_model import ModelledCamera, Placement
 
 N = 16

@@ -14,8 +14,7 @@ from mitsim.calibrate.model_fit import fit_placement, model_of, simulated
 from mitsim.calibrate.session import Session
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
-from mitsim.devices.model_fit import Modelling
-from mitsim.devices.session import load_recipe
+from mitsim.devices.session import Modelling, load_recipe
 from mitsim.studies.paper.models import OFF_MM, as_built
 from tests.real_session import RealSession, write_list
 

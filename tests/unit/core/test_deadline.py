@@ -9,9 +9,8 @@ from collections.abc import Callable
 
 import pytest
 
-from mitsim.core.deadline import within
 from mitsim.core.errors import MitsimError
-from mitsim.core.job import Job
+from mitsim.core.job import Job, within
 from mitsim.core.resources import Limits
 from mitsim.core.worker import OutOfTime
 

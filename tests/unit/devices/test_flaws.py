@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask_flaws import Dust, dusted, etched
+from mitsim.devices.mask import Dust, dusted, etched
 from mitsim.devices.mask_profile import MaskProfile, load_mask
 from mitsim.devices.plate import Plate, within
 

@@ -9,7 +9,8 @@ from scipy import sparse
 
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.patterns import Lighting
-from mitsim.optics.frames import ExpectedFrames, Filed
+from mitsim.optics.forming import Filed
+from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions
 

@@ -5,14 +5,13 @@ import pytest
 from scipy import sparse
 from scipy.linalg import hadamard
 
+from mitsim.optics import forming
 from mitsim.optics import frames as frames_module
+from mitsim.optics.forming import Filed, _product, pair_shots
 from mitsim.optics.frames import (
     ClassFrames,
     ExpectedFrames,
-    Filed,
     Frame,
-    _paired,
-    _product,
     at_once,
     formed_frames,
     frames_in_memory,
@@ -140,7 +139,7 @@ def test_shots_of_a_class_each_are_formed_where_the_classes_lay(
         return [list(expected), list(expected)]
 
     once, twice = formed()
-    monkeypatch.setattr(frames_module._Mixture, "one_each", False)
+    monkeypatch.setattr(forming.Mixture, "one_each", False)
     plain, _ = formed()
     assert any(frame.removed for frame in plain) and len({frame.variance for frame in plain}) == 4
     for found, again, frame in zip(once, twice, plain, strict=True):
@@ -278,7 +277,7 @@ def test_shots_of_signed_patterns_are_pairs(low: float) -> None:
     signs = hadamard(8)
     lit = np.stack([signs > 0, signs < 0], axis=1).reshape(16, 8)
     weights = np.where(lit, 1.0, low)
-    kept, mixture = _paired(weights)  # type: ignore[misc]
+    kept, mixture = pair_shots(weights)  # type: ignore[misc]
     assert kept.shape == (8, 8)
     assert np.abs(mixture.weights @ kept - weights).max() < 1e-15
     assert mixture.own.nnz <= 2 * len(weights)
@@ -297,7 +296,7 @@ def test_other_shots_are_not_pairs(name: str) -> None:
         "more pairs than classes": np.concatenate([np.ones((1, 3)), np.eye(3)]),
         "one value": np.ones((2, 2)),
     }[name]
-    assert _paired(weights) is None
+    assert pair_shots(weights) is None
 
 
 def test_frames_of_pairs_are_those_of_classes() -> None:

@@ -4,16 +4,14 @@ import numpy as np
 import pytest
 from scipy import sparse
 
+from mitsim.optics.forming import Filed
 from mitsim.optics.frames import (
     ClassFrames,
-    Filed,
-    _probes,
-    bound_of,
     monte_carlo_bound,
     monte_carlo_error,
-    shares_of_bound,
 )
 from mitsim.optics.image_formation import FrameOptics
+from mitsim.optics.replicates import bound_of, probe_vectors, shares_of_bound
 from mitsim.optics.shadow import Directions
 from tests.unit.optics.small_camera import (
     BESIDE,
@@ -129,7 +127,7 @@ def test_probes_see_every_matrix_with_its_norm_and_what_columns_share_exactly() 
     those.
     """
     pixels = 12
-    probes = [_probes(pixels, seed) for seed in range(400)]
+    probes = [probe_vectors(pixels, seed) for seed in range(400)]
     for one in probes[:5]:
         assert np.square(np.ones(pixels) @ one).sum() == pytest.approx(pixels, rel=1e-12)
     mean = np.mean([one @ one.T for one in probes], axis=0)

@@ -72,7 +72,7 @@ def test_fine_nodes_are_as_good_as_finer_ones(monkeypatch: pytest.MonkeyPatch) -
     small = CameraGeometry(pixels=512).model_copy(update={"mask_motion": MaskMotion(rotation_mrad=1.0)})
     cell, few = Directions.cells(np.array([0.05, 0.0523])), (3, 4, 5, 250, 508, 509)
     shadow = [operator(shadow_terms(small, cell, cell, DEPTH, places=(few, few)))]
-    monkeypatch.setattr("mitsim.optics.mask_defects.NODE_UM", 0.05)
+    monkeypatch.setattr("mitsim.optics.terms.NODE_UM", 0.05)
     shadow.append(operator(shadow_terms(small, cell, cell, DEPTH, places=(few, few))))
     still = operator(shadow_terms(small.model_copy(update={"mask_motion": None}), cell, cell, DEPTH, places=(few, few)))
     assert np.linalg.norm(shadow[0] - shadow[1]) < 0.01 * np.linalg.norm(shadow[1] - still)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.scene import thin
+from mitsim.scene import tree as thin
 from mitsim.scene.load import LoadedScene, load_scene
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -1,0 +1,271 @@
+"""Forming frames: estimates of light and the optics that it passes in; frames of mixtures of its rows out.
+
+A *basis* is a matrix (b, rows) of mixtures. Its frames are formed by the closed form of
+:mod:`mitsim.optics.image_formation`; shots that are sums of few frames of a basis are then added up
+(:class:`Mixture`). Beside each frame its *replicates*, those of single groups of the light, are seen by probing
+vectors alone (:mod:`mitsim.optics.replicates`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.parallel import in_threads
+from mitsim.optics.image_formation import Entries, FrameOptics
+from mitsim.optics.replicates import noise_of_groups
+
+_FEW = 2
+"""Classes a shot, beside what all shots light alike, up to which adding up their frames takes less than a product of
+matrices: a twentieth for dots whose black pixels leak."""
+_COLUMNS = 2**14
+"""Columns of a product at a time: how a product is cut shows in its last bits, so not by the number of threads."""
+_MOST_COLUMNS = 2**22
+"""Places of light from which a product is worked out on those that are lit: SciPy takes 16 bytes for each of all, and
+20 to add two unsorted matrices."""
+
+
+@dataclass(frozen=True, eq=False)
+class Filed:
+    """Light and the optics that forms it.
+
+    Attributes
+    ----------
+    optics
+        fits the cells that the light is filed in.
+    groups
+        independent estimates of the light, (rows, cells) each; their mean is used.
+    """
+
+    optics: FrameOptics
+    groups: tuple[sparse.csr_array, ...]
+
+
+def form_frames(
+    lights: Sequence[Filed], basis: sparse.csr_array, probes: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
+    """Frames of mixtures of light, and its replicates times probes.
+
+    Parameters
+    ----------
+    lights
+        of the same rows; their frames add up.
+    basis
+        (b, rows) mixtures.
+    probes
+        (m', probes) of :func:`mitsim.optics.replicates.probe_vectors`; None: no replicates.
+
+    Returns
+    -------
+    (b, m, m') frames, and (b, m * groups * probes) of single groups.
+    """
+    shape, groups = lights[0].optics.frame_shape, len(lights[0].groups)
+    mixed, count = _mixed(lights, basis), basis.shape[0]
+    frames = np.zeros((count, *shape))
+    probed = np.zeros((count, shape[0] * groups * (0 if probes is None else probes.shape[1])))
+
+    def form(row: int) -> None:
+        for number, (optics, parts) in enumerate(mixed):
+            frame, seen = optics.seen([_row(part, row) for part in parts], probes, None if number else frames[row])
+            if number:
+                frames[row] += frame
+            probed[row] += seen.ravel()
+
+    in_threads(form, range(count))
+    return frames, probed
+
+
+def probe_frames(lights: Sequence[Filed], basis: sparse.csr_array, probes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Replicates of mixtures of light, without the frames themselves.
+
+    Parameters
+    ----------
+    lights, basis, probes
+        as for :func:`form_frames`.
+
+    Returns
+    -------
+    (b, m * groups * probes) of single groups, and (b, lights, groups) squared norms of their differences.
+    """
+    rows, groups = lights[0].optics.frame_shape[0], len(lights[0].groups)
+    mixed, count = _mixed(lights, basis), basis.shape[0]
+    probed, noise = np.zeros((count, rows * groups * probes.shape[1])), np.zeros((count, len(lights), groups))
+
+    def probe(row: int) -> None:
+        for number, (optics, parts) in enumerate(mixed):
+            estimates = [_row(part, row) for part in parts]
+            if not any(len(places) for places, _ in estimates):
+                continue
+            seen = optics.probe(estimates, probes)
+            noise[row, number] = noise_of_groups(seen, rows, groups)
+            probed[row] += seen.ravel()
+
+    in_threads(probe, range(count))
+    return probed, noise
+
+
+def _mixed(lights: Sequence[Filed], basis: sparse.csr_array) -> list[tuple[FrameOptics, list[sparse.csr_array]]]:
+    """Mixtures ``basis`` (b, rows) of each group of each light, with the light's optics."""
+    mixed = [(light.optics, [_product(basis, group) for group in light.groups]) for light in lights]
+    for _, parts in mixed:
+        for part in parts:
+            part.sort_indices()
+    return mixed
+
+
+def _product(basis: sparse.csr_array, light: sparse.csr_array) -> sparse.csr_array:
+    """``basis @ light``; ``light`` itself where each row stays what it is."""
+    if basis.nnz == len(basis.indices) == basis.shape[1] and not (basis - sparse.eye_array(*basis.shape)).nnz:
+        return light
+    if light.shape[1] <= _MOST_COLUMNS:
+        return basis @ light
+    places, indices = np.unique(light.indices, return_inverse=True)
+    lit = sparse.csr_array((light.data, indices, light.indptr), shape=(light.shape[0], max(len(places), 1)))
+    product = (basis @ lit).tocsr()
+    # SciPy adds matrices of sorted rows entry by entry, and others by way of all their columns.
+    product.sort_indices()
+    wide = places[product.indices] if len(places) else product.indices
+    return sparse.csr_array((product.data, wide, product.indptr), shape=(basis.shape[0], light.shape[1]))
+
+
+def _row(matrix: sparse.csr_array, row: int) -> Entries:
+    inside = slice(matrix.indptr[row], matrix.indptr[row + 1])
+    return matrix.indices[inside], matrix.data[inside]
+
+
+# ---- Shots as sums of frames that are held ----
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """Shots as sums of frames that are held.
+
+    Attributes
+    ----------
+    weights
+        (shots, b) of each held frame in each shot.
+    least
+        (b,) parts of them that all shots have and are added once.
+    own
+        the weights less these.
+    """
+
+    weights: FloatArray
+    least: FloatArray
+    own: sparse.csr_array
+
+    @property
+    def sparse(self) -> bool:
+        """Whether shots have few frames of their own: adding them up then takes less than a product of matrices."""
+        return bool(self.own.nnz <= _FEW * len(self.weights))
+
+    @cached_property
+    def one_each(self) -> bool:
+        """Whether every shot has one held frame, and every held frame one shot."""
+        shots, held = self.own.shape
+        alone = np.array_equal(np.diff(self.own.indptr), np.ones(shots))
+        return shots == held and alone and np.array_equal(np.sort(self.own.indices), np.arange(held))
+
+    def in_place(self, basis: FloatArray) -> Sequence[FloatArray]:
+        """All shots of which :attr:`one_each` holds, bit for bit as :meth:`shots` has them, where the frames of the
+        ``basis`` (b, ...) lay: those are overwritten, for no memory is as dear as new memory."""
+        common = mix_frames(self.least[None], basis)[0] if self.least.any() else None
+
+        def turned(shot: int) -> FloatArray:
+            (number,), (weight,) = _row(self.own, shot)
+            frame: FloatArray = basis[number]
+            if weight != 1:
+                frame *= weight
+            if common is not None:
+                frame += common
+            return frame
+
+        return in_threads(turned, range(len(self.weights)))
+
+    def shots(self, basis: FloatArray, start: int, stop: int) -> Sequence[FloatArray]:
+        """Shots of the frames that are held; some may be of these themselves.
+
+        Parameters
+        ----------
+        basis
+            (b, ...) frames that are held.
+        start, stop
+            numbers of shots.
+        """
+        if not self.sparse:
+            return list(mix_frames(self.weights[start:stop], basis))
+        common = mix_frames(self.least[None], basis)[0] if self.least.any() else None
+
+        def added(shot: int) -> FloatArray:
+            numbers, weights = _row(self.own, shot)
+            if common is None and list(weights) == [1]:
+                return np.asarray(basis[numbers[0]])
+            total = np.zeros(basis.shape[1:]) if common is None else common.copy()
+            for number, weight in zip(numbers, weights, strict=True):
+                if weight == -1:
+                    total -= basis[number]
+                else:
+                    total += basis[number] if weight == 1 else weight * basis[number]
+            return total
+
+        return in_threads(added, range(start, stop))
+
+
+def pair_shots(weights: FloatArray) -> tuple[FloatArray, Mixture] | None:
+    """Shots of which all others are one, or what one leaves of the light of all pixels; and all shots by these.
+
+    Patterns of +1 and -1 are shown as two shots that add up to the light of all pixels (of Hadamard patterns the first
+    is that light), so half of the shots need no product of matrices. None where ``weights`` (shots, classes) have
+    other values than two, or more pairs of shots than classes.
+    """
+    low, high = float(weights.min()), float(weights.max())
+    lit = weights == high
+    if not low < high or np.any(weights[~lit] != low):
+        return None
+    chosen: dict[bytes, int] = {}
+    kept: list[npt.NDArray[np.bool_]] = []
+    numbers, left = np.zeros(len(weights), int), np.zeros(len(weights), bool)
+    for shot, row in enumerate(lit):
+        key, other = row.tobytes(), (~row).tobytes()
+        if key not in chosen and other not in chosen:
+            chosen[key if row.any() else other] = len(kept)
+            kept.append(row if row.any() else ~row)
+        left[shot] = key not in chosen
+        numbers[shot] = chosen[other if left[shot] else key]
+    everything = chosen.get(np.ones(weights.shape[1], bool).tobytes())
+    if everything is None or len(kept) > weights.shape[1]:
+        return None
+    by_pair = np.zeros((len(weights), len(kept)))
+    by_pair[left, everything] = (low + high) / high
+    by_pair[np.arange(len(weights)), numbers] += np.where(left, -1.0, 1.0)
+    mixture = Mixture(by_pair, np.zeros(len(kept)), sparse.csr_array(by_pair))
+    return np.where(np.array(kept), high, low), mixture
+
+
+def mix_frames(weights: FloatArray, basis: FloatArray, out: FloatArray | None = None) -> FloatArray:
+    """(shots, ...) sums of a basis by weights.
+
+    Parameters
+    ----------
+    weights
+        (shots, b).
+    basis
+        (b, ...) arrays.
+    out
+        (shots, ...) for the result, which may be the first of the basis itself; a new array if not given.
+    """
+    flat = basis.reshape(len(basis), -1)
+    mixed = np.empty((len(weights), flat.shape[1])) if out is None else out.reshape(len(weights), -1)
+
+    def part(start: int) -> None:
+        inside = slice(start, start + _COLUMNS)
+        mixed[:, inside] = weights @ flat[:, inside]
+
+    in_threads(part, range(0, flat.shape[1], _COLUMNS))
+    return mixed.reshape(len(weights), *basis.shape[1:])

@@ -1,0 +1,462 @@
+"""The tree of a checked scene in; the same tree, changed so that Mitsuba renders rightly what it describes, out.
+
+Mitsuba makes objects in single precision, and its parser's tree is in double precision: so what would lose its place,
+width or brightness is changed in the tree, before objects are made of it.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.devices.camera import CameraGeometry
+from mitsim.scene.guard.check import CheckedScene
+from mitsim.scene.guard.limits import PLUGINS, references
+from mitsim.scene.guard.outline import Outline, Tag
+
+# ---- The camera moved to the origin, or a refusal ----
+#
+# Mitsuba makes objects in single precision, which leaves 0.03 mm at 300 m: 2e-2 of frames. The tree is in double
+# precision, so what stands far from the origin is moved there before objects are made of it. The vertices of a mesh
+# file are single precision already; where too few of their digits are left near the camera the scene is refused.
+
+_CENTRES = {"sphere": "center", "cylinder": "p0"}
+"""Points of shapes that are places beside ``to_world``, and single precision in Mitsuba."""
+_PLACED = ("point", "spot", "projector", "mitsim_projector")
+"""Lamps that stand somewhere; all others but those of shapes only have a direction."""
+_ROUNDING = 2.0**-24
+"""Half of the distance between numbers of single precision, relatively."""
+_COARSEST = 5e-6
+"""Rounding over distance from the camera [rad]: 1/400 of a pixel of 128 over 17 degrees, by which frames of a print
+change by 1e-3."""
+_ALIGNED = float(CameraGeometry.model_fields["scene_distance"].default)
+
+
+def move_to_camera(outline: Outline, state: mi.parser.ParserState) -> tuple[tuple[Tag, float], ...]:
+    """Move all that stands in the world of a checked tree so that its first ``mitsim_lensless`` is at the origin.
+
+    A scene whose camera is there already, or that has none, is left as it is. Directions are kept.
+
+    Parameters
+    ----------
+    outline
+        of the scene, for refusals.
+    state
+        the tree, which is changed.
+
+    Returns
+    -------
+    for each shape of the scene, in its order, its tag and how far [mm] vertices of single precision are moved to the
+    world: 0 for what has none.
+
+    Raises
+    ------
+    MitsimError
+        for a projector so far from its camera that single precision loses its light's places.
+    """
+    nodes = state.nodes
+    cameras = [node for node in nodes if node.props.plugin_name() == "mitsim_lensless"]
+    away, reach = np.eye(4), _ALIGNED
+    if cameras:
+        away[:3, 3] = -placed(cameras[0].props)[:3, 3]
+        reach = float(cameras[0].props.get("scene_distance", reach))
+    places = {index: away @ placed(nodes[index].props) for index in standing(nodes)}
+    for index, place in places.items():
+        props, distance = nodes[index].props, float(np.linalg.norm(place[:3, 3]))
+        if props.plugin_name() == "projector" and distance * _ROUNDING > _COARSEST * reach:
+            rule = (
+                f"single precision loses the places that it lights {reach:g} mm before the camera; it may stand "
+                f"{_COARSEST / _ROUNDING * reach:.0f} mm away"
+            )
+            got = f"{distance:.0f} mm from the camera"
+            raise outline.tag(mi.parser.SceneNode(nodes[index]), "to_world").refusal("to_world", got, rule)
+        if away[:3, 3].any():
+            _place(props, place)
+    moved = []
+    for index in filter(lambda index: _is(nodes[index], "shape"), standing(nodes, merged=False)):
+        name = "filename" if "filename" in nodes[index].props else "to_world"
+        parts = standing(nodes, index) if nodes[index].props.plugin_name() == "merge" else (index,)
+        single = [part for part in parts if nodes[part].props.plugin_name() in ("obj", "ply", "instance")]
+        distance = max((float(np.linalg.norm(places[part][:3, 3])) for part in single), default=0.0)
+        moved.append((outline.tag(mi.parser.SceneNode(nodes[index]), name), distance))
+    return tuple(moved)
+
+
+def check_meshes(moved: Sequence[tuple[Tag, float]], scene: mi.Scene) -> None:
+    """MitsimError for a mesh whose vertices have lost their digits near the camera.
+
+    Parameters
+    ----------
+    moved
+        as :func:`move_to_camera` gives it.
+    scene
+        made of that tree.
+    """
+    if len(moved) != len(scene.shapes()):
+        return
+    for (tag, distance), shape in zip(moved, scene.shapes(), strict=True):
+        if not distance:
+            continue
+        if shape.is_mesh():
+            vertices = np.array(shape.vertex_position(mi.UInt32(np.arange(shape.vertex_count()))), dtype=np.float64)
+            nearest = float(np.sqrt(np.square(vertices).sum(axis=0)).min(initial=np.inf))
+        else:
+            box = shape.bbox()
+            nearest = float(np.linalg.norm(np.clip(0, np.array(box.min), np.array(box.max))))
+        if distance * _ROUNDING > _COARSEST * nearest:
+            rule = (
+                f"vertices are of single precision; {nearest:.4g} mm from the camera, as these are at their nearest, "
+                f"they may be moved by {_COARSEST / _ROUNDING * nearest:.0f} mm; write the mesh about its own origin"
+            )
+            raise tag.refusal("mesh", f"vertices that are moved by {distance:.0f} mm to stand before the camera", rule)
+
+
+def standing(nodes: Sequence[mi.parser.SceneNode], at: int = 0, merged: bool = True) -> Iterator[int]:
+    """Numbers of the nodes that stand in the world.
+
+    Parameters
+    ----------
+    nodes
+        of a tree, the root first.
+    at
+        number of the node that they are below.
+    merged
+        give each part of what is merged into one shape, in place of the whole.
+    """
+    props = nodes[at].props
+    for index in references(props):
+        node = nodes[index]
+        if node.props.plugin_name() == "merge" and merged:
+            yield from standing(nodes, index)
+        elif _is(node, "shape") or _is(node, "sensor") or node.props.plugin_name() in _PLACED:
+            yield index
+
+
+def _is(node: mi.parser.SceneNode, kind: str) -> bool:
+    plugin = node.props.plugin_name()
+    return plugin in PLUGINS[kind].split() and plugin != "shapegroup"
+
+
+def placed(props: mi.Properties, centred: bool = True) -> FloatArray:
+    """(4, 4) from an object to the world.
+
+    Parameters
+    ----------
+    props
+        of the object.
+    centred
+        from about its ``center``, ``p0`` or ``position``, where it has one.
+    """
+    name = _CENTRES.get(props.plugin_name(), "position")
+    matrix = np.array(props["to_world"].matrix, dtype=np.float64) if "to_world" in props else np.eye(4)
+    return matrix @ _shift(props[name]) if centred and name in props else matrix
+
+
+def _place(props: mi.Properties, matrix: FloatArray) -> None:
+    """Have what is described stand where a ``matrix`` says, about its centre."""
+    plugin = props.plugin_name()
+    if plugin == "cylinder" and "p0" in props:
+        last = np.array(props.get("p1", (0, 0, 1)), dtype=np.float64)  # its default
+        props["p1"] = mi.ScalarPoint3d(last - np.array(props["p0"], dtype=np.float64))
+    name = _CENTRES.get(plugin)
+    if name and name in props:
+        props[name] = mi.ScalarPoint3d(0)
+    elif "position" in props:
+        props["position"] = mi.ScalarPoint3d(matrix[:3, 3])
+        return
+    props["to_world"] = mi.ScalarAffineTransform4d(matrix)
+
+
+def _shift(point: mi.ScalarPoint3d) -> FloatArray:
+    matrix = np.eye(4)
+    matrix[:3, 3] = np.array(point, dtype=np.float64)
+    return matrix
+
+
+# ---- Thin cylinders and small lamps as meshes ----
+#
+# Mitsuba solves a quadratic in single precision for the point where a ray meets a cylinder: with a radius r at a
+# distance D its discriminant is off by 6e-8 (D / r)^2, by as much as itself for 0.15 mm at 400 mm, which loses 3 to 7
+# % of the light. Triangles keep the rounding of their corners, 3e-8 D. So a thin cylinder is handed on as a prism
+# whose mean width is that of the cylinder (perimeter over pi), made in double precision. Spheres are met from the
+# ray's point nearest to them, which loses 5e-4 of the light where r is 1e-5 D, and stay - unless they shine: Mitsuba
+# draws points of such a lamp by the cosine of its radius seen from afar, 1 - (r / D)^2 / 2, which single precision has
+# only 1.2e-7 (D / r)^2 of. Its light on surfaces is 3 % too much for 0.5 mm at 300 mm, 7 % for 0.1 mm, and nothing for
+# 0.05 mm. Of a mesh points are drawn by area. (Cauchy: a convex body shows a quarter of its area in the mean.)
+
+_SLENDER = 400.0
+"""Distance over radius from which Mitsuba's cylinders lose 8e-4 of their light (2e-4 at half of it)."""
+_SMALL = 64.0
+"""The same for spheres that shine, whose light is out by 5e-4 there, and by 2e-3 on what is twice as far away."""
+_FINEST = {"cylinder": 1e5, "lamp": 1e5, "sphere": 1e6}
+"""Distance over radius at which rounding moves a mesh's corners by 3e-3 of the radius, and a sphere loses 5e-3."""
+_SIDES = 96
+"""Of a prism: its width changes by 5e-4 with the direction that it is seen from."""
+_RINGS = 24
+"""Of a lamp, with twice as many sides: its area as it is seen changes by 3e-4 (standard deviation over directions), and
+rounding moves corners by 2 % of an edge at 1e-5 of the distance."""
+_POLISHED = ("conductor", "dielectric", "mitsim_glass", "thindielectric")
+"""Materials whose light comes by single directions alone, which are followed on the cylinder itself."""
+_MIXED = ("plastic", "pplastic")
+"""Materials that need the cylinder for their glint, which holds no matt light."""
+Mesh = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+"""Corners (k, 3), normals (k, 3) and uv (k, 2), and triangles (m, 3)."""
+
+
+@contextmanager
+def with_thin_shapes_as_meshes(outline: Outline, state: mi.parser.ParserState) -> Iterator[None]:
+    """Have thin cylinders and small lamps of a tree be meshes, whose files exist while the context lasts.
+
+    Parameters
+    ----------
+    outline
+        of the scene, for refusals.
+    state
+        the tree with its camera at the origin, which is changed.
+
+    Raises
+    ------
+    MitsimError
+        for a cylinder or sphere that is too thin for its distance, for a thin cylinder of smooth plastic, and where the
+        meshes cannot be written.
+    """
+    thin = set(_thin(outline, state.nodes))
+    with ExitStack() as stack:
+        try:
+            folder = stack.enter_context(tempfile.TemporaryDirectory()) if thin else ""
+            for index in thin:
+                _replace(state.nodes, index, Path(folder) / f"{index}.ply")
+        except OSError as error:
+            rule = "free some space there, or set TMPDIR to another folder"
+            raise MitsimError(
+                f"{outline.path}: meshes of its thin cylinders and small lamps: {error}; {rule}"
+            ) from None
+        yield
+
+
+def _thin(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Iterator[int]:
+    """Numbers of the nodes of thin cylinders and small lamps; MitsimError for what cannot be held."""
+    eyes = [placed(node.props)[:3, 3] for node in nodes if node.props.plugin_name() == "projector"] + [np.zeros(3)]
+    places = [placed(nodes[index].props)[:3, 3] for index in standing(nodes)]
+    for index, to_world in _seen(nodes):
+        props, kind = nodes[index].props, nodes[index].props.plugin_name()
+        if kind not in _FINEST:
+            continue
+        below = _plugins_below(nodes, index)
+        lamp = kind == "sphere" and "area" in below
+        ends, radius = _extent(props, to_world)
+        distance = _farthest(ends, eyes)
+        tag = outline.tag(mi.parser.SceneNode(nodes[index]), "radius")
+        got, held = f"{radius:g} mm at a distance of {distance:.4g} mm", "single precision holds {:.2g} mm there; {}"
+        finest = _FINEST["lamp" if lamp else kind]
+        if distance > finest * radius:
+            raise tag.refusal("radius", got, held.format(distance / finest, "take a larger radius"))
+        if lamp:
+            kept, slender, rule = set[str](), _SMALL, "take a matt material"
+            mixed = set(_MIXED + _POLISHED)
+        else:
+            kept, slender, rule = set(_POLISHED), _SLENDER, "take roughplastic in place of the smooth one"
+            mixed = set(_MIXED)
+        if (kind == "sphere" and not lamp) or below & kept:
+            continue
+        if distance > slender * radius and below & mixed:
+            raise tag.refusal("radius", got, held.format(distance / slender, rule))
+        # What a lamp lights may be further away than camera and projector.
+        if not below & mixed and (_farthest(ends, eyes + places) if lamp else distance) > slender * radius:
+            yield index
+
+
+def _farthest(ends: Sequence[FloatArray], places: Sequence[FloatArray]) -> float:
+    """Largest distance of the ``ends`` from any of the ``places``."""
+    return max(float(np.linalg.norm(end - place)) for end in ends for place in places)
+
+
+def _seen(nodes: Sequence[mi.parser.SceneNode]) -> Iterator[tuple[int, FloatArray]]:
+    """Numbers of all nodes of shapes, and (4, 4) from where they stand to the world: of a group's once an instance."""
+    for index in standing(nodes):
+        yield index, np.eye(4)
+        if nodes[index].props.plugin_name() == "instance":
+            for group in references(nodes[index].props):
+                yield from ((own, placed(nodes[index].props)) for own in standing(nodes, group))
+
+
+def _replace(nodes: Sequence[mi.parser.SceneNode], index: int, path: Path) -> None:
+    """Have a node be the mesh of its cylinder or sphere, written to ``path``."""
+    props = nodes[index].props
+    _write(path, ball(props) if props.plugin_name() == "sphere" else prism(props))
+    props.set_plugin_name("ply")
+    for name in ("p0", "p1", "center", "radius", "to_world"):
+        if name in props:
+            del props[name]
+    props["filename"] = str(path)
+    # A lamp with vertex normals would shine by them, and lose light.
+    props["face_normals"] = _emits(props, nodes)
+
+
+def _extent(props: mi.Properties, to_world: FloatArray) -> tuple[list[FloatArray], float]:
+    """Ends or centre in the world, and the largest radius there."""
+    local = to_world @ placed(props, centred=False)
+    ends = [(to_world @ placed(props))[:3, 3]]
+    if props.plugin_name() == "cylinder":
+        ends.append(local[:3, :3] @ _point(props, "p1", (0, 0, 1)) + local[:3, 3])
+    stretch = float(np.linalg.svd(local[:3, :3], compute_uv=False)[0])
+    return ends, stretch * float(props.get("radius", 1.0))
+
+
+def _plugins_below(nodes: Sequence[mi.parser.SceneNode], index: int) -> set[str]:
+    """Names of all plugins below a node."""
+    found = set[str]()
+    for below in references(nodes[index].props):
+        found |= {str(nodes[below].props.plugin_name())} | _plugins_below(nodes, below)
+    return found
+
+
+def _point(props: mi.Properties, name: str, default: tuple[float, float, float]) -> FloatArray:
+    return np.array(props.get(name, default), dtype=np.float64)
+
+
+def prism(props: mi.Properties) -> Mesh:
+    """The prism of a cylinder's ``props`` in the world, with normals and uv as Mitsuba has the cylinder's."""
+    radius = float(props.get("radius", 1.0))
+    first, last = _point(props, "p0", (0, 0, 0)), _point(props, "p1", (0, 0, 1))
+    v, u = np.meshgrid([0.0, 1.0], np.linspace(0, 1, _SIDES + 1), indexing="ij")
+    x, y = _beside((last - first) / np.linalg.norm(last - first))
+    normal = np.cos(2 * np.pi * u)[..., None] * x + np.sin(2 * np.pi * u)[..., None] * y
+    grown = radius * (np.pi / _SIDES) / np.sin(np.pi / _SIDES)  # a perimeter of 2 pi r
+    mirrored = bool(np.linalg.det(placed(props)[:3, :3]) < 0)
+    return _in_world(props, first + v[..., None] * (last - first) + grown * normal, normal, (u, v), mirrored)
+
+
+def ball(props: mi.Properties) -> Mesh:
+    """The mesh of a sphere's ``props`` in the world, of the same area."""
+    v, u = np.meshgrid(np.linspace(0, 1, _RINGS + 1), np.linspace(0, 1, 2 * _RINGS + 1), indexing="ij")
+    sine = np.sin(np.pi * v)
+    normal = np.stack([sine * np.cos(2 * np.pi * u), sine * np.sin(2 * np.pi * u), np.cos(np.pi * v)], axis=-1)
+    corner = normal.reshape(-1, 3)[_triangles(*u.shape)]
+    double = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+    grown = float(props.get("radius", 1.0)) * np.sqrt(8 * np.pi / double.sum())
+    # A mirrored sphere of Mitsuba's faces inwards.
+    return _in_world(props, _point(props, "center", (0, 0, 0)) + grown * normal, normal, (u, v), True)
+
+
+def _in_world(
+    props: mi.Properties, points: FloatArray, normals: FloatArray, uv: Sequence[FloatArray], turned: bool
+) -> Mesh:
+    """The mesh of a grid (k, l, 3) of points and normals in the frame of ``props``; ``turned``: its triangles the other
+    way round."""
+    matrix = placed(props, centred=False)
+    triangles = _triangles(*uv[0].shape)
+    points = points.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
+    normals = normals.reshape(-1, 3) @ np.linalg.inv(matrix[:3, :3])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    if turned:
+        triangles = triangles[:, ::-1]
+    return points, normals, np.stack([each.ravel() for each in uv], axis=1), triangles
+
+
+def _triangles(rows: int, columns: int) -> FloatArray:
+    """Two (m, 3) of each square of a grid of corners."""
+    a = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    b, c, d = a + 1, a + columns, a + columns + 1
+    return np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
+
+
+def _beside(n: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Two axes across ``n`` where Mitsuba has them (Duff et al., Building an Orthonormal Basis, Revisited, 2017)."""
+    sign = float(np.copysign(1, n[2]))
+    a = -1 / (sign + n[2])
+    b = n[0] * n[1] * a
+    return np.array([1 + sign * n[0] ** 2 * a, sign * b, -sign * n[0]]), np.array([b, sign + n[1] ** 2 * a, -n[1]])
+
+
+def _write(path: Path, mesh: Mesh) -> None:
+    """A binary PLY."""
+    points, normals, uv, triangles = mesh
+    names = ("x", "y", "z", "nx", "ny", "nz", "u", "v")
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    header += [f"property float {name}" for name in names]
+    header += [f"element face {len(triangles)}", "property list uchar int vertex_indices", "end_header", ""]
+    faces = np.empty(len(triangles), dtype=[("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, triangles
+    vertices = np.concatenate([points, normals, uv], axis=1).astype("<f4")
+    path.write_bytes("\n".join(header).encode() + vertices.tobytes() + faces.tobytes())
+
+
+# ---- Lamps that are meshes emit by their faces ----
+#
+# Mitsuba draws points of a mesh emitter with the normals of its vertices, and weighs the light by their cosine instead
+# of the face's: of normals 30 and 60 degrees off it keeps 0.85 and 0.47. ``face_normals`` drops them. They also say
+# which side emits, so faces that are wound the other way are flipped.
+
+_MESHES = ("obj", "ply")
+_FLAT = 1e-4
+"""Sine of the angle to a face below which a normal is the face's own: meshes are written with five digits."""
+
+
+def emit_by_faces(checked: CheckedScene) -> tuple[str, ...]:
+    """Set ``face_normals`` on meshes of the ``checked`` scene that emit and whose normals are not those of their faces.
+
+    Returns
+    -------
+    for each of them, a sentence that says so.
+
+    Raises
+    ------
+    MitsimError
+        for a mesh whose normals lie on either side of its faces: then no side is known to emit.
+    """
+    notes, nodes = [], checked.state.nodes
+    for node in nodes:
+        props = node.props
+        if props.plugin_name() not in _MESHES or not _emits(props, nodes) or props.get("face_normals", False):
+            continue
+        sines, sides = _tilts(props)
+        if not sines.size or sines.max() < _FLAT:
+            continue
+        tag = checked.outline.tag(node)
+        behind = int((~(sides > 0)).sum())
+        if behind not in (0, sides.size):
+            raise tag.refusal(
+                "normals",
+                f"{behind} of {sides.size} corners that do not face the way that their face is wound",
+                "a lamp emits from one side; wind all faces alike, or give face_normals",
+            )
+        props["face_normals"] = True
+        if behind:
+            props["flip_normals"] = not props.get("flip_normals", False)
+        notes.append(
+            f"{tag.path.name}:{tag.line}: this lamp emits by its faces (face_normals), for its vertex normals are up "
+            f"to {np.degrees(np.arcsin(sines.max())):.3g} degrees off them"
+        )
+    return tuple(notes)
+
+
+def _emits(props: mi.Properties, nodes: Sequence[mi.parser.SceneNode]) -> bool:
+    return any(nodes[index].props.plugin_name() == "area" for index in references(props))
+
+
+def _tilts(props: mi.Properties) -> tuple[FloatArray, FloatArray]:
+    """At every corner of the faces, (k,) each: sine of the angle between its normal and the face, and their cosine."""
+    geometry = {name: props[name] for name in ("filename", "flip_normals", "to_world") if name in props}
+    mesh = mi.load_dict({"type": props.plugin_name(), **geometry})
+    if not mesh.has_vertex_normals():
+        return np.zeros(0), np.zeros(0)
+    data = mi.traverse(mesh)
+    corners = np.array(data["faces"]).reshape(-1, 3)
+    place, normal = (np.array(data[f"vertex_{name}"], np.float64).reshape(-1, 3) for name in ("positions", "normals"))
+    a, b, c = (place[corners[:, i]] for i in range(3))
+    face = np.cross(b - a, c - a)
+    size = np.linalg.norm(face, axis=1)
+    face, corners = face[size > 0] / size[size > 0, None], corners[size > 0]
+    own = normal[corners]
+    with np.errstate(invalid="ignore"):  # a normal of no length faces no way
+        own = own / np.linalg.norm(own, axis=2, keepdims=True)
+    sine = np.linalg.norm(np.cross(own, face[:, None]), axis=2)
+    return np.minimum(sine, 1).ravel(), (own * face[:, None]).sum(axis=2).ravel()
