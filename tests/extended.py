@@ -1,7 +1,7 @@
 """docs/extending.md as a reader follows it: a section's edits, new files and commands, in a copy of the tree.
 
-An edit is a sentence "In `FILE`, below (above, in place of) `LINE`:" or "In `FILE`, at the end:" over a block of code; a
-new file is "New file `FILE`:" over its text. A command is an indented line that begins with ``$``.
+An edit is a sentence "In `FILE`, below (above, in place of) `LINE`:" or "In `FILE`, at the end:" over a block of code;
+a new file is "New file `FILE`:" over its text. A command is an indented line that begins with ``$``.
 """
 
 from __future__ import annotations
@@ -108,7 +108,9 @@ def _write(step: Step, path: Path) -> None:
     lines = text.splitlines(keepends=True)
     at = [number for number, line in enumerate(lines) if line.strip() == step.line.strip()]
     assert len(at) == 1, f"{step.file}: `{step.line}` stands there {len(at)} times"
-    first, last = {"below": (at[0] + 1, at[0] + 1), "above": (at[0], at[0]), "in place of": (at[0], at[0] + 1)}[step.how]
+    first, last = {"below": (at[0] + 1, at[0] + 1), "above": (at[0], at[0]), "in place of": (at[0], at[0] + 1)}[
+        step.how
+    ]
     path.write_text("".join([*lines[:first], step.code, *lines[last:]]), encoding="utf-8")
 
 

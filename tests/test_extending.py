@@ -1,4 +1,4 @@
-"""docs/extending.md followed to the letter: each section's edits in a copy of the tree, and the checks that it names."""
+"""docs/extending.md followed to the letter: each section's edits in a copy of the tree, and the checks it names."""
 
 from __future__ import annotations
 

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from mitsim.cli import app
 from mitsim.cli.options import Seed, option, verb
+from mitsim.devices.patterns import pattern_names
 
 LIST = Path(__file__).with_name("options.json")
 """Help, metavar and default of each option; written anew by ``python -m tests.unit.cli.test_help``."""
@@ -26,7 +27,7 @@ def described(command: Any) -> dict[str, Any]:
         name = " ".join(parameter.opts) if parameter.param_type_name == "option" else parameter.name
         default = parameter.default
         options[name] = {
-            "help": parameter.help,
+            "help": parameter.help.replace(pattern_names(), "PATTERNS"),  # which grow with their registry
             "metavar": parameter.metavar,
             "default": default if isinstance(default, str | int | float | None) else str(default),
             "shown": parameter.show_default,
