@@ -3,10 +3,11 @@
     python benchmarks/bit_equal.py note FILE.json [--python PY] [--scenes NAME ...]
     python benchmarks/bit_equal.py compare FILE.json [--python PY] [--scenes NAME ...] [--json RESULT.json]
 
-``note`` runs the command line (of the environment that ``--python`` belongs to) on the twelve shipped scenes and writes
-a checksum of every result; ``compare`` runs the same and exits with 1 when one differs. Checksums are of pixel values,
-not of files, so that metadata and file layout may change. Numbers depend on the processor's vector width and on LLVM,
-which are noted too: note the old version on the same machine, in an environment of its own.
+``note`` runs the command line (of the environment that ``--python`` belongs to) on the twelve shipped scenes, one of
+them also by lines and behind a mosaic, with a calibration, images and a study of two points, and writes a checksum of
+every result; ``compare`` runs the same and exits with 1 when one differs. Checksums are of pixel values, not of files,
+so that metadata and file layout may change. Numbers depend on the processor's vector width and on LLVM, which are noted
+too: note the old version on the same machine, in an environment of its own.
 """
 
 from __future__ import annotations
@@ -52,7 +53,14 @@ def runs(scene: str, folder: Path) -> list[tuple[str, list[str], list[str]]]:
         factored = [*render, "--estimator", "factored", "-o", str(folder / "factored.exr")]
         jobs.append(("reference", reference, ["reference.exr"]))
         jobs.append(("factored", factored, ["factored.exr"]))
+    if scene == "colour_chart":
+        few = ["capture", scene, "--accuracy", ACCURACY, "--patterns", "dots:2"]
+        mosaic = ["--colour", "mosaic", "--camera", "imx249_rggb"]
+        jobs.append(("lines", [*few, "--colour", "lines", "-o", str(folder / "lines")], ["lines"]))
+        jobs.append(("mosaic", [*few, *mosaic, "-o", str(folder / "mosaic")], ["mosaic"]))
     if scene == "photograph":
+        sweep = ["study", "sweep", scene, "--over", "sheet_z=398:402:2", "--patterns", "dots:2"]
+        jobs.append(("sweep", [*sweep, "-o", str(folder / "sweep")], ["sweep/sweep.csv"]))
         calibrate = ["calibrate", scene, "--accuracy", ACCURACY, "-o", str(folder / "cal")]
         image = ["reconstruct", str(folder / "dots"), "--calibration", str(folder / "cal"), "-o", str(folder / "image")]
         jobs.append(("calibrate", calibrate, ["cal"]))
@@ -62,7 +70,10 @@ def runs(scene: str, folder: Path) -> list[tuple[str, list[str], list[str]]]:
 
 
 def digest(path: Path) -> str:
-    """SHA-256 over names, types, shapes and values of all channels of a file, or of all OpenEXR files of a folder."""
+    """SHA-256 over names, types, shapes and values of all channels of a file, or of all OpenEXR files of a folder; of
+    the text of a table."""
+    if path.suffix == ".csv":
+        return hashlib.sha256(path.read_bytes()).hexdigest()
     total = hashlib.sha256()
     for file in sorted(path.rglob("*.exr")) if path.is_dir() else [path]:
         with OpenEXR.File(str(file), separate_channels=True) as image:
