@@ -75,7 +75,7 @@ def trial(
     return {
         "oracle": oracle,
         "automatic": psnr(automatic.image, image),
-        "lam_relative": automatic.lam_relative,
+        "lam_relative": automatic.lam / scale,
     }
 
 

@@ -38,8 +38,7 @@ from mitsim.devices.mask_profile import load_psf
 from mitsim.devices.patterns import parse_patterns
 from mitsim.devices.sensor import load_sensor
 from mitsim.metrics import psnr
-from mitsim.reconstruct.convolution import ConvolutionalCamera
-from mitsim.reconstruct.dots import Classes
+from mitsim.reconstruct.convolution import Classes, ConvolutionalCamera
 from mitsim.reconstruct.solver import prepare
 from mitsim.report.exposures import CONVENTIONS
 from mitsim.studies.diffusercam import best_image, race, take

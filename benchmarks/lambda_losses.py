@@ -28,7 +28,7 @@ from skimage.transform import resize
 
 import mitsim
 from mitsim.metrics import psnr
-from mitsim.reconstruct.reconstruct import accumulated, reconstruct
+from mitsim.reconstruct.reconstruct import accumulate, reconstruct
 from mitsim.reconstruct.regularisation import automatic_lambda
 
 SCENES = (
@@ -125,7 +125,7 @@ def calibration(subject: Subject, seed: int, work: Path) -> mitsim.Factors:
 def case(shots: mitsim.Capture, factors: mitsim.Factors) -> dict[str, object]:
     """PSNR at the best lambda, at the automatic one and at that of version 0.4.0."""
     result = reconstruct(shots, factors)
-    sums = accumulated(shots, factors)
+    sums = accumulate(shots, factors)
     problem = sums.prepared.problem(sums.frames)
 
     def quality(lam: float) -> float:

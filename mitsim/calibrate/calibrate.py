@@ -50,7 +50,7 @@ from mitsim.reconstruct.estimate_factors import (
 )
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.session_faults import Checked, Circumstances, check_session
-from mitsim.reconstruct.session_findings import frame_words
+from mitsim.reconstruct.faults import frame_words
 
 NOISY, NOISE_FREE = "noisy", "noise_free"
 """Kinds of responses that factors are estimated from."""

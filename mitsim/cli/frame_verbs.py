@@ -100,12 +100,12 @@ def reconstruct(
     """Recover the image from frames and a calibration alone; of coloured folders, one of each line, and in colour."""
     from mitsim.core.files import check_output
     from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
-    from mitsim.reconstruct.request import IMAGE_FILE, check_asked, check_parallax
+    from mitsim.reconstruct.request import IMAGE_FILE, ImageRequest, check_parallax
 
     options = solving.read()
     output = output or run / "reconstruction"
     if not is_mosaic(run):
-        check_asked(**options)
+        ImageRequest(**options)
     if is_coloured(run):
         options["overwrite"] = overwrite
         if is_mosaic(run):

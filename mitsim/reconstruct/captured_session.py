@@ -1,6 +1,13 @@
 """A folder with the frames of a real calibration session in; the camera's factors, and what nobody knows of them, out.
 
 Numbers are those of a simulated session: frames of one, written to such a folder, give its factors bit for bit.
+
+*Exposures of one frame.* No frame of a session is brighter than the uniform one. A pixel that this one, read at the
+shortest exposure, would not bring near saturation at a longer one is saturated by no frame at that exposure. So the
+weights of all exposures are found once, and belong to pixels: found by a uniform frame of the other side's stripes,
+they hang on no noise of the frames that they merge, which keeps merged rates without bias, of the variance sum_k w_k^2
+v_k. With w_k in proportion to 1/v_k that is least (Granados et al. 2010, "Optimal HDR reconstruction with linear
+digital cameras", CVPR).
 """
 
 from __future__ import annotations

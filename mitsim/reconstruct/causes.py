@@ -17,7 +17,7 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.runs import Measurement
-from mitsim.reconstruct.detail import LitFrame, blocks_of, orthonormal, print_part, slope_of
+from mitsim.reconstruct.detail import LitFrame, block_indices, factor_slope, orthonormal, print_part
 from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.sides import IndexArray, group_pixels
@@ -37,23 +37,19 @@ _EVERYWHERE = 0.75
 """The same of what light of all scene pixels explains: a lamp's own colours leave 0.06 to 0.2 of theirs."""
 _ALL = 0.3
 """Unexplained part of the measurements above which neither depth nor ambient light is the cause, but another rig."""
+STEPS = (
+    "one step late: each shot shows the pattern of the shot before",
+    "one step early: each shot shows the pattern of the next",
+)
+"""Ways in which shots are a step beside their patterns."""
 
 
 class Cause(Enum):
     """Why measurements do not fit; the value is its sentence and the remedy."""
 
-    FRAMES = (
-        "frames that are not what they say",
-        "capture these frames again",
-    )
-    ORIENTATION = (
-        "frames that are turned or mirrored",
-        "turn them back, or calibrate with the camera as it is",
-    )
-    ORDER = (
-        "frames in another order than their patterns",
-        "bring the frames into the order of the patterns",
-    )
+    FRAMES = ("frames that are not what they say", "capture these frames again")
+    ORIENTATION = ("frames that are turned or mirrored", "turn them back, or calibrate with the camera as it is")
+    ORDER = ("frames in another order than their patterns", "bring the frames into the order of the patterns")
     GAMMA = (
         "numbers that are not proportional to the light",
         "save the camera's raw numbers, without gamma or tone curve",
@@ -62,14 +58,8 @@ class Cause(Enum):
         "numbers that were multiplied, as of few bits left-aligned in more",
         "divide the numbers by that factor, or give a camera file of these numbers",
     )
-    SATURATION = (
-        "readings at the full well or the ADC's end",
-        "expose for less",
-    )
-    AMBIENT = (
-        "ambient light, the same in every shot",
-        "darken the room, or capture with ambient_frame=yes",
-    )
+    SATURATION = ("readings at the full well or the ADC's end", "expose for less")
+    AMBIENT = ("ambient light, the same in every shot", "darken the room, or capture with ambient_frame=yes")
     DEPTH = (
         "depth, light that lands beside where the calibration saw it",
         "put the scene at the calibrated distance, calibrate at the scene's, or give its depth as focus",
@@ -94,10 +84,17 @@ class Cause(Enum):
         "print finer than a scene pixel, light beside the centres of the pixels",
         "use a projector of more pixels, or bring projector and scene closer together",
     )
-    UNKNOWN = (
-        "unknown: depth, gloss or indirect light",
-        "compare the map of the misfit with the scene",
-    )
+    UNKNOWN = ("unknown: depth, gloss or indirect light", "compare the map of the misfit with the scene")
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """Another way to take the frames: the ``cause`` that it is, in ``words``; which leaves the part ``left`` of all
+    measurements, rms."""
+
+    cause: Cause
+    words: str
+    left: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -208,12 +205,12 @@ class Evidence:
 
     @cached_property
     def _lit_frames(self) -> list[LitFrame]:
-        slopes = [slope_of(side, spline=True) for side in self._factors]
+        slopes = [factor_slope(side, spline=True) for side in self._factors]
         frames = []
         for groups, frame, variance in zip(self._groups, self._frames, self._variances, strict=True):
             rows, columns = (group.pixels for group in groups)
             lit = self._factors[0][:, rows], self._factors[1][:, columns]
-            blocks = blocks_of(rows, self._factors[0].shape[1]), blocks_of(columns, self._factors[1].shape[1])
+            blocks = block_indices(rows, self._factors[0].shape[1]), block_indices(columns, self._factors[1].shape[1])
             frames.append(LitFrame(frame, variance, lit, (slopes[0][:, rows], slopes[1][:, columns]), blocks))
         return frames
 

@@ -30,23 +30,23 @@ _PLAIN_S = 0.05
 
 
 @dataclass(frozen=True)
-class Predicted:
+class ImageCost:
     """What an image takes: ``seconds`` by stage as it will state them, and ``memory_bytes`` at most."""
 
     seconds: dict[str, float]
     memory_bytes: float
 
 
-def predicted(shots: Capture, factors: Factors) -> Predicted:
+def predict_cost(shots: Capture, factors: Factors) -> ImageCost:
     """What the Tikhonov image of ``shots`` by ``factors`` takes, at the calibrated depth."""
     pixels = float(len(factors.left) * len(factors.right))
     count, (left, right) = len(shots.manifest.patterns.captures), shots.patterns
     measured = left.shape[1] * right.shape[1]
-    kept = is_kept(shots, factors)
+    kept = keeps_frames(shots, factors)
     reading, judging = count * (pixels * _READ_S + _SHOT_S), measured * pixels * _JUDGE_S
     solving = sum(len(factor) * factor.shape[1] ** 2 * _PRODUCT_S for factor in (factors.left, factors.right))
     held = 8.0 * pixels * (_FRAMES + _KEPT * measured * kept)
-    return Predicted(
+    return ImageCost(
         seconds={
             "accumulate": solving + reading + measured * pixels * _ADD_S,
             "solve": _PLAIN_S,
@@ -57,7 +57,7 @@ def predicted(shots: Capture, factors: Factors) -> Predicted:
     )
 
 
-def is_kept(shots: Capture, factors: Factors) -> bool:
+def keeps_frames(shots: Capture, factors: Factors) -> bool:
     """Whether the measurements of ``shots`` are so few numbers that they are not read twice; ``factors`` tell the
     sensor's pixels."""
     left, right = shots.patterns

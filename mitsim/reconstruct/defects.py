@@ -19,7 +19,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.runs import Ambient, Capture, Measurement
 from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.sides import IndexArray
-from mitsim.reconstruct.solver import Prepared, centred
+from mitsim.reconstruct.solver import Prepared
 
 _SPREADS = 7.0
 """Standard deviations of noise, 1e-12 for a pixel, beyond which its residual's energy is no chance."""
@@ -73,7 +73,7 @@ class Defects:
 
     def left_out(
         self, shots: Capture, measured: Callable[[], Iterable[Measurement]], prepared: Prepared, weights: FloatArray
-    ) -> _LeftOut:
+    ) -> LeftOut:
         """The capture whose readings at these pixels are those that all others tell.
 
         Parameters
@@ -84,8 +84,7 @@ class Defects:
             the factorised model, and W of ``shots``.
         """
         values = {
-            (each.row, each.column): (centred(each.frame) if prepared.centre else each.frame)[self.rows, self.columns]
-            for each in measured()
+            (each.row, each.column): prepared.as_solved(each.frame)[self.rows, self.columns] for each in measured()
         }
         # Of a reading that is changed the means of its row and column take up their part.
         gain = (1 - 1 / prepared.left.sensor_size) * (1 - 1 / prepared.right.sensor_size) if prepared.centre else 1.0
@@ -94,25 +93,19 @@ class Defects:
         for _ in range(_ROUNDS):
             change = np.zeros_like(weights)
             for (row, column), value in values.items():
-                left, right = prepared.left.slabs[row], prepared.right.slabs[column]
+                left, right = prepared.slabs((row, column))
                 own, other = left.matrix[self.rows], right.matrix[self.columns]
                 told = (own @ weights[left.columns][:, right.columns] * other).sum(axis=1)
                 leverage = np.square(own).sum(axis=1) * np.square(other).sum(axis=1)
                 step = (told - value) / np.maximum(1 - leverage / gain, 0.5)
                 value += step
                 step /= gain
-                places = np.ix_(
-                    *(
-                        np.arange(len(change.T if axis else change))[slab.columns]
-                        for axis, slab in enumerate((left, right))
-                    )
-                )
-                change[places] += own.T @ (step[:, None] * other)
+                change[prepared.places((row, column))] += own.T @ (step[:, None] * other)
             weights += change
         moved = {pattern: (values[pattern] - first[pattern]) / gain for pattern in values}
-        return _LeftOut(shots, measured, self, moved)
+        return LeftOut(shots, measured, self, moved)
 
-    def beyond_chance(self, rest: _LeftOut, noise: FrameNoise) -> Defects | None:
+    def beyond_chance(self, rest: LeftOut, noise: FrameNoise) -> Defects | None:
         """Those of them whose readings differ by more than noise from what all others tell; None where none does.
 
         Parameters
@@ -131,8 +124,16 @@ class Defects:
         return Defects(self.rows[kept], self.columns[kept]) if kept.any() else None
 
 
-class _LeftOut(Capture):
-    """A capture whose readings at some pixels are ``moved``, by pattern."""
+class LeftOut(Capture):
+    """A capture whose readings at some pixels are other ones.
+
+    Parameters
+    ----------
+    whole, measured
+        the capture, and what gives its measurements.
+    defects, moved
+        the pixels, and by pattern what is added to their readings.
+    """
 
     def __init__(
         self,

@@ -6,6 +6,9 @@ neighbours' light: parallax by k pixels moves the image by as much, and all that
 edges and what the sensor's own width adds to parallax. So depths are tried in steps of a pixel of parallax, every
 valley that may be the lowest is followed to its bottom, and those that chance or the model's own misfit may have made
 lower are named beside the lowest.
+
+*The basis that depths share.* Columns of neighbouring depths are much alike: a few hundred vectors span all of them,
+and what of a frame lies outside is not explained at any depth. So frames are read once and kept small.
 """
 
 from __future__ import annotations
@@ -23,7 +26,7 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture, Measurement
 from mitsim.reconstruct.causes import Evidence
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import LEAST_PART, FactorOfDepths, focused, parallax_period, stated_parallax
+from mitsim.reconstruct.focus import LEAST_PART, FactorOfDepths, move_factors, parallax_of, parallax_period
 from mitsim.reconstruct.misfit import CHANCE
 from mitsim.reconstruct.noise import FrameNoise, factor_energy
 from mitsim.reconstruct.sides import Group, factorise, group_pixels
@@ -94,7 +97,7 @@ class Depth:
         return f"{found} +- {self.error_mm:.1g}, by the least misfit from {near:.0f} to {far:.0f} mm"
 
 
-def by_chance(difference: float, variance: float, unknowns: int) -> float:
+def chance_difference(difference: float, variance: float, unknowns: int) -> float:
     """Energy by which noise may make what two models leave over differ.
 
     The light that the wrong one does not explain, of energy D, meets noise: 4 v D. The noise that one of them takes up
@@ -144,18 +147,18 @@ class _Search:
     """
 
     def __init__(self, shots: Capture, factors: Factors, depth_range: tuple[float, float] | None) -> None:
-        self._ends, self._period = searched(factors, depth_range), np.inf
+        self._ends, self._period = shifts_searched(factors, depth_range), np.inf
         beyond = 0.0
         if depth_range is None:
             # A surface beyond the range, but for a period, is within it: only where a range is given that is excluded.
-            self._period = parallax_period(shots.patterns, stated_parallax(factors))
+            self._period = parallax_period(shots.patterns, parallax_of(factors))
             beyond = min(self._period, self._ends[1])
         self._tried = self._ends[0] - beyond, self._ends[1] + beyond
         self._shots, self._factors = shots, factors
         rows, columns = shots.patterns
         self._groups = group_pixels(rows, "auto"), group_pixels(columns, "auto")
-        self._all = AllDepths(shots, factors, self._tried, self._groups)
-        self._inverse, self._factor_noise = 1 / stated_parallax(factors).depth_mm, factors.manifest.noise
+        self._all = CommonBasis(shots, factors, self._tried, self._groups)
+        self._inverse, self._factor_noise = 1 / parallax_of(factors).depth_mm, factors.manifest.noise
         self.pixel = 1 / max(self._all.reach(axis) for axis in (0, 1))
         self._unknowns = self._all.shape[0] * self._all.shape[1]
 
@@ -268,7 +271,7 @@ class _Search:
 
     def _indifferent(self, difference: float, least: float, misfit: float) -> float:
         """Energy by which two depths may differ of which either is the right one."""
-        return max(by_chance(difference, self._variance(least), self._unknowns), _OPPOSED * misfit)
+        return max(chance_difference(difference, self._variance(least), self._unknowns), _OPPOSED * misfit)
 
     def _ties(self, valleys: list[tuple[float, float]], misfit: float) -> list[tuple[float, float]]:
         """Those of the sorted ``valleys`` that may be the right one, beside the lowest, by what its depth leaves beyond
@@ -279,7 +282,7 @@ class _Search:
     def _print_part(self, shift: float) -> float:
         """Part of the misfit at the depth of ``shift`` that is print finer than a scene pixel: its light lies on either
         side of the pixels' centres, so no other depth explains it."""
-        there = focused(self._factors, self._mm(shift))
+        there = move_factors(self._factors, self._mm(shift))
         evidence = Evidence(there.factors, self._all.patterns)
         for each in there.of(self._shots).measured():
             frame = centred(each.frame) if there.factors.manifest.centre else each.frame
@@ -322,7 +325,7 @@ shadows there: a quarter of the vectors (54 of 200, 20 of 126), where more paral
 that these are made of, as no neighbour's column makes up for one between."""
 
 
-class AllDepths:
+class CommonBasis:
     """Frames of a capture, and factors of any depth within a range.
 
     Parameters
@@ -358,7 +361,7 @@ class AllDepths:
         shifts: tuple[float, float],
         groups: tuple[tuple[Group, ...], tuple[Group, ...]] | None = None,
     ) -> None:
-        self.parallax, self.patterns = stated_parallax(factors), shots.patterns
+        self.parallax, self.patterns = parallax_of(factors), shots.patterns
         self._sides = tuple(
             FactorOfDepths(side, self.parallax, axis) for axis, side in enumerate((factors.left, factors.right))
         )
@@ -435,7 +438,7 @@ class AllDepths:
         return centred_columns(columns) if self._centre else columns
 
 
-def searched(factors: Factors, depth_range: tuple[float, float] | None) -> tuple[float, float]:
+def shifts_searched(factors: Factors, depth_range: tuple[float, float] | None) -> tuple[float, float]:
     """Least and largest change of 1/z [1/mm] of the depths that are looked for.
 
     Parameters
@@ -445,7 +448,7 @@ def searched(factors: Factors, depth_range: tuple[float, float] | None) -> tuple
     depth_range
         nearest and farthest depth [mm], ArgumentError where the mask is beyond the nearest; None: :data:`RANGE`.
     """
-    parallax = stated_parallax(factors)
+    parallax = parallax_of(factors)
     if depth_range is None:
         return -RANGE / parallax.depth_mm, RANGE / parallax.depth_mm
     near, far = depth_range

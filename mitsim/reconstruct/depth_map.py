@@ -1,18 +1,27 @@
 """Shots under shifting dots and factors in; a depth for each projector pixel, and the image in focus everywhere, out.
 
-The start is where most light of each pixel arrives (:mod:`mitsim.reconstruct.arrivals`). Then the model is each pixel's
-own: columns of both factors at its own depth (:mod:`mitsim.reconstruct.depth_map`). It is linear in (X, X o d), d a
+The start is where most light of each pixel arrives (:class:`Arrivals`). Then the model is each pixel's own: columns of
+both factors at its own depth (:class:`PixelDepths`). It is linear in (X, X o d), d a
 change of 1/z, so each Gauss-Newton step, the d of neighbours pooled, is one closed-form solve for each frame. Last,
 single pixels beside an edge take the depth on its other side where that explains more. Steps end when they leave no
 less.
 
 A displacement by a whole period of the dots is the neighbour's: depths whose parallax spans more are not told.
+
+*Where light arrives.* Every frame is reconstructed at the calibrated depth as if all pixels along the baseline were
+lit, which shows where each dot's light arrives; dots a period apart do not meet as long as their parallax differs by
+less.
+
+*A depth for each pixel.* Of a frame under dots Y = sum_p X_p l_p(z_p) r_p(z_p)^T over its lit pixels p, with columns of
+both factors at the pixels' own depths. The normal matrix of a frame is (L^T L) o (R^T R), a number for each pair of lit
+pixels; frames of dots share no pixel, so they are solved one by one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -23,13 +32,13 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture, Measurement
-from mitsim.reconstruct.arrivals import LAMBDAS, MEDIAN, OFFSETS, Arrivals
-from mitsim.reconstruct.depth import AllDepths, Alternative, best_depth, by_chance, searched
+from mitsim.reconstruct.depth import Alternative, CommonBasis, best_depth, chance_difference, shifts_searched
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import STEP, stated_parallax
+from mitsim.reconstruct.focus import STEP, are_dots, parallax_of, pixels_of_parallax, unambiguous_parallax
 from mitsim.reconstruct.misfit import Balance, Misfit
 from mitsim.reconstruct.noise import FrameNoise
-from mitsim.reconstruct.status import Status, Verdict
+from mitsim.reconstruct.solver import prepare
+from mitsim.reconstruct.status import Solution, Status, Verdict
 
 _STEPS, _STEP_POOLED = 4, 3.0
 """Gauss-Newton steps at most, and the standard deviation [pixels] over which changes of depth are pooled: with 2 and
@@ -95,14 +104,11 @@ class DepthMap:
         return f"focus: depths of {depths}, told for {said['told_part']:.0%} of pixels"
 
     @property
-    def residual(self) -> float:
-        """||Y - model|| / ||Y|| over all frames."""
-        return float(np.sqrt(self.left_over / self.energy))
-
-    @property
-    def status(self) -> Status:
-        """Solved: dots leave fewer unknowns in a frame than the sensor has data."""
-        return Status(Verdict.SOLVED, "Solved: a depth and a reflectance for each projector pixel")
+    def solution(self) -> Solution:
+        """The image; solved, as dots leave fewer unknowns in a frame than the sensor has data."""
+        residual = float(np.sqrt(self.left_over / self.energy))
+        status = Status(Verdict.SOLVED, "Solved: a depth and a reflectance for each projector pixel")
+        return Solution(self.image, self.lam, residual, status)
 
     @property
     def alternatives(self) -> tuple[Alternative, ...]:
@@ -179,8 +185,8 @@ class _Search:
 
     def __init__(self, shots: Capture, factors: Factors, depth_range: tuple[float, float] | None) -> None:
         # Of a flat scene far from the calibrated depth dots of any period tell the rest.
-        self._ends = searched(factors, depth_range)
-        inverse = 1 / stated_parallax(factors).depth_mm
+        self._ends = shifts_searched(factors, depth_range)
+        inverse = 1 / parallax_of(factors).depth_mm
         self._plane = best_depth(shots, factors, (1 / (inverse + self._ends[1]), 1 / (inverse + self._ends[0])))
         self._middle = (self._ends[0] + self._ends[1]) / 2
         # A start, so in doubt any of several depths will do; but an end of the range is the depth of nothing.
@@ -229,7 +235,7 @@ class _Search:
         variance, unknowns = self._pixels.variance(found), 2 * shift.size
         less = found.left_over - self._left_over(np.zeros(shift.shape))
         # Of a sheet at the calibrated depth either may leave more.
-        if not told.any() or less > by_chance(less, variance, unknowns):
+        if not told.any() or less > chance_difference(less, variance, unknowns):
             return "Depths by pixel explain no more of the measurements than the calibrated one, which the image is of."
         span = float(np.ptp(np.percentile(shift[told], (1, 99))))
         astray = max(
@@ -243,7 +249,7 @@ class _Search:
                 "the calibrated one. Use dots of a longer period along the baseline, such as dots:7x16."
             )
         ties = [(other.mm, other.difference**2 * self._all.energy) for other in self._plane.alternatives]
-        others = [f"{mm:.1f}" for mm, more in ties if more < by_chance(more, variance, unknowns)]
+        others = [f"{mm:.1f}" for mm, more in ties if more < chance_difference(more, variance, unknowns)]
         if others:
             return (
                 f"Depths may be off by a whole period of the dots: {self._plane.mm:.1f} or {' or '.join(others)} mm "
@@ -319,7 +325,7 @@ class PixelDepths:
         between them.
     """
 
-    def __init__(self, depths: AllDepths, limit: float, step: float) -> None:
+    def __init__(self, depths: CommonBasis, limit: float, step: float) -> None:
         self._all = depths
         self._shifts = np.linspace(-limit, limit, max(2 * int(np.ceil(limit / step)) + 1, len(_CUBIC)))
         self._tables = [np.stack([depths.side(axis, shift).T for shift in self._shifts], axis=1) for axis in (0, 1)]
@@ -424,3 +430,146 @@ class PixelDepths:
         weights = _CUBIC @ np.stack(powers)
         table = self._tables[axis]
         return np.asarray(sum(weight[:, None] * table[pixels, start + k - 1] for k, weight in enumerate(weights)))
+
+
+# ---- Where most light of each projector pixel arrives ----------------------------------------------------------------
+
+
+LAMBDAS = 1e-5, 1e-6, 1e-7
+"""Of the largest sigma^2: at less, noise rules, at more, dots blur (cookie_bag under dots:7x16 at 1.4 s: median errors
+of 1.2, 0.6, 0.4 mm)."""
+OFFSETS = -1.0, -0.5, 0.5, 1.0
+"""Projector pixels by which the range of displacements may be moved: it is the period wide, and a surface at its end
+would else be taken for one at the other."""
+MEDIAN = 5
+"""Projector pixels: width of the median of places; wider ones round the edges of cards."""
+_POOLED = 1.0
+"""Projector pixels: standard deviation over which light is pooled before its place is taken; with 2 edges blur, with
+none single pixels go astray."""
+_BESIDE_LARGEST = 2
+"""Projector pixels beyond the largest displacement, so that a dot's image is not cut."""
+_LEAST_PARALLAX = 0.5
+"""Projector pixels that the range of depths must move light along an axis, or it is one without parallax."""
+_NEIGHBOURHOOD = 2.0
+"""Projector pixels of displacement beside the largest light that belong to it: a second one further off is a doubt."""
+
+
+class Arrivals:
+    """Where light arrives, by pixel and change of 1/z.
+
+    Parameters
+    ----------
+    shots, factors
+        under shifting dots, and of the same camera; MitsimError for other patterns, and for a rig without parallax.
+    ends
+        least and largest change of 1/z [1/mm] of the depths that are looked for.
+    beside
+        change of 1/z [1/mm] of the middle of those that are told apart, at most.
+
+    Attributes
+    ----------
+    depths
+        frames and factors.
+    pixel
+        change of 1/z [1/mm] that moves light by one projector pixel.
+    width, reach
+        changes of 1/z that are told apart, and the largest that is tried, either way.
+    """
+
+    def __init__(self, shots: Capture, factors: Factors, ends: tuple[float, float], beside: float) -> None:
+        self._classes = [_classes(patterns) for patterns in shots.patterns]
+        parallax, counts = parallax_of(factors), (factors.left.shape[1], factors.right.shape[1])
+        self._span = ends[1] - ends[0]
+        moves = [max(map(abs, pixels_of_parallax(parallax, axis, count)[:2])) for axis, count in enumerate(counts)]
+        self._open = [move * self._span > _LEAST_PARALLAX for move in moves]
+        if not any(self._open):
+            raise MitsimError(
+                f"focus map: camera and projector of calibration {factors.name} have no baseline, so depth moves no "
+                "light; give a depth, or auto"
+            )
+        self.pixel = 1 / max(moves)
+        periods = [own.shape[1] for own in shots.patterns]
+        self.width = min(
+            self._span, unambiguous_parallax(np.where(self._open, moves, 0.0) * self.pixel, periods) * self.pixel
+        )
+        self.reach = beside + self.width / 2 + (max(OFFSETS) + _BESIDE_LARGEST) * self.pixel
+        self.depths = CommonBasis(shots, factors, (-self.reach, self.reach))
+        self._margin = int(np.ceil(self.reach / self.pixel)) + 1
+
+    @property
+    def limited(self) -> bool:
+        """Whether the dots' period limits the range of depths."""
+        return self.width < self._span
+
+    def most(self, lam: float, offset: float) -> tuple[FloatArray, FloatArray]:
+        """Changes of 1/z by pixel where most light arrives, and how much more than elsewhere.
+
+        Parameters
+        ----------
+        lam
+            of the look, over the largest sigma^2.
+        offset
+            middle of the displacements [projector pixels].
+        """
+        count = 2 * int(np.ceil(self.width / self.pixel / STEP / 2)) + 1
+        shifts = np.linspace(-self.width / 2, self.width / 2, count) + offset * self.pixel
+        light = np.stack([self._arriving(self._seen[lam], shift) for shift in shifts])
+        light = np.maximum(gaussian_filter(light, (0, _POOLED, _POOLED)), 0.0)
+        place, step = light.argmax(axis=0), shifts[1] - shifts[0]
+        near = round(_NEIGHBOURHOOD * self.pixel / step)
+        beside = np.arange(count)[:, None, None] - place
+        own = np.where(np.abs(beside) <= near, light, 0.0)
+        other = np.where(np.abs(beside) <= near, 0.0, light).max(axis=0)
+        peak = light.max(axis=0)
+        dark = peak <= np.finfo(float).tiny
+        centroid = (own * beside).sum(axis=0) / np.where(dark, 1.0, own.sum(axis=0))
+        found = median_filter(shifts[place] + step * centroid, MEDIAN)
+        elsewhere = np.maximum(other, np.median(other))  # of a dark pixel alone it would be small by chance
+        return found, np.where(dark, 0.0, np.maximum(1 - elsewhere / np.where(dark, 1.0, peak), 0.0))
+
+    def _arriving(self, seen: FloatArray, shift: float) -> FloatArray:
+        """(n, n') light of ``seen`` images that arrives where pixels of a changed 1/z would be seen."""
+        keys, places, parts = [], [], []
+        for axis, (classes, opened) in enumerate(zip(self._classes, self._open, strict=True)):
+            place = np.arange(classes.size) + (self.depths.edges(axis) * shift + self._margin if opened else 0.0)
+            whole = np.floor(place).astype(np.intp)
+            whole = np.clip(whole, 0, max(seen.shape[2 + axis] - 2, 0)) if opened else whole
+            keys.append(classes if opened else np.zeros_like(classes))
+            places.append(whole)
+            parts.append(place - whole)
+        total = np.zeros(self.depths.shape)
+        for row in (0, 1) if self._open[0] else (0,):
+            for column in (0, 1) if self._open[1] else (0,):
+                weights = [part if end else 1 - part for part, end in zip(parts, (row, column), strict=True)]
+                value = seen[keys[0][:, None], keys[1], (places[0] + row)[:, None], places[1] + column]
+                total += np.outer(*weights) * value
+        return total
+
+    @cached_property
+    def _seen(self) -> dict[float, FloatArray]:
+        """By lambda, (K, K', rows, columns) images of each class of dots along axes with parallax, all pixels of these
+        axes, and so many beside the window, taken for lit; K = 1 along an axis without."""
+        sides, patterns = [], []
+        for axis, opened in enumerate(self._open):
+            side = self.depths.widened(axis, self._margin) if opened else self.depths.side(axis, 0.0)
+            sides.append(side)
+            patterns.append(np.ones((side.shape[1], 1)) if opened else self.depths.patterns[axis])
+        prepared = prepare(sides[0], sides[1], patterns[0], patterns[1])
+        counts = [own.shape[1] if opened else 1 for own, opened in zip(self.depths.patterns, self._open, strict=True)]
+        sums = {key: prepared.accumulator() for key in np.ndindex(*counts)}
+        for each in self.depths.frames:
+            key = (each.row if self._open[0] else 0, each.column if self._open[1] else 0)
+            sums[key].add(each.frame, 0 if self._open[0] else each.row, 0 if self._open[1] else each.column)
+        problems = {key: prepared.problem(own) for key, own in sums.items()}
+        found = {}
+        for lam in LAMBDAS:
+            images = [prepared.solve(own, lam * problems[key].scale).image for key, own in sums.items()]
+            found[lam] = np.stack(images).reshape(*counts, *images[0].shape)
+        return found
+
+
+def _classes(patterns: FloatArray) -> np.ndarray:
+    """(n,) which of the (n, K) ``patterns`` lights each pixel; MitsimError where it is not one of them, as of dots."""
+    if not are_dots(patterns):
+        raise MitsimError("focus map: needs shifting dots, such as dots:7x16, whose displacement tells depth")
+    return np.asarray(patterns.argmax(axis=1))

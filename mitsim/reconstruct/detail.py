@@ -3,11 +3,12 @@
 Print that changes within a projector pixel has its light a dipole d beside the centre, which moves the frames by Phi_L
 (P_ij o d) Phi_R'^T, Phi_R' being the slope of Phi_R along its columns, and by the same of rows. The image tells the
 dipole of its ramp, g / 12, but not of finer print; frames do. A slope is another vector for every pixel, so halves of
-the sensor's columns take it for different images: W_0 - G W of :mod:`mitsim.reconstruct.regularisation` holds sum_j
-(U_0j - U_j G)^T Phi_R' diag(p_j) d^T, as known as the sum_j U_j^T Phi_R' diag(p_j) d^T that strikes the image. For
-independent dipoles one energy is in closed form a multiple of the other, and turns the disagreement that noise does not
-explain into an error of the image, place by place. A surface beside the calibrated distance moves light alike, and is
-told too."""
+the sensor's columns take it for different images: W_0 - G W of :mod:`mitsim.reconstruct.regularisation` holds
+sum_j (U_0j - U_j G)^T Phi_R' diag(p_j) d^T, as known as the sum_j U_j^T Phi_R' diag(p_j) d^T that strikes the image.
+For independent dipoles one energy is in closed form a multiple of the other, and turns the disagreement that noise does
+not explain into an error of the image, place by place. A surface beside the calibrated distance moves light alike, and
+is told too.
+"""
 
 from __future__ import annotations
 
@@ -74,14 +75,14 @@ class Model:
 
     @cached_property
     def slopes(self) -> tuple[FloatArray, FloatArray]:
-        """Phi_L' and Phi_R', see :func:`slope_of`."""
-        return slope_of(self.factors[0]), slope_of(self.factors[1])
+        """Phi_L' and Phi_R', see :func:`factor_slope`."""
+        return factor_slope(self.factors[0]), factor_slope(self.factors[1])
 
     @cached_property
     def moved(self) -> tuple[FloatArray, FloatArray]:
-        """:func:`moved_responses` of both sides."""
+        """:func:`offset_responses` of both sides."""
         left, right = zip(self.sides, self.slopes, self.patterns, strict=True)
-        return moved_responses(*left), moved_responses(*right)
+        return offset_responses(*left), offset_responses(*right)
 
 
 def print_energy(model: Model, image: FloatArray) -> float:
@@ -89,7 +90,7 @@ def print_energy(model: Model, image: FloatArray) -> float:
 
     Light of slope g a pixel moves the frames by Phi_L (P_ij o g / 12) Phi_R'^T, Phi_R' being the slope of Phi_R along
     its columns. With C = S_L V_L^T g / 12 that is sum_pq (C^T C o P_R P_R^T o Phi_R'^T Phi_R')[p, q] in all, of which
-    |C T|^2 is in the range, T being :func:`moved_responses`; and the same of the other side.
+    |C T|^2 is in the range, T being :func:`offset_responses`; and the same of the other side.
     """
     total = 0.0
     own = tuple(zip(model.sides, model.slopes, model.patterns, model.moved, strict=True))
@@ -213,12 +214,12 @@ def orthonormal(matrix: FloatArray) -> FloatArray:
     return np.asarray(left[:, singular > singular[0] * max(matrix.shape) * np.finfo(np.float64).eps])
 
 
-def blocks_of(pixels: IndexArray, size: int) -> IndexArray:
+def block_indices(pixels: IndexArray, size: int) -> IndexArray:
     """Which of the blocks along a side of ``size`` scene pixels each of the ``pixels`` is in."""
     return pixels * _BLOCKS // size
 
 
-def moved_responses(side: Side, slope: FloatArray, patterns: FloatArray) -> FloatArray:
+def offset_responses(side: Side, slope: FloatArray, patterns: FloatArray) -> FloatArray:
     """(2, n, r) sum_j diag(p_j) Phi'^T U_j over each half of the sensor: what coefficients see of light one pixel
     beside the centre of its own.
 
@@ -236,7 +237,7 @@ def moved_responses(side: Side, slope: FloatArray, patterns: FloatArray) -> Floa
     return total
 
 
-def slope_of(factor: FloatArray, spline: bool = False) -> FloatArray:
+def factor_slope(factor: FloatArray, spline: bool = False) -> FloatArray:
     """(m, n) Phi', change of a ``factor`` (m, n) by scene pixel.
 
     Where a shadow moves by more than a sensor pixel from one scene pixel to the next, its slope is that along the

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.errors import MitsimError
+from mitsim.reconstruct.solver import centred
 from mitsim.reconstruct.status import Status, Verdict
 
 SEPARABLE_RESIDUAL = 0.01
@@ -364,15 +365,15 @@ def factors_of_sums(
     expected = spare * (stated_noise or 0.0) ** 2 / energy
     unexplained = float(np.sqrt(max(residual**2 - expected, 0.0)))
     allowed = UNKNOWN_NOISE if stated_noise is None else max(SEPARABLE_RESIDUAL, NOISE_MODEL * float(np.sqrt(expected)))
-    singular = _singular(phi[0]), _singular(phi[1])
-    condition = max(map(_squared_condition, singular))
+    singular = _Singular.of(phi[0]), _Singular.of(phi[1])
+    condition = max(values.squared_condition for values in singular)
     predicted, rank = [], []
     for factor, common, values, more in zip(phi, (v, a), singular, extra, strict=True):
         error = predicted_error(factor, noise, float(np.linalg.norm(common)), count)
         if more:
             error = float(np.hypot(error, np.sqrt(more / count) / np.linalg.norm(factor)))
         predicted.append(error)
-        rank.append(_rank(factor, values, predicted[-1]))
+        rank.append(values.rank(factor, error))
     n = phi[0].shape[1], phi[1].shape[1]
     figures = (
         f"Factor error {predicted[0]:.1e} and {predicted[1]:.1e}, "
@@ -467,27 +468,6 @@ def _status(inseparable: bool, residual: float, error: float, lost: tuple[int, i
     return Status(Verdict.CALIBRATED, "Calibrated: responses are separable", "", figures)
 
 
-def _rank(phi: FloatArray, singular: _Singular, error: float) -> int:
-    """Singular values of a factor beyond rounding and what its noise makes of zero.
-
-    Along a scene direction that the sensor does not see the factor holds m independent numbers of that noise: their
-    norm squared is chi-square with m degrees of freedom, taken at three standard deviations above its mean.
-
-    Parameters
-    ----------
-    phi, singular
-        (m, n), and its singular values.
-    error
-        noise, as a part of ||phi||.
-    """
-    if not phi.any():
-        return 0
-    deviation = error * np.linalg.norm(phi) / np.sqrt(phi.size)
-    rows = phi.shape[0]
-    noise = deviation * np.sqrt(rows + 3 * np.sqrt(2 * rows))
-    return int(np.count_nonzero(singular.values > max(float(noise), singular.rounding)))
-
-
 @dataclass(frozen=True, eq=False)
 class _Singular:
     """Singular ``values`` of a factor, what of them is ``rounding``, and whether the factor is ``wide``: of fewer rows
@@ -497,21 +477,35 @@ class _Singular:
     rounding: float
     wide: bool
 
+    @classmethod
+    def of(cls, phi: FloatArray) -> _Singular:
+        """Those of ``phi`` (m, n), with the rounding that numpy.linalg.matrix_rank states."""
+        values = np.asarray(np.linalg.svd(phi, compute_uv=False))
+        rounding = float(values[0] * max(phi.shape) * np.finfo(np.float64).eps)
+        return cls(values, rounding, phi.shape[0] < phi.shape[1])
 
-def _singular(phi: FloatArray) -> _Singular:
-    """Singular values of ``phi`` (m, n), with the rounding that numpy.linalg.matrix_rank states."""
-    values = np.asarray(np.linalg.svd(phi, compute_uv=False))
-    return _Singular(values, float(values[0] * max(phi.shape) * np.finfo(np.float64).eps), phi.shape[0] < phi.shape[1])
+    @property
+    def squared_condition(self) -> float:
+        """cond(phi)^2; inf where ``phi`` is rank deficient."""
+        lost = self.wide or self.values[-1] <= self.rounding
+        return float("inf") if lost else float((self.values[0] / self.values[-1]) ** 2)
+
+    def rank(self, phi: FloatArray, error: float) -> int:
+        """Values beyond rounding and what an ``error``, as a part of ||``phi``||, makes of zero.
+
+        Along a scene direction that the sensor does not see the factor holds m independent numbers of that noise: their
+        norm squared is chi-square with m degrees of freedom, taken at three standard deviations above its mean.
+        """
+        if not phi.any():
+            return 0
+        deviation, rows = error * np.linalg.norm(phi) / np.sqrt(phi.size), phi.shape[0]
+        noise = deviation * np.sqrt(rows + 3 * np.sqrt(2 * rows))
+        return int(np.count_nonzero(self.values > max(float(noise), self.rounding)))
 
 
 def squared_condition(phi: FloatArray) -> float:
     """cond(phi)^2 of a factor ``phi`` (m, n); inf when it is rank deficient."""
-    return _squared_condition(_singular(phi))
-
-
-def _squared_condition(singular: _Singular) -> float:
-    values = singular.values
-    return float("inf") if singular.wide or values[-1] <= singular.rounding else float((values[0] / values[-1]) ** 2)
+    return _Singular.of(phi).squared_condition
 
 
 def _rank_one_split(mean: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -560,10 +554,7 @@ def _response(response: npt.ArrayLike, name: str, shape: tuple[int, ...] | None,
     if not np.isfinite(values).all():
         bad = np.count_nonzero(~np.isfinite(values))
         raise MitsimError(f"{name} has {bad} values that are not finite; capture it again")
-    if centre:
-        values = values - values.mean(axis=1, keepdims=True)
-        values = values - values.mean(axis=0, keepdims=True)
-    return values
+    return centred(values) if centre else values
 
 
 def _checked_signs(H: npt.ArrayLike, has_uniform: bool) -> FloatArray:

@@ -1,281 +1,183 @@
-"""Measurements, the factorised model and its fit in; out come frames that are not what they say, by number and fault.
-
-A frame is suspected where it is off by more than noise, and by more than the other frames are: a scene that does not
-fit has all its frames off. It is named where one fault explains what it is off by. The halves of signed patterns add up
-to the same frame for all of them, which foretells each half by the other without any model.
-"""
+"""What may be wrong with frames, of captures and of calibration sessions, and how it is said."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from enum import Enum, auto
+from typing import Any
 
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.reconstruct.brightness import odd_brightness
-from mitsim.reconstruct.explanations import Explanations
-from mitsim.reconstruct.framefault import Fault, FrameFault
-from mitsim.reconstruct.leaveoneout import CHANCE, OFF, FrameSums, LeaveOneOut, Pattern
-from mitsim.reconstruct.sides import group_pixels
+from mitsim.devices.session import UNIFORM, Half, Side
 
-_MORE = 4.0
-"""Times the median frame's unexplained energy from which a frame is suspected: chosen, as one that is wrong puts part
-of its energy into the others where patterns overlap."""
-_MOST_BAD = 0.25
-"""Of all patterns: above it the run is another than it says, and no single frames are at fault."""
-_FURTHER, _TRIED = 4.0, 3
-"""In place of :data:`CHANCE`, once one frame is suspected; and the most frames of which it is tried which one puts the
-others off: chosen, only what a fault explains is named."""
-_NEGATIVE = 0.5
-"""Mean reflectance of pixels that are lit alike, over the largest such mean, below which less the image is negative:
-chosen, no noise of a picture that shows anything is as large."""
-_ODD = 0.1
-"""Of the light of a signed pair, by which that of another pair differs that is none: half of it or more."""
-STEPS = (
-    "one step late: each shot shows the pattern of the shot before",
-    "one step early: each shot shows the pattern of the next",
-)
-"""Ways in which shots are a step beside their patterns."""
-_COSTS, _FEWEST_PAIRS = 0.5, 4
-"""Of the noise's energy, from which a lamp of other power from shot to shot is named: uncertainties are then a fifth
-too small; and the fewest pairs that tell a median."""
-_MEDIAN_SQUARE = 0.455
-"""Median of the square of a normal number of variance 1."""
-_QUIET, _AVERAGED = 0.5, 0.01
-"""Part of the sensor's noise, without rounding, that frames may have at least: half where numbers are digital, stated
-gains are that wrong; where they are not, means of up to 100 shots may have been given."""
+# ---- Frames of a capture ---------------------------------------------------------------------------------------------
 
 
-class FrameCheck(LeaveOneOut):
-    """Finds the frames of a run that are not what they say."""
+class Fault(Enum):
+    """What may be wrong with frames of a capture."""
 
-    def all_off(self, sums: FrameSums, beside_noise: float) -> bool:
-        """Whether the typical frame is off, and not single ones; ``sums`` and ``beside_noise`` as :meth:`faults` takes
-        them."""
-        noise = self.noise.variance * self.size * self.prepared.spare
-        share = beside_noise * sums.power / max(float(sums.power.sum()), np.finfo(float).tiny)
-        part = np.maximum(sums.residual - noise - share, 0.0) / np.maximum(sums.power, np.finfo(float).tiny)
-        return bool(np.median(part) > OFF**2)
+    BLACK = auto()
+    DIM = auto()
+    BRIGHT = auto()
+    REPEATED = auto()
+    SWAPPED = auto()
+    """Two frames are in each other's place."""
+    MISPLACED = auto()
+    """It holds the light of another pattern."""
+    HALF_LOST = auto()
+    SHIFTED = auto()
+    CLIPPED = auto()
+    NOISELESS = auto()
+    FLICKER = auto()
+    """The lamp's power differs from frame to frame."""
 
-    def faults(self, sums: FrameSums, beside_noise: float, fits: bool = True) -> tuple[FrameFault, ...]:
-        """The frames at fault.
 
-        Parameters
-        ----------
-        sums
-            of all measurements.
-        beside_noise
-            energy that rendering, the factors' noise and print put into all of them.
-        fits
-            whether what frames foretell counts only where they fit; not of a scene whose depths are known to differ.
-        """
-        found = [*self._same(sums), *self._clipped(sums), *self._noiseless(sums)]
-        suspects = self._suspects(sums, beside_noise)
-        if suspects is None:  # too many
-            return tuple(found or self._flicker(sums))
-        named = self._explained(sums, beside_noise, fits, *suspects) if suspects[0] else []
-        if not named and not found:
-            return tuple(self._flicker(sums))
-        # What is known without the model is said where that does not say more; of clipped frames it explains the rest.
-        clipped = {number for fault in found if fault.fault is Fault.CLIPPED for number in fault.numbers}
-        named = [fault for fault in named if not clipped & set(fault.numbers)]
-        known = clipped | {number for fault in named for number in fault.numbers}
-        return (*(each for each in found if each.fault is Fault.CLIPPED or not known & set(each.numbers)), *named)
+@dataclass(frozen=True)
+class FrameFault:
+    """A ``fault`` of the shots of some ``numbers``, in ``files``, from 0 in the manifest's order; ``words`` say it."""
 
-    def _suspects(self, sums: FrameSums, beside_noise: float) -> tuple[dict[Pattern, bool], FloatArray] | None:
-        """Patterns that are off, each with whether its brightness alone is, and W with these as the others foretell
-        them; None where too many are. The parameters are those of :meth:`faults`."""
-        bad: dict[Pattern, bool] = {}
-        weights, count = self.weights, self.noise.variance.size
-        while candidates := self._off(sums, weights, beside_noise, bad, _FURTHER if bad else CHANCE):
-            if len(bad) + 1 > max(1, _MOST_BAD * count):
-                return None
-            if count == 1:
-                return dict(candidates), weights
-            # Where patterns overlap a frame puts others off: it is the one without which the rest fits best.
-            several = not (self.exclusive or self.signed)
-            least = np.inf
-            for pattern, by_brightness in candidates[: _TRIED if several else 1]:
-                rest, explained = self.without((*bad, pattern))
-                noise = float(self.noise.variance[pattern]) * self.size * self.prepared.spare
-                if (left := noise - float(sums.energy[pattern]) - explained) < least:
-                    least, found = left, (pattern, by_brightness, rest)
-            bad[found[0]], weights = found[1:]
-            sums = self.gathered(weights, bad)
-        return bad, weights
+    fault: Fault
+    numbers: tuple[int, ...]
+    files: tuple[str, ...]
+    words: str
 
-    def _explained(
-        self, sums: FrameSums, beside_noise: float, fits: bool, bad: dict[Pattern, bool], weights: FloatArray
-    ) -> list[FrameFault]:
-        """Faults of patterns that are suspected, :meth:`_suspects` as :meth:`faults` takes its parameters."""
-        explanations = Explanations(self, bad, weights)
-        if not fits:
-            return explanations.faults(-np.inf)
-        good = np.ones(self.noise.variance.shape, dtype=np.bool_)
-        for pattern in bad:
-            good[pattern] = False
-        variance, energy, total = self.noise.variance[good], float(sums.energy[good].sum()), float(sums.power.sum())
-        beside = beside_noise * float(sums.power[good].sum()) / max(total, np.finfo(float).tiny)
-        off = explanations.others_left(energy) - float(variance.sum()) * self.size * self.prepared.spare - beside
-        chance = CHANCE / 2 * float(np.sqrt(2 * self.size * np.square(variance).sum()))
-        return explanations.faults(off if off > max(chance, (OFF / 2) ** 2 * energy) else 0.0)
+    def __str__(self) -> str:
+        return self.words
 
-    def out_of_step(self, sums: FrameSums) -> str:
-        """How signed shots are a step beside their patterns, as ``sums`` of their light tell, or nothing.
+    def summary(self) -> dict[str, Any]:
+        """For result.json."""
+        return {
+            "fault": self.fault.name.lower(),
+            "frames": list(self.numbers),
+            "files": list(self.files),
+            "words": self.words,
+        }
 
-        That of two halves is the same for all patterns; most is that of the half that lights all pixels.
-        """
-        if self._whole is None or self.noise.variance.size < 4:
-            return ""
-        whole = self.number[(*self._whole, 1)]
-        light = np.zeros(len(self.shots))
-        for pattern, halves in sums.halves.items():
-            for sign, half in zip((1, -1), halves, strict=True):
-                light[self.number[(*pattern, sign)]] = half
 
-        def odd(step: int) -> int:
-            pairs: dict[Pattern, float] = {}
-            for number, shot in enumerate(self.shots):
-                pattern = shot.row, shot.column
-                pairs[pattern] = pairs.get(pattern, 0.0) + light[(number + step) % len(light)]
-            totals = np.array(list(pairs.values()))
-            return int((np.abs(totals - np.median(totals)) > _ODD * abs(np.median(totals))).sum())
+def frame_list(numbers: tuple[int, ...], files: tuple[str, ...]) -> str:
+    """Frames by their ``numbers`` and ``files``, the first few."""
+    shown = ", ".join(f"{number} ({file})" for number, file in zip(numbers[:4], files[:4], strict=True))
+    more = f" and {len(numbers) - 4} more" if len(numbers) > 4 else ""
+    return f"frame{'s' if len(numbers) > 1 else ''} {shown}{more}"
 
-        if odd(0) > 1:
-            for step, words in ((1, STEPS[0]), (-1, STEPS[1])):
-                if odd(step) == 0 and int(np.argmax(np.roll(light, -step))) == whole:
-                    return words
-        return ""
 
-    def whole(self) -> FloatArray | None:
-        """(m, m') the sum of a signed pattern's halves, as the model has it of the pattern of +1 alone; None without
-        that."""
-        return None if self._whole is None else self.modelled(self.weights, *self._whole)
+# ---- Frames of a calibration session ---------------------------------------------------------------------------------
 
-    def negative(self) -> str:
-        """Why signed patterns were taken the wrong way round, or nothing: pixels that are always lit alike then have a
-        negative reflectance in the mean, where noise is averaged."""
-        if not self.signed or max(self._periods) < 2:
-            return ""
-        image = self.image(self.weights)
-        rows, columns = (group_pixels(side, "block") for side in self.patterns)
-        means = np.array([[image[np.ix_(row.pixels, column.pixels)].mean() for column in columns] for row in rows])
-        if means.min() > -_NEGATIVE * np.abs(means).max():
-            return ""
-        return "the image is negative: the halves of signed pairs are exchanged, or their frames in another order"
 
-    def _off(
-        self, sums: FrameSums, weights: FloatArray, beside_noise: float, bad: dict[Pattern, bool], level: float
-    ) -> list[tuple[Pattern, bool]]:
-        """Patterns that are off, the most first, and whether their brightness alone is.
+DARK = 0.03
+"""Light of a black frame, as a part of what it should have: stray light and the projector's own black level."""
 
-        Parameters
-        ----------
-        sums, weights
-            of all, and W of those that are not ``bad``.
-        beside_noise
-            as :meth:`faults` takes it.
-        bad
-            patterns that are suspected already.
-        level
-            standard deviations of noise by which others must be off.
-        """
-        good = np.ones(self.noise.variance.shape, dtype=np.bool_)
-        for pattern in bad:
-            good[pattern] = False
-        if not good.any():
-            return []
-        noise = self.noise.variance * self.size
-        chance = level * self.noise.variance * np.sqrt(2 * self.size)
-        share = beside_noise * sums.power / max(float(sums.power.sum()), np.finfo(float).tiny)
-        others = max(good.sum() - 1, 1)
-        # Behind a mask with a constant term most of a frame's light says nothing, and is no part of what it is off by.
-        whole = sums.energy if self.prepared.centre else sums.power
-        tests = [(sums.residual, whole, noise * self.prepared.spare + share, chance)]
-        if self.signed:
-            mean = float(noise[good].mean())
-            tests.append((sums.sums, sums.power, noise + mean / others + share, 2 * chance))
-        parts = np.zeros(good.shape)
-        for energy, whole, expected, allowed in tests:
-            power = np.maximum(whole, np.median(whole[good]))
-            beyond = np.where(good, np.maximum(energy - expected, 0.0), 0.0)
-            part = beyond / np.maximum(power, np.finfo(float).tiny)
-            usual = float(np.median(part[good])) if good.sum() > 2 else 0.0
-            off = good & (beyond > allowed) & (part > max(OFF**2, _MORE * usual))
-            parts = np.maximum(parts, np.where(off, part, 0.0))
-        if parts.any():
-            order = np.argsort(-parts, axis=None, kind="stable")[: np.count_nonzero(parts)]
-            rows, columns = np.unravel_index(order, parts.shape)
-            return [((int(row), int(column)), False) for row, column in zip(rows, columns, strict=True)]
-        if self.exclusive:
-            ratio = odd_brightness(self, weights, good)
-            return [] if ratio is None else [(ratio, True)]
-        return [((0, 0), True)] if good.size == 1 and self._is_dark() else []
 
-    def _is_dark(self) -> bool:
-        """Whether the only frame has no more light than noise makes."""
-        return bool(abs(self.noise.means[0, 0]) < CHANCE * float(np.sqrt(self.noise.variance[0, 0] / self.size)))
+def robust_scatter(values: FloatArray, middle: float = 0.0) -> float:
+    """Standard deviation of normal ``values`` about their ``middle``, by the median, which a few others do not move."""
+    return 1.4826 * float(np.median(np.abs(values - middle)))
 
-    def _same(self, sums: FrameSums) -> Iterable[FrameFault]:
-        """Shots that are one and the same frame, noise and all."""
-        if not self.noise.variance.any():
-            return
-        for digest, shots in sums.digests.items():
-            if digest and len(shots) > 1:
-                numbers = [self.number[(*pattern, (1 - 2 * half) if self.signed else 0)] for pattern, half in shots]
-                yield self.fault(Fault.REPEATED, numbers, "are one and the same")
 
-    def _clipped(self, sums: FrameSums) -> Iterable[FrameFault]:
-        """Shots with many readings at their largest number; where most have, it is the end of the sensor's range."""
-        if len(sums.clipped) <= max(1, _MOST_BAD * len(self.shots)):
-            for (pattern, half), count in sums.clipped.items():
-                numbers = [self.number[(*pattern, (1 - 2 * half) if self.signed else 0)]]
-                yield self.fault(Fault.CLIPPED, numbers, f"has {count} readings at its largest number")
+@dataclass(frozen=True)
+class SessionFault:
+    """One pattern, or one of its frames, that is not what it should be.
 
-    def _flicker(self, sums: FrameSums) -> Iterable[FrameFault]:
-        """All shots, where the sums of signed pairs, which are one and the same light, tell that the lamp's power
-        differs from shot to shot by what costs more than part of the noise."""
-        powers = [(pattern, *power) for pattern, power in sums.powers.items()]
-        if len(powers) < _FEWEST_PAIRS or not self.manifest.digital.noise_is_stated:
-            return
-        variance = np.array([self.noise.variance[pattern] for pattern, *_ in powers])
-        common, apart, whole, difference, square = np.array([power for _, *power in powers]).T
-        # Behind a mask with a constant term the solver takes part of the light alone.
-        taken = np.array([sums.energy[pattern] for pattern, *_ in powers]) / difference
-        cost = taken * (np.square(common) * difference + np.square(apart) * whole)
-        noise = np.maximum(variance * self.size, np.finfo(float).tiny)
-        # What noise makes of it, where halves are alike, or one is black for the most part.
-        chance = taken * variance * (np.square(whole) + np.square(difference)) / square
-        times = float(np.median(cost / noise)) / _MEDIAN_SQUARE
-        if times > _COSTS + CHANCE * float(np.median(chance / noise)):
-            differ = 100 * float(np.sqrt(np.square(common).mean() + np.square(apart).mean()))
-            yield self.fault(
-                Fault.FLICKER,
-                list(range(len(self.shots))),
-                f"differ by {differ:.2g} % in their lamp's power, as sums of pairs tell, which puts {times:.2g} times "
-                "the noise into the image: use a steadier lamp, or expose for whole periods of it",
+    Attributes
+    ----------
+    side, index
+        of the pattern.
+    sign
+        of the frame; None: both frames.
+    kind
+        ``black``, ``dim``, ``bright``, ``half lost``, ``repeated``, ``shifted``, ``clipped``, ``exchanged``,
+        ``swapped``, ``wrong``.
+    detail
+        the same in words, after the frame's name.
+    other
+        the frame that it repeats, or the pattern that it is swapped with.
+    repair
+        what is done about it, in words.
+    cost
+        relative error of its factor that this leaves beyond the noise.
+    """
+
+    side: Side
+    index: int
+    sign: int | None
+    kind: str
+    detail: str
+    repair: str
+    other: Half | None = None
+    cost: float = 0.0
+
+    def _names(self, name: Callable[[Half], str], index: int) -> list[str]:
+        """Names of a pattern's frames, both or that of its sign."""
+        return [name((self.side, index, sign)) for sign in ((1, -1) if self.sign is None else (self.sign,))]
+
+    def words(self, name: Callable[[Half], str]) -> str:
+        """A sentence; ``name`` says which frame it is."""
+        others = []
+        if self.other is not None:
+            others = self._names(name, self.other[1]) if self.other[2] == UNIFORM else [name(self.other)]
+        other = f" ({' and '.join(others)})" if others else ""
+        cost = f", at a factor error of {self.cost:.1e}" if self.cost else ""
+        names = " and ".join(self._names(name, self.index))
+        return f"frames: {names}: {self.detail}{other}; {self.repair}{cost}"
+
+    def listed(self, name: Callable[[Half], str]) -> dict[str, Any]:
+        """The same for a manifest; ``name`` says which frame it is."""
+        return {"frames": self._names(name, self.index), **asdict(self)}
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """How the projector's power changes over the session.
+
+    Attributes
+    ----------
+    drift
+        from the session's begin to its end, as a part of its mean.
+    flicker
+        from frame to frame, rms, as a part of it.
+    drift_cost, flicker_cost
+        relative error of both factors that each would leave, or leaves, in them.
+    remaining
+        the error that is left after correction.
+    corrected
+        whether factors are corrected for it.
+    """
+
+    drift: float = 0.0
+    flicker: float = 0.0
+    drift_cost: float = 0.0
+    flicker_cost: float = 0.0
+    remaining: float = 0.0
+    corrected: bool = False
+
+    def listed(self) -> dict[str, float] | None:
+        """The same for a manifest; None of a steady one."""
+        return asdict(self) if self.drift or self.flicker else None
+
+    def warnings(self) -> Iterator[str]:
+        """What is said of an unsteady lamp."""
+        left = "frames are divided by its power" + (f", and {self.remaining:.1e} is left" if self.remaining else "")
+        left = left if self.corrected else "its error is in what is stated"
+        if self.drift:
+            yield (
+                f"lamp: its power drifts by {self.drift:+.1%} over the session, a factor error of "
+                f"{self.drift_cost:.1e} if nothing is done; {left}: let it warm up"
+            )
+        if self.flicker:
+            yield (
+                f"lamp: its power flickers by {self.flicker:.2%} from frame to frame, a factor error of "
+                f"{self.flicker_cost:.1e} if nothing is done; {left}: use a steadier one, or expose for whole periods"
             )
 
-    def _noiseless(self, sums: FrameSums) -> Iterable[FrameFault]:
-        """Frames with less noise than their sensor has: only where readings can show it."""
-        digital = self.manifest.digital
-        if not digital.noise_is_stated:
-            return
-        light = self.noise.means
-        rounding = ((digital.step_dn or 0.0) / digital.gain_dn_per_e / digital.exposure_s) ** 2 / 12 * self.noise.shots
-        own = self.noise.variance - rounding
-        # Digital numbers of one reading: its noise, and how far it is above the end of its range.
-        deviation = np.sqrt(np.maximum(own, 0) / self.noise.shots) * digital.exposure_s * digital.gain_dn_per_e
-        above = (light / self.noise.shots) * digital.exposure_s * digital.gain_dn_per_e + digital.black_level_dn
-        shows = (deviation > 0.5 * (digital.step_dn or 0.0)) & (above > 3 * deviation) & (own > 0)
-        shows &= self.noise.saturated < 1e-3 * max(self.noise.readings, 1)
-        expected = np.where(shows, own * self.size * self.prepared.spare, 1.0)
-        least = _QUIET if digital.step_dn else _AVERAGED
-        quiet = shows & (
-            sums.residual / expected < least * (1 - CHANCE * np.sqrt(2 / (self.size * self.prepared.spare)))
-        )
-        numbers = [n for n, shot in enumerate(self.shots) if quiet[shot.row, shot.column]]
-        if numbers:
-            part = float(sums.residual[quiet].sum() / expected[quiet].sum())
-            has = f"{'have' if len(numbers) > 1 else 'has'} {part:.2g} of the noise that the sensor makes"
-            yield self.fault(Fault.NOISELESS, numbers, has)
+
+def frame_words(half: Half) -> str:
+    """Which frame of a session a ``half`` is, in words."""
+    side, index, sign = half
+    return f"{side} stripes {index} of sign {sign:+d}" if sign != UNIFORM else f"{side} stripes {index}"
+
+
+def name_by_light(part: float) -> tuple[str, str]:
+    """Kind and words of a frame with a ``part`` of its light."""
+    kind = "dim" if part < 1 else "bright"
+    return kind, f"is {kind}: it has {part:.3g} of its light"

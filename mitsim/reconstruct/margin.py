@@ -24,7 +24,7 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import Parallax
 from mitsim.core.runs import Ambient, Capture, Measurement
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import LEAST_PART, FactorOfDepths, Focused, stated_parallax
+from mitsim.reconstruct.focus import LEAST_PART, FactorOfDepths, MovedFactors, parallax_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +33,12 @@ class Margin:
 
     cells: int
 
-    def factors(self, factors: Factors) -> Focused:
+    def factors(self, factors: Factors) -> MovedFactors:
         """The ``factors`` with columns of these cells, on the part of the sensor where these are known.
 
         MitsimError where they do not state their parallax, and for more cells than the window, or the sensor, tells of.
         """
-        parallax, sides = stated_parallax(factors), (factors.left, factors.right)
+        parallax, sides = parallax_of(factors), (factors.left, factors.right)
         if self.cells > (most := min(factor.shape[1] for factor in sides)):
             raise ArgumentError("margin", f"{self.cells}: give at most {most}, the projector's pixels a side")
         widened = [FactorOfDepths(factor, parallax, axis).beyond(self.cells) for axis, factor in enumerate(sides)]
@@ -53,7 +53,7 @@ class Margin:
         manifest = factors.manifest.model_copy(update={"parallax": _wider(parallax, sizes, self.cells)})
         shape = len(factors.left), len(factors.right)
         wider = replace(factors, left=left[rows], right=right[columns], manifest=manifest, lacking=())
-        return Focused(wider, rows, columns, shape)
+        return MovedFactors(wider, rows, columns, shape)
 
     def of(self, shots: Capture) -> Capture:
         """The ``shots`` with patterns that light these cells always; MitsimError for patterns of -1."""

@@ -4,6 +4,15 @@ Of data Y the model can explain what lies in its range, U_L W U_R^T, whatever th
 U_R^T hangs on no lambda. Its energy is held against what the sensor's stated noise, that of the calibrated factors and
 the error of simulated frames put there; what is more is *unexplained*: light that no flat, matt scene at the calibrated
 distance sends.
+
+*What factors lack.* A camera whose shadow is no single product, as of waves behind a FlatCam or MURA mask, adds sum_k
+L_k (P_ij o X) R_k^T to the frames that Phi_L (P_ij o X) Phi_R^T explains. With G_kl = L_k^T L_l and H_kl = R_l^T R_k
+its energy over all patterns is ::
+
+    sum_kl <X, (G_kl o P_L P_L^T) X (H_kl o P_R P_R^T)>
+
+of which |T|^2 lies in the model's range, T = sum_k (sum_i U_Li^T L_k diag(p_i)) X (sum_j U_Rj^T R_k diag(q_j))^T being
+what coefficients W take for image.
 """
 
 from __future__ import annotations
@@ -17,17 +26,17 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray, SeparableTerm
 from mitsim.core.runs import Measurement
-from mitsim.reconstruct.causes import Cause, Evidence, Signatures, likely_cause
+from mitsim.reconstruct.causes import Cause, Evidence, Reading, Signatures, likely_cause
 from mitsim.reconstruct.defects import Defects, defects_of
 from mitsim.reconstruct.detail import Model
 from mitsim.reconstruct.estimate_factors import decibels
-from mitsim.reconstruct.faults import FrameCheck
-from mitsim.reconstruct.framefault import FrameFault
-from mitsim.reconstruct.leaveoneout import FrameSums
+from mitsim.reconstruct.faults import FrameFault
+from mitsim.reconstruct.frame_check import FrameCheck
+from mitsim.reconstruct.leave_one_out import FrameSums
 from mitsim.reconstruct.noise import FrameNoise
-from mitsim.reconstruct.readings import Reading, Readings, multiple
+from mitsim.reconstruct.readings import Readings, multiple
 from mitsim.reconstruct.sides import Side
-from mitsim.reconstruct.solver import Prepared, centred
+from mitsim.reconstruct.solver import Prepared
 from mitsim.reconstruct.status import Status, Verdict
 
 UNEXPLAINED = 3.5e-3
@@ -124,6 +133,10 @@ class Misfit:
             return self.reading.words
         return self.cause.value[0] if self.cause else ""
 
+    def read_as(self, reading: Reading) -> Misfit:
+        """The same of frames that fit when they are taken as another ``reading`` has them."""
+        return replace(self, flagged=True, cause=reading.cause, reading=reading)
+
     def summary(self) -> dict[str, Any]:
         """What result.json and the command line's JSON say of it."""
         return {
@@ -147,7 +160,9 @@ class Misfit:
         if not self.flagged or self.cause is None:
             return status
         if self.faults:
-            return self._faulty(status)
+            more = f"; and {len(self.faults) - _SHOWN} more" if len(self.faults) > _SHOWN else ""
+            named = "; ".join(map(str, self.faults[:_SHOWN]))
+            return self._flagged(status, f"Faulty frames: {named}{more}", Cause.FRAMES)
         times = f", {shown(self.chi_square)} times what its noise makes" if self.stated else ""
         foretold = ""
         if self.foretold:
@@ -155,17 +170,14 @@ class Misfit:
         sentence = (
             f"{self.unexplained:.1%} of the measurements fit no image{times}{foretold}; likely cause: {self.reason}"
         )
-        if not status.verdict.good:
-            return replace(status, flags=(*status.flags, f"Misfit: {sentence}; {self.cause.value[1]}."))
-        return replace(status, verdict=Verdict.MISFIT, sentence=f"Misfit: {sentence}", remedy=self.cause.value[1])
+        return self._flagged(status, f"Misfit: {sentence}", self.cause)
 
-    def _faulty(self, status: Status) -> Status:
-        """The ``status`` of a solution of faulty frames."""
-        more = f"; and {len(self.faults) - _SHOWN} more" if len(self.faults) > _SHOWN else ""
-        sentence = f"Faulty frames: {'; '.join(map(str, self.faults[:_SHOWN]))}{more}"
+    def _flagged(self, status: Status, sentence: str, cause: Cause) -> Status:
+        """The ``status`` of a solution with a ``sentence`` and the remedy of a ``cause``."""
+        remedy = cause.value[1]
         if not status.verdict.good:
-            return replace(status, flags=(*status.flags, f"{sentence}; {Cause.FRAMES.value[1]}."))
-        return replace(status, verdict=Verdict.MISFIT, sentence=sentence, remedy=Cause.FRAMES.value[1])
+            return replace(status, flags=(*status.flags, f"{sentence}; {remedy}."))
+        return replace(status, verdict=Verdict.MISFIT, sentence=sentence, remedy=remedy)
 
 
 def shown(chi_square: float) -> str:
@@ -199,6 +211,14 @@ class Residuals:
         (m, m') sum of the squares of residuals of each sensor pixel.
     """
 
+    @classmethod
+    def of(cls, check: FrameCheck, evidence: Evidence) -> Residuals:
+        """Of all measurements of a ``check``, which are read once more; ``evidence`` is empty."""
+        sums = cls(check.prepared, check.weights, check.noise, evidence)
+        for measurement in check.measured():
+            sums.add(measurement)
+        return sums
+
     def __init__(self, prepared: Prepared, weights: FloatArray, noise: FrameNoise, evidence: Evidence) -> None:
         self._prepared, self._weights, self._noise, self.evidence = prepared, weights, noise, evidence
         sizes = prepared.left.sensor_size, prepared.right.sensor_size
@@ -214,9 +234,8 @@ class Residuals:
 
     def add(self, measurement: Measurement) -> None:
         """Count in one ``measurement``."""
-        prepared = self._prepared
-        frame = centred(measurement.frame) if prepared.centre else measurement.frame
-        left, right = prepared.left.slabs[measurement.row], prepared.right.slabs[measurement.column]
+        frame = self._prepared.as_solved(measurement.frame)
+        left, right = self._prepared.slabs((measurement.row, measurement.column))
         modelled = left.matrix @ self._weights[left.columns][:, right.columns]
         residual = np.matmul(modelled, right.matrix.T, out=self._residual)
         np.subtract(frame, residual, out=residual)
@@ -263,8 +282,7 @@ class Residuals:
         if whole is None:
             return found
         # Differences of halves tell little of pixels that stand still, their sums all.
-        mean = centred(mean) if self._prepared.centre else mean
-        still = defects_of(np.square(mean - whole), variance / count, 1)
+        still = defects_of(np.square(self._prepared.as_solved(mean) - whole), variance / count, 1)
         return still.with_others(found) if still else found
 
     def at(self, defects: Defects) -> float:
@@ -295,12 +313,8 @@ class Residuals:
         return np.asarray(np.add.reduceat(rows, self._starts, axis=1))
 
 
-def judge(
-    check: FrameCheck,
-    factor_energy: float | None,
-    print_energy: float,
-    evidence: Evidence,
-    with_defects: bool = True,
+def find_misfit(
+    check: FrameCheck, factor_energy: float | None, print_energy: float, evidence: Evidence, with_defects: bool = True
 ) -> Misfit | None:
     """Hold all measurements against the model; None where there are no more data than unknowns.
 
@@ -320,27 +334,19 @@ def judge(
     prepared, noise = check.prepared, check.noise
     if prepared.spare <= 0:
         return None
-    sums = Residuals(prepared, check.weights, noise, evidence)
-    for measurement in check.measured():
-        sums.add(measurement)
+    sums = Residuals.of(check, evidence)
     expected = sums.expected(factor_energy or 0.0)
     balance = Balance(sums.residual, sums.energy, expected, sums.pixels, factor_energy is not None)
     found, excess = balance.misfit(noise, print_energy)
     if evidence.foretold is not None:
         found = replace(found, foretold=float(np.sqrt(evidence.foretold / max(float(sums.energy.sum()), _TINY))))
     beside_noise = noise.rendering + (factor_energy or 0.0) + print_energy
-    scaled = multiple(noise, found.chi_square)
-    if scaled:
-        return replace(found, flagged=True, cause=scaled.cause, reading=scaled)
-    step = check.out_of_step(sums.by_pattern)
-    if step:
-        return replace(
-            found, flagged=True, cause=Cause.ORDER, reading=Reading(Cause.ORDER, f"the frames are {step}", 0.0)
-        )
+    if reading := multiple(noise, found.chi_square) or check.out_of_step(sums.by_pattern):
+        return found.read_as(reading)
     defects = sums.defects(check.whole()) if with_defects else None
     if defects and excess > 0 and sums.at(defects) > _MOSTLY * excess:
         return replace(found, defects=defects)
-    readings, reading = Readings(prepared, check.manifest, noise, check.measured), None
+    readings = Readings(prepared, check.manifest, noise, check.measured)
     chance = _chance(noise, float(sums.pixels.sum()))
     hinted = found.flagged or (found.stated and found.unexplained > UNEXPLAINED and found.chi_square > 1 + chance / 2)
     if hinted:
@@ -349,15 +355,14 @@ def judge(
     elif noise.stated and sums.quiet:
         reading = readings.curved()
     if reading:
-        return replace(found, flagged=True, cause=reading.cause, reading=reading)
+        return found.read_as(reading)
     faults = check.faults(sums.by_pattern, beside_noise)
     if faults:
         return replace(found, flagged=True, cause=Cause.FRAMES, faults=faults)
     if defects:
         return replace(found, defects=defects)
-    negative = check.negative()
-    if negative:
-        return replace(found, flagged=True, cause=Cause.ORDER, reading=Reading(Cause.ORDER, negative, 0.0))
+    if reading := check.negative():
+        return found.read_as(reading)
     if not found.flagged:
         return found
     signatures = evidence.signatures(excess, noise.saturated / max(noise.readings, 1))
@@ -375,14 +380,11 @@ def faulty_frames(check: FrameCheck, beside_noise: float, evidence: Evidence) ->
     Parameters
     ----------
     check, evidence
-        as :func:`judge` takes them.
+        as :func:`find_misfit` takes them.
     beside_noise
         as :meth:`FrameCheck.faults` takes it.
     """
-    sums = Residuals(check.prepared, check.weights, check.noise, evidence)
-    for measurement in check.measured():
-        sums.add(measurement)
-    return check.faults(sums.by_pattern, beside_noise, fits=False)
+    return check.faults(Residuals.of(check, evidence).by_pattern, beside_noise, fits=False)
 
 
 @dataclass(frozen=True, eq=False)

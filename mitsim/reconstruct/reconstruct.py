@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -16,36 +16,34 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import Capture, Measurement
 from mitsim.reconstruct.causes import Cause, Evidence
-from mitsim.reconstruct.cost import BYTES_A_NUMBER, is_kept, predicted, slab_numbers
+from mitsim.reconstruct.cost import BYTES_A_NUMBER, keeps_frames, predict_cost, slab_numbers
+from mitsim.reconstruct.defects import Defects, LeftOut
 from mitsim.reconstruct.depth import Depth, best_depth
 from mitsim.reconstruct.depth_map import DepthMap, depth_map
 from mitsim.reconstruct.detail import Model, print_energy
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.faults import FrameCheck
-from mitsim.reconstruct.focus import focused
-from mitsim.reconstruct.framefault import FrameFault
+from mitsim.reconstruct.faults import FrameFault
+from mitsim.reconstruct.focus import move_factors
+from mitsim.reconstruct.frame_check import FrameCheck
 from mitsim.reconstruct.margin import Margin
-from mitsim.reconstruct.misfit import Lack, Misfit, faulty_frames, judge
+from mitsim.reconstruct.misfit import Lack, Misfit, faulty_frames, find_misfit
 from mitsim.reconstruct.noise import FrameNoise, factor_energy
-from mitsim.reconstruct.request import MARKOV, TIKHONOV, TV, check_asked
+from mitsim.reconstruct.request import TIKHONOV, ImageRequest
 from mitsim.reconstruct.result import Reconstruction
-from mitsim.reconstruct.solver import Accumulator, Prepared, Solution, prepare
-from mitsim.reconstruct.status import Verdict
-from mitsim.reconstruct.tv import TVSolution, solve_tv
+from mitsim.reconstruct.solver import Accumulator, Prepared
+from mitsim.reconstruct.solvers import SOLVERS, SeparableSolver
+from mitsim.reconstruct.status import Solution, Verdict
 from mitsim.reconstruct.uncertainty import Propagation, Uncertainty, uncertainty
 
-_LAMBDA_OF_TV = 1e-3
-"""Lambda, over the largest sigma^2, by which frames are foretold beside an image of total variation, whose own weight
-says nothing of it: chosen, between those of bright and of dim runs."""
-
+_LAMBDA_BESIDE = 1e-3
+"""Lambda, over the largest sigma^2, by which frames are foretold beside an image whose own weight says nothing of it,
+as of total variation: chosen, between those of bright and of dim runs."""
 _DEFECT_ROUNDS = 6
 """Times that defective pixels are looked for: beside bright ones dim ones show when these are left out, of a tenth of
 their energy each time."""
 _BETTER = 0.5
 """Part of what was unexplained, rms, that frames may leave without pixels that count as defective though the rest does
 not fit either."""
-
-
 _OF_THE_SCENE = Cause.GLOSS, Cause.INDIRECT, Cause.DETAIL, Cause.UNKNOWN, Cause.RIG
 """Causes that light of a depth beyond the searched range is taken for."""
 
@@ -92,53 +90,46 @@ def reconstruct(
         for a capture and factors that do not fit each other, a frame that cannot be read, more memory than is free,
         another lambda, method, focus, margin or range, or a calibration that does not state its parallax.
     """
-    asked = inputs(shots, factors, lam, method, focus, margin, depth_range)
+    request = ImageRequest(lam, method, focus, margin, depth_range)
+    solver, asked = SOLVERS[method], request.inputs(shots, factors)
     factors.check_fit(shots)
     beside = Margin(margin) if margin else None
     if beside:
         wider = beside.factors(factors)
         shots, factors = beside.of(wider.of(shots)), wider.factors
     # Depths that are looked for, and total variation, take as long as the data ask for.
-    cost = predicted(shots, factors) if method == TIKHONOV and focus not in ("auto", "map") else None
-    _check_factorising(shots, factors, method)
+    cost = predict_cost(shots, factors) if method == TIKHONOV and not request.looks_for_depth else None
+    _check_factorising(shots, factors, solver)
     if cost:
         Cost(sum(cost.seconds.values()), cost.memory_bytes).check(f"{shots.name}: its image", Limits())
     started = time.perf_counter()
-    depth = _depth(shots, factors, lam, focus, depth_range)
+    depth = _depth(shots, factors, request)
     doubts = [depth.doubt] if depth else []
     found = time.perf_counter()
     if isinstance(depth, Depth):
-        of_depth = focused(factors, depth.mm)
+        of_depth = move_factors(factors, depth.mm)
         shots, factors = of_depth.of(shots), of_depth.factors
         if of_depth.hidden:
             hidden = f"{of_depth.hidden:.1%} of the scene's pixels, which come out dark"
             doubts.append(f"At {depth.mm:.4g} mm the field stop takes most of the light of {hidden}.")
-    data = accumulated(shots, factors, method)
-    prepared, frames = data.prepared, data.frames
+    data = accumulate(shots, factors, method)
     added = time.perf_counter()
-    solution: DepthMap | Solution | TVSolution
-    solution = depth if isinstance(depth, DepthMap) and not depth.doubt else data.solution(lam, method)
+    by_pixel = depth if isinstance(depth, DepthMap) and not depth.doubt else None
+    solution = by_pixel.solution if by_pixel else data.solution(lam)
     solved = time.perf_counter()
-    misfit = data.misfit(shots, factors, solution)
-    if misfit and isinstance(solution, DepthMap):
-        # At the depth of most of the scene a frame that is not what it says is off by more than depth puts it.
-        of_depth = focused(factors, float(np.median(solution.mm)))
-        faults = accumulated(of_depth.of(shots), of_depth.factors).faulty_frames(
-            of_depth.of(shots), of_depth.factors, solution
-        )
-        misfit = replace(misfit, flagged=True, cause=Cause.FRAMES, faults=faults) if faults else misfit
+    misfit = data.misfit_at(by_pixel) if by_pixel else data.misfit(solution)
     if misfit and misfit.defects:
-        shots, data, solution, misfit = _without_defects(shots, factors, lam, method, data, misfit)
-        prepared, frames = data.prepared, data.frames
+        data, solution, misfit = _without_defects(data, lam, misfit)
     if misfit and misfit.cause in _OF_THE_SCENE and isinstance(depth, Depth) and depth.at_end:
         misfit = replace(misfit, cause=Cause.DEPTH)
     explained = factors.status.verdict is not Verdict.NOT_SEPARABLE and (misfit is None or not misfit.flagged)
-    if isinstance(solution, Solution) and lam == "auto" and (factors.lacking or not explained):
-        lack = data.lack(factors, solution.image)
+    linear = solver.linear and not by_pixel
+    if linear and lam == "auto" and (factors.lacking or not explained):
+        lack = data.lack(solution.image)
         known = (lack.struck, lack.energy) if lack else None
-        solution = prepared.solve(frames, lam, explained=explained, lack=known)
+        solution = data.prepared.solve(data.frames, lam, explained=explained, lack=known)
     judged = time.perf_counter()
-    uncertainties = data.uncertainty(shots, factors, solution) if isinstance(solution, Solution) else None
+    uncertainties = data.uncertainty(solution) if linear else None
     status = misfit.judged(solution.status) if misfit else solution.status
     image = solution.image
     if beside:
@@ -147,16 +138,17 @@ def reconstruct(
             {name: beside.inside(values) for name, values in uncertainties.sources.items()}, uncertainties.bias_factor
         )
     doubts.append(uncertainties.loss(image) if uncertainties else "")
-    flags = (*status.flags, *(doubt for doubt in doubts if doubt), *_flags(shots, factors))
+    flags = (*status.flags, *(doubt for doubt in doubts if doubt), *_flags(data.shots, factors))
+    left, right = data.model.sides
     return Reconstruction(
         image=image,
         lam=solution.lam,
-        rank=prepared.rank,
-        condition=prepared.condition,
-        rank_sides=(prepared.left.rank, prepared.right.rank),
-        condition_sides=(prepared.left.condition, prepared.right.condition),
+        rank=data.prepared.rank,
+        condition=data.prepared.condition,
+        rank_sides=(left.rank, right.rank),
+        condition_sides=(left.condition, right.condition),
         residual=solution.residual,
-        rounding=getattr(solution, "rounding", None),
+        rounding=solution.rounding,
         misfit=misfit,
         uncertainties=uncertainties,
         status=replace(status, flags=flags),
@@ -170,17 +162,19 @@ def reconstruct(
         inputs=asked,
         focus=depth,
         predicted=cost,
-        objective=getattr(solution, "objective", None),
-        relative_gap=getattr(solution, "relative_gap", None),
+        objective=solution.objective,
+        relative_gap=solution.relative_gap,
     )
 
 
 @dataclass(frozen=True, eq=False)
-class Accumulated:
+class Accumulation:
     """A run's frames added up.
 
     Attributes
     ----------
+    shots, factors, method
+        of which, and for what image.
     model
         that the frames are of, factorised.
     frames, noise
@@ -189,10 +183,18 @@ class Accumulated:
         the frames themselves while they are few; all or none.
     """
 
+    shots: Capture
+    factors: Factors
+    method: str
     model: Model
     frames: Accumulator
     noise: FrameNoise
     kept: tuple[Measurement, ...]
+
+    @property
+    def solver(self) -> SeparableSolver:
+        """Of the method."""
+        return SOLVERS[self.method]
 
     @property
     def prepared(self) -> Prepared:
@@ -205,131 +207,104 @@ class Accumulated:
         problem = self.prepared.problem(self.frames)
         return np.where(problem.sigma > 0, problem.projected, 0.0)
 
-    def solution(self, lam: float | Literal["auto"], method: str) -> Solution | TVSolution:
-        """Their image at ``lam`` by a ``method``."""
-        if method == TV:
-            return solve_tv(self.prepared, self.frames, lam)
-        return self.prepared.solve(self.frames, lam)
+    def measured(self) -> Iterable[Measurement]:
+        """All measurements once more: those that are kept, or reads them."""
+        return self.kept or self.shots.measured()
 
-    def lack(self, factors: Factors, image: FloatArray) -> Lack | None:
-        """What ``factors`` are known to lack of the camera, of an ``image`` (n, n'); None where nothing is known."""
-        return Lack(self.model, factors.lacking, image) if factors.lacking else None
+    def solution(self, lam: float | Literal["auto"]) -> Solution:
+        """Their image at ``lam``."""
+        return self.solver.compute(self.prepared, self.frames, lam)
 
-    def misfit(
-        self,
-        shots: Capture,
-        factors: Factors,
-        solution: DepthMap | Solution | TVSolution,
-        with_defects: bool = True,
-    ) -> Misfit | None:
+    def lack(self, image: FloatArray) -> Lack | None:
+        """What the factors are known to lack of the camera, of an ``image`` (n, n'); None where nothing is known."""
+        return Lack(self.model, self.factors.lacking, image) if self.factors.lacking else None
+
+    def misfit(self, solution: Solution, with_defects: bool = True) -> Misfit | None:
         """What of the measurements the model leaves unexplained, or None; reads frames again that were not kept.
 
         Parameters
         ----------
-        shots, factors
-            that these sums are of.
         solution
             of them, for what the factors' noise adds to the frames.
         with_defects
             whether defective pixels are looked for, and no cause where there are some.
         """
-        problem, stated, image = self.prepared.problem(self.frames), factors.manifest.noise, solution.image
-        added = factor_energy(self.prepared, shots.patterns, stated, image) if stated else None
-        lack = self.lack(factors, image)
-        if isinstance(solution, DepthMap):
-            return solution.misfit(self.noise, added, print_energy(self.model, image))
-        lam = _LAMBDA_OF_TV * problem.scale if isinstance(solution, TVSolution) else solution.lam
-        evidence = Evidence(factors, shots.patterns, lack.energy if lack else None)
-        return judge(self._check(shots, lam), added, print_energy(self.model, image), evidence, with_defects)
+        image, lack = solution.image, self.lack(solution.image)
+        lam = solution.lam if self.solver.linear else _LAMBDA_BESIDE * self.prepared.problem(self.frames).scale
+        evidence = Evidence(self.factors, self.shots.patterns, lack.energy if lack else None)
+        of_factors = self._factor_energy(image)
+        return find_misfit(self._check(lam), of_factors, print_energy(self.model, image), evidence, with_defects)
 
-    def faulty_frames(self, shots: Capture, factors: Factors, depths: DepthMap) -> tuple[FrameFault, ...]:
-        """Frames at fault of a scene of several depths.
+    def misfit_at(self, depths: DepthMap) -> Misfit:
+        """The same of an image with a depth for each pixel, ``depths``."""
+        of_factors = self._factor_energy(depths.image)
+        misfit = depths.misfit(self.noise, of_factors, print_energy(self.model, depths.image))
+        # At the depth of most of the scene a frame that is not what it says is off by more than depth puts it.
+        most = move_factors(self.factors, float(np.median(depths.mm)))
+        faults = accumulate(most.of(self.shots), most.factors)._faulty_frames(depths)
+        return replace(misfit, flagged=True, cause=Cause.FRAMES, faults=faults) if faults else misfit
 
-        Parameters
-        ----------
-        shots, factors
-            that these sums are of, at the depth of most of the scene.
-        depths
-            of its pixels, and their image.
-        """
-        stated = factors.manifest.noise
-        added = factor_energy(self.prepared, shots.patterns, stated, depths.image) if stated else 0.0
+    def _faulty_frames(self, depths: DepthMap) -> tuple[FrameFault, ...]:
+        """Frames at fault of a scene of several ``depths``, these sums being at that of most of it."""
+        added = self._factor_energy(depths.image) or 0.0
         beside = self.noise.rendering + added + print_energy(self.model, depths.image)
-        return faulty_frames(self._check(shots, depths.lam), beside, Evidence(factors, shots.patterns))
+        return faulty_frames(self._check(depths.lam), beside, Evidence(self.factors, self.shots.patterns))
 
-    def _check(self, shots: Capture, lam: float) -> FrameCheck:
-        measured = self.measured(shots)
-        return FrameCheck(self.prepared, self.weights, lam, shots.patterns, shots.manifest, self.noise, measured)
+    def _factor_energy(self, image: FloatArray) -> float | None:
+        stated = self.factors.manifest.noise
+        return factor_energy(self.prepared, self.shots.patterns, stated, image) if stated else None
 
-    def measured(self, shots: Capture) -> Callable[[], Iterable[Measurement]]:
-        """What gives the measurements of ``shots``, any number of times: those that are kept, or reads them."""
-        return lambda: self.kept or shots.measured()
+    def _check(self, lam: float) -> FrameCheck:
+        patterns, manifest = self.shots.patterns, self.shots.manifest
+        return FrameCheck(self.prepared, self.weights, lam, patterns, manifest, self.noise, self.measured)
 
-    def uncertainty(self, shots: Capture, factors: Factors, solution: Solution) -> Uncertainty:
-        """Standard uncertainty of a solution.
-
-        Parameters
-        ----------
-        shots, factors
-            that these sums are of.
-        solution
-            of these sums.
-        """
-        calibrated = factors.manifest.digital.exposure_uncertainty if factors.manifest.digital else 0.0
+    def uncertainty(self, solution: Solution) -> Uncertainty:
+        """Standard uncertainty of a ``solution`` of these sums."""
+        manifest = self.factors.manifest
+        calibrated = manifest.digital.exposure_uncertainty if manifest.digital else 0.0
         return uncertainty(
             Propagation(self.model, solution.lam),
             self.noise,
-            factors.manifest.noise,
-            math.hypot(shots.manifest.digital.exposure_uncertainty, calibrated),
+            manifest.noise,
+            math.hypot(self.shots.manifest.digital.exposure_uncertainty, calibrated),
             solution.image,
             self.prepared.problem(self.frames),
-            self.lack(factors, solution.image),
+            self.lack(solution.image),
         )
 
 
 def _without_defects(
-    shots: Capture,
-    factors: Factors,
-    lam: float | Literal["auto"],
-    method: str,
-    data: Accumulated,
-    misfit: Misfit,
-) -> tuple[Capture, Accumulated, Solution | TVSolution, Misfit | None]:
-    """Shots without the readings of defective pixels, their sums, solution and misfit; all as it was where the frames
-    fit no better so.
+    data: Accumulation, lam: float | Literal["auto"], misfit: Misfit
+) -> tuple[Accumulation, Solution, Misfit | None]:
+    """Sums without the readings of defective pixels, their solution at ``lam`` and misfit; all as it was where the
+    frames fit no better so. ``misfit`` is that of ``data``, with the first defects."""
 
-    Parameters
-    ----------
-    shots, factors, lam, method
-        as :func:`reconstruct` takes them.
-    data, misfit
-        sums of ``shots``, and their misfit with the first defects.
-    """
+    def left_out(defects: Defects) -> tuple[LeftOut, Accumulation, Solution]:
+        rest = defects.left_out(data.shots, data.measured, data.prepared, data.weights)
+        without = accumulate(rest, data.factors, data.method)
+        return rest, without, without.solution(lam)
+
     found, now, without = None, misfit, data
     for _ in range(_DEFECT_ROUNDS):
         if now.defects is None:
             break
         found = now.defects.with_others(found)
-        rest = found.left_out(shots, data.measured(shots), data.prepared, data.weights)
-        without = accumulated(rest, factors, method)
-        solution = without.solution(lam, method)
-        again = without.misfit(rest, factors, solution)
-        now = again or now
+        rest, without, solution = left_out(found)
+        now = without.misfit(solution) or now
     # What bright ones put into other pixels is none of these: they are taken in again.
     while found and (own := found.beyond_chance(rest, data.noise)) and len(own.rows) < len(found.rows):
-        found, rest = own, own.left_out(shots, data.measured(shots), data.prepared, data.weights)
-        without = accumulated(rest, factors, method)
-        solution = without.solution(lam, method)
-        now = without.misfit(rest, factors, solution, with_defects=False) or now
+        found = own
+        rest, without, solution = left_out(found)
+        now = without.misfit(solution, with_defects=False) or now
     if now.flagged:
-        now = without.misfit(rest, factors, solution, with_defects=False) or now
+        now = without.misfit(solution, with_defects=False) or now
     if now.flagged and now.unexplained > _BETTER * misfit.unexplained:
-        solution = data.solution(lam, method)
-        return shots, data, solution, data.misfit(shots, factors, solution, with_defects=False)
-    return rest, without, solution, replace(now, defects=found)
+        solution = data.solution(lam)
+        return data, solution, data.misfit(solution, with_defects=False)
+    return without, solution, replace(now, defects=found)
 
 
-def accumulated(shots: Capture, factors: Factors, method: str = TIKHONOV) -> Accumulated:
+def accumulate(shots: Capture, factors: Factors, method: str = TIKHONOV) -> Accumulation:
     """The model of shots and factors factorised, and every frame added.
 
     Parameters
@@ -344,26 +319,24 @@ def accumulated(shots: Capture, factors: Factors, method: str = TIKHONOV) -> Acc
     MitsimError
         when that takes more memory than is free, or a frame cannot be read.
     """
-    left, right = shots.patterns
-    _check_factorising(shots, factors, method)
-    prepared = prepare(factors.left, factors.right, left, right, centre=factors.manifest.centre)
-    if method == MARKOV:
-        prepared = prepared.correlated()
+    solver = SOLVERS[method]
+    _check_factorising(shots, factors, solver)
+    prepared = solver.init(factors, shots.patterns)
     noise = FrameNoise(shots.manifest, _ambient_noise(shots))
     frames, kept = prepared.accumulator(), list[Measurement]()
-    few = is_kept(shots, factors)
+    few = keeps_frames(shots, factors)
     for measurement in shots.measured((len(factors.left), len(factors.right))):
         frames.add(measurement.frame, measurement.row, measurement.column)
         noise.add(measurement)
         if few:
             kept.append(measurement)
-    return Accumulated(Model(prepared, factors.sides, shots.patterns), frames, noise, tuple(kept))
+    model = Model(prepared, factors.sides, shots.patterns)
+    return Accumulation(shots, factors, method, model, frames, noise, tuple(kept))
 
 
-def _check_factorising(shots: Capture, factors: Factors, method: str) -> None:
-    """MitsimError where factorising the model of ``shots`` and ``factors`` for a ``method`` takes more memory than is
-    free."""
-    cost = Cost(memory_bytes=BYTES_A_NUMBER * slab_numbers(shots, factors, whole=method == MARKOV))
+def _check_factorising(shots: Capture, factors: Factors, solver: SeparableSolver) -> None:
+    """MitsimError where factorising the model of ``shots`` and ``factors`` takes more memory than is free."""
+    cost = Cost(memory_bytes=BYTES_A_NUMBER * slab_numbers(shots, factors, whole=solver.whole))
     cost.check(f"{shots.name}: factorising its patterns", Limits())
 
 
@@ -374,49 +347,12 @@ def _ambient_noise(shots: Capture) -> tuple[FloatArray, FloatArray] | None:
     return shots.ambient.variance.mean(axis=1), shots.ambient.variance.mean(axis=0)
 
 
-def inputs(
-    shots: Capture,
-    factors: Factors,
-    lam: float | str,
-    method: str,
-    focus: float | str | None = None,
-    margin: int = 0,
-    depth_range: tuple[float, float] | None = None,
-) -> dict[str, Any]:
-    """What decides an image.
-
-    Parameters
-    ----------
-    shots, factors
-        told by their fingerprints.
-    lam, method, focus, margin, depth_range
-        as asked for; ArgumentError for an unknown method, or another lambda, focus, margin or range than reconstruct
-        takes.
-    """
-    check_asked(lam, method, focus, margin, depth_range)
-    asked: dict[str, Any] = {
-        "run": shots.fingerprint,
-        "calibration": factors.fingerprint,
-        "lambda": lam,
-        "method": method,
-    }
-    asked |= {} if focus is None else {"focus": focus}
-    asked |= {} if depth_range is None else {"depth_range": list(depth_range)}
-    return {**asked, "margin": margin} if margin else asked
-
-
-def _depth(
-    shots: Capture,
-    factors: Factors,
-    lam: float | Literal["auto"],
-    focus: float | str | None,
-    depth_range: tuple[float, float] | None,
-) -> Depth | DepthMap | None:
-    if focus == "map":
-        return depth_map(shots, factors, lam, depth_range)
-    if focus == "auto":
-        return best_depth(shots, factors, depth_range)
-    return None if focus is None else Depth(float(focus))
+def _depth(shots: Capture, factors: Factors, request: ImageRequest) -> Depth | DepthMap | None:
+    if request.focus == "map":
+        return depth_map(shots, factors, request.lam, request.depth_range)
+    if request.focus == "auto":
+        return best_depth(shots, factors, request.depth_range)
+    return None if request.focus is None else Depth(float(request.focus))
 
 
 def _flags(shots: Capture, factors: Factors) -> tuple[str, ...]:

@@ -4,6 +4,13 @@ In the basis of the factors the fit is diagonal: coefficient W_ij is kept by the
 sigma_ij^2 / (sigma_ij^2 + lambda), so any lambda costs n^2 operations, whatever the number of frames. Where the model
 explains the frames, lambda minimises an unbiased estimate of the image's error; where it does not, the image must also
 stand still when lambda changes. What was tried instead: docs/decisions/0004-lambda-by-halves.md.
+
+*Noise by halves of the sensor.* Where Y = U S X' + noise, with X' the image in the diagonal basis, the half W_0 = U_0^T
+Y of the sum over the sensor's rows is G W up to noise, G = U_0^T U_0: in W_0 - G W there is no image, and nothing else
+that both halves agree on. White noise gives its number i the variance G (I - G)_ii times its own, since G and I - G
+commute. An error E of the left factor that is independent from sensor row to row, as a calibration's noise is, shows
+too: U^T E X S' strikes all numbers of a column of W alike, by that column's light. Halves of the columns tell the same
+of the right factor.
 """
 
 from __future__ import annotations
@@ -247,10 +254,7 @@ def _least(score: Callable[[float], float], scale: float, exponents: FloatArray)
         return 0.0
     lower, upper = exponents[max(best - 1, 0)], exponents[min(best + 1, len(exponents) - 1)]
     refined = minimize_scalar(
-        lambda exponent: score(scale * 10.0**exponent),
-        bounds=(lower, upper),
-        method="bounded",
-        options={"xatol": 1e-3},
+        lambda exponent: score(scale * 10.0**exponent), bounds=(lower, upper), method="bounded", options={"xatol": 1e-3}
     )
     return float(scale * 10.0 ** float(refined.x))
 

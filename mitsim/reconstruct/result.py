@@ -15,7 +15,7 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.files import output_folder, plain, read_json, whole_file, write_json
 from mitsim.core.pictures import card, png, scaled, span
-from mitsim.reconstruct.cost import Predicted
+from mitsim.reconstruct.cost import ImageCost
 from mitsim.reconstruct.depth import Depth
 from mitsim.reconstruct.depth_map import DepthMap
 from mitsim.reconstruct.misfit import Misfit
@@ -82,7 +82,7 @@ class Reconstruction:
     seconds: dict[str, float]
     inputs: dict[str, Any]
     focus: Depth | DepthMap | None = None
-    predicted: Predicted | None = None
+    predicted: ImageCost | None = None
     objective: float | None = None
     relative_gap: float | None = None
 

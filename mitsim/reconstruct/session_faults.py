@@ -17,8 +17,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.session import SIDES, Half, Side
 from mitsim.reconstruct.estimate_factors import Estimate, StripeSums, factors_of_sums
-from mitsim.reconstruct.session_findings import Lamp, SessionFault, frame_words
-from mitsim.reconstruct.session_frames import WrongPairs
+from mitsim.reconstruct.faults import Lamp, SessionFault, frame_words
 from mitsim.reconstruct.session_lamp import lamp_of_frames
 from mitsim.reconstruct.session_pairs import Pairs
 from mitsim.reconstruct.session_side import MOST_FAULTS, SideCheck
@@ -145,7 +144,7 @@ def check_session(
         if taken.saturated and pairs.many:
             return Checked(sums)
         lamp = pairs.check(not taken.unsteady)
-        WrongPairs(pairs).repair(lamp)
+        pairs.repair(lamp)
     else:
         for own in work:
             own.leave_out_known(taken.wrong)

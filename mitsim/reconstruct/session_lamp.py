@@ -10,7 +10,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.devices.session import Half
 from mitsim.reconstruct.estimate_factors import FLUX_NOISE
-from mitsim.reconstruct.session_findings import DARK, Lamp
+from mitsim.reconstruct.faults import DARK, Lamp, robust_scatter
 from mitsim.reconstruct.session_side import SLIGHT, SideCheck
 
 MATTERS = 0.5
@@ -69,7 +69,7 @@ def trend_of(times: FloatArray, power: FloatArray) -> tuple[FloatArray, float, f
             break
         found = np.polyfit(times[kept], power[kept], degree)
         away = np.abs(power - np.polyval(found, times))
-        scatter = 1.4826 * float(np.median(away))
+        scatter = robust_scatter(away)
         again = away <= max(4 * scatter, 1e-12)
         if (again == kept).all():
             break
@@ -111,7 +111,7 @@ class _Frames:
                 inverse = np.linalg.pinv(both[kept])
                 found = inverse @ (flux / shown)[kept]
                 away = np.abs(flux / shown - both @ found)
-                scatter = 1.4826 * float(np.median(away[~far])) * float(np.sqrt(count / (count - both.shape[1])))
+                scatter = robust_scatter(away[~far]) * float(np.sqrt(count / (count - both.shape[1])))
                 again = ~far & (away <= max(6 * scatter, 1e-12))
                 if (again == kept).all():
                     break

@@ -18,8 +18,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices import session
 from mitsim.devices.session import SIDES, UNIFORM, Half
 from mitsim.reconstruct.estimate_factors import StripeSums
+from mitsim.reconstruct.faults import DARK, SessionFault, frame_words, name_by_light, robust_scatter
 from mitsim.reconstruct.moving_shadow import MovingShadow
-from mitsim.reconstruct.session_findings import DARK, SessionFault, dimmed, frame_words
 
 MOST_FAULTS = 0.1
 """Part of the patterns that may be wrong before the session is refused: with more, what most share is in doubt."""
@@ -145,10 +145,6 @@ class SideCheck:
             self.vectors = self.vectors.copy()
         self.vectors[:, index] = vector
 
-    def rescale(self, factor: float) -> None:
-        """Make the uniform response's share in all vectors smaller by ``factor``, and them larger."""
-        self.vectors = self.vectors * factor
-
     def result(self) -> StripeSums:
         """The sums with what was changed."""
         if self.vectors is self.sums.vectors and not self.uncounted:
@@ -174,8 +170,11 @@ class SideCheck:
         self._check_misfits()
         count = self.signs.shape[1]
         if not self.enough:
-            for index in self.unknown:
-                self._forget(index)
+            for (
+                index
+            ) in self.unknown:  # nothing foretells them: their error is then their size, which the others' tells
+                self.extras[index] = self._size(index)
+                self.change(index, np.zeros(self.length))
             return
         if self.unknown:
             self._foretell_unknown()
@@ -199,15 +198,19 @@ class SideCheck:
                 continue
             if sign == UNIFORM:
                 raise MitsimError(f"{side} stripes: of their uniform frame, {detail}; take the session again")
-            self._add(index, "wrong", f"is wrong: {detail}", "it is left out")
-            self.unknown.add(index)
-            self.uncounted.add(index)
+            self._do_without(index, "wrong", f"is wrong: {detail}")
+
+    def _do_without(self, index: int, kind: str, detail: str, other: Half | None = None) -> None:
+        """A pattern is left out, and what others foretell will come in its place."""
+        self.add(index, kind, detail, "it is left out", other)
+        self.unknown.add(index)
+        self.uncounted.add(index)
 
     def _check_misfits(self) -> None:
         """Responses that hold much that no separable camera explains, where the others do not."""
         misfits, energies = self.sums.misfits, self.sums.energies
         middle = float(np.median(misfits))
-        scatter = 1.4826 * float(np.median(np.abs(misfits - middle)))
+        scatter = robust_scatter(misfits, middle)
         excess = misfits - middle - max(_UNEXPLAINED * float(np.median(energies)), _DEVIATIONS * scatter)
         # Where no separable camera explains any, one that is no worse than others says nothing.
         noise = middle * float(np.sqrt(2 / self.length / len(self.sums.common)))
@@ -218,13 +221,22 @@ class SideCheck:
             part = misfits[index] / energies[index]
             detail = f"no {self.side} stripes: {part:.0%} of their response is of other shape"
             # One frame for the mean of many is of other noise alone.
-            kind, detail, other = self._repeated(int(index)) or ("wrong", detail, None)
-            self._add(int(index), kind, detail, "it is left out", other)
-            self.unknown.add(int(index))
-            self.uncounted.add(int(index))
+            self._do_without(int(index), *(self._repeated(int(index)) or ("wrong", detail)))
 
-    def _add(self, index: int, kind: str, detail: str, repair: str, other: Half | None = None) -> None:
-        self.faults.append(SessionFault(self.side, index, None if self.pairs else 1, kind, detail, repair, other))
+    def add(
+        self, index: int, kind: str, detail: str, repair: str, other: Half | None = None, sign: int | None = None
+    ) -> None:
+        """Note a fault.
+
+        Parameters
+        ----------
+        index, kind, detail, repair, other
+            as :class:`mitsim.reconstruct.faults.SessionFault` has them.
+        sign
+            of the frame of a pair that is at fault; None: both.
+        """
+        sign = sign if self.pairs else 1
+        self.faults.append(SessionFault(self.side, index, sign, kind, detail, repair, other))
 
     # ---- patterns that do not fit the others -------------------------------------------------------------------------
 
@@ -281,7 +293,7 @@ class SideCheck:
         part = float(light[index])
         self.change(index, (self.vectors[:, index] + uniform) / part - uniform)
         self.extras[index] = self.errors[index] + max(1 / part**2 - 1, 0.0) * self.noise
-        self._add(index, *dimmed(part), "its numbers are divided by that")
+        self.add(index, *name_by_light(part), "its numbers are divided by that")
         return True
 
     def _repeated(self, index: int) -> tuple[str, str, Half] | None:
@@ -317,11 +329,11 @@ class SideCheck:
         self._settled.update(places)
         if rest:
             detail = f"in the place of {self.side} stripes {rest[0]}, and those in theirs"
-            self._add(first, "swapped", detail, "both count in their right order", (self.side, rest[0], UNIFORM))
+            self.add(first, "swapped", detail, "both count in their right order", (self.side, rest[0], UNIFORM))
         elif not self.pairs:
-            self._add(first, "exchanged", "shows black where white should be", "it counts with its sign")
+            self.add(first, "exchanged", "shows black where white should be", "it counts with its sign")
         elif not self._turned(first):
-            self._add(first, "exchanged", "in each other's place", "they count in their right order")
+            self.add(first, "exchanged", "in each other's place", "they count in their right order")
 
     def _turned(self, index: int) -> bool:
         """Whether a pattern's faulty frame is the other one of its pair: a frame may repeat the other, or that it."""
@@ -338,17 +350,10 @@ class SideCheck:
     def _leave_out(self, index: int, kind: str, detail: str, other: Half | None = None) -> None:
         """Put what the others foretell in place of a pattern."""
         self.faults = [fault for fault in self.faults if fault.index != index]
-        self.uncounted.add(index)
-        self.unknown.add(index)
+        self._do_without(index, kind, detail, other)
         self._foretell_unknown()
-        self._add(index, kind, detail, "it is left out", other)
 
     # ---- what others foretell of a pattern ---------------------------------------------------------------------------
-
-    def _forget(self, index: int) -> None:
-        """Leave a pattern out where nothing foretells it; its error is then its own size, which the others' tells."""
-        self.extras[index] = self._size(index)
-        self.change(index, np.zeros(self.length))
 
     def _size(self, index: int) -> float:
         """Mean squared length of the other patterns' vectors, but for the uniform one."""

@@ -95,7 +95,24 @@ class Side:
     @cached_property
     def response(self) -> FloatArray:
         """B^T U (n, r): what the coefficients see of light of each scene pixel."""
-        return _frozen((self.basis if self.dual is None else self.dual) * self.singular)
+        return _frozen(self.duals * self.singular)
+
+    @property
+    def duals(self) -> FloatArray:
+        """V' (n, r) of B = U S V'^T."""
+        return self.basis if self.dual is None else self.dual
+
+    @property
+    def common(self) -> FloatArray:
+        """(m, r) sum of all slabs: how each coefficient takes what is common to all frames."""
+        total = np.zeros((self.sensor_size, self.accumulated_size))
+        for slab in self.slabs:
+            total[:, slab.columns] += slab.matrix
+        return total
+
+    def columns(self, index: int) -> IndexArray:
+        """Places in W of what pattern ``index`` contributes."""
+        return np.arange(self.accumulated_size)[self.slabs[index].columns]
 
     @property
     def rank(self) -> int:
@@ -125,11 +142,10 @@ class Side:
     @cached_property
     def first_half(self) -> FloatArray:
         """G = U_0^T U_0 (r, r), with U_0 the rows of U in the first half of the sensor: what that half sees of W."""
-        size = self.accumulated_size
-        gram = np.zeros((size, size))
-        for slab in self.slabs:
+        gram = np.zeros((self.accumulated_size, self.accumulated_size))
+        for index, slab in enumerate(self.slabs):
             rows = np.concatenate([slab.matrix[strip] for strip in self.halves[0]])
-            columns = np.arange(size)[slab.columns]
+            columns = self.columns(index)
             gram[np.ix_(columns, columns)] += rows.T @ rows
         if self.projected:
             return gram

@@ -19,6 +19,16 @@ of ending the SVD of a side, magnified by sigma_max max_ij sigma_ij / (sigma_ij^
 sqrt(lambda_rel)); for ``gram``, whose data carry sigma_max^2 eps, by sigma_max^2 / min_ij (sigma_ij^2 +
 lambda). That is relative to the image, for frames that the model explains; what it does not explain is
 magnified as noise, and by more.
+
+*Neighbours alike.* Tikhonov's lambda ||X||^2 says that every pixel is near black and knows nothing of the next one.
+Where the frames are noisy lambda then darkens the image, its large even parts too. Pictures are not so: with the
+covariance rho^|p - p'| along rows and along columns (a separable first-order Markov field; Jain, Fundamentals of
+Digital Image Processing, 1989, chapter 2) an even part of many pixels has many times the variance of a single pixel,
+and is kept.
+
+With C = F F^T on each side the image is X = F_L Z F_R^T, Z independent numbers, so that the penalty lambda ||Z||^2 is
+Tikhonov's of the model B F in the place of B = U S V^T. From the SVD S V^T F = U' S' V'^T follow U U', S', and the
+columns F V' that make an image of coefficients: all that was a closed form stays one.
 """
 
 from __future__ import annotations
@@ -44,7 +54,7 @@ from mitsim.reconstruct.sides import (
     factorise,
     group_pixels,
 )
-from mitsim.reconstruct.status import Status, Verdict
+from mitsim.reconstruct.status import Solution, Status, Verdict
 
 ROUNDING_LIMIT = 0.01
 """Rounding above this part of the image flags a solution: two digits are the least that anyone can see or use."""
@@ -57,46 +67,6 @@ _SMALLEST, _LARGEST = 1e-30, 1e30
 """Largest number of a factor or pattern: sigma^2, a product of eight of them, then stays far from 1e-308 and 1e308."""
 _UNSEEN = 1e-60
 """Singular values below it are zero: the square of ``_SMALLEST``, a factor that small times a pattern that small."""
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """An image and how far to trust it.
-
-    Attributes
-    ----------
-    image
-        (n, n') estimate of X, neither clipped nor normalised.
-    lam
-        lambda that was used, in the unit of (Phi_L Phi_R)^2; ``lam_relative`` is that over the largest
-        sigma^2.
-    rank, unknowns
-        numerical rank of the whole model, and n n'.
-    condition
-        the larger cond(A) of the two sides; inf when rank deficient.
-    residual
-        ||Y - model|| / ||Y|| over all frames; rounding hides what is below about 1e-8.
-    rounding
-        what rounding may have changed, ||error|| / ||image||; see above.
-    status
-        not ok when the image lacks something that no lambda explains, or rounding may have changed more than
-        ROUNDING_LIMIT of it; with rank, condition and rounding.
-    """
-
-    image: FloatArray
-    lam: float
-    lam_relative: float
-    rank: int
-    unknowns: int
-    condition: float
-    residual: float
-    rounding: float
-    status: Status
-
-    @property
-    def ok(self) -> bool:
-        """Whether the image can be used as it is."""
-        return self.status.ok
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +106,33 @@ class Prepared:
         return self.left.scene_size * self.right.scene_size
 
     @property
+    def sigma(self) -> FloatArray:
+        """(r, r') singular values of the whole model, exact zeros beyond its rank."""
+        return np.outer(self.left.singular, self.right.singular)
+
+    def as_solved(self, frame: FloatArray) -> FloatArray:
+        """A ``frame`` (m, m') as the solver takes it: centred where the model is."""
+        return centred(frame) if self.centre else frame
+
+    def slabs(self, pattern: tuple[int, int]) -> tuple[Slab, Slab]:
+        """What the row and the column of a ``pattern`` contribute."""
+        return self.left.slabs[pattern[0]], self.right.slabs[pattern[1]]
+
+    def places(self, pattern: tuple[int, int]) -> Any:
+        """Where the coefficients of a ``pattern`` are in W."""
+        return np.ix_(self.left.columns(pattern[0]), self.right.columns(pattern[1]))
+
+    def frame(self, weights: FloatArray, pattern: tuple[int, int]) -> FloatArray:
+        """(m, m') frame of a ``pattern``, as the ``weights`` W tell it."""
+        left, right = self.slabs(pattern)
+        return np.asarray(left.matrix @ weights[left.columns][:, right.columns] @ right.matrix.T)
+
+    def weights(self, frame: FloatArray, pattern: tuple[int, int]) -> FloatArray:
+        """What a ``frame`` (m, m') of a ``pattern``, as the solver takes it, adds to W at its :meth:`places`."""
+        left, right = self.slabs(pattern)
+        return np.asarray(left.matrix.T @ frame @ right.matrix)
+
+    @property
     def extent(self) -> str:
         """Rank and condition of the whole model and of its two sides, as every status ends with them."""
         left, right = self.left, self.right
@@ -146,8 +143,8 @@ class Prepared:
         )
 
     def correlated(self) -> Prepared:
-        """The same model for images whose neighbouring pixels are alike (:mod:`mitsim.reconstruct.solver`); frames go
-        to its own accumulator. MitsimError for the Gram method."""
+        """The same model for images whose neighbouring pixels are alike; frames go to its own accumulator. MitsimError
+        for the Gram method."""
         with single_threaded_blas():
             left = correlated(self.left)
             return replace(self, left=left, right=left if self.right is self.left else correlated(self.right))
@@ -167,7 +164,7 @@ class Prepared:
         if missing:
             total = self.left.pattern_count * self.right.pattern_count
             raise MitsimError(f"{len(missing)} of {total} frames are missing, first {missing[0]}; add them all")
-        sigma = np.outer(self.left.singular, self.right.singular)
+        sigma = self.sigma
         quarters = frames.quarters
         if self.method == "gram":
             rotated = self.left.basis.T @ quarters @ self.right.basis
@@ -230,13 +227,9 @@ class Prepared:
         return Solution(
             image=self.image(filtered),
             lam=lam,
-            lam_relative=lam / problem.scale,
-            rank=self.rank,
-            unknowns=self.unknowns,
-            condition=self.condition,
             residual=float(np.sqrt(residual / problem.energy)) if problem.energy > 0 else 0.0,
-            rounding=rounding,
             status=self._status(lam, rounding, problem.scale),
+            rounding=rounding,
         )
 
     def _rounding(self, problem: DiagonalProblem, lam: float) -> float:

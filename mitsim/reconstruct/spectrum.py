@@ -111,7 +111,7 @@ def scene_spectrum(sides: tuple[Side, Side], problem: DiagonalProblem, noise: fl
     sigma, measured = problem.sigma, problem.sigma > 0
     if not problem.projected[measured].any():
         return None
-    duals = [side.basis if side.dual is None else side.dual for side in sides]
+    duals = [side.duals for side in sides]
     even = np.outer(*(dual.sum(axis=0) for dual in duals))
     bands = [_bands(side.scene_size) for side in sides]
     left, right = (

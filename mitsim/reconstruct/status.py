@@ -1,9 +1,17 @@
-"""What a result is worth: a verdict with its sentence and remedy."""
+"""What a solver found: an image, its statistics, and a status, which is a verdict with its sentence and remedy."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import Literal, Protocol, TypeVar
+
+from mitsim.core.arrays import FloatArray
+
+CameraT = TypeVar("CameraT", contravariant=True)
+PatternsT = TypeVar("PatternsT", contravariant=True)
+PreparedT = TypeVar("PreparedT")
+FramesT = TypeVar("FramesT", contravariant=True)
 
 
 class Verdict(Enum):
@@ -70,3 +78,71 @@ class Status:
     def __str__(self) -> str:
         remedy = f"; {self.remedy}" if self.remedy else ""
         return " ".join(part for part in (f"{self.sentence}{remedy}.", self.figures, *self.flags) if part)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """An image, and what its solver says of it.
+
+    Attributes
+    ----------
+    image
+        (n, n') estimate of X, neither clipped nor normalised.
+    lam
+        lambda that was used, in the unit of the model squared; for total variation its weight [data^2 / image].
+    residual
+        ||Y - model|| / ||Y|| over all frames, where rounding hides what is below about 1e-8; of a convolutional camera
+        that of the normal equations, relative to their right-hand side.
+    status
+        not ok when the image lacks something that no lambda explains, rounding may have changed too much of it, or
+        iterations did not converge; with rank and condition, where they are known.
+    rounding
+        what rounding may have changed, ||error|| / ||image||; None where the solver does not bound it.
+    iterations
+        that were spent; 0 in closed form.
+    objective, relative_gap
+        what was minimised, and an upper bound of how far it is above its minimum, relative to the part of it that
+        images change; None in closed form.
+    """
+
+    image: FloatArray
+    lam: float
+    residual: float
+    status: Status
+    rounding: float | None = None
+    iterations: int = 0
+    objective: float | None = None
+    relative_gap: float | None = None
+
+    @property
+    def ok(self) -> bool:
+        """Whether the image can be used as it is."""
+        return self.status.ok
+
+
+class Solver(Protocol[CameraT, PatternsT, PreparedT, FramesT]):
+    """A way from frames to an image: prepared once for a camera and its patterns, and then applied to any scenes.
+
+    Attributes
+    ----------
+    linear
+        whether images at one lambda are linear in the frames, so that noise of the frames is told for each pixel.
+    """
+
+    linear: bool
+
+    def init(self, camera: CameraT, patterns: PatternsT) -> PreparedT:
+        """What depends on the ``camera`` and the ``patterns`` alone; applying it changes nothing in it."""
+        ...
+
+    def compute(self, prepared: PreparedT, frames: FramesT, lam: float | Literal["auto"]) -> Solution:
+        """The image of one scene.
+
+        Parameters
+        ----------
+        prepared, frames
+            what :meth:`init` gives, and frames of all patterns.
+        lam
+            lambda; what ``auto`` does is the solver's own.
+        """
+        ...

@@ -18,8 +18,6 @@ with the Q that the D step gives, the best mu, and r = ||X||. (mu is for directi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.fft import dctn, idctn
 
@@ -27,7 +25,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.regularisation import DiagonalProblem, automatic_lambda, noise_variance
 from mitsim.reconstruct.solver import Accumulator, Prepared
-from mitsim.reconstruct.status import Status, Verdict
+from mitsim.reconstruct.status import Solution, Status, Verdict
 
 _BALANCE, _STEP = 3.0, 2.0
 """Ratio of two residuals, or of two parts of the gap, beyond which a penalty changes, and by how much at most: they set
@@ -46,43 +44,6 @@ AUTO_WEIGHT = 0.12
 the anchor's photograph."""
 
 
-@dataclass(frozen=True, eq=False)
-class TVSolution:
-    """What :func:`solve_tv` found.
-
-    Attributes
-    ----------
-    image
-        (n, n').
-    lam
-        weight of the total variation that was used [data^2 / image].
-    iterations
-        that were spent.
-    objective
-        P(X) of the image [data^2].
-    relative_gap
-        upper bound of what P(X) exceeds its minimum by, over the part of P(X) that images change: not the energy
-        outside the model's range.
-    residual
-        ||Y - model|| / ||Y|| over all frames.
-    status
-        of the convergence, with rank and condition.
-    """
-
-    image: FloatArray
-    lam: float
-    iterations: int
-    objective: float
-    relative_gap: float
-    residual: float
-    status: Status
-
-    @property
-    def ok(self) -> bool:
-        """Whether the iterations converged."""
-        return self.status.ok
-
-
 def automatic_weight(problem: DiagonalProblem) -> float:
     """Weight for a ``problem``: standard deviation of its noise times the root mean square of sigma, times a constant.
 
@@ -98,7 +59,7 @@ def solve_tv(
     weight: float | str = "auto",
     iterations: int = 5000,
     tolerance: float = 1e-4,
-) -> TVSolution:
+) -> Solution:
     """Total-variation solution of the added frames.
 
     Parameters
@@ -253,7 +214,7 @@ def _solution(
     iterations: int,
     gap: float,
     converged: bool,
-) -> TVSolution:
+) -> Solution:
     modelled = problem.sigma * prepared.coefficients(image)
     outside = max(problem.energy - float(np.sum(np.square(problem.projected))), 0.0)
     misfit = outside + float(np.sum(np.square(problem.projected - modelled)))
@@ -277,7 +238,7 @@ def _solution(
     else:
         sentence = f"Solved: total variation converged in {iterations} iterations, {gap:.0e} or less above its minimum"
         status = Status(Verdict.SOLVED, sentence, "", figures)
-    return TVSolution(
+    return Solution(
         image=image,
         lam=weight,
         iterations=iterations,

@@ -205,7 +205,7 @@ class Propagation:
             (m,) and (m',) mean variance of its pixels by sensor row, and by sensor column.
         """
         sides = zip(self.model.sides, (rows, columns), strict=True)
-        left, right = (common_response(side) * np.sqrt(variance)[:, None] for side, variance in sides)
+        left, right = (side.common * np.sqrt(variance)[:, None] for side, variance in sides)
         mean = max(float(rows.mean()), float(columns.mean()))
         return np.asarray(self._taken(left, right) / (mean or 1.0))
 
@@ -311,8 +311,7 @@ class Propagation:
 
     @cached_property
     def _sigma(self) -> FloatArray:
-        """(r, r') singular values of the whole model."""
-        return np.outer(*(side.singular for side in self.model.sides))
+        return self.model.prepared.sigma
 
 
 def uncertainty(
@@ -359,14 +358,6 @@ def uncertainty(
         "regularisation_bias": lost,
     }
     return Uncertainty({name: np.sqrt(np.maximum(each, 0.0)) for name, each in variances.items()}, factor)
-
-
-def common_response(side: Side) -> FloatArray:
-    """(m, r) sum of all slabs of a ``side``: how each coefficient takes what is common to all frames."""
-    total = np.zeros((side.sensor_size, len(side.singular)))
-    for slab in side.slabs:
-        total[:, slab.columns] += slab.matrix
-    return total
 
 
 def _of_factor(

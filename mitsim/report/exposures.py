@@ -37,7 +37,8 @@ from mitsim.optics.separable import best_term, centred, relative_difference
 from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import shadow_terms
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.solver import Accumulator, Prepared, Solution, prepare
+from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
+from mitsim.reconstruct.status import Solution
 from mitsim.report.study_options import CONVENTIONS as CONVENTIONS
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.sensor.specimen import response_variance

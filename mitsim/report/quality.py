@@ -11,8 +11,8 @@ from mitsim.core.files import output_folder
 from mitsim.core.runs import load_run
 from mitsim.metrics import Quality, truth_error_for, truth_for
 from mitsim.reconstruct.factors import load_calibration
-from mitsim.reconstruct.reconstruct import inputs
 from mitsim.reconstruct.reconstruct import reconstruct as solve
+from mitsim.reconstruct.request import ImageRequest
 from mitsim.reconstruct.result import Reconstruction, may_replace
 
 
@@ -61,7 +61,7 @@ def reconstruct(
     factors.check_fit(shots)
     board = factors.manifest.board_reflectance
     truth, truth_error = truth_for(shots, board), truth_error_for(shots, board)
-    replaces = may_replace(Path(output), inputs(shots, factors, lam, method, **place), overwrite)
+    replaces = may_replace(Path(output), ImageRequest(lam, method, **place).inputs(shots, factors), overwrite)
     with output_folder(output, overwrite=replaces) as folder:
         read = time.perf_counter() - started
         image = solve(shots, factors, lam, method, **place)

@@ -20,9 +20,9 @@ from mitsim.core.seeds import stream
 from mitsim.devices.patterns import PatternFamily, parse_patterns
 from mitsim.devices.sensor import SensorModel
 from mitsim.metrics import psnr, relative_error
-from mitsim.reconstruct.convolution import ConvolutionalCamera, ConvolutionSolution, solve_iteratively
-from mitsim.reconstruct.dots import Classes, FactorisedClasses
+from mitsim.reconstruct.convolution import Classes, ConvolutionalCamera, FactorisedClasses, solve_iteratively
 from mitsim.reconstruct.solver import prepare
+from mitsim.reconstruct.status import Solution
 from mitsim.report.exposures import CONVENTIONS, IdealCamera
 from mitsim.sensor.chain import dn_to_electrons, electrons_from_irradiance, expose, exposure_for_peak
 
@@ -104,9 +104,7 @@ def take(
     return DiffuserShots(frames, time, saturated / frames.size)
 
 
-def best_by_psnr(
-    solve: Callable[[float], ConvolutionSolution], truth: FloatArray, largest: float
-) -> tuple[ConvolutionSolution, float]:
+def best_by_psnr(solve: Callable[[float], Solution], truth: FloatArray, largest: float) -> tuple[Solution, float]:
     """The solution nearest to the truth over lambda, to a quarter of a decade, and its PSNR [dB].
 
     Parameters
@@ -134,7 +132,7 @@ def best_by_psnr(
     return best, psnr(best.image, truth)
 
 
-def best_image(classes: Classes, shots: DiffuserShots, truth: FloatArray) -> tuple[ConvolutionSolution, float]:
+def best_image(classes: Classes, shots: DiffuserShots, truth: FloatArray) -> tuple[Solution, float]:
     """The image that is nearest to the truth over lambda, as :func:`best_by_psnr`, and its PSNR [dB].
 
     Parameters
@@ -220,7 +218,7 @@ def race(classes: Classes, whole: Classes, truth: FloatArray, sensor: SensorMode
     }
 
 
-def _timed(factorised: FactorisedClasses, frames: FloatArray, tolerance: float) -> tuple[ConvolutionSolution, float]:
+def _timed(factorised: FactorisedClasses, frames: FloatArray, tolerance: float) -> tuple[Solution, float]:
     """Solution of frames, and its CPU seconds."""
     start = time.process_time()
     solution = factorised.solve(factorised.classes.projected(frames), tolerance)

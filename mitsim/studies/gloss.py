@@ -25,7 +25,8 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.light.light import SampledLight
 from mitsim.light.light_estimate import LightEstimate
 from mitsim.optics.frames import ExpectedFrames, Frame
-from mitsim.reconstruct.solver import Prepared, Solution
+from mitsim.reconstruct.solver import Prepared
+from mitsim.reconstruct.status import Solution
 from mitsim.report.exposures import RENDERED, LitScene, Unexposed
 from mitsim.sensor.moments import frame_moments
 

@@ -30,7 +30,8 @@ from mitsim.core.seeds import integer, stream
 from mitsim.devices.session import load_recipe
 from mitsim.light.light import SampledLight
 from mitsim.optics.frames import ExpectedFrames, Frame
-from mitsim.reconstruct.solver import Solution, centred, centred_columns, prepare
+from mitsim.reconstruct.solver import centred, centred_columns, prepare
+from mitsim.reconstruct.status import Solution
 from mitsim.report.exposures import EQUAL_PEAK, EQUAL_TOTAL, RENDERED, IdealCamera, LitScene, Pair
 
 Places = Mapping[float, Pair]

@@ -199,5 +199,5 @@ def test_the_report_s_numbers_are_json() -> None:
 
     prepared = prepare(np.eye(3, 4), np.eye(5, 4), np.ones((4, 1)), np.ones((4, 1)))
     solution = prepared.solve(summed(prepared, {(0, 0): np.ones((3, 5))}), 0.1)
-    payload = json.loads(json.dumps(plain({"condition": solution.condition, "status": str(solution.status)})))
+    payload = json.loads(json.dumps(plain({"condition": prepared.condition, "status": str(solution.status)})))
     assert payload["condition"] is None and "condition inf" in payload["status"]

@@ -33,7 +33,6 @@ from mitsim.reconstruct.colour import ColourModel, chart, delta_e
 from mitsim.reconstruct.request import MARKOV, TIKHONOV
 from mitsim.reconstruct.sides import Side
 from mitsim.reconstruct.solver import Prepared, prepare
-from mitsim.reconstruct.uncertainty import common_response
 from mitsim.report.charts import curves
 from mitsim.report.compare import label
 from mitsim.report.exposures import RENDERED
@@ -177,7 +176,7 @@ def _weights(side: Side, first: int, end: int) -> tuple[float, float]:
     a = np.divide(
         side.basis[first:end].sum(axis=0), side.singular, out=np.zeros_like(side.singular), where=side.singular > 0
     )
-    return float(a @ a), float(np.square(common_response(side) @ a).sum())
+    return float(a @ a), float(np.square(side.common @ a).sum())
 
 
 def expected(means: FloatArray, variances: FloatArray, judged: Judge) -> float:

@@ -21,8 +21,7 @@ from mitsim.bench.diffuser import rendered_psf
 from mitsim.core.arrays import FloatArray
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.mask_profile import load_psf
-from mitsim.reconstruct.convolution import ConvolutionalCamera
-from mitsim.reconstruct.dots import Classes
+from mitsim.reconstruct.convolution import Classes, ConvolutionalCamera
 from mitsim.report.charts import curves, image_grid
 from mitsim.report.exposures import EQUAL_FRAME, EQUAL_PEAK
 from mitsim.report.table import Mean, Table, Value

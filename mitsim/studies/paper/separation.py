@@ -1,6 +1,6 @@
 """Direct from global light by the dots themselves: what it gains over images that take all light for direct.
 
-Nayar, Krishnan, Grossberg and Raskar (2006) need a camera with a lens; here :mod:`mitsim.reconstruct.dots` does
+Nayar, Krishnan, Grossberg and Raskar (2006) need a camera with a lens; here :mod:`mitsim.reconstruct.convolution` does
 it, in scenes whose light over several surfaces is known. Depth hides most of it, so every scene is shown twice: as it
 is, and with direct light as the calibrated factors have it at any depth, as if depth were mended.
 """
@@ -19,8 +19,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import Shot
 from mitsim.light.light import SampledLight
 from mitsim.metrics import psnr
-from mitsim.reconstruct.dots import separate
-from mitsim.reconstruct.focus import FactorOfDepths, stated_parallax
+from mitsim.reconstruct.focus import FactorOfDepths, parallax_of
+from mitsim.reconstruct.separation import separate
 from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.report.charts import image_grid
 from mitsim.report.exposures import EQUAL_PEAK, RENDERED, LitScene, Unexposed
@@ -63,7 +63,7 @@ def _measure(studio: Studio, point: Point) -> Found:
     lit = frames.lit
     if not lit.light.simulation.physics.interreflection:
         raise MitsimError(f"study separation: light over several surfaces is not worth following in {point['subject']}")
-    parallax = stated_parallax(studio.factors(point.setup, int(point["seed"])))
+    parallax = parallax_of(studio.factors(point.setup, int(point["seed"])))
     margin = _MARGIN * max(frames.family.left.shape[1], frames.family.right.shape[1])
     left, right = (FactorOfDepths(factor, parallax, axis).beyond(margin)[0] for axis, factor in enumerate(frames.sides))
     electrons = frames.exposer(1.0).electrons

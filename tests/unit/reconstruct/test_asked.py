@@ -7,13 +7,14 @@ import math
 import pytest
 
 from mitsim.core.errors import ArgumentError
-from mitsim.reconstruct.request import METHODS, check_asked, check_joint
+from mitsim.reconstruct.request import ImageRequest, check_joint
+from mitsim.reconstruct.solvers import SOLVERS
 
 TAKEN = [
-    *(("auto", method, None, 0) for method in METHODS),
+    *(("auto", method, None, 0) for method in SOLVERS),
     *((lam, "tikhonov", None, 0) for lam in (0.0, 1e-300, 5)),
     *(("auto", "tikhonov", focus, 0) for focus in ("auto", "map", 1e-3, 400)),
-    *(("auto", method, 400.0, 0) for method in METHODS),
+    *(("auto", method, 400.0, 0) for method in SOLVERS),
     *(("auto", "tikhonov", None, margin) for margin in (1, 2)),
 ]
 REFUSED = [
@@ -29,7 +30,7 @@ REFUSED = [
 
 @pytest.mark.parametrize("asked", TAKEN)
 def test_what_an_image_may_be_asked_by_is_taken(asked: tuple[float | str, str, float | str | None, int]) -> None:
-    check_asked(*asked)
+    ImageRequest(*asked)
 
 
 @pytest.mark.parametrize(("asked", "name", "said"), REFUSED)
@@ -38,7 +39,7 @@ def test_what_no_image_is_made_by_is_refused(
 ) -> None:
     """By the name of the argument, and by what it may be. (Planted: 0 taken for a depth, a bool for a number.)"""
     with pytest.raises(ArgumentError, match=said) as refusal:
-        check_asked(*asked)
+        ImageRequest(*asked)
     assert refusal.value.argument == name
 
 

@@ -11,8 +11,13 @@ import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import parse_patterns
-from mitsim.reconstruct.convolution import ConvolutionalCamera, conjugate_gradients, solve_iteratively
-from mitsim.reconstruct.dots import MOST_FACTORISED, Classes
+from mitsim.reconstruct.convolution import (
+    MOST_FACTORISED,
+    Classes,
+    ConvolutionalCamera,
+    conjugate_gradients,
+    solve_iteratively,
+)
 from mitsim.reconstruct.status import Verdict
 
 SENSORS = [None, (15, 12), (8, 15)]

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mitsim.reconstruct.cost import Predicted, is_kept, predicted, slab_numbers
+from mitsim.reconstruct.cost import ImageCost, keeps_frames, predict_cost, slab_numbers
 
 
 def made(rows: tuple[int, int], lines: tuple[int, int], patterns: tuple[int, int], shots: int = 24) -> tuple:
@@ -16,8 +16,8 @@ def made(rows: tuple[int, int], lines: tuple[int, int], patterns: tuple[int, int
     return SimpleNamespace(manifest=manifest, patterns=pairs), SimpleNamespace(left=left, right=right)
 
 
-def of(*sizes: tuple[int, int]) -> Predicted:
-    return predicted(*made(*sizes))
+def of(*sizes: tuple[int, int]) -> ImageCost:
+    return predict_cost(*made(*sizes))
 
 
 def test_seconds_are_those_of_frames_numbers_and_factors() -> None:
@@ -47,7 +47,7 @@ def test_memory_is_that_of_frames_measurements_and_slabs() -> None:
 
 
 def test_numbers_are_kept_up_to_two_to_the_24() -> None:
-    assert is_kept(*made((2048, 2048), (2, 2), (2, 2)))
-    assert not is_kept(*made((2048, 2049), (2, 2), (2, 2)))
-    assert not is_kept(*made((2049, 2048), (2, 2), (2, 2)))
-    assert not is_kept(*made((2048, 2048), (2, 3), (2, 3)))
+    assert keeps_frames(*made((2048, 2048), (2, 2), (2, 2)))
+    assert not keeps_frames(*made((2048, 2049), (2, 2), (2, 2)))
+    assert not keeps_frames(*made((2049, 2048), (2, 2), (2, 2)))
+    assert not keeps_frames(*made((2048, 2048), (2, 3), (2, 3)))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mitsim.reconstruct.defects import Defects, defects_of
-from mitsim.reconstruct.reconstruct import accumulated, reconstruct
+from mitsim.reconstruct.reconstruct import accumulate, reconstruct
 from tests.ideal_sessions import BLACK, CODES, bench, picture
 from tests.unit.reconstruct.test_faults import Frames, with_frames
 
@@ -66,7 +66,7 @@ def test_a_dead_line() -> None:
 def test_only_readings_that_differ_from_what_others_tell_are_defects() -> None:
     """A bright pixel's part in the fit makes others be off, which are right."""
     shots, factors = with_frames(bench().run("uniform", picture(1), 1), broken), bench().calibrated(1)
-    data = accumulated(shots, factors)
+    data = accumulate(shots, factors)
     looked_at = Defects(np.array([10, 10, 40, 40]), np.array([11, 51, 11, 51]))
     rest = looked_at.left_out(shots, shots.measured, data.prepared, data.weights)
     found = looked_at.beyond_chance(rest, data.noise)

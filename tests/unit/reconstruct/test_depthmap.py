@@ -14,10 +14,10 @@ import pytest
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.causes import Cause
-from mitsim.reconstruct.depth import AllDepths, Depth
+from mitsim.reconstruct.depth import CommonBasis, Depth
 from mitsim.reconstruct.depth_map import PixelDepths, depth_map
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.reconstruct import accumulated, reconstruct
+from mitsim.reconstruct.reconstruct import accumulate, reconstruct
 from tests.ideal_sessions import PEAK, Bench, picture
 from tests.ideal_sessions import shadow as plain_shadow
 from tests.unit.reconstruct.test_faults import dark, with_frames
@@ -83,7 +83,7 @@ def test_a_card_before_a_board(patterns: str, baseline: tuple[float, float], lea
     sign; edges left as pooled, 12 dB.)"""
     run, factors, true = shots(cards(), patterns, baseline), calibrated(baseline), 1 / cards() - 1 / 400
     found, one = depth_map(run, factors), reconstruct(run, factors)
-    depths = AllDepths(run, factors, (-4e-4, 4e-4))
+    depths = CommonBasis(run, factors, (-4e-4, 4e-4))
     known = PixelDepths(depths, 4e-4, 5e-6)
     ideal = known.final(true, known.solve(true)).image
     error = np.abs(found.mm - cards())
@@ -223,7 +223,7 @@ def test_misfit_leaves_noise_and_print_to_the_scene() -> None:
     """Half of what is left beyond the noise may be print: 0.7 of the unexplained part stays, and none if all is.
     (Planted: the sensor's part over the print's energy.)"""
     run, factors = shots(cards(), "dots:8", BASELINE), calibrated(BASELINE)
-    found, noise = depth_map(run, factors), accumulated(run, factors).noise
+    found, noise = depth_map(run, factors), accumulate(run, factors).noise
     plain = found.misfit(noise, 0.0, 0.0)
     excess = plain.unexplained**2 * found.energy / found.part
     assert plain.unexplained > 3.5e-3 and plain.flagged and plain.stated
@@ -238,7 +238,7 @@ def test_the_step_is_the_derivative() -> None:
 
     (Planted: one half of the derivative of u v^T.)"""
     run, factors = shots(np.full((N, N), 400.0), "dots:4x8"), calibrated()
-    depths = AllDepths(run, factors, (-4e-4, 4e-4))
+    depths = CommonBasis(run, factors, (-4e-4, 4e-4))
     model, pixel = PixelDepths(depths, 4e-4, 5e-6), 0.3 / N / 60
     bright = PRINT > 0.5
     # Columns between those that are computed, 5e-6 apart, and their slopes against differences over a tenth of that.

@@ -8,9 +8,9 @@ from mitsim.devices.mask import mls_mask
 from mitsim.devices.patterns import parse_patterns
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.causes import Cause
-from mitsim.reconstruct.detail import LitFrame, Model, disagreement, moved_responses, print_part, slope_of
+from mitsim.reconstruct.detail import LitFrame, Model, disagreement, factor_slope, offset_responses, print_part
 from mitsim.reconstruct.misfit import UNEXPLAINED
-from mitsim.reconstruct.reconstruct import accumulated, reconstruct
+from mitsim.reconstruct.reconstruct import accumulate, reconstruct
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.uncertainty import Propagation
 from tests.ideal_sessions import PITCH, PIXELS, Bench, N, shadow
@@ -44,7 +44,7 @@ def test_moved_light_is_seen_by_the_difference_of_neighbours() -> None:
     expected = np.zeros((5, len(side.singular)))
     for pattern, slab in zip(patterns.T, side.slabs, strict=True):
         expected[:, slab.columns] += np.outer(pattern, 0.01 * step[:, 0] @ slab.matrix)
-    assert moved_responses(side, slope_of(factor), patterns).sum(axis=0) == pytest.approx(expected, abs=1e-12)
+    assert offset_responses(side, factor_slope(factor), patterns).sum(axis=0) == pytest.approx(expected, abs=1e-12)
 
 
 def test_a_single_pixel_has_no_neighbour() -> None:
@@ -64,7 +64,7 @@ def test_the_slope_of_a_moving_shadow(step: float) -> None:
     waves = [(2 * np.pi / length, rng.uniform(0, 6)) for length in rng.uniform(10, 40, 12)]
     factor = sum(np.sin(k * place + phase) for k, phase in waves)
     exact = sum(-step * k * np.cos(k * place + phase) for k, phase in waves)
-    error = (slope_of(factor) - exact)[2:-2, 1:-1]
+    error = (factor_slope(factor) - exact)[2:-2, 1:-1]
     assert np.sqrt(np.square(error).mean() / np.square(exact).mean()) < 0.1
 
 
@@ -140,7 +140,7 @@ def test_noise_alone_is_no_disagreement(patterns: str) -> None:
     camera, told = Bench(shadow(), shadow()), 0
     for seed in range(20):
         shots, factors = camera.run(patterns, np.full((N, N), 0.7), seed), camera.calibrated(seed, 0.01)
-        sums, image = accumulated(shots, factors), reconstruct(shots, factors, 1e-9)
+        sums, image = accumulate(shots, factors), reconstruct(shots, factors, 1e-9)
         propagation = Propagation(sums.model, 1e-9)
         frames = propagation.of_frames(sums.noise.rows, sums.noise.columns)
         assert factors.manifest.noise and image.ok

@@ -21,9 +21,9 @@ from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.causes import Cause
-from mitsim.reconstruct.depth import AllDepths, Depth, best_depth
+from mitsim.reconstruct.depth import CommonBasis, Depth, best_depth
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import FactorOfDepths, focused
+from mitsim.reconstruct.focus import FactorOfDepths, move_factors
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.result import Reconstruction
 from mitsim.reconstruct.sides import group_pixels
@@ -172,7 +172,7 @@ def test_depth_may_differ_from_pixel_to_pixel() -> None:
 
 def test_the_calibrated_depth_has_the_calibrations_own_factors() -> None:
     factors = calibrated()
-    there = focused(factors, 400.0)
+    there = move_factors(factors, 400.0)
     assert np.array_equal(there.factors.left, factors.left) and np.array_equal(there.factors.right, factors.right)
     frames, own = shots(400.0), there.of(shots(400.0))
     for a, b in zip(frames.measured(), own.measured(), strict=True):
@@ -336,7 +336,9 @@ def test_light_that_the_field_stop_hides_is_told() -> None:
     factors = calibrated()
     stopped = PARALLAX.model_copy(update={"stop_tan": 0.16})
     factors = replace(factors, manifest=factors.manifest.model_copy(update={"parallax": stopped}))
-    assert focused(factors, 395.0).hidden == 0 and "field stop" not in str(reconstruct(shots(395.0), factors).status)
+    assert move_factors(factors, 395.0).hidden == 0 and "field stop" not in str(
+        reconstruct(shots(395.0), factors).status
+    )
     image = reconstruct(shots(340.0), factors, focus=340.0)
     assert not image.ok and "the field stop takes most of the light" in str(image.status)
 
@@ -350,12 +352,12 @@ def test_noise_of_moved_columns_is_stated() -> None:
     found, known = side.at(shift)
     noise = float(np.std((found - 1000)[known]))
     assert side.noise(shift) == pytest.approx(noise, rel=0.1) and noise < 0.8
-    moved, own = focused(calibrated(), 360.0).factors.manifest.noise, calibrated().manifest.noise
+    moved, own = move_factors(calibrated(), 360.0).factors.manifest.noise, calibrated().manifest.noise
     assert moved is not None and own is not None and moved.left == pytest.approx(own.left * side.noise(shift))
 
 
 def test_the_ambient_frame_loses_the_same_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    there = focused(calibrated(), 360.0)
+    there = move_factors(calibrated(), 360.0)
     ambient = SimpleNamespace(rate=np.arange(PIXELS**2.0).reshape(PIXELS, -1), variance=np.ones((PIXELS, PIXELS)))
     ambient.shots = 16
     monkeypatch.setattr(Capture, "ambient", ambient)
@@ -393,7 +395,7 @@ def test_a_depth_without_factors_is_refused() -> None:
         reconstruct(frames, camera().calibrated(0), focus=380.0)
     small = replace(calibrated(), left=np.ones((PIXELS, 3)))
     with pytest.raises(MitsimError, match="3 x 40 projector pixels"):
-        focused(small, 380.0)
+        move_factors(small, 380.0)
 
 
 @pytest.mark.parametrize(("patterns", "own"), [("dots:4", True), ("hadamard:4", False)])
@@ -402,7 +404,7 @@ def test_dots_own_basis_leaves_as_much_as_the_common_one(patterns: str, own: boo
     level = replace(calibrated(), manifest=calibrated().manifest.model_copy(update={"parallax": LEVEL}))
     run, ends = shots(400.0, patterns), (-2e-4, 2e-4)
     groups = tuple(group_pixels(each, "auto") for each in run.patterns)
-    one, each = AllDepths(run, level, ends), AllDepths(run, level, ends, (groups[0], groups[1]))
+    one, each = CommonBasis(run, level, ends), CommonBasis(run, level, ends, (groups[0], groups[1]))
     assert (each.stack.shape[1] < one.stack.shape[1] / 2) == own
     for shift in (-2e-4, -0.7e-4, 0.0, 1.3e-4):
         left = []

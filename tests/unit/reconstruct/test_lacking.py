@@ -15,7 +15,7 @@ from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.detail import Model
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.misfit import Lack
-from mitsim.reconstruct.reconstruct import accumulated, reconstruct
+from mitsim.reconstruct.reconstruct import accumulate, reconstruct
 from mitsim.reconstruct.solver import prepare
 from tests.ideal_sessions import Bench, picture, shadow
 
@@ -133,9 +133,9 @@ def test_lambda_heeds_what_factors_lack() -> None:
     (Planted: known terms not passed on.)"""
     camera, factors = doubled()
     shots = camera.run("dots:3", picture(), 0)
-    sums = accumulated(shots, factors)
+    sums = accumulate(shots, factors)
     first = sums.prepared.solve(sums.frames)
-    lack = sums.lack(factors, first.image)
+    lack = sums.lack(first.image)
     image = reconstruct(shots, factors)
     assert lack and image.misfit
     known = sums.prepared.solve(sums.frames, "auto", not image.misfit.flagged, (lack.struck, lack.energy))

@@ -12,7 +12,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.reconstruct import accumulated
+from mitsim.reconstruct.reconstruct import accumulate
 from mitsim.reconstruct.regularisation import (
     RISK_POWER,
     DiagonalProblem,
@@ -303,7 +303,7 @@ def test_a_dark_print_keeps_its_stars(seed):
     stars[rng.integers(0, 64, 40), rng.integers(0, 64, 40)] = 0.1 + 0.9 * rng.random(40)
     y, x = np.mgrid[:PIXELS, :PIXELS] / PIXELS
     camera = Bench(side, side, peak=2000.0, optics=lambda light: light * (1 + 0.03 * np.cos(5 * y + 3 * x * y)))
-    sums = accumulated(camera.run("random:4", stars, seed), camera.calibrated(seed))
+    sums = accumulate(camera.run("random:4", stars, seed), camera.calibrated(seed))
     assert lost(sums.prepared, sums.frames, stars, explained=False)[0] < 0.5
 
 

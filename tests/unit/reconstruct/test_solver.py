@@ -79,7 +79,8 @@ def test_blocks_of_dots_and_full_agree(n, k, seed):
     results = [solve(factor, factor, dots(n, k), dots(n, k), frames, 0.0, structure=s) for s in ("block", "full")]
     np.testing.assert_allclose(results[0].image, image, rtol=0, atol=1e-10)
     np.testing.assert_allclose(results[1].image, image, rtol=0, atol=1e-10)
-    assert results[0].condition == pytest.approx(results[1].condition, rel=1e-9)
+    block, full = (prepare(factor, factor, dots(n, k), dots(n, k), structure=s) for s in ("block", "full"))
+    assert block.condition == pytest.approx(full.condition, rel=1e-9)
 
 
 def test_block_structure_is_found_and_lit_columns_only_are_touched():
@@ -128,7 +129,7 @@ def test_status_names_what_is_missing():
     under = solve(short, tall, one, one, frames_of(short, tall, one, one, image), 0.1)
     assert not under.ok
     assert str(under.status).startswith("Under-determined: 4 sensor rows")
-    assert (under.rank, under.unknowns, under.condition) == (24, 36, np.inf)
+    assert "Rank 24 of 36 " in str(under.status) and ", condition inf " in str(under.status)
 
     deficient = solve(twin, tall, one, one, frames_of(twin, tall, one, one, image), 0.0)
     assert not deficient.ok
@@ -139,7 +140,7 @@ def test_status_names_what_is_missing():
     assert solve(twin, tall, one, one, frames_of(twin, tall, one, one, image), 0.1).ok
     good = solve(tall, tall, one, one, frames_of(tall, tall, one, one, image), 0.0)
     assert good.ok
-    assert good.rank == 36
+    assert "Rank 36 of 36 " in str(good.status)
 
 
 def test_values_are_neither_clipped_nor_normalised():

@@ -15,7 +15,7 @@ from mitsim.core.manifests import Digital, FactorNoise
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.detail import EDGES, PRINT, Model, print_energy
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.reconstruct import accumulated, reconstruct
+from mitsim.reconstruct.reconstruct import accumulate, reconstruct
 from mitsim.reconstruct.regularisation import DiagonalProblem, automatic_lambda
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.spectrum import scene_spectrum
@@ -246,7 +246,7 @@ def test_scenes_of_few_pixels_have_a_spectrum_too(shape: tuple[int, int]) -> Non
 def test_what_lambda_takes_away() -> None:
     """Over all of the image, the lost part of the energy; more where the image has detail than where it is even."""
     shots, factors = bench().run("uniform", picture(), 0), bench().calibrated(0)
-    sums = accumulated(shots, factors)
+    sums = accumulate(shots, factors)
     problem = sums.prepared.problem(sums.frames)
     lam = automatic_lambda(problem)
     propagation = Propagation(sums.model, lam)
@@ -324,7 +324,7 @@ def test_an_image_of_which_lambda_takes_most_is_flagged(lam: float, lost: bool) 
     side = shadow(n=32)
     seen = Bench(side, side, peak=80.0)
     shots, factors = seen.run("hadamard:4", picture(1, 32), 1), seen.calibrated(1)
-    sums = accumulated(shots, factors)
+    sums = accumulate(shots, factors)
     lam = lam if isinstance(lam, str) else lam * sums.prepared.problem(sums.frames).scale
     image = reconstruct(shots, factors, lam)
     assert ("Lambda takes away more" in str(image.status)) is lost
@@ -337,7 +337,7 @@ def test_what_lambda_takes_away_of_as_many_data_as_unknowns() -> None:
     rng = np.random.default_rng(0)
     camera = Bench(*(rng.random((8, 16)) for _ in range(2)), peak=20.0)
     shots, factors = camera.run("dots:2", picture(), 0), camera.calibrated(0)
-    sums = accumulated(shots, factors)
+    sums = accumulate(shots, factors)
     problem, stated = sums.prepared.problem(sums.frames), float(np.mean(sums.noise.variance))
     lam = 1e-2 * problem.scale
     uncertainties = reconstruct(shots, factors, lam).uncertainties

@@ -6,9 +6,7 @@ solved. Under shifting dots no pixel is in two frames, and those left out have l
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -17,10 +15,10 @@ from scipy.ndimage import uniform_filter
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.manifests import RunManifest
 from mitsim.core.runs import Measurement
-from mitsim.reconstruct.framefault import Fault, FrameFault, listed
+from mitsim.reconstruct.faults import Fault, FrameFault, frame_list
 from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.sides import group_pixels
-from mitsim.reconstruct.solver import Prepared, centred
+from mitsim.reconstruct.solver import Prepared
 
 Pattern = tuple[int, int]
 BoolArray = npt.NDArray[np.bool_]
@@ -36,7 +34,6 @@ _SETTLED, _MOST_STEPS = 0.1, 100
 which patterns that know nothing of each other do not need: chosen."""
 
 
-@dataclass(eq=False)
 class FrameSums:
     """Energies by pattern, (K, K') each, gathered as measurements are held against a model.
 
@@ -50,15 +47,9 @@ class FrameSums:
     tell the two apart.
     """
 
-    counts: tuple[int, int]
-    residual: FloatArray = field(init=False)
-    power: FloatArray = field(init=False)
-    energy: FloatArray = field(init=False)
-    sums: FloatArray = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.residual, self.power, self.energy = (np.zeros(self.counts) for _ in range(3))
-        self.sums = np.zeros(self.counts)
+    def __init__(self, counts: tuple[int, int]) -> None:
+        """Nothing yet, of ``counts`` K and K' of patterns."""
+        self.residual, self.power, self.energy, self.sums = (np.zeros(counts) for _ in range(4))
         self.digests: dict[int, list[tuple[Pattern, int]]] = {}
         self.clipped: dict[tuple[Pattern, int], int] = {}
         self.halves: dict[Pattern, tuple[float, float]] = {}
@@ -137,46 +128,12 @@ class LeaveOneOut:
         self.signed = any(shot.sign for shot in self.shots)
         all_lit = [np.flatnonzero((side > 0).all(axis=0)) for side in patterns]
         self._whole = (int(all_lit[0][0]), int(all_lit[1][0])) if self.signed and all(map(len, all_lit)) else None
-        self.sigma = sigma = np.outer(prepared.left.singular, prepared.right.singular)
+        self.sigma = sigma = prepared.sigma
         self._kept = np.divide(np.square(sigma), np.square(sigma) + lam, out=np.zeros_like(sigma), where=sigma > 0)
         self._periods = tuple(len(group_pixels(side, "block")) for side in patterns)
         lit = [(side != 0).sum(axis=1) for side in patterns]
         self.exclusive = bool(max(lit[0]) == 1 and max(lit[1]) == 1) and noise.variance.size > 1
         self.size = prepared.left.sensor_size * prepared.right.sensor_size
-
-    def columns(self, row: int, column: int) -> Any:
-        """Where the coefficients of the pattern of a ``row`` and a ``column`` are in W."""
-        places = [
-            np.arange(side.accumulated_size)[side.slabs[index].columns]
-            for side, index in ((self.prepared.left, row), (self.prepared.right, column))
-        ]
-        return np.ix_(*places)
-
-    def modelled(self, weights: FloatArray, row: int, column: int) -> FloatArray:
-        """(m, m') the frame of a pattern.
-
-        Parameters
-        ----------
-        weights
-            W.
-        row, column
-            of the pattern.
-        """
-        left, right = self.prepared.left.slabs[row], self.prepared.right.slabs[column]
-        return np.asarray(left.matrix @ weights[left.columns][:, right.columns] @ right.matrix.T)
-
-    def projected(self, frame: FloatArray, row: int, column: int) -> FloatArray:
-        """What a frame adds to W at its columns.
-
-        Parameters
-        ----------
-        frame
-            (m, m') as the solver takes it.
-        row, column
-            of its pattern.
-        """
-        left, right = self.prepared.left.slabs[row], self.prepared.right.slabs[column]
-        return np.asarray(left.matrix.T @ frame @ right.matrix)
 
     def image(self, weights: FloatArray) -> FloatArray:
         """(n, n') image of the ``weights`` W at the image's lambda."""
@@ -185,8 +142,7 @@ class LeaveOneOut:
 
     def _seen(self, image: FloatArray) -> FloatArray:
         """W of an ``image`` without noise."""
-        duals = [side.basis if side.dual is None else side.dual for side in (self.prepared.left, self.prepared.right)]
-        return np.asarray(self.sigma * (duals[0].T @ image @ duals[1]))
+        return np.asarray(self.sigma * (self.prepared.left.duals.T @ image @ self.prepared.right.duals))
 
     def lit(self, good: BoolArray) -> BoolArray:
         """(n, n') pixels that a ``good`` pattern lights."""
@@ -207,38 +163,37 @@ class LeaveOneOut:
         wanted = set(patterns)
         return {key: each for each in self.measured() if (key := (each.row, each.column)) in wanted}
 
-    def as_solved(self, frame: FloatArray) -> FloatArray:
-        """A ``frame`` as the solver takes it."""
-        return centred(frame) if self.prepared.centre else frame
+    def all_but(self, bad: Iterable[Pattern]) -> BoolArray:
+        """(K, K') whether patterns are none of the ``bad``."""
+        good = np.ones(self.noise.variance.shape, dtype=np.bool_)
+        for pattern in bad:
+            good[pattern] = False
+        return good
+
+    def rest(self, measurements: Mapping[Pattern, Measurement]) -> FloatArray:
+        """W without what some ``measurements`` add to it."""
+        rest = self.weights.copy()
+        for pattern, each in measurements.items():
+            rest[self.prepared.places(pattern)] -= self.prepared.weights(self.prepared.as_solved(each.frame), pattern)
+        return rest
 
     def without(self, bad: tuple[Pattern, ...]) -> tuple[FloatArray, float]:
         """W of all patterns, the ``bad`` ones as the others foretell them, and what it explains of these others'
         energy."""
-        rest = self.weights.copy()
-        for pattern, measurement in self.measurements(bad).items():
-            rest[self.columns(*pattern)] -= self.projected(self.as_solved(measurement.frame), *pattern)
-        good = np.ones(self.noise.variance.shape, dtype=np.bool_)
-        for pattern in bad:
-            good[pattern] = False
+        rest = self.rest(self.measurements(bad))
         image = self.image(self.weights)
         if not self.exclusive and max(self._periods) > 1:
             # One pattern of +-1 that is wrong is a comb of the dots' period, without a mean.
             image = uniform_filter(image, self._periods, mode="nearest")
-        lit = self.lit(good)
+        lit = self.lit(self.all_but(bad))
         image = np.where(lit, image, self.neighbours(image, lit))
         weights = self._seen(image)
-        grams = {
-            pattern: (
-                self.prepared.left.slabs[pattern[0]].matrix.T @ self.prepared.left.slabs[pattern[0]].matrix,
-                self.prepared.right.slabs[pattern[1]].matrix.T @ self.prepared.right.slabs[pattern[1]].matrix,
-            )
-            for pattern in bad
-        }
+        grams = {pattern: [slab.matrix.T @ slab.matrix for slab in self.prepared.slabs(pattern)] for pattern in bad}
 
         def of_bad(values: FloatArray) -> FloatArray:
             own = np.zeros_like(values)
             for pattern, (left, right) in grams.items():
-                places = self.columns(*pattern)
+                places = self.prepared.places(pattern)
                 own[places] += left @ values[places] @ right
             return own
 
@@ -269,19 +224,17 @@ class LeaveOneOut:
         sums = FrameSums((self.noise.variance.shape[0], self.noise.variance.shape[1]))
         total = np.zeros(0)
         if self.signed:
-            total = sum((each.light for each in self.measurements(self._good(bad)).values()), start=np.zeros(()))
+            good = zip(*np.nonzero(self.all_but(bad)), strict=True)
+            total = sum((each.light for each in self.measurements(good).values()), start=np.zeros(()))
         others = max(self.noise.variance.size - len(set(bad)), 2)
         for each in self.measured():
-            pattern, frame = (each.row, each.column), self.as_solved(each.frame)
-            residual = frame - self.modelled(weights, each.row, each.column)
+            pattern, frame = (each.row, each.column), self.prepared.as_solved(each.frame)
+            residual = frame - self.prepared.frame(weights, pattern)
             sums.residual[pattern], sums.power[pattern] = sum_of_squares(residual), each.power
             sums.energy[pattern] = sum_of_squares(frame)
             if self.signed:
                 sums.sums[pattern] = sum_of_squares((each.light * others - total) / (others - 1))
         return sums
-
-    def _good(self, bad: Iterable[Pattern]) -> set[Pattern]:
-        return set(np.ndindex(self.noise.variance.shape)) - set(bad)
 
     def fault(self, fault: Fault, numbers: Iterable[int], words: str) -> FrameFault:
         """That.
@@ -293,4 +246,4 @@ class LeaveOneOut:
         """
         numbers = tuple(sorted(numbers))
         files = tuple(self.shots[number].file for number in numbers)
-        return FrameFault(fault, numbers, files, f"{listed(numbers, files)} {words}")
+        return FrameFault(fault, numbers, files, f"{frame_list(numbers, files)} {words}")
