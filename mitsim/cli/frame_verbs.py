@@ -31,8 +31,16 @@ from mitsim.core.spectral_manifests import (
     read_colours,
     read_mosaic,
 )
+from mitsim.reconstruct.request import MARKOV, METHODS, TIKHONOV
 
 # ---- `mitsim reconstruct` --------------------------------------------------------------------------------------------
+
+
+def method_names() -> str:
+    """Methods of solving, as the help lists them."""
+    notes = {MARKOV: f"{MARKOV} (neighbouring pixels alike: for noisy frames)"}
+    *others, last = (notes.get(name, name) for name in METHODS)
+    return f"{', '.join(others)} or {last}"
 
 
 @dataclass(frozen=True)
@@ -40,7 +48,7 @@ class Solving:
     """How an image is solved for."""
 
     lam: str = option("auto", "regularisation, or auto", "--lambda", metavar="auto|VALUE")
-    method: str = option("tikhonov", "tikhonov, markov (neighbouring pixels alike: for noisy frames) or tv")
+    method: str = option(TIKHONOV, method_names())
     focus: str | None = option(
         None,
         "depth of the scene; auto: found; map: one for each pixel, by dots; the calibrated one if not given",

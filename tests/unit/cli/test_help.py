@@ -13,6 +13,7 @@ import typer
 from typer.testing import CliRunner
 
 from mitsim.cli import app
+from mitsim.cli.frame_verbs import method_names
 from mitsim.cli.options import Seed, option, verb
 from mitsim.devices.patterns import pattern_names
 
@@ -26,8 +27,10 @@ def described(command: Any) -> dict[str, Any]:
     for parameter in command.params:
         name = " ".join(parameter.opts) if parameter.param_type_name == "option" else parameter.name
         default = parameter.default
+        # These grow with their registries.
+        said = parameter.help.replace(pattern_names(), "PATTERNS").replace(method_names(), "METHODS")
         options[name] = {
-            "help": parameter.help.replace(pattern_names(), "PATTERNS"),  # which grow with their registry
+            "help": said,
             "metavar": parameter.metavar,
             "default": default if isinstance(default, str | int | float | None) else str(default),
             "shown": parameter.show_default,
