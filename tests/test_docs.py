@@ -11,7 +11,6 @@ import json
 import os
 import re
 import shlex
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -24,7 +23,6 @@ import pytest
 from PIL.PngImagePlugin import PngImageFile
 
 import mitsim
-from mitsim.core.configuration import shipped
 from tests import tour
 from tests.conftest import write_small_scene
 from tests.exchanged import made
@@ -42,8 +40,9 @@ FIRST_SCREEN = 40
 ELSEWHERE = {"--check", "--closed-form", "--strict"}
 """Options in the docs that are not mitsim's: of scenes/generate.py, benchmarks/coverage.py and mypy."""
 
-ELSEWHERE_RUN = {"docs/bench.md"}
-"""Pages whose commands need files that a camera writes between them: tests/system/test_real_bench.py."""
+ELSEWHERE_RUN = {"docs/bench.md", "docs/extending.md"}
+"""Pages whose commands need files that a camera writes between them (tests/system/test_real_bench.py), or that a reader
+writes (tests/test_extending.py)."""
 
 NO_MODULES = {"mitsim.key"}
 """Names in the docs that only look like modules: metadata of OpenEXR files."""
@@ -134,7 +133,6 @@ def test_every_option_in_the_docs_is_one_of_a_verb() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in EXAMPLES if examples(page) and page not in ELSEWHERE_RUN])
 def test_the_commands_of_a_page_run_in_their_order(page: str, tmp_path: Path) -> None:
-    prepare(tmp_path)
     for example in examples(page):
         command = verbs()[example.arguments[0]]
         options = {option for parameter in command.params for option in parameter.opts}
@@ -161,13 +159,6 @@ def test_the_exit_statuses_of_readme(status: str, line: str, sentence: str, tmp_
     done = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == int(status)
     assert sentence in " ".join(done.stderr.split())
-
-
-def prepare(folder: Path) -> None:
-    """What readers of docs/extending.md have written before they type its commands."""
-    shutil.copytree(shipped("calibration"), folder / "calibration")
-    shutil.copy(shipped("calibration", "mp_cl1.toml"), folder / "mine.toml")
-    shutil.copytree(shipped("scenes", "photograph"), folder / "path" / "to")
 
 
 # ---- Python ----------------------------------------------------------------------------------------------------------
@@ -208,7 +199,7 @@ SLOW = {"README.md"}
     [
         pytest.param(page, marks=[pytest.mark.slow] if page in SLOW else [])
         for page in EXAMPLES
-        if blocks(page, "python")
+        if blocks(page, "python") and page not in ELSEWHERE_RUN
     ],
 )
 def test_the_python_of_a_page_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variant: str) -> None:
@@ -282,11 +273,14 @@ def test_links_lead_somewhere(page: str) -> None:
 
 @pytest.mark.parametrize("page", EXAMPLES)
 def test_files_tests_and_modules_that_a_page_names_exist(page: str) -> None:
-    missing = []
+    """But for those that a reader makes."""
+    missing, new = [], set(re.findall(r"^New file `(.+)`:$", text_of(page), flags=re.M))
     for span in re.findall(r"`([^`\n]+)`", prose_of(page)):
         for name, test in re.findall(r"\b((?:mitsim|tests|benchmarks|scenes|docs)/[\w/]+\.\w+)(?:::(\w+))?", span):
             path = ROOT / name
-            if "NAME" not in name and not (path.is_file() and (f"def {test}(" if test else "") in text_of(name)):
+            if not ("NAME" in name or name in new) and not (
+                path.is_file() and (f"def {test}(" if test else "") in text_of(name)
+            ):
                 missing.append(span)
         dotted = set(re.findall(r"^mitsim(?:\.\w+)+$", span)) - NO_MODULES
         missing += [name for name in dotted if not resolves(name)]
