@@ -33,7 +33,7 @@ import numpy as np
 import mitsim as ms
 from mitsim.api.bench import Bench
 from mitsim.devices.patterns import PatternFamily, parse_patterns
-from mitsim.light.light_estimate import LightEstimate
+from mitsim.light.grids import LightEstimate
 from mitsim.light.passes import Simulation
 from mitsim.transport.accumulator import fetched
 from mitsim.transport.direct import DirectTracer

@@ -32,9 +32,8 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.resources import Cost, Limits
 from mitsim.core.seeds import integer
 from mitsim.devices.session import SIDES, SessionRecipe, load_recipe
-from mitsim.light.grids import GRIDS
+from mitsim.light.grids import GRIDS, LightEstimate
 from mitsim.light.light import SampledLight
-from mitsim.light.light_estimate import LightEstimate
 from mitsim.light.passes import Simulation
 from mitsim.light.plan import Plan
 from mitsim.optics.frames import Frame

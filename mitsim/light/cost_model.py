@@ -17,7 +17,7 @@ from mitsim.bench.effects import names
 from mitsim.core.arrays import FloatArray
 from mitsim.devices.plate import FEW
 from mitsim.light.pass_table import PASSES
-from mitsim.light.pilot_result import Effort, Evidence, Forming
+from mitsim.light.pilot_result import Evidence, Forming, SampleCost
 from mitsim.light.settings import GROUPS, Number, Settings
 from mitsim.optics.frames import PROBES, formed_frames, mixes
 from mitsim.transport.accumulator import MOST_PLACES
@@ -67,7 +67,7 @@ class UnitCosts:
         a path, or a connection, of each pass by its name.
     frame, product
         a frame, and a multiplication in forming it.
-    entry, filed
+    entry, accumulated
         an entry of a wave-optical shadow, and one of accumulated light.
     ray
         a ray of the truth.
@@ -79,7 +79,7 @@ class UnitCosts:
     frame: float
     product: float
     entry: float
-    filed: float
+    accumulated: float
     ray: float
     pixel: float = 0.0
 
@@ -89,7 +89,7 @@ FIXED = UnitCosts(
     frame=2.2e-3,
     product=2.1e-11,
     entry=3.5e-8,
-    filed=1e-8,
+    accumulated=1e-8,
     ray=1e-7,
     pixel=3e-8,
 )
@@ -106,7 +106,7 @@ _FILED = 0.2
 """What tracing takes more for each further line: 0.15 of a mono capture's seconds, 0.3 of one line's (three lines of
 photograph, benchmarks/colour.py)."""
 _PASSED = 0.4
-"""A place of a ledger, which is emptied and looked through, over an entry of light that is filed (corner in three
+"""A place of a ledger, which is emptied and looked through, over an entry of light that is accumulated (corner in three
 lines: 4e-9 s)."""
 SHARED_COST = 6
 """Paths that a path of shared indirect light takes as long as: corner 5.7, cookie_bag 3.4."""
@@ -164,22 +164,8 @@ class Numbers:
         occluded, raster_cells
             as above.
         """
-        anchors, layers, cells, followed, occluded_anchors, width, coarse_cells, all_layers = counts
-        return cls(
-            anchors,
-            layers,
-            cells,
-            followed,
-            occluded_anchors,
-            width,
-            coarse_cells,
-            all_layers,
-            waves=float(in_waves(effects)),
-            indirect=float("interreflection" in effects),
-            mixed=float(MIXING in effects),
-            occluded=float(occluded),
-            raster_cells=float(raster_cells),
-        )
+        on = in_waves(effects), "interreflection" in effects, MIXING in effects
+        return cls(*counts, *map(float, (*on, occluded, raster_cells)))  # type: ignore[arg-type]
 
     @classmethod
     def of(cls, settings: Settings) -> Numbers:
@@ -203,27 +189,30 @@ def unit_costs_of(evidence: Evidence) -> UnitCosts:
     product = forming.product or slower * FIXED.product
     # The frame that the pilot forms is small: beside its products there is what every frame takes.
     frame = max(forming.seconds - product * products, 0.0) if forming.product else slower * FIXED.frame
-    measured = {name: effort.seconds for name, effort in evidence.efforts.items() if effort.seconds}
+    measured = {name: sample_cost.seconds for name, sample_cost in evidence.sample_costs.items() if sample_cost.seconds}
     return UnitCosts(
         passes={**FIXED.passes, **measured},
         frame=float(frame),
         product=float(product),
         entry=float(product / FIXED.product * FIXED.entry),
-        filed=float(product / FIXED.product * FIXED.filed),
+        accumulated=float(product / FIXED.product * FIXED.accumulated),
         ray=evidence.spread.seconds * FIXED.ray / FIXED.passes["direct"] or FIXED.ray,
         pixel=float(product / FIXED.product * FIXED.pixel),
     )
 
 
-def priced() -> frozenset[str]:
+def costly_effects() -> frozenset[str]:
     """Names of effects that take time; to have the others on costs nothing."""
     return names(lambda effect: effect.followed or effect.in_shadow) | {MIXING}
 
 
-def efforts(evidence: Evidence, effects: frozenset[str]) -> dict[str, Effort]:
+def sample_costs(evidence: Evidence, effects: frozenset[str]) -> dict[str, SampleCost]:
     """What each pass that ``effects`` call for takes by the ``evidence``; connections to anchors: to one."""
-    found = ((name, evidence.efforts[name]) for name in PASSES if name in evidence.efforts)
-    return {name: effort for name, effort in found if PASSES[name].called_for(effects)}
+    found = ((name, evidence.sample_costs[name]) for name in PASSES if name in evidence.sample_costs)
+    return {name: sample_cost for name, sample_cost in found if PASSES[name].called_for(effects)}
+
+
+# -------- Forming frames, and checking their error
 
 
 def _by_fft(forming: Forming, numbers: Numbers) -> bool:
@@ -357,6 +346,9 @@ def tells_all(classes: int, shots: int, pixels: float) -> bool:
     return classes <= MOST_CHECKED and mixes(classes, shots, pixels)
 
 
+# -------- Tracing, accumulating and the truth
+
+
 def tracing_seconds(evidence: Evidence, settings: Settings, costs: UnitCosts) -> dict[str, float]:
     """Seconds of tracing the samples in ``settings``, by kind of light.
 
@@ -373,16 +365,16 @@ def tracing_seconds(evidence: Evidence, settings: Settings, costs: UnitCosts) ->
         name: traced_for(evidence.forming.lines, evidence.forming.parted)
         * GROUPS
         * float(PASSES[name].whole(PASSES[name].predicted(settings)))
-        * effort.paths
+        * sample_cost.paths
         * costs.passes[name]
         * float(PASSES[name].connections(settings))
-        for name, effort in efforts(evidence, settings.effects).items()
+        for name, sample_cost in sample_costs(evidence, settings.effects).items()
     }
 
 
 def traced_for(lines: int, parted: bool = False) -> float:
-    """Times what one line takes that tracing and filing take for so many ``lines`` on the same paths, or on paths of
-    their own where glass has ``parted`` them."""
+    """Times what one line takes that tracing and accumulating take for so many ``lines`` on the same paths, or on paths
+    of their own where glass has ``parted`` them."""
     return lines if parted else 1 + _FILED * (lines - 1)
 
 
@@ -403,7 +395,7 @@ def predicted_rays(pixels: int, samples: float, rate: float) -> float:
 
 
 def entries(pixels: int, classes: int, numbers: Numbers, samples: Settings | Mapping[str, Number]) -> Number:
-    """Entries of one group's filed light, at most: a pixel's direct light lies in its own cells, indirect light in all.
+    """Entries of one group's light, at most: a pixel's direct light lies in its own cells, indirect light in all.
 
     Parameters
     ----------
@@ -439,19 +431,19 @@ def entries(pixels: int, classes: int, numbers: Numbers, samples: Settings | Map
     return cast(Number, pixels * found)
 
 
-def filing_seconds(forming: Forming, numbers: Numbers, filed: Number, costs: UnitCosts) -> Number:
-    """Seconds of filing the light of each line.
+def accumulation_seconds(forming: Forming, numbers: Numbers, entries_of_group: Number, costs: UnitCosts) -> Number:
+    """Seconds of accumulating the light of each line.
 
     Parameters
     ----------
     forming, numbers, costs
         as for :func:`forming_seconds`.
-    filed
-        entries of one group's light.
+    entries_of_group
+        of one group's light.
     """
     ledger = forming.classes * np.square(forming.cells * numbers.coarse_cells) * numbers.coarse_layers
     passed = numbers.indirect * _PASSED * np.where(ledger < MOST_PLACES, ledger, 0.0)
-    return cast(Number, forming.lines * GROUPS * costs.filed * (filed + passed))
+    return cast(Number, forming.lines * GROUPS * costs.accumulated * (entries_of_group + passed))
 
 
 def truth_seconds(evidence: Evidence, settings: Settings, costs: UnitCosts) -> float:
@@ -462,7 +454,7 @@ def truth_seconds(evidence: Evidence, settings: Settings, costs: UnitCosts) -> f
     evidence, settings, costs
         as for :func:`tracing_seconds`.
     """
-    row, direct = PASSES["direct"], evidence.efforts["direct"]
+    row, direct = PASSES["direct"], evidence.sample_costs["direct"]
     rate = (evidence.spread if settings.anchors > 1 else direct).noise.rate
     return (
         traced_for(evidence.forming.lines, evidence.forming.parted)

@@ -1,16 +1,20 @@
-"""The grids that light of a bench is accumulated in: cells, anchors and layers, and the optics that form their frames.
+"""The grids that light of a bench is accumulated in, and one estimate of it: a sparse matrix by grid.
 
-:data:`GRIDS` is the table of them, in the order in which their frames are added up.
+A grid has cells, anchors and layers, and the optics that form frames of the light in it. :data:`GRIDS` is the table of
+them, in the order in which their frames are added up.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, reduce
+from operator import add
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
+from scipy import sparse
 
 from mitsim.bench.bench import Apparatus
 from mitsim.bench.effects import Physics
@@ -179,7 +183,7 @@ class Grids:
         return np.asarray(anchor_weights(positions, (edges[:-1] + edges[1:]) / 2).mean(axis=0))
 
 
-# ---- The table
+# -------- The table
 
 
 def _fine(made: Grids) -> Bundle:
@@ -217,42 +221,23 @@ def _sharp(made: Grids) -> Bundle:
     return Bundle(cells, sharp.anchors, settings.depths, between=True, lamps=made.lamp_rows)
 
 
-GRIDS: Mapping[str, GridRow] = MappingProxyType(
-    {
-        row.name: row
-        for row in (
-            # What the sensor sees on average of direct light, caustics and lamps.
-            GridRow("fine", "fine", _fine, lambda settings, physics: True, lamps=True),
-            # What each anchor sees of direct light beyond that; and of light that is hidden from part of the sensor.
-            GridRow(
-                "anchor_residual",
-                "coarse",
-                lambda made: _coarse(made, made.settings.anchors),
-                lambda settings, physics: settings.anchors > 1,
-            ),
-            GridRow(
-                "penumbra",
-                "occluded",
-                lambda made: _coarse(made, made.settings.occluded_anchors),
-                lambda settings, physics: bool(settings.with_own_anchors),
-            ),
-            # Direct light over sharp lobes, of the pixels that are traced apart.
-            GridRow("sharp", "sharp", _sharp, lambda settings, physics: settings.sharp is not None),
-            # What each anchor sees of light over several surfaces, mirrors' and lamps' beyond its mean; and that mean,
-            # of light over several surfaces: smooth or small, so coarse cells hold them well.
-            GridRow(
-                "indirect_residual",
-                "followed",
-                _wide,
-                lambda settings, physics: settings.followed_anchors > 1,
-                lamps=True,
-            ),
-            GridRow(
-                "indirect", "smooth", lambda made: _coarse(made, 1), lambda settings, physics: physics.interreflection
-            ),
-        )
-    }
-)
+_ROWS = (
+    # What the sensor sees on average of direct light, caustics and lamps.
+    GridRow("fine", "fine", _fine, lambda settings, physics: True, lamps=True),
+    # What each anchor sees of direct light beyond that; and of light that is hidden from part of the sensor.
+    GridRow("anchor_residual", "coarse", lambda made: _coarse(made, made.settings.anchors),
+            lambda settings, physics: settings.anchors > 1),
+    GridRow("penumbra", "occluded", lambda made: _coarse(made, made.settings.occluded_anchors),
+            lambda settings, physics: bool(settings.with_own_anchors)),
+    # Direct light over sharp lobes, of the pixels that are traced apart.
+    GridRow("sharp", "sharp", _sharp, lambda settings, physics: settings.sharp is not None),
+    # What each anchor sees of light over several surfaces, mirrors' and lamps' beyond its mean; and that mean, of light
+    # over several surfaces: smooth or small, so coarse cells hold them well.
+    GridRow("indirect_residual", "followed", _wide, lambda settings, physics: settings.followed_anchors > 1,
+            lamps=True),
+    GridRow("indirect", "smooth", lambda made: _coarse(made, 1), lambda settings, physics: physics.interreflection),
+)  # fmt: skip
+GRIDS: Mapping[str, GridRow] = MappingProxyType({row.name: row for row in _ROWS})
 """The grids by name."""
 
 
@@ -260,3 +245,77 @@ def _bands(low_nm: float, high_nm: float, count: int) -> Spectrum:
     """Equal photons in ``count`` bands between two wavelengths, each taken at its centre."""
     edges = np.linspace(low_nm, high_nm, count + 1)
     return Spectrum((edges[:-1] + edges[1:]) / 2, np.full(count, 1 / count))
+
+
+# -------- One estimate of the light
+
+MEAN_GRIDS = ("fine", "indirect")
+"""Grids of what the sensor sees on average."""
+
+
+@dataclass(frozen=True, eq=False)
+class LightEstimate:
+    """Light by grid (:data:`mitsim.light.grids.GRIDS`), (classes + 1, places) each, the last row ambient light
+    [W m^-2], or one of the last for each band of its wavelengths.
+
+    Attributes
+    ----------
+    light
+        by the name of the grid; of all grids.
+    received, outside
+        all light, a mean over the sensor without its mask, and what of it came from beyond all cells: it is in no
+        frame [W m^-2].
+    flux
+        (n^2,) irradiance of each projector pixel's direct light on the sensor, its mean, without the mask [W m^-2];
+        None where no pass told it.
+    """
+
+    light: Mapping[str, sparse.csr_array]
+    received: float = 0.0
+    outside: float = 0.0
+    flux: FloatArray | None = None
+
+    def __getitem__(self, grid: str) -> sparse.csr_array:
+        return self.light[grid]
+
+    def __add__(self, other: LightEstimate) -> LightEstimate:
+        return LightEstimate(*(_sum(getattr(self, each.name), getattr(other, each.name)) for each in fields(self)))
+
+    def __truediv__(self, count: float) -> LightEstimate:
+        return LightEstimate(*(_divided(getattr(self, each.name), count) for each in fields(self)))
+
+    def with_light(self, light: Mapping[str, sparse.csr_array]) -> LightEstimate:
+        """The same with other ``light`` in some grids."""
+        return replace(self, light={**self.light, **light})
+
+    @property
+    def rows(self) -> int:
+        """Classes, and rows of ambient light."""
+        return int(self.light[MEAN_GRIDS[0]].shape[0])
+
+    @property
+    def totals(self) -> FloatArray:
+        """(rows,) light of each row, a mean over the sensor, but for pixels that are traced apart [W m^-2]."""
+        return np.asarray(reduce(add, (self.light[grid].sum(axis=1) for grid in MEAN_GRIDS)), dtype=np.float64)
+
+
+def _sum(one: Any, other: Any) -> Any:
+    """Of numbers, matrices, or several of them; a matrix to which nothing is added is not copied."""
+    if one is None or other is None:
+        return one if other is None else other
+    if isinstance(one, Mapping):
+        return {name: _sum(light, other[name]) for name, light in one.items()}
+    if not isinstance(one, sparse.csr_array) or (one.nnz and other.nnz):
+        return one + other
+    return one if one.nnz else other
+
+
+def _divided(light: Any, count: float) -> Any:
+    """Numbers or matrices over ``count``; SciPy would copy where a matrix has its light, which lines may share."""
+    if light is None:
+        return None
+    if isinstance(light, Mapping):
+        return {name: _divided(each, count) for name, each in light.items()}
+    if not isinstance(light, sparse.csr_array):
+        return light / count
+    return sparse.csr_array((light.data * (1 / count), light.indices, light.indptr), shape=light.shape)

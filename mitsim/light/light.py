@@ -20,11 +20,10 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.light.cost_model import CHECKED_SHOTS, MOST_CHECKED, tells_all
-from mitsim.light.groups import Group, trace_groups
-from mitsim.light.light_estimate import LightEstimate
+from mitsim.light.grids import LightEstimate
 from mitsim.light.passes import Simulation, expected_of
 from mitsim.light.plan import Plan
-from mitsim.light.rounds import first_samples, next_samples
+from mitsim.light.sampling import Group, first_samples, next_samples, trace_groups
 from mitsim.light.settings import GROUPS, MOST_PATHS, Estimate, Settings
 from mitsim.light.truth import Truth, trace_truth
 from mitsim.optics.frames import ExpectedFrames, bound_of, shares_of_bound
@@ -70,7 +69,7 @@ class Sampling:
 
 
 @dataclass(frozen=True, eq=False)
-class Looked:
+class FrameCheck:
     """What a look at the error of frames found, for who forms them.
 
     Attributes
@@ -143,7 +142,7 @@ class SampledLight:
     sampling_error: float
     reached: bool
     samples: Mapping[str, int] = field(default_factory=dict)
-    looked: Looked | None = None
+    looked: FrameCheck | None = None
     known_truth: Truth | None = None
 
     def __repr__(self) -> str:
@@ -262,6 +261,9 @@ class SampledLight:
         return self.apparent.reflectance
 
 
+# -------- Tracing until the error meets its target
+
+
 def trace_light(
     bench: Apparatus,
     plan: Plan,
@@ -283,9 +285,9 @@ def trace_light(
     seed
         root of the random streams.
     sampling
-        target, filing and streams.
+        target, accumulation and streams.
     progress
-        told how near the target is.
+        is called with how near the target is.
     """
     (light,) = trace_lines(bench, (bench,), plan, lighting, seed, sampling, progress)
     return light
@@ -327,17 +329,17 @@ def trace_lines(
         lines = [_line_of(groups, line, each, plan, seed) for line, each in enumerate(own)]
         last = lines[0].paths >= MOST_PATHS
         enough = math.inf if last or sampling.excess or sampling.target else plan.sampling_target
-        looks = _looks(lines, partial(_parts, groups), lighting, followed, enough)
+        checks = _checks(lines, partial(_parts, groups), lighting, followed, enough)
         lights, near, worst, excess = dict[int, SampledLight](), 1.0, 0, 0.0
-        more = sampling.excess([looks[line].light for line in sorted(looks)]) if sampling.excess else 1.0
-        for line, look in looks.items():
-            light, error = look.light, look.light.sampling_error
+        more = sampling.excess([checks[line].light for line in sorted(checks)]) if sampling.excess else 1.0
+        for line, check in checks.items():
+            light, error = check.light, check.light.sampling_error
             # The plan's budget is for what the error may be; a user's own target for what it is expected to be.
             if sampling.target:
                 target = sampling.target(light.frames(_some(lighting, CHECKED_SHOTS), seed, leaking=False))
             else:
                 target = plan.sampling_target
-            seen = more * (error if sampling.target else look.bound)
+            seen = more * (error if sampling.target else check.bound)
             lights[line] = replace(light, reached=seen <= target)
             if seen > target and (beyond := _excess(seen, more * error, target)) > excess:
                 worst, excess = line, beyond
@@ -345,9 +347,9 @@ def trace_lines(
         progress("transport", near)
         if last or all(light.reached for light in lights.values()):
             return [lights[line] for line in range(len(own))]
-        samples = next_samples(simulation, samples, looks[worst].variances, excess)
+        samples = next_samples(simulation, samples, checks[worst].variances, excess)
         # What the next round replaces is not held beside it: new memory is dear.
-        del lines, looks, look, lights, light
+        del lines, checks, check, lights, light
 
 
 @single_threaded_blas()
@@ -393,8 +395,11 @@ def _flux(estimates: Sequence[LightEstimate], like: FloatArray) -> list[FloatArr
     return [np.zeros_like(like) if each.flux is None else each.flux for each in estimates]
 
 
+# -------- Checks of the error, by the frames of some shots
+
+
 @dataclass(frozen=True)
-class _Look:
+class _Check:
     """A ``light`` with the Monte Carlo error of the frames, what that is below at 95 %, and what each part of the light
     brings to the square of the latter, by the name of the pass, up to one factor."""
 
@@ -412,21 +417,21 @@ def _parts(groups: Sequence[Group], line: int) -> Parts:
     return {name: [group.part(name, line) for group in groups] for name in groups[0].done}
 
 
-def _looks(
+def _checks(
     lines: Sequence[SampledLight], parts: Callable[[int], Parts], lighting: Lighting, followed: bool, enough: float
-) -> dict[int, _Look]:
-    """What :func:`_looked` finds of the light of each line and its ``parts``, by its number: of the noisiest first, and
+) -> dict[int, _Check]:
+    """What :func:`_check` finds of the light of each line and its ``parts``, by its number: of the noisiest first, and
     of the others when its bound is ``enough``, as long as theirs are; else all are traced on whatever theirs is."""
     noise = [float(np.square(light.flux_error).sum() / (np.square(light.flux).sum() or 1.0)) for light in lines]
-    looks = {}
+    checks = {}
     for line in sorted(range(len(lines)), key=lambda line: -noise[line]):
-        looks[line] = _looked(lines[line], parts(line), lighting, followed)
-        if looks[line].bound > enough:
+        checks[line] = _check(lines[line], parts(line), lighting, followed)
+        if checks[line].bound > enough:
             break
-    return looks
+    return checks
 
 
-def _looked(light: SampledLight, parts: Parts, lighting: Lighting, followed: bool) -> _Look:
+def _check(light: SampledLight, parts: Parts, lighting: Lighting, followed: bool) -> _Check:
     """A look at the frames of a light.
 
     Parameters
@@ -446,7 +451,7 @@ def _looked(light: SampledLight, parts: Parts, lighting: Lighting, followed: boo
     error, bound = (ratio * of_seen for ratio, of_seen in zip(more, expected.sampling_error(), strict=True))
     light = replace(light, sampling_error=error)
     if whole and expected.probed is not None:
-        found = Looked(light.groups, light.simulation, light.rows_of(lighting), expected.probed)
+        found = FrameCheck(light.groups, light.simulation, light.rows_of(lighting), expected.probed)
         light = replace(light, looked=found)
     by_part = np.concatenate([noise.reshape(len(parts), -1, len(light.groups)) for noise in expected.noise], axis=1)
     variances = dict(zip(parts, shares_of_bound(by_part.sum(axis=1)).tolist(), strict=True))
@@ -454,7 +459,7 @@ def _looked(light: SampledLight, parts: Parts, lighting: Lighting, followed: boo
         for name, groups in parts.items():
             _, more_of_part = _unchecked(replace(light, groups=tuple(groups)), lighting, seen)
             variances[name] *= more_of_part**2
-    return _Look(light, bound, variances)
+    return _Check(light, bound, variances)
 
 
 def _excess(seen: float, error: float, target: float) -> float:
@@ -486,6 +491,9 @@ def _unchecked(light: SampledLight, lighting: Lighting, checked: Lighting) -> tu
     ratios = every.sum() / some.sum(), (bound_of(every, 1.0) / bound_of(some, 1.0)) ** 2
     error, bound = (math.sqrt(max(ratio / _BY_CHANCE, 1.0)) for ratio in ratios)
     return error, bound
+
+
+# -------- A view for people
 
 
 def pinhole_view(bench: Apparatus, board_reflectance: float, seed: int) -> FloatArray:

@@ -127,7 +127,7 @@ def _write_shadow(group: h5py.Group, grid: Grid) -> None:
 def _ambient(light: SampledLight) -> FloatArray:
     """(groups, m, m') irradiance of lamps by each group of a ``light``."""
     frames = np.zeros((len(light.groups), *light.bench.geometry.frame_shape))
-    for filed in light.simulation.filed(light.groups, light.bench.n**2)[1]:
+    for filed in light.simulation.with_optics(light.groups, light.bench.n**2)[1]:
         for frame, group in zip(frames, filed.groups, strict=True):
             group.sort_indices()
             frame += filed.optics.frame(group.indices, group.data)

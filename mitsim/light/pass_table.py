@@ -1,4 +1,4 @@
-"""The passes that light is traced in, one row each: what makes its paths, where their light is accumulated, its cost.
+"""The passes that light is traced in, one row each: what traces it, where its light is accumulated, its cost.
 
 :data:`PASSES` is read by all that enumerates light: tracing, accumulation, rounds of sampling, costs, pilot, plans and
 files. A new pass is a row here, and its tracer.
@@ -7,15 +7,142 @@ files. A new pass is a row here, and its tracer.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
 
 from mitsim.bench.effects import names
+from mitsim.core.arrays import Labels
+from mitsim.light.grids import Grids
 from mitsim.light.settings import Number, Settings
-from mitsim.light.tracers import PassTracer, Tracers
+from mitsim.transport.connect import SensorPoints
+from mitsim.transport.direct import AimedTracer, DirectTracer
+from mitsim.transport.from_camera import Counted, FromCameraTracer, LampTracer, Paths, Together
+from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.path_reuse import NeighbourTracer
+
+# -------- What traces
+
+FromCamera = FromCameraTracer | Together
+"""What follows light from the camera's side."""
+PassTracer = DirectTracer | IndirectTracer | FromCamera
+"""What traces a pass."""
+
+
+class Tracers(Grids):
+    """What is traced of a bench with settings; its parameters are those of :class:`mitsim.light.grids.Grids`."""
+
+    # ---- Direct light
+
+    @cached_property
+    def direct(self) -> DirectTracer:
+        """Follows direct light from the projector to the sensor's centre, or to all of it where anchors are used."""
+        return self._direct(1, spread=self.settings.anchors > 1)
+
+    @property
+    def spread(self) -> DirectTracer:
+        """Follows direct light to random points of the sensor."""
+        return self._direct(1, spread=True)
+
+    @cached_property
+    def anchored(self) -> DirectTracer | None:
+        """The same to every anchor, but for occluded pixels."""
+        settings = self.settings
+        return self._direct(settings.anchors, settings.with_own_anchors) if settings.anchors > 1 else None
+
+    @cached_property
+    def anchored_occluded(self) -> DirectTracer | None:
+        """Follows direct light of occluded pixels to anchors of their own; none where there are none."""
+        settings = self.settings
+        others = np.setdiff1d(np.arange(self.bench.n**2), settings.with_own_anchors)
+        return self._direct(settings.occluded_anchors, others) if settings.with_own_anchors else None
+
+    @cached_property
+    def sharp(self) -> AimedTracer | None:
+        """Follows direct light of the sharp pixels to their anchors; none where there are none."""
+        loaded, physics, sharp = self.bench.loaded, self.physics, self.settings.sharp
+        if sharp is None:
+            return None
+        parts = loaded.scene, loaded.camera, physics.projector, sharp.anchors, physics.geometry
+        return AimedTracer(*parts, np.array(sharp.pixels))
+
+    def _direct(self, anchors: int, without: Labels | tuple[int, ...] = (), spread: bool = False) -> DirectTracer:
+        """Of all pixels that are not sharp, ``without`` some."""
+        loaded, physics, sharp = self.bench.loaded, self.physics, self.settings.sharp
+        absent = np.union1d(without, sharp.pixels if sharp else ()).astype(np.int64)
+        pixels = np.setdiff1d(np.arange(self.bench.n**2), absent) if len(absent) else None
+        return DirectTracer(loaded.scene, loaded.camera, physics.projector, anchors, physics.geometry, spread, pixels)
+
+    # ---- Light that is followed further
+
+    @cached_property
+    def indirect(self) -> IndirectTracer | None:
+        """Follows light over several surfaces from the projector to the sensor's centre, or to all of it where it has
+        anchors; none where there is none."""
+        tracer, repeats = self._indirect(self._mean_points, self.settings.shared), self.settings.repeats
+        return tracer.repeating(repeats) if tracer and repeats else tracer
+
+    @cached_property
+    def from_camera(self) -> FromCamera | None:
+        """Follows all other light, from the same points; none where there is none."""
+        return self._from_camera(self._mean_points)
+
+    @cached_property
+    def at_anchors(self) -> tuple[IndirectTracer | None, FromCamera | None]:
+        """Both, to every anchor of followed light."""
+        points = self._points(self.settings.followed_anchors)
+        return self._indirect(points), self._from_camera(points)
+
+    @property
+    def _mean_points(self) -> SensorPoints:
+        return self._points(1, self.settings.followed_anchors > 1)
+
+    @property
+    def lamps_apart(self) -> bool:
+        """Whether lamps' paths are followed for no light of the projector."""
+        return not self._from_camera_of_projector
+
+    @property
+    def _from_camera_of_projector(self) -> bool:
+        return self.physics.mirrors or (self.physics.interreflection and self.bench.loaded.glossy)
+
+    def _points(self, anchors: int, spread: bool = False) -> SensorPoints:
+        return SensorPoints(self.physics.geometry.half_width, anchors, spread, self.settings.depth)
+
+    def _indirect(self, points: SensorPoints, shared: bool = False) -> IndirectTracer | None:
+        loaded, physics = self.bench.loaded, self.physics
+        paths = physics.mirrors, physics.interreflection
+        if not any(paths):
+            return None
+        parts = loaded.scene, loaded.camera, physics.projector, *paths, physics.geometry, points
+        return NeighbourTracer(*parts) if shared else IndirectTracer(*parts)
+
+    def _from_camera(self, points: SensorPoints) -> FromCamera | None:
+        loaded, physics, lamplight = self.bench.loaded, self.physics, self.bench.lamplight
+        of_projector = self._from_camera_of_projector
+        if not (physics.lamps or of_projector):
+            return None
+        paths = Paths(physics.mirrors, physics.interreflection, physics.lamps)
+        parts = loaded.scene, loaded.camera, physics.projector
+        tracer = FromCameraTracer(*parts, self.aim, paths, physics.geometry, points)
+        if lamplight is None or not physics.lamps:
+            return tracer
+        # Lamps have wavelengths of their own, and filters of each colour count them on their own.
+        units = lamplight.units_of(self.bench.projector.lines)
+        lamps: list[FromCameraTracer] = []
+        for number, response in enumerate(lamplight.responses):
+            rows = lamplight.rows(number)
+            own = [unit * response.part for unit in units]
+            lamps.append(LampTracer(tracer, Counted(response, lamplight.bands[rows], own, rows.start)))
+        if of_projector:
+            lamps.insert(0, FromCameraTracer(*parts, self.aim, replace(paths, emitters=()), physics.geometry, points))
+        return lamps[0] if len(lamps) == 1 else Together(*lamps)
+
+
+# -------- The table
 
 FOLLOWED = names(lambda effect: effect.followed)
 """Effects whose light is followed over several surfaces or from the camera."""
@@ -113,93 +240,23 @@ def even(samples: Number) -> Number:
 
 
 _ROWS = (
-    Pass(
-        name="direct",
-        stream="direct",
-        tracer=lambda made: made.direct,
-        unit_cost=1.8e-7,
-        grid="fine",
-        even=True,
-        variance_rate=1.5,
-        flux=True,
-        pilot="cells",
-    ),
-    Pass(
-        name="anchor_residual",
-        key="anchored",
-        stream="anchored",
-        tracer=lambda made: made.anchored,
-        unit_cost=1.6e-7,
-        grid="anchor_residual",
-        anchors="anchors",
-        even=True,
-        device="pays",
-        pilot="anchors",
-    ),
-    Pass(
-        name="penumbra",
-        key="occluded",
-        stream="occluded",
-        tracer=lambda made: made.anchored_occluded,
-        unit_cost=5e-7,
-        grid="penumbra",
-        anchors="occluded_anchors",
-        even=True,
-        pilot="occluded",
-    ),
-    Pass(
-        name="sharp",
-        stream="sharp",
-        tracer=lambda made: made.sharp,
-        unit_cost=3e-7,
-        grid="sharp",
-        even=True,
-        flux=True,
-        device="pays",
-    ),
-    Pass(
-        name="indirect",
-        stream="indirect",
-        tracer=lambda made: made.indirect,
-        unit_cost=1.2e-7,
-        grid="fine",
-        indirect_grid="indirect",
-        effects=FOLLOWED,
-        device="room",
-    ),
-    Pass(
-        name="from_camera",
-        stream="other",
-        tracer=lambda made: made.from_camera,
-        unit_cost=2e-7,
-        grid="fine",
-        indirect_grid="indirect",
-        effects=FOLLOWED,
-    ),
-    Pass(
-        name="indirect_residual",
-        key="followed",
-        stream="indirect at anchors",
-        tracer=lambda made: made.at_anchors[0],
-        unit_cost=1.3e-7,
-        grid="indirect_residual",
-        anchors="followed_anchors",
-        effects=FOLLOWED,
-        device="room",
-        pilot="followed",
-    ),
-    Pass(
-        name="camera_residual",
-        key="followed_from_camera",
-        stream="from camera at anchors",
-        tracer=lambda made: made.at_anchors[1],
-        unit_cost=1.3e-7,
-        grid="indirect_residual",
-        anchors="followed_anchors",
-        effects=FOLLOWED,
-        pilot="followed",
-    ),
-)
+    Pass("direct", "direct", lambda made: made.direct, 1.8e-7, "fine",
+         even=True, variance_rate=1.5, flux=True, pilot="cells"),
+    Pass("anchor_residual", "anchored", lambda made: made.anchored, 1.6e-7, "anchor_residual",
+         even=True, anchors="anchors", device="pays", pilot="anchors", key="anchored"),
+    Pass("penumbra", "occluded", lambda made: made.anchored_occluded, 5e-7, "penumbra",
+         even=True, anchors="occluded_anchors", pilot="occluded", key="occluded"),
+    Pass("sharp", "sharp", lambda made: made.sharp, 3e-7, "sharp",
+         even=True, flux=True, device="pays"),
+    Pass("indirect", "indirect", lambda made: made.indirect, 1.2e-7, "fine", "indirect",
+         effects=FOLLOWED, device="room"),
+    Pass("from_camera", "other", lambda made: made.from_camera, 2e-7, "fine", "indirect",
+         effects=FOLLOWED),
+    Pass("indirect_residual", "indirect at anchors", lambda made: made.at_anchors[0], 1.3e-7, "indirect_residual",
+         effects=FOLLOWED, anchors="followed_anchors", device="room", pilot="followed", key="followed"),
+    Pass("camera_residual", "from camera at anchors", lambda made: made.at_anchors[1], 1.3e-7, "indirect_residual",
+         effects=FOLLOWED, anchors="followed_anchors", pilot="followed", key="followed_from_camera"),
+)  # fmt: skip
 """In the order in which they are traced and their light is added up. Unit costs were chosen near what was measured of
 eight shipped scenes on two cores (plans at 1e-3, November 2026); only their ratios decide. Direct light takes half as
 much where one cell a pixel holds it, and more in many fine ones."""

@@ -13,11 +13,9 @@ from scipy import sparse
 from mitsim.bench.effects import Physics
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.devices.patterns import Lighting
-from mitsim.light.grids import GRIDS
-from mitsim.light.light_estimate import LightEstimate
-from mitsim.light.pass_table import PASSES, Pass
+from mitsim.light.grids import GRIDS, LightEstimate
+from mitsim.light.pass_table import PASSES, Pass, PassTracer, Tracers
 from mitsim.light.settings import LANES_AT_ONCE
-from mitsim.light.tracers import PassTracer, Tracers
 from mitsim.optics.frames import ClassFrames, ExpectedFrames, Filed
 from mitsim.transport.accumulator import DeviceSums, Ledger
 from mitsim.transport.direct import DirectTracer
@@ -190,7 +188,7 @@ class Simulation(Tracers):
 
     # ---- Frames
 
-    def filed(self, groups: Sequence[LightEstimate], first: int) -> tuple[list[Filed], list[Filed]]:
+    def with_optics(self, groups: Sequence[LightEstimate], first: int) -> tuple[list[Filed], list[Filed]]:
         """Light of the projector and ambient light, with the optics that form their frames.
 
         Parameters
@@ -211,7 +209,7 @@ class Simulation(Tracers):
         Parameters
         ----------
         groups, first
-            as for :meth:`filed`.
+            as for :meth:`with_optics`.
         bands
             of which it is, where not of all.
         """
@@ -276,14 +274,14 @@ def expected_of(
     Parameters
     ----------
     parts
-        simulations of one rig, each with the light that it filed; black pixels leak as the first says, glint is that of
-        the last.
+        simulations of one rig, each with the light that it accumulated; black pixels leak as the first says, glint is
+        that of the last.
     rows, lighting, seed, leaking, probed
         as for :meth:`Simulation.expected`.
     """
     light = emitted(parts[0][0].physics, lighting, leaking)
-    filed = [simulation.filed(groups, len(rows)) for simulation, groups in parts]
-    lights, ambient = ([each for part in filed for each in part[kind]] for kind in (0, 1))
+    formed = [simulation.with_optics(groups, len(rows)) for simulation, groups in parts]
+    lights, ambient = ([each for part in formed for each in part[kind]] for kind in (0, 1))
     glint = parts[-1][0].glint_frames(lighting.labels)
     return ExpectedFrames(lights, Lighting(rows, light), seed, ambient, glint, probed)
 

@@ -20,7 +20,7 @@ occluded pixels, and projector pixels a side of a cell for what the former see b
 _FEWEST_SAMPLES = 1e-3
 """Samples of light without noise: next to none, and above 0 because costs are ratios."""
 LOOKS = 4
-"""Independent looks of the pilot, the fewest whose spread tells a standard error worth its name."""
+"""Independent replicates of the pilot, the fewest whose spread tells a standard error worth its name."""
 SURE = 2.35
 """Standard errors from an estimate to its 95 % bound: Student's distribution with ``LOOKS`` - 1 degrees of freedom."""
 RASTER_RATE = 1.5
@@ -42,18 +42,18 @@ class Noise:
 
     @classmethod
     def among(cls, seen: FloatArray, light: float, samples: int, paths: FloatArray) -> Noise:
-        """Of one of several looks, by random paths of which few may be heavy.
+        """Of one of several replicates, by random paths of which few may be heavy.
 
         Parameters
         ----------
         seen
-            (looks, ...) frames.
+            (replicates, ...) frames.
         light
             norm of the frames of all light, which the error is relative to.
         samples
-            of a look.
+            of a replicate.
         paths
-            light that each path of all looks brought.
+            light that each path of all replicates brought.
         """
         energies = np.square(seen - seen.mean(axis=0)).reshape(len(seen), -1).sum(axis=1)
         mean = float(energies.mean())
@@ -74,16 +74,16 @@ class Noise:
 
 
 @dataclass(frozen=True)
-class Effort:
-    """What one kind of light takes: its noise relative to all light, paths in a sample, and seconds to trace and file a
-    path, 0 where nobody has timed it."""
+class SampleCost:
+    """What one kind of light takes: its noise relative to all light, paths in a sample, and seconds to trace and
+    accumulate a path, 0 where nobody has timed it."""
 
     noise: Noise
     paths: int
     seconds: float = 0.0
 
     @classmethod
-    def none(cls) -> Effort:
+    def none(cls) -> SampleCost:
         """Of light that there is none of."""
         return cls(Noise(0.0, 1, 0.5), 0)
 
@@ -103,16 +103,16 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Changes:
-    """What each part changes in the frames, as inner products between independent looks: the sum of any of them, with
-    its signs, without the looks' noise.
+    """What each part changes in the frames, as inner products between independent replicates: the sum of any of them,
+    with its signs, without the replicates' noise.
 
     Attributes
     ----------
     parts
         what was changed.
     products
-        (looks, looks, parts, parts) inner products of the changes, relative to the squared norm of all light; those of
-        a look with itself hold its noise, and are not used.
+        (replicates, replicates, parts, parts) inner products of the changes, relative to the squared norm of all light;
+        those of a replicate with itself hold its noise, and are not used.
     """
 
     parts: tuple[Part, ...]
@@ -120,7 +120,7 @@ class Changes:
 
     @classmethod
     def between(cls, seen: Mapping[Part, FloatArray], energy: float) -> Changes:
-        """Of changes (looks, ...) that were ``seen`` of frames whose squared norm is ``energy``."""
+        """Of changes (replicates, ...) that were ``seen`` of frames whose squared norm is ``energy``."""
         flat = np.array([change.reshape(LOOKS, -1) for change in seen.values()]).reshape(len(seen) * LOOKS, -1)
         with single_threaded_blas():  # sums of several threads depend on their number in the last bits
             pairs = (flat @ flat.T).reshape(len(seen), LOOKS, len(seen), LOOKS)
@@ -130,16 +130,16 @@ class Changes:
     def squared(self, chosen: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(m,) squared changes by m sums of parts and their standard errors, from ``chosen`` (m, parts) weights.
 
-        The mean product of two different looks, and its jackknife over looks.
+        The mean product of two different replicates, and its jackknife over replicates.
         """
-        looks = len(self.products)
-        pairs = np.zeros((looks, looks, len(chosen)))
-        for i, j in zip(*np.triu_indices(looks, 1), strict=True):
+        replicates = len(self.products)
+        pairs = np.zeros((replicates, replicates, len(chosen)))
+        for i, j in zip(*np.triu_indices(replicates, 1), strict=True):
             pairs[i, j] = np.einsum("mp,mp->m", chosen @ self.products[i, j], chosen)
-        total, kept = pairs.sum(axis=(0, 1)), looks * (looks - 1) / 2
+        total, kept = pairs.sum(axis=(0, 1)), replicates * (replicates - 1) / 2
         of_look = pairs.sum(axis=0) + pairs.sum(axis=1)
-        without = (total - of_look) / (kept - looks + 1)
-        spread = np.sqrt((looks - 1) * np.square(without - without.mean(axis=0)).mean(axis=0))
+        without = (total - of_look) / (kept - replicates + 1)
+        spread = np.sqrt((replicates - 1) * np.square(without - without.mean(axis=0)).mean(axis=0))
         return total / kept, spread
 
     def estimate(self, parts: Collection[Part]) -> Estimate:
@@ -217,7 +217,7 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a short look at the scene measured (:mod:`mitsim.planner.pilot`); all errors are relative.
+    """What a short replicate at the scene measured (:mod:`mitsim.planner.pilot`); all errors are relative.
 
     Attributes
     ----------
@@ -226,7 +226,7 @@ class Evidence:
     changes
         of the frames by each effect that the bench has when it is left out, by each number of anchors, layers and
         cells that was tried, and by one coarse cell a pixel, or one layer, for light that lies in coarse cells.
-    efforts
+    sample_costs
         what each pass takes, by its name (:mod:`mitsim.light.pass_table`); of light at anchors: paths to one of them.
     spread
         what direct light takes that goes to random points of the sensor, and not to its centre.
@@ -256,8 +256,8 @@ class Evidence:
     depth: float
     layers: Mapping[int, tuple[float, ...]]
     changes: Changes
-    efforts: Mapping[str, Effort]
-    spread: Effort
+    sample_costs: Mapping[str, SampleCost]
+    spread: SampleCost
     forming: Forming
     apart: Mapping[str, float] = field(default_factory=dict)
     unresolved: float = 0.0
@@ -272,9 +272,9 @@ class Evidence:
     raster: tuple[Drawn, Drawn] = (Drawn(), Drawn())
     hits: float = math.inf
 
-    def with_efforts(self, found: Mapping[str, Effort]) -> Evidence:
+    def with_sample_costs(self, found: Mapping[str, SampleCost]) -> Evidence:
         """The same, where some passes take what was ``found``."""
-        return replace(self, efforts={**self.efforts, **found})
+        return replace(self, sample_costs={**self.sample_costs, **found})
 
     def forms(self, waves: bool) -> tuple[int, ...]:
         """Raster cells along a pixel that frames may be formed of, 0 for a sum of terms; with ``waves`` or not."""

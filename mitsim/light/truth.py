@@ -199,8 +199,8 @@ def _allotted(likely: FloatArray, samples: IntArray, first: int, part: float, mo
     gain, cost = (1 - 2.0**-_RATE) * left, samples[:, None] * 2.0**doublings
     best = np.argsort(-(gain / cost), axis=None, kind="stable")
     enough = int(np.searchsorted(np.cumsum(gain.ravel()[best]), (1 - part) * left[:, 0].sum())) + 1
-    affordable = int(np.searchsorted(np.cumsum(cost.ravel()[best]), most - samples.sum(), side="right"))
-    made = np.bincount(best[: min(enough, affordable)] // _DOUBLINGS, minlength=len(likely))
+    accuracy_for_time = int(np.searchsorted(np.cumsum(cost.ravel()[best]), most - samples.sum(), side="right"))
+    made = np.bincount(best[: min(enough, accuracy_for_time)] // _DOUBLINGS, minlength=len(likely))
     return np.asarray(samples << np.minimum(made, _AT_ONCE))
 
 

@@ -23,19 +23,19 @@ from mitsim.core.arrays import FloatArray
 from mitsim.light.cost_model import (
     FIXED,
     Numbers,
+    accumulation_seconds,
     checking_seconds,
-    efforts,
+    costly_effects,
     entries,
-    filing_seconds,
     in_waves,
     optics_seconds,
-    priced,
+    sample_costs,
     tells_all,
     traced_for,
     truth_seconds,
 )
 from mitsim.light.pass_table import FOLLOWED, PASSES
-from mitsim.light.pilot_result import COUNTED, SURE, Effort, Evidence, Part
+from mitsim.light.pilot_result import COUNTED, SURE, Evidence, Part, SampleCost
 from mitsim.light.settings import GROUPS, Estimate, Number, Settings
 from mitsim.optics.frames import bound_over_error
 
@@ -43,7 +43,8 @@ _MARGIN = 0.95
 """Part of the accuracy that is planned for: frames that the pilot looks at differ from all by a few percent, and so do
 shots whose error is seen, where it is not that of all."""
 _MOST_ENTRIES = 2.0**25
-"""Entries of one group's filed light beyond which settings are not chosen: 12 GB in all (`mitsim.planner.memory`)."""
+"""Entries of one group's accumulated light beyond which settings are not chosen: 12 GB in all
+(`mitsim.planner.memory`)."""
 _LUCKY = -1.0
 """Standard errors below an estimate at which what keeps no accuracy for certain may still keep it: one case in six."""
 _AS_GOOD = 1.1
@@ -65,7 +66,7 @@ _SETTLED = 8
 
 
 @dataclass(frozen=True)
-class Choice:
+class Candidate:
     """Settings, and what they are predicted to leave and to take.
 
     Attributes
@@ -81,7 +82,7 @@ class Choice:
     fits
         whether the total is within the accuracy, but for what nothing could make up for.
     work
-        seconds at fixed paces.
+        seconds at fixed unit costs.
     """
 
     settings: Settings
@@ -105,7 +106,7 @@ def parts_of(evidence: Evidence, settings: Settings) -> frozenset[Part]:
     return frozenset(chain((Part(*count) for count in counts), off))
 
 
-def cheapest(accuracy: float, evidence: Evidence, switches: Mapping[str, bool], sure: float = SURE) -> Choice:
+def cheapest(accuracy: float, evidence: Evidence, switches: Mapping[str, bool], sure: float = SURE) -> Candidate:
     """The choice of least work whose predicted total error is below ``accuracy``; failing that, of least error.
 
     What the user switched off, and light that is known to be missing, does not count for that: nothing could make up
@@ -123,7 +124,7 @@ def cheapest(accuracy: float, evidence: Evidence, switches: Mapping[str, bool], 
         standard errors that are added to an estimate.
     """
     table, index = Candidates(evidence, switches, sure).best(accuracy)
-    return table.choice(index)
+    return table.candidate(index)
 
 
 class Candidates:
@@ -156,7 +157,7 @@ class Candidates:
         return min(found, key=lambda each: each[0].rank(each[1]))
 
     def seconds(self, accuracy: float) -> tuple[float, bool]:
-        """Seconds at fixed paces of that choice and of its truth, and whether it keeps the ``accuracy``."""
+        """Seconds at fixed unit costs of that choice and of its truth, and whether it keeps the ``accuracy``."""
         table, index = self.best(accuracy)
         truth = truth_seconds(self.evidence, table.settings(index), FIXED)
         return float(table.work[index]) + truth, bool(table.fits[index])
@@ -164,7 +165,7 @@ class Candidates:
 
 def predicted(
     accuracy: float, evidence: Evidence, settings: Settings, switches: Mapping[str, bool], sure: float = SURE
-) -> Choice:
+) -> Candidate:
     """What ``settings`` leave and take with samples of their own for the rest of the budget.
 
     Parameters
@@ -174,7 +175,7 @@ def predicted(
     settings
         effects and numbers.
     """
-    return _table_of(accuracy, evidence, settings, switches, sure).choice(0)
+    return _table_of(accuracy, evidence, settings, switches, sure).candidate(0)
 
 
 def _table_of(
@@ -187,7 +188,7 @@ def _table_of(
     return _Table(accuracy, evidence, (settings.effects, cells), row, _given(switches), sure)
 
 
-def doubt(accuracy: float, evidence: Evidence, switches: Mapping[str, bool]) -> tuple[float, Part]:
+def value_of_refining(accuracy: float, evidence: Evidence, switches: Mapping[str, bool]) -> tuple[float, Part]:
     """Work that knowing the evidence for certain could save, and the part that is known worst.
 
     Parameters
@@ -202,6 +203,9 @@ def doubt(accuracy: float, evidence: Evidence, switches: Mapping[str, bool]) -> 
         return careful.work - hopeful.work, worst
     lucky = cheapest(accuracy, evidence, switches, _LUCKY)
     return lucky.work if lucky.fits else 0.0, worst
+
+
+# -------- Predictions of many candidates
 
 
 class _Table:
@@ -285,12 +289,13 @@ class _Table:
             raster_cells=self.raster_cells,
         )
 
-    def choice(self, index: int) -> Choice:
+    def candidate(self, index: int) -> Candidate:
         """The choice of a row."""
+        evidence = self.evidence
         lacking = {
-            "light over sharp lobes": self.evidence.unresolved,
-            "light over mirrors or curved glass both ways, or once and a sharp lobe (left out)": self.evidence.left_out,
-            "light over small mirrors alone (not resolved)": self.evidence.glint,
+            "light over sharp lobes": evidence.unresolved,
+            "light over mirrors or curved glass both ways, or once and a sharp lobe (left out)": evidence.left_out,
+            "light over small mirrors alone (not resolved)": evidence.glint,
         }
         missing = min(sum(lacking.values()), 1.0)
         # Errors of the light that is there count for its part of all.
@@ -299,7 +304,7 @@ class _Table:
             one_hit = 1 / (self.evidence.hits * float(self.samples["direct"][index]))
             rest = [math.hypot(error, hits * one_hit) for error, hits in zip(rest, _OFF_BY_HITS, strict=True)]
         value, bound = (missing + (1 - missing) * error for error in rest)
-        return Choice(
+        return Candidate(
             settings=self.settings(index),
             systematic=Estimate(value, bound),
             lacking=lacking,
@@ -381,12 +386,12 @@ class _Table:
         )
 
     @cached_property
-    def _prices(self) -> dict[str, Number]:
+    def _work_of_sample(self) -> dict[str, Number]:
         """(m,) work of one sample in every group, by kind of light."""
         lines = traced_for(self.evidence.forming.lines, self.evidence.forming.parted)
         return {
-            name: lines * GROUPS * FIXED.passes[name] * effort.paths * PASSES[name].connections(self.numbers)
-            for name, effort in efforts(self.evidence, self.effects).items()
+            name: lines * GROUPS * FIXED.passes[name] * sample_cost.paths * PASSES[name].connections(self.numbers)
+            for name, sample_cost in sample_costs(self.evidence, self.effects).items()
         }
 
     @cached_property
@@ -397,12 +402,12 @@ class _Table:
     @cached_property
     def needed(self) -> dict[str, FloatArray]:
         """(m,) samples of a group by kind of light, or the part of one: the least work for a sum of variances."""
-        parts = {name: np.sqrt(self._by_row(name, _variance) * price) for name, price in self._prices.items()}
+        parts = {name: np.sqrt(self._by_row(name, _variance) * price) for name, price in self._work_of_sample.items()}
         every = sum(parts.values()) + np.zeros(len(self.rows))
         single = self.target * math.sqrt(GROUPS) / _BOUND_OVER_ERROR
         found = {}
         for name, part in parts.items():
-            # SampledLight without noise takes no share; a share of one keeps the division defined.
+            # Light without noise takes no share; a share of one keeps the division defined.
             share = np.sqrt(np.divide(part, every, out=np.ones(len(every)), where=part > 0))
             needed = self._by_row(name, partial(_needed, target=single * share))
             if name == "direct":
@@ -420,36 +425,36 @@ class _Table:
             total = total + (PASSES[name].connections(self.numbers) > 0) * np.square(left) / GROUPS
         return np.sqrt(total)
 
-    def _by_row(self, name: str, of: Callable[[Effort], Number]) -> FloatArray:
+    def _by_row(self, name: str, of: Callable[[SampleCost], Number]) -> FloatArray:
         """(m,) something ``of`` the light ``name``: where there are several anchors, direct light goes to random points
         of the sensor."""
-        found = of(efforts(self.evidence, self.effects)[name]) + np.zeros(len(self.rows))
+        found = of(sample_costs(self.evidence, self.effects)[name]) + np.zeros(len(self.rows))
         if name == "direct":
             found = np.where(self.rows[:, 0] > 1, of(self.evidence.spread), found)
         return np.asarray(found)
 
     @cached_property
     def _entries(self) -> FloatArray:
-        """(m,) of one group's filed light."""
-        pixels, classes = self.evidence.efforts["direct"].paths, self.evidence.forming.classes
+        """(m,) of one group's accumulated light."""
+        pixels, classes = self.evidence.sample_costs["direct"].paths, self.evidence.forming.classes
         found = entries(pixels, classes, self.numbers, self.samples)
         return np.asarray(found) + np.zeros(len(self.rows))
 
     @cached_property
     def work(self) -> FloatArray:
-        """(m,) seconds at fixed paces."""
-        tracing = sum(self.samples[name] * price for name, price in self._prices.items())
+        """(m,) seconds at fixed unit costs."""
+        tracing = sum(self.samples[name] * price for name, price in self._work_of_sample.items())
         forming = self.evidence.forming
-        filing = filing_seconds(forming, self.numbers, self._entries, FIXED)
+        accumulating = accumulation_seconds(forming, self.numbers, self._entries, FIXED)
         shown = optics_seconds(forming, self.numbers, FIXED) + checking_seconds(forming, self.numbers, FIXED)
-        return np.asarray(tracing + filing + shown)
+        return np.asarray(tracing + accumulating + shown)
 
 
-def _variance(kind: Effort) -> Number:
+def _variance(kind: SampleCost) -> Number:
     return kind.variance
 
 
-def _needed(kind: Effort, target: Number) -> Number:
+def _needed(kind: SampleCost, target: Number) -> Number:
     """Samples at which sampling may stop at a ``target``: by a bound, which lies the further above the error the fewer
     paths make it."""
     noise = kind.noise
@@ -461,7 +466,7 @@ def _needed(kind: Effort, target: Number) -> Number:
     return needed
 
 
-def _left(kind: Effort, samples: Number) -> Number:
+def _left(kind: SampleCost, samples: Number) -> Number:
     return kind.noise.left(samples)
 
 
@@ -493,7 +498,7 @@ def _given(switches: Mapping[str, bool]) -> frozenset[Part]:
 
 def _subsets(evidence: Evidence, switches: Mapping[str, bool]) -> Iterator[frozenset[str]]:
     """Effects that may be on together: those that take no time always are, unless the user switches them off."""
-    takes_time, present = priced(), frozenset(evidence.effects)
+    takes_time, present = costly_effects(), frozenset(evidence.effects)
     free = [name for name in EFFECTS if name in takes_time & present and name not in switches]
     always = {name for name in EFFECTS if switches.get(name, name in present - takes_time)}
     for several in chain.from_iterable(combinations(free, count) for count in range(len(free) + 1)):
@@ -502,7 +507,7 @@ def _subsets(evidence: Evidence, switches: Mapping[str, bool]) -> Iterator[froze
 
 # -------- The finest accuracy that a time buys
 
-FIRST_LOOK = 1e-3
+FIRST_ACCURACY = 1e-3
 """Accuracy of the look that tells what accuracies cost: a looser one takes as long."""
 _STEPS, _DECADES = 10, 5
 """Accuracies a decade: neighbours differ by a quarter, as predictions of time are good to. The finest, 1e-5, is
@@ -510,8 +515,9 @@ a thirtieth of what sensors tell, and ladders of anchors and cells end near it."
 
 
 @dataclass(frozen=True)
-class Affordable:
-    """An ``accuracy``, the ``seconds`` that its run is predicted to take at fixed paces, and whether that ``fits``."""
+class AccuracyForTime:
+    """An ``accuracy``, the ``seconds`` that its run is predicted to take at fixed unit costs, and whether that
+    ``fits``."""
 
     accuracy: float
     seconds: float
@@ -524,7 +530,7 @@ def accuracies(finest: float) -> list[float]:
     return [HIGHEST_ACCURACY, *(each for each in steps if finest <= each < HIGHEST_ACCURACY)]
 
 
-def affordable(candidates: Candidates, seconds: float, finest: float, kept: bool = True) -> Affordable:
+def accuracy_for_time(candidates: Candidates, seconds: float, finest: float, kept: bool = True) -> AccuracyForTime:
     """The finest accuracy whose light, frames and truth take at most so many seconds; the loosest where none does.
 
     Parameters
@@ -539,15 +545,15 @@ def affordable(candidates: Candidates, seconds: float, finest: float, kept: bool
         whether the choice must be predicted to keep the accuracy; else only its price counts.
     """
 
-    def tried(accuracy: float) -> Affordable:
+    def tried(accuracy: float) -> AccuracyForTime:
         taken, keeps = candidates.seconds(accuracy)
-        return Affordable(accuracy, taken, taken <= seconds and (keeps or not kept))
+        return AccuracyForTime(accuracy, taken, taken <= seconds and (keeps or not kept))
 
     grid = accuracies(finest)
     best, too_fine = tried(grid[0]), len(grid)
     if not best.fits:
         # What keeps no accuracy at all is for the plan to say; here only time counts.
-        return Affordable(best.accuracy, best.seconds, best.seconds <= seconds)
+        return AccuracyForTime(best.accuracy, best.seconds, best.seconds <= seconds)
     coarse = 0
     while too_fine - coarse > 1:
         middle = (coarse + too_fine) // 2
@@ -559,7 +565,7 @@ def affordable(candidates: Candidates, seconds: float, finest: float, kept: bool
     return best
 
 
-def told(found: Affordable, seconds: float, around: float) -> Iterator[str]:
+def time_warnings(found: AccuracyForTime, seconds: float, around: float) -> Iterator[str]:
     """Why a plan is flagged: more time was needed than was given.
 
     Parameters

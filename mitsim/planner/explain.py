@@ -18,19 +18,20 @@ from mitsim.bench.request import check_accuracy
 from mitsim.light.cost_model import (
     Numbers,
     UnitCosts,
+    accumulation_seconds,
     checking_seconds,
+    costly_effects,
     entries,
-    filing_seconds,
     optics_seconds,
-    priced,
     tracing_seconds,
     truth_seconds,
     unit_costs_of,
 )
+from mitsim.light.pass_table import FOLLOWED
 from mitsim.light.pilot_result import Evidence
 from mitsim.light.plan import Plan, PlanRow, State
 from mitsim.light.settings import Estimate, Settings
-from mitsim.planner.choose import Choice, cheapest, predicted
+from mitsim.planner.choose import Candidate, cheapest, predicted
 from mitsim.transport.missed import polished_shapes
 
 if TYPE_CHECKING:
@@ -44,8 +45,8 @@ _GREY = "no surface differs by wavelength; the mask's shadow is the mean over al
 _FEW_WAVELENGTHS = 2
 """Mean width of a mask's openings below which scalar waves, and shadows, are a guess: half the openings of codes and of
 random masks are one feature, which is half the mean and a wavelength then."""
-_TOLD = 2.0
-"""An estimate whose bound is above this much of it is told as a bound."""
+_VAGUE = 2.0
+"""An estimate whose bound is above this much of it is reported as a bound."""
 
 
 @dataclass(frozen=True)
@@ -78,47 +79,50 @@ class SceneFacts:
     @classmethod
     def of(cls, bench: Apparatus, switches: Mapping[str, bool] | None = None) -> SceneFacts:
         """The facts of ``bench``, without what effects that the user's ``switches`` put out would bring."""
-        geometry, warnings = bench.geometry, [*known_losses(bench.loaded, switches or {})]
-        if bench.field_stop_cuts:
-            warnings.append(
-                "the field stop (fov) cuts into the projector's window for part of the sensor; its edge is blurred "
-                "over the anchors, so open it or accept an error there"
-            )
-        if geometry.wall_shift_features >= 1:
-            warnings.append(
-                f"mask_thickness {geometry.mask_thickness} mm shifts the far face by "
-                f"{geometry.wall_shift_features:.1f} features at the field stop; the two-face model holds below 1"
-            )
-        plate = geometry.mask_plate
-        if (
-            not geometry.diffracts
-            and not (plate and plate.irradiance)
-            and (switches or {}).get("diffraction") is not False
-        ):
-            warnings.append(
-                "diffraction is left out: behind blurred edges it is worked out for masks of one separable term, and "
-                f"this one ({geometry.mask_words}) has more; --effects=-diffraction says that a geometric shadow is "
-                "meant"
-            )
-        waves = geometry.diffracts and (switches or {}).get("diffraction") is not False
-        if geometry.tilt_left_out(waves) or (any(geometry.mask_tilt) and bench.loaded.mirrors):
-            whose = "" if geometry.tilt_left_out(waves) else " of light over mirrors"
-            warnings.append(
-                f"the mask's tilt is left out{whose}: it moves shadows by up to {geometry.tilt_shift_mm * 1e3:.2g} um; "
-                "render --estimator reference has it, or set it to 0 in the camera's [mask]"
-            )
-        longest, opening = float(bench.spectrum.wavelengths_nm.max()), geometry.build_mask().opening_mm
-        if opening * 1e6 < _FEW_WAVELENGTHS * longest and not (plate and plate.irradiance):
-            warnings.append(
-                f"mask_feature {geometry.mask_feature:g} mm: the mask's openings are {opening:.3g} mm wide, less than "
-                f"{_FEW_WAVELENGTHS} wavelengths of {longest:.0f} nm; scalar theory of masks needs wider ones, so the "
-                "shadow is a guess"
-            )
+        loaded, off = bench.loaded, {name for name, on in (switches or {}).items() if not on}
+        warnings = (*known_losses(loaded, switches or {}), *_limits(bench, waves="diffraction" not in off))
         notes = {name: effect.note(bench) for name, effect in EFFECTS.items()}
-        loaded = bench.loaded
         polished = polished_shapes(loaded.scene) if loaded.mirrors and loaded.shapes else ()
         mirrors = tuple(loaded.shapes[number] for number in polished)
-        return cls(notes, loaded.pixels.keystone, tuple(warnings), loaded.shapes, mirrors, _spectrum(bench))
+        return cls(notes, loaded.pixels.keystone, warnings, loaded.shapes, mirrors, _spectrum(bench))
+
+
+def _limits(bench: Apparatus, waves: bool) -> Iterator[str]:
+    """What the model of a ``bench``'s devices does not cover, where diffraction is simulated or not."""
+    geometry = bench.geometry
+    if bench.field_stop_cuts:
+        yield (
+            "the field stop (fov) cuts into the projector's window for part of the sensor; its edge is blurred over "
+            "the anchors, so open it or accept an error there"
+        )
+    if geometry.wall_shift_features >= 1:
+        yield (
+            f"mask_thickness {geometry.mask_thickness} mm shifts the far face by {geometry.wall_shift_features:.1f} "
+            "features at the field stop; the two-face model holds below 1"
+        )
+    of_light = bool(geometry.mask_plate and geometry.mask_plate.irradiance)
+    if not geometry.diffracts and not of_light and waves:
+        yield (
+            "diffraction is left out: behind blurred edges it is worked out for masks of one separable term, and this "
+            f"one ({geometry.mask_words}) has more; --effects=-diffraction says that a geometric shadow is meant"
+        )
+    left_out = geometry.tilt_left_out(geometry.diffracts and waves)
+    if left_out or (any(geometry.mask_tilt) and bench.loaded.mirrors):
+        yield (
+            f"the mask's tilt is left out{'' if left_out else ' of light over mirrors'}: it moves shadows by up to "
+            f"{geometry.tilt_shift_mm * 1e3:.2g} um; render --estimator reference has it, or set it to 0 in the "
+            "camera's [mask]"
+        )
+    longest, opening = float(bench.spectrum.wavelengths_nm.max()), geometry.build_mask().opening_mm
+    if opening * 1e6 < _FEW_WAVELENGTHS * longest and not of_light:
+        yield (
+            f"mask_feature {geometry.mask_feature:g} mm: the mask's openings are {opening:.3g} mm wide, less than "
+            f"{_FEW_WAVELENGTHS} wavelengths of {longest:.0f} nm; scalar theory of masks needs wider ones, so the "
+            "shadow is a guess"
+        )
+
+
+# -------- A plan, and what it says of its choice
 
 
 def decide(
@@ -126,7 +130,7 @@ def decide(
     evidence: Evidence,
     facts: SceneFacts,
     switches: Mapping[str, bool] | None = None,
-    chosen: Choice | None = None,
+    chosen: Candidate | None = None,
 ) -> Plan:
     """Choose effects, anchors, layers, cells and samples.
 
@@ -165,10 +169,10 @@ def _stages(evidence: Evidence, settings: Settings, costs: UnitCosts) -> dict[st
     """Seconds of transport, truth and optics."""
     forming, numbers = evidence.forming, Numbers.of(settings)
     tracing = tracing_seconds(evidence, settings, costs)
-    filed = entries(evidence.efforts["direct"].paths, forming.classes, numbers, settings)
+    held = entries(evidence.sample_costs["direct"].paths, forming.classes, numbers, settings)
     return {
         "transport": sum(tracing.values())
-        + float(filing_seconds(forming, numbers, filed, costs))
+        + float(accumulation_seconds(forming, numbers, held, costs))
         + float(checking_seconds(forming, numbers, costs)),
         "truth": truth_seconds(evidence, settings, costs),
         "optics": float(optics_seconds(forming, numbers, costs)),
@@ -181,7 +185,7 @@ class _Words:
 
     accuracy: float
     evidence: Evidence
-    chosen: Choice
+    chosen: Candidate
     facts: SceneFacts
     switches: Mapping[str, bool]
 
@@ -221,18 +225,18 @@ class _Words:
         kinds = Counter(str(mirror.attributes.get("type", "shape")) for mirror in mirrors)
         among = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
         rule = (
-            f"{self.evidence.glint:.2g} of the light comes over the scene's mirrors and curved glass alone ({among}; "
-            "this is the first), in beams too fine to be placed on the sensor: it is left out, or in the wrong pixels; "
-            "use fewer or larger ones, move them apart, or make them rough"
+            f"{self.evidence.glint:.2g} of the light comes over the scene's mirrors and curved glass alone "
+            f"({among}; this is the first), in beams too fine to be placed on the sensor: it is left out, or in the "
+            "wrong pixels; use fewer or larger ones, move them apart, or make them rough"
         )
         return str(mirrors[0].refusal("shape", repr(mirrors[0].attributes.get("type", "")), rule))
 
     def _left_out(self, mirror: Tag) -> str:
         """What is lost over a ``mirror`` or curved glass."""
         rule = (
-            f"{self.evidence.left_out:.2g} of the light comes over it and, besides, a mirror, curved glass or a sharp "
-            "lobe, where paths find it never or too seldom, so all or most of it is left out of the frames; turn it "
-            "away, make it rough, or give the projector a lens (aperture_radius_mm) with the effect interreflection"
+            f"{self.evidence.left_out:.2g} of the light comes over it and, besides, a mirror, curved glass or a "
+            "sharp lobe, where paths find it never or too seldom, so all or most of it is left out of the frames; turn "
+            "it away, make it rough, or give the projector a lens (aperture_radius_mm) with the effect interreflection"
         )
         return str(mirror.refusal("shape", repr(mirror.attributes.get("type", "")), rule))
 
@@ -274,60 +278,54 @@ class _Words:
         return math.hypot(other.systematic.bound, self.chosen.noise)
 
     def _anchors(self) -> PlanRow:
-        anchors, one = self.chosen.settings.anchors, self._number("anchors", 1)
-        if anchors == 1:
-            reason = f"falloff, gloss and parallax over the sensor: one anchor leaves {_said(one)}"
-            return PlanRow("anchors", "off", reason, one.value, 0.0)
-        left = _said(self._number("anchors", anchors))
-        reason = f"falloff, gloss and parallax: {anchors}x{anchors} anchors leave {left}, one {_said(one)}"
-        return PlanRow("anchors", "approximate", reason, one.value, self._seconds(anchors=1, occluded_anchors=1))
+        side = self.chosen.settings.anchors
+        alone, several = "falloff, gloss and parallax over the sensor: one anchor", "falloff, gloss and parallax"
+        seconds = self._seconds(anchors=1, occluded_anchors=1)
+        return self._row_of_anchors("anchors", alone, f"{several}: {side}x{side} anchors", seconds)
 
     def _layers(self) -> PlanRow:
         depths, one = self.chosen.settings.depths, self._number("layers", 1)
         if len(depths) == 1:
-            reason = f"the light is seen at {self.evidence.depth:.1f} mm; one layer leaves {_said(one)}"
+            reason = f"the light is seen at {self.evidence.depth:.1f} mm; one layer leaves {_error_words(one)}"
             return PlanRow("layers", "off", reason, one.value, 0.0)
-        left = _said(self._number("layers", len(depths)))
+        left = _error_words(self._number("layers", len(depths)))
         reason = f"the light is seen from {depths[-1]:.0f} to {depths[0]:.0f} mm; {len(depths)} layers leave {left}"
-        return PlanRow("layers", "approximate", f"{reason}, one {_said(one)}", one.value, self._seconds(layers=()))
+        return PlanRow(
+            "layers", "approximate", f"{reason}, one {_error_words(one)}", one.value, self._seconds(layers=())
+        )
 
     def _cells(self) -> PlanRow:
         cells, errors = self.chosen.settings.subdivision, self.evidence.ladders["cells"]
-        reason = f"{cells}x{cells} cells of even light a projector pixel leave {_said(errors[cells])}"
+        reason = f"{cells}x{cells} cells of even light a projector pixel leave {_error_words(errors[cells])}"
         return PlanRow("cells", "approximate", reason, max(error.value for error in errors.values()), 0.0)
 
     def _followed_anchors(self) -> PlanRow:
-        name, anchors, one = (
-            "followed-anchors",
-            self.chosen.settings.followed_anchors,
-            self._number("followed_anchors", 1),
-        )
-        if not any(effect.followed and effect.name in self.chosen.settings.effects for effect in EFFECTS.values()):
-            return PlanRow(name, "off", "no light over several surfaces, in mirrors or of lamps is followed", 0.0, 0.0)
-        if anchors == 1:
-            reason = f"light over several surfaces, in mirrors and of lamps: one point leaves {_said(one)}"
-            return PlanRow(name, "off", reason, one.value, 0.0)
-        left, width = _said(self._number("followed_anchors", anchors)), self.chosen.settings.followed_width
-        cells = f" in cells of {width}x{width} pixels" if width > 1 else ""
-        reason = f"light over several surfaces, in mirrors and of lamps: {anchors}x{anchors}{cells} leave {left}, one "
-        return PlanRow(name, "approximate", reason + _said(one), one.value, self._seconds(followed_anchors=1))
+        settings, light = self.chosen.settings, "light over several surfaces, in mirrors and of lamps"
+        if not settings.effects & FOLLOWED:
+            reason = "no light over several surfaces, in mirrors or of lamps is followed"
+            return PlanRow("followed-anchors", "off", reason, 0.0, 0.0)
+        side, width = settings.followed_anchors, settings.followed_width
+        several = f"{light}: {side}x{side}{f' in cells of {width}x{width} pixels' if width > 1 else ''}"
+        seconds = self._seconds(followed_anchors=1)
+        return self._row_of_anchors("followed_anchors", f"{light}: one point", several, seconds)
 
     def _occluded_anchors(self) -> PlanRow:
-        name, anchors, pixels = (
-            "occluded-anchors",
-            self.chosen.settings.occluded_anchors,
-            len(self.evidence.occluded),
-        )
-        one = self._number("occluded_anchors", 1)
+        pixels, side = len(self.evidence.occluded), self.chosen.settings.occluded_anchors
         if not pixels:
-            return PlanRow(name, "off", "few anchors serve all projector pixels", 0.0, 0.0)
-        reason = f"{pixels} projector pixels are hidden from part of the sensor"
-        if anchors == 1:
-            return PlanRow(name, "off", f"{reason}: one anchor leaves {_said(one)}", one.value, 0.0)
-        left = _said(self._number("occluded_anchors", anchors))
-        reason = f"{reason}: {anchors}x{anchors} anchors leave {left}, one {_said(one)}"
+            return PlanRow("occluded-anchors", "off", "few anchors serve all projector pixels", 0.0, 0.0)
+        hidden = f"{pixels} projector pixels are hidden from part of the sensor"
         # To see them apart saves time: with as many anchors for all pixels, it would take far more.
-        return PlanRow(name, "approximate", reason, one.value, 0.0)
+        return self._row_of_anchors(
+            "occluded_anchors", f"{hidden}: one anchor", f"{hidden}: {side}x{side} anchors", 0.0
+        )
+
+    def _row_of_anchors(self, count: str, alone: str, several: str, seconds: float) -> PlanRow:
+        """Of the setting ``count``, in words for one and for ``several``."""
+        name, one = count.replace("_", "-"), self._number(count, 1)
+        if (chosen := getattr(self.chosen.settings, count)) == 1:
+            return PlanRow(name, "off", f"{alone} leaves {_error_words(one)}", one.value, 0.0)
+        reason = f"{several} leave {_error_words(self._number(count, chosen))}, one {_error_words(one)}"
+        return PlanRow(name, "approximate", reason, one.value, seconds)
 
     @property
     def _waves(self) -> bool:
@@ -350,23 +348,21 @@ class _Words:
             formed = replace(settings, raster=cells > 0, raster_cells=cells)
             return _stages(self.evidence, formed, costs)["optics"]
 
-        fewest = drawn.cells[0]
+        fewest, leaves = drawn.cells[0], _error_words(left)
         cells = settings.raster_cells or fewest
         on_raster, by_fft = f"on a raster of {cells} cells a pixel", seconds(cells)
         if drawn.needed:
-            reason = f"the mask's shadow is drawn {on_raster}, and frames are formed by FFT: that leaves {_said(left)}"
+            reason = f"the mask's shadow is drawn {on_raster}, and frames are formed by FFT: that leaves {leaves}"
             if cells == fewest or drawn.error is None:
                 return (PlanRow("mask-shadow", "approximate", reason, None, 0.0),)
-            reason += f", {fewest} {_said(drawn.error)}"
+            reason += f", {fewest} {_error_words(drawn.error)}"
             return (PlanRow("mask-shadow", "approximate", reason, None, max(by_fft - seconds(fewest), 0.0)),)
         sums = seconds(0)
         terms = f"{forming.geometric_terms:.0f} separable terms"
         if settings.raster:
-            reason = (
-                f"{terms}: by FFT {on_raster}, {by_fft:.2g} s, which leaves {_said(left)}; their sum takes {sums:.2g} s"
-            )
+            reason = f"{terms}: by FFT {on_raster}, {by_fft:.2g} s, which leaves {leaves}; their sum takes {sums:.2g} s"
             return (PlanRow("mask-shadow", "approximate", reason, 0.0, max(by_fft, 0.0)),)
-        reason = f"{terms} are summed, {sums:.2g} s; by FFT {on_raster}, {by_fft:.2g} s, {_said(left)} would be left"
+        reason = f"{terms} are summed, {sums:.2g} s; by FFT {on_raster}, {by_fft:.2g} s, {leaves} would be left"
         return (PlanRow("mask-shadow", "exact", reason, left.value, sums),)
 
     def _effect(self, effect: Effect) -> PlanRow:
@@ -377,8 +373,8 @@ class _Words:
         if error is None:
             return PlanRow(name, state, effect.absent or "nothing in the scene calls for it", 0.0, 0.0)
         said = [self.facts.notes.get(name, ""), "switched by the user" if name in self.switches else ""]
-        said.append(f"left out, the frames change by {_said(error)}")
-        takes_time = name in priced()
+        said.append(f"left out, the frames change by {_error_words(error)}")
+        takes_time = name in costly_effects()
         if on and name not in self.switches:
             less = replace(settings, effects=settings.effects - {name})
             said.append(self._without(less) if takes_time else "it takes no time")
@@ -386,11 +382,11 @@ class _Words:
         return PlanRow(name, state, "; ".join(filter(None, said)), error.value, seconds)
 
 
-def _said(error: Estimate) -> str:
+def _error_words(error: Estimate) -> str:
     """An error as people read it: below its bound where it cannot be told from none."""
     if error.bound == 0:
         return "0"
-    return f"{error.value:.1e}" if error.bound < _TOLD * error.value else f"less than {error.bound:.1e}"
+    return f"{error.value:.1e}" if error.bound < _VAGUE * error.value else f"less than {error.bound:.1e}"
 
 
 def _spectrum(bench: Apparatus) -> PlanRow:

@@ -7,12 +7,14 @@ import math
 from mitsim.bench.bench import Apparatus
 from mitsim.bench.effects import names
 from mitsim.core.resources import Cost, workers
+from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.patterns import Lighting
-from mitsim.devices.plate import FEW
+from mitsim.devices.plate import FEW, Plate
+from mitsim.devices.projector import Spectrum
 from mitsim.light.cost_model import Numbers, entries
-from mitsim.light.drawing_cost import raster_bytes
 from mitsim.light.passes import Simulation
 from mitsim.light.settings import GROUPS, Settings
+from mitsim.optics.fft_shadow import cells_a_side, cells_per_pixel, points_per_cell
 from mitsim.optics.frames import PROBES, frames_in_memory
 
 _LANES_BYTES = 380e6
@@ -24,10 +26,11 @@ _ENTRY_BYTES = 45.0
 """An entry of a sparse matrix of light (12), the sum that it is added to, and what frames are formed of; measured 32 to
 45 where matrices are large."""
 _DEPOSIT_BYTES = 500.0
-"""A path's light while it is filed in one cell or two; measured."""
+"""A path's light while it is accumulated in one cell or two; measured."""
 _PATH_BYTES, _PART_BYTES = 200.0, 75.0
-"""The same where it is shared between more: the light of a path that is filed, and of one that is traced meanwhile (74
-each); and each cell's part of it, its place, row and light, sorted (64; 382 in all for four, glossy balls)."""
+"""The same where it is shared between more: the light of a path that is accumulated, and of one that is traced
+meanwhile (74 each); and each cell's part of it, its place, row and light, sorted (64; 382 in all for four, glossy
+balls)."""
 _TERM_BYTES = 3 * 16.0
 """A pixel and cell of a term of a mask of many: both sides in the shadow, stacked, and picked for a frame."""
 _EXPOSED = 6
@@ -101,18 +104,18 @@ def frames_cost(
 
 
 def light_bytes(bench: Apparatus, classes: int, settings: Settings, lines: int = 1) -> float:
-    """Memory of tracing light, and of filing it.
+    """Memory of tracing light, and of accumulating it.
 
     Parameters
     ----------
     bench, settings
         what is simulated.
     classes
-        of projector pixels, that light is filed by.
+        of projector pixels, that light is accumulated by.
     lines
         that share the paths: the light of each is held.
     """
-    filed = float(entries(bench.n**2, classes, Numbers.of(settings), settings))
+    held = float(entries(bench.n**2, classes, Numbers.of(settings), settings))
     paths = Simulation(bench, settings).paths_at_once
     followed = bool(settings.effects & names(lambda effect: effect.followed))
     geometry, cells = bench.geometry, bench.n * max(settings.subdivision, settings.coarse_cells) * settings.anchors
@@ -123,12 +126,82 @@ def light_bytes(bench: Apparatus, classes: int, settings: Settings, lines: int =
             0.0 if settings.raster else factors,
             raster_bytes(geometry.model_copy(update={"mask_cells": settings.raster_cells}), bench.waves),
         )
-    held = lines * GROUPS * filed * _ENTRY_BYTES + min(lines, workers()) * paths * deposit_bytes(settings)
+    held = lines * GROUPS * held * _ENTRY_BYTES + min(lines, workers()) * paths * deposit_bytes(settings)
     return factors + _LANES_BYTES + _FOLLOWED_BYTES * followed + held
 
 
 def deposit_bytes(settings: Settings) -> float:
-    """Memory of a path's light while it is filed with these ``settings``: that of sharp pixels lies in four cells of
-    two layers at most."""
+    """Memory of a path's light while it is accumulated with these ``settings``: that of sharp pixels lies in four cells
+    of two layers at most."""
     parts = min(len(settings.depths), 2) * (4 if settings.sharp else 1)
     return max(_DEPOSIT_BYTES, _PATH_BYTES + parts * _PART_BYTES)
+
+
+# -------- Drawing a mask's shadow on a raster
+
+_MEANS_S, _TURNED_S = 8e-8, 5e-7
+"""A cell of a shadow without diffraction, of a mask that is straight and of one that is turned; here and below 0.7 of
+the processor seconds of 2310 to 3466 cells a side on a busy core (benchmarks/masks.py)."""
+_POINT_S, _TERM_S = 9e-9, 8e-11
+"""A point at which waves are squared, and a term of their field there."""
+_AROUND = 2.0
+"""Cells of the light that is turned over those of its turned square."""
+_HELD, _AT_WORK, _BLOCK_BYTES = 10, 14, 1.2e8
+"""Numbers of 8 bytes that are held for each cell, of the 8 shadows that are kept and of their spectra; that are worked
+on while another is made or a frame formed; and what points that are asked for at a time take."""
+_FINER = (4 / 3, 2)
+"""Times the fewest cells: 8 and 12 for 6."""
+_MOST_BYTES = 2.0**32
+"""Memory that more cells than the fewest are chosen for: twice as many of 320 pixels a side, 4 / 3 of 512."""
+
+
+def cells_to_choose(geometry: CameraGeometry, spectrum: Spectrum | None) -> tuple[int, ...]:
+    """Raster cells a pixel, fewest first, that a plan may choose for a camera whose mask is drawn.
+
+    Parameters
+    ----------
+    geometry, spectrum
+        as for :func:`drawing_seconds`.
+    """
+    fewest = cells_per_pixel(geometry)
+
+    def held(cells: int) -> bool:
+        return raster_bytes(geometry.model_copy(update={"mask_cells": cells}), spectrum) <= _MOST_BYTES
+
+    return fewest, *filter(held, (math.ceil(by * fewest) for by in _FINER))
+
+
+def drawing_seconds(geometry: CameraGeometry, spectrum: Spectrum | None) -> float:
+    """Seconds of drawing the shadow of one depth; 0 for a mask that is never drawn.
+
+    Parameters
+    ----------
+    geometry
+        the camera.
+    spectrum
+        lines of the light; None: without diffraction.
+    """
+    mask = geometry.mask_plate
+    waves = spectrum is not None
+    if mask is None or not (geometry.drawn(waves) or geometry.may_be_drawn(waves)):
+        return 0.0
+    cells, turned = float(cells_a_side(geometry, spectrum)) ** 2, bool(mask.flaws.turn_deg)
+    if spectrum is None or mask.irradiance:
+        return cells * (_TURNED_S if turned else _MEANS_S)
+    seen = geometry.build_mask()
+    assert isinstance(seen, Plate)
+    step = geometry.pixel_pitch / cells_per_pixel(geometry)
+    points = (points_per_cell(float(line), geometry.mask_distance, step) for line in spectrum.wavelengths_nm)
+    each = _POINT_S + _TERM_S * len(seen.amplitude.terms)
+    return cells * (_AROUND if turned else 1.0) * each * sum(count**2 for count in points)
+
+
+def raster_bytes(geometry: CameraGeometry, spectrum: Spectrum | None) -> float:
+    """Memory of shadows on rasters behind a camera whose mask is drawn [bytes].
+
+    Parameters
+    ----------
+    geometry, spectrum
+        as for :func:`drawing_seconds`.
+    """
+    return 8.0 * (_HELD + _AT_WORK) * cells_a_side(geometry, spectrum) ** 2 + _BLOCK_BYTES

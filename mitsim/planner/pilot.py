@@ -20,20 +20,21 @@ from mitsim.devices.patterns import Lighting
 from mitsim.light.cost_model import FIXED, Numbers, forming_seconds
 from mitsim.light.pass_table import PASSES
 from mitsim.light.passes import Simulation
-from mitsim.light.pilot_result import LOOKS, Changes, Drawn, Effort, Evidence, Forming, Part
+from mitsim.light.pilot_result import LOOKS, Changes, Drawn, Evidence, Forming, Part, SampleCost
 from mitsim.light.settings import Settings
-from mitsim.planner.pilot_direct import SMOOTH, AnchoredLight, FineLight, OccludedLight, occluded_pixels, sharp_pixels
-from mitsim.planner.pilot_indirect import FollowedLight, SwitchedEffects
+from mitsim.planner.pilot_anchors import AnchorRuns, FollowedRuns, PenumbraRuns
+from mitsim.planner.pilot_direct import SMOOTH, DirectRuns, occluded_pixels, sharp_pixels
+from mitsim.planner.pilot_effects import EffectRuns
 from mitsim.planner.pilot_samples import GOOD_ENOUGH, Sample
 from mitsim.scene.darkness import why_dark
 from mitsim.transport.highlights import highlights
 from mitsim.transport.missed import LeftOut, left_out_light
 from mitsim.transport.sharp_lobes import SharpLight, sharp_light, with_neighbours
 
-STAGES = ("cells", "effects", "anchors", "followed", "occluded")
+RUNS = ("cells", "effects", "anchors", "followed", "occluded")
 """What is looked at apart: cells and layers of direct light, effects switched off, anchors, those of followed light,
 and of occluded pixels."""
-_STAGE_OF = {
+_RUN_OF = {
     "layers": "cells",
     "cells": "cells",
     "followed_width": "followed",
@@ -41,7 +42,7 @@ _STAGE_OF = {
 }
 """What tells the error of the numbers that a plan chooses."""
 FINER = 4
-"""Samples of a stage over those of the look before: standard errors are halved at least."""
+"""Samples of a run over those of the look before: standard errors are halved at least."""
 _ROUGH = 0.5
 """Part of the accuracy that a few anchors may leave at most before it is asked which pixels are to blame."""
 _OF_FOLLOWED = 0.5
@@ -51,7 +52,7 @@ _FRAMES_AS_MANY = 20.0
 """Frames whose forming takes as long as one more change does: four shots seen by four looks, and finer cells."""
 _OF_EFFECTS = 3
 """Changes that each effect's look takes as long as: it forms all light with and without, and coarse cells besides."""
-_OVER_PRICES, _LESS_S = 4.2, 0.6
+_OVER_WORK, _LESS_S = 4.2, 0.6
 """Seconds of a look over the price of its samples, and less what flat scenes have less: kernels, searches for lobes and
 edges, chains of changes (processor seconds in a new process: photograph 1.0, gift_card 2, corner 3, cookie_bag 7.5; six
 tenths of them by the clock on two cores)."""
@@ -81,7 +82,7 @@ _ALIGNED = 1e-6
 
 
 class Look:
-    """A look at a scene, as short as it can be at first; each of its stages is repeated with more samples.
+    """A look at a scene, as short as it can be at first; each of its runs is repeated with more samples.
 
     Parameters
     ----------
@@ -120,10 +121,10 @@ class Look:
         if not bench.loaded.mirrors and not self._sharp.irradiance:
             sample = _enough(sample, hits, bench)
             self._hits = hits if hits < _FEWEST_HITS else math.inf
-        self.samples = dict.fromkeys(STAGES, sample)
-        self.occluded: OccludedLight | None = None
-        for stage in STAGES:
-            self._measure(stage)
+        self.samples = dict.fromkeys(RUNS, sample)
+        self.occluded: PenumbraRuns | None = None
+        for run in RUNS:
+            self._measure(run)
         if self._rough:
             self._look_for_occluded()
 
@@ -135,37 +136,37 @@ class Look:
         # Unless the sample's shots show some of either kind, nobody knows how many anchors each takes.
         if shown.any() and not shown.all():
             self._base = replace(self._base, occluded=occluded)
-            for stage in ("anchors", "occluded"):
-                self._measure(stage)
+            for run in ("anchors", "occluded"):
+                self._measure(run)
 
-    def refine(self, stage: str) -> None:
-        """Repeat a ``stage`` with so many more samples that its standard errors are halved."""
-        self.samples[stage] = self._finer(stage)
-        self._measure(stage)
+    def refine(self, run: str) -> None:
+        """Repeat a ``run`` with so many more samples that its standard errors are halved."""
+        self.samples[run] = self._finer(run)
+        self._measure(run)
         vars(self).pop("evidence", None)
 
-    def price(self, stage: str) -> float:
-        """Work of repeating a ``stage``, in seconds at fixed paces; infinite where it has all the samples it may."""
-        now, finer = self.samples[stage], self._finer(stage)
+    def work(self, run: str) -> float:
+        """Work of repeating a ``run``, in seconds at fixed unit costs; infinite where it has all the samples it may."""
+        now, finer = self.samples[run], self._finer(run)
         if (finer.fine, finer.direct) == (now.fine, now.direct):
             return math.inf
         costs, changes = FIXED.passes, 0
         one = forming_seconds(self.forming, Numbers.coarsest(), _FRAMES_AS_MANY, FIXED)
         pixels, shown = self.bench.n**2, len(finer.shown)
-        if stage == "cells":
+        if run == "cells":
             paths, changes = costs["direct"] * shown * finer.fine, len(self.fine.changes)
-        elif stage == "anchors":
-            connections = sum(part.count**2 for part in self.anchored.changes if part.name == stage)
+        elif run == "anchors":
+            connections = sum(part.count**2 for part in self.anchored.changes if part.name == run)
             paths = costs["anchor_residual"] * shown * finer.anchored * connections
             changes = len(self.anchored.changes)
-        elif stage == "occluded":
+        elif run == "occluded":
             count = len(self.occluded.pixels) if self.occluded else 0
             if self.occluded is None or finer.occluded(count) == now.occluded(count):
                 return math.inf
             connections = sum(part.count**2 for part in self.occluded.changes if " " not in part.name)
             paths = costs["penumbra"] * FINER * self.occluded.paths / LOOKS * connections
             changes = len(self.occluded.changes)
-        elif stage == "followed":
+        elif run == "followed":
             connections = sum(part.count**2 for part in self.followed.changes if part.name == "followed_anchors")
             lanes = sum(self.switched.lanes.values())
             paths = costs["indirect_residual"] * lanes * finer.followed * connections
@@ -178,44 +179,44 @@ class Look:
 
     @property
     def seconds(self) -> float:
-        """What the look took, about, at fixed paces."""
-        prices = [price / FINER for price in map(self.price, STAGES) if math.isfinite(price)]
-        return max(_OVER_PRICES * sum(prices) - _LESS_S, 0.0)
+        """What the look took, about, at fixed unit costs."""
+        repeats = [work / FINER for work in map(self.work, RUNS) if math.isfinite(work)]
+        return max(_OVER_WORK * sum(repeats) - _LESS_S, 0.0)
 
     @property
     def _rough(self) -> bool:
         """Whether a few anchors may leave too much: light that is hidden from part of the sensor, or sharp gloss."""
-        few = Changes.between(self.anchored.few, self.switched.light**2).estimate([Part("anchors", SMOOTH)])
+        few = Changes.between(self.anchored.of_few, self.switched.light**2).estimate([Part("anchors", SMOOTH)])
         return few.bound > _ROUGH * self.accuracy
 
-    def heavy(self, samples: int) -> dict[str, Effort]:
+    def heavy(self, samples: int) -> dict[str, SampleCost]:
         """What passes from the camera take, by name, as looks of more ``samples`` see it: a lobe that is met in one of
         a million paths, and brings most of the noise, is in none of the short ones."""
         found = {
             "from_camera": self.switched.with_more(samples),
             "camera_residual": self.followed.with_more(self.switched.light, samples),
         }
-        return {name: effort for name, effort in found.items() if effort.noise.error}
+        return {name: sample_cost for name, sample_cost in found.items() if sample_cost.noise.error}
 
-    def _finer(self, stage: str) -> Sample:
-        sample = self.samples[stage]
-        return replace(sample, effort=FINER * sample.effort)
+    def _finer(self, run: str) -> Sample:
+        sample = self.samples[run]
+        return replace(sample, times=FINER * sample.times)
 
-    def _measure(self, stage: str) -> None:
-        bench, base, sample, seed = self.bench, self._base, self.samples[stage], self.seed
-        if stage == "cells":
-            self.fine = FineLight(bench, base, sample, self.accuracy, seed)
-        elif stage == "effects":
-            looked = bench, self._everything, sample, seed, self.fine.judging, self.accuracy
-            self.switched = SwitchedEffects(*looked)
-        elif stage == "followed":
+    def _measure(self, run: str) -> None:
+        bench, base, sample, seed = self.bench, self._base, self.samples[run], self.seed
+        if run == "cells":
+            self.fine = DirectRuns(bench, base, sample, self.accuracy, seed)
+        elif run == "effects":
+            judged = self.fine.judging, self.accuracy
+            self.switched = EffectRuns(bench, self._everything, sample, seed, *judged)
+        elif run == "followed":
             tolerance, lit = self._tolerance(_OF_FOLLOWED), self.switched.received > 0
-            self.followed = FollowedLight(bench, self._everything, sample, tolerance, seed, self.fine.judging, lit=lit)
-        elif stage == "occluded":
+            self.followed = FollowedRuns(bench, self._everything, sample, tolerance, seed, self.fine.judging, lit=lit)
+        elif run == "occluded":
             if base.occluded:
-                self.occluded = OccludedLight(bench, base, sample, self._tolerance(), seed, self.fine.judging)
+                self.occluded = PenumbraRuns(bench, base, sample, self._tolerance(), seed, self.fine.judging)
         else:
-            self.anchored = AnchoredLight(bench, base, sample, self._tolerance(), seed, self.fine.judging)
+            self.anchored = AnchorRuns(bench, base, sample, self._tolerance(), seed, self.fine.judging)
 
     def _tolerance(self, part: float = GOOD_ENOUGH) -> float:
         """Norm of that ``part`` of all light that the capture may leave out."""
@@ -276,16 +277,15 @@ class Look:
             seen |= self.occluded.changes
         light, sharp, apart = switched.light, self._sharp, self._base.sharp
         samples = self.samples["effects"].followed * LOOKS
-        indirect, shared, repeats = switched.indirect_effort()
-        efforts = {
-            **switched.efforts,
-            **self.followed.efforts(light),
-            "direct": fine.effort(light),
-            "anchor_residual": anchored.effort(light),
+        indirect, shared, repeats = switched.indirect_cost()
+        sample_costs = {
+            **switched.sample_costs,
+            **self.followed.sample_costs(light),
+            **anchored.sample_costs(light),
+            **(self.occluded.sample_costs(light) if self.occluded else {}),
+            "direct": fine.sample_cost(light),
             "indirect": indirect,
         }
-        if self.occluded:
-            efforts["penumbra"] = self.occluded.effort(light)
         left_out, mirror = self._left_out.unseen(_FEWEST_HITS / samples, _FEWEST_MET / samples)
         found = self._light + sharp.irradiance + switched.received
         few = not apart and sharp.hits * self.samples["cells"].fine * LOOKS < _FEWEST_HITS
@@ -295,7 +295,7 @@ class Look:
             depth=self._base.depth,
             layers=fine.layers,
             changes=Changes.between(seen, light**2),
-            efforts=efforts,
+            sample_costs=sample_costs,
             spread=fine.spread(light),
             shared=shared,
             repeats=repeats,
@@ -324,12 +324,12 @@ def measure(bench: Apparatus, lighting: Lighting, accuracy: float, seed: int) ->
     return Look(bench, lighting, accuracy, seed).evidence
 
 
-def stage_of(part: Part) -> str:
-    """The stage that tells the error of a ``part``."""
+def run_of(part: Part) -> str:
+    """The run that tells the error of a ``part``."""
     light, _, _ = part.name.rpartition(" ")
     if light:
         return PASSES[light].pilot if PASSES[light].anchors else "effects"
-    return _STAGE_OF.get(part.name, "effects")
+    return _RUN_OF.get(part.name, "effects")
 
 
 def _enough(sample: Sample, hits: float, bench: Apparatus) -> Sample:
@@ -337,9 +337,9 @@ def _enough(sample: Sample, hits: float, bench: Apparatus) -> Sample:
 
     MitsimError where that takes more than a look may trace.
     """
-    effort = math.ceil(_FEWEST_IN_LOOK / (hits * sample.direct)) if hits else 1
-    more = replace(sample, effort=effort * sample.effort)
-    if effort > 1 and hits * more.direct < _FEWEST_IN_LOOK:
+    times = math.ceil(_FEWEST_IN_LOOK / (hits * sample.direct)) if hits else 1
+    more = replace(sample, times=times * sample.times)
+    if times > 1 and hits * more.direct < _FEWEST_IN_LOOK:
         n, side = bench.n, math.sqrt(hits)
         raise MitsimError(
             f"what the camera sees is too small for the projector's light: all that it lights fills {hits:.1e} of a "
@@ -411,7 +411,7 @@ def _equal(values: FloatArray) -> float:
 # -------- How far from the axis light comes
 
 _CONNECTIONS = 2**16
-"""Connections that look for near surfaces, some 10 ms; what they overlook is counted when the light is filed."""
+"""Connections that look for near surfaces, some 10 ms; what they overlook is counted when the light is accumulated."""
 _FLAT = 1e-4
 """Relative distance of the nearest light from the mean below which the scene is flat: single precision is 1e-7."""
 

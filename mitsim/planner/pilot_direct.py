@@ -1,4 +1,4 @@
-"""Direct light, filed in different ways: what few anchors, layers or cells change, and noise."""
+"""Direct light, accumulated in different ways: what few layers or cells change, noise, and pixels of their own."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -19,29 +18,22 @@ from mitsim.core.resources import workers
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum
-from mitsim.light.drawing_cost import cells_to_choose, drawing_seconds
-from mitsim.light.grids import Grid
-from mitsim.light.pass_table import PASSES
 from mitsim.light.passes import Simulation, emitted
-from mitsim.light.pilot_result import LOOKS, Drawn, Effort, Forming, Noise, Part
+from mitsim.light.pilot_result import LOOKS, Drawn, Forming, Noise, Part, SampleCost
 from mitsim.light.settings import GROUPS, Estimate, Settings, SharpPixels
 from mitsim.optics.fft_shadow import cells_per_pixel
 from mitsim.optics.frames import ExpectedFrames, Filed
 from mitsim.optics.image_formation import raster_error
-from mitsim.planner.pilot_samples import EVEN_CELLS, GOOD_ENOUGH, Sample, coarsened, known, ladder, noise, norm
+from mitsim.planner.memory import cells_to_choose, drawing_seconds
+from mitsim.planner.pilot_samples import EVEN_CELLS, GOOD_ENOUGH, Sample, ladder, noise, norm
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.records import Deposits
 from mitsim.transport.sharp_lobes import SharpLight, with_neighbours
 
-ANCHOR_LADDER, LAYER_LADDER, CELL_LADDER = (1, 2, 3, 5, 8), (1, 2, 3, 4, 6, 8, 12), (1, 2, 4, 8)
+LAYER_LADDER, CELL_LADDER = (1, 2, 3, 4, 6, 8, 12), (1, 2, 4, 8)
 """Numbers that are tried, each step about half the error of the one before or less."""
-_FIRST_JUDGES = {"anchors": 2, "layers": 2, "cells": 1}
+_FIRST_JUDGES = {"layers": 2, "cells": 1}
 """Indices of the numbers that judge at first: two steps, or one where it is known how the error falls."""
-OCCLUDED_LADDER = (1, 2, 3, 5, 8, 16, 32)
-"""Numbers that are tried for occluded pixels. An edge's penumbra has kinks, at which interpolation between N anchors
-errs by about 1 / N^1.5; 32 leave a hundredth of what one does."""
-_FEW_ANCHORS, _FEW_OCCLUDED = 3, 5
-"""Anchors whose noise is measured: fewer leave a plan's choice to them unseen."""
 _JUDGING = 4
 """Layers that judge one layer for light in coarse cells: the error of one is told to a twentieth."""
 _FLAT = 1e-4
@@ -62,8 +54,8 @@ _FARTHEST = 1e-4
 """Inverse depth, relative to the scene's, below which light counts as infinitely far."""
 
 
-class FineLight:
-    """Direct light in many samples a cell, filed in different ways.
+class DirectRuns:
+    """Direct light in many samples a cell, accumulated in different ways.
 
     Parameters
     ----------
@@ -79,9 +71,9 @@ class FineLight:
 
     def __init__(self, bench: Apparatus, base: Settings, sample: Sample, accuracy: float, seed: int) -> None:
         self.bench, self.base, self.sample, self.accuracy = bench, base, sample, accuracy
-        self._seeds = [integer(seed, "pilot", "fine", look) for look in range(LOOKS)]
+        self._seeds = [integer(seed, "pilot", "fine", replicate) for replicate in range(LOOKS)]
         self._simulation = simulation = sample.simulation(bench, base)
-        self._tracer = _tracer(simulation, _shown(base, sample), base.anchors)
+        self._tracer = tracer_of(simulation, shown_pixels(base, sample), base.anchors)
         self._deposits = self._tracer.trace_looks(self._seeds, sample.fine)
         apart, samples = simulation.sharp, sample.sharp(simulation)
         self._sharp = apart.trace_looks(self._seeds, samples) if apart else []
@@ -121,22 +113,22 @@ class FineLight:
             found |= {Part("layers", count): change for count, change in layers.items()}
         return found
 
-    def effort(self, light: float) -> Effort:
+    def sample_cost(self, light: float) -> SampleCost:
         """Monte Carlo error of one estimate of what the sensor's centre sees, relative to all ``light``, how fast it
         falls, and its paths."""
-        return self._effort(self._noise, light)
+        return self._sample_cost(self._noise, light)
 
-    def spread(self, light: float) -> Effort:
+    def spread(self, light: float) -> SampleCost:
         """The same, as a part of ``light``, of what random points of the sensor see: gloss differs over the sensor, and
         makes noise there."""
-        return self._effort(self._spread_noise, light)
+        return self._sample_cost(self._spread_noise, light)
 
-    def _effort(self, noises: tuple[float, float], light: float) -> Effort:
+    def _sample_cost(self, noises: tuple[float, float], light: float) -> SampleCost:
         many, few = noises
         steep = many > 0 and few > 0 and self._fewer < self.sample.fine
         rate = math.log(few / many) / math.log(self.sample.fine / self._fewer) if steep else 0.5
         relative = many / light if light else 0.0
-        return Effort(Noise(relative, self.sample.fine, min(max(rate, 0.5), _STEEPEST)), self.bench.n**2)
+        return SampleCost(Noise(relative, self.sample.fine, min(max(rate, 0.5), _STEEPEST)), self.bench.n**2)
 
     @property
     def _fewer(self) -> int:
@@ -144,7 +136,7 @@ class FineLight:
 
     @cached_property
     def _whole(self) -> FloatArray:
-        """(looks, ...) frames of the light in the cells and layers of the base."""
+        """(replicates, ...) frames of the light in the cells and layers of the base."""
         return self._formed(self._simulation, self._deposits, self.sample.fine)
 
     @cached_property
@@ -153,12 +145,12 @@ class FineLight:
 
     @cached_property
     def _spread_noise(self) -> tuple[float, float]:
-        tracer = _tracer(self._simulation, _shown(self.base, self.sample), 1, spread=True)
+        tracer = tracer_of(self._simulation, shown_pixels(self.base, self.sample), 1, spread=True)
         seen = tracer.trace_looks(self._seeds, self.sample.fine)
         return self._noise_of(tracer, self._formed(self._simulation, seen, self.sample.fine))
 
     def _noise_of(self, tracer: DirectTracer, many: FloatArray) -> tuple[float, float]:
-        """Error of a look of the ``tracer`` whose frames of all samples are ``many``, and of one with fewer."""
+        """Error of a replicate of the ``tracer`` whose frames of all samples are ``many``, and of one with fewer."""
         few = tracer.trace_looks(self._seeds, self._fewer)
         return noise(many), noise(self._formed(self._simulation, few, self._fewer))
 
@@ -195,8 +187,8 @@ class FineLight:
         """What a shadow on a raster leaves of a frame, without diffraction and with it."""
         simulation = Simulation(self.bench, self.base)
         bundle, geometry = simulation.grids["fine"].bundle, self.bench.geometry
-        filed = bundle.file(self._deposits[0], self.sample.lighting.labels, self.sample.fine)
-        shot = sparse.csr_array(self.sample.lighting.weights[:1]) @ filed[: self.sample.lighting.weights.shape[1]]
+        light = bundle.file(self._deposits[0], self.sample.lighting.labels, self.sample.fine)
+        shot = sparse.csr_array(self.sample.lighting.weights[:1]) @ light[: self.sample.lighting.weights.shape[1]]
         light = shot.toarray().reshape(bundle.anchors, bundle.cells[0], bundle.anchors, bundle.cells[1])
 
         def drawn(spectrum: Spectrum | None) -> Drawn:
@@ -242,137 +234,12 @@ def _product_seconds() -> float:
     return min(taken) / (_TRIALS * _SIDE**3)
 
 
-class AnchoredLight:
-    """The frames with fewer anchors; every anchor is connected to the same points, so little noise is left.
-
-    Frames, not radiance: the falloff's error is odd in the scene's coordinates and mostly cancels in a frame. Of one
-    wavelength: anchors change the same with all (to 0.2 % in photograph, cards and corner), coarse cells at most a
-    quarter less.
-
-    Parameters
-    ----------
-    bench, base, sample, seed
-        as for :class:`FineLight`.
-    tolerance
-        norm of a change at which the search for enough may stop.
-    layers
-        depths [mm] that judge one layer; none for a flat scene.
-    """
-
-    _ladder: tuple[int, ...] = ANCHOR_LADDER
-    _pass, _few_anchors = PASSES["anchor_residual"], _FEW_ANCHORS
-
-    def __init__(
-        self,
-        bench: Apparatus,
-        base: Settings,
-        sample: Sample,
-        tolerance: float,
-        seed: int,
-        layers: tuple[float, ...] = (),
-    ) -> None:
-        self.bench, self.base, self.sample, self.tolerance = bench, base, sample, tolerance
-        self.layers = layers
-        self._seeds = [integer(seed, "pilot", "anchors", look) for look in range(LOOKS)]
-        self.pixels, self._samples = self._of(sample)
-
-    def _of(self, sample: Sample) -> tuple[Labels, int]:
-        """Pixels that are followed, and samples of each in a look."""
-        return np.setdiff1d(_shown(self.base, sample), self.base.occluded), sample.anchored
-
-    @property
-    def paths(self) -> int:
-        """Paths of all looks to one anchor."""
-        return LOOKS * len(self.pixels) * self._samples
-
-    @cached_property
-    def changes(self) -> dict[Part, FloatArray]:
-        """Change of the frames by every number of anchors that was tried, and by coarse cells for what they see."""
-        coarse = coarsened(self._pass.name, self._beyond, self.layers)
-        return {**self._until(self.tolerance), **coarse}
-
-    @property
-    def few(self) -> dict[Part, FloatArray]:
-        """Change of the frames by the numbers of anchors that are always tried, as far as they tell."""
-        return self._until(math.inf)
-
-    def _until(self, tolerance: float) -> dict[Part, FloatArray]:
-        found = ladder(self._ladder, self._frames, _FIRST_JUDGES["anchors"], tolerance)
-        return {Part(self._pass.anchors, count): change for count, change in found.items()}
-
-    def effort(self, light: float) -> Effort:
-        """Monte Carlo error of one estimate of what a few anchors see beyond their mean, relative to all ``light``."""
-        relative = self._noise / light if light else 0.0
-        return Effort(Noise(relative, self._samples, 0.5), self._lanes)
-
-    @property
-    def _lanes(self) -> int:
-        return self.bench.n**2 - len(self.base.occluded)
-
-    @cached_property
-    def _noise(self) -> float:
-        return noise(self._beyond(1, ()))
-
-    @known
-    def _beyond(self, cells: int, layers: tuple[float, ...]) -> FloatArray:
-        """Frames of what a few anchors see beyond their mean, in coarse cells and layers."""
-        coarse = replace(self.base, coarse_cells=cells, coarse_layers=bool(layers), layers=layers)
-        simulation = self._simulation(self._few_anchors, coarse)
-        grid, weights = self._grid(simulation), simulation.mean_weights(self._few_anchors)
-        mean = [look.averaged(weights) for look in self._few]
-        frames = self._frames(self._few_anchors) if coarse == self.base else self._formed(grid, self._few)
-        return frames - self._formed(grid.of_mean, mean)
-
-    @cached_property
-    def _few(self) -> list[Deposits]:
-        return self._traced(self._simulation(self._few_anchors, self.base))
-
-    @known
-    def _frames(self, anchors: int) -> FloatArray:
-        simulation = self._simulation(anchors, self.base)
-        traced = self._few if anchors == self._few_anchors else self._traced(simulation)
-        return self._formed(self._grid(simulation), traced)
-
-    def _simulation(self, anchors: int, settings: Settings) -> Simulation:
-        several: dict[str, Any] = {self._pass.anchors: anchors}
-        return self.sample.simulation(self.bench, replace(settings, **several), one_line=True)
-
-    def _grid(self, simulation: Simulation) -> Grid:
-        """Where light of these pixels is accumulated."""
-        return simulation.grids[self._pass.grid]
-
-    def _traced(self, simulation: Simulation) -> list[Deposits]:
-        """Light to every anchor, look by look."""
-        anchors = self._grid(simulation).bundle.anchors
-        tracer = _tracer(simulation, self.pixels, anchors)
-        return tracer.trace_looks(self._seeds, self._samples)
-
-    def _formed(self, grid: Grid, looks: list[Deposits]) -> FloatArray:
-        """(looks, shots, places, places) frames of light in a ``grid``."""
-        return self.sample.frames(grid, looks, self._samples)
-
-
-class OccludedLight(AnchoredLight):
-    """The same of occluded pixels, which many anchors see."""
-
-    _ladder = OCCLUDED_LADDER
-    _pass, _few_anchors = PASSES["penumbra"], _FEW_OCCLUDED
-
-    def _of(self, sample: Sample) -> tuple[Labels, int]:
-        pixels = np.intersect1d(_shown(self.base, sample), self.base.occluded)
-        return pixels, sample.occluded(len(pixels))
-
-    @property
-    def _lanes(self) -> int:
-        return len(self.base.occluded)
-
-
-def _shown(settings: Settings, sample: Sample) -> Labels:
+def shown_pixels(settings: Settings, sample: Sample) -> Labels:
     """Projector pixels that the shots of a ``sample`` show, but for those that are traced apart."""
     return np.setdiff1d(sample.shown, settings.sharp.pixels) if settings.sharp else sample.shown
 
 
-def _tracer(simulation: Simulation, pixels: Labels, anchors: int, spread: bool = False) -> DirectTracer:
+def tracer_of(simulation: Simulation, pixels: Labels, anchors: int, spread: bool = False) -> DirectTracer:
     """Direct light of some projector ``pixels`` to every anchor, or ``spread`` over the sensor."""
     loaded, physics = simulation.bench.loaded, simulation.physics
     parts = loaded.scene, loaded.camera, physics.projector, anchors, physics.geometry
@@ -413,13 +280,13 @@ def occluded_pixels(simulation: Simulation, accuracy: float, seed: int) -> tuple
     rough, whole = _roughness(simulation, pixels, _FIRST, seed)
     rest = (_LEFT * accuracy) ** 2 * whole
     found = pixels[_most(rough, rest)]
-    every, looked = np.zeros(n**2), np.zeros(n**2, dtype=bool)
+    every, frame_check = np.zeros(n**2), np.zeros(n**2, dtype=bool)
     # Few rays miss what is hidden by a little; it lies beside what is hidden by much.
-    while len(near := np.intersect1d(_beside(found, n), pixels[~looked[pixels]])):
-        if looked.sum() + len(near) > 9 * _MOST * n**2:
+    while len(near := np.intersect1d(_beside(found, n), pixels[~frame_check[pixels]])):
+        if frame_check.sum() + len(near) > 9 * _MOST * n**2:
             return ()
-        every[near], _ = _roughness(simulation, near, _NEAR, integer(seed, "near", int(looked.sum())))
-        looked[near] = True
+        every[near], _ = _roughness(simulation, near, _NEAR, integer(seed, "near", int(frame_check.sum())))
+        frame_check[near] = True
         found = _most(every, rest)
     return tuple(np.sort(found).tolist()) if len(found) <= _MOST * n**2 else ()
 
@@ -485,14 +352,15 @@ _WELL_MET = 30.0
 """Hits of one connection of each pixel from which even points meet lobes often enough, where few anchors do: in
 compact_disc (125 hits) tracing 600 pixels apart took 1.5 times the time for the same error."""
 _SEEN = 0.5
-"""Hits of one connection of each pixel from which the pilot's ordinary looks, 64 connections or more, tell how a lobe's
-light varies over the sensor: they meet it thirty times."""
+"""Hits of one connection of each pixel from which the pilot's ordinary replicates, 64 connections or more, tell how a
+lobe's light varies over the sensor: they meet it thirty times."""
 _TRIAL, _LARGEST_TRIAL = 16, 2**21
 """Samples that tell how noisy the light is, and connections of them, some 0.5 s."""
 _AFFORDABLE = 2.0**29
 """Connections, some 100 s, beyond which sharp lobes are left unresolved, and said to be."""
 _LOOKS = 64
-"""Rays of each pixel that tell which directions its light comes from; what they overlook is counted when filed."""
+"""Rays of each pixel that tell which directions its light comes from; what they overlook is counted when it is
+accumulated."""
 
 
 def sharp_pixels(
@@ -532,7 +400,7 @@ def sharp_pixels(
         order = np.argsort(-sharp.by_pixel, kind="stable")
         held = np.cumsum(sharp.by_pixel[order])[:lit]
         count = min(int(np.searchsorted(held, sharp.irradiance - _LEFT_SHARP * accuracy * whole)) + 1, lit)
-    # Beside a lobe's light is that of its tails, which ordinary looks meet as seldom where it is small.
+    # Beside a lobe's light is that of its tails, which ordinary replicates meet as seldom where it is small.
     pixels = with_neighbours(np.isin(np.arange(len(order)), order[:count]), simulation.bench.n)
     # One pixel at least stays with the others.
     if len(pixels) == len(order):
@@ -543,7 +411,8 @@ def sharp_pixels(
 
 
 def _unseen(sharp: SharpLight, order: Labels, negligible: float) -> int:
-    """Pixels, the first in ``order``, without which the others' light is ``negligible`` or seen by ordinary looks."""
+    """Pixels, the first in ``order``, without which the others' light is ``negligible`` or seen by ordinary
+    replicates."""
     held, moments = (np.cumsum(values[order][::-1])[::-1] for values in (sharp.by_pixel, sharp.moments))
     told = (held <= negligible) | (np.square(held) >= _SEEN * moments)
     return int(np.argmax(told)) if told.any() else len(order)

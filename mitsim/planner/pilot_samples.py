@@ -1,4 +1,4 @@
-"""Frames in a few independent looks: what is compared in, relative changes without the noise's own energy out.
+"""Frames in a few independent replicates: what is compared in, relative changes without the noise's own energy out.
 
 Looks see the same change with independent noise, so the mean product of two different ones estimates its square.
 """
@@ -8,8 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import wraps
-from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -26,15 +24,15 @@ from mitsim.optics.shadow import Places
 from mitsim.transport.from_camera import FromCameraTracer, Together
 from mitsim.transport.records import AMBIENT, Deposits
 
-_Method = TypeVar("_Method", bound=Callable[..., Any])
 Known = dict[Hashable, tuple[Sequence[Deposits], FloatArray]]
 """Frames that were formed, with the light that they show."""
 _SHOTS, _MOST_SHOTS, _SHOWN = 4, 16, 1024
-"""Shots of the family that the pilot looks at: patterns of a family differ little, and each costs its forming; but more
-where they show fewer pixels than this all together, which are no fair sample of the scene, or a mirror does."""
+"""Shots of the family that the pilot replicates at: patterns of a family differ little, and each costs its forming; but
+more where they show fewer pixels than this all together, which are no fair sample of the scene, or a mirror does."""
 _PLACES = 128
-"""Rows and columns of pixels that the pilot looks at: a frame's neighbours are alike, and each costs its forming. Where
-they meet, most changes are told to 2 to 6 % (photograph, gift_card, compact_disc, lamp_bench, against all 512)."""
+"""Rows and columns of pixels that the pilot replicates at: a frame's neighbours are alike, and each costs its forming.
+Where they meet, most changes are told to 2 to 6 % (photograph, gift_card, compact_disc, lamp_bench, against all
+512)."""
 _GOLDEN = (math.sqrt(5) - 1) / 2
 """Steps by it never meet a mask's features in one phase."""
 _DIGITS = 12
@@ -44,19 +42,19 @@ _SPARSE = 8
 _PIXELS = 64**2
 """Few pixels are sampled more often, until they take as many samples as so many pixels."""
 _MOST_PATHS = 2**20
-"""Paths of one look that are held at a time: 60 MB."""
+"""Paths of one replicate that are held at a time: 60 MB."""
 _AT_ONCE = 2**19
-"""Paths of a longer look that are held at a time: 30 MB."""
+"""Paths of a longer replicate that are held at a time: 30 MB."""
 _CLOSER = 16
-"""Times the samples of a look that a closer look takes at most: its standard errors are a quarter; of four, they were
-as large as before in half of the cases (cookie_bag, corner)."""
+"""Times the samples of a replicate that a closer replicate takes at most: its standard errors are a quarter; of four,
+they were as large as before in half of the cases (cookie_bag, corner)."""
 _SHARP_PATHS = 2**18
-"""Paths of sharp pixels in one look: each is filed in four cells, again and again."""
+"""Paths of sharp pixels in one replicate: each is accumulated in four cells, again and again."""
 _MOST_SHARP = 256
-"""Samples of a sharp pixel in a look: its error is then 3e-3 (plates of roughness 1e-3 and 1e-4)."""
+"""Samples of a sharp pixel in a replicate: its error is then 3e-3 (plates of roughness 1e-3 and 1e-4)."""
 _OCCLUDED, _MOST_OCCLUDED, _FEWEST_OCCLUDED = 2**9, 2**11, 4
-"""Points on occluded pixels in a first look, each seen from up to 32 x 32 anchors, the most in any (2^21 connections,
-some 0.5 GB in four looks), and the fewest of one pixel."""
+"""Points on occluded pixels in a first replicate, each seen from up to 32 x 32 anchors, the most in any (2^21
+connections, some 0.5 GB in four replicates), and the fewest of one pixel."""
 EVEN_CELLS = 0.25
 """Half as large cells leave this much of the error where light is smooth: they are of second order."""
 _UNKNOWN_GAIN = 0.5
@@ -65,30 +63,16 @@ GOOD_ENOUGH = 0.3
 """Part of the accuracy below which a finer step is not tried: its square is a tenth of the budget's."""
 
 
-def known(method: _Method) -> _Method:
-    """A ``method`` that remembers for each object what it returned for which arguments."""
-
-    @wraps(method)
-    def remembering(self: Any, *counts: Any, **cells: Any) -> Any:
-        found = vars(self).setdefault(f"known {method.__name__}", {})
-        key = counts, tuple(sorted(cells.items()))
-        if key not in found:
-            found[key] = method(self, *counts, **cells)
-        return found[key]
-
-    return cast("_Method", remembering)
-
-
 @dataclass(frozen=True)
 class Sample:
-    """The shots that the pilot looks at, the rows and columns of pixels, and how many samples it takes.
+    """The shots that the pilot replicates at, the rows and columns of pixels, and how many samples it takes.
 
-    ``effort`` multiplies the samples of the first, shortest look.
+    ``times`` multiplies the samples of the first, shortest replicate.
     """
 
     lighting: Lighting
     places: Places
-    effort: int = 1
+    times: int = 1
 
     @classmethod
     def of(cls, lighting: Lighting, shape: tuple[int, int], mirrors: bool) -> Sample:
@@ -117,7 +101,7 @@ class Sample:
 
     @property
     def rows(self) -> Labels:
-        """Class of each row of light that is filed by class."""
+        """Class of each row of light that is accumulated by class."""
         return np.arange(self.lighting.weights.shape[1])
 
     @property
@@ -127,19 +111,19 @@ class Sample:
 
     @property
     def fine(self) -> int:
-        """Samples a shown pixel to tell cells and layers apart, in each look."""
-        return self._within(4 * self.effort * max(1, _PIXELS // len(self.shown)), len(self.shown))
+        """Samples a shown pixel to tell cells and layers apart, in each replicate."""
+        return self._within(4 * self.times * max(1, _PIXELS // len(self.shown)), len(self.shown))
 
     @property
     def anchored(self) -> int:
-        """Samples a shown pixel to tell anchors apart, in each look."""
+        """Samples a shown pixel to tell anchors apart, in each replicate."""
         return max(1, self.fine // 4)
 
     @property
     def direct(self) -> int:
-        """Samples a projector pixel to tell effects apart, in each look."""
+        """Samples a projector pixel to tell effects apart, in each replicate."""
         pixels = len(self.lighting.labels)
-        return self._within(2 * self.effort * max(1, _PIXELS // pixels), pixels)
+        return self._within(2 * self.times * max(1, _PIXELS // pixels), pixels)
 
     @property
     def followed(self) -> int:
@@ -147,15 +131,15 @@ class Sample:
         return max(1, self.direct // 2)
 
     def closer(self, paths: int) -> int:
-        """Samples of so many ``paths`` that a closer look at followed light takes at most."""
+        """Samples of so many ``paths`` that a closer replicate at followed light takes at most."""
         return self._within(_CLOSER * self.followed, paths)
 
     def occluded(self, pixels: int) -> int:
-        """Samples of each of so many occluded ``pixels``, in each look."""
-        return max(_FEWEST_OCCLUDED, min(self.effort * _OCCLUDED, _MOST_OCCLUDED) // max(pixels, 1))
+        """Samples of each of so many occluded ``pixels``, in each replicate."""
+        return max(_FEWEST_OCCLUDED, min(self.times * _OCCLUDED, _MOST_OCCLUDED) // max(pixels, 1))
 
     def sharp(self, simulation: Simulation) -> int:
-        """Samples of each pixel that a ``simulation`` traces apart, in each look."""
+        """Samples of each pixel that a ``simulation`` traces apart, in each replicate."""
         paths = simulation.sharp.lanes if simulation.sharp else 1
         return min(max(_SHARP_PATHS // paths, 4), _MOST_SHARP)
 
@@ -175,12 +159,13 @@ class Sample:
     def frames(
         self,
         grid: Grid,
-        looks: Sequence[Deposits],
+        replicates: Sequence[Deposits],
         samples: int,
         emitted: FloatArray | None = None,
         known: Known | None = None,
     ) -> FloatArray:
-        """(looks, shots, rows, columns) frames of light in each look, nothing set to zero that came out below it.
+        """(replicates, shots, rows, columns) frames of light in each replicate, nothing set to zero that came out below
+        it.
 
         A shot's pattern and what all pixels emit at least make a frame each.
 
@@ -188,7 +173,7 @@ class Sample:
         ----------
         grid
             where the light is accumulated.
-        looks
+        replicates
             light of each.
         samples
             that it is divided by.
@@ -201,45 +186,45 @@ class Sample:
         least, most = emitted.min(axis=1), emitted.max(axis=1)
         span = np.where(most > least, most - least, 1.0)
         pattern = (emitted - least[:, None]) / span[:, None]
-        frames = span[:, None, None] * self._lit(grid, looks, pattern, known)
+        frames = span[:, None, None] * self._lit(grid, replicates, pattern, known)
         if least.any():
-            frames += least[:, None, None] * self._lit(grid, looks, np.ones((1, emitted.shape[1])), known)
+            frames += least[:, None, None] * self._lit(grid, replicates, np.ones((1, emitted.shape[1])), known)
         return frames / samples
 
-    def lamps(self, grid: Grid, looks: Sequence[Deposits], samples: int, known: Known | None = None) -> FloatArray:
-        """(looks, 1, places, places) frames of lamps' light in each look.
+    def lamps(self, grid: Grid, replicates: Sequence[Deposits], samples: int, known: Known | None = None) -> FloatArray:
+        """(replicates, 1, places, places) frames of lamps' light in each replicate.
 
         Parameters
         ----------
-        grid, looks, samples, known
+        grid, replicates, samples, known
             as for :meth:`frames`.
         """
         pattern = np.zeros((1, self.lighting.weights.shape[1] + 1))
         pattern[:, -1] = 1
-        return self._lit(grid, looks, pattern, known) / samples
+        return self._lit(grid, replicates, pattern, known) / samples
 
-    def _lit(self, grid: Grid, looks: Sequence[Deposits], patterns: FloatArray, known: Known | None) -> FloatArray:
-        """(looks, patterns, rows, columns) frames of classes that are lit in ``patterns`` (patterns, classes), where
-        lamps are the last class; else as for :meth:`frames`."""
+    def _lit(self, grid: Grid, replicates: Sequence[Deposits], patterns: FloatArray, known: Known | None) -> FloatArray:
+        """(replicates, patterns, rows, columns) frames of classes that are lit in ``patterns`` (patterns, classes),
+        where lamps are the last class; else as for :meth:`frames`."""
         known = {} if known is None else known
         classes = self.lighting.weights.shape[1]
         patterns = np.pad(patterns, ((0, 0), (0, classes + 1 - patterns.shape[1])))
-        light = grid.key, *map(id, looks)
+        light = grid.key, *map(id, replicates)
         keys = [(*light, np.round(row, _DIGITS).tobytes()) for row in patterns]
         missing = [place for place, key in enumerate(keys) if key not in known]
         classes_of = np.append(self.lighting.labels, [classes] * grid.bundle.lamps)
         size = grid.bundle.size
-        entries = [grid.bundle.entries(look) for look in looks] if missing else []
+        entries = [grid.bundle.entries(replicate) for replicate in replicates] if missing else []
         optics = grid.optics if any(len(place) for place, *_ in entries) else None
 
         def form(row: int) -> None:
-            frames = np.zeros((len(looks), *self.shape))
+            frames = np.zeros((len(replicates), *self.shape))
             if optics:
                 share = patterns[row][classes_of]
                 seen = optics.probe([gathered(place, value * share[pixel], size) for place, value, pixel in entries])
                 frames = np.moveaxis(seen.reshape(len(frames[0]), len(frames), -1), 1, 0)
-            # The looks are held with the frames: their numbers must not be given to others.
-            known[keys[row]] = looks, frames
+            # The replicates are held with the frames: their numbers must not be given to others.
+            known[keys[row]] = replicates, frames
 
         in_threads(form, missing)
         return np.stack([known[key][1] for key in keys], axis=1)
@@ -264,7 +249,7 @@ def ladder(
     steps
         numbers from coarse to fine.
     frames
-        (looks, ...) of a step.
+        (replicates, ...) of a step.
     first
         index of the step that judges at first; finer ones are tried until the one before the judge is good enough.
     tolerance
@@ -302,7 +287,7 @@ def coarsened(
     name
         of the light.
     frames
-        (looks, ...) that it makes in so many coarse cells a side of a pixel and such layers.
+        (replicates, ...) that it makes in so many coarse cells a side of a pixel and such layers.
     layers
         depths [mm] that judge the one; none for a flat scene.
     """
@@ -332,15 +317,15 @@ def gathered(places: Labels, values: FloatArray, size: int) -> Entries:
 
 
 def product(one: FloatArray, other: FloatArray) -> float:
-    """Inner product of ``one`` and the ``other`` (looks, ...), mean over pairs of different looks."""
-    looks = len(one)
+    """Inner product of ``one`` and the ``other`` (replicates, ...), mean over pairs of different replicates."""
+    replicates = len(one)
     # Sums by numpy: those of BLAS depend on the number of its threads in the last bits.
     whole = float((one.sum(axis=0) * other.sum(axis=0)).sum())
-    return (whole - float((one * other).sum())) / (looks * (looks - 1))
+    return (whole - float((one * other).sum())) / (replicates * (replicates - 1))
 
 
 def norm(seen: FloatArray) -> float:
-    """Norm of frames ``seen`` in looks, without their noise."""
+    """Norm of frames ``seen`` in replicates, without their noise."""
     return math.sqrt(max(product(seen, seen), 0.0))
 
 
@@ -358,5 +343,5 @@ def heavy_paths(tracer: FromCameraTracer | Together, seed: int, samples: int) ->
 
 
 def noise(seen: FloatArray) -> float:
-    """Norm of the error of one look of frames ``seen``."""
+    """Norm of the error of one replicate of frames ``seen``."""
     return math.sqrt(float(np.square(seen - seen.mean(axis=0)).sum()) / (len(seen) - 1))

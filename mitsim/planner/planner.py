@@ -17,12 +17,21 @@ from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.light.cost_model import FIXED, tracing_seconds, unit_costs_of
 from mitsim.light.passes import Simulation
-from mitsim.light.pilot_result import LOOKS, Effort, Evidence
+from mitsim.light.pilot_result import LOOKS, Evidence, SampleCost
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, MOST_PATHS
 from mitsim.optics.diffraction import check_openings
 from mitsim.planner import pilot
-from mitsim.planner.choose import FIRST_LOOK, Candidates, Choice, affordable, cheapest, doubt, predicted, told
+from mitsim.planner.choose import (
+    FIRST_ACCURACY,
+    Candidate,
+    Candidates,
+    accuracy_for_time,
+    cheapest,
+    predicted,
+    time_warnings,
+    value_of_refining,
+)
 from mitsim.planner.explain import SceneFacts, decide
 from mitsim.planner.memory import frame_seconds
 
@@ -32,12 +41,13 @@ _LONGER = 2.0
 """Seconds of a second, finer look over those of the first (photograph 1.0, corner 1.1, gift_card 1.3, cookie_bag 2.6 at
 a tenth of the accuracy)."""
 _REHEARSED = 2**16
-"""Paths that tell a tracer's pace at first: a tenth of a second or less."""
+"""Paths that tell a pass's unit cost at first: a tenth of a second or less."""
 _SELDOM = 3.0
 """What knowing for certain saves at most, over what a closer look may take for it: the look seldom turns out as hoped
 (corner and cookie_bag at 1e-3: four looks of 1 to 13 s, and no run was the faster for them)."""
 _MORE, _OF_ALL = 4, 0.1
-"""Times as many paths as before that tell a pace, or noise, next, and the part of all planned that they are at most."""
+"""Times as many paths as before that tell a unit cost, or noise, next, and the part of all planned that they are at
+most."""
 _LEAST_SLOPE = 0.25
 """Part of a path's seconds in a launch that are its own at least, whatever shorter launches seem to say."""
 _HEAVY_PATHS, _MOST_HEAVY_PATHS = 2**19, 2**23
@@ -48,8 +58,8 @@ _FEW, _FEWEST = 8.0, 4.0
 tell nothing of its samples: ten glossy balls of alpha 0.005 need a hundred times those planned, one time in ten."""
 _LEAST, _MOST = 0.7, 5.0
 """Times the planned work on heavy paths that a run takes in nine cases of ten where more are met: sampling begins with
-0.8 of it (:mod:`mitsim.light.light`), at a pace known to a tenth (93, 99, 100 and 95 % of 400 pilots and runs, drawn
-from 1.3e8 paths of balls of alpha 0.02, 0.05 and 0.1 and of a torus)."""
+0.8 of it (:mod:`mitsim.light.light`), at a unit cost known to a tenth (93, 99, 100 and 95 % of 400 pilots and runs,
+drawn from 1.3e8 paths of balls of alpha 0.02, 0.05 and 0.1 and of a torus)."""
 _HEAVIER = 1.25
 """Tracing that takes so many times as long as planned is planned anew; less is what predictions are good to."""
 
@@ -76,7 +86,7 @@ def make_plan(
     switches
         effects that are switched on or off by name, whatever they are worth.
     lines
-        that share the paths, of which the bench shows one; what it takes is told of all.
+        that share the paths, of which the bench shows one; what it takes is time_warnings of all.
 
     Raises
     ------
@@ -86,15 +96,15 @@ def make_plan(
     check_accuracy(accuracy)
     _refuse_unfit(bench, switches or {})
     started = time.perf_counter()
-    look = pilot.Look(bench, lighting, accuracy, seed, lines)
+    runs = pilot.Look(bench, lighting, accuracy, seed, lines)
     while True:
-        evidence = look.evidence
-        worth, part = doubt(accuracy, evidence, switches or {})
-        stage = pilot.stage_of(part)
-        if _SELDOM * look.price(stage) > worth:
+        evidence = runs.evidence
+        worth, part = value_of_refining(accuracy, evidence, switches or {})
+        run = pilot.run_of(part)
+        if _SELDOM * runs.work(run) > worth:
             break
-        look.refine(stage)
-    return _decided(look, accuracy, switches or {}).taking(plan=time.perf_counter() - started)
+        runs.refine(run)
+    return _decided(runs, accuracy, switches or {}).taking(plan=time.perf_counter() - started)
 
 
 @single_threaded_blas()
@@ -103,7 +113,7 @@ def plan_within(
 ) -> Plan:
     """The plan of the finest accuracy whose run is predicted to end within so many seconds.
 
-    Predicted at fixed paces, looking and opening the scene included: the same seconds mean the same plan.
+    Predicted at fixed unit costs, looking and opening the scene included: the same seconds mean the same plan.
 
     Parameters
     ----------
@@ -120,21 +130,21 @@ def plan_within(
     started, switches = time.perf_counter(), switches or {}
     _refuse_unfit(bench, switches)
     around = OPENING_S + sum(frame_seconds(bench, len(lighting.weights)).values())
-    look = pilot.Look(bench, lighting, FIRST_LOOK, seed)
-    around += look.seconds
-    again = _LONGER * look.seconds
-    found = affordable(Candidates(look.evidence, switches), seconds - around, FIRST_LOOK)
+    runs = pilot.Look(bench, lighting, FIRST_ACCURACY, seed)
+    around += runs.seconds
+    again = _LONGER * runs.seconds
+    found = accuracy_for_time(Candidates(runs.evidence, switches), seconds - around, FIRST_ACCURACY)
     # What a look tells of finer accuracies than its own is their price, not whether they are kept.
-    aim = affordable(Candidates(look.evidence, switches), seconds - around - again, 0.0, kept=False)
-    if found.fits and aim.fits and aim.accuracy < FIRST_LOOK:
+    aim = accuracy_for_time(Candidates(runs.evidence, switches), seconds - around - again, 0.0, kept=False)
+    if found.fits and aim.fits and aim.accuracy < FIRST_ACCURACY:
         around += again
         closer = pilot.Look(bench, lighting, aim.accuracy, seed)
-        finer = affordable(Candidates(closer.evidence, switches), seconds - around, aim.accuracy)
+        finer = accuracy_for_time(Candidates(closer.evidence, switches), seconds - around, aim.accuracy)
         # It may say that no accuracy is kept at all, and then has the loosest.
         if finer.fits and finer.accuracy <= found.accuracy:
-            look, found = closer, finer
-    plan = _decided(look, found.accuracy, switches).taking(plan=time.perf_counter() - started)
-    return replace(plan, asked_seconds=seconds, warnings=(*told(found, seconds, around), *plan.warnings))
+            runs, found = closer, finer
+    plan = _decided(runs, found.accuracy, switches).taking(plan=time.perf_counter() - started)
+    return replace(plan, asked_seconds=seconds, warnings=(*time_warnings(found, seconds, around), *plan.warnings))
 
 
 def _refuse_unfit(bench: Apparatus, switches: Mapping[str, bool]) -> None:
@@ -145,14 +155,14 @@ def _refuse_unfit(bench: Apparatus, switches: Mapping[str, bool]) -> None:
         check_openings(bench.geometry.build_mask(), float(bench.spectrum.wavelengths_nm.max()))
 
 
-def _decided(look: pilot.Look, accuracy: float, switches: Mapping[str, bool]) -> Plan:
-    """The plan at an ``accuracy`` of what a ``look`` found, with the paces of its choice measured."""
-    evidence, bench = look.evidence, look.bench
+def _decided(runs: pilot.Look, accuracy: float, switches: Mapping[str, bool]) -> Plan:
+    """The plan at an ``accuracy`` of what ``runs`` found, with the unit costs of its choice measured."""
+    evidence, bench = runs.evidence, runs.bench
     chosen = cheapest(accuracy, evidence, switches)
     if evidence.sharp is not None and Simulation(bench, chosen.settings).from_camera is not None:
-        evidence, chosen = _with_heavy_paths(look, accuracy, chosen, switches)
+        evidence, chosen = _with_heavy_paths(runs, accuracy, chosen, switches)
     simulation = Simulation(bench, chosen.settings)
-    timed = _timed(evidence, simulation, look.lighting.labels, look.seed)
+    timed = _timed(evidence, simulation, runs.lighting.labels, runs.seed)
     plan = decide(accuracy, timed, SceneFacts.of(bench, switches), switches, chosen)
     plan = replace(plan, predicted_range=_range(timed, plan))
     if simulation.physics.mirrors:
@@ -162,35 +172,35 @@ def _decided(look: pilot.Look, accuracy: float, switches: Mapping[str, bool]) ->
 
 
 def _with_heavy_paths(
-    look: pilot.Look, accuracy: float, chosen: Choice, switches: Mapping[str, bool]
-) -> tuple[Evidence, Choice]:
-    """What a ``look`` found, and ``chosen`` with samples for rare paths over gloss where these make most of the noise.
+    runs: pilot.Look, accuracy: float, chosen: Candidate, switches: Mapping[str, bool]
+) -> tuple[Evidence, Candidate]:
+    """What ``runs`` found, and ``chosen`` with samples for rare paths over gloss where these make most of the noise.
 
     Whether the first samples of a run meet such paths is chance, and where they do not, nothing in it tells that their
     light is missing. So sampling begins with what looks of ever more paths ask for, the last of a part of the run's.
     """
-    plain = tracing_seconds(look.evidence, chosen.settings, FIXED)
+    plain = tracing_seconds(runs.evidence, chosen.settings, FIXED)
     paths = _HEAVY_PATHS
     while True:
-        known = look.evidence.efforts
+        known = runs.evidence.sample_costs
         heavier = {
-            name: replace(known[name], noise=effort.noise)
-            for name, effort in look.heavy(max(1, paths // (LOOKS * known["from_camera"].paths))).items()
-            if effort.variance > known[name].variance
+            name: replace(known[name], noise=sample_cost.noise)
+            for name, sample_cost in runs.heavy(max(1, paths // (LOOKS * known["from_camera"].paths))).items()
+            if sample_cost.variance > known[name].variance
         }
-        evidence = look.evidence.with_efforts(heavier)
+        evidence = runs.evidence.with_sample_costs(heavier)
         planned = predicted(accuracy, evidence, chosen.settings, switches)
         seconds = tracing_seconds(evidence, planned.settings, FIXED)
         if sum(seconds.values()) <= _HEAVIER * sum(plain.values()):
-            return look.evidence, chosen
+            return runs.evidence, chosen
         paths *= _MORE
         asked = {name: seconds[name] / FIXED.passes[name] for name in heavier}
-        few = any(effort.noise.heavy < _FEW for effort in heavier.values())
+        few = any(sample_cost.noise.heavy < _FEW for sample_cost in heavier.values())
         if paths > (_MOST_HEAVY_PATHS if few else min(_MOST_HEAVY_PATHS, _OF_ALL * sum(asked.values()))):
             return evidence, _limited(planned, asked)
 
 
-def _limited(chosen: Choice, paths: Mapping[str, float]) -> Choice:
+def _limited(chosen: Candidate, paths: Mapping[str, float]) -> Candidate:
     """The choice with no more samples of light whose ``paths`` in a run are known than sampling stops at."""
     samples = dict(chosen.settings.samples)
     samples |= {name: MOST_PATHS / count * samples[name] for name, count in paths.items() if count > MOST_PATHS}
@@ -202,7 +212,7 @@ def _range(evidence: Evidence, plan: Plan) -> tuple[float, float] | None:
     where many bring it, whose samples are known."""
     costs, least, most = unit_costs_of(evidence), 0.0, 0.0
     for name, seconds in tracing_seconds(evidence, plan.settings, costs).items():
-        heavy = evidence.efforts[name].noise.heavy
+        heavy = evidence.sample_costs[name].noise.heavy
         if seconds and math.isfinite(heavy):
             limit = MOST_PATHS * costs.passes[name]
             least += (_LEAST - 1) * seconds
@@ -227,13 +237,13 @@ def _timed(evidence: Evidence, simulation: Simulation, labels: Labels, seed: int
     own, found, spread = integer(seed, "pilot", "paces"), {}, evidence.spread
     for name, each in simulation.passes.items():
         seconds, longest = _pace(simulation, name, labels, own)
-        effort = evidence.efforts.get(name, Effort.none())
+        sample_cost = evidence.sample_costs.get(name, SampleCost.none())
         # A path of shared light counts for several.
-        paths = effort.paths if name == "indirect" else each.tracer.lanes
-        found[name] = replace(effort, seconds=seconds / paths)
+        paths = sample_cost.paths if name == "indirect" else each.tracer.lanes
+        found[name] = replace(sample_cost, seconds=seconds / paths)
         if name == "direct":
             spread = replace(spread, seconds=longest / paths)
-    return replace(evidence.with_efforts(found), spread=spread)
+    return replace(evidence.with_sample_costs(found), spread=spread)
 
 
 def _pace(simulation: Simulation, name: str, labels: Labels, seed: int) -> tuple[float, float]:

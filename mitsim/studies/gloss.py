@@ -22,8 +22,8 @@ from scipy import sparse
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.parallel import single_threaded_blas
+from mitsim.light.grids import LightEstimate
 from mitsim.light.light import SampledLight
-from mitsim.light.light_estimate import LightEstimate
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.reconstruct.solver import Prepared
 from mitsim.reconstruct.status import Solution

@@ -1,4 +1,4 @@
-"""Light filed where it is traced: connections on the device in, a sparse matrix of light per row and place out.
+"""Light added up where it is traced: connections on the device in, a sparse matrix of light per row and place out.
 
 Light is added up in whole numbers of a small unit, so that the sums do not hang on the order in which threads add, and
 nothing but the sums is ever fetched. Where :class:`mitsim.transport.records.Bundle` splits light between two layers,
@@ -109,7 +109,7 @@ class Ledger:
     Parameters
     ----------
     bundle
-        how light is filed.
+        how light is accumulated.
     labels
         (n^2,) row of each projector pixel.
     one
@@ -175,7 +175,7 @@ class Ledger:
         return ledgers * entries < MOST_PLACES and entries < _PAYS * parts * paths
 
     def place(self, seen: Sightings, chosen: mi.Float, anchor: tuple[mi.UInt32, mi.UInt32] | None = None) -> mi.UInt32:
-        """Where light is filed, all of it in one place.
+        """Where light is accumulated, all of it in one place.
 
         Parameters
         ----------
@@ -193,7 +193,7 @@ class Ledger:
         return self._placed(seen, layer, cells, anchor)
 
     def shares(self, seen: Sightings, anchor: tuple[mi.UInt32, mi.UInt32]) -> Iterator[tuple[mi.UInt32, mi.Float]]:
-        """Where light is filed, each place with its part of it, as :meth:`Bundle.file` splits it.
+        """Where light is accumulated, each place with its part of it, as :meth:`Bundle.file` splits it.
 
         Parameters
         ----------
@@ -238,8 +238,8 @@ class Ledger:
         cells: Sequence[mi.UInt32],
         anchor: tuple[mi.UInt32, mi.UInt32] | None,
     ) -> mi.UInt32:
-        """Where light of a ``layer`` and of ``cells`` along rows and columns is filed, or its anchor's place for what
-        lies beyond all cells."""
+        """Where light of a ``layer`` and of ``cells`` along rows and columns is accumulated, or its anchor's place for
+        what lies beyond all cells."""
         inside = mi.Bool(True)
         for axis, tau in self._axes(seen):
             position = self._position(axis, tau)

@@ -1,7 +1,7 @@
 """From paths to light per cell: deposits in, a sparse matrix out, light[row, layer x (anchor, cell) x (anchor, cell)].
 
 A row is a projector pixel, or a class of pixels that a pattern family always lights together. Ambient light has the
-last row, or one of the last for each band of its wavelengths. A path's light is filed in the cell that holds its
+last row, or one of the last for each band of its wavelengths. A path's light is accumulated in the cell that holds its
 direction, over which it is then taken as even, and split between the two layers (in 1/z) that enclose its depth.
 """
 
@@ -222,7 +222,7 @@ _ARRAYS = tuple(name for name in Deposits.__dataclass_fields__ if name not in ("
 
 @dataclass(frozen=True)
 class Bundle:
-    """How light is filed.
+    """How light is accumulated.
 
     Attributes
     ----------
@@ -294,7 +294,7 @@ class Bundle:
         return light
 
     def entries(self, deposits: Deposits, samples: int = 1) -> tuple[IntArray, FloatArray, IntArray]:
-        """(e,) place, light and projector pixel of all that is filed, in no order and not summed.
+        """(e,) place, light and projector pixel of all that is accumulated, in no order and not summed.
 
         Parameters
         ----------
@@ -324,7 +324,7 @@ class Bundle:
         return self.grid.rows.holds(deposits.row) & self.grid.columns.holds(deposits.column)
 
     def repeated(self, light: sparse.csr_array) -> sparse.csr_array:
-        """``light`` that was filed with one anchor, (rows, size / anchors^2), as if every anchor saw it."""
+        """``light`` that was accumulated with one anchor, (rows, size / anchors^2), as if every anchor saw it."""
         entries = light.tocoo()
         height, width = self.cells
         layer, place = np.divmod(entries.col.astype(np.int64), height * width)

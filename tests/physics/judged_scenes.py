@@ -317,8 +317,6 @@ def opened(judged: Judged, folder: Path, open_bench: Callable[..., Bench]) -> Be
 
 def verdict(judged: Judged, bench: Bench, patterns: str = "dots:3", accuracy: float = 1e-2, seed: int = 0) -> Verdict:
     """Frames of a family by the factored estimator against the judge's."""
-    from mitsim.light.light_file import error_bound
-
     light = bench.light(patterns, accuracy=accuracy, seed=seed, effects=LEFT_OUT)
     lighting = bench.family(patterns, seed).lighting
     rows, columns = np.array(POINTS).T
@@ -330,5 +328,5 @@ def verdict(judged: Judged, bench: Bench, patterns: str = "dots:3", accuracy: fl
     total = float(ours.sum() / frames.sum() - 1)
     # What the judge lacks too is no part of it; the plan adds its errors as energies.
     left_out = sum((row.error_if_off or 0.0) ** 2 for row in light.plan.effects if row.name in LEFT_OUT)
-    bound = float(np.sqrt(max(error_bound(light) ** 2 - left_out, light.sampling_error**2)))
+    bound = float(np.sqrt(max(light.error_bound**2 - left_out, light.sampling_error**2)))
     return Verdict(difference, total, bound, right.error, warnings, float(right.light.sum()))

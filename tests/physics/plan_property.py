@@ -57,12 +57,12 @@ def answer(bench: Bench, shots: Lighting, depth: float, seed: int, effort: Effor
     base = replace(base, followed_anchors=effort.followed_anchors)
     settings = replace(base, anchors=effort.anchors, layers=_layers(bench, base, seed, effort.layers))
     simulation = Simulation(bench, settings)
-    counts = {"direct": effort.direct, "anchored": max(1, effort.direct // 4)}
+    counts = {"direct": effort.direct, "anchor_residual": max(1, effort.direct // 4)}
     groups = []
     for group in range(GROUPS):
         parts = [
-            stage.file(stage.tracer.trace(integer(seed, name, group), 0, count), shots.labels, count)
-            for name, stage in simulation.passes.items()
+            simulation.accumulate(name, each.tracer.trace(integer(seed, name, group), 0, count), shots.labels, count)
+            for name, each in simulation.passes.items()
             for count in [counts.get(name, effort.other)]
         ]
         groups.append(sum(parts[1:], parts[0]))

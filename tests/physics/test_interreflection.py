@@ -96,11 +96,11 @@ def factored(scene: Path, spp: int, seed: int) -> Measured:
         own = 1000 * seed + group
         one, more = (
             [
-                stage.file(stage.tracer.trace(own, 0, count), lighting.labels, count)
-                for name, stage in simulation.passes.items()
+                simulation.accumulate(name, each.tracer.trace(own, 0, count), lighting.labels, count)
+                for name, each in simulation.passes.items()
                 if name in names
             ]
-            for names, count in ((("direct", "anchored"), samples), (("indirect",), 64 * samples))
+            for names, count in ((("direct", "anchor_residual"), samples), (("indirect",), 64 * samples))
         )
         for light in (sum(one[1:], one[0]), more[0]):
             frames = [frame.irradiance for frame in simulation.expected([light], np.arange(K**2), lighting, 0)]

@@ -37,15 +37,15 @@ from mitsim.bench.bench import Apparatus
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
+from mitsim.light.grids import LightEstimate
 from mitsim.light.light import SampledLight, traced_again
-from mitsim.light.light_estimate import LightEstimate
 from mitsim.light.pass_table import PASSES
 from mitsim.light.passes import Simulation, TracedPass, expected_of
 from mitsim.light.settings import Settings
 from mitsim.light.truth import Truth
 from mitsim.optics.frames import ClassFrames, ExpectedFrames
 from mitsim.scene.projector import straightening
-from mitsim.transport.accumulator import DeviceSums
+from mitsim.transport.accumulator import DeviceSums, Ledger
 from mitsim.transport.coordinates import rows_columns, turn_and_origin
 from mitsim.transport.integrator import ANY, FollowingTracer
 from mitsim.transport.projector import CanvasMap
@@ -209,6 +209,10 @@ class _Filing(Simulation):
     @cached_property
     def passes(self) -> Mapping[str, TracedPass]:
         return {name: each for name, each in super().passes.items() if each.row.even == self._only_direct}
+
+    def ledgers(self, name: str, labels: Labels, lines: int) -> tuple[Ledger, ...]:
+        # What is added up on the device lies where it was traced.
+        return () if self._off & {DEPTH, KEYSTONE} and PASSES[name].anchors else super().ledgers(name, labels, lines)
 
     def accumulate(self, name: str, found: Deposits | DeviceSums, labels: Labels, samples: int) -> LightEstimate:
         if isinstance(found, DeviceSums) or not (name == "direct" or PASSES[name].anchors):

@@ -22,7 +22,7 @@ from mitsim.light.light import SampledLight, traced_again
 from mitsim.light.passes import Simulation
 from mitsim.light.pilot_result import LOOKS, Changes, Part
 from mitsim.light.plan import Plan
-from mitsim.light.rounds import first_samples
+from mitsim.light.sampling import first_samples
 from mitsim.light.settings import GROUPS, Estimate, Settings
 from mitsim.metrics import relative_error
 from mitsim.optics.frames import ExpectedFrames

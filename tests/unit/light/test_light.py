@@ -26,7 +26,7 @@ from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, Settings
 from mitsim.optics.frames import ExpectedFrames, monte_carlo_error
 from mitsim.planner import choose, memory, planner
-from mitsim.planner.choose import Choice
+from mitsim.planner.choose import Candidate
 from mitsim.planner.explain import SceneFacts
 from mitsim.planner.planner import make_plan
 from tests.unit.planner.invented_evidence import EVIDENCE
@@ -263,11 +263,11 @@ def test_lines_are_looked_at_from_the_noisiest_until_one_is_not_good_enough(
     """Noise of 2, 1 and 3 in 4 of their light, and a dark line; 2 is enough. (Planted: no end; the quietest first.)"""
     lines: list[Any] = [SimpleNamespace(flux=np.full(3, 4.0), flux_error=np.full(3, noise)) for noise in (2, 1, 3)]
     lines.append(SimpleNamespace(flux=np.zeros(3), flux_error=np.zeros(3)))
-    monkeypatch.setattr(module, "_looked", lambda light, line, *_: module._Look(light, bounds[line], {}))
-    seen = module._looks(lines, lambda line: line, Lighting.uniform(1), False, 2.0)
+    monkeypatch.setattr(module, "_check", lambda light, line, *_: module._Check(light, bounds[line], {}))
+    seen = module._checks(lines, lambda line: line, Lighting.uniform(1), False, 2.0)
     assert list(seen) == looked
     assert all(seen[line].light is lines[line] and seen[line].bound == bounds[line] for line in looked)
-    assert len(module._looks(lines, lambda line: line, Lighting.uniform(1), False, math.inf)) == 4
+    assert len(module._checks(lines, lambda line: line, Lighting.uniform(1), False, math.inf)) == 4
 
 
 def test_a_plan_of_several_lines_is_priced_for_all(
@@ -279,7 +279,7 @@ def test_a_plan_of_several_lines_is_priced_for_all(
     """
     seen: list[int] = []
 
-    def cheapest(accuracy: float, evidence: Evidence, switches: Mapping[str, bool]) -> Choice:
+    def cheapest(accuracy: float, evidence: Evidence, switches: Mapping[str, bool]) -> Candidate:
         seen.append(evidence.forming.lines)
         return choose.cheapest(accuracy, evidence, switches)
 
@@ -388,6 +388,6 @@ def test_paces_are_measured_of_what_was_chosen_alone(bench: Bench, monkeypatch: 
     simulation = Simulation(bench, Settings(depth=400.0, anchors=2))
     timed = planner._timed(EVIDENCE, simulation, np.arange(bench.n**2), 0)
     for name in ("direct", "anchor_residual"):
-        assert timed.efforts[name].seconds == pytest.approx(1e-7)
+        assert timed.sample_costs[name].seconds == pytest.approx(1e-7)
     for name in ("indirect", "indirect_residual"):
-        assert timed.efforts[name] == EVIDENCE.efforts[name]
+        assert timed.sample_costs[name] == EVIDENCE.sample_costs[name]

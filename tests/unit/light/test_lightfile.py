@@ -16,9 +16,8 @@ from mitsim.api.light import Light
 from mitsim.bench.effects import EFFECTS
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import Lighting
-from mitsim.light.grids import GRIDS
+from mitsim.light.grids import GRIDS, LightEstimate
 from mitsim.light.light import Sampling, trace_light
-from mitsim.light.light_estimate import LightEstimate
 from mitsim.light.light_file import write_light
 from mitsim.light.passes import Simulation
 from mitsim.light.plan import Plan

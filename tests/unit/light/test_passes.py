@@ -29,7 +29,7 @@ import mitsim as ms
 from mitsim.light.cost_model import FIXED, tracing_seconds
 from mitsim.light.light import trace_light
 from mitsim.light.light_file import write_light
-from mitsim.light.rounds import next_samples
+from mitsim.light.sampling import next_samples
 from mitsim.planner import pilot
 assert pathlib.Path(ms.__file__).parents[1] == pathlib.Path.cwd(), ms.__file__
 scene, folder = pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2])
@@ -42,13 +42,13 @@ for name in ("plain", "veiled"):
     light = trace_light(bench, plan, lighting, 0)
     write_light(folder / f"{name}.h5", light)
     grown = next_samples(light.simulation, light.samples, {each: float(each == "veil") for each in light.samples}, 2.0)
-    effort = result.efforts["veil"]
+    sample_cost = result.sample_costs["veil"]
     found[name] = {
         "plan": plan.payload(),
         "samples": dict(light.samples),
         "grown": grown,
-        "noise": effort.noise.error,
-        "paths": effort.paths,
+        "noise": sample_cost.noise.error,
+        "paths": sample_cost.paths,
         "seconds": tracing_seconds(result, plan.settings, FIXED)["veil"],
         "reached": light.reached,
     }

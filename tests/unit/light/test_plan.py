@@ -181,8 +181,8 @@ def test_many_terms_are_summed_or_formed_by_fft_whichever_takes_less() -> None:
 
     def shown(accuracy: float, terms: float, drawing: float = 0.05) -> Plan:
         forming = replace(EVIDENCE.forming, geometric_terms=terms, drawing=(drawing, 0.0))
-        choice = replace(EVIDENCE, forming=forming, raster=(Drawn(Estimate(4e-4, 6e-4)), Drawn()))
-        return plan(accuracy, choice, "-diffraction")
+        candidate = replace(EVIDENCE, forming=forming, raster=(Drawn(Estimate(4e-4, 6e-4)), Drawn()))
+        return plan(accuracy, candidate, "-diffraction")
 
     few, many = shown(1e-2, 3.0), shown(1e-2, 200.0)
     assert not few.settings.raster and many.settings.raster
@@ -195,11 +195,11 @@ def test_many_terms_are_summed_or_formed_by_fft_whichever_takes_less() -> None:
 
 def test_settings_do_not_depend_on_the_machines_pace() -> None:
     """Bit-equal repetition and --resume need it: the same seed must mean the same settings."""
-    efforts = {
-        name: replace(EVIDENCE.efforts[name], seconds=1e-4)
+    sample_costs = {
+        name: replace(EVIDENCE.sample_costs[name], seconds=1e-4)
         for name in ("direct", "anchor_residual", "indirect", "from_camera")
     }
-    slow = replace(EVIDENCE.with_efforts(efforts), forming=replace(EVIDENCE.forming, seconds=1.0))
+    slow = replace(EVIDENCE.with_sample_costs(sample_costs), forming=replace(EVIDENCE.forming, seconds=1.0))
     for accuracy in ACCURACIES:
         one, other = plan(accuracy), plan(accuracy, slow)
         assert one.settings == other.settings and one.sampling_target == other.sampling_target

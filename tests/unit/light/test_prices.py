@@ -8,23 +8,23 @@ from mitsim.light.cost_model import (
     FIXED,
     Numbers,
     UnitCosts,
+    accumulation_seconds,
     checking_seconds,
     entries,
-    filing_seconds,
     forming_seconds,
     optics_seconds,
     tracing_seconds,
     truth_seconds,
     unit_costs_of,
 )
-from mitsim.light.pilot_result import Effort, Forming, Noise
+from mitsim.light.pilot_result import Forming, Noise, SampleCost
 from mitsim.light.settings import GROUPS, Settings
 from mitsim.optics.frames import PROBES
 from tests.unit.planner.invented_evidence import EVIDENCE, plan
 
 FORMING = Forming(pixels=50, cells=10, lit=0.5, terms=3.0, shots=4, classes=4)
 ONE = Numbers.coarsest()
-COUNTED = UnitCosts(dict.fromkeys(FIXED.passes, 0.0), frame=0.0, product=1.0, entry=0.0, filed=0.0, ray=0.0)
+COUNTED = UnitCosts(dict.fromkeys(FIXED.passes, 0.0), frame=0.0, product=1.0, entry=0.0, accumulated=0.0, ray=0.0)
 """Unit costs at which seconds are multiplications of forming frames."""
 
 
@@ -38,21 +38,22 @@ def test_the_frame_that_the_pilot_measured_takes_what_it_took() -> None:
     measured = replace(EVIDENCE, forming=replace(EVIDENCE.forming, seconds=0.125))
     assert forming_seconds(measured.forming, ONE, 1.0, unit_costs_of(measured)) == pytest.approx(0.125, rel=1e-12)
     none = replace(
-        EVIDENCE.with_efforts({"direct": replace(EVIDENCE.efforts["direct"], seconds=0.0)}),
+        EVIDENCE.with_sample_costs({"direct": replace(EVIDENCE.sample_costs["direct"], seconds=0.0)}),
         forming=replace(EVIDENCE.forming, seconds=0.0),
     )
     assert (
         unit_costs_of(none).passes["direct"] == FIXED.passes["direct"] and unit_costs_of(none).product == FIXED.product
     )
     slower = {
-        name: getattr(unit_costs_of(measured), name) / getattr(FIXED, name) for name in ("frame", "entry", "filed")
+        name: getattr(unit_costs_of(measured), name) / getattr(FIXED, name)
+        for name in ("frame", "entry", "accumulated")
     }
     assert slower == pytest.approx(dict.fromkeys(slower, unit_costs_of(measured).product / FIXED.product))
     timed = replace(measured, forming=replace(measured.forming, product=FIXED.product / 6))
     assert forming_seconds(timed.forming, ONE, 1.0, unit_costs_of(timed)) == pytest.approx(0.125, rel=1e-12)
     assert unit_costs_of(timed).product == FIXED.product / 6, "large products are not slower because small frames are"
     assert unit_costs_of(timed).entry == pytest.approx(FIXED.entry / 6)
-    other = EVIDENCE.with_efforts({"direct": replace(EVIDENCE.efforts["direct"], seconds=5e-6)})
+    other = EVIDENCE.with_sample_costs({"direct": replace(EVIDENCE.sample_costs["direct"], seconds=5e-6)})
     assert unit_costs_of(other).passes["direct"] == 5e-6
 
 
@@ -118,13 +119,13 @@ def test_shadows_take_entries_of_waves_or_a_thirtieth_of_one_without() -> None:
 def test_tracing_takes_a_path_of_every_sample_in_every_group_and_connections_to_all_anchors() -> None:
     """Samples are whole; differences between 3 x 3 anchors take nine connections each, and one anchor has none."""
     settings = replace(plan().settings, samples={"direct": 2.5, "anchor_residual": 4.0})
-    costs, paths = replace(COUNTED, passes=dict.fromkeys(FIXED.passes, 1.0)), EVIDENCE.efforts["direct"].paths
+    costs, paths = replace(COUNTED, passes=dict.fromkeys(FIXED.passes, 1.0)), EVIDENCE.sample_costs["direct"].paths
     several, one = (tracing_seconds(EVIDENCE, replace(settings, anchors=count), costs) for count in (3, 1))
     assert several["direct"] == one["direct"] == GROUPS * 3 * paths
-    anchored = 9 * GROUPS * 4 * EVIDENCE.efforts["anchor_residual"].paths
+    anchored = 9 * GROUPS * 4 * EVIDENCE.sample_costs["anchor_residual"].paths
     assert several["anchor_residual"] == anchored and one["anchor_residual"] == 0
-    light = Effort(Noise(1e-3, 4, 0.5), 3)
-    occluded = replace(EVIDENCE, occluded=(3, 4, 5)).with_efforts({"penumbra": light})
+    light = SampleCost(Noise(1e-3, 4, 0.5), 3)
+    occluded = replace(EVIDENCE, occluded=(3, 4, 5)).with_sample_costs({"penumbra": light})
     own = replace(settings, occluded=(3, 4, 5), occluded_anchors=8, samples={"penumbra": 2.0})
     assert tracing_seconds(occluded, own, costs)["penumbra"] == 64 * GROUPS * 2 * 3
     assert tracing_seconds(occluded, settings, costs)["penumbra"] == 0
@@ -152,10 +153,10 @@ def test_every_shot_is_looked_through_once_more_than_it_is_formed() -> None:
 
     (Planted: a side of the sensor in place of its pixels.)
     """
-    looked = replace(COUNTED, product=0.0, pixel=1.0)
+    frame_check = replace(COUNTED, product=0.0, pixel=1.0)
     for classes in (FORMING.classes, 9):
         forming = replace(FORMING, classes=classes)
-        assert optics_seconds(forming, ONE, looked) == pytest.approx(FORMING.shots * 50**2)
+        assert optics_seconds(forming, ONE, frame_check) == pytest.approx(FORMING.shots * 50**2)
 
 
 def test_lines_share_paths_and_form_and_file_each_its_own() -> None:
@@ -167,7 +168,7 @@ def test_lines_share_paths_and_form_and_file_each_its_own() -> None:
         lambda forming: forming_seconds(forming, numbers, 5.0, FIXED),
         lambda forming: optics_seconds(forming, numbers, FIXED),
         lambda forming: checking_seconds(forming, numbers, FIXED),
-        lambda forming: filing_seconds(forming, numbers, 1e6, FIXED),
+        lambda forming: accumulation_seconds(forming, numbers, 1e6, FIXED),
     ):
         assert seconds(three.forming) == pytest.approx(3 * seconds(EVIDENCE.forming))  # type: ignore[no-untyped-call]
     one, several = (tracing_seconds(evidence, settings, FIXED) for evidence in (EVIDENCE, three))
@@ -179,11 +180,11 @@ def test_a_ledger_is_emptied_and_looked_through_where_it_has_room() -> None:
     """4 classes of 20 x 20 cells in two layers, where light is followed over several surfaces."""
     numbers = replace(ONE, indirect=1.0, coarse_cells=2.0, layers=2.0)
     places = 4 * 20**2 * 2
-    entry = GROUPS * FIXED.filed
-    assert filing_seconds(FORMING, numbers, 1000.0, FIXED) == pytest.approx(entry * (1000 + 0.4 * places))
-    assert filing_seconds(FORMING, replace(numbers, indirect=0.0), 1000.0, FIXED) == pytest.approx(entry * 1000)
+    entry = GROUPS * FIXED.accumulated
+    assert accumulation_seconds(FORMING, numbers, 1000.0, FIXED) == pytest.approx(entry * (1000 + 0.4 * places))
+    assert accumulation_seconds(FORMING, replace(numbers, indirect=0.0), 1000.0, FIXED) == pytest.approx(entry * 1000)
     most = 2**26 // 800
     large = replace(FORMING, classes=most)
-    assert filing_seconds(large, numbers, 1000.0, FIXED) == pytest.approx(entry * (1000 + 0.4 * most * 800))
+    assert accumulation_seconds(large, numbers, 1000.0, FIXED) == pytest.approx(entry * (1000 + 0.4 * most * 800))
     larger = replace(FORMING, classes=most + 1)
-    assert filing_seconds(larger, numbers, 1000.0, FIXED) == pytest.approx(entry * 1000)
+    assert accumulation_seconds(larger, numbers, 1000.0, FIXED) == pytest.approx(entry * 1000)

@@ -9,7 +9,7 @@ import pytest
 
 from mitsim.light.cost_model import FIXED, SHARED_COST
 from mitsim.light.pass_table import EVEN, even
-from mitsim.light.rounds import SampledPass, cheapest_samples, first_samples, next_samples
+from mitsim.light.sampling import SampledPass, cheapest_samples, first_samples, next_samples
 from mitsim.transport.path_reuse import NeighbourTracer
 
 LIGHTS = (
@@ -113,7 +113,7 @@ def test_work_is_that_of_paths_at_fixed_paces() -> None:
         simulation, dict.fromkeys(("indirect", "from_camera"), 1000), {"indirect": 1, "from_camera": 1}, 1.5
     )
     assert found["indirect"] / found["from_camera"] == pytest.approx(math.sqrt(dear / cheap), rel=2e-3)
-    simulation = simulated(**{"camera_residual": (of_lanes(100), 1.0), "from_camera": (of_lanes(100), 1.0)})
+    simulation = simulated(camera_residual=(of_lanes(100), 1.0), from_camera=(of_lanes(100), 1.0))
     found = next_samples(simulation, dict.fromkeys(simulation.passes, 1000), dict.fromkeys(simulation.passes, 1), 1.5)
     ratio = math.sqrt(FIXED.passes["from_camera"] / FIXED.passes["camera_residual"])
     assert found["camera_residual"] / found["from_camera"] == pytest.approx(ratio, rel=2e-3)

@@ -12,14 +12,14 @@ from mitsim.bench.effects import parse_switches
 from mitsim.light.cost_model import (
     Numbers,
     UnitCosts,
+    accumulation_seconds,
     checking_seconds,
     entries,
-    filing_seconds,
     optics_seconds,
     tracing_seconds,
     truth_seconds,
 )
-from mitsim.light.pilot_result import LOOKS, Changes, Effort, Evidence, Forming, Noise, Part
+from mitsim.light.pilot_result import LOOKS, Changes, Evidence, Forming, Noise, Part, SampleCost
 from mitsim.light.plan import Plan, PlanRow
 from mitsim.light.settings import Settings
 from mitsim.planner.explain import SceneFacts, decide
@@ -54,15 +54,15 @@ EVIDENCE = Evidence(
     depth=380.0,
     layers={1: (380.0,), 2: (400.0, 300.0), 3: (400.0, 343.0, 300.0), 4: (400.0, 369.0, 327.0, 300.0)},
     changes=changes(SIZES),
-    efforts={
-        "direct": Effort(Noise(2e-3, 16, 0.8), 16_384, 1e-7),
-        "anchor_residual": Effort(Noise(3e-4, 4, 0.5), 16_384, 1e-7),
-        "indirect": Effort(Noise(4e-3, 2, 0.5), 16_384, 2e-7),
-        "from_camera": Effort(Noise(1e-2, 2, 0.5), 20_000, 6e-7),
-        "indirect_residual": Effort(Noise(2e-3, 2, 0.5), 36_384, 6e-7),
-        "camera_residual": Effort.none(),
+    sample_costs={
+        "direct": SampleCost(Noise(2e-3, 16, 0.8), 16_384, 1e-7),
+        "anchor_residual": SampleCost(Noise(3e-4, 4, 0.5), 16_384, 1e-7),
+        "indirect": SampleCost(Noise(4e-3, 2, 0.5), 16_384, 2e-7),
+        "from_camera": SampleCost(Noise(1e-2, 2, 0.5), 20_000, 6e-7),
+        "indirect_residual": SampleCost(Noise(2e-3, 2, 0.5), 36_384, 6e-7),
+        "camera_residual": SampleCost.none(),
     },
-    spread=Effort(Noise(2e-3, 16, 0.8), 16_384, 1e-7),
+    spread=SampleCost(Noise(2e-3, 16, 0.8), 16_384, 1e-7),
     forming=Forming(pixels=512, cells=150, lit=0.2, terms=3.0, shots=49, classes=49, seconds=2e-3),
     apart=APART,
 )
@@ -84,8 +84,8 @@ def rows(found: Plan) -> dict[str, PlanRow]:
 def stages(evidence: Evidence, settings: Settings, costs: UnitCosts) -> dict[str, float]:
     """Seconds of each stage: paths, filing of what they bring, looks at the error; rays of the truth; frames."""
     forming, numbers = evidence.forming, Numbers.of(settings)
-    filed = entries(evidence.efforts["direct"].paths, forming.classes, numbers, settings)
-    filing = filing_seconds(forming, numbers, filed, costs)
+    held = entries(evidence.sample_costs["direct"].paths, forming.classes, numbers, settings)
+    filing = accumulation_seconds(forming, numbers, held, costs)
     looking = checking_seconds(forming, numbers, costs)
     return {
         "transport": sum(tracing_seconds(evidence, settings, costs).values()) + filing + looking,
@@ -97,5 +97,5 @@ def stages(evidence: Evidence, settings: Settings, costs: UnitCosts) -> dict[str
 def with_occluded(sizes: dict[int, float]) -> Evidence:
     """150 pixels that leave so much by the number of their anchors."""
     found = changes(SIZES | {Part("occluded_anchors", count): size for count, size in sizes.items()})
-    light = Effort(Noise(1e-4, 4, 0.5), 150)
-    return replace(ONE_CLASS, changes=found, occluded=tuple(range(150))).with_efforts({"penumbra": light})
+    light = SampleCost(Noise(1e-4, 4, 0.5), 150)
+    return replace(ONE_CLASS, changes=found, occluded=tuple(range(150))).with_sample_costs({"penumbra": light})

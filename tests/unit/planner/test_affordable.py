@@ -8,7 +8,15 @@ import pytest
 
 from mitsim.bench.request import HIGHEST_ACCURACY
 from mitsim.light.cost_model import FIXED, truth_seconds
-from mitsim.planner.choose import FIRST_LOOK, Affordable, Candidates, accuracies, affordable, cheapest, told
+from mitsim.planner.choose import (
+    FIRST_ACCURACY,
+    AccuracyForTime,
+    Candidates,
+    accuracies,
+    accuracy_for_time,
+    cheapest,
+    time_warnings,
+)
 from tests.unit.planner.invented_evidence import EVIDENCE
 
 TIMES = (0.01, 0.3, 0.95, 1.0, 2.0, 4.0, 10.0, 40.0, 1e5)
@@ -20,13 +28,13 @@ def candidates() -> Candidates:
 
 
 @pytest.fixture(scope="module")
-def bought(candidates: Candidates) -> list[Affordable]:
-    return [affordable(candidates, seconds, 1e-4) for seconds in TIMES]
+def bought(candidates: Candidates) -> list[AccuracyForTime]:
+    return [accuracy_for_time(candidates, seconds, 1e-4) for seconds in TIMES]
 
 
 def test_accuracies_fall_by_the_same_step_down_to_the_finest() -> None:
-    grid = accuracies(FIRST_LOOK)
-    assert grid[0] == HIGHEST_ACCURACY and grid[-1] == FIRST_LOOK
+    grid = accuracies(FIRST_ACCURACY)
+    assert grid[0] == HIGHEST_ACCURACY and grid[-1] == FIRST_ACCURACY
     assert all(1.15 < coarse / fine < 1.3 for coarse, fine in pairwise(grid))
     assert accuracies(0.0)[-1] == 1e-5
 
@@ -35,19 +43,19 @@ def test_candidates_choose_as_the_plan_does(candidates: Candidates) -> None:
     """What is shared between accuracies does not depend on them, nor on their order."""
     for accuracy in (3e-4, 0.1, 3e-3):
         table, index = candidates.best(accuracy)
-        choice = cheapest(accuracy, EVIDENCE, {})
-        assert table.settings(index) == choice.settings
+        candidate = cheapest(accuracy, EVIDENCE, {})
+        assert table.settings(index) == candidate.settings
         seconds, keeps = candidates.seconds(accuracy)
-        assert seconds == pytest.approx(choice.work + truth_seconds(EVIDENCE, choice.settings, FIXED), rel=1e-12)
-        assert keeps is choice.fits
+        assert seconds == pytest.approx(candidate.work + truth_seconds(EVIDENCE, candidate.settings, FIXED), rel=1e-12)
+        assert keeps is candidate.fits
 
 
-def test_more_seconds_never_buy_less(bought: list[Affordable]) -> None:
+def test_more_seconds_never_buy_less(bought: list[AccuracyForTime]) -> None:
     found = [each.accuracy for each in bought]
     assert found == sorted(found, reverse=True) and len(set(found)) > 4
 
 
-def test_what_is_bought_fits_and_the_next_finer_does_not(bought: list[Affordable], candidates: Candidates) -> None:
+def test_what_is_bought_fits_and_the_next_finer_does_not(bought: list[AccuracyForTime], candidates: Candidates) -> None:
     grid = accuracies(1e-4)
     for seconds, each in zip(TIMES[2:6], bought[2:6], strict=True):
         assert each.fits and each.seconds <= seconds
@@ -56,11 +64,11 @@ def test_what_is_bought_fits_and_the_next_finer_does_not(bought: list[Affordable
         assert candidates.seconds(finer)[0] > seconds
 
 
-def test_no_finer_than_the_evidence_is_good_for(bought: list[Affordable], candidates: Candidates) -> None:
+def test_no_finer_than_the_evidence_is_good_for(bought: list[AccuracyForTime], candidates: Candidates) -> None:
     assert bought[-1].accuracy >= 1e-4 and bought[-1].fits
-    assert affordable(candidates, math.inf, FIRST_LOOK).accuracy == FIRST_LOOK
-    kept, priced = (affordable(candidates, math.inf, 0.0, kept=kept) for kept in (True, False))
-    assert priced.accuracy == 1e-5 < kept.accuracy, "the ladders end before it, so only its price is known"
+    assert accuracy_for_time(candidates, math.inf, FIRST_ACCURACY).accuracy == FIRST_ACCURACY
+    kept, costly_effects = (accuracy_for_time(candidates, math.inf, 0.0, kept=kept) for kept in (True, False))
+    assert costly_effects.accuracy == 1e-5 < kept.accuracy, "the ladders end before it, so only its price is known"
 
 
 @pytest.mark.parametrize("seconds", [0.05, 0.2])
@@ -72,12 +80,12 @@ def test_where_nothing_is_kept_time_alone_counts(seconds: float) -> None:
             return 0.1, False
 
     found: Any = Hopeless()
-    assert affordable(found, seconds, 1e-4) == Affordable(HIGHEST_ACCURACY, 0.1, seconds > 0.1)
+    assert accuracy_for_time(found, seconds, 1e-4) == AccuracyForTime(HIGHEST_ACCURACY, 0.1, seconds > 0.1)
 
 
-def test_too_little_time_is_told(bought: list[Affordable]) -> None:
+def test_too_little_time_is_told(bought: list[AccuracyForTime]) -> None:
     assert bought[0].accuracy == HIGHEST_ACCURACY and not bought[0].fits
-    [line] = told(bought[0], 0.01, 2.0)
+    [line] = time_warnings(bought[0], 0.01, 2.0)
     assert line.startswith("0.01 seconds are too few: even accuracy 0.3")
     assert f"{bought[0].seconds + 2.0:.1f} s" in line
-    assert not [*told(bought[3], 1.0, 2.0)]
+    assert not [*time_warnings(bought[3], 1.0, 2.0)]

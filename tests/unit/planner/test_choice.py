@@ -8,10 +8,10 @@ import pytest
 
 from mitsim.bench.effects import parse_switches
 from mitsim.light.cost_model import FIXED, Numbers, entries
-from mitsim.light.pilot_result import LOOKS, Changes, Effort, Evidence, Noise, Part
+from mitsim.light.pilot_result import LOOKS, Changes, Evidence, Noise, Part, SampleCost
 from mitsim.light.settings import GROUPS, Settings, SharpPixels
-from mitsim.planner.choose import cheapest, doubt, parts_of, predicted
-from mitsim.planner.pilot import stage_of
+from mitsim.planner.choose import cheapest, parts_of, predicted, value_of_refining
+from mitsim.planner.pilot import run_of
 from tests.unit.planner.invented_evidence import (
     ACCURACIES,
     APART,
@@ -25,7 +25,7 @@ from tests.unit.planner.invented_evidence import (
     with_occluded,
 )
 
-PRICED = {"interreflection", "ambient", "diffraction", "black-level"}
+COSTLY = {"interreflection", "ambient", "diffraction", "black-level"}
 
 
 def random_evidence(seed: int) -> Evidence:
@@ -38,9 +38,9 @@ def random_evidence(seed: int) -> Evidence:
     names = "direct", "spread", "anchor_residual", "indirect", "from_camera", "indirect_residual"
     noises = {name: Noise(10 ** rng.uniform(-4, -1.5), 4, 0.5) for name in names}
     spread = replace(EVIDENCE.spread, noise=noises.pop("spread"))
-    efforts = {name: replace(EVIDENCE.efforts[name], noise=noise) for name, noise in noises.items()}
+    sample_costs = {name: replace(EVIDENCE.sample_costs[name], noise=noise) for name, noise in noises.items()}
     found = Changes.between(dict(zip(sizes, looks, strict=True)), 1.0)
-    return replace(EVIDENCE, changes=found, spread=spread).with_efforts(efforts)
+    return replace(EVIDENCE, changes=found, spread=spread).with_sample_costs(sample_costs)
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -57,7 +57,7 @@ def test_no_choice_that_fits_is_cheaper(accuracy: float, seed: int) -> None:
         return
     assert chosen.total.bound <= accuracy
     now = chosen.settings
-    others = [replace(now, effects=now.effects - {name}) for name in PRICED & now.effects]
+    others = [replace(now, effects=now.effects - {name}) for name in COSTLY & now.effects]
     others += [replace(now, anchors=count) for count in evidence.ladders["anchors"]]
     others += [replace(now, layers=evidence.layers[count] if count > 1 else ()) for count in evidence.ladders["layers"]]
     others += [replace(now, subdivision=count) for count in evidence.ladders["cells"]]
@@ -139,21 +139,21 @@ def test_what_the_pilot_cannot_tell_is_on() -> None:
     assert "interreflection" not in cheapest(1e-3, sure, {}).settings.effects
     careful, hopeful = (cheapest(1e-3, unsure, {}, sigmas).settings.effects for sigmas in (2.35, 0.0))
     assert "interreflection" in careful
-    worth, part = doubt(1e-3, unsure, {})
+    worth, part = value_of_refining(1e-3, unsure, {})
     assert worth > 0 and part == Part("interreflection") and "interreflection" not in hopeful
-    assert doubt(1e-3, sure, {})[0] == 0
+    assert value_of_refining(1e-3, sure, {})[0] == 0
 
 
 def test_nothing_is_worth_knowing_where_no_luck_would_keep_the_accuracy() -> None:
     """Every number of cells is known to leave all of the light. (Planted: a second's worth.)"""
     sizes = {part: 1.0 if part.name == "cells" else size for part, size in SIZES.items()}
-    assert doubt(1e-3, replace(EVIDENCE, changes=changes(sizes), apart={}), {})[0] == 0.0
+    assert value_of_refining(1e-3, replace(EVIDENCE, changes=changes(sizes), apart={}), {})[0] == 0.0
 
 
 @pytest.mark.parametrize("accuracy", [1e-3, 1e-4, 1e-6])
 def test_no_light_is_asked_for_that_cannot_be_held(accuracy: float) -> None:
     """Of 49 classes indirect light lies in all cells of each: 2^25 entries a group are 12 GB. (Planted: no limit.)"""
-    settings, pixels = cheapest(accuracy, EVIDENCE, {}).settings, EVIDENCE.efforts["direct"].paths
+    settings, pixels = cheapest(accuracy, EVIDENCE, {}).settings, EVIDENCE.sample_costs["direct"].paths
     assert entries(pixels, 49, Numbers.of(settings), settings) <= 2**25
     samples = {**settings.samples, "indirect": 1e5, "indirect_residual": 1e5}
     finest = replace(settings, followed_anchors=3, coarse_cells=8, samples=samples)
@@ -164,7 +164,7 @@ def test_occluded_pixels_count_with_their_anchors() -> None:
     """Each of 100 pixels lights four places of its own for each of 16 x 16 anchors, in two layers twice as many; with
     one anchor it is a pixel like the others."""
     pixels, few = (
-        EVIDENCE.efforts["direct"].paths,
+        EVIDENCE.sample_costs["direct"].paths,
         replace(cheapest(1e-2, EVIDENCE, {}).settings, layers=(), coarse_layers=False),
     )
     own = replace(few, occluded=tuple(range(100)), occluded_anchors=16, samples={**few.samples, "penumbra": 9.0})
@@ -199,7 +199,7 @@ def test_occluded_pixels_have_several_anchors_where_the_others_do(accuracy: floa
 def test_light_to_random_points_of_the_sensor_has_its_own_noise() -> None:
     """Ten times the noise takes so many more samples where there are several anchors, and none where there is one.
     (Planted: the centre's noise for both; spread noise with one anchor.)"""
-    noisy = replace(EVIDENCE, spread=Effort(Noise(2e-2, 16, 0.5), 16_384))
+    noisy = replace(EVIDENCE, spread=SampleCost(Noise(2e-2, 16, 0.5), 16_384))
     for switches, factor in (({"anchors": False}, 1.0), ({"anchors": True}, 10.0)):
         quiet, loud = (cheapest(3e-3, evidence, switches) for evidence in (EVIDENCE, noisy))
         assert (loud.settings.anchors > 1) == (factor > 1)
@@ -231,13 +231,13 @@ def test_samples_take_the_least_work_for_the_target() -> None:
     noises = {name: Noise(0.0, 1, 0.5) for name in ("direct", "anchor_residual", "indirect_residual")}
     noises["from_camera"] = Noise(3e-2, 2, 0.5)
     evidence = replace(
-        EVIDENCE.with_efforts({name: replace(EVIDENCE.efforts[name], noise=n) for name, n in noises.items()}),
+        EVIDENCE.with_sample_costs({name: replace(EVIDENCE.sample_costs[name], noise=n) for name, n in noises.items()}),
         spread=replace(EVIDENCE.spread, noise=Noise(0.0, 1, 0.5)),
     )
     found = cheapest(1e-3, evidence, parse_switches("+interreflection"))
     settings = found.settings
     counts = settings.samples["indirect"], settings.samples["from_camera"]
-    variances = evidence.efforts["indirect"].variance, evidence.efforts["from_camera"].variance
+    variances = evidence.sample_costs["indirect"].variance, evidence.sample_costs["from_camera"].variance
     prices = 16_384 * FIXED.passes["indirect"], 20_000 * FIXED.passes["from_camera"]
     kinds = list(zip(variances, counts, prices, strict=True))
     assert math.sqrt(sum(v / n for v, n, _ in kinds) / GROUPS) == pytest.approx(found.target / 1.1, rel=0.01)
@@ -251,17 +251,17 @@ def test_wide_cells_hold_light_of_many_anchors() -> None:
     whatever the width; the width's own error not counted.)"""
     many = {Part("followed_anchors", count): size for count, size in {1: 7e-3, 2: 3e-3, 5: 6e-4, 8: 2e-5}.items()}
     wide = {Part("followed_width", width): size for width, size in {1: 0.0, 2: 5e-5, 4: 4e-4}.items()}
-    followed = Effort(Noise(2e-2, 2, 0.5), 36_384)
+    followed = SampleCost(Noise(2e-2, 2, 0.5), 36_384)
     sizes = {part: size for part, size in SIZES.items() if part.name != "followed_anchors"} | many
     without, found = (
-        replace(EVIDENCE, changes=changes(each)).with_efforts({"indirect_residual": followed})
+        replace(EVIDENCE, changes=changes(each)).with_sample_costs({"indirect_residual": followed})
         for each in (sizes, sizes | wide)
     )
     assert not cheapest(5e-4, without, {}).fits
     chosen = cheapest(5e-4, found, {})
     settings = chosen.settings
     assert chosen.fits and (settings.followed_anchors, settings.followed_width) == (8, 2)
-    assert entries(EVIDENCE.efforts["direct"].paths, 49, Numbers.of(settings), settings) <= 2**25
+    assert entries(EVIDENCE.sample_costs["direct"].paths, 49, Numbers.of(settings), settings) <= 2**25
     narrow = predicted(5e-4, without, replace(settings, followed_width=1), {}).systematic.value
     assert chosen.systematic.value == pytest.approx(math.hypot(narrow, 5e-5), rel=1e-6)
     assert cheapest(1e-2, found, {}).settings.followed_width == 1, "one anchor sees nothing beyond its mean"
@@ -276,16 +276,16 @@ def test_doubt_about_coarse_cells_names_them() -> None:
     products = EVIDENCE.changes.products.copy()
     products[:, :, place, place] = changes({Part("indirect cells", 1): 1e-4}, 8e-3).products[:, :, 0, 0]
     unsure = replace(ONE_CLASS, changes=Changes(EVIDENCE.changes.parts, products))
-    worth, part = doubt(1e-3, unsure, {})
-    assert worth > 0 and part == Part("indirect cells", 1) and stage_of(part) == "effects"
+    worth, part = value_of_refining(1e-3, unsure, {})
+    assert worth > 0 and part == Part("indirect cells", 1) and run_of(part) == "effects"
 
 
 def test_what_interpolation_leaves_of_sharp_light_counts() -> None:
     """Points for sharp lobes leave 6e-4 of the light between them. (Planted: nothing left.)"""
     sharp = SharpPixels((3, 4), 7, (-0.1, 0.1, -0.1, 0.1), 6e-4)
-    light = Effort(Noise(1e-4, 4, 0.75), 98)
+    light = SampleCost(Noise(1e-4, 4, 0.75), 98)
     found, exact = (
-        replace(ONE_CLASS, sharp=each).with_efforts({"sharp": light}) for each in (sharp, replace(sharp, left=0.0))
+        replace(ONE_CLASS, sharp=each).with_sample_costs({"sharp": light}) for each in (sharp, replace(sharp, left=0.0))
     )
     chosen = cheapest(1e-3, found, {})
     without = predicted(1e-3, exact, replace(chosen.settings, sharp=exact.sharp), {})

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import open_bench
-from mitsim.light.groups import Group, trace_groups
 from mitsim.light.passes import Simulation
+from mitsim.light.sampling import Group, trace_groups
 from mitsim.light.settings import LANES_AT_ONCE, Settings, SharpPixels
 from mitsim.planner.memory import deposit_bytes
 from mitsim.transport.records import DIRECT, Bundle, CellAxis, CellGrid, Deposits

@@ -22,8 +22,9 @@ from mitsim.light.passes import Simulation
 from mitsim.light.pilot_result import LOOKS, Changes, Evidence, Part
 from mitsim.light.settings import Settings
 from mitsim.optics.frames import monte_carlo_error
-from mitsim.planner import pilot, pilot_direct, pilot_indirect, pilot_samples
-from mitsim.planner.pilot_indirect import SwitchedEffects
+from mitsim.planner import pilot, pilot_anchors, pilot_direct, pilot_samples
+from mitsim.planner.pilot_anchors import AnchorRuns, FollowedRuns
+from mitsim.planner.pilot_effects import EffectRuns
 from mitsim.transport.records import Deposits
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -88,7 +89,7 @@ def test_what_is_measured(bench: Bench, evidence: Evidence) -> None:
     )
     assert set(evidence.effects) <= set(EFFECTS)
     ladders = evidence.ladders
-    assert {1, 2, 3} <= set(ladders["anchors"]) <= set(pilot_direct.ANCHOR_LADDER)
+    assert {1, 2, 3} <= set(ladders["anchors"]) <= set(AnchorRuns.ladder)
     assert {1, 2, 3} <= set(ladders["layers"]) <= set(pilot_direct.LAYER_LADDER)
     assert {1, 2} <= set(ladders["cells"]) <= set(pilot_direct.CELL_LADDER)
     for name, errors in ladders.items():
@@ -96,17 +97,17 @@ def test_what_is_measured(bench: Bench, evidence: Evidence) -> None:
         coarsest, finest = (max(errors), 1) if name == "followed_width" else (1, max(errors))
         assert len(errors) == 1 or errors[coarsest].value > errors[finest].value
     widths = ladders["followed_width"]
-    assert tuple(widths) == pilot_indirect.WIDTHS and widths[1].value < widths[2].value < widths[4].value
-    assert {1, 2} <= set(ladders["followed_anchors"]) <= set(pilot_indirect.FOLLOWED_LADDER)
+    assert tuple(widths) == pilot_anchors.WIDTHS and widths[1].value < widths[2].value < widths[4].value
+    assert {1, 2} <= set(ladders["followed_anchors"]) <= set(FollowedRuns.ladder)
     assert 0 < evidence.forming.seconds < 1
     assert (
-        evidence.efforts["direct"].paths
-        == evidence.efforts["indirect"].paths
+        evidence.sample_costs["direct"].paths
+        == evidence.sample_costs["indirect"].paths
         == N * N
-        < evidence.efforts["from_camera"].paths
+        < evidence.sample_costs["from_camera"].paths
     )
-    assert evidence.efforts["indirect_residual"].paths == evidence.efforts["indirect"].paths
-    assert evidence.efforts["camera_residual"].paths == evidence.efforts["from_camera"].paths
+    assert evidence.sample_costs["indirect_residual"].paths == evidence.sample_costs["indirect"].paths
+    assert evidence.sample_costs["camera_residual"].paths == evidence.sample_costs["from_camera"].paths
     assert evidence.forming.terms == len(bench.spectrum.weights)
 
 
@@ -123,7 +124,7 @@ def test_gloss_makes_noise_at_random_points_of_the_sensor(small_scene: Callable[
     groups = [made.accumulate("direct", made.direct.trace(seed, 0, 16), lighting.labels, 16) for seed in range(8)]
     actual = monte_carlo_error(made.expected(groups, np.arange(16), lighting, 0)) * 8**0.5
     assert promised(float(found.spread.noise.left(16)), actual)
-    assert found.spread.noise.left(16) > 10 * found.efforts["direct"].noise.left(16)
+    assert found.spread.noise.left(16) > 10 * found.sample_costs["direct"].noise.left(16)
 
 
 def test_depth_and_layers(bench: Bench, evidence: Evidence) -> None:
@@ -197,9 +198,9 @@ def test_light_to_many_anchors_is_traced_in_parts(
     """All of it at once takes gigabytes. Parts of two samples make the same ladder but for the order of sums.
     (Planted: every part from the first sample on.)"""
     monkeypatch.setattr(
-        pilot_indirect,
+        pilot_anchors,
         "_AT_ONCE",
-        2 * 9 * (evidence.efforts["indirect_residual"].paths + evidence.efforts["from_camera"].paths),
+        2 * 9 * (evidence.sample_costs["indirect_residual"].paths + evidence.sample_costs["from_camera"].paths),
     )
     again = measured(bench, seed=3).ladders["followed_anchors"]
     for count, error in evidence.ladders["followed_anchors"].items():
@@ -246,7 +247,7 @@ def test_noise_comes_true(bench: Bench, evidence: Evidence) -> None:
     everything = frames(bench, Settings(depth=evidence.depth, subdivision=2, effects=every))
     for kind in switched:
         made = Simulation(bench, Settings(depth=evidence.depth, subdivision=2, effects=switched[kind]))
-        each, noise = made.passes[kind], evidence.efforts[kind].noise
+        each, noise = made.passes[kind], evidence.sample_costs[kind].noise
         samples = int(noise.samples)
         traced = [each.tracer.trace(integer(9, kind, index), 0, samples) for index in range(6)]
         groups = [made.accumulate(kind, found, labels, samples) for found in traced]
@@ -271,7 +272,7 @@ def test_frames_of_looks_are_those_that_a_capture_forms(bench: Bench, monkeypatc
     rows, columns = sample.places
     sample = replace(sample, places=(rows, tuple(place + 1 for place in columns[:-1])))
     everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
-    found = SwitchedEffects(bench, everything, sample, 5)
+    found = EffectRuns(bench, everything, sample, 5)
     made = Simulation(bench, everything)
     filed = [
         made.accumulate("direct", pilot_direct, lighting.labels, sample.direct)
@@ -290,9 +291,9 @@ def test_followed_light_of_either_side_has_its_own_noise(bench: Bench) -> None:
     lighting = parse_patterns("dots:4", N).lighting
     sample = pilot_samples.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
     everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
-    found = pilot_indirect.FollowedLight(bench, everything, sample, 0.0, 5)
-    indirect, camera = found.efforts(1.0).values()
-    alone, nothing = pilot_indirect.FollowedLight(bench, everything, sample, 0.0, 5), [Deposits.none()] * LOOKS
+    found = FollowedRuns(bench, everything, sample, 0.0, 5)
+    indirect, camera = found.sample_costs(1.0).values()
+    alone, nothing = FollowedRuns(bench, everything, sample, 0.0, 5), [Deposits.none()] * LOOKS
     vars(alone)["_few_by_tracer"] = [found._few_by_tracer[0], nothing]
     assert indirect.noise.error == pytest.approx(pilot_samples.noise(alone._beyond_mean()), rel=1e-9)
     both = pilot_samples.noise(found._beyond_mean())
@@ -306,13 +307,13 @@ def test_indirect_light_is_looked_at_closer_where_noise_hides_what_coarse_cells_
     lighting = parse_patterns("dots:4", N).lighting
     sample = pilot_samples.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
     everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
-    first, close = (SwitchedEffects(bench, everything, sample, 5, (450.0, 330.0), told) for told in (1.0, 1e-7))
+    first, close = (EffectRuns(bench, everything, sample, 5, (450.0, 330.0), told) for told in (1.0, 1e-7))
     seen = [Changes.between(found.changes, found.light**2) for found in (first, close)]
     open_ = [bound**2 - value**2 for value, bound in (each.estimate([Part("indirect cells", 1)]) for each in seen)]
     assert open_[1] < open_[0] / 4
     one, two = (each.estimate([Part("indirect layers", 1)]).value for each in seen)
     assert two == pytest.approx(one, rel=0.3)
-    noises = [found.effort("indirect").noise for found in (first, close)]
+    noises = [found.sample_cost("indirect").noise for found in (first, close)]
     assert [noise.samples for noise in noises] == [sample.followed, 16 * sample.followed]
     assert 0.5 < noises[1].error * math.sqrt(16) / noises[0].error < 2
     one, two = (found._closer[0][0].value[:50] for found in (first, close))

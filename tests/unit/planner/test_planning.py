@@ -14,12 +14,12 @@ import pytest
 
 from mitsim.devices.patterns import Lighting
 from mitsim.light.cost_model import FIXED
-from mitsim.light.pilot_result import LOOKS, Effort, Noise
+from mitsim.light.pilot_result import LOOKS, Noise, SampleCost
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, MOST_PATHS
 from mitsim.optics.frames import bound_of
 from mitsim.planner import pilot, planner
-from mitsim.planner.choose import _BOUND_OVER_ERROR, FIRST_LOOK, Choice, _needed, cheapest
+from mitsim.planner.choose import _BOUND_OVER_ERROR, FIRST_ACCURACY, Candidate, _needed, cheapest
 from tests.unit.planner.invented_evidence import ONE_CLASS, plan
 
 LIGHTING, SEED, LOOKING, FRAMES = Lighting.uniform(4), 7, 0.5, {"sensor": 0.2, "write": 0.1}
@@ -103,7 +103,7 @@ def test_what_looks_leave_is_for_the_light(looks: Looks, light: float, bought: f
     """Opening, frames and looking come off; a finer look is taken where what it leaves buys a finer accuracy."""
     found = within(light)
     finer = [(finer_look, SEED)] if finer_look else []
-    assert looks.asked == [(FIRST_LOOK, SEED), *finer]
+    assert looks.asked == [(FIRST_ACCURACY, SEED), *finer]
     assert looks.decided == (looks, bought, {}) and found.accuracy == bought
     assert found.asked_seconds == AROUND + light and found.warnings == (OWN,)
 
@@ -122,7 +122,7 @@ def test_too_few_seconds_are_told_with_what_all_would_take(looks: Looks) -> None
     assert found.accuracy == 0.3 and found.asked_seconds == pytest.approx(0.01) and own == OWN
     assert line.startswith("0.01 seconds are too few: even accuracy 0.3")
     assert f"to take {PRICE / 0.3 + AROUND:.1f} s from start to finish" in line
-    assert looks.asked == [(FIRST_LOOK, SEED)], "no time for another look"
+    assert looks.asked == [(FIRST_ACCURACY, SEED)], "no time for another look"
 
 
 @pytest.mark.parametrize(("dearer", "bought"), [(1.3, 1.58e-4), (1e5, 1e-3)])
@@ -181,17 +181,17 @@ class Heavy:
     """A look at evidence whose light from the camera turns out to have noise of such a variance in a sample."""
 
     def __init__(self, variance: float, spread: float = 0.0, paths: float = 50.0) -> None:
-        residual = replace(ONE_CLASS.efforts["indirect_residual"], seconds=0.0)
-        self.evidence = ONE_CLASS.with_efforts({"camera_residual": residual})
-        self.variance, self.spread, self.paths, self.looked = variance, spread, paths, list[int]()
+        residual = replace(ONE_CLASS.sample_costs["indirect_residual"], seconds=0.0)
+        self.evidence = ONE_CLASS.with_sample_costs({"camera_residual": residual})
+        self.variance, self.spread, self.paths, self.frame_check = variance, spread, paths, list[int]()
 
-    def heavy(self, samples: int) -> dict[str, Effort]:
-        self.looked.append(samples)
+    def heavy(self, samples: int) -> dict[str, SampleCost]:
+        self.frame_check.append(samples)
         noise = Noise(math.sqrt(self.variance / samples), samples, 0.5, self.spread, self.paths)
-        return {"from_camera": Effort(noise, self.evidence.efforts["from_camera"].paths)}
+        return {"from_camera": SampleCost(noise, self.evidence.sample_costs["from_camera"].paths)}
 
 
-def planned_with(look: Any, accuracy: float = 3e-3) -> tuple[Choice, Choice]:
+def planned_with(look: Any, accuracy: float = 3e-3) -> tuple[Candidate, Candidate]:
     """The choice by the look's evidence, and that with heavy paths."""
     chosen = cheapest(accuracy, look.evidence, {})
     assert "interreflection" in chosen.settings.effects
@@ -201,7 +201,7 @@ def planned_with(look: Any, accuracy: float = 3e-3) -> tuple[Choice, Choice]:
 def test_rare_heavy_paths_are_sampled_from_the_first() -> None:
     """The run begins with the samples that looks at more paths ask for. (Planted: the settings stay as they were, and
     a run that meets none of these paths ends without them.)"""
-    plain = ONE_CLASS.efforts["from_camera"].variance
+    plain = ONE_CLASS.sample_costs["from_camera"].variance
     same, unchanged = planned_with(Heavy(1.01 * plain))
     assert unchanged is same
     look = Heavy(400 * plain)
@@ -210,13 +210,13 @@ def test_rare_heavy_paths_are_sampled_from_the_first() -> None:
     left = math.sqrt(look.variance / after.settings.samples["from_camera"] / GROUPS)
     assert after.settings.samples["from_camera"] > 20 * before.settings.samples["from_camera"] and left < target
     assert (
-        look.looked == sorted(look.looked)
-        and look.looked[-1] * LOOKS * look.evidence.efforts["from_camera"].paths <= 2**23
+        look.frame_check == sorted(look.frame_check)
+        and look.frame_check[-1] * LOOKS * look.evidence.sample_costs["from_camera"].paths <= 2**23
     )
     _, more = planned_with(Heavy(400 * plain, spread=4.0))
     assert more.settings.samples["from_camera"] > 1.02 * after.settings.samples["from_camera"]
     _, most = planned_with(Heavy(1e9 * plain))
-    assert most.settings.samples["from_camera"] * GROUPS * ONE_CLASS.efforts["from_camera"].paths == pytest.approx(
+    assert most.settings.samples["from_camera"] * GROUPS * ONE_CLASS.sample_costs["from_camera"].paths == pytest.approx(
         MOST_PATHS
     )
 
@@ -224,12 +224,12 @@ def test_rare_heavy_paths_are_sampled_from_the_first() -> None:
 def test_looks_go_on_while_few_heavy_paths_are_met() -> None:
     """To the most, whatever they say that the run takes: 5 equal paths tell little of that; 50 end them at a tenth of
     it. (Planted: looks end at a tenth whatever they met.)"""
-    plain = ONE_CLASS.efforts["from_camera"].variance
+    plain = ONE_CLASS.sample_costs["from_camera"].variance
     many, few = Heavy(3 * plain, paths=50.0), Heavy(3 * plain, paths=5.0)
     planned_with(many)
     planned_with(few)
-    assert many.looked == few.looked[: len(many.looked)] and len(few.looked) > len(many.looked)
-    assert few.looked[-1] * LOOKS * ONE_CLASS.efforts["from_camera"].paths == pytest.approx(2**23, rel=0.01)
+    assert many.frame_check == few.frame_check[: len(many.frame_check)] and len(few.frame_check) > len(many.frame_check)
+    assert few.frame_check[-1] * LOOKS * ONE_CLASS.sample_costs["from_camera"].paths == pytest.approx(2**23, rel=0.01)
 
 
 def test_a_run_of_heavy_paths_has_a_range_of_seconds() -> None:
@@ -240,13 +240,14 @@ def test_a_run_of_heavy_paths_has_a_range_of_seconds() -> None:
     settings = replace(settings, samples={**settings.samples, "from_camera": 100.0})
     planned = replace(plan(3e-3, ONE_CLASS), settings=settings)
     assert planner._range(evidence, planned) is None and planned.range_words == ""
-    pace, total = evidence.efforts["from_camera"].seconds or FIXED.passes["from_camera"], planned.predicted_seconds
-    work = GROUPS * 100 * evidence.efforts["from_camera"].paths * pace
+    pace, total = evidence.sample_costs["from_camera"].seconds or FIXED.passes["from_camera"], planned.predicted_seconds
+    work = GROUPS * 100 * evidence.sample_costs["from_camera"].paths * pace
 
     def ends(paths: float) -> tuple[float, float] | None:
-        light = evidence.efforts["from_camera"]
+        light = evidence.sample_costs["from_camera"]
         return planner._range(
-            evidence.with_efforts({"from_camera": replace(light, noise=replace(light.noise, heavy=paths))}), planned
+            evidence.with_sample_costs({"from_camera": replace(light, noise=replace(light.noise, heavy=paths))}),
+            planned,
         )
 
     assert ends(20.0) == pytest.approx((total - 0.3 * work, total + 4 * work))
@@ -262,7 +263,7 @@ def test_bounds_of_few_heavy_paths_take_more_samples() -> None:
     rate, per_look = 2.0, 50  # heavy paths in a look of so many samples
     # Each brings an energy of 1 in its own pixels: variance of a sample, and of a look's energy over its square.
     noise, target = Noise(math.sqrt(rate) / per_look, per_look, 0.5, 1 / rate), 1e-2
-    samples = float(_needed(Effort(noise, 1), target * math.sqrt(GROUPS) / _BOUND_OVER_ERROR))
+    samples = float(_needed(SampleCost(noise, 1), target * math.sqrt(GROUPS) / _BOUND_OVER_ERROR))
     rng = np.random.default_rng(5)
     met = rng.poisson(rate * samples / per_look, (4000, GROUPS)).astype(np.float64)
     bounds = np.array([bound_of(each / (samples * GROUPS) ** 2, 1.0) for each in met])

@@ -227,3 +227,13 @@ def test_lobes_are_averaged_over_anchors_with_their_weights(far: SampledLight) -
     again = bundle.repeated(replace(bundle, anchors=1).file(deposits.averaged(weights), labels, 1))
     assert abs(mean - again).max() < 1e-12 and mean.sum() == pytest.approx(9 * weight)
     assert partial_light._even_lobes(filed, far.simulation) is filed, "nothing to average where nothing is sharp"
+
+
+def test_what_is_moved_is_added_up_on_the_host(far: SampledLight) -> None:
+    """Anchors see light without depth where the sensor's centre does: sums on the device would hold it where it was
+    traced. (Planted: sums on the device.)"""
+    settings = replace(far.simulation.settings, anchors=3, samples={"anchor_residual": 1e4})
+    labels = np.arange(far.bench.n**2)
+    for off, held in ((frozenset[str](), 1), (frozenset({partial_light.DEPTH}), 0)):
+        filing = partial_light._Filing(far.bench, settings, True, off)
+        assert len(filing.ledgers("anchor_residual", labels, 1)) == held

@@ -205,15 +205,15 @@ def test_ledgers_of_several_lines_are_fetched_together() -> None:
         place = ledgers[0].place(light, mi.Float(0.5))
         for ledger, some in zip(ledgers, lit, strict=True):
             ledger.add(light.value, light.pixel, place, some)
-    for ledger, own, counted in zip(together, single, fetched(together), strict=True):
-        (matrix, *sums), (expected, *own_sums) = ledger.filed(counted, 4), own.filed(samples=4)
+    for own, counted in zip(single, fetched(together), strict=True):
+        (matrix, *sums), (expected, *own_sums) = counted.light(4), own.filed(4)
         assert np.array_equal(matrix.toarray(), expected.toarray()) and sums == own_sums
-    for ledger, counted in zip(together, fetched(together), strict=True):
-        assert ledger.filed(counted)[1] == 0.0 and not ledger.filed(counted)[0].nnz
+    for counted in fetched(together):
+        assert counted.light()[1] == 0.0 and not counted.light()[0].nnz
     assert own_sums == [0.0, 0.0] and not expected.nnz, "the last line is dark"
     for ledger, value in zip(together, (1.0, np.nan, 1.0), strict=True):
         ledger.add(mi.Float(value), mi.UInt32(0), mi.UInt32(0), mi.Bool(True))
     broken = fetched(together)
-    assert [together[line].filed(broken[line])[1] for line in (0, 2)] == [1.0, 1.0]
+    assert [broken[line].light()[1] for line in (0, 2)] == [1.0, 1.0]
     with pytest.raises(MitsimError, match="NaN"):
-        together[1].filed(broken[1])
+        broken[1].light()
