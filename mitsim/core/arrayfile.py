@@ -128,7 +128,7 @@ def whole_hdf5(path: Path | str) -> Iterator[h5py.File]:
     import h5py  # here: it takes 50 ms to import, and most work writes none
 
     with whole_file(path) as part, open(part, "w+b", buffering=0) as disk:
-        kept = _Kept(disk)
+        kept = _FirstErrorFile(disk)
         try:
             with h5py.File(kept, "w", track_order=True) as file:
                 yield file
@@ -138,7 +138,7 @@ def whole_hdf5(path: Path | str) -> Iterator[h5py.File]:
             raise kept.error
 
 
-class _Kept:
+class _FirstErrorFile:
     """A file whose first error in writing is kept as ``error``: what follows is dropped, as if it were written."""
 
     def __init__(self, disk: FileIO) -> None:
@@ -148,11 +148,11 @@ class _Kept:
 
     def write(self, data: Any) -> int:
         """Write ``data``; returns its length."""
-        return self._tried(self._whole, memoryview(data).cast("B"), memoryview(data).nbytes)
+        return self._try(self._whole, memoryview(data).cast("B"), memoryview(data).nbytes)
 
     def truncate(self, size: int) -> int:
         """Make the file ``size`` bytes long; returns that."""
-        return self._tried(self._disk.truncate, size, size)
+        return self._try(self._disk.truncate, size, size)
 
     def flush(self) -> None:
         """Nothing waits: it is not buffered here."""
@@ -168,7 +168,7 @@ class _Kept:
         while view:
             view = view[self._disk.write(view) :]
 
-    def _tried(self, work: Any, argument: Any, result: int) -> int:
+    def _try(self, work: Any, argument: Any, result: int) -> int:
         try:
             if self.error is None:
                 work(argument)

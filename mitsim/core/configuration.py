@@ -32,6 +32,12 @@ Positive = Annotated[float, pydantic.Field(ge=1 / LARGEST, le=LARGEST, allow_inf
 NonNegative = Annotated[float, pydantic.Field(ge=0, le=LARGEST, allow_inf_nan=False)]
 
 
+class Configuration(pydantic.BaseModel):
+    """A frozen model of finite numbers, of the very types that it states, without further fields."""
+
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
 def shipped(*parts: str) -> Path:
     """A file or folder that comes with mitsim, for example ``shipped("calibration", "imx249.toml")`` of ``parts``.
 
@@ -121,7 +127,7 @@ def _complaint(model: type[pydantic.BaseModel], problem: Any) -> str:
         meant = f"did you mean {near[0]}? " if near and problem["type"] == "extra_forbidden" else ""
         rule = "no such field" if problem["type"] == "extra_forbidden" else rule
         hint = f"; {meant}known fields: {', '.join(known)}"
-    value = "nothing" if problem["type"] == "missing" else _shown(problem["input"])
+    value = "nothing" if problem["type"] == "missing" else _short_text(problem["input"])
     return f"{field or 'contents'}: got {value}, {rule}{hint}; correct this field"
 
 
@@ -151,7 +157,7 @@ def _range(model: Any, location: tuple[int | str, ...]) -> str:
     return f" (range: {'above ' if 'gt' in ends else ''}{low} to {'below ' if 'lt' in ends else ''}{high})"
 
 
-def _shown(value: object) -> str:
+def _short_text(value: object) -> str:
     """A value on one short line, however large it is."""
     try:
         return cut(_SHORT.repr(value), 120)

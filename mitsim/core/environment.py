@@ -77,10 +77,10 @@ def load_variant(name: str) -> ModuleType:
     if name.startswith("llvm_"):
         select_llvm()
     with held_back():
-        return _loaded(name)
+        return _set_variant(name)
 
 
-def _loaded(name: str) -> ModuleType:
+def _set_variant(name: str) -> ModuleType:
     try:
         import mitsuba
     except ImportError as error:
@@ -324,7 +324,7 @@ def find_llvm() -> Path:
     """
     named = os.environ.get(VARIABLE)
     if named:
-        return _checked(Path(named))
+        return _check_named(Path(named))
     tried = []
     for path in candidates():
         result = _cached_probe(path)
@@ -345,7 +345,7 @@ def select_llvm() -> Path:
     return path
 
 
-def _checked(path: Path) -> Path:
+def _check_named(path: Path) -> Path:
     major = version(path)
     if major is not None and major < OLDEST:
         raise MitsimError(
@@ -419,7 +419,7 @@ _PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "scikit-image", "OpenEXR")
 
 def versions() -> dict[str, str]:
     """Versions of mitsim, Python and the packages that decide the numbers, by name; imports none of them."""
-    return dict(_installed())
+    return dict(_read_versions())
 
 
 def deciding_versions() -> dict[str, str]:
@@ -428,7 +428,7 @@ def deciding_versions() -> dict[str, str]:
 
 
 @cache
-def _installed() -> tuple[tuple[str, str], ...]:
+def _read_versions() -> tuple[tuple[str, str], ...]:
     """Read once: it takes 8 ms, and a coloured run states them nine times."""
     by_name = {"mitsim": __version__, "python": platform.python_version()}
     for name in _PACKAGES:

@@ -134,7 +134,7 @@ def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     new = not Path(path).exists()
     folder = prepare_output(path, overwrite)
     try:
-        with _locked(folder, folder / LOCK):
+        with _lock(folder, folder / LOCK):
             prepare_output(path, overwrite)  # nobody finished a work there between the first look and the lock
             yield folder
     except BaseException:
@@ -152,7 +152,7 @@ def output_file(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     MitsimError as for :func:`prepare_output`, and when another process holds the file.
     """
     path = prepare_output(path, overwrite, "file")
-    with _locked(path, _beside(resolved(path), LOCK)):
+    with _lock(path, _beside(resolved(path), LOCK)):
         yield prepare_output(path, overwrite, "file")  # nobody wrote it between the first look and the lock
 
 
@@ -212,7 +212,7 @@ def _check_plain(path: Path) -> None:
 
 
 @contextmanager
-def _locked(path: Path, name: Path) -> Iterator[None]:
+def _lock(path: Path, name: Path) -> Iterator[None]:
     """Hold the lock of the output ``path``, whose file has this ``name``; MitsimError where another process does."""
     from filelock import FileLock, Timeout  # here: it takes 20 ms to import, and no refusal needs it
 
@@ -247,12 +247,12 @@ def _prepare_folder(path: Path, overwrite: bool) -> None:
         raise MitsimError(f"output {path}: cannot be used ({error.strerror}); choose another place") from error
     if occupied and not overwrite:
         raise MitsimError(
-            f"output {path}: the folder holds files already{_unfinished(path) or '; choose a new one or empty it'}"
+            f"output {path}: the folder holds files already{_unfinished_work(path) or '; choose a new one or empty it'}"
         )
     _try_writing(path, path)
 
 
-def _unfinished(folder: Path) -> str:
+def _unfinished_work(folder: Path) -> str:
     """What a killed capture or calibration left in the folder, and how to go on; nothing when there is none."""
     try:
         manifest = json.loads(read_text(folder / "manifest.json", _LONGEST_HEAD))

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from mitsim.core.configuration import Configuration
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import MOST_SIDE, check_plain
 
@@ -23,14 +24,15 @@ BARE = (".raw", ".bin", ".dat")
 _Side = Annotated[int, Field(ge=1, le=MOST_SIDE)]
 
 
-class Raw(BaseModel):
+class Raw(Configuration):
     """How files without a header (`.raw`, `.bin`, `.dat`) are read."""
 
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
-
-    shape: tuple[_Side, _Side] = Field(strict=False, description="rows and columns")
-    bits: int = Field(ge=1, le=32, description="of a number; up to 8 take a byte, up to 16 two, up to 32 four")
-    byte_order: Literal["little", "big"] = Field("little", description="which byte of a number comes first")
+    shape: tuple[_Side, _Side] = Field(strict=False)
+    """Rows and columns."""
+    bits: int = Field(ge=1, le=32)
+    """Of a number; up to 8 take a byte, up to 16 two, up to 32 four."""
+    byte_order: Literal["little", "big"] = "little"
+    """Which byte of a number comes first."""
 
     @classmethod
     def of(cls, shape: str, bits: int | None, byte_order: str) -> Raw:

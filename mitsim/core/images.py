@@ -69,7 +69,7 @@ _CHANNEL = "DN"
 
 
 @dataclass(frozen=True)
-class _Found:
+class _Header:
     """What a file's header says: pages, size of the first, what reads the numbers of each page, and bytes of memory
     that a pixel takes meanwhile."""
 
@@ -88,8 +88,8 @@ def image_pages(path: Path | str, wanted: Wanted = FRAME) -> tuple[int, tuple[in
         as for :func:`read_images`, whose errors it raises.
     """
     path = Path(path)
-    with _told(path, wanted):
-        found = _look(path, wanted)
+    with _one_line_refusals(path, wanted):
+        found = _read_header(path, wanted)
         return found.pages, found.size
 
 
@@ -144,8 +144,8 @@ def read_images(path: Path | str, wanted: Wanted = FRAME) -> Iterator[Numbers]:
         not wanted, with numbers that its reader would change, that are not finite, or that memory does not hold.
     """
     path = Path(path)
-    with _told(path, wanted):
-        found = _look(path, wanted)
+    with _one_line_refusals(path, wanted):
+        found = _read_header(path, wanted)
         Cost(memory_bytes=found.pixel_bytes * math.prod(found.size)).check(f"{wanted.what} {path}", Limits())
         for values in found.read():
             _check_size(path, wanted, values.shape[0], values.shape[1])
@@ -160,7 +160,7 @@ def own_end(values: Numbers) -> float | None:
     return float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" and values.dtype.itemsize < 4 else None
 
 
-def _look(path: Path, wanted: Wanted) -> _Found:
+def _read_header(path: Path, wanted: Wanted) -> _Header:
     """What the header of a file says, before pixels are read: what it claims is allocated."""
     check_plain(path, wanted.what)
     ending = path.suffix.lower()
@@ -178,7 +178,7 @@ def _check_size(path: Path, wanted: Wanted, rows: int, columns: int) -> None:
         raise wanted.refusal(path, f"{rows} x {columns} pixels; {FRAME_LIMITS} are read; bin it, or cut out a part")
 
 
-def _png(path: Path, wanted: Wanted) -> _Found:
+def _png(path: Path, wanted: Wanted) -> _Header:
     with open(path, "rb") as file:
         head = file.read(_HEAD)
         if len(head) < _HEAD or not head.startswith(_SIGNATURE):
@@ -189,12 +189,12 @@ def _png(path: Path, wanted: Wanted) -> _Found:
     bits, colour = head[24], head[25]
     if not (colour == _GREY and bits in wanted.bits) and not (wanted.colour and colour in _COLOURS and bits == 8):
         raise wanted.refusal(
-            path, f"is no {_allowed('PNG', (bits for bits in wanted.bits if bits in _PNG_BITS), wanted)}"
+            path, f"is no {_allowed_kinds('PNG', (bits for bits in wanted.bits if bits in _PNG_BITS), wanted)}"
         )
 
     def read() -> Iterator[Numbers]:
         """Its one page."""
-        with _opened(path, "PNG") as picture:
+        with _open_picture(path, "PNG") as picture:
             if "transparency" in picture.info:
                 raise wanted.refusal(path, "names a number that is transparent; save it without transparency")
             # Some versions of Pillow give 16 bits of a PNG as 32.
@@ -202,7 +202,7 @@ def _png(path: Path, wanted: Wanted) -> _Found:
             _check_upright(path, picture, wanted)  # a PNG may say it behind its pixels
             yield values
 
-    return _Found(1, (rows, columns), read)
+    return _Header(1, (rows, columns), read)
 
 
 def _kinds_of_chunks(file: BinaryIO) -> set[bytes]:
@@ -227,10 +227,10 @@ def _check_upright(path: Path, picture: Image, wanted: Wanted) -> None:
         )
 
 
-def _tiff(path: Path, wanted: Wanted) -> _Found:
+def _tiff(path: Path, wanted: Wanted) -> _Header:
     def read() -> Iterator[Numbers]:
         """Its pages."""
-        with _opened(path, "TIFF", packed) as picture:
+        with _open_picture(path, "TIFF", packed) as picture:
             for page in range(pages):
                 picture.seek(page)
                 unsigned = _check_tags(path, picture, wanted)
@@ -240,7 +240,7 @@ def _tiff(path: Path, wanted: Wanted) -> _Found:
                 # Pillow holds 32 bits as if they had a sign.
                 yield values.view(np.uint32) if unsigned and values.dtype == np.int32 else values
 
-    with _opened(path, "TIFF") as picture:
+    with _open_picture(path, "TIFF") as picture:
         _check_tags(path, picture, wanted)
         size = picture.height, picture.width
         packed = picture.tag_v2.get(_COMPRESSION, _PLAIN) != _PLAIN  # type: ignore[attr-defined]
@@ -248,7 +248,7 @@ def _tiff(path: Path, wanted: Wanted) -> _Found:
     if pages > _MOST_PAGES:
         raise wanted.refusal(path, f"has over {_MOST_PAGES} pages; give fewer")
     held = path.stat().st_size / max(math.prod(size), 1) if packed else 0.0
-    return _Found(pages, size, read, held + _PIXEL_BYTES)
+    return _Header(pages, size, read, held + _PIXEL_BYTES)
 
 
 def _pages_of(path: Path) -> int:
@@ -272,7 +272,7 @@ def _check_tags(path: Path, picture: Image, wanted: Wanted) -> bool:
     bits, photometric, samples = tags.get(_BITS, (1,)), tags.get(_PHOTOMETRIC), tags.get(_SAMPLES, (_UNSIGNED,))
     grey = photometric == _BLACK_IS_ZERO and len(bits) == 1 and bits[0] in wanted.bits
     if not grey and not (wanted.colour and photometric == _RGB and set(bits) == {8}):
-        raise wanted.refusal(path, f"is no {_allowed('TIFF', wanted.bits, wanted)}")
+        raise wanted.refusal(path, f"is no {_allowed_kinds('TIFF', wanted.bits, wanted)}")
     if tags.get(_PAGE_KIND, 0) & _NO_PAGE or _PARTS in tags:
         raise wanted.refusal(path, "holds previews, masks or parts beside the picture; save the picture alone")
     if any(tags.get(tag, 0) > max(picture.size) + _TILE_MARGIN for tag in _TILES):
@@ -281,7 +281,7 @@ def _check_tags(path: Path, picture: Image, wanted: Wanted) -> bool:
     return bool(samples[0] == _UNSIGNED)
 
 
-def _npy(path: Path, wanted: Wanted) -> _Found:
+def _npy(path: Path, wanted: Wanted) -> _Header:
     with open(path, "rb") as file:
         array = Npy.of(file, path.stat().st_size)
     kinds, sides = "buif" if 1 in wanted.bits else "uif", array.shape[-2:]
@@ -298,10 +298,10 @@ def _npy(path: Path, wanted: Wanted) -> _Found:
             for page in range(pages):
                 yield array.part(file, page if len(array.shape) == 3 else None)
 
-    return _Found(pages, (sides[0], sides[1]), read, at_once + _PIXEL_BYTES)
+    return _Header(pages, (sides[0], sides[1]), read, at_once + _PIXEL_BYTES)
 
 
-def _exr(path: Path, wanted: Wanted) -> _Found:
+def _exr(path: Path, wanted: Wanted) -> _Header:
     from mitsim.core.exr import (
         read_frame,
         read_header,  # most work reads no picture of this kind
@@ -318,10 +318,10 @@ def _exr(path: Path, wanted: Wanted) -> _Found:
             raise wanted.refusal(path, f"its channels are {names}; {_CHANNEL}, or a single one, is needed")
         yield channels[name]
 
-    return _Found(1, (header.height, header.width), read)
+    return _Header(1, (header.height, header.width), read)
 
 
-def _bare(path: Path, wanted: Wanted) -> _Found:
+def _bare(path: Path, wanted: Wanted) -> _Header:
     raw = wanted.raw
     if raw is None:
         raise wanted.refusal(path, "has no header; say how it is read by shape and bits")
@@ -341,17 +341,17 @@ def _bare(path: Path, wanted: Wanted) -> _Found:
             raise wanted.refusal(path, f"has the number {most}, beyond {raw.bits} bits; correct bits or byte_order")
         yield values
 
-    return _Found(1, raw.shape, read)
+    return _Header(1, raw.shape, read)
 
 
-_READERS: dict[str, Callable[[Path, Wanted], _Found]] = {
+_READERS: dict[str, Callable[[Path, Wanted], _Header]] = {
     **dict(zip(FORMATS, (_png, _tiff, _tiff, _npy, _exr), strict=True)),
     **dict.fromkeys(BARE, _bare),
 }
 """What looks into a file, by the end of its name in small letters."""
 
 
-def _allowed(kind: str, bits: Any, wanted: Wanted) -> str:
+def _allowed_kinds(kind: str, bits: Any, wanted: Wanted) -> str:
     numbers = [str(count) for count in bits]
     colours = ", nor of red, green and blue of 8 bits" if wanted.colour else ""
     zero = " whose zero is black" if kind == "TIFF" else ""
@@ -359,7 +359,7 @@ def _allowed(kind: str, bits: Any, wanted: Wanted) -> str:
 
 
 @contextmanager
-def _opened(path: Path, kind: str, whole: bool = False) -> Iterator[Image]:
+def _open_picture(path: Path, kind: str, whole: bool = False) -> Iterator[Image]:
     """A picture file of that ``kind``, its pixels not yet read; ``whole``: from a copy in memory, as the library for
     packed TIFF would map the file, or read all of it for each page."""
     from PIL import Image, UnidentifiedImageError  # most work reads no picture
@@ -387,7 +387,7 @@ class _Copied:
 
 
 @contextmanager
-def _told(path: Path, wanted: Wanted) -> Iterator[None]:
+def _one_line_refusals(path: Path, wanted: Wanted) -> Iterator[None]:
     """Whatever readers raise, as one line that names the file."""
     try:
         yield

@@ -88,22 +88,22 @@ class _Part(BaseModel):
 class Digital(_Part):
     """How digital numbers become photoelectrons a second: (DN - black level) / gain / exposure - dark current."""
 
-    exposure_s: Positive = Field(description="exposure of every frame [s]")
-    gain_dn_per_e: Positive = Field(description="digital numbers per electron")
-    black_level_dn: BinnedSum = Field(description="digital number of a (binned) pixel without charge")
-    dark_current_e_per_s: BinnedSum = Field(description="dark electrons a second and (binned) pixel")
-    read_noise_e: BinnedSum | None = Field(
-        default=None, description="standard deviation of a (binned) pixel's reading [electrons]; none: not stated"
-    )
-    step_dn: BinnedSum | None = Field(
-        default=None, description="step between digital numbers; 0: real output; none: not stated, taken as 0"
-    )
-    saturation_dn: BinnedSum | None = Field(
-        default=None, description="digital number at the full well or the ADC's end; none: never, or not stated"
-    )
-    exposure_uncertainty: float = Field(
-        default=0.0, ge=0, le=1, description="relative standard uncertainty of exposure times light"
-    )
+    exposure_s: Positive
+    """Exposure of every frame [s]."""
+    gain_dn_per_e: Positive
+    """Digital numbers per electron."""
+    black_level_dn: BinnedSum
+    """Digital number of a (binned) pixel without charge."""
+    dark_current_e_per_s: BinnedSum
+    """Dark electrons a second and (binned) pixel."""
+    read_noise_e: BinnedSum | None = None
+    """Standard deviation of a (binned) pixel's reading [electrons]; none: not stated."""
+    step_dn: BinnedSum | None = None
+    """Step between digital numbers; 0: real output; none: not stated, taken as 0."""
+    saturation_dn: BinnedSum | None = None
+    """Digital number at the full well or the ADC's end; none: never, or not stated."""
+    exposure_uncertainty: float = Field(default=0.0, ge=0, le=1)
+    """Relative standard uncertainty of exposure times light."""
 
     @property
     def noise_is_stated(self) -> bool:
@@ -141,10 +141,14 @@ class Digital(_Part):
 class ShotFile(_Part):
     """One shot: pattern (row, column), whole (sign 0) or the +1 or -1 half of a signed pattern."""
 
-    file: FileName = Field(description="name of the frame in the run's folder, without a path")
-    row: int = Field(ge=0, description="column i of P_L")
-    column: int = Field(ge=0, description="column j of P_R")
-    sign: int = Field(ge=-1, le=1, description="0, or the half (1 + P)/2 or (1 - P)/2 of a signed pattern P")
+    file: FileName
+    """Name of the frame in the run's folder, without a path."""
+    row: int = Field(ge=0)
+    """Column i of P_L."""
+    column: int = Field(ge=0)
+    """Column j of P_R."""
+    sign: int = Field(ge=-1, le=1)
+    """0, or the half (1 + P)/2 or (1 - P)/2 of a signed pattern P."""
 
 
 class _Family(Protocol):
@@ -163,13 +167,16 @@ class _Family(Protocol):
 class Patterns(_Part):
     """Factors of the patterns, and the shots that show them."""
 
-    family: str | None = Field(default=None, description="name of the family, such as `dots:7`")
-    n: int | None = Field(default=None, ge=1, le=MOST_PIXELS, description="projector pixels a side")
-    P_L: Rows = Field(description="rows of P_L: for each scene row, one number a pattern column i")
-    P_R: Rows = Field(description="rows of P_R: for each scene column, one number a pattern column j")
-    captures: Annotated[tuple[ShotFile, ...], FailFast()] = Field(
-        strict=False, max_length=MOST_SHOTS, description="every shot; each pattern (i, j) once, or as its two halves"
-    )
+    family: str | None = None
+    """Name of the family, such as `dots:7`."""
+    n: int | None = Field(default=None, ge=1, le=MOST_PIXELS)
+    """Projector pixels a side."""
+    P_L: Rows
+    """Rows of P_L: for each scene row, one number a pattern column i."""
+    P_R: Rows
+    """Rows of P_R: for each scene column, one number a pattern column j."""
+    captures: Annotated[tuple[ShotFile, ...], FailFast()] = Field(strict=False, max_length=MOST_SHOTS)
+    """Every shot; each pattern (i, j) once, or as its two halves."""
 
     @classmethod
     def of(cls, family: _Family, files: Sequence[str]) -> Patterns:
@@ -237,38 +244,38 @@ class Patterns(_Part):
 
 
 class _Head(_Part):
-    format: int = Field(
-        default=FORMAT,
-        ge=1,
-        le=FORMAT,
-        description="version of this format; without it unknown fields are ignored, as by version 0.3.0",
-    )
-    status: Literal["incomplete", "complete"] = Field(default="complete", description="whether all files are written")
-    configuration: Plain = Field(
-        default={}, description="all that decides the frames: options, files, devices, versions"
-    )
-    warnings: Texts = Field(default=(), description="why the folder is flagged; an image made of it is flagged too")
-    versions: dict[str, str] = Field(default={}, description="of mitsim, Python and packages")
+    format: int = Field(default=FORMAT, ge=1, le=FORMAT)
+    """Version of this format; without it unknown fields are ignored, as by version 0.3.0."""
+    status: Literal["incomplete", "complete"] = "complete"
+    """Whether all files are written."""
+    configuration: Plain = {}
+    """All that decides the frames: options, files, devices, versions."""
+    warnings: Texts = ()
+    """Why the folder is flagged; an image made of it is flagged too."""
+    versions: dict[str, str] = {}
+    """Of mitsim, Python and packages."""
 
 
 class AmbientFile(_Part):
     """The ambient frame: what a camera sees with the projector off, taken off frames that are not one of a pair."""
 
-    file: FileName = Field(description="name of the frame in the run's folder, without a path")
-    shots: int = Field(ge=1, le=MOST_SHOTS, description="shots that it is the mean of, each exposed as the frames")
-    part: float | None = Field(default=None, description="ambient light in all light of the frames")
-    noise: float | None = Field(
-        default=None, description="noise of the frames less the ambient frame, over the projector's light; closed form"
-    )
+    file: FileName
+    """Name of the frame in the run's folder, without a path."""
+    shots: int = Field(ge=1, le=MOST_SHOTS)
+    """Shots that it is the mean of, each exposed as the frames."""
+    part: float | None = None
+    """Ambient light in all light of the frames."""
+    noise: float | None = None
+    """Noise of the frames less the ambient frame, over the projector's light; closed form."""
 
 
 class RunHead(_Head):
     """What an unfinished run's manifest says, and a finished one's begins with."""
 
-    kind: Literal["capture"] = Field(default="capture", description="what the folder is")
-    configuration_sha256: str = Field(
-        default="", description="hash of `configuration`; a run is resumed by the same alone"
-    )
+    kind: Literal["capture"] = "capture"
+    """What the folder is."""
+    configuration_sha256: str = ""
+    """Hash of `configuration`; a run is resumed by the same alone."""
 
     @classmethod
     def of(cls, configuration: Mapping[str, Any]) -> RunHead:
@@ -280,49 +287,45 @@ class RunHead(_Head):
 class RunManifest(RunHead):
     """A capture: how its frames are read, and what was projected."""
 
-    camera: Plain = Field(description="identity that a calibration must share; anything, as long as both are equal")
-    digital: Digital = Field(description="how digital numbers become electrons a second")
-    patterns: Patterns = Field(description="what was projected, and in which file it is seen")
-    ambient_frame: AmbientFile | None = Field(
-        default=None, description="the frame of ambient light alone; none: nothing is taken off the frames"
-    )
-    checksums: Checksums = Field(default={}, description="SHA-256 by file name, where known")
-    plan: Plain | None = Field(default=None, description="the effect plan, see Plan")
-    mc_error: float | None = Field(default=None, description="relative Monte Carlo error of the expected frames")
-    total_error: float | None = Field(
-        default=None,
-        description="relative error of the expected frames, all in all: the plan's systematic error and that",
-    )
-    total_error_bound: float | None = Field(default=None, description="what it is below, at 95 %")
-    total_error_of_projector: float | None = Field(
-        default=None, description="that bound relative to the projector's light alone: more, where lamps are on"
-    )
-    mc_to_sensor_noise: float | None = Field(
-        default=None, description="largest ratio of that to a frame's sensor noise"
-    )
-    sensor_noise: float | None = Field(None, description="relative noise of the sensor over all frames, closed form")
-    heaviest_group: float | None = Field(
-        default=None,
-        description="largest part of the Monte Carlo variance in one of the groups of the light; above 0.72 a few "
-        "heavy paths make it",
-    )
-    truth_error: float | None = Field(
-        default=None, description="standard error of truth.exr, rms over the image; 1 is the board's reflectance"
-    )
-    light_error: float | None = Field(
-        default=None,
-        description="standard error of single projector pixels' light in the frames, rms; 1 is the board's",
-    )
-    paths: int | None = Field(default=None, description="connections and paths traced")
-    lost_light: float | None = Field(
-        default=None, description="part of the light that came from beyond the plan's directions; it is in no frame"
-    )
-    seconds: dict[str, float] = Field(
-        default={}, description="by stage; `imports`: of modules that no earlier work needed"
-    )
-    predicted_memory_bytes: float | None = Field(
-        default=None, description="memory that this was predicted to take at most, beyond what the program held before"
-    )
+    camera: Plain
+    """Identity that a calibration must share; anything, as long as both are equal."""
+    digital: Digital
+    """How digital numbers become electrons a second."""
+    patterns: Patterns
+    """What was projected, and in which file it is seen."""
+    ambient_frame: AmbientFile | None = None
+    """The frame of ambient light alone; none: nothing is taken off the frames."""
+    checksums: Checksums = {}
+    """SHA-256 by file name, where known."""
+    plan: Plain | None = None
+    """The effect plan, see Plan."""
+    mc_error: float | None = None
+    """Relative Monte Carlo error of the expected frames."""
+    total_error: float | None = None
+    """Relative error of the expected frames, all in all: the plan's systematic error and that."""
+    total_error_bound: float | None = None
+    """What it is below, at 95 %."""
+    total_error_of_projector: float | None = None
+    """That bound relative to the projector's light alone: more, where lamps are on."""
+    mc_to_sensor_noise: float | None = None
+    """Largest ratio of that to a frame's sensor noise."""
+    sensor_noise: float | None = None
+    """Relative noise of the sensor over all frames, closed form."""
+    heaviest_group: float | None = None
+    """Largest part of the Monte Carlo variance in one of the groups of the light; above 0.72 a few heavy paths make
+    it."""
+    truth_error: float | None = None
+    """Standard error of truth.exr, rms over the image; 1 is the board's reflectance."""
+    light_error: float | None = None
+    """Standard error of single projector pixels' light in the frames, rms; 1 is the board's."""
+    paths: int | None = None
+    """Connections and paths traced."""
+    lost_light: float | None = None
+    """Part of the light that came from beyond the plan's directions; it is in no frame."""
+    seconds: dict[str, float] = {}
+    """By stage; `imports`: of modules that no earlier work needed."""
+    predicted_memory_bytes: float | None = None
+    """Memory that this was predicted to take at most, beyond what the program held before."""
 
     @model_validator(mode="after")
     def _ambient_frame_is_no_capture(self) -> RunManifest:
@@ -335,9 +338,12 @@ class RunManifest(RunHead):
 class FactorNoise(_Part):
     """How far a calibration's factors are from those of the camera."""
 
-    left: NonNegative = Field(description="standard deviation of each number of the left factor, as its noise makes it")
-    right: NonNegative = Field(description="the same of the right factor")
-    unexplained: NonNegative = Field(description="part of the responses that no separable camera explains, rms")
+    left: NonNegative
+    """Standard deviation of each number of the left factor, as its noise makes it."""
+    right: NonNegative
+    """The same of the right factor."""
+    unexplained: NonNegative
+    """Part of the responses that no separable camera explains, rms."""
 
 
 Edges = Annotated[tuple[Coordinate, ...], Field(strict=False, min_length=2, max_length=2)]
@@ -348,17 +354,24 @@ class Parallax(_Part):
     """How a calibration's factors move with depth: the projector's window, seen from the middle of the frames on a
     plane at distance z, has its edges at tan-angles window + parallax (1/z - 1/depth), in index coordinates."""
 
-    depth_mm: Distance = Field(description="sensor to the board [mm]")
-    row_tan: Edges = Field(description="first and last edge of the window's rows on the board")
-    column_tan: Edges = Field(description="the same of its columns")
-    row_mm: Edges = Field(description="parallax of these edges; the baseline, where the projector faces as the camera")
-    column_mm: Edges = Field(description="the same of columns")
-    pixel_pitch_mm: Distance = Field(description="between columns of (binned) sensor pixels, and between rows")
-    row_pitch_mm: Distance | None = Field(default=None, description="between rows, where pixels are not square")
-    mask_distance_mm: Distance = Field(description="sensor to the mask")
-    stop_tan: Distance | None = Field(
-        default=None, description="tangent at which a square field stop ends, along both axes; none: not known"
-    )
+    depth_mm: Distance
+    """Sensor to the board [mm]."""
+    row_tan: Edges
+    """First and last edge of the window's rows on the board."""
+    column_tan: Edges
+    """The same of its columns."""
+    row_mm: Edges
+    """Parallax of these edges; the baseline, where the projector faces as the camera."""
+    column_mm: Edges
+    """The same of columns."""
+    pixel_pitch_mm: Distance
+    """Between columns of (binned) sensor pixels, and between rows."""
+    row_pitch_mm: Distance | None = None
+    """Between rows, where pixels are not square."""
+    mask_distance_mm: Distance
+    """Sensor to the mask."""
+    stop_tan: Distance | None = None
+    """Tangent at which a square field stop ends, along both axes; none: not known."""
 
     @model_validator(mode="after")
     def _a_window_behind_a_mask(self) -> Parallax:
@@ -377,43 +390,54 @@ class Parallax(_Part):
 class FittedNumber(_Part):
     """A number of a modelled camera."""
 
-    value: float = Field(description="in its unit")
-    standard_error: NonNegative | None = Field(default=None, description="as its fit tells it; none: it was held")
-    unit: str = Field(description="of both")
+    value: float
+    """In its unit."""
+    standard_error: NonNegative | None = None
+    """As its fit tells it; none: it was held."""
+    unit: str
+    """Of both."""
 
 
 class ModelledFactors(_Part):
     """What modelled factors were fitted by."""
 
-    model: Literal["geometric", "wave"] = Field(description="of the mask's shadow")
-    frames: int = Field(ge=1, le=MOST_SHOTS, description="that it was fitted to")
-    chi_square: NonNegative = Field(description="a datum, of what the fit uses of the frames; 1 for a right model")
-    parameters: dict[str, FittedNumber] = Field(description="by name: where mask and projector are, and the gain")
+    model: Literal["geometric", "wave"]
+    """Of the mask's shadow."""
+    frames: int = Field(ge=1, le=MOST_SHOTS)
+    """That it was fitted to."""
+    chi_square: NonNegative
+    """A datum, of what the fit uses of the frames; 1 for a right model."""
+    parameters: dict[str, FittedNumber]
+    """By name: where mask and projector are, and the gain."""
 
 
 class CalibrationManifest(_Head):
     """A calibration: of which camera, and how its factors are used."""
 
-    kind: Literal["calibration"] = Field(default="calibration", description="what the folder is")
-    camera: Plain = Field(description="identity that a run must share")
-    centre: bool = Field(default=False, description="frames and factors lose row and column means (FlatCam masks)")
-    board_reflectance: float | None = Field(
-        default=None, gt=0, le=1, description="reflectance of the board that counts as 1 in the image; none: unknown"
-    )
-    digital: Digital | None = Field(default=None, description="of the session's frames")
-    checksums: Checksums = Field(default={}, description="SHA-256 by file name, where known")
-    noise: FactorNoise | None = Field(default=None, description="how exact the factors are; none: not stated")
-    parallax: Parallax | None = Field(
-        default=None, description="how the factors move with depth; none: not known, and no `--focus`"
-    )
-    modelled: ModelledFactors | None = Field(
-        default=None, description="the model that was fitted; none: the factors are measured"
-    )
-    result: Plain = Field(default={}, description="the session in numbers, as `calibrate --json` gives them")
-    estimate: str | None = Field(default=None, description="the estimator's own words")
-    verdict: str | None = Field(
-        default=None, description="the estimator's verdict, one of `mitsim.reconstruct.status.Verdict`"
-    )
+    kind: Literal["calibration"] = "calibration"
+    """What the folder is."""
+    camera: Plain
+    """Identity that a run must share."""
+    centre: bool = False
+    """Frames and factors lose row and column means (FlatCam masks)."""
+    board_reflectance: float | None = Field(default=None, gt=0, le=1)
+    """Reflectance of the board that counts as 1 in the image; none: unknown."""
+    digital: Digital | None = None
+    """Of the session's frames."""
+    checksums: Checksums = {}
+    """SHA-256 by file name, where known."""
+    noise: FactorNoise | None = None
+    """How exact the factors are; none: not stated."""
+    parallax: Parallax | None = None
+    """How the factors move with depth; none: not known, and no `--focus`."""
+    modelled: ModelledFactors | None = None
+    """The model that was fitted; none: the factors are measured."""
+    result: Plain = {}
+    """The session in numbers, as `calibrate --json` gives them."""
+    estimate: str | None = None
+    """The estimator's own words."""
+    verdict: str | None = None
+    """The estimator's verdict, one of `mitsim.reconstruct.status.Verdict`."""
 
 
 Manifest = TypeVar("Manifest", RunManifest, CalibrationManifest)

@@ -114,7 +114,7 @@ def card(title: str, pictures: Mapping[str, npt.ArrayLike], facts: Iterable[str]
         f'<figcaption style="font-size:85%;white-space:pre-line">{html.escape(caption)}</figcaption></figure>'
         for caption, source in sources.items()
     )
-    return _titled(title, f"<div>{figures}</div>", facts)
+    return _with_title(title, f"<div>{figures}</div>", facts)
 
 
 def table(
@@ -146,9 +146,9 @@ def table(
         )
 
     body = "".join(f"<tr>{line(row, 'td')}</tr>" for row in rows)
-    return _titled(title, f"<table><tr>{line(headings, 'th')}</tr>{body}</table>", facts)
+    return _with_title(title, f"<table><tr>{line(headings, 'th')}</tr>{body}</table>", facts)
 
 
-def _titled(title: str, body: str, facts: Iterable[str]) -> str:
+def _with_title(title: str, body: str, facts: Iterable[str]) -> str:
     lines = "".join(f"<div>{html.escape(fact)}</div>" for fact in facts)
     return f"<div><b>{html.escape(title)}</b></div>{body}{lines}"

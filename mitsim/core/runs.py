@@ -92,13 +92,13 @@ class Capture:
     @cached_property
     def dn(self) -> Channel:
         """(shots, rows, columns) digital numbers, uint32; float32 of a sensor without an ADC."""
-        return self._stacked("DN")
+        return self._stack("DN")
 
     @cached_property
     def electrons(self) -> Channel | None:
         """(shots, rows, columns) expected photoelectrons; None for a real camera, whose expectation nobody knows."""
         first = self.manifest.patterns.captures[0].file
-        return self._stacked("electrons") if "electrons" in self.read(first)[0] else None
+        return self._stack("electrons") if "electrons" in self.read(first)[0] else None
 
     @cached_property
     def truth(self) -> FloatArray | None:
@@ -166,20 +166,20 @@ class Capture:
                     f"{_size(shape or ())}; calibrate this camera"
                 )
             light = digital.rate(dn)
-            own = light * shot.sign if shot.sign else self._lit(light)
+            own = light * shot.sign if shot.sign else self._projector_part(light)
             factor, top = _common_factor(dn), float(dn.max())
             full, cut = 0, 0
             if digital.saturation_dn is not None and top >= digital.saturation_dn:
                 full = int(np.count_nonzero(dn >= digital.saturation_dn))
             else:
-                cut = _clipped(dn, top, digital, factor)
+                cut = _clipped_readings(dn, top, digital, factor)
             half = Measurement(own, *index, light, 1, full, factor, (_digest(dn),), (cut,))
             if shot.sign and index not in waiting:
                 waiting[index] = half
                 continue
             yield waiting.pop(index) + half if shot.sign else half
 
-    def _lit(self, light: FloatArray) -> FloatArray:
+    def _projector_part(self, light: FloatArray) -> FloatArray:
         """The projector's part of a shot's ``light``."""
         if self.ambient is None:
             return light
@@ -304,7 +304,7 @@ class Capture:
     def _channel(self, name: str, channel: str) -> FloatArray:
         return finite_channel(self.read(name)[0], channel, self.folder / name if self.folder else Path(name))
 
-    def _stacked(self, channel: str) -> Channel:
+    def _stack(self, channel: str) -> Channel:
         shots = self.manifest.patterns.captures
         stack: Channel = np.array([self.read(shot.file)[0][channel] for shot in shots])
         if self.folder is None and isinstance(self._memory, dict):  # one copy: the shots become views of the stack
@@ -340,7 +340,7 @@ def _digest(dn: FloatArray) -> int:
     return 0 if (some == some.flat[0]).all() else 1 + zlib.crc32(some.tobytes())
 
 
-def _clipped(dn: FloatArray, top: float, digital: Digital, factor: int) -> int:
+def _clipped_readings(dn: FloatArray, top: float, digital: Digital, factor: int) -> int:
     """Readings at the largest of all numbers, ``top``, where noise does not leave so many; else 0.
 
     Of light that ends in noise alone, no number at its end is more frequent than those just below it.

@@ -60,13 +60,12 @@ class Line(BaseModel):
 
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore")
 
-    name: Annotated[str, Field(pattern=r"^[\w.+-]+$", max_length=255)] = Field(
-        description="of the line, and of its folder"
-    )
-    wavelength_nm: float = Field(ge=1, le=1e6, allow_inf_nan=False, description="of the line's light [nm]")
-    radiant_share: float | None = Field(
-        None, ge=0, le=1, allow_inf_nan=False, description="part of the projector's power; none: not known"
-    )
+    name: Annotated[str, Field(pattern=r"^[\w.+-]+$", max_length=255)]
+    """Of the line, and of its folder."""
+    wavelength_nm: float = Field(ge=1, le=1e6, allow_inf_nan=False)
+    """Of the line's light [nm]."""
+    radiant_share: float | None = Field(default=None, ge=0, le=1, allow_inf_nan=False)
+    """Part of the projector's power; none: not known."""
 
     @field_validator("name")
     @classmethod
@@ -81,12 +80,10 @@ class ColourManifest(BaseModel):
 
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore")
 
-    kind: Literal["colour-run", "colour-calibration", "colour-image", "mosaic-run"] = Field(
-        description="what the folder is"
-    )
-    channels: Annotated[tuple[Line, ...], Field(strict=False, min_length=1, max_length=256)] = Field(
-        description="spectral lines, each in a folder of its name"
-    )
+    kind: Literal["colour-run", "colour-calibration", "colour-image", "mosaic-run"]
+    """What the folder is."""
+    channels: Annotated[tuple[Line, ...], Field(strict=False, min_length=1, max_length=256)]
+    """Spectral lines, each in a folder of its name."""
 
     @field_validator("channels")
     @classmethod
@@ -111,12 +108,12 @@ class ColourManifest(BaseModel):
 class MosaicManifest(ColourManifest):
     """What colour.json says of a run behind colour filters, beside its lines."""
 
-    mosaic: Literal["RGGB", "BGGR", "GRBG", "GBRG"] = Field(
-        description="filters of 2 x 2 pixels, row by row from the frame's first pixel"
-    )
+    mosaic: Literal["RGGB", "BGGR", "GRBG", "GBRG"]
+    """Filters of 2 x 2 pixels, row by row from the frame's first pixel."""
     weights: Annotated[
         tuple[Annotated[tuple[Weight, ...], Field(strict=False)], ...], Field(strict=False, min_length=4, max_length=4)
-    ] = Field(description="of each of these four pixels, electrons per photon of each line")
+    ]
+    """Of each of these four pixels, electrons per photon of each line."""
 
     @model_validator(mode="after")
     def _a_weight_for_each_line(self) -> MosaicManifest:

@@ -81,7 +81,7 @@ def enter_worker() -> None:
     # Signals stay blocked in this thread, so it is the main one that they interrupt.
     threading.Thread(target=_end_with_parent, args=(reading,), daemon=True).start()
     _insist_on_signals()
-    for number in _heeded():
+    for number in _signals_to_heed():
         signal.signal(number, _stop)
     signal.signal(signal.SIGALRM, _again)
     sys.unraisablehook = _unraisable
@@ -218,7 +218,7 @@ def _check_address_space() -> None:
         sys.exit(2)
 
 
-def _heeded() -> list[int]:
+def _signals_to_heed() -> list[int]:
     """Signals that are not ignored already, as nohup and background jobs of a shell have it."""
     return [number for number in _STOPS if signal.getsignal(number) is not signal.SIG_IGN]
 
@@ -226,7 +226,7 @@ def _heeded() -> list[int]:
 def _stop(number: int, _: FrameType | None) -> None:
     global _stopped_by
     _stopped_by = number
-    for heeded in _heeded():  # a terminal sends Control-C to both processes, and the parent passes it on
+    for heeded in _signals_to_heed():  # a terminal sends Control-C to both processes, and the parent passes it on
         signal.signal(heeded, signal.SIG_IGN)
     raise KeyboardInterrupt
 
@@ -275,7 +275,7 @@ def _watch(child: int) -> NoReturn:
     asked: list[int] = []
     # Signals stay blocked and are waited for, the worker's end among them: a handler's call can be late by a wait.
     signal.signal(signal.SIGCHLD, lambda *_: None)  # some systems drop what is ignored, blocked or not
-    awaited = {*_heeded(), signal.SIGCHLD}
+    awaited = {*_signals_to_heed(), signal.SIGCHLD}
     while not (ended := os.waitpid(child, os.WNOHANG))[0]:
         number = signal.sigwait(awaited)
         if number != signal.SIGCHLD:

@@ -11,11 +11,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.configuration import validated
+from mitsim.core.configuration import Configuration, validated
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import FRAME_LIMITS, fits_a_frame
 from mitsim.devices.drift import MaskMotion
@@ -36,70 +36,83 @@ _NOT_KNOWN_BEFORE = (
 """Beginnings of the names of fields that calibrations of 0.4 do not know."""
 
 
-class CameraGeometry(BaseModel):
+class CameraGeometry(Configuration, arbitrary_types_allowed=True):
     """Bare sensor under a coded mask; the defaults are the geometry of Zheng & Asif, section IV-A."""
 
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True
-    )
+    pixels: int = Field(default=512, ge=1, le=16384)
+    """Sensor pixels a side, of a square sensor.
 
-    pixels: int = Field(512, ge=1, le=16384, description="sensor pixels a side, of a square sensor")
-    """More than the largest square sensors, 10 560, of which a region is read."""
-    rows: int | None = Field(None, ge=1, le=16384, description="rows of sensor pixels; none: `pixels`")
-    columns: int | None = Field(None, ge=1, le=16384, description="columns of sensor pixels; none: `pixels`")
-    pixel_pitch: float = Field(
-        0.01172, ge=1e-6, le=1e3, description="distance between columns of sensor pixels, and between rows [mm]"
-    )
-    """A nanometre to a metre: shadows keep at least eight digits there (tests/hard/test_hard_shadows.py)."""
-    row_pitch: float | None = Field(
-        None,
-        ge=1e-6,
-        le=1e3,
-        description="distance between rows of pixels that are not square [mm]; none: `pixel_pitch`",
-    )
-    roi: tuple[int, int, int, int] | None = Field(
-        None, strict=False, description="region of interest: its first row and column, rows and columns; none: all"
-    )
-    mask: CameraMask = Field("separable", description="mask construction; plate: what a camera file's [mask] gives")
-    mask_order: int = Field(9, ge=2, le=16, description="order of the maximum length sequence")
-    """The orders of :func:`mitsim.devices.mask.mls_code`: 3 to 65 535 features a side."""
-    mask_feature: float = Field(0.06, ge=1e-6, le=1e3, description="mask feature size [mm]")
-    """As pixels; lithography ends at some 10 nm, masks of telescopes at some cm."""
-    mask_distance: float = Field(2.0, ge=1e-9, le=1e7, description="sensor to the mask's near face [mm]")
-    """A picometre, in contact, to 10 km; masks of gamma-ray telescopes stand 10 m away."""
-    mask_thickness: float = Field(0.0, ge=0, le=1e7, description="mask thickness [mm]; 0 is a thin mask")
-    """As the distance; a mask must end before the scene."""
-    mask_offset_row: float = Field(0.0, ge=-1e7, le=1e7, description="mask's centre off the axis, down the rows [mm]")
-    mask_offset_column: float = Field(0.0, ge=-1e7, le=1e7, description="the same along the columns [mm]")
-    """As the distance: no mask is wider."""
-    scene_distance: float = Field(
-        400.0, ge=1e-6, le=1e10, description="sensor to the plane that the rig is aligned to [mm]"
-    )
-    """A nanometre, for masks in contact, to 10 000 km."""
-    fov: float = Field(20.0, ge=1e-3, lt=180, description="full angle of the square field stop [degrees]")
-    """3.6 seconds of arc, the width of a star's blur, to all that a plane can see."""
-    pixel_fill_factor: float = Field(
-        1.0,
-        ge=1e-4,
-        le=1,
-        description="part of a pixel that is active, in its middle and as high to wide as it; 1 is the whole pixel",
-    )
-    """Pixels with a counter each fill some 1e-2."""
-    angular_exponent: float = Field(
-        0.0, ge=0, le=1000, description="a pixel responds as cos(theta) to this power; 0 is no angular response"
-    )
-    """1000 halves the response at 2 degrees, far less than any microlens."""
-    mask_plate: SkipJsonSchema[Plate | None] = Field(None, exclude=True, description="mask of a camera file")
-    """The mask ``plate``, which no scene states."""
-    mask_motion: SkipJsonSchema[MaskMotion | None] = Field(None, exclude=True, description="turn and vibration")
-    """What a drift adds between calibration and capture, which no scene states."""
-    mask_lean_mrad: SkipJsonSchema[tuple[float, float] | None] = Field(
-        None, exclude=True, description="tilt by a drift"
-    )
-    """Beside the tilt of a camera file's mask: along rows and along columns, which no scene states."""
-    mask_fft: SkipJsonSchema[bool] = Field(False, exclude=True, description="frames by FFT where that is a choice")
-    mask_cells: SkipJsonSchema[int] = Field(0, exclude=True, description="raster cells along a pixel; 0: the fewest")
-    """What a plan chooses, which no scene states."""
+    More than the largest square sensors, 10 560, of which a region is read."""
+    rows: int | None = Field(default=None, ge=1, le=16384)
+    """Rows of sensor pixels; none: `pixels`."""
+    columns: int | None = Field(default=None, ge=1, le=16384)
+    """Columns of sensor pixels; none: `pixels`."""
+    pixel_pitch: float = Field(default=0.01172, ge=1e-6, le=1e3)
+    """Distance between columns of sensor pixels, and between rows [mm].
+
+    A nanometre to a metre: shadows keep at least eight digits there (tests/hard/test_hard_shadows.py)."""
+    row_pitch: float | None = Field(default=None, ge=1e-6, le=1e3)
+    """Distance between rows of pixels that are not square [mm]; none: `pixel_pitch`."""
+    roi: tuple[int, int, int, int] | None = Field(default=None, strict=False)
+    """Region of interest: its first row and column, rows and columns; none: all."""
+    mask: CameraMask = "separable"
+    """Mask construction; plate: what a camera file's [mask] gives."""
+    mask_order: int = Field(default=9, ge=2, le=16)
+    """Order of the maximum length sequence.
+
+    The orders of :func:`mitsim.devices.mask.mls_code`: 3 to 65 535 features a side."""
+    mask_feature: float = Field(default=0.06, ge=1e-6, le=1e3)
+    """Mask feature size [mm].
+
+    As pixels; lithography ends at some 10 nm, masks of telescopes at some cm."""
+    mask_distance: float = Field(default=2.0, ge=1e-9, le=1e7)
+    """Sensor to the mask's near face [mm].
+
+    A picometre, in contact, to 10 km; masks of gamma-ray telescopes stand 10 m away."""
+    mask_thickness: float = Field(default=0.0, ge=0, le=1e7)
+    """Mask thickness [mm]; 0 is a thin mask.
+
+    As the distance; a mask must end before the scene."""
+    mask_offset_row: float = Field(default=0.0, ge=-1e7, le=1e7)
+    """Mask's centre off the axis, down the rows [mm]."""
+    mask_offset_column: float = Field(default=0.0, ge=-1e7, le=1e7)
+    """The same along the columns [mm].
+
+    As the distance: no mask is wider."""
+    scene_distance: float = Field(default=400.0, ge=1e-6, le=1e10)
+    """Sensor to the plane that the rig is aligned to [mm].
+
+    A nanometre, for masks in contact, to 10 000 km."""
+    fov: float = Field(default=20.0, ge=1e-3, lt=180)
+    """Full angle of the square field stop [degrees].
+
+    3.6 seconds of arc, the width of a star's blur, to all that a plane can see."""
+    pixel_fill_factor: float = Field(default=1.0, ge=1e-4, le=1)
+    """Part of a pixel that is active, in its middle and as high to wide as it; 1 is the whole pixel.
+
+    Pixels with a counter each fill some 1e-2."""
+    angular_exponent: float = Field(default=0.0, ge=0, le=1000)
+    """A pixel responds as cos(theta) to this power; 0 is no angular response.
+
+    1000 halves the response at 2 degrees, far less than any microlens."""
+    mask_plate: SkipJsonSchema[Plate | None] = Field(default=None, exclude=True)
+    """Mask of a camera file.
+
+    The mask ``plate``, which no scene states."""
+    mask_motion: SkipJsonSchema[MaskMotion | None] = Field(default=None, exclude=True)
+    """Turn and vibration.
+
+    What a drift adds between calibration and capture, which no scene states."""
+    mask_lean_mrad: SkipJsonSchema[tuple[float, float] | None] = Field(default=None, exclude=True)
+    """Tilt by a drift.
+
+    Beside the tilt of a camera file's mask: along rows and along columns, which no scene states."""
+    mask_fft: SkipJsonSchema[bool] = Field(default=False, exclude=True)
+    """Frames by FFT where that is a choice."""
+    mask_cells: SkipJsonSchema[int] = Field(default=0, exclude=True)
+    """Raster cells along a pixel; 0: the fewest.
+
+    What a plan chooses, which no scene states."""
 
     @model_validator(mode="after")
     def _mask_lies_before_the_scene(self) -> CameraGeometry:

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.configuration import locate, validated
+from mitsim.core.configuration import Configuration, locate, validated
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import read_json
 
@@ -20,15 +20,13 @@ Box = Annotated[tuple[Edge, ...], Field(strict=False, min_length=4, max_length=4
 """First row, row after the last, first column, column after the last [projector pixels]."""
 
 
-class ChartPlace(BaseModel):
+class ChartPlace(Configuration):
     """The patches of a chart in an image."""
 
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
-
-    spectra: Literal["ColorChecker N Ohta"] = Field(description="measured spectra of the patches, in colour-science")
-    patches: Annotated[tuple[Box, ...], Field(strict=False, min_length=PATCHES, max_length=PATCHES)] = Field(
-        description="of each patch, row by row: [first row, end, first column, end] inside it [image pixels]"
-    )
+    spectra: Literal["ColorChecker N Ohta"]
+    """Measured spectra of the patches, in colour-science."""
+    patches: Annotated[tuple[Box, ...], Field(strict=False, min_length=PATCHES, max_length=PATCHES)]
+    """Of each patch, row by row: [first row, end, first column, end] inside it [image pixels]."""
 
     @field_validator("patches")
     @classmethod

@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from mitsim.core.configuration import validated
+from mitsim.core.configuration import Configuration, validated
 from mitsim.core.errors import MitsimError
 
 LARGEST_ROTATION_MRAD = 10.0
@@ -45,77 +45,73 @@ STILL = "gap_um_per_k", "power_ripple_hz", "lamp_ripple_hz"
 """Fields of :class:`Drift` that move nothing by themselves: they say what a kind does."""
 
 
-class MaskMotion(BaseModel):
+class MaskMotion(Configuration):
     """How a mask is turned in its plane about its centre, from rows to columns, and how it moves during an exposure."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
     rotation_mrad: float = Field(default=0.0, ge=-LARGEST_ROTATION_MRAD, le=LARGEST_ROTATION_MRAD)
-    vibration_um: float = Field(default=0.0, ge=0, le=1000, description="rms along each axis, um")
+    vibration_um: float = Field(default=0.0, ge=0, le=1000)
+    """Rms along each axis, um."""
 
 
-class Drift(BaseModel):
+class Drift(Configuration):
     """What moves between a calibration and a capture, and by how much."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    mask_rows_um: float = Field(default=0.0, ge=-1000, le=1000)
+    """Mask moves down the rows, um."""
+    mask_columns_um: float = Field(default=0.0, ge=-1000, le=1000)
+    """The same along the columns, um."""
+    mask_axis_um: float = Field(default=0.0, ge=-1000, le=1000)
+    """Mask moves away from the sensor, um.
 
-    mask_rows_um: float = Field(default=0.0, ge=-1000, le=1000, description="mask moves down the rows, um")
-    mask_columns_um: float = Field(default=0.0, ge=-1000, le=1000, description="the same along the columns, um")
-    mask_axis_um: float = Field(default=0.0, ge=-1000, le=1000, description="mask moves away from the sensor, um")
-    """A millimetre: a mask that has come loose."""
-    mask_rotation_mrad: float = Field(
-        default=0.0, ge=-LARGEST_ROTATION_MRAD, le=LARGEST_ROTATION_MRAD, description="mask turns in its plane, mrad"
-    )
-    mask_tilt_rows_mrad: float = Field(
-        default=0.0,
-        ge=-LARGEST_TILT_MRAD,
-        le=LARGEST_TILT_MRAD,
-        description="mask tilts about its centre, its distance growing down the rows, mrad",
-    )
-    mask_tilt_columns_mrad: float = Field(
-        default=0.0, ge=-LARGEST_TILT_MRAD, le=LARGEST_TILT_MRAD, description="the same along the columns, mrad"
-    )
-    vibration_um: float = Field(
-        default=0.0, ge=0, le=1000, description="normal motion of the mask during each exposure, um rms along each axis"
-    )
-    temperature_k: float = Field(default=0.0, ge=-200, le=200, description="sensor and camera grow warmer, K")
-    gap_um_per_k: float = Field(
-        default=0.0, ge=-100, le=100, description="gap from sensor to mask grows, um/K; moves nothing by itself"
-    )
-    """A metre of aluminium has 23 um/K."""
-    exposure: float = Field(default=0.0, gt=-1, le=10, description="exposure time's error, as a part of it")
-    power: float = Field(default=0.0, ge=-1, le=10, description="projector's power changes, as a part of it")
-    power_ramp: float = Field(
-        default=0.0, ge=-1, le=10, description="the same, evenly from begin to end of the capture, as a part of it"
-    )
-    power_flicker: float = Field(
-        default=0.0, ge=0, le=1, description="the same from frame to frame, normal deviates, rms as a part of it"
-    )
-    power_ripple: float = Field(
-        default=0.0, ge=0, le=1, description="power during each frame, a sine of any phase, amplitude as a part of it"
-    )
-    power_ripple_hz: float | None = Field(default=None, ge=1e-3, le=1e7, description="its frequency, Hz")
-    """Mains bring 100 or 120, a projector's pictures some 60, drivers of light-emitting diodes up to 1e6."""
-    session_ramp: float = Field(
-        default=0.0, ge=-1, le=10, description="power changes from begin to end of the session, as a part of it"
-    )
-    session_flicker: float = Field(
-        default=0.0, ge=0, le=1, description="power from frame to frame of the session, rms as a part of it"
-    )
-    lamp: float = Field(
-        default=0.0, ge=-1, le=10, description="lamps change after the ambient frame, as a part of their light"
-    )
-    lamp_flicker: float = Field(
-        default=0.0, ge=0, le=1, description="lamps from frame to frame, normal deviates, rms as a part of their light"
-    )
-    lamp_ripple: float = Field(
-        default=0.0, ge=0, le=1, description="lamps during each frame, a sine of any phase, amplitude as a part of it"
-    )
-    lamp_ripple_hz: float | None = Field(default=None, ge=1e-3, le=1e7, description="its frequency, Hz")
-    projector_rows: float = Field(default=0.0, gt=-0.5, lt=0.5, description="picture moves down the rows, its pixels")
-    projector_columns: float = Field(default=0.0, gt=-0.5, lt=0.5, description="the same along the columns")
-    """Beyond half a pixel, pixels at the window's edge would light nothing."""
-    black_level_dn: float = Field(default=0.0, ge=-1e4, le=1e4, description="black level of a pixel moves, DN")
+    A millimetre: a mask that has come loose."""
+    mask_rotation_mrad: float = Field(default=0.0, ge=-LARGEST_ROTATION_MRAD, le=LARGEST_ROTATION_MRAD)
+    """Mask turns in its plane, mrad."""
+    mask_tilt_rows_mrad: float = Field(default=0.0, ge=-LARGEST_TILT_MRAD, le=LARGEST_TILT_MRAD)
+    """Mask tilts about its centre, its distance growing down the rows, mrad."""
+    mask_tilt_columns_mrad: float = Field(default=0.0, ge=-LARGEST_TILT_MRAD, le=LARGEST_TILT_MRAD)
+    """The same along the columns, mrad."""
+    vibration_um: float = Field(default=0.0, ge=0, le=1000)
+    """Normal motion of the mask during each exposure, um rms along each axis."""
+    temperature_k: float = Field(default=0.0, ge=-200, le=200)
+    """Sensor and camera grow warmer, K."""
+    gap_um_per_k: float = Field(default=0.0, ge=-100, le=100)
+    """Gap from sensor to mask grows, um/K; moves nothing by itself.
+
+    A metre of aluminium has 23 um/K."""
+    exposure: float = Field(default=0.0, gt=-1, le=10)
+    """Exposure time's error, as a part of it."""
+    power: float = Field(default=0.0, ge=-1, le=10)
+    """Projector's power changes, as a part of it."""
+    power_ramp: float = Field(default=0.0, ge=-1, le=10)
+    """The same, evenly from begin to end of the capture, as a part of it."""
+    power_flicker: float = Field(default=0.0, ge=0, le=1)
+    """The same from frame to frame, normal deviates, rms as a part of it."""
+    power_ripple: float = Field(default=0.0, ge=0, le=1)
+    """Power during each frame, a sine of any phase, amplitude as a part of it."""
+    power_ripple_hz: float | None = Field(default=None, ge=1e-3, le=1e7)
+    """Its frequency, Hz.
+
+    Mains bring 100 or 120, a projector's pictures some 60, drivers of light-emitting diodes up to 1e6."""
+    session_ramp: float = Field(default=0.0, ge=-1, le=10)
+    """Power changes from begin to end of the session, as a part of it."""
+    session_flicker: float = Field(default=0.0, ge=0, le=1)
+    """Power from frame to frame of the session, rms as a part of it."""
+    lamp: float = Field(default=0.0, ge=-1, le=10)
+    """Lamps change after the ambient frame, as a part of their light."""
+    lamp_flicker: float = Field(default=0.0, ge=0, le=1)
+    """Lamps from frame to frame, normal deviates, rms as a part of their light."""
+    lamp_ripple: float = Field(default=0.0, ge=0, le=1)
+    """Lamps during each frame, a sine of any phase, amplitude as a part of it."""
+    lamp_ripple_hz: float | None = Field(default=None, ge=1e-3, le=1e7)
+    """Its frequency, Hz."""
+    projector_rows: float = Field(default=0.0, gt=-0.5, lt=0.5)
+    """Picture moves down the rows, its pixels."""
+    projector_columns: float = Field(default=0.0, gt=-0.5, lt=0.5)
+    """The same along the columns.
+
+    Beyond half a pixel, pixels at the window's edge would light nothing."""
+    black_level_dn: float = Field(default=0.0, ge=-1e4, le=1e4)
+    """Black level of a pixel moves, DN."""
 
     @model_validator(mode="after")
     def _ripples_have_a_frequency(self) -> Drift:

@@ -12,9 +12,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, FailFast, Field, model_validator
+from pydantic import BeforeValidator, FailFast, Field, model_validator
 
-from mitsim.core.configuration import Positive, read_toml, validated
+from mitsim.core.configuration import Configuration, Positive, read_toml, validated
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import read_json
 from mitsim.core.imagelist import Raw, Wanted, image_files
@@ -30,64 +30,69 @@ Key = tuple[Side, int, int, int, int]
 """Side, number of the pattern, sign, number of the exposure and repeat of a frame."""
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
-
-
-class StripeFile(_Part):
+class StripeFile(Configuration):
     """One frame of a session: the +1 or -1 half of a stripe pattern, or the uniform frame of a side."""
 
-    file: FileName = Field(description="name of the frame in the folder, without a path")
-    side: Side = Field(description="stripes along rows, H[:, index] 1^T, or along columns, 1 H[:, index]^T")
-    index: int = Field(ge=0, lt=2 * MOST_PIXELS, description="column of H; 0 of a uniform frame")
-    sign: int = Field(ge=-1, le=1, description="half (1 + P)/2 or (1 - P)/2 of a pattern P; 0: uniform frame")
-    repeat: int = Field(default=0, ge=0, lt=MOST_REPEATS, description="which one of `repeats`")
-    exposure: int = Field(default=0, ge=0, lt=MOST_RUNGS, description="which one of `exposure_ladder`")
-    exposure_s: Positive | None = Field(
-        default=None, description="its exposure [s]; none: as in `digital`, times that of `exposure_ladder`"
-    )
+    file: FileName
+    """Name of the frame in the folder, without a path."""
+    side: Side
+    """Stripes along rows, H[:, index] 1^T, or along columns, 1 H[:, index]^T."""
+    index: int = Field(ge=0, lt=2 * MOST_PIXELS)
+    """Column of H; 0 of a uniform frame."""
+    sign: int = Field(ge=-1, le=1)
+    """Half (1 + P)/2 or (1 - P)/2 of a pattern P; 0: uniform frame."""
+    repeat: int = Field(default=0, ge=0, lt=MOST_REPEATS)
+    """Which one of `repeats`."""
+    exposure: int = Field(default=0, ge=0, lt=MOST_RUNGS)
+    """Which one of `exposure_ladder`."""
+    exposure_s: Positive | None = None
+    """Its exposure [s]; none: as in `digital`, times that of `exposure_ladder`."""
 
 
-class DarkFile(_Part):
+class DarkFile(Configuration):
     """One frame with the projector off."""
 
-    file: FileName = Field(description="name of the frame in the folder, without a path")
-    exposure: int = Field(default=0, ge=0, lt=MOST_RUNGS, description="which one of `exposure_ladder`")
-    exposure_s: Positive | None = Field(default=None, description="its exposure [s]; none: as for other frames")
+    file: FileName
+    """Name of the frame in the folder, without a path."""
+    exposure: int = Field(default=0, ge=0, lt=MOST_RUNGS)
+    """Which one of `exposure_ladder`."""
+    exposure_s: Positive | None = None
+    """Its exposure [s]; none: as for other frames."""
 
 
-def _named(camera: Any) -> Any:
+def _with_name(camera: Any) -> Any:
     return {"name": camera} if isinstance(camera, str) else camera
 
 
-class FrameList(_Part):
+class FrameList(Configuration):
     """What a real session's frames are of, and how they are read."""
 
-    camera: Annotated[Plain, BeforeValidator(_named)] = Field(
-        description="identity that a run must share: a name, or anything as a run's manifest has it"
-    )
-    n: int = Field(ge=1, le=MOST_PIXELS, description="projector pixels a side")
-    signed_capture: Literal["pair", "uniform"] = Field(description="how a +-1 pattern was captured")
-    repeats: int = Field(default=1, ge=1, le=MOST_REPEATS, description="frames of each half, whose mean is taken")
-    exposure_ladder: Exposures = Field(
-        default=(1.0,), description="exposures of every frame, over the shortest, which `digital` states"
-    )
-    ladder_merge: Merge = Field(default="weighted", description="how they make one: by variance, or the longest alone")
-    digital: Digital = Field(description="how digital numbers become electrons a second, as in a run's manifest")
-    centre: bool = Field(default=False, description="frames lose row and column means (FlatCam masks)")
-    board_reflectance: float | None = Field(
-        default=None, gt=0, le=1, description="reflectance of the board that counts as 1 in the image; none: unknown"
-    )
-    parallax: Parallax | None = Field(
-        default=None, description="how the factors move with depth; none: not known, and no `--focus`"
-    )
-    raw: Raw | None = Field(default=None, description="how frames without a header are read; none: there are none")
-    frames: Annotated[tuple[StripeFile, ...], FailFast()] = Field(
-        default=(), strict=False, max_length=MOST_SHOTS, description="every frame; none: by the order of their names"
-    )
-    dark: Annotated[tuple[DarkFile, ...], FailFast()] = Field(
-        default=(), strict=False, max_length=MOST_SHOTS, description="frames with the projector off"
-    )
+    camera: Annotated[Plain, BeforeValidator(_with_name)]
+    """Identity that a run must share: a name, or anything as a run's manifest has it."""
+    n: int = Field(ge=1, le=MOST_PIXELS)
+    """Projector pixels a side."""
+    signed_capture: Literal["pair", "uniform"]
+    """How a +-1 pattern was captured."""
+    repeats: int = Field(default=1, ge=1, le=MOST_REPEATS)
+    """Frames of each half, whose mean is taken."""
+    exposure_ladder: Exposures = (1.0,)
+    """Exposures of every frame, over the shortest, which `digital` states."""
+    ladder_merge: Merge = "weighted"
+    """How they make one: by variance, or the longest alone."""
+    digital: Digital
+    """How digital numbers become electrons a second, as in a run's manifest."""
+    centre: bool = False
+    """Frames lose row and column means (FlatCam masks)."""
+    board_reflectance: float | None = Field(default=None, gt=0, le=1)
+    """Reflectance of the board that counts as 1 in the image; none: unknown."""
+    parallax: Parallax | None = None
+    """How the factors move with depth; none: not known, and no `--focus`."""
+    raw: Raw | None = None
+    """How frames without a header are read; none: there are none."""
+    frames: Annotated[tuple[StripeFile, ...], FailFast()] = Field(default=(), strict=False, max_length=MOST_SHOTS)
+    """Every frame; none: by the order of their names."""
+    dark: Annotated[tuple[DarkFile, ...], FailFast()] = Field(default=(), strict=False, max_length=MOST_SHOTS)
+    """Frames with the projector off."""
 
     @model_validator(mode="after")
     def _saturation_is_known(self) -> FrameList:
@@ -171,7 +176,7 @@ def load_frames(folder: Path | str) -> SessionFrames:
         )
     data = read_toml(lists[0]) if lists[0].suffix == ".toml" else read_json(lists[0])
     listed = validated(FrameList, data, f"frames {lists[0]}")
-    wanted = [*_wanted(listed)]
+    wanted = [*_keys_of_session(listed)]
     if listed.frames:
         frames, dark = listed.frames, listed.dark
     else:
@@ -195,7 +200,7 @@ def load_frames(folder: Path | str) -> SessionFrames:
     return session
 
 
-def _wanted(listed: FrameList) -> Iterator[Key]:
+def _keys_of_session(listed: FrameList) -> Iterator[Key]:
     """Frames of a session in the order in which they are listed."""
     for half in taken(stripe_count(listed.n), listed.signed_capture == "pair"):
         for exposure in range(len(listed.exposure_ladder)):

@@ -287,7 +287,7 @@ NO_FLAWS = Flaws()
 """A mask as it is drawn."""
 
 
-def etched(values: FloatArray, feature_mm: float, grow_mm: float) -> tuple[FloatArray, FloatArray]:
+def etch(values: FloatArray, feature_mm: float, grow_mm: float) -> tuple[FloatArray, FloatArray]:
     """Lines (2 N + 2,) and transmissions (2 N + 1, 2 N + 1) of a mask whose openings have grown on each side.
 
     Every place gets the greatest transmission within a square of half-side ``grow_mm``, or the least where that is
@@ -316,7 +316,7 @@ def etched(values: FloatArray, feature_mm: float, grow_mm: float) -> tuple[Float
     return lines, values
 
 
-def dusted(lines: FloatArray, values: FloatArray, dust: Dust, reach_mm: float) -> tuple[FloatArray, FloatArray]:
+def draw_dust(lines: FloatArray, values: FloatArray, dust: Dust, reach_mm: float) -> tuple[FloatArray, FloatArray]:
     """A mask's lines and transmissions with dust on it.
 
     Parameters

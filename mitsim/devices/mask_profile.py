@@ -6,17 +6,17 @@ from pathlib import Path
 from typing import Literal, cast, get_args
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.configuration import read_toml, validated
+from mitsim.core.configuration import Configuration, read_toml, validated
 from mitsim.core.errors import MitsimError
 from mitsim.core.imagelist import Wanted
 from mitsim.core.images import image_size, read_image
 from mitsim.core.resources import Cost, Limits
 from mitsim.core.seeds import stream
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask import Dust, Flaws, MaskKind, etched, mls_mask
+from mitsim.devices.mask import Dust, Flaws, MaskKind, etch, mls_mask
 from mitsim.devices.plate import LARGEST, Plate, read_drawing, squared
 
 _OWN = {
@@ -44,52 +44,58 @@ _DUST = {"dust_per_mm2", "dust_radius_um", "dust_opacity", "dust_seed"}
 _QUARTER = 90
 """Degrees of a turn that takes features to features."""
 _MOST_ETCHED = LARGEST // 2
-"""Features a side of a mask that is etched: each has two lines then."""
+"""Features a side of a mask that is etch: each has two lines then."""
 _MOST_GROWTH = 8
 """Features by which openings grow or shrink at most: beyond it nothing of a code is left."""
 
 
-class MaskProfile(BaseModel):
+class MaskProfile(Configuration):
     """What a mask is made of; the scene states where it stands."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    kind: Literal["separable", "flatcam", "open", "mura", "random", "drawing", "psf"]
+    """See below."""
+    feature_mm: float = Field(ge=1e-6, le=1e3)
+    """Side of a feature, or of a picture's pixel [mm].
 
-    kind: Literal["separable", "flatcam", "open", "mura", "random", "drawing", "psf"] = Field(description="see below")
-    feature_mm: float = Field(ge=1e-6, le=1e3, description="side of a feature, or of a picture's pixel [mm]")
-    """As a scene's ``mask_feature``."""
-    order: int = Field(9, ge=2, le=16, description="separable, flatcam, open: order of the maximum length sequence")
-    features: int | None = Field(None, ge=1, le=LARGEST, description="mura (an odd prime), random: features a side")
-    open_part: float = Field(0.5, gt=0, le=1, description="random: probability that a feature is open")
-    seed: int = Field(0, ge=0, le=2**63 - 1, description="random: which of all such masks")
-    file: str | None = Field(
-        None, min_length=1, max_length=4096, description="drawing, psf: PNG, TIFF, NPY or OpenEXR file"
-    )
-    psf_distance_mm: float | None = Field(
-        None, gt=0, le=1e10, description="psf: from the sensor to the point that the picture shows the light of [mm]"
-    )
-    aperture_mm2: float | None = Field(None, gt=0, le=1e8, description="psf: area of the mask that lets light through")
-    psf_reduce: int = Field(1, ge=1, le=1024, description="psf: pixels a side of the picture that become one")
-    over_etch_um: float = Field(
-        0.0, ge=-1000, le=1000, description="how far every opening has grown on each side [um]; below 0 shrunk"
-    )
-    edge_blur_um: float = Field(
-        0.0, ge=0, le=1000, description="standard deviation of a Gaussian blur of the transmission [um]"
-    )
-    opaque_transmission: float = Field(
-        0.0, ge=0, le=1, description="part of the light that a closed feature lets through"
-    )
-    clear_transmission: float = Field(
-        1.0, ge=0, le=1, description="part of the light that an open feature lets through"
-    )
-    rotation_deg: float = Field(
-        0.0, ge=-180, le=180, description="turn in its plane, from the rows' direction to the columns' [degrees]"
-    )
-    tilt_row_mrad: float = Field(0.0, ge=-300, le=300, description="how its distance grows down the rows [mrad]")
-    tilt_column_mrad: float = Field(0.0, ge=-300, le=300, description="the same along the columns [mrad]")
-    dust_per_mm2: float = Field(0.0, ge=0, le=1e4, description="discs of dust, mean number on a square millimetre")
-    dust_radius_um: float = Field(10.0, gt=0, le=1e5, description="their radius [um]")
-    dust_opacity: float = Field(1.0, gt=0, le=1, description="part of the light that a disc takes")
-    dust_seed: int = Field(0, ge=0, le=2**63 - 1, description="which of all such dusts")
+    As a scene's ``mask_feature``."""
+    order: int = Field(default=9, ge=2, le=16)
+    """Separable, flatcam, open: order of the maximum length sequence."""
+    features: int | None = Field(default=None, ge=1, le=LARGEST)
+    """Mura (an odd prime), random: features a side."""
+    open_part: float = Field(default=0.5, gt=0, le=1)
+    """Random: probability that a feature is open."""
+    seed: int = Field(default=0, ge=0, le=2**63 - 1)
+    """Random: which of all such masks."""
+    file: str | None = Field(default=None, min_length=1, max_length=4096)
+    """Drawing, psf: PNG, TIFF, NPY or OpenEXR file."""
+    psf_distance_mm: float | None = Field(default=None, gt=0, le=1e10)
+    """Psf: from the sensor to the point that the picture shows the light of [mm]."""
+    aperture_mm2: float | None = Field(default=None, gt=0, le=1e8)
+    """Psf: area of the mask that lets light through."""
+    psf_reduce: int = Field(default=1, ge=1, le=1024)
+    """Psf: pixels a side of the picture that become one."""
+    over_etch_um: float = Field(default=0.0, ge=-1000, le=1000)
+    """How far every opening has grown on each side [um]; below 0 shrunk."""
+    edge_blur_um: float = Field(default=0.0, ge=0, le=1000)
+    """Standard deviation of a Gaussian blur of the transmission [um]."""
+    opaque_transmission: float = Field(default=0.0, ge=0, le=1)
+    """Part of the light that a closed feature lets through."""
+    clear_transmission: float = Field(default=1.0, ge=0, le=1)
+    """Part of the light that an open feature lets through."""
+    rotation_deg: float = Field(default=0.0, ge=-180, le=180)
+    """Turn in its plane, from the rows' direction to the columns' [degrees]."""
+    tilt_row_mrad: float = Field(default=0.0, ge=-300, le=300)
+    """How its distance grows down the rows [mrad]."""
+    tilt_column_mrad: float = Field(default=0.0, ge=-300, le=300)
+    """The same along the columns [mrad]."""
+    dust_per_mm2: float = Field(default=0.0, ge=0, le=1e4)
+    """Discs of dust, mean number on a square millimetre."""
+    dust_radius_um: float = Field(default=10.0, gt=0, le=1e5)
+    """Their radius [um]."""
+    dust_opacity: float = Field(default=1.0, gt=0, le=1)
+    """Part of the light that a disc takes."""
+    dust_seed: int = Field(default=0, ge=0, le=2**63 - 1)
+    """Which of all such dusts."""
 
     @model_validator(mode="after")
     def _fields_of_its_kind(self) -> MaskProfile:
@@ -128,7 +134,7 @@ class MaskProfile(BaseModel):
                     f"{drawn.words}: has {len(values)} features a side, and over_etch_um is worked out for at most "
                     f"{_MOST_ETCHED}; draw the part that the sensor sees"
                 )
-            lines, values = etched(values, feature, self.over_etch_um * 1e-3)
+            lines, values = etch(values, feature, self.over_etch_um * 1e-3)
         values = self.opaque_transmission + (self.clear_transmission - self.opaque_transmission) * values
         extent = drawn.extent_mm + 2 * max(self.over_etch_um, 0.0) * 1e-3
         dust = (

@@ -20,7 +20,7 @@ from mitsim.core.arrays import ByValue, FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.imagelist import Wanted
 from mitsim.core.images import image_size, own_end, read_image
-from mitsim.devices.mask import NO_FLAWS, BoolArray, Flaws, Term, dusted, mean_opening
+from mitsim.devices.mask import NO_FLAWS, BoolArray, Flaws, Term, draw_dust, mean_opening
 
 LEFT_OUT = 1e-7
 """Part of a transmission, rms, that singular vectors may leave: a tenth of the finest accuracy that a plan takes."""
@@ -266,7 +266,7 @@ def within(plate: Plate, reach_mm: float) -> Plate:
         reach_mm *= 2**0.5
     seen = reach_mm + flaws.margin_mm
     if flaws.dust is not None:
-        lines, values = dusted(plate.lines, plate.values, flaws.dust, seen)
+        lines, values = draw_dust(plate.lines, plate.values, flaws.dust, seen)
         return within(replace(plate, lines_mm=lines, values=values, flaws=flaws.clean), reach_mm)
     if plate.lines_mm is not None:
         inside = (plate.lines_mm[1:] > -seen) & (plate.lines_mm[:-1] < seen)

@@ -8,9 +8,10 @@ from itertools import pairwise
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from mitsim.core.arrays import ByValue, FloatArray
+from mitsim.core.configuration import Configuration
 from mitsim.core.errors import MitsimError
 from mitsim.core.spectral_manifests import MOST_LINES
 
@@ -140,28 +141,21 @@ Share = Annotated[float, Field(ge=0, le=1e6)]
 """Power beside the other lines' power: a millionth is none."""
 
 
-class Coherence(BaseModel):
+class Coherence(Configuration):
     """What decides the contrast of a laser projector's speckle (:func:`mitsim.optics.speckle.contrast_of`)."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    beam_radius_mm: float | None = Field(default=None, ge=1e-3, le=1e3)
+    """1/e^2 radius of a scanned beam's spot [mm]; none: all is lit at once.
 
-    beam_radius_mm: float | None = Field(
-        default=None,
-        ge=1e-3,
-        le=1e3,
-        description="1/e^2 radius of a scanned beam's spot [mm]; none: all is lit at once",
-    )
-    """A micrometre, less than any grain, to a metre, which is all at once."""
-    polarisation: float = Field(
-        default=0.0, ge=0, le=1, description="degree of polarisation of the scattered light; 0: paper, paint; 1: metal"
-    )
-    roughness_um: float | None = Field(
-        default=None, ge=0, le=1e6, description="surface's height, standard deviation [um]; none: lines speckle apart"
-    )
-    linewidth_nm: float = Field(
-        default=0.0, ge=0, le=1e3, description="standard deviation of each line [nm]; needs roughness_um"
-    )
-    """Laser diodes have some 1."""
+    A micrometre, less than any grain, to a metre, which is all at once."""
+    polarisation: float = Field(default=0.0, ge=0, le=1)
+    """Degree of polarisation of the scattered light; 0: paper, paint; 1: metal."""
+    roughness_um: float | None = Field(default=None, ge=0, le=1e6)
+    """Surface's height, standard deviation [um]; none: lines speckle apart."""
+    linewidth_nm: float = Field(default=0.0, ge=0, le=1e3)
+    """Standard deviation of each line [nm]; needs roughness_um.
+
+    Laser diodes have some 1."""
 
     @model_validator(mode="after")
     def _a_linewidth_needs_a_roughness(self) -> Coherence:
@@ -170,61 +164,77 @@ class Coherence(BaseModel):
         return self
 
 
-class ProjectorModel(BaseModel):
+class ProjectorModel(Configuration):
     """A projector's light and lens, and where their numbers come from.
 
     Ranges hold every device known, with room. The fields from ``luminous_flux_lm`` on are not simulated: from them
     follows the power that scenes state, irradiance = flux / efficacy / area of the picture.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    name: str
+    """What the projector is called in reports."""
+    effective_wavelength_nm: Nanometres
+    """One wavelength that carries as many photons per watt [nm]."""
+    wavelengths_nm: tuple[Nanometres, ...] = Field(default=(), strict=False, max_length=256)
+    """Spectral lines [nm]; none: the effective wavelength.
 
-    name: str = Field(description="what the projector is called in reports")
-    effective_wavelength_nm: Nanometres = Field(description="one wavelength that carries as many photons per watt [nm]")
-    wavelengths_nm: tuple[Nanometres, ...] = Field(
-        (), strict=False, max_length=256, description="spectral lines [nm]; none: the effective wavelength"
-    )
-    """A lamp's visible spectrum in steps of 2 nm has 200; each costs a shadow of its own."""
-    radiant_shares: tuple[Share, ...] = Field(
-        (), strict=False, description="part of the power in each line, relative to their sum"
-    )
-    contrast_ratio: float = Field(
-        math.inf, gt=1, allow_inf_nan=True, description="light of a white pixel over that of a black one"
-    )
-    """Without an upper end: inf is a black that is black."""
-    aperture_radius_mm: float = Field(0.0, ge=0, le=1000, description="radius of the lens [mm]; 0: pinhole")
-    """Lenses for the largest screens have some 100."""
-    focus_mm: float | None = Field(
-        None, ge=1, le=1e7, description="distance of the sharp plane [mm]; none: scene_distance"
-    )
-    """A millimetre, for microscopes, to 10 km."""
-    speckle_contrast: float = Field(0.0, ge=0, le=1, description="of one sensor pixel's light; see docs/physics.md")
-    """1 is speckle fully developed; more needs light that is not laser light."""
-    speckle: Coherence | None = Field(
-        None, description="table, in place of a number: what the contrast is computed from"
-    )
-    blur_pixels: float = Field(0.0, ge=0, le=16, description="spot's standard deviation [pixels]")
-    """16 leaves 0.7 % of the contrast of stripes of 16 pixels: a projector with fewer pixels than it says."""
-    luminous_flux_lm: float | None = Field(None, ge=1e-3, le=1e6, description="light of a white picture [lm]")
-    """The largest cinemas have 75 000."""
-    luminous_efficacy_lm_per_w: float | None = Field(None, ge=0, le=684, description="lumens per watt of light")
-    """683 at most, at 555 nm."""
-    radiant_flux_w: float | None = Field(None, ge=1e-9, le=1e5, description="power of a white picture's light [W]")
-    """The largest cinemas have some 300."""
-    throw_ratio: float | None = Field(None, ge=0.01, le=100, description="distance over width of the picture")
-    """0.2 beside the screen, 15 across a hall."""
-    columns: int | None = Field(None, ge=1, le=65536, description="pixels a row of the device's own raster")
-    rows: int | None = Field(None, ge=1, le=65536, description="rows of the device's own raster")
-    pixel_aspect: float = Field(
-        1.0, ge=0.1, le=10, description="width of a pixel of this raster on the scene, over its height; 1: square"
-    )
-    """0.1 to 10: a picture of 16:9 in a raster ten times too wide or too high."""
-    laser_class: Literal["1", "1C", "1M", "2", "2M", "3R", "3B", "4"] | None = Field(
-        None, description="class printed on the device (IEC 60825-1)"
-    )
-    assumed: tuple[str, ...] = Field((), strict=False, description="fields without a public measurement")
-    derived: tuple[str, ...] = Field((), strict=False, description="fields computed from others")
-    source: str = Field("", description="where the numbers come from")
+    A lamp's visible spectrum in steps of 2 nm has 200; each costs a shadow of its own."""
+    radiant_shares: tuple[Share, ...] = Field(default=(), strict=False)
+    """Part of the power in each line, relative to their sum."""
+    contrast_ratio: float = Field(default=math.inf, gt=1, allow_inf_nan=True)
+    """Light of a white pixel over that of a black one.
+
+    Without an upper end: inf is a black that is black."""
+    aperture_radius_mm: float = Field(default=0.0, ge=0, le=1000)
+    """Radius of the lens [mm]; 0: pinhole.
+
+    Lenses for the largest screens have some 100."""
+    focus_mm: float | None = Field(default=None, ge=1, le=1e7)
+    """Distance of the sharp plane [mm]; none: scene_distance.
+
+    A millimetre, for microscopes, to 10 km."""
+    speckle_contrast: float = Field(default=0.0, ge=0, le=1)
+    """Of one sensor pixel's light; see docs/physics.md.
+
+    1 is speckle fully developed; more needs light that is not laser light."""
+    speckle: Coherence | None = None
+    """Table, in place of a number: what the contrast is computed from."""
+    blur_pixels: float = Field(default=0.0, ge=0, le=16)
+    """Spot's standard deviation [pixels].
+
+    16 leaves 0.7 % of the contrast of stripes of 16 pixels: a projector with fewer pixels than it says."""
+    luminous_flux_lm: float | None = Field(default=None, ge=1e-3, le=1e6)
+    """Light of a white picture [lm].
+
+    The largest cinemas have 75 000."""
+    luminous_efficacy_lm_per_w: float | None = Field(default=None, ge=0, le=684)
+    """Lumens per watt of light.
+
+    683 at most, at 555 nm."""
+    radiant_flux_w: float | None = Field(default=None, ge=1e-9, le=1e5)
+    """Power of a white picture's light [W].
+
+    The largest cinemas have some 300."""
+    throw_ratio: float | None = Field(default=None, ge=0.01, le=100)
+    """Distance over width of the picture.
+
+    0.2 beside the screen, 15 across a hall."""
+    columns: int | None = Field(default=None, ge=1, le=65536)
+    """Pixels a row of the device's own raster."""
+    rows: int | None = Field(default=None, ge=1, le=65536)
+    """Rows of the device's own raster."""
+    pixel_aspect: float = Field(default=1.0, ge=0.1, le=10)
+    """Width of a pixel of this raster on the scene, over its height; 1: square.
+
+    0.1 to 10: a picture of 16:9 in a raster ten times too wide or too high."""
+    laser_class: Literal["1", "1C", "1M", "2", "2M", "3R", "3B", "4"] | None = None
+    """Class printed on the device (IEC 60825-1)."""
+    assumed: tuple[str, ...] = Field(default=(), strict=False)
+    """Fields without a public measurement."""
+    derived: tuple[str, ...] = Field(default=(), strict=False)
+    """Fields computed from others."""
+    source: str = ""
+    """Where the numbers come from."""
 
     @model_validator(mode="after")
     def _lines_have_shares(self) -> ProjectorModel:

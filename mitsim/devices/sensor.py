@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from mitsim.core.configuration import read_toml, validated
+from mitsim.core.configuration import Configuration, read_toml, validated
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import Digital
 
@@ -29,7 +29,7 @@ _LEVELS = 256
 """Parts of the full well at which the linearity polynomial must rise: its terms end at the fifth power."""
 
 
-class SensorModel(BaseModel):
+class SensorModel(Configuration, defer_build=True):
     """A camera after EMVA 1288 release 4.0: per-pixel electronics and how pixels are binned.
 
     The fields describe one **pixel**; a frame's element is a **superpixel** of `binning` x `binning` = b^2
@@ -44,102 +44,104 @@ class SensorModel(BaseModel):
     Ranges hold every device known, with room: what lies outside is a slip of the unit or of the keyboard.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
+    name: str
+    """What the sensor is called in reports."""
+    pixel_pitch_um: float = Field(ge=1e-3, le=1e4)
+    """Distance between centres of pixels in a row, um.
 
-    name: str = Field(description="what the sensor is called in reports")
-    pixel_pitch_um: float = Field(ge=1e-3, le=1e4, description="distance between centres of pixels in a row, um")
-    """Pixels of telephones have 0.5 um, those of X-ray panels some 100 um."""
-    row_pitch_um: float | None = Field(
-        default=None,
-        ge=1e-3,
-        le=1e4,
-        description="distance between rows of pixels that are not square, um; none: as above",
-    )
-    binning: int = Field(default=1, ge=1, le=64, description="pixels summed along each side of a superpixel")
-    """Cameras bin up to 16 x 16."""
-    full_well_e: float = Field(ge=0.1, allow_inf_nan=True, description="electrons a pixel holds; inf = no limit")
-    """An avalanche diode counts one; read-outs of infrared arrays integrate 1e8, so 1e12 is the most, or inf."""
-    read_noise_e: float = Field(ge=0, le=1e6, description="standard deviation of one pixel's reading, electrons")
-    """0.2 in the quietest cameras, some 1e4 in photodiode arrays."""
-    dark_current_e_per_s: float = Field(default=0.0, ge=0, le=1e10, description="electrons a second and pixel")
-    """Warm infrared arrays have 1e8."""
-    dark_current_temperature_c: float | None = Field(
-        default=None, ge=-273.15, le=200, description="temperature that the dark current is stated at, degrees Celsius"
-    )
-    dark_doubling_c: float | None = Field(
-        default=None, ge=1, le=100, description="rise of the temperature that doubles the dark current, kelvin"
-    )
-    """5 to 10 in silicon."""
-    temperature_c: float | None = Field(
-        default=None, ge=-273.15, le=200, description="temperature of the sensor, degrees Celsius; none: as stated"
-    )
-    dark_current_spread_e_per_s: float = Field(
-        default=0.0, ge=0, le=1e10, description="its standard deviation over the pixels, electrons a second"
-    )
-    dsnu_pixel_e: float = Field(
-        default=0.0, ge=0, le=1e6, description="standard deviation of pixels' offsets, electrons"
-    )
-    dsnu_row_e: float = Field(default=0.0, ge=0, le=1e6, description="the same of offsets that a row shares")
-    dsnu_column_e: float = Field(default=0.0, ge=0, le=1e6, description="the same of offsets that a column shares")
-    """As read noise."""
-    prnu_pixel: float = Field(default=0.0, ge=0, le=0.1, description="relative standard deviation of pixels' response")
-    prnu_row: float = Field(default=0.0, ge=0, le=0.1, description="the same of what a row shares")
-    prnu_column: float = Field(default=0.0, ge=0, le=0.1, description="the same of what a column shares")
-    """Cameras have some 1e-2; beyond 0.1 the normal law of the response would reach zero."""
-    row_noise_e: float = Field(
-        default=0.0, ge=0, le=1e6, description="standard deviation of a noise that a row's pixels share, electrons"
-    )
-    hot_pixels: float = Field(default=0.0, ge=0, le=0.5, description="part of the pixels that are hot")
-    hot_dark_current_e_per_s: float = Field(
-        default=0.0, ge=0, le=1e10, description="what a hot pixel has of dark current beyond others, electrons a second"
-    )
-    dead_pixels: float = Field(default=0.0, ge=0, le=0.5, description="part of the pixels that do not respond to light")
-    pattern_seed: int = Field(
-        default=0, ge=0, lt=2**64, description="which specimen: root of all that is fixed in space, apart from a run's"
-    )
-    linearity: Annotated[tuple[float, ...], Field(strict=False, max_length=4)] = Field(
-        default=(), description="c_k of N (1 + sum c_k (N/F)^k), k = 1, 2, ..: what N of F electrons are read as"
-    )
-    crosstalk: float = Field(
-        default=0.0, ge=0, le=0.5, description="part of a pixel's light that its four neighbours get, a quarter each"
-    )
-    binning_on_chip: bool = Field(default=False, description="charge is summed and read once, in place of readings")
-    binned_full_well_e: float | None = Field(
-        default=None, ge=0.1, le=1e14, description="electrons a superpixel holds on chip; none: binning^2 full wells"
-    )
-    shutter: Literal["global", "rolling"] = Field(
-        default="global", description="whether all rows are exposed at once, or each some time after the one before"
-    )
-    line_time_us: float | None = Field(
-        default=None,
-        ge=1e-3,
-        le=1e6,
-        description="from the begin of a row's exposure to that of the next one, us; needed where light ripples",
-    )
-    """Some 1 to 100 in cameras; long exposures of a telephone's sensor stretch it to 1e4."""
-    quantum_efficiency: float | None = Field(
-        default=None,
-        ge=1e-6,
-        le=1,
-        description="electrons per photon, at source's wavelength; none: no source gives it",
-    )
-    """One electron a photon at most; photocathodes and silicon at their red end fall to 1e-4."""
-    quantum_efficiency_curve: EfficiencyCurve | None = Field(
-        default=None, description="table: electrons per photon over wavelength, in place of quantum_efficiency"
-    )
-    mosaic: Mosaic | None = Field(
-        default=None, description="colour filters of 2 x 2 pixels, row by row; none: a monochrome sensor"
-    )
-    mosaic_curves: MosaicCurves | None = Field(
-        default=None, description="tables R, G, B: curves of the pixels under each filter, in place of both"
-    )
-    gain_dn_per_e: float = Field(ge=1e-12, le=1e6, description="digital numbers per electron")
-    """1e-12 spreads the largest full well over one number; electron multiplication brings some 1e3."""
-    black_level_dn: float = Field(default=0.0, ge=0, lt=2**24, description="digital number of a pixel without charge")
-    """Below the largest ADC's last number."""
-    bits: int | None = Field(default=None, ge=1, le=24, description="bits of the ADC; None = real output")
-    """Cameras have up to 16, laboratory converters 24."""
-    source: str = Field(description="where the numbers come from")
+    Pixels of telephones have 0.5 um, those of X-ray panels some 100 um."""
+    row_pitch_um: float | None = Field(default=None, ge=1e-3, le=1e4)
+    """Distance between rows of pixels that are not square, um; none: as above."""
+    binning: int = Field(default=1, ge=1, le=64)
+    """Pixels summed along each side of a superpixel.
+
+    Cameras bin up to 16 x 16."""
+    full_well_e: float = Field(ge=0.1, allow_inf_nan=True)
+    """Electrons a pixel holds; inf = no limit.
+
+    An avalanche diode counts one; read-outs of infrared arrays integrate 1e8, so 1e12 is the most, or inf."""
+    read_noise_e: float = Field(ge=0, le=1e6)
+    """Standard deviation of one pixel's reading, electrons.
+
+    0.2 in the quietest cameras, some 1e4 in photodiode arrays."""
+    dark_current_e_per_s: float = Field(default=0.0, ge=0, le=1e10)
+    """Electrons a second and pixel.
+
+    Warm infrared arrays have 1e8."""
+    dark_current_temperature_c: float | None = Field(default=None, ge=-273.15, le=200)
+    """Temperature that the dark current is stated at, degrees Celsius."""
+    dark_doubling_c: float | None = Field(default=None, ge=1, le=100)
+    """Rise of the temperature that doubles the dark current, kelvin.
+
+    5 to 10 in silicon."""
+    temperature_c: float | None = Field(default=None, ge=-273.15, le=200)
+    """Temperature of the sensor, degrees Celsius; none: as stated."""
+    dark_current_spread_e_per_s: float = Field(default=0.0, ge=0, le=1e10)
+    """Its standard deviation over the pixels, electrons a second."""
+    dsnu_pixel_e: float = Field(default=0.0, ge=0, le=1e6)
+    """Standard deviation of pixels' offsets, electrons."""
+    dsnu_row_e: float = Field(default=0.0, ge=0, le=1e6)
+    """The same of offsets that a row shares."""
+    dsnu_column_e: float = Field(default=0.0, ge=0, le=1e6)
+    """The same of offsets that a column shares.
+
+    As read noise."""
+    prnu_pixel: float = Field(default=0.0, ge=0, le=0.1)
+    """Relative standard deviation of pixels' response."""
+    prnu_row: float = Field(default=0.0, ge=0, le=0.1)
+    """The same of what a row shares."""
+    prnu_column: float = Field(default=0.0, ge=0, le=0.1)
+    """The same of what a column shares.
+
+    Cameras have some 1e-2; beyond 0.1 the normal law of the response would reach zero."""
+    row_noise_e: float = Field(default=0.0, ge=0, le=1e6)
+    """Standard deviation of a noise that a row's pixels share, electrons."""
+    hot_pixels: float = Field(default=0.0, ge=0, le=0.5)
+    """Part of the pixels that are hot."""
+    hot_dark_current_e_per_s: float = Field(default=0.0, ge=0, le=1e10)
+    """What a hot pixel has of dark current beyond others, electrons a second."""
+    dead_pixels: float = Field(default=0.0, ge=0, le=0.5)
+    """Part of the pixels that do not respond to light."""
+    pattern_seed: int = Field(default=0, ge=0, lt=2**64)
+    """Which specimen: root of all that is fixed in space, apart from a run's."""
+    linearity: Annotated[tuple[float, ...], Field(strict=False, max_length=4)] = ()
+    """c_k of N (1 + sum c_k (N/F)^k), k = 1, 2, ..: what N of F electrons are read as."""
+    crosstalk: float = Field(default=0.0, ge=0, le=0.5)
+    """Part of a pixel's light that its four neighbours get, a quarter each."""
+    binning_on_chip: bool = False
+    """Charge is summed and read once, in place of readings."""
+    binned_full_well_e: float | None = Field(default=None, ge=0.1, le=1e14)
+    """Electrons a superpixel holds on chip; none: binning^2 full wells."""
+    shutter: Literal["global", "rolling"] = "global"
+    """Whether all rows are exposed at once, or each some time after the one before."""
+    line_time_us: float | None = Field(default=None, ge=1e-3, le=1e6)
+    """From the begin of a row's exposure to that of the next one, us; needed where light ripples.
+
+    Some 1 to 100 in cameras; long exposures of a telephone's sensor stretch it to 1e4."""
+    quantum_efficiency: float | None = Field(default=None, ge=1e-6, le=1)
+    """Electrons per photon, at source's wavelength; none: no source gives it.
+
+    One electron a photon at most; photocathodes and silicon at their red end fall to 1e-4."""
+    quantum_efficiency_curve: EfficiencyCurve | None = None
+    """Table: electrons per photon over wavelength, in place of quantum_efficiency."""
+    mosaic: Mosaic | None = None
+    """Colour filters of 2 x 2 pixels, row by row; none: a monochrome sensor."""
+    mosaic_curves: MosaicCurves | None = None
+    """Tables R, G, B: curves of the pixels under each filter, in place of both."""
+    gain_dn_per_e: float = Field(ge=1e-12, le=1e6)
+    """Digital numbers per electron.
+
+    1e-12 spreads the largest full well over one number; electron multiplication brings some 1e3."""
+    black_level_dn: float = Field(default=0.0, ge=0, lt=2**24)
+    """Digital number of a pixel without charge.
+
+    Below the largest ADC's last number."""
+    bits: int | None = Field(default=None, ge=1, le=24)
+    """Bits of the ADC; None = real output.
+
+    Cameras have up to 16, laboratory converters 24."""
+    source: str
+    """Where the numbers come from."""
 
     @field_validator("full_well_e")
     @classmethod
@@ -455,18 +457,19 @@ _MOST_POINTS = 1024
 """The visible and near infrared in steps of a nanometre have 800."""
 
 
-class EfficiencyCurve(BaseModel):
+class EfficiencyCurve(Configuration):
     """Electrons per photon over wavelength, linear between its points and unknown outside them."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
     wavelengths_nm: tuple[Annotated[float, Field(ge=1, le=1e6)], ...] = Field(
-        strict=False, min_length=2, max_length=_MOST_POINTS, description="wavelengths of its points, rising [nm]"
+        strict=False, min_length=2, max_length=_MOST_POINTS
     )
-    """As a projector's."""
+    """Wavelengths of its points, rising [nm].
+
+    As a projector's."""
     efficiency: tuple[Annotated[float, Field(ge=0, le=1)], ...] = Field(
-        strict=False, min_length=2, max_length=_MOST_POINTS, description="electrons per photon at each"
+        strict=False, min_length=2, max_length=_MOST_POINTS
     )
+    """Electrons per photon at each."""
 
     @model_validator(mode="after")
     def _a_curve(self) -> EfficiencyCurve:
@@ -498,11 +501,12 @@ class EfficiencyCurve(BaseModel):
         return self.efficiency[above - 1] * (1 - part) + self.efficiency[above] * part
 
 
-class MosaicCurves(BaseModel):
+class MosaicCurves(Configuration):
     """Curves of the pixels under each colour of a filter array, filters included."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
-    R: EfficiencyCurve = Field(description="of pixels under red filters")
-    G: EfficiencyCurve = Field(description="of pixels under green filters")
-    B: EfficiencyCurve = Field(description="of pixels under blue filters")
+    R: EfficiencyCurve
+    """Of pixels under red filters."""
+    G: EfficiencyCurve
+    """Of pixels under green filters."""
+    B: EfficiencyCurve
+    """Of pixels under blue filters."""

@@ -12,10 +12,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from mitsim.core.arguments import checked, checked_fields
-from mitsim.core.configuration import load_model, shipped
+from mitsim.core.configuration import Configuration, load_model, shipped
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.devices.drift import Drift
 from mitsim.devices.sensor import ExposureFraction
@@ -35,27 +35,23 @@ CELLS = 64
 """Facets a side of a bowed board: they lie up to 1/4096 of the bow off the paraboloid."""
 
 
-class BoardShape(BaseModel):
+class BoardShape(Configuration):
     """Size, bow and tilt of the white board; its middle stays on the camera's axis."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    size_mm: float | None = Field(default=None, ge=1e-3, le=1e7)
+    """Side of the square board [mm]; none: larger than the view.
 
-    size_mm: float | None = Field(
-        default=None, ge=1e-3, le=1e7, description="side of the square board [mm]; none: larger than the view"
-    )
-    """From a board for masks in contact to one 10 km away."""
-    bow_mm: float = Field(
-        default=0.0,
-        ge=-1e6,
-        le=1e6,
-        description="height of the middle over the middles of the edges, a paraboloid [mm]; above 0: to the camera",
-    )
-    """Up to a tenth of the largest board."""
-    tilt_row_deg: float = Field(
-        default=0.0, ge=-60, le=60, description="tilt [degrees]; above 0: later rows are farther from the camera"
-    )
-    """At 60 degrees half of the light is left, and no board is hung worse."""
-    tilt_column_deg: float = Field(default=0.0, ge=-60, le=60, description="the same of later columns")
+    From a board for masks in contact to one 10 km away."""
+    bow_mm: float = Field(default=0.0, ge=-1e6, le=1e6)
+    """Height of the middle over the middles of the edges, a paraboloid [mm]; above 0: to the camera.
+
+    Up to a tenth of the largest board."""
+    tilt_row_deg: float = Field(default=0.0, ge=-60, le=60)
+    """Tilt [degrees]; above 0: later rows are farther from the camera.
+
+    At 60 degrees half of the light is left, and no board is hung worse."""
+    tilt_column_deg: float = Field(default=0.0, ge=-60, le=60)
+    """The same of later columns."""
 
     @model_validator(mode="after")
     def _a_bow_has_a_size(self) -> BoardShape:
@@ -133,13 +129,13 @@ MOST_SEED = 2**32 - 1
 Merge = Literal["weighted", "longest"]
 
 
-def _rising(exposures: tuple[float, ...]) -> tuple[float, ...]:
+def _check_rising(exposures: tuple[float, ...]) -> tuple[float, ...]:
     if exposures[0] != 1 or any(later <= earlier for earlier, later in itertools.pairwise(exposures)):
         raise ValueError(f"got {', '.join(f'{value:g}' for value in exposures)}; give 1, and rising numbers after it")
     return exposures
 
 
-def _different(depths: tuple[float, ...]) -> tuple[float, ...]:
+def _check_different(depths: tuple[float, ...]) -> tuple[float, ...]:
     names = [f"{depth:g}" for depth in depths]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
@@ -150,35 +146,47 @@ def _different(depths: tuple[float, ...]) -> tuple[float, ...]:
 Exposures = Annotated[
     tuple[Annotated[float, Field(ge=1, le=LONGEST)], ...],
     Field(strict=False, min_length=1, max_length=MOST_RUNGS),
-    AfterValidator(_rising),
+    AfterValidator(_check_rising),
 ]
 Depths = Annotated[
     tuple[Annotated[float, Field(ge=1e-6, le=1e10)], ...],
     Field(strict=False, max_length=64),
-    AfterValidator(_different),
+    AfterValidator(_check_different),
 ]
 """As `scene_distance`; 64 sessions of the shipped scenes take ten minutes."""
 
 
-class SessionRecipe(BaseModel):
+class SessionRecipe(Configuration):
     """A session's board and exposure, how signed patterns are taken, and how often."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    board_reflectance: float = Field(ge=0.01, le=1)
+    """Diffuse reflectance of the white board.
 
-    board_reflectance: float = Field(ge=0.01, le=1, description="diffuse reflectance of the white board")
-    """Black velvet reflects 0.004, and a board of 1 % would take a hundred times the exposure."""
-    board: BoardShape = Field(default=BoardShape(), description="size, bow and tilt of the board; none: ideal")
-    exposure_fraction: ExposureFraction = Field(description="brightest pixel's mean, as a part of the full well")
-    signed_capture: Literal["pair", "uniform"] = Field(description="how a +-1 pattern is captured")
-    repeats: int = Field(default=1, ge=1, le=MOST_REPEATS, description="shots of every frame, whose mean is taken")
-    depths: Depths = Field(default=(), description="of the board [mm], a CAL folder each; none: on the aligned plane")
-    exposure_ladder: Exposures = Field(default=(1.0,), description="exposures of every frame, over the shortest")
-    ladder_merge: Merge = Field(default="weighted", description="how they make one: by variance, or the longest alone")
-    dark_frames: int = Field(default=0, ge=0, le=MOST_REPEATS, description="frames without light, of each exposure")
-    order: Order = Field(default="listed", description="order in which patterns are taken")
-    order_seed: int = Field(default=0, ge=0, le=MOST_SEED, description="of a random order")
-    drift: Drift = Field(default=Drift(), description="what moves between calibration and capture; none: nothing")
-    source: str = Field(description="where the numbers come from")
+    Black velvet reflects 0.004, and a board of 1 % would take a hundred times the exposure."""
+    board: BoardShape = BoardShape()
+    """Size, bow and tilt of the board; none: ideal."""
+    exposure_fraction: ExposureFraction
+    """Brightest pixel's mean, as a part of the full well."""
+    signed_capture: Literal["pair", "uniform"]
+    """How a +-1 pattern is captured."""
+    repeats: int = Field(default=1, ge=1, le=MOST_REPEATS)
+    """Shots of every frame, whose mean is taken."""
+    depths: Depths = ()
+    """Of the board [mm], a CAL folder each; none: on the aligned plane."""
+    exposure_ladder: Exposures = (1.0,)
+    """Exposures of every frame, over the shortest."""
+    ladder_merge: Merge = "weighted"
+    """How they make one: by variance, or the longest alone."""
+    dark_frames: int = Field(default=0, ge=0, le=MOST_REPEATS)
+    """Frames without light, of each exposure."""
+    order: Order = "listed"
+    """Order in which patterns are taken."""
+    order_seed: int = Field(default=0, ge=0, le=MOST_SEED)
+    """Of a random order."""
+    drift: Drift = Drift()
+    """What moves between calibration and capture; none: nothing."""
+    source: str
+    """Where the numbers come from."""
 
     @model_validator(mode="after")
     def _dark_frames_are_of_use(self) -> SessionRecipe:

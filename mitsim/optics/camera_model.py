@@ -96,26 +96,26 @@ class ModelledCamera:
 
     def factors(self, placement: Placement) -> tuple[FloatArray, FloatArray]:
         """(m, n) left and (m', n) right factor [sqrt(electrons / s)] of the mask at a ``placement``, but not turned."""
-        left, right = self._kept(
+        left, right = self._cached_factors(
             placement.moved({"gain": 1 - placement.gain, "mask_rotation": -placement.mask_rotation})
         )
         root = np.sqrt(placement.gain)
         return left * root, right * root
 
     @cached_property
-    def _kept(self) -> Callable[[Placement], tuple[FloatArray, FloatArray]]:
+    def _cached_factors(self) -> Callable[[Placement], tuple[FloatArray, FloatArray]]:
         """The last factors: a fit asks for the same again, with other numbers that scale or turn them."""
-        return lru_cache(maxsize=_KEPT)(self._formed)
+        return lru_cache(maxsize=_KEPT)(self._form_factors)
 
     @cached_property
-    def _kept_axis(self) -> Callable[[float, float, Directions], SeparableTerms]:
+    def _cached_axis(self) -> Callable[[float, float, Directions], SeparableTerms]:
         """The last shadows of an axis: most of what is fitted changes one of the two."""
         return lru_cache(maxsize=_KEPT)(self._axis)
 
-    def _formed(self, placement: Placement) -> tuple[FloatArray, FloatArray]:
+    def _form_factors(self, placement: Placement) -> tuple[FloatArray, FloatArray]:
         shifts = placement.mask_shift_row, placement.mask_shift_column
         by_row, by_column = (
-            self._kept_axis(placement.mask_distance, own + shift, directions)
+            self._cached_axis(placement.mask_distance, own + shift, directions)
             for own, shift, directions in zip(
                 self.geometry.mask_offset, shifts, self._directions(placement), strict=True
             )

@@ -80,7 +80,7 @@ class Steps:
     def at(self, s: FloatArray) -> FloatArray:
         """Values at points ``s`` [mm]; at an edge, those of the interval that begins there."""
         if self.blur_mm:
-            return self._blurred(s, 0.0, 0.0)
+            return self._blurred_means(s, 0.0, 0.0)
         padded = np.concatenate(([0.0], self.values, [0.0]))
         return np.asarray(padded[np.searchsorted(self.edges, s, side="right")])
 
@@ -107,7 +107,7 @@ class Steps:
             first edge and width [mm] of the cells, and their number.
         """
         if self.blur_mm:
-            return self._blurred(np.asarray(start + step * (np.arange(count) + 0.5)), step / 2, 0.0)
+            return self._blurred_means(np.asarray(start + step * (np.arange(count) + 0.5)), step / 2, 0.0)
         bounds = start + step * np.arange(count + 1)
         index = np.searchsorted(self.edges, bounds, side="right")
         means = np.concatenate(([0.0], self.values, [0.0]))[index[:-1]]
@@ -134,9 +134,9 @@ class Steps:
 
     def over(self, centres: FloatArray, half: FloatArray) -> FloatArray:
         """Means over boxes of half-widths ``half`` [mm] about ``centres`` (the arrays broadcast); at 0 the value."""
-        return self._blurred(centres, half, 0.0)
+        return self._blurred_means(centres, half, 0.0)
 
-    def _blurred(self, centres: FloatArray, half: FloatArray | float, other: float) -> FloatArray:
+    def _blurred_means(self, centres: FloatArray, half: FloatArray | float, other: float) -> FloatArray:
         """Means over two boxes, edge by edge; half-widths [mm], the ``other``'s one for all, which may be 0."""
         reach = half + other + _BEYOND * self.blur_mm
         jumps = np.diff(self.values, prepend=0.0, append=0.0)
@@ -160,7 +160,7 @@ class Steps:
             their half-widths [mm].
         """
         if self.blur_mm:
-            return self._blurred(centres, half_pixel, half_cell)
+            return self._blurred_means(centres, half_pixel, half_cell)
         reach = half_pixel + half_cell
         low, high = centres.min() - reach, centres.max() + reach
         inside = self.edges[(self.edges > low) & (self.edges < high)]

@@ -92,12 +92,12 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
             "pixels, larger features, or a mask of one or two separable terms"
         )
     if mask.irradiance:
-        values = _resampled(mask, step, count)
+        values = _resample(mask, step, count)
     elif spectrum is None:
-        means = _turned if mask.flaws.turn_deg else _resampled
-        values = sharpened(means(mask, step, count))
+        means = _turned_means if mask.flaws.turn_deg else _resample
+        values = sharpen(means(mask, step, count))
     else:
-        values = sharpened(_waves(replace(shadow, mask=mask.amplitude), spectrum, step, count))
+        values = sharpen(_waves(replace(shadow, mask=mask.amplitude), spectrum, step, count))
     return Plate(step, values, mask.words, flaws=Flaws(mask.blur_mm if spectrum is None else 0.0), irradiance=True)
 
 
@@ -147,7 +147,7 @@ def cells_per_pixel(geometry: CameraGeometry) -> int:
     return geometry.mask_cells or _CELLS_PER_PIXEL
 
 
-def sharpened(values: FloatArray) -> FloatArray:
+def sharpen(values: FloatArray) -> FloatArray:
     """(n, n) means over cells, whose blur by the cells is taken back to second order along both axes of ``values``."""
     for _ in ("rows", "columns"):
         padded = np.pad(values, ((1, 1), (0, 0)))
@@ -155,7 +155,7 @@ def sharpened(values: FloatArray) -> FloatArray:
     return values
 
 
-def _turned(mask: Plate, step: float, count: int) -> FloatArray:
+def _turned_means(mask: Plate, step: float, count: int) -> FloatArray:
     """(count, count) mean transmissions of cells of a ``step`` [mm], at points of a lattice in each: no two of them lie
     in one row or column, and an edge that is turned by little is told to a part in so many."""
     corners = (np.arange(count) - count / 2) * step
@@ -171,7 +171,7 @@ def _turned(mask: Plate, step: float, count: int) -> FloatArray:
     return means
 
 
-def _resampled(mask: Plate, step: float, count: int) -> FloatArray:
+def _resample(mask: Plate, step: float, count: int) -> FloatArray:
     """(count, count) mean values of a mask that is not turned over cells of a ``step`` [mm]."""
     start = -count * step / 2
     along = np.stack(
@@ -193,14 +193,14 @@ def _waves(shadow: ShadowGeometry, spectrum: Spectrum, step: float, count: int) 
         # Waves turn with the mask.
         even = replace(shadow, mask=replace(mask, flaws=NO_FLAWS))
         whole = 2 * int(np.ceil(count / 2**0.5)) + _AROUND
-        return _turned_light(_waves(even, spectrum, step, whole), count, mask.flaws)
+        return _turn_light(_waves(even, spectrum, step, whole), count, mask.flaws)
     total = np.zeros((count, count))
     for wavelength, share in zip(spectrum.wavelengths_nm, spectrum.weights, strict=True):
         total += share * _intensity(*_fields(shadow, float(wavelength), step, count))
     return total
 
 
-def _turned_light(values: FloatArray, count: int, flaws: Flaws) -> FloatArray:
+def _turn_light(values: FloatArray, count: int, flaws: Flaws) -> FloatArray:
     """(count, count) cells of light (n, n) that is turned about its centre, between its cells by cubic splines."""
     # Imported here: most masks are not turned.
     from scipy import ndimage
@@ -231,13 +231,13 @@ def _fields(
     terms, lines = shadow.mask.terms, shadow.mask.lines
 
     def field(profile: FloatArray) -> npt.NDArray[np.complex64]:
-        return _at_points(waves.field(Steps.between(profile, lines), -half), between).astype(np.complex64)
+        return _means_at_points(waves.field(Steps.between(profile, lines), -half), between).astype(np.complex64)
 
     rows = np.stack([np.complex64(weight) * field(row) for weight, row, _ in terms], axis=1)
     return rows, np.stack([field(column) for *_, column in terms]), points
 
 
-def _at_points(field: npt.NDArray[np.complex128], between: int) -> npt.NDArray[np.complex128]:
+def _means_at_points(field: npt.NDArray[np.complex128], between: int) -> npt.NDArray[np.complex128]:
     """(n,) of a ``field`` (n * between,): its means from point to point, their blur taken back to second order.
 
     Fringes of far edges are finer than points are apart. Met at points, they add up wherever the code's lattice meets

@@ -66,7 +66,7 @@ def form_frames(
     (b, m, m') frames, and (b, m * groups * probes) of single groups.
     """
     shape, groups = lights[0].optics.frame_shape, len(lights[0].groups)
-    mixed, count = _mixed(lights, basis), basis.shape[0]
+    mixed, count = _mix_lights(lights, basis), basis.shape[0]
     frames = np.zeros((count, *shape))
     probed = np.zeros((count, shape[0] * groups * (0 if probes is None else probes.shape[1])))
 
@@ -94,7 +94,7 @@ def probe_frames(lights: Sequence[Filed], basis: sparse.csr_array, probes: Float
     (b, m * groups * probes) of single groups, and (b, lights, groups) squared norms of their differences.
     """
     rows, groups = lights[0].optics.frame_shape[0], len(lights[0].groups)
-    mixed, count = _mixed(lights, basis), basis.shape[0]
+    mixed, count = _mix_lights(lights, basis), basis.shape[0]
     probed, noise = np.zeros((count, rows * groups * probes.shape[1])), np.zeros((count, len(lights), groups))
 
     def probe(row: int) -> None:
@@ -110,7 +110,7 @@ def probe_frames(lights: Sequence[Filed], basis: sparse.csr_array, probes: Float
     return probed, noise
 
 
-def _mixed(lights: Sequence[Filed], basis: sparse.csr_array) -> list[tuple[FrameOptics, list[sparse.csr_array]]]:
+def _mix_lights(lights: Sequence[Filed], basis: sparse.csr_array) -> list[tuple[FrameOptics, list[sparse.csr_array]]]:
     """Mixtures ``basis`` (b, rows) of each group of each light, with the light's optics."""
     mixed = [(light.optics, [_product(basis, group) for group in light.groups]) for light in lights]
     for _, parts in mixed:

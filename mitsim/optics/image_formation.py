@@ -32,7 +32,7 @@ Entries = tuple[IntArray, FloatArray]
 """Increasing indices into (layers, rows, columns), and the light [W m^-2] at each."""
 _FILLED = 1 / 8
 """Part of all places from which light is laid out whole: of places at random, an eighth lights every row and column."""
-_kept_shadow = lru_cache(maxsize=24)(shadow_terms)
+_keep_shadow = lru_cache(maxsize=24)(shadow_terms)
 """The last shadows, a few MiB each: a plan asks for some ten of them again and again."""
 _KEPT_RASTERS = 8
 """The last shadows on rasters, some 40 MiB each at 512 pixels: layers of a scene, with one line and with all."""
@@ -81,8 +81,8 @@ class _Terms:
         lefts, rights = zip(*self._factors(lit), strict=True)
         # The cheaper order of the two products: fewer lit rows or fewer lit columns next to the sensor's side.
         if len(lefts[0]) < len(rights[0]):
-            return np.matmul(_stacked(lefts).T, _stacked([lit.mean @ right for right in rights]), out=out)
-        return np.matmul(_stacked([lit.mean.T @ left for left in lefts]).T, _stacked(rights), out=out)
+            return np.matmul(_stack(lefts).T, _stack([lit.mean @ right for right in rights]), out=out)
+        return np.matmul(_stack([lit.mean.T @ left for left in lefts]).T, _stack(rights), out=out)
 
     def probe(self, lit: _Lit, vectors: FloatArray | None) -> FloatArray:
         """(m, estimates * probes) products of each estimate's frame with ``vectors`` (m', probes); without them the
@@ -289,7 +289,7 @@ class FrameOptics:
 def _shadow(geometry: CameraGeometry, *directions: Any) -> SeparableTerms:
     """The shadow of ``geometry`` toward ``directions``; of masks of many terms, 100 MiB each, none is kept."""
     many = geometry.mask_terms > FEW or geometry.mask_motion is not None
-    return (shadow_terms if many else _kept_shadow)(geometry, *directions)
+    return (shadow_terms if many else _keep_shadow)(geometry, *directions)
 
 
 def raster_error(
@@ -342,7 +342,7 @@ def _correlation(
     return Correlation(shadow, rows, columns, geometry.pixel_fill_factor)
 
 
-def _stacked(parts: Sequence[FloatArray]) -> FloatArray:
+def _stack(parts: Sequence[FloatArray]) -> FloatArray:
     """Matrices one above the other; one alone is not copied."""
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 

@@ -74,7 +74,7 @@ class Directions(ByValue):
     @classmethod
     def cells(cls, edges: npt.ArrayLike) -> Directions:
         """The equal cells between ``edges`` (c + 1,); raises MitsimError for unequal ones."""
-        array = _checked_edges("cell edges", edges)
+        array = _check_edges("cell edges", edges)
         widths = np.diff(array)
         width = float(array[-1] - array[0]) / len(widths)
         if np.abs(widths - width).max() > 1e-6 * width:
@@ -302,8 +302,8 @@ def shadow_factor(
     _require_positive("mask feature size", feature_mm)
     _require_positive("distance from sensor to mask", mask_distance_mm)
     _require_beyond(depth_mm, mask_distance_mm)
-    pixels = _checked_edges("sensor pixel edges", pixel_edges_mm) * _shrink(mask_distance_mm, depth_mm) / feature_mm
-    cells = _checked_edges("cell edges", cell_edges_tan) * mask_distance_mm / feature_mm
+    pixels = _check_edges("sensor pixel edges", pixel_edges_mm) * _shrink(mask_distance_mm, depth_mm) / feature_mm
+    cells = _check_edges("cell edges", cell_edges_tan) * mask_distance_mm / feature_mm
     centre = (pixels[:-1] + pixels[1:])[:, None] / 2 + (cells[:-1] + cells[1:])[None, :] / 2
     return _trapezoid_mean(values, centre, np.diff(pixels)[:, None] / 2, np.diff(cells)[None, :] / 2)
 
@@ -389,7 +389,7 @@ def _require_beyond(depth_mm: float, mask_mm: float) -> None:
         raise MitsimError(f"scene depth is {depth_mm} mm; it must lie beyond the mask at {mask_mm} mm")
 
 
-def _checked_edges(name: str, edges: npt.ArrayLike) -> FloatArray:
+def _check_edges(name: str, edges: npt.ArrayLike) -> FloatArray:
     array = np.asarray(edges, dtype=np.float64)
     if array.ndim != 1 or array.size < 2 or not np.isfinite(array).all() or not (np.diff(array) > 0).all():
         raise MitsimError(f"{name} of shape {array.shape} are not at least 2 finite increasing numbers; sort them")

@@ -44,23 +44,23 @@ def why_dark(loaded: LoadedScene) -> str:
         rows, columns = (low + (high - low) * (np.arange(_RAYS) + 0.5) / _RAYS for low, high in part)
         y, x = (-geometry.scene_distance * edges.ravel() for edges in np.meshgrid(rows, columns, indexing="ij"))
         plane = to_world @ mi.Point3f(x, y, geometry.scene_distance)
-        if not _any((projector_to_world.inverse() @ plane).z > 0):
+        if not _is_any((projector_to_world.inverse() @ plane).z > 0):
             return "the projector looks away from the scene, whose aligned plane lies behind it; turn the projector"
         towards = dr.normalize(plane - start)
-        si = _opaque(loaded.scene, mi.Ray3f(start, towards), None)
+        si = _meet_opaque(loaded.scene, mi.Ray3f(start, towards), None)
         met = np.array(si.is_valid()).ravel()
         if met.any():
             break
-        if _any(loaded.scene.ray_test(mi.Ray3f(start, towards))):
+        if _is_any(loaded.scene.ray_test(mi.Ray3f(start, towards))):
             return "all that the projector's rays meet lets light pass; put something opaque behind it"
     else:
-        return _missed(loaded, to_world, any(parts[1:]))
+        return _where_scene_lies(loaded, to_world, any(parts[1:]))
     back = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.BackSide)
     centre = to_world @ mi.Point3f(0)
     lit = si.is_valid() & (back | (si.wi.z > 0))
     facing = lit & (back | (dr.dot(si.n, centre - si.p) * dr.sign(dr.dot(si.n, start - si.p)) > 0))
-    if not _any(lit) or not _any(facing):
-        which = "camera" if _any(lit) else "projector"
+    if not _is_any(lit) or not _is_any(facing):
+        which = "camera" if _is_any(lit) else "projector"
         return (
             f"{met.sum()} of {met.size} rays of the projector meet a surface, and it turns its back to the {which}: a "
             "mesh wound the wrong way; flip its normals or put its material in <bsdf type='twosided'>"
@@ -74,7 +74,7 @@ def why_dark(loaded: LoadedScene) -> str:
             f"what is lit lies outside the field stop: {np.degrees(np.arctan(slope.min())):.3g} degrees off the axis "
             f"or more, and the stop (fov) lets {geometry.fov / 2:g} degrees pass; turn the camera or widen fov"
         )
-    if not _any(facing & ~_opaque(loaded.scene, si.spawn_ray_to(centre), centre).is_valid()):
+    if not _is_any(facing & ~_meet_opaque(loaded.scene, si.spawn_ray_to(centre), centre).is_valid()):
         return "something hides from the camera what is lit; move it out of the way"
     if part is not window:
         extents = [(own[1] - own[0]) / (whole[1] - whole[0]) for own, whole in zip(part, window, strict=True)]
@@ -116,20 +116,20 @@ def _corners(box: mi.BoundingBox3f, to_world: mi.Transform4f) -> FloatArray:
     return np.array(to_world.inverse() @ mi.Point3f(corners)).reshape(3, -1)
 
 
-def _opaque(scene: mi.Scene, ray: mi.Ray3f, target: mi.Point3f | None) -> mi.SurfaceInteraction3f:
+def _meet_opaque(scene: mi.Scene, ray: mi.Ray3f, target: mi.Point3f | None) -> mi.SurfaceInteraction3f:
     """What rays meet that lets no light pass, before their ``target`` if there is one; panes are taken for thin."""
     si = scene.ray_intersect(ray)
     for _ in range(_MOST_PASSED):
         clear = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)
         passing = si.is_valid() & (clear | (dr.max(si.bsdf().eval_null_transmission(si)) > 0))
-        if not _any(passing):
+        if not _is_any(passing):
             break
         onward = si.spawn_ray(ray.d) if target is None else si.spawn_ray_to(target)
         si = dr.select(passing, scene.ray_intersect(onward, passing), si)
     return si
 
 
-def _missed(loaded: LoadedScene, to_world: mi.Transform4f, within: bool) -> str:
+def _where_scene_lies(loaded: LoadedScene, to_world: mi.Transform4f, within: bool) -> str:
     """Where the scene lies, when no ray of the projector meets it; ``within`` tells whether the box of a shape lies in
     the window."""
     distance, box = loaded.camera.geometry.scene_distance, loaded.scene.bbox()
@@ -161,5 +161,5 @@ def _extent(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     return points.min(axis=1), points.max(axis=1)
 
 
-def _any(mask: mi.Bool) -> bool:
+def _is_any(mask: mi.Bool) -> bool:
     return bool(np.array(mask).any())

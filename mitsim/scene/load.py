@@ -125,7 +125,7 @@ def load_scene(
         projectors[0] if grid else None,
         grid,
         tuple(emitter for emitter in emitters if grid is None or emitter.class_name() != "Projector"),
-        *_polished(scene, checked.unfit),
+        *_mirrors_and_gloss(scene, checked.unfit),
         checked.unfit,
         checked.shapes if len(checked.shapes) == len(scene.shapes()) else (),
         tuple(zip(small, checked.small_lamps, strict=True)),
@@ -136,7 +136,7 @@ def load_scene(
     )
 
 
-def _polished(scene: mi.Scene, unfit: Unfit) -> tuple[bool, bool]:
+def _mirrors_and_gloss(scene: mi.Scene, unfit: Unfit) -> tuple[bool, bool]:
     """Whether a surface of the scene is a mirror or bends light, and whether one has a glossy component.
 
     An instance hides its materials: what is glossy there is looked for by rays, so it may be.
@@ -187,12 +187,12 @@ def check_texels(path: Path, scene: mi.Scene, limits: Mapping[str, Range]) -> No
             limit = limits.get(file[1] if file else last) or limits.get(name.rpartition(".")[2], _ANY)
             wrong = ~np.isfinite(values) | (values < limit.low) | (values > limit.high + _ROUNDING)
             if wrong.any():
-                place = _place(key, values, wrong, file[1] if file else key)
+                place = _place_of_wrong(key, values, wrong, file[1] if file else key)
                 words = f" of {limit.low:g} to {limit.high:g}{limit.hint}" if limit is not _ANY else ""
                 raise MitsimError(f"{path}: {place}; allowed are finite numbers{words}")
 
 
-def _place(key: str, values: npt.NDArray[np.float32], wrong: npt.NDArray[np.bool_], file: str) -> str:
+def _place_of_wrong(key: str, values: npt.NDArray[np.float32], wrong: npt.NDArray[np.bool_], file: str) -> str:
     """What holds the first wrong number, and where."""
     at = np.argwhere(wrong)[0]
     name, _, last = key.rpartition(".")

@@ -227,7 +227,7 @@ def with_thin_shapes_as_meshes(outline: Outline, state: mi.parser.ParserState) -
         for a cylinder or sphere that is too thin for its distance, for a thin cylinder of smooth plastic, and where the
         meshes cannot be written.
     """
-    thin = set(_thin(outline, state.nodes))
+    thin = set(_thin_shapes(outline, state.nodes))
     with ExitStack() as stack:
         try:
             folder = stack.enter_context(tempfile.TemporaryDirectory()) if thin else ""
@@ -241,11 +241,11 @@ def with_thin_shapes_as_meshes(outline: Outline, state: mi.parser.ParserState) -
         yield
 
 
-def _thin(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Iterator[int]:
+def _thin_shapes(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Iterator[int]:
     """Numbers of the nodes of thin cylinders and small lamps; MitsimError for what cannot be held."""
     eyes = [placed(node.props)[:3, 3] for node in nodes if node.props.plugin_name() == "projector"] + [np.zeros(3)]
     places = [placed(nodes[index].props)[:3, 3] for index in standing(nodes)]
-    for index, to_world in _seen(nodes):
+    for index, to_world in _occurrences(nodes):
         props, kind = nodes[index].props, nodes[index].props.plugin_name()
         if kind not in _FINEST:
             continue
@@ -278,7 +278,7 @@ def _farthest(ends: Sequence[FloatArray], places: Sequence[FloatArray]) -> float
     return max(float(np.linalg.norm(end - place)) for end in ends for place in places)
 
 
-def _seen(nodes: Sequence[mi.parser.SceneNode]) -> Iterator[tuple[int, FloatArray]]:
+def _occurrences(nodes: Sequence[mi.parser.SceneNode]) -> Iterator[tuple[int, FloatArray]]:
     """Numbers of all nodes of shapes, and (4, 4) from where they stand to the world: of a group's once an instance."""
     for index in standing(nodes):
         yield index, np.eye(4)
@@ -327,7 +327,7 @@ def prism(props: mi.Properties) -> Mesh:
     radius = float(props.get("radius", 1.0))
     first, last = _point(props, "p0", (0, 0, 0)), _point(props, "p1", (0, 0, 1))
     v, u = np.meshgrid([0.0, 1.0], np.linspace(0, 1, _SIDES + 1), indexing="ij")
-    x, y = _beside((last - first) / np.linalg.norm(last - first))
+    x, y = _axes_across((last - first) / np.linalg.norm(last - first))
     normal = np.cos(2 * np.pi * u)[..., None] * x + np.sin(2 * np.pi * u)[..., None] * y
     grown = radius * (np.pi / _SIDES) / np.sin(np.pi / _SIDES)  # a perimeter of 2 pi r
     mirrored = bool(np.linalg.det(placed(props)[:3, :3]) < 0)
@@ -368,7 +368,7 @@ def _triangles(rows: int, columns: int) -> FloatArray:
     return np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
 
 
-def _beside(n: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _axes_across(n: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Two axes across ``n`` where Mitsuba has them (Duff et al., Building an Orthonormal Basis, Revisited, 2017)."""
     sign = float(np.copysign(1, n[2]))
     a = -1 / (sign + n[2])

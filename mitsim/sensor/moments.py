@@ -54,11 +54,11 @@ def clipped_moments(expected: npt.ArrayLike, full_well_e: float) -> tuple[FloatA
     # Twelve standard deviations below the full well the loss is under 1e-30: left out, and with it nearly all the time.
     near = full_well_e - mean < 12 * np.sqrt(full_well_e) if np.isfinite(full_well_e) else np.zeros(mean.shape, bool)
     if near.any():
-        clipped[near], variance[near] = _clipped(mean[near], full_well_e)
+        clipped[near], variance[near] = _clip_moments(mean[near], full_well_e)
     return clipped, variance
 
 
-def _clipped(mean: FloatArray, full_well_e: float) -> tuple[FloatArray, FloatArray]:
+def _clip_moments(mean: FloatArray, full_well_e: float) -> tuple[FloatArray, FloatArray]:
     """:func:`clipped_moments` without short cuts."""
     step = math.ceil(full_well_e)
     over = mean - full_well_e
@@ -149,17 +149,19 @@ def _general(expected: FloatArray, offset: FloatArray | None, model: SensorModel
         room = np.minimum(mean, model.largest_dn - mean)
         rest |= (room < 8 * deviation) | (dither < _DITHERED)
     if rest.any():
-        mean[rest], noise[rest] = _cut_apart(expected[rest], 0.0 if offset is None else offset[rest], model)
+        mean[rest], noise[rest] = _cut_by_offset(expected[rest], 0.0 if offset is None else offset[rest], model)
     return mean, noise
 
 
-def _cut_apart(expected: FloatArray, offset: FloatArray | float, model: SensorModel) -> tuple[FloatArray, FloatArray]:
+def _cut_by_offset(
+    expected: FloatArray, offset: FloatArray | float, model: SensorModel
+) -> tuple[FloatArray, FloatArray]:
     """:func:`_cut` of pixels (pixels,) whose offsets differ: an offset is another black level.
 
     Moments are formed at black levels that are close to each other, and linear between two of them.
     """
     if not np.ptp(offset):
-        return _cut(expected, _blacker(model, float(np.mean(offset))))
+        return _cut(expected, _with_offset(model, float(np.mean(offset))))
     read = model.superpixel_reading_noise_e * model.gain_dn_per_e
     step = max(_STEP * read, _FINEST) / model.gain_dn_per_e
     place = np.asarray(offset) / step
@@ -169,13 +171,13 @@ def _cut_apart(expected: FloatArray, offset: FloatArray | float, model: SensorMo
     for node in np.unique(np.concatenate([below, below + 1])):
         for here, weight in ((below == node, 1 - part), (below + 1 == node, part)):
             if here.any():
-                first, second = _cut(expected[here], _blacker(model, node * step))
+                first, second = _cut(expected[here], _with_offset(model, node * step))
                 mean[here] += weight[here] * first
                 variance[here] += weight[here] * second
     return mean, variance
 
 
-def _blacker(model: SensorModel, offset: float) -> SensorModel:
+def _with_offset(model: SensorModel, offset: float) -> SensorModel:
     """The ``model`` with a black level higher by an ``offset`` [electrons] of its superpixels; it may be below 0."""
     black = model.black_level_dn + offset * model.gain_dn_per_e / model.codes
     return model.model_copy(update={"black_level_dn": black})
@@ -270,7 +272,7 @@ def _cut(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArr
     mean, noise = np.asarray(amplify(clipped, model)), np.asarray(variance * gain**2 + read**2)
     dim, some = expected < _FEW, (expected >= _FEW) & (expected < _SOME)
     if model.linearity:
-        return _summed_up(expected, (dim, some), np.ones(expected.shape, bool), (mean, noise), model)
+        return _sum_counts(expected, (dim, some), np.ones(expected.shape, bool), (mean, noise), model)
     if model.largest_dn is None:
         return mean, noise
     room, deviation = np.minimum(mean, model.largest_dn - mean), np.sqrt(noise)
@@ -280,10 +282,10 @@ def _cut(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArr
     total = np.asarray(noise + 1 / 12)
     gone = room < -10 * deviation
     mean[gone], total[gone] = model.largest_dn, 0.0
-    return _summed_up(expected, (dim, some), hard & ~gone, (mean, total), model)
+    return _sum_counts(expected, (dim, some), hard & ~gone, (mean, total), model)
 
 
-def _summed_up(
+def _sum_counts(
     expected: FloatArray,
     few: tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]],
     hard: npt.NDArray[np.bool_],
@@ -292,7 +294,7 @@ def _summed_up(
 ) -> tuple[FloatArray, FloatArray]:
     """`moments` with those of the `hard` pixels summed over counts; `few`: which are dim, and which have some."""
     (dim, some), (mean, total) = few, moments
-    for part, found in ((dim, _counted), (some, _summed), (~dim & ~some, _averaged)):
+    for part, found in ((dim, _counted), (some, _summed), (~dim & ~some, _average_counts)):
         part = hard & part
         if part.any():
             mean[part], total[part] = found(expected[part], model)
@@ -332,7 +334,7 @@ def _summed(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, Float
     return _between(expected, nodes, mean, variance)
 
 
-def _averaged(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
+def _average_counts(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
     """:func:`frame_moments` as a mean over 129 electron counts, for many electrons."""
     nodes = _grid(expected)
     deviates = np.linspace(-8, 8, 129)
@@ -372,10 +374,10 @@ def _read_out(electrons: FloatArray, model: SensorModel) -> tuple[FloatArray, Fl
     read = np.full(signal.shape, model.superpixel_reading_noise_e * model.gain_dn_per_e)
     if model.largest_dn is None:
         return signal, np.square(read)
-    return _rounded(signal, read, model.largest_dn)
+    return _round_moments(signal, read, model.largest_dn)
 
 
-def _rounded(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple[FloatArray, FloatArray]:
+def _round_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple[FloatArray, FloatArray]:
     """Mean and variance of a normal signal (pixels,) rounded to the codes 0 .. `largest`, all in DN."""
     first, second = np.empty_like(mean), np.empty_like(mean)
     wide = deviation >= _SMOOTH
@@ -386,7 +388,7 @@ def _rounded(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple[Flo
 
 
 def _cut_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple[FloatArray, FloatArray]:
-    """:func:`_rounded` for deviations of at least 2 DN.
+    """:func:`_round_moments` for deviations of at least 2 DN.
 
     The number is the sum over its codes of P(signal > code - 1/2), the midpoint rule for an integral in closed form:
     that of a cut normal signal. Euler and Maclaurin's first term, -1/24 of the integrand's slope between the ends, is
@@ -407,7 +409,7 @@ def _cut_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple
 
 
 def _code_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple[FloatArray, FloatArray]:
-    """:func:`_rounded` for deviations below 2 DN: code by code around the nearest one."""
+    """:func:`_round_moments` for deviations below 2 DN: code by code around the nearest one."""
     nearest = np.clip(np.rint(mean), 0, largest)
     if not deviation.any():
         return nearest, np.zeros_like(mean)

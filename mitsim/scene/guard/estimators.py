@@ -57,7 +57,7 @@ class Unfit:
         tree = _References(nodes)
         medium = next(tree.to(PLUGINS["medium"].split()), None)
         if medium is None:
-            factored = _blurred(outline, tree)
+            factored = _blended_picture(outline, tree)
         else:
             node, name = medium
             rule = (
@@ -89,7 +89,7 @@ def _caustics(outline: Outline, tree: _References, lights: Sequence[str], estima
     return str(outline.tag(light).refusal("light", repr(str(light.props.plugin_name())), rule))
 
 
-def _blurred(outline: Outline, tree: _References) -> MitsimError | None:
+def _blended_picture(outline: Outline, tree: _References) -> MitsimError | None:
     """The refusal of a projector whose picture blends its texels: the factored estimator takes pixels for even."""
     for node in tree.nodes:
         picture = tree.child(node, "irradiance") if node.props.plugin_name() == "projector" else None

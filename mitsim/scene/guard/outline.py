@@ -159,7 +159,7 @@ class Outline:
             if self._elements > MOST_ELEMENTS:
                 raise refuse(f"over {MOST_ELEMENTS} elements with all includes; make the scene smaller")
             tag = Tag(path, parser.CurrentLineNumber, name, attributes)
-            texts = {key: self._resolved(tag, text) for key, text in attributes.items()}
+            texts = {key: self._with_parameters(tag, text) for key, text in attributes.items()}
             if texts.get("name") == "" and name != "default":
                 raise tag.refusal("name", "''", "give a name; only objects may go without the attribute")
             if not open_tags:
@@ -201,7 +201,7 @@ class Outline:
         except ValueError as error:  # an encoding that Python does not know
             raise MitsimError(f"{path}:1: not well-formed XML ({error}); write the scene in UTF-8") from None
 
-    def _resolved(self, tag: Tag, text: str) -> str:
+    def _with_parameters(self, tag: Tag, text: str) -> str:
         """The text with its parameters put in."""
         if "\\" in text:
             raise tag.refusal("text", repr(text), "backslashes are not allowed")

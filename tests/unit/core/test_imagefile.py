@@ -19,7 +19,7 @@ from PIL import Image, PngImagePlugin
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.imagelist import Raw, Wanted, image_files
-from mitsim.core.images import _look, _told, image_size, own_end, read_image, read_images
+from mitsim.core.images import _one_line_refusals, _read_header, image_size, own_end, read_image, read_images
 
 NUMBERS = (np.arange(35).reshape(5, 7) * 113).astype(np.uint16)
 LARGE = np.arange(35, dtype=np.uint32).reshape(5, 7) * 120_000_000
@@ -321,10 +321,10 @@ def test_a_file_that_is_cut_while_it_is_read_is_refused(tmp_path: Path, name: st
     """Between header and pixels: a map of the file would end the process. (Planted: NPY mapped, which it did.)"""
     write(tmp_path / name)
     wanted = Wanted(raw=Raw.of("500x500", 16, "little"))
-    with _told(tmp_path / name, wanted):
-        found = _look(tmp_path / name, wanted)
+    with _one_line_refusals(tmp_path / name, wanted):
+        found = _read_header(tmp_path / name, wanted)
     os.truncate(tmp_path / name, 600)
-    with pytest.raises(MitsimError, match="cannot be read"), _told(tmp_path / name, wanted):
+    with pytest.raises(MitsimError, match="cannot be read"), _one_line_refusals(tmp_path / name, wanted):
         list(found.read())
 
 

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask import Dust, dusted, etched
+from mitsim.devices.mask import Dust, draw_dust, etch
 from mitsim.devices.mask_profile import MaskProfile, load_mask
 from mitsim.devices.plate import Plate, within
 
@@ -37,7 +37,7 @@ def test_etching_is_dilation_by_a_square_and_erosion(grow: int) -> None:
     """A random grey mask of 12 units a feature, by a unit's drawing of it; -14 takes openings of one feature, 7 closes
     gaps of one. (Planted: rows alone; the least beyond the mask 1.)"""
     values = np.random.default_rng(1).choice([0, 0.4, 1], (7, 7))
-    lines, got = etched(values, 12.0, grow)
+    lines, got = etch(values, 12.0, grow)
     fine = np.pad(values.repeat(12, 0).repeat(12, 1), 20)
     size = 2 * abs(grow) + 1  # a drawn pixel and so many on each side
     expected = (ndimage.grey_dilation if grow > 0 else ndimage.grey_erosion)(fine, (size, size))
@@ -77,7 +77,7 @@ def test_quarter_turns_are_numpys_and_no_flaw_is_no_change() -> None:
 def test_a_disc_of_dust_takes_its_area() -> None:
     """Before a wholly open mask. (Planted: the diameter for the radius; clear for opaque.)"""
     dust = Dust(np.array([[0.11, -0.23], [-0.4, 0.3]]), 0.03, 0.6)
-    lines, values = dusted(np.linspace(-1, 1, 21), np.ones((20, 20)), dust, 1.0)
+    lines, values = draw_dust(np.linspace(-1, 1, 21), np.ones((20, 20)), dust, 1.0)
     width = np.diff(lines)
     assert 4 - width @ values @ width == pytest.approx(2 * 0.6 * np.pi * 0.03**2, rel=1e-3)
     plate = Plate(0.1, values, "it", lines)

@@ -175,6 +175,7 @@ def test_the_manual_lists_the_parameters_of_the_geometry() -> None:
     default."""
     from mitsim.devices.camera import CameraGeometry
     from mitsim.transport.plugins import lensless
+    from tests.unit.core.test_formats import documents
 
     rows = re.findall(r"^``(\w+)`` +(\S+) +(\S+) ", lensless.__doc__, re.M)
     films = "pixels", "rows", "columns", "roi"
@@ -182,8 +183,9 @@ def test_the_manual_lists_the_parameters_of_the_geometry() -> None:
         name: field for name, field in CameraGeometry.model_fields.items() if not (name in films or field.exclude)
     }
     assert [name for name, _, _ in rows] == [*fields, "to_world"]
+    meanings = documents().meanings(CameraGeometry)
     for name, unit, default in rows[:-1]:
         stated = fields[name]
         known = "-" if stated.default is None else stated.default
         assert default == (known if isinstance(known, str) else f"{known:g}"), name
-        assert f"[{unit}]" in stated.description or unit == "-", name
+        assert f"[{unit}]" in meanings[name] or unit == "-", name
