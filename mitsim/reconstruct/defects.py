@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from scipy.ndimage import maximum_filter, uniform_filter
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.runs import Ambient, Capture, Measurement
+from mitsim.core.runs import Capture, Measurement
+from mitsim.reconstruct.focus import DerivedCapture
 from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.sides import IndexArray
 from mitsim.reconstruct.solver import Prepared
@@ -124,7 +124,7 @@ class Defects:
         return Defects(self.rows[kept], self.columns[kept]) if kept.any() else None
 
 
-class LeftOut(Capture):
+class LeftOut(DerivedCapture):
     """A capture whose readings at some pixels are other ones.
 
     Parameters
@@ -142,18 +142,8 @@ class LeftOut(Capture):
         defects: Defects,
         moved: dict[tuple[int, int], FloatArray],
     ) -> None:
-        super().__init__(whole.manifest, whole.folder)
-        self._whole, self._measured, self._defects, self.moved = whole, measured, defects, moved
-
-    @cached_property
-    def patterns(self) -> tuple[FloatArray, FloatArray]:
-        """As of the capture itself."""
-        return self._whole.patterns
-
-    @cached_property
-    def ambient(self) -> Ambient | None:
-        """As of the capture itself."""
-        return self._whole.ambient
+        super().__init__(whole)
+        self._measured, self._defects, self.moved = measured, defects, moved
 
     def measured(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
         """As of the capture itself, whose ``shape`` is known, with other readings at its defective pixels."""

@@ -303,27 +303,48 @@ def _cubic(factor: FloatArray, row: npt.NDArray[np.intp], column: FloatArray) ->
     return np.asarray(sum(weight * factor[row, start + k] for k, weight in enumerate(weights)))
 
 
-class _Part(Capture):
+class DerivedCapture(Capture):
+    """A ``whole`` capture of which something is changed; all else is its own."""
+
+    def __init__(self, whole: Capture) -> None:
+        super().__init__(whole.manifest, whole.folder)
+        self.whole = whole
+
+    @cached_property
+    def patterns(self) -> tuple[FloatArray, FloatArray]:
+        """P_L (n, K) and P_R (n', K')."""
+        return self.whole.patterns
+
+    @cached_property
+    def ambient(self) -> Ambient | None:
+        """What is taken off every frame."""
+        return self.whole.ambient
+
+    def measured(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
+        """What was measured, of a ``shape`` that is asked for."""
+        return self.whole.measured(shape)
+
+
+class _Part(DerivedCapture):
     """What a part of the sensor saw of a capture."""
 
     def __init__(self, whole: Capture, part: MovedFactors) -> None:
-        super().__init__(whole.manifest, whole.folder)
-        self._whole, self._seen = whole, part
+        super().__init__(whole)
+        self._part = part
 
     def measured(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
         """As of the whole sensor, whose frames must have the shape that the calibration's have."""
-        part = self._seen
-        for each in self._whole.measured(part.sensor):
-            frame, light = each.frame[part.rows, part.columns], each.light[part.rows, part.columns]
-            yield replace(each, frame=frame, light=light)
+        for each in self.whole.measured(self._part.sensor):
+            yield replace(each, frame=self._cut(each.frame), light=self._cut(each.light))
 
     @cached_property
     def ambient(self) -> Ambient | None:
         """The ambient frame of that part."""
-        whole, part = self._whole.ambient, self._seen
-        if whole is None:
-            return None
-        return Ambient(whole.rate[part.rows, part.columns], whole.variance[part.rows, part.columns], whole.shots)
+        whole = self.whole.ambient
+        return whole and Ambient(self._cut(whole.rate), self._cut(whole.variance), whole.shots)
+
+    def _cut(self, values: FloatArray) -> FloatArray:
+        return values[self._part.rows, self._part.columns]
 
 
 def parallax_period(patterns: tuple[FloatArray, FloatArray], parallax: Parallax) -> float:

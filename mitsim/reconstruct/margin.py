@@ -13,7 +13,6 @@ lit. Light that is the same in all frames is explained so as far as it changes l
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -22,9 +21,9 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import Parallax
-from mitsim.core.runs import Ambient, Capture, Measurement
+from mitsim.core.runs import Capture
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import LEAST_PART, FactorOfDepths, MovedFactors, parallax_of
+from mitsim.reconstruct.focus import LEAST_PART, DerivedCapture, FactorOfDepths, MovedFactors, parallax_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,28 +68,19 @@ class Margin:
         return image[self.cells : -self.cells, self.cells : -self.cells]
 
 
-class _Padded(Capture):
+class _Padded(DerivedCapture):
     """A capture whose patterns light a margin always."""
 
     def __init__(self, whole: Capture, cells: int) -> None:
-        super().__init__(whole.manifest, whole.folder)
-        self._whole, self._cells = whole, cells
+        super().__init__(whole)
+        self._cells = cells
 
     @cached_property
     def patterns(self) -> tuple[FloatArray, FloatArray]:
         """P_L (n + 2 cells, K) and P_R (n' + 2 cells, K')."""
         pad = (self._cells, self._cells), (0, 0)
-        left, right = (np.pad(side.astype(np.float64), pad, constant_values=1.0) for side in self._whole.patterns)
+        left, right = (np.pad(side.astype(np.float64), pad, constant_values=1.0) for side in self.whole.patterns)
         return left, right
-
-    def measured(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
-        """As of the capture itself."""
-        return self._whole.measured(shape)
-
-    @cached_property
-    def ambient(self) -> Ambient | None:
-        """As of the capture itself."""
-        return self._whole.ambient
 
 
 def _wider(parallax: Parallax, sizes: tuple[int, int], cells: int) -> Parallax:

@@ -122,8 +122,8 @@ class Misfit:
         defects = f"; {self.defects}" if self.defects else ""
         detail = f" beside {self.detail:.1e} of print finer than a scene pixel" if self.detail else ""
         return (
-            f"misfit: chi-square {shown(self.chi_square)} a datum{noise}, {self.unexplained:.1e} unexplained{detail}"
-            f"{cause}{defects}"
+            f"misfit: chi-square {shown(self.chi_square)} a datum{noise}, "
+            f"{self.unexplained:.1e} unexplained{detail}{cause}{defects}"
         )
 
     @property

@@ -71,8 +71,8 @@ class Side:
         one a pattern index.
     projected
         True: slabs are rows of U. False (``gram``): slabs are Phi diag(p_i), and W is the paper's Q.
-    n_blocks, pattern_count, sensor_size, scene_size, data_rows
-        number of blocks; K; m; n; independent data rows, m K (less K once frames are centred).
+    pattern_count, sensor_size, scene_size, data_rows
+        K; m; n; independent data rows, m K (less K once frames are centred).
     dual
         (n, r) V' with B = U S V'^T; None: V' is the basis, which is orthonormal
         (:mod:`mitsim.reconstruct.solver` has others).
@@ -84,7 +84,6 @@ class Side:
     singular: FloatArray
     slabs: tuple[Slab, ...]
     projected: bool
-    n_blocks: int
     pattern_count: int
     sensor_size: int
     scene_size: int
@@ -208,7 +207,6 @@ def factorise(
         singular=_frozen(singular),
         slabs=slabs,
         projected=method == "svd",
-        n_blocks=len(groups),
         pattern_count=patterns.shape[1],
         sensor_size=sensor,
         scene_size=scene,

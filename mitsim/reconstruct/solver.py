@@ -557,6 +557,5 @@ def correlated(side: Side) -> Side:
         dual=np.linalg.solve(root.T, right.T),
         singular=singular,
         slabs=tuple(Slab(slice(0, len(singular)), slab.matrix @ turned[slab.columns]) for slab in side.slabs),
-        n_blocks=1,
         spread=float(np.linalg.cond(root)),
     )

@@ -47,7 +47,7 @@ from mitsim.core.manifests import FactorNoise
 from mitsim.reconstruct.detail import PRINT, Model, disagreement
 from mitsim.reconstruct.misfit import Lack
 from mitsim.reconstruct.noise import FrameNoise
-from mitsim.reconstruct.regularisation import DiagonalProblem, Halves, coefficient_noise
+from mitsim.reconstruct.regularisation import DiagonalProblem, coefficient_noise
 from mitsim.reconstruct.sides import Side
 from mitsim.reconstruct.spectrum import scene_spectrum
 
@@ -288,18 +288,6 @@ class Propagation:
             (np.square(self.model.prepared.image(self.gain * each)) for each in seen), np.zeros_like(image)
         )
 
-    def of_disagreement(self, halves: Halves, rows: FloatArray, columns: FloatArray) -> FloatArray:
-        """(n, n') variance of the image by what ``halves`` of the sensor disagree on beyond chance.
-
-        Parameters
-        ----------
-        halves
-            of the image's data.
-        rows, columns
-            (n, n') variances of the image by known errors that change from sensor row to row, and column to column.
-        """
-        return disagreement(self.model, self.gain, halves, (rows, columns))
-
     def _spread(self, variances: FloatArray) -> FloatArray:
         """(n, n') variance of the image, that of each coefficient of W being ``variances`` (r, r')."""
         return self._seen(np.square(self.gain) * variances)
@@ -345,7 +333,9 @@ def uncertainty(
     zero, data = np.zeros_like(image), problem.data_count
     frames = propagation.of_frames(noise.rows, noise.columns)
     left, right = propagation.of_factors(factors, image) if factors else (zero, zero)
-    told = propagation.of_disagreement(problem.halves, frames + left, frames + right) if problem.halves else zero
+    known, told = (frames + left, frames + right), zero
+    if problem.halves:
+        told = disagreement(propagation.model, propagation.gain, problem.halves, known)
     lost, factor = propagation.of_regularisation(problem, float(noise.variance.mean()))
     variances = {
         "frame_noise": frames,

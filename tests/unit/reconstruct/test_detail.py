@@ -125,12 +125,14 @@ def test_noise_is_taken_off_what_halves_disagree_on() -> None:
         known = deviation**2 * white
         halves = model.prepared.problem(sums).halves
         assert halves
-        told += propagation.of_disagreement(halves, known, known).mean()
+        told += disagreement(propagation.model, propagation.gain, halves, (known, known)).mean()
     assert told / 40 == pytest.approx(struck, rel=0.12)
     # Light that moves along the rows is told by halves of the rows, and by what is known of those alone.
-    everything = propagation.of_disagreement(halves, known, known)
-    assert propagation.of_disagreement(halves, known, 1e6 * known) == pytest.approx(everything)
-    assert everything.any() and not propagation.of_disagreement(halves, 1e6 * known, known).any()
+    everything = disagreement(propagation.model, propagation.gain, halves, (known, known))
+    assert disagreement(propagation.model, propagation.gain, halves, (known, 1e6 * known)) == pytest.approx(everything)
+    assert (
+        everything.any() and not disagreement(propagation.model, propagation.gain, halves, (1e6 * known, known)).any()
+    )
 
 
 @pytest.mark.parametrize("patterns", ["dots:4", "hadamard:4"])
@@ -147,7 +149,7 @@ def test_noise_alone_is_no_disagreement(patterns: str) -> None:
         left, right = propagation.of_factors(factors.manifest.noise, image.image)
         halves = sums.prepared.problem(sums.frames).halves
         assert halves
-        told += propagation.of_disagreement(halves, frames + left, frames + right).any()
+        told += disagreement(propagation.model, propagation.gain, halves, (frames + left, frames + right)).any()
     assert told <= 3
 
 

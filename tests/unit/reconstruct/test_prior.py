@@ -106,7 +106,7 @@ def test_the_covariance_is_that_of_a_first_order_markov_field() -> None:
 def test_equal_sides_are_factorised_once_and_gram_is_refused() -> None:
     factor, lit = np.random.default_rng(0).random((9, 5)), np.ones((5, 1))
     found = prepare(factor, factor, lit, lit).correlated()
-    assert found.left is found.right and found.left.n_blocks == 1
+    assert found.left is found.right and found.left.slabs[0].matrix.shape == (9, 5)
     with pytest.raises(MitsimError, match="prepare by svd"):
         prepare(factor, factor, lit, lit, method="gram").correlated()
 

@@ -199,7 +199,8 @@ def test_dots_may_have_a_period_for_each_axis(tmp_path: Path) -> None:
     again = load_run(shots.save(tmp_path / "run"))
     assert len(again.manifest.patterns.captures) == 12 and again.manifest.patterns.family == "dots:2x6"
     prepared = accumulate(again, factors).prepared
-    assert (prepared.left.n_blocks, prepared.right.n_blocks) == (2, 6)
+    for side, period in ((prepared.left, 2), (prepared.right, 6)):  # each coefficient is one pattern's
+        assert len(side.slabs) == period and sum(slab.matrix.shape[1] for slab in side.slabs) == side.rank
     image = reconstruct(again, factors)
     assert image.ok and np.abs(image.image - picture()).max() < 0.1  # 0.02 of noise; 0.4 with the periods exchanged
 
