@@ -469,21 +469,61 @@ def test_lanes_are_not_added_up_in_32_bits() -> None:
 
 # ---- sizes and names -------------------------------------------------------------------------------------------------
 
-MOST_FILES, MOST_LINES_OF_CODE = 286, 41_700
-"""What the house was when its rooms were last counted: a change that needs more says so here. A new file or line is one
-more that the next reader has to know."""
+MOST_FILES, MOST_LINES_OF_CODE = 285, 41_300
+"""What the house was when its rooms were last counted, and room for an extension or two: a change that needs more says so
+here. A new file or line is one more that the next reader has to know."""
 LONG = 450
 """Lines of a file that a reader does not scroll without headings; chosen: some six screens."""
 HEADING = re.compile(r"^\s*# -{4,} ?\w", flags=re.M)
 UNNAMED = {"__init__", "__main__"}
-ALIKE: set[str] = set()
-"""Names that files of several rooms have."""
+ALIKE: set[str] = {
+    "bench",
+    "colour",
+    "depth",
+    "diffraction",
+    "diffuser",
+    "drift",
+    "exposure",
+    "lamps",
+    "light",
+    "mosaic",
+    "page",
+    "patterns",
+    "pictures",
+    "plan",
+    "projector",
+    "regularisation",
+    "request",
+    "separation",
+    "session",
+    "solver",
+    "spectral",
+}
+"""Names that files of several rooms have still: a change takes some away, and adds none."""
+WITHOUT_HEADINGS: set[str] = {
+    "mitsim.acquire.capture",
+    "mitsim.acquire.spectral",
+    "mitsim.api.bench",
+    "mitsim.calibrate.model_fit",
+    "mitsim.core.manifests",
+    "mitsim.exchange.pictures",
+    "mitsim.reconstruct.captured_session",
+    "mitsim.reconstruct.depth",
+    "mitsim.reconstruct.estimate_factors",
+    "mitsim.reconstruct.focus",
+    "mitsim.reconstruct.misfit",
+    "mitsim.report.exposures",
+    "mitsim.studies.calibration",
+    "mitsim.transport.records",
+    "mitsim.transport.transmission",
+}
+"""Long files that have none still."""
 PARTICIPLE = re.compile(
     "begun|bent|bound|broken|brought|built|caught|chosen|done|drawn|driven|fallen|felt|filed|forgotten|formed|found"
     "|given|gone|grown|held|hidden|kept|known|laid|led|left|lent|lit|lost|made|meant|met|paid|said|seen|sent|shown"
     "|spent|split|spoken|struck|sunk|swept|taken|thought|thrown|told|understood|worn|written|[a-z]+[^e]ed"
 )
-MOST_PARTICIPLES = 530
+MOST_PARTICIPLES = 416
 """Functions that are named by a participle alone: what was done is no name of what a function does or gives. A change
 takes some away, and adds none."""
 TOKENS_WITHOUT_CODE = {
@@ -529,7 +569,8 @@ def test_the_house_has_no_more_files_and_lines_than_it_had() -> None:
 
 def test_long_files_have_headings() -> None:
     texts = {name: text for name, (text, _) in sources().items() if text.count("\n") > LONG}
-    assert not [name for name, text in texts.items() if len(HEADING.findall(text)) < 2]
+    without = {name for name, text in texts.items() if len(HEADING.findall(text)) < 2}
+    assert without == WITHOUT_HEADINGS, without ^ WITHOUT_HEADINGS
     assert HEADING.findall("# ---- Anchors\n\n    # -------- anchors of it\n") and not HEADING.findall("# --\n#----")
 
 
