@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
+from mitsim.core.errors import reason_of
 from mitsim.core.files import whole_file
 from mitsim.core.resources import Cost, Limits
 
@@ -113,7 +114,7 @@ def read_npz(file: BinaryIO, name: Path | str) -> dict[str, npt.NDArray[Any]]:
                 arrays[part.filename.removesuffix(".npy")] = Npy.of(data, part.file_size).part(data)
             return arrays
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OverflowError) as error:
-        raise ValueError(" ".join(str(error).split()) or type(error).__name__) from error
+        raise ValueError(reason_of(error)) from error
 
 
 # -------- HDF5 files

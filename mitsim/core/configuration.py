@@ -1,6 +1,5 @@
 """Configuration files: a TOML path in, a checked pydantic model out; where the shipped ones lie."""
 
-import difflib
 import os
 import reprlib
 import sys
@@ -9,7 +8,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import pydantic
 
-from mitsim.core.errors import MitsimError, cut
+from mitsim.core.errors import MitsimError, cut, near_name
 from mitsim.core.files import read_text
 
 if sys.version_info >= (3, 11):
@@ -123,8 +122,7 @@ def _complaint(model: type[pydantic.BaseModel], problem: Any) -> str:
     hint = _range(model, problem["loc"])
     if problem["type"] in ("extra_forbidden", "missing"):
         known = [*_holder(model, problem["loc"][:-1]).model_fields]
-        near = difflib.get_close_matches(str(problem["loc"][-1]), known, 1)
-        meant = f"did you mean {near[0]}? " if near and problem["type"] == "extra_forbidden" else ""
+        meant = near_name(str(problem["loc"][-1]), known) if problem["type"] == "extra_forbidden" else ""
         rule = "no such field" if problem["type"] == "extra_forbidden" else rule
         hint = f"; {meant}known fields: {', '.join(known)}"
     value = "nothing" if problem["type"] == "missing" else _short_text(problem["input"])
@@ -194,8 +192,7 @@ def locate(name: Path | str, shelf: Literal["scenes", "calibration"], ending: st
         return path / ending if inside and path.is_dir() else path
     names = [place.parent.name for place in folder.glob(f"*/{ending}")] if inside else []
     names = names or [place.stem for place in folder.glob(f"*{ending}")]
-    near = difflib.get_close_matches(text, names, 1)
-    hint = f"did you mean {near[0]}? " if near else ""
     raise MitsimError(
-        f"{name}: no such file, and none of that name is shipped; {hint}shipped are {', '.join(sorted(names))}"
+        f"{name}: no such file, and none of that name is shipped; {near_name(text, names)}"
+        f"shipped are {', '.join(sorted(names))}"
     )

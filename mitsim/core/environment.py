@@ -12,14 +12,15 @@ import site
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType
 
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import MitsimError, reason_of
+from mitsim.core.files import write_json
 from mitsim.core.worker import held_back
 from mitsim.version import __version__
 
@@ -93,7 +94,7 @@ def _set_variant(name: str) -> ModuleType:
     try:
         mitsuba.set_variant(name)
     except ImportError as error:
-        raise MitsimError(f"variant {name}: cannot be loaded ({_one_line(error)}); run: mitsim doctor") from error
+        raise MitsimError(f"variant {name}: cannot be loaded ({reason_of(error)}); run: mitsim doctor") from error
     import drjit
 
     if drjit.thread_count() < _FEWEST_THREADS:
@@ -207,7 +208,7 @@ def _attempt(name: str, look: Callable[[], str], remedy: str) -> Check:
     try:
         return Check(name, True, look())
     except (MitsimError, OSError, ImportError) as error:
-        return Check(name, False, _one_line(error), remedy)
+        return Check(name, False, reason_of(error), remedy)
 
 
 def _child(name: str, program: str, success: str, remedy: str) -> Check:
@@ -217,10 +218,6 @@ def _child(name: str, program: str, success: str, remedy: str) -> Check:
 
 def _reinstall(package: str) -> str:
     return f"{sys.executable} -m pip install --force-reinstall {package}"
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())
 
 
 # -------- The LLVM library Dr.Jit compiles with
@@ -359,22 +356,15 @@ def _check_named(path: Path) -> Path:
     return path
 
 
-def _names() -> Iterable[Path]:
-    machine = platform.machine()
-    folders = [
-        Path(f"/usr/lib/{machine}-linux-gnu"),
-        Path("/usr/lib64"),
-        Path("/usr/lib"),
-        Path("/usr/local/lib"),
-    ]
-    folders += [Path(sys.prefix) / "lib", Path("/opt/homebrew/opt/llvm/lib"), Path("/usr/local/opt/llvm/lib")]
+def _names() -> Iterator[Path]:
+    folders = [f"/usr/lib/{platform.machine()}-linux-gnu", "/usr/lib64", "/usr/lib", "/usr/local/lib"]
+    folders += [f"{sys.prefix}/lib", "/opt/homebrew/opt/llvm/lib", "/usr/local/opt/llvm/lib"]
     for number in range(_NEWEST, OLDEST - 1, -1):
-        for folder in [*folders, Path(f"/usr/lib/llvm-{number}/lib"), Path(f"/usr/lib/llvm/{number}/lib64")]:
-            # Debian ships libLLVM-19.so as a link to libLLVM.so.19.1; up to 17 the file was libLLVM-17.so.1.
-            yield from (folder / f"libLLVM.so.{number}.1", folder / f"libLLVM-{number}.so.1")
-            yield from (folder / f"libLLVM-{number}.so", folder / f"libLLVM.so.{number}")
-    for folder in folders:
-        yield from (folder / "libLLVM.so", folder / "libLLVM.dylib")
+        # Debian ships libLLVM-19.so as a link to libLLVM.so.19.1; up to 17 the file was libLLVM-17.so.1.
+        names = f"libLLVM.so.{number}.1", f"libLLVM-{number}.so.1", f"libLLVM-{number}.so", f"libLLVM.so.{number}"
+        own = f"/usr/lib/llvm-{number}/lib", f"/usr/lib/llvm/{number}/lib64"
+        yield from (Path(folder, name) for folder in (*folders, *own) for name in names)
+    yield from (Path(folder, f"libLLVM.{ending}") for folder in folders for ending in ("so", "dylib"))
 
 
 def _cached_probe(path: Path) -> Probe:
@@ -396,18 +386,10 @@ def _cached_probe(path: Path) -> Probe:
         pass
     result = probe(path)
     if result.ok:
-        _remember(store, key)
+        with suppress(OSError, MitsimError):  # without a cache the probe runs again next time
+            store.parent.mkdir(parents=True, exist_ok=True)
+            write_json(store, [key])
     return result
-
-
-def _remember(store: Path, key: str) -> None:
-    temporary = store.with_name(f"{store.name}.{os.getpid()}.part")
-    try:
-        store.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_text(json.dumps([key]), encoding="utf-8")
-        os.replace(temporary, store)
-    except OSError:
-        return  # without a cache the probe runs again next time
 
 
 # -------- Versions of what computes

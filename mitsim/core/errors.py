@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 _LONGEST = 1500
 """Characters of a message: a screen of 80 x 20."""
 
@@ -38,3 +41,14 @@ def cut(text: str, length: int = 60) -> str:
     """One printable line of ``text``, of at most ``length`` characters."""
     shown = printable(text[: length + 1]).replace("\n", " ")
     return shown if len(text) <= length else shown[: length - 3] + "..."
+
+
+def reason_of(error: BaseException) -> str:
+    """What an ``error`` of a library says, on one line; its name where it says nothing."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def near_name(text: str, known: Iterable[str]) -> str:
+    """ "did you mean NAME? " for the ``known`` name that a mistyped ``text`` is nearest to; empty without one."""
+    near = difflib.get_close_matches(text, [*known], 1)
+    return f"did you mean {near[0]}? " if near else ""

@@ -23,7 +23,7 @@ import numpy.typing as npt
 import OpenEXR
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError, cut
+from mitsim.core.errors import MitsimError, cut, reason_of
 from mitsim.core.files import (
     FRAME_LIMITS,
     MOST_SIDE,
@@ -73,7 +73,7 @@ def write_frame(path: Path | str, channels: Channels, metadata: Metadata) -> Non
         try:
             OpenEXR.File(header, pixels).write(str(part))
         except RuntimeError as error:
-            raise OSError(_one_line(error)) from error
+            raise OSError(reason_of(error)) from error
 
 
 def read_frame(path: Path | str) -> tuple[dict[str, Channel], dict[str, Value]]:
@@ -95,7 +95,7 @@ def read_frame(path: Path | str) -> tuple[dict[str, Channel], dict[str, Value]]:
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     except (OSError, RuntimeError, ValueError, TypeError) as error:
         raise MitsimError(
-            f"frame {path}: damaged or incomplete OpenEXR file ({_one_line(error)}); write or copy it again"
+            f"frame {path}: damaged or incomplete OpenEXR file ({reason_of(error)}); write or copy it again"
         ) from error
     wide = {name: c.astype(np.float32) if c.dtype == np.float16 else c for name, c in channels.items()}
     return wide, metadata
@@ -195,10 +195,6 @@ def _open(path: Path) -> Any:
     # one to stderr, past Python; it raises later on. The lock keeps two threads from restoring each other's streams.
     with stderr_silenced(), contextlib.redirect_stdout(io.StringIO()):
         return OpenEXR.File(str(path), separate_channels=True)
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())
 
 
 # -------- An OpenEXR file's path in

@@ -309,9 +309,7 @@ def json_text(obj: Any) -> str:
 
 def write_json(path: Path | str, obj: Any) -> None:
     """Write ``obj`` to ``path`` as :func:`json_text`, all or nothing. MitsimError when the file cannot be written."""
-    text = json_text(obj)
-    with whole_file(path) as part:
-        part.write_text(text, encoding="utf-8")
+    write_text(path, json_text(obj))
 
 
 def parse_json(text: str) -> Any:

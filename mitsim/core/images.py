@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrayfile import Npy
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import MitsimError, reason_of
 from mitsim.core.files import FRAME_LIMITS, check_plain, fits_a_frame, stderr_silenced
 from mitsim.core.imagelist import BARE, FORMATS, FRAME, Wanted
 from mitsim.core.resources import Cost, Limits
@@ -31,16 +31,10 @@ if TYPE_CHECKING:
 
 Numbers = npt.NDArray[Any]
 """(rows, columns) numbers of a picture: whole, or real; where colours are wanted, (rows, columns, 3 or 4)."""
-_SIGNATURE, _HEAD = b"\x89PNG\r\n\x1a\n", 26
-"""First bytes of a PNG, and bytes up to its colour type (ISO/IEC 15948, 5.2 and 11.2.2)."""
-_PNG_BITS = (1, 2, 4, 8, 16)
-"""Of a grey number in a PNG."""
-_GREY, _COLOURS = 0, (2, 6)
-"""Colour types of a PNG: one number a pixel; red, green, blue, without and with alpha."""
-_ANIMATED = b"acTL"
-"""Chunk before the pixels of a PNG of several frames (ISO/IEC 15948:2023, 11.3.6.1)."""
-_MOST_CHUNKS = 1000
-"""Before the pixels of a PNG; programs write some ten."""
+_PNG_BITS = {"1": 1, "L;2": 2, "L;4": 4, "L": 8, "I;16B": 16}
+"""Of a grey number in a PNG, by Pillow's name of how it is stored."""
+_COLOURS = "RGB", "RGBA"
+"""The same of numbers of 8 bits of red, green and blue."""
 _BITS, _COMPRESSION, _PHOTOMETRIC, _SAMPLES = 258, 259, 262, 339
 """Tags of TIFF 6.0: BitsPerSample, Compression, PhotometricInterpretation, SampleFormat."""
 _BIG = 43
@@ -179,18 +173,22 @@ def _check_size(path: Path, wanted: Wanted, rows: int, columns: int) -> None:
 
 
 def _png(path: Path, wanted: Wanted) -> _Header:
-    with open(path, "rb") as file:
-        head = file.read(_HEAD)
-        if len(head) < _HEAD or not head.startswith(_SIGNATURE):
-            raise ValueError("it does not begin as a PNG")
-        if _ANIMATED in _kinds_of_chunks(file):
-            raise wanted.refusal(path, f"is an animated PNG of several; give each {wanted.what} a file of its own")
-    columns, rows = (int.from_bytes(head[place : place + 4], "big") for place in (16, 20))
-    bits, colour = head[24], head[25]
-    if not (colour == _GREY and bits in wanted.bits) and not (wanted.colour and colour in _COLOURS and bits == 8):
-        raise wanted.refusal(
-            path, f"is no {_allowed_kinds('PNG', (bits for bits in wanted.bits if bits in _PNG_BITS), wanted)}"
-        )
+    from PIL.PngImagePlugin import PngImageFile
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            with PngImageFile(path) as picture:  # not by Image.open, for which the size that it states may be too large
+                stored, (columns, rows) = str(picture.tile[0][3]) if picture.tile else "", picture.size
+                animated = picture.custom_mimetype is not None
+        except SyntaxError:
+            raise ValueError("it does not begin as a PNG") from None
+    if animated:
+        raise wanted.refusal(path, f"is an animated PNG of several; give each {wanted.what} a file of its own")
+    bits = _PNG_BITS.get(stored, 0)
+    if bits not in wanted.bits and not (wanted.colour and stored in _COLOURS):
+        known = (count for count in wanted.bits if count in _PNG_BITS.values())
+        raise wanted.refusal(path, f"is no {_allowed_kinds('PNG', known, wanted)}")
 
     def read() -> Iterator[Numbers]:
         """Its one page."""
@@ -203,19 +201,6 @@ def _png(path: Path, wanted: Wanted) -> _Header:
             yield values
 
     return _Header(1, (rows, columns), read)
-
-
-def _kinds_of_chunks(file: BinaryIO) -> set[bytes]:
-    """Kinds of the chunks of a PNG ``file`` that stand before its pixels."""
-    kinds: set[bytes] = set()
-    file.seek(len(_SIGNATURE))
-    for _ in range(_MOST_CHUNKS):
-        length, kind = int.from_bytes(file.read(4), "big"), file.read(4)
-        if kind in (b"IDAT", b""):
-            return kinds
-        kinds.add(kind)
-        file.seek(length + 4, os.SEEK_CUR)
-    raise ValueError(f"it has over {_MOST_CHUNKS} chunks before its pixels")
 
 
 def _check_upright(path: Path, picture: Image, wanted: Wanted) -> None:
@@ -395,7 +380,8 @@ def _one_line_refusals(path: Path, wanted: Wanted) -> Iterator[None]:
         raise
     # Readers of damaged files raise whatever they stumble over.
     except Exception as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
         raise wanted.refusal(
-            path, f"cannot be read: damaged, or of another kind than its name says ({reason}); write or copy it again"
+            path,
+            f"cannot be read: damaged, or of another kind than its name says ({reason_of(error)}); "
+            "write or copy it again",
         ) from error

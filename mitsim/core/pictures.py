@@ -18,10 +18,17 @@ _SHOWN_HEIGHT = 144
 """Height of a notebook's pictures [screen pixels]: four stand side by side."""
 
 
-def png(values: npt.ArrayLike, largest: int | None = None) -> bytes:
-    """A grey PNG of reflectances ``values`` (rows, columns), shown as :func:`lightness`; ``largest`` as for
-    :func:`grey_png`."""
-    return grey_png(lightness(values), largest)
+def png(values: npt.ArrayLike, largest: int | None = None, smallest: int = 1) -> bytes:
+    """A PNG of reflectances, or of linear sRGB, shown as :func:`lightness`.
+
+    Parameters
+    ----------
+    values
+        (rows, columns), or (rows, columns, 3) in colour.
+    largest, smallest
+        as for :func:`grey_png`.
+    """
+    return grey_png(lightness(values), largest, smallest)
 
 
 def lightness(reflectance: npt.ArrayLike) -> npt.NDArray[np.float64]:
@@ -31,25 +38,21 @@ def lightness(reflectance: npt.ArrayLike) -> npt.NDArray[np.float64]:
 
 
 def grey_png(values: npt.ArrayLike, largest: int | None = None, smallest: int = 1) -> bytes:
-    """A grey PNG of ``values`` as they are.
+    """A PNG of ``values`` as they are.
 
     Parameters
     ----------
     values
-        (rows, columns), 0 black, 1 white.
+        (rows, columns), or (rows, columns, 3) in colour, 0 black, 1 white.
     largest
         pixels a side beyond which every picture pixel is the mean of 2 x 2 (3 x 3, ...).
     smallest
         pixels a side that there are at least: each value then takes a square of them.
     """
-    return _png(np.asarray(values, dtype=np.float64), largest, smallest)
-
-
-def _png(shown: npt.NDArray[np.float64], largest: int | None, smallest: int) -> bytes:
-    """A PNG of values ``shown`` (rows, columns), or (rows, columns, 3) in colour, 0 black and 1 white."""
     # Imported here: most work shows nothing.
     from PIL import Image
 
+    shown = np.asarray(values, dtype=np.float64)
     copies = -(-smallest // max(shown.shape[:2]))
     levels = np.rint(255 * np.clip(shown.repeat(copies, axis=0).repeat(copies, axis=1), 0, 1))
     picture = Image.fromarray(levels.astype(np.uint8))
@@ -60,17 +63,7 @@ def _png(shown: npt.NDArray[np.float64], largest: int | None, smallest: int) -> 
     return buffer.getvalue()
 
 
-def colour_png(rgb: npt.ArrayLike, largest: int | None = None, smallest: int = 1) -> bytes:
-    """A PNG in colour of linear sRGB.
-
-    Parameters
-    ----------
-    rgb
-        (rows, columns, 3), cut to 0..1 and encoded for a screen.
-    largest, smallest
-        as for :func:`grey_png`.
-    """
-    return _png(lightness(rgb), largest, smallest)
+colour_png = png  # until all call sites have its name
 
 
 def data_uri(picture: bytes) -> str:
@@ -104,10 +97,7 @@ def card(title: str, pictures: Mapping[str, npt.ArrayLike], facts: Iterable[str]
     facts
         lines below them.
     """
-    sources = {
-        caption: data_uri((colour_png if np.ndim(values) == 3 else png)(values, _LARGEST_INLINE))
-        for caption, values in pictures.items()
-    }
+    sources = {caption: data_uri(png(values, _LARGEST_INLINE)) for caption, values in pictures.items()}
     figures = "".join(
         '<figure style="display:inline-block;vertical-align:top;margin:4px 12px 4px 0">'
         f'<img style="height:{_SHOWN_HEIGHT}px;image-rendering:pixelated" src="{source}">'

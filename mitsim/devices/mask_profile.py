@@ -44,7 +44,7 @@ _DUST = {"dust_per_mm2", "dust_radius_um", "dust_opacity", "dust_seed"}
 _QUARTER = 90
 """Degrees of a turn that takes features to features."""
 _MOST_ETCHED = LARGEST // 2
-"""Features a side of a mask that is etch: each has two lines then."""
+"""Features a side of a mask that is etched: each has two lines then."""
 _MOST_GROWTH = 8
 """Features by which openings grow or shrink at most: beyond it nothing of a code is left."""
 

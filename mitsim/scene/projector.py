@@ -27,8 +27,8 @@ takes 67 MB for a sensor of 512 pixels and one layer. The paper's geometry has 1
 
 
 @dataclass(frozen=True)
-class ProjectorGrid:
-    """Window of n x n projector pixels in a canvas, and where it lands on the camera's aligned plane.
+class Window:
+    """Window of n x n projector pixels in a canvas.
 
     Attributes
     ----------
@@ -38,6 +38,20 @@ class ProjectorGrid:
         canvas texel of the window's pixel (0, 0); between texels where a picture has drifted.
     canvas
         (rows, columns) of the whole texture.
+    """
+
+    n: int
+    first_row: float
+    first_column: float
+    canvas: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class ProjectorGrid(Window):
+    """A projector's window, and where it lands on the camera's aligned plane.
+
+    Attributes
+    ----------
     row_tan, column_tan
         (first edge, last edge) of the window as tan-angles y/z and x/z from the camera, index coordinates, on the plane
         at the camera's scene distance (bounding box when the projector casts a keystone).
@@ -45,10 +59,6 @@ class ProjectorGrid:
         largest departure of the window's corners from that box, in projector pixels; 0 for a shifted lens.
     """
 
-    n: int
-    first_row: float
-    first_column: float
-    canvas: tuple[int, int]
     row_tan: tuple[float, float]
     column_tan: tuple[float, float]
     keystone: float
@@ -89,7 +99,8 @@ def locate_projector(where: str, projector: mi.Emitter, camera: mi.Sensor) -> Pr
             "paint the window white"
         )
     z = camera.geometry.scene_distance
-    corners = _window_corners(where, projector, camera, lit.shape, (int(rows[0]), int(columns[0])), width, z)
+    window = Window(width, int(rows[0]), int(columns[0]), (int(lit.shape[0]), int(lit.shape[1])))
+    corners = _window_corners(where, projector, camera, window, z)
     low, high = corners.min(axis=0), corners.max(axis=0)
     span = float((high - low).min())
     across = 2 * camera.geometry.tan_half_fov * width / span if span > 0 else np.inf
@@ -101,10 +112,7 @@ def locate_projector(where: str, projector: mi.Emitter, camera: mi.Sensor) -> Pr
     ideal = np.array([[low[0], low[1]], [low[0], high[1]], [high[0], low[1]], [high[0], high[1]]])
     keystone = float(np.abs((corners - ideal) / (high - low)).max()) * width
     return ProjectorGrid(
-        n=width,
-        first_row=int(rows[0]),
-        first_column=int(columns[0]),
-        canvas=(int(lit.shape[0]), int(lit.shape[1])),
+        **vars(window),
         row_tan=(float(low[0]), float(high[0])),
         column_tan=(float(low[1]), float(high[1])),
         keystone=keystone if keystone > _NO_KEYSTONE else 0.0,
@@ -130,8 +138,7 @@ def window_at(
     MitsimError
         when the projector does not light the plane.
     """
-    first = grid.first_row, grid.first_column
-    corners = _window_corners(where, projector, camera, grid.canvas, first, grid.n, depth)
+    corners = _window_corners(where, projector, camera, grid, depth)
     (top, left), (bottom, right) = corners.min(axis=0), corners.max(axis=0)
     return (float(top), float(bottom)), (float(left), float(right))
 
@@ -152,8 +159,7 @@ def straightening(
     MitsimError
         when the projector does not light the plane.
     """
-    first = grid.first_row, grid.first_column
-    corners = _window_corners(where, projector, camera, grid.canvas, first, grid.n, depth)
+    corners = _window_corners(where, projector, camera, grid, depth)
     low, high = corners.min(axis=0), corners.max(axis=0)
     return _homography(corners, np.where([[0, 0], [0, 1], [1, 0], [1, 1]], high, low))
 
@@ -162,9 +168,7 @@ def _window_corners(
     where: str,
     projector: mi.Emitter,
     camera: mi.Sensor,
-    canvas: tuple[int, ...],
-    first: tuple[float, float],
-    n: int,
+    window: Window,
     z: float,
 ) -> FloatArray:
     """(4, 2) tan-angles (row, column) of the window's corners on the plane at ``z``, in index coordinates.
@@ -179,8 +183,8 @@ def _window_corners(
     uv = np.array(sample.uv, dtype=np.float64).T
     uv = uv.T if uv.shape[0] == 2 and uv.shape[1] == len(probes) else uv
     homography = _homography(uv, probes) if np.isfinite(uv).all() else np.full((3, 3), np.nan)
-    rows = (first[0] + n * np.array([0, 0, 1, 1])) / canvas[0]
-    columns = (first[1] + n * np.array([0, 1, 0, 1])) / canvas[1]
+    rows = (window.first_row + window.n * np.array([0, 0, 1, 1])) / window.canvas[0]
+    columns = (window.first_column + window.n * np.array([0, 1, 0, 1])) / window.canvas[1]
     mapped = np.stack([columns, rows, np.ones(4)], axis=1) @ homography.T
     points = mapped[:, :2] / mapped[:, 2:]
     if not np.isfinite(points).all():

@@ -120,12 +120,12 @@ def test_fringes_of_far_edges_do_not_add_up() -> None:
 
 
 def test_sharpened_cells_are_read_half_as_blurred() -> None:
-    """Means of x^2 over unit cells are a twelfth above it, sharpen ones a twelfth below: reading them in cells adds
+    """Means of x^2 over unit cells are a twelfth above it, sharpened ones a twelfth below: reading them in cells adds
     one. (Planted: one axis alone; the sign.)"""
     x = np.arange(-5, 6.0)
     means = np.add.outer(x**2, 2 * x**2) + 3 / 12
     inner = slice(1, -1)
-    got = rasters.sharpened(means)[inner, inner]
+    got = rasters.sharpen(means)[inner, inner]
     np.testing.assert_allclose(got, (np.add.outer(x**2, 2 * x**2) - 3 / 12)[inner, inner], rtol=0, atol=1e-12)
 
 
@@ -225,7 +225,7 @@ def judged(camera: CameraGeometry, at: Directions, light: np.ndarray) -> tuple[f
     ],
 )
 def test_what_a_raster_leaves_is_told_before(mask: dict[str, object]) -> None:
-    """Of dots, from 64 x 64 of 96 x 96 pixels; sums and FFT agree to it. (Planted: not sharpen; etched lines
+    """Of dots, from 64 x 64 of 96 x 96 pixels; sums and FFT agree to it. (Planted: not sharpened; etched lines
     taken for even ones.)"""
     camera = MaskProfile.model_validate({"feature_mm": 0.06, **mask}).worn(CameraGeometry(pixels=96), Path())
     light = np.zeros((40, 40))

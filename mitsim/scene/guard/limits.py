@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Container, Iterable
 from dataclasses import dataclass
 
@@ -10,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.errors import cut
+from mitsim.core.errors import cut, near_name
 from mitsim.devices.camera import CameraGeometry
 from mitsim.scene.guard.headers import FARTHEST
 from mitsim.scene.guard.outline import Tag
@@ -181,9 +180,9 @@ def check_plugin(tag: Tag, plugin: str) -> None:
     """MitsimError when the object at ``tag`` cannot be a ``plugin``."""
     allowed = PLUGINS.get(tag.name, "scene").split()
     if plugin not in allowed or (tag.name == "scene" and "version" not in tag.attributes):
-        near = difflib.get_close_matches(cut(plugin), allowed, 1)
-        hint = f"did you mean {near[0]}? " if near else ""
-        raise tag.refusal("type", repr(plugin), f"{hint}allowed are {', '.join(sorted(allowed))}")
+        raise tag.refusal(
+            "type", repr(plugin), f"{near_name(cut(plugin), allowed)}allowed are {', '.join(sorted(allowed))}"
+        )
 
 
 def check_variant(tag: Tag, plugin: str, given: Container[str], variant: str) -> None:
