@@ -96,9 +96,9 @@ def calibrate_frames(
         session, doubts = _with_camera(session, camera)
     _check_sizes(session)
     if output is None:
-        return _calibrated(session, job, doubts)
+        return _calibrate(session, job, doubts)
     with output_folder(output) as place:
-        factors = _calibrated(session, job, doubts)
+        factors = _calibrate(session, job, doubts)
         factors.write(place)
     return factors
 
@@ -138,7 +138,7 @@ def chosen_responses(session: SessionFrames, chosen: Iterable[tuple[Side, int]])
         yield rate, float(np.sqrt(variance))
 
 
-def _calibrated(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -> Factors:
+def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -> Factors:
     listed = session.listed
     readings = _Readings(session)
     estimate, noise, found = _estimate(readings, job)
@@ -221,15 +221,8 @@ def _check_sizes(session: SessionFrames) -> None:
 
 
 def _check_levels(session: SessionFrames, uniform: FloatArray) -> None:
-    """MitsimError where frames have no light by the levels that the list states.
-
-    Parameters
-    ----------
-    session
-        whose list it is.
-    uniform
-        (rows, columns) the brighter of both uniform responses [electrons/s].
-    """
+    """MitsimError where frames have no light by the levels that the list of a ``session`` states, ``uniform`` (rows,
+    columns) being the brighter of both uniform responses [electrons/s]."""
     first = session.repeated((SIDES[0], 0, 1 if session.pairs else UNIFORM))[0]
     values, digital = read_image(session.folder / first.file, session.wanted), session.listed.digital
     if digital.rate(values).max() <= 0 or not uniform.any():
@@ -323,16 +316,10 @@ class _Readings:
 
     def response(self, side: Side, index: int) -> tuple[FloatArray, float, FloatArray | None]:
         """Response (rows, columns) to a +-1 pattern [electrons/s], its mean noise variance, and the sum of its two
-        frames (rows, columns); None where it is not their difference.
-
-        Parameters
-        ----------
-        side, index
-            of the pattern.
-        """
-        positive = self._merged((side, index, 1))
+        frames (rows, columns); None where it is not their difference."""
+        positive = self._merge((side, index, 1))
         if self.session.pairs:
-            negative = self._merged((side, index, -1))
+            negative = self._merge((side, index, -1))
             light = positive.rate + negative.rate
             return positive.rate - negative.rate, positive.ladder.variance(light, 2) / positive.shots, light
         uniform = self._uniform[side]
@@ -352,7 +339,7 @@ class _Readings:
 
     @cached_property
     def _uniform(self) -> dict[Side, _Reading]:
-        return {side: self._merged((side, 0, UNIFORM)) for side in SIDES}
+        return {side: self._merge((side, 0, UNIFORM)) for side in SIDES}
 
     @cached_property
     def _ladders(self) -> dict[Side, Ladder] | None:
@@ -413,7 +400,7 @@ class _Readings:
                     return True
         return False
 
-    def _merged(self, half: Half) -> _Reading:
+    def _merge(self, half: Half) -> _Reading:
         """What shows a ``half`` of a pattern, of all exposures and repeats."""
         if self._ladders is None:
             return self._read(self.session.repeated(half), True)
@@ -484,17 +471,8 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Ch
 def _sums(
     readings: _Readings, count: int, job: Job, uniform: Side | None = None
 ) -> tuple[tuple[StripeSums, StripeSums], list[float]]:
-    """Sums over all responses, and the noise variance of each.
-
-    Parameters
-    ----------
-    readings, job
-        as for :func:`_estimate`.
-    count
-        patterns of a side.
-    uniform
-        the side whose first response is the uniform one; None: the mean of both.
-    """
+    """Sums over all responses, and the noise variance of each; ``uniform`` is the side whose first response is the
+    uniform one, None: the mean of both."""
     with job.clock.stage("frames"):
         first = [readings.response(side, 0) for side in SIDES]
     (left, *_), (right, *_) = first
@@ -526,7 +504,7 @@ Chosen = npt.NDArray[np.bool_] | bool
 """Pixels (rows, columns) that are chosen, or all or none."""
 _ROOM = 5.0
 """Deviations of its noise that a uniform frame's pixel must stay below saturation: one of 3 million goes beyond."""
-_ladder_LIT = 0.5
+_STRIPES_LIGHT = 0.5
 """Light of stripes over that of the uniform frame, whose noise decides on the weights."""
 
 
@@ -566,7 +544,7 @@ class Ladder:
         usable = np.ones((len(digitals), *uniform.shape), dtype=bool)
         variance = np.empty(usable.shape)
         for rung, digital in enumerate(digitals):
-            variance[rung] = digital.variance(_ladder_LIT * light)
+            variance[rung] = digital.variance(_STRIPES_LIGHT * light)
             if rung and digital.saturation_dn is not None:
                 unit = digital.gain_dn_per_e * digital.exposure_s
                 brightest = uniform + digital.dark_current_e_per_s + _ROOM * np.sqrt(error + digital.variance(light))

@@ -103,7 +103,7 @@ class Signatures:
 
     ``rows``, ``columns``, ``everywhere``: explained by light of any scene row, of any column, of any pixel.
     ``gloss``: explained by factors that change over the sensor. ``common``: the same in every shot. ``saturated``: part
-    of the readings at the end of their range. ``mask``: foretold by what the calibration knows that its factors lack.
+    of the readings at the end of their range. ``mask``: predicted by what the calibration knows that its factors lack.
     ``detail``: light beside the centres of the lit pixels, but not because of depth; NaN where pixels of patterns
     overlap.
     """
@@ -127,14 +127,14 @@ class Evidence:
         of the model.
     patterns
         P_L (n, K) and P_R (n', K').
-    foretold
+    predicted
         energy that terms of the camera which the factors lack leave; None: not known.
     """
 
     def __init__(
-        self, factors: Factors, patterns: tuple[FloatArray, FloatArray], foretold: float | None = None
+        self, factors: Factors, patterns: tuple[FloatArray, FloatArray], predicted: float | None = None
     ) -> None:
-        self.foretold = foretold
+        self.predicted = predicted
         self._factors = factors.sides
         noise = factors.manifest.noise
         self.of_factors = noise.unexplained if noise else 0.0
@@ -190,11 +190,11 @@ class Evidence:
         left = np.zeros(5)
         for each in self._lit_frames:
             own = each.ranges
-            glossy = [orthonormal(_modulated(side)) for side in each.factors]
+            glossy = [orthonormal(_modulate(side)) for side in each.factors]
             ranges = own, (everything[0], own[1]), (own[0], everything[1]), everything, glossy
             left += [each.beyond(*pair) for pair in ranges]
         rows, columns, everywhere, gloss = 1 - left[1:] / left[0] if left[0] > 0 else np.full(4, np.nan)
-        mask = self.foretold / unexplained if self.foretold is not None and unexplained > 0 else np.nan
+        mask = self.predicted / unexplained if self.predicted is not None and unexplained > 0 else np.nan
         told = rows, columns, everywhere, gloss, common, saturated, mask, self.print_part()
         return Signatures(*(float(value) for value in told))
 
@@ -264,7 +264,7 @@ def likely_cause(signatures: Signatures, unexplained: float, of_factors: float =
     return Cause.GLOSS if signatures.gloss > _MOST else Cause.UNKNOWN
 
 
-def _modulated(factor: FloatArray) -> FloatArray:
+def _modulate(factor: FloatArray) -> FloatArray:
     """A factor's columns (m, c), and these times powers of the place along the sensor: (m, c (degree + 1))."""
     place = np.linspace(-1, 1, len(factor))[:, None]
     return np.concatenate([factor * place**power for power in range(_DEGREE + 1)], axis=1)

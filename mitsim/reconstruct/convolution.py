@@ -53,7 +53,7 @@ Watch = Callable[[FloatArray], bool]
 """Looks at an image (n, n) under way, and says whether it is good enough."""
 
 
-def _unwatched(image: FloatArray) -> bool:
+def _never_enough(image: FloatArray) -> bool:
     return False
 
 
@@ -173,7 +173,7 @@ def solve_iteratively(
     lam: float,
     tolerance: float = 1e-6,
     iterations: int = 500,
-    watch: Watch = _unwatched,
+    watch: Watch = _never_enough,
 ) -> Solution:
     """Tikhonov image of any ``family`` by conjugate gradients.
 
@@ -209,16 +209,17 @@ def conjugate_gradients(
     inverse: Operator | None = None,
     tolerance: float = 1e-6,
     most: int = 500,
-    watch: Watch = _unwatched,
+    watch: Watch = _never_enough,
+    start: FloatArray | None = None,
 ) -> Solution:
-    """Solve (``normal`` + lambda) X = ``target``, from X = 0 (Hestenes and Stiefel 1952).
+    """Solve (``normal`` + lambda) X = ``target`` (Hestenes and Stiefel 1952).
 
     Parameters
     ----------
     normal
         a symmetric operator without negative eigenvalues.
     target
-        (n, n) right-hand side.
+        right-hand side, of the shape of X.
     lam
         lambda >= 0.
     inverse
@@ -227,13 +228,16 @@ def conjugate_gradients(
         relative residual at which it ends, and the most steps.
     watch
         called with the image after each step; where it says True, that was the last.
+    start
+        X to begin with; None: 0.
     """
     lam = check_lambda(lam)
-    image, left = np.zeros_like(target), target.copy()
-    size = float(np.linalg.norm(target))
+    image = np.zeros_like(target) if start is None else start
+    left = target.copy() if start is None else target - normal(start) - lam * start
+    size = float(np.linalg.norm(target)) or 1.0
     turned = inverse(left) if inverse else left
     direction, power, spent = turned, float(np.vdot(left, turned)), 0
-    residual = 1.0 if size > 0 else 0.0
+    residual = float(np.linalg.norm(left)) / size
     while residual > tolerance and spent < most:
         spent += 1
         moved = normal(direction) + lam * direction
@@ -293,13 +297,13 @@ class Classes:
     def projected(self, frames: Iterable[FloatArray]) -> FloatArray:
         """(n, n) sum of all ``frames`` weighted by the light of each scene pixel: `ConvolutionalCamera.projected`, each
         frame taken at its own pixels only."""
-        return self._interleaved(spectrum for spectrum in self._folded(frames))
+        return self._interleave(spectrum for spectrum in self._fold_frames(frames))
 
     def divided(self, frames: Iterable[FloatArray], lam: float) -> FloatArray:
         """(n, n) image by one division, of ``frames`` at ``lam``: the Tikhonov image of a plane without a dark
         surround, exact for the whole light."""
         weight = 1 / (self._power + check_lambda(lam))
-        return self._interleaved(spectrum * weight for spectrum in self._folded(frames))
+        return self._interleave(spectrum * weight for spectrum in self._fold_frames(frames))
 
     def factorise(self, lam: float) -> FactorisedClasses:
         """All classes at ``lam``, ready for any number of scenes.
@@ -332,7 +336,7 @@ class Classes:
         if not self.camera.cropped:
             classes = fft.rfft2(self._split(image), self._section[0])
             whole = fft.irfft2(classes * self._section[1], self._section[0])
-            return self._joined(whole[..., : self._side, : self._side])
+            return self._join(whole[..., : self._side, : self._side])
         light = np.zeros_like(image)
         total = np.zeros_like(image)
         for a, b in product(range(self.k), repeat=2):
@@ -349,7 +353,7 @@ class Classes:
 
         def divide(image: FloatArray) -> FloatArray:
             spectra = fft.rfft2(self._split(image), self._grid) * weight
-            return self._joined(fft.irfft2(spectra, self._grid)[..., : self._side, : self._side])
+            return self._join(fft.irfft2(spectra, self._grid)[..., : self._side, : self._side])
 
         return divide
 
@@ -392,7 +396,7 @@ class Classes:
         kernel = np.where(np.outer(near, near), correlation[np.ix_(rows, columns)], 0.0)
         return (size, size), np.asarray(fft.rfft2(kernel))
 
-    def _folded(self, frames: Iterable[FloatArray]) -> Iterator[npt.NDArray[np.complex128]]:
+    def _fold_frames(self, frames: Iterable[FloatArray]) -> Iterator[npt.NDArray[np.complex128]]:
         """Spectrum of each frame's correlation with h at the pixels of its class."""
         weight = self._spectrum.conj()
         (row, column), (rows, columns) = self.camera.origin, self.camera.shape
@@ -403,12 +407,12 @@ class Classes:
             placed = np.roll(placed, (row - a, column - b), axis=(0, 1))
             yield self._fold(fft.fft2(placed) * weight)
 
-    def _interleaved(self, spectra: Iterable[npt.NDArray[np.complex128]]) -> FloatArray:
+    def _interleave(self, spectra: Iterable[npt.NDArray[np.complex128]]) -> FloatArray:
         """Image (n, n) of the spectra of its classes."""
         classes = np.empty((self.k**2, self._side, self._side))
         for place, spectrum in zip(classes, spectra, strict=True):
             place[:] = fft.ifft2(spectrum).real[: self._side, : self._side]
-        return self._joined(classes.reshape(self.k, self.k, self._side, self._side))
+        return self._join(classes.reshape(self.k, self.k, self._side, self._side))
 
     def _split(self, image: FloatArray) -> FloatArray:
         """(k, k, side, side) classes of an image, zero beyond its edge."""
@@ -416,7 +420,7 @@ class Classes:
         padded = np.pad(image, ((0, room), (0, room)))
         return padded.reshape(self._side, self.k, self._side, self.k).transpose(1, 3, 0, 2)
 
-    def _joined(self, classes: FloatArray) -> FloatArray:
+    def _join(self, classes: FloatArray) -> FloatArray:
         """Image (n, n) of its classes."""
         size = self._side * self.k
         return np.ascontiguousarray(classes.transpose(2, 0, 3, 1).reshape(size, size)[: self.camera.n, : self.camera.n])
@@ -432,14 +436,14 @@ class Classes:
             below, right = step
             i = np.arange(below, side)[:, None]
             j = np.arange(max(right, 0), side + min(right, 0))[None, :]
-            shared = self._split(self._shared(below * k, right * k))
+            shared = self._split(self._shared_light(below * k, right * k))
             grams[:, :, i, j, i - below, j - right] = shared[:, :, i, j]
 
         steps = product(range(side), range(1 - side, side))
         in_threads(fill, [(below, right) for below, right in steps if below or right >= 0])
         return grams
 
-    def _shared(self, below: int, right: int) -> FloatArray:
+    def _shared_light(self, below: int, right: int) -> FloatArray:
         """(n, n) sum over the sensor of each pixel's light times that of the pixel so far above and to the left."""
         psf, (rows, columns) = self.camera.psf, self.camera.psf.shape
         first, last = max(-right, 0), columns - max(right, 0)
@@ -488,4 +492,4 @@ class FactorisedClasses:
                 image[place].shape
             )
         status = Status(Verdict.SOLVED, "Solved", "", f"{classes.k**2} classes of {factor.shape[0]} pixels factorised.")
-        return Solution(classes._joined(image), self.lam, 0.0, status)
+        return Solution(classes._join(image), self.lam, 0.0, status)

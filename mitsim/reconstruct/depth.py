@@ -295,13 +295,13 @@ class _Search:
         noise, stated = self._all.noise, self._factor_noise
         if not (noise.stated and stated):
             return 0.0
-        prepared, sums = self._summed(shift)
+        prepared, sums = self._sum_frames(shift)
         image = prepared.solve(sums, _LAMBDA * prepared.problem(sums).scale).image
         expected = float(noise.variance.mean()) * (self._all.data - self._unknowns) + self._all.part * noise.rendering
         of_factors = self._all.smoothing(shift) * factor_energy(prepared, self._all.patterns, stated, image)
         return float(max(least - expected - of_factors, 0.0))
 
-    def _summed(self, shift: float) -> tuple[Prepared, Accumulator]:
+    def _sum_frames(self, shift: float) -> tuple[Prepared, Accumulator]:
         prepared = prepare(self._all.side(0, shift), self._all.side(1, shift), *self._all.patterns)
         sums = prepared.accumulator()
         for each in self._all.frames:
@@ -408,15 +408,15 @@ class CommonBasis:
 
     def side(self, axis: int, shift: float | FloatArray) -> FloatArray:
         """(r, n) factor of an ``axis`` on its basis, 1/z changed by ``shift`` [1/mm] for all pixels or for each."""
-        return self._bases[axis].seen(self._own(self._moved(axis, shift)))
+        return self._bases[axis].seen(self._own(self._columns_at(axis, shift)))
 
     def widened(self, axis: int, pixels: int) -> FloatArray:
         """(r, ``pixels`` + n + ``pixels``) columns of an ``axis`` on its basis, with those that light beside the window
         has: of the outermost pixels, moved there by their depth."""
         edges = self.edges(axis)
-        before, beyond = (self._moved(axis, offset / edges) for offset in (-pixels, pixels))
+        before, beyond = (self._columns_at(axis, offset / edges) for offset in (-pixels, pixels))
         count = before.shape[1]
-        columns = np.hstack([before[:, :pixels], self._moved(axis, 0.0), beyond[:, count - pixels :]])
+        columns = np.hstack([before[:, :pixels], self._columns_at(axis, 0.0), beyond[:, count - pixels :]])
         return self._bases[axis].seen(self._own(columns))
 
     def edges(self, axis: int) -> FloatArray:
@@ -431,7 +431,7 @@ class CommonBasis:
         """Variance of noise in the factors at 1/z changed by ``shift`` [1/mm], over that of the calibrated ones."""
         return float(np.mean([side.noise(shift) ** 2 for side in self._sides]))
 
-    def _moved(self, axis: int, shift: float | FloatArray) -> FloatArray:
+    def _columns_at(self, axis: int, shift: float | FloatArray) -> FloatArray:
         return self._sides[axis].at(shift)[0][self._parts[axis]]
 
     def _own(self, columns: FloatArray) -> FloatArray:

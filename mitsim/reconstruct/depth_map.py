@@ -186,11 +186,12 @@ class _Search:
     def __init__(self, shots: Capture, factors: Factors, depth_range: tuple[float, float] | None) -> None:
         # Of a flat scene far from the calibrated depth dots of any period tell the rest.
         self._ends = shifts_searched(factors, depth_range)
-        inverse = 1 / parallax_of(factors).depth_mm
-        self._plane = best_depth(shots, factors, (1 / (inverse + self._ends[1]), 1 / (inverse + self._ends[0])))
+        self._inverse = 1 / parallax_of(factors).depth_mm
+        self._range_mm = 1 / (self._inverse + self._ends[1]), 1 / (self._inverse + self._ends[0])
+        self._plane = best_depth(shots, factors, self._range_mm)
         self._middle = (self._ends[0] + self._ends[1]) / 2
         # A start, so in doubt any of several depths will do; but an end of the range is the depth of nothing.
-        self._start = self._middle if self._plane.at_end else 1 / self._plane.mm - inverse
+        self._start = self._middle if self._plane.at_end else 1 / self._plane.mm - self._inverse
         self._arrivals = Arrivals(shots, factors, self._ends, max(abs(self._start), abs(self._middle)))
         self._all, self.width, self.pixel = self._arrivals.depths, self._arrivals.width, self._arrivals.pixel
         self._pixels = PixelDepths(self._all, self._arrivals.reach, STEP * self.pixel)
@@ -207,29 +208,27 @@ class _Search:
         start = min(tried, key=lambda start: tried[start])
         rivals = [other for other, left_over in tried.items() if left_over < _RIVAL * tried[start]]
         shift, confidence = self._arrivals.most(*start)
-        shift = self._sharpened(self._refined(shift, start[1] * self.pixel, tried[start]))
+        shift = self._sharpen(self._refine(shift, start[1] * self.pixel, tried[start]))
         doubt = self._doubt(shift, confidence, rivals)
         if doubt:
             shift, confidence = np.zeros(shift.shape), np.zeros(shift.shape)
         solved = self._pixels.solve(shift, None if lam == "auto" else lam)
         solved = self._pixels.final(shift, solved) if lam == "auto" else solved
-        z = 1 / (1 / self._all.parallax.depth_mm + shift)
-        known = self._all.energy, self._all.data, self._all.part
-        inverse = 1 / self._all.parallax.depth_mm
-        range_mm = 1 / (inverse + self._ends[1]), 1 / (inverse + self._ends[0])
-        smoothing = self._all.smoothing(float(np.median(shift)))
-        return DepthMap(solved.image, z, confidence, solved.lam, solved.left_over, *known, doubt, range_mm, smoothing)
+        return DepthMap(
+            solved.image,
+            1 / (self._inverse + shift),
+            confidence,
+            solved.lam,
+            solved.left_over,
+            *(self._all.energy, self._all.data, self._all.part),
+            doubt,
+            self._range_mm,
+            self._all.smoothing(float(np.median(shift))),
+        )
 
     def _doubt(self, shift: FloatArray, confidence: FloatArray, rivals: Sequence[tuple[float, float]]) -> str:
-        """Why depths are not to be trusted, or nothing.
-
-        Parameters
-        ----------
-        shift, confidence
-            changes of 1/z by pixel, and how sure each is.
-        rivals
-            starts (look, offset) that explain nearly as much as that of these.
-        """
+        """Why depths are not to be trusted, or nothing; ``rivals`` are starts (look, offset) that explain nearly as
+        much as that of these."""
         told = confidence >= _TOLD
         found = self._pixels.solve(shift)
         variance, unknowns = self._pixels.variance(found), 2 * shift.size
@@ -261,7 +260,7 @@ class _Search:
     def _left_over(self, shift: FloatArray) -> float:
         return self._pixels.solve(shift).left_over
 
-    def _refined(self, shift: FloatArray, offset: float, left_over: float) -> FloatArray:
+    def _refine(self, shift: FloatArray, offset: float, left_over: float) -> FloatArray:
         """The ``shift`` after steps that leave less and less."""
         for _ in range(_STEPS):
             image, moved = self._pixels.step(shift, self.pixel)
@@ -276,7 +275,7 @@ class _Search:
             shift, left_over = ahead, now
         return shift
 
-    def _sharpened(self, shift: FloatArray) -> FloatArray:
+    def _sharpen(self, shift: FloatArray) -> FloatArray:
         """The ``shift`` with edges where they are, as long as that leaves less and less."""
         solved = self._pixels.solve(shift)
         for _ in range(_ROUNDS):
@@ -513,7 +512,7 @@ class Arrivals:
         """
         count = 2 * int(np.ceil(self.width / self.pixel / STEP / 2)) + 1
         shifts = np.linspace(-self.width / 2, self.width / 2, count) + offset * self.pixel
-        light = np.stack([self._arriving(self._seen[lam], shift) for shift in shifts])
+        light = np.stack([self._arriving(self._class_images[lam], shift) for shift in shifts])
         light = np.maximum(gaussian_filter(light, (0, _POOLED, _POOLED)), 0.0)
         place, step = light.argmax(axis=0), shifts[1] - shifts[0]
         near = round(_NEIGHBOURHOOD * self.pixel / step)
@@ -546,7 +545,7 @@ class Arrivals:
         return total
 
     @cached_property
-    def _seen(self) -> dict[float, FloatArray]:
+    def _class_images(self) -> dict[float, FloatArray]:
         """By lambda, (K, K', rows, columns) images of each class of dots along axes with parallax, all pixels of these
         axes, and so many beside the window, taken for lit; K = 1 along an axis without."""
         sides, patterns = [], []

@@ -193,11 +193,14 @@ def print_part(frames: Sequence[LitFrame]) -> float:
         return 0.0
     depths = [each.of_depths() for each in frames]
     whole = np.tile(np.eye(2), _BLOCKS**2)
-    of_depth = max(_foretold(depths), _foretold([(whole @ matrix @ whole.T, whole @ side) for matrix, side in depths]))
+    of_depth = max(
+        _predicted_energy(depths),
+        _predicted_energy([(whole @ matrix @ whole.T, whole @ side) for matrix, side in depths]),
+    )
     return float(np.clip(1 - (max(left_over, 0.0) + max(of_depth, 0.0)) / own, 0.0, 1.0))
 
 
-def _foretold(problems: Sequence[tuple[FloatArray, FloatArray]]) -> float:
+def _predicted_energy(problems: Sequence[tuple[FloatArray, FloatArray]]) -> float:
     """Energy of least-squares ``problems`` that the solution of all others explains; of a single one, its own."""
     total = 0.0
     for index, (matrix, side) in enumerate(problems):

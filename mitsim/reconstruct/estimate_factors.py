@@ -206,9 +206,9 @@ class StripeSums:
         shape = len(self.vectors), len(self.common)
         shape = shape if self.side == "horizontal" else shape[::-1]
         checked = _response(response, f"{self.side} response {number}", shape, self.centre)
-        return self._seen_checked(checked, np.asarray(response), light)
+        return self._fit_checked(checked, np.asarray(response), light)
 
-    def _pair_seen(self, response: FloatArray, light: FloatArray) -> PairSeen:
+    def _pair_light(self, response: FloatArray, light: FloatArray) -> PairSeen:
         across = self.side == "horizontal"
         vector = (light if across else light.T) @ (self.common / np.dot(self.common, self.common))
         # Both factors' means are zero where frames are centred; what centring takes off the other side, v does.
@@ -219,7 +219,7 @@ class StripeSums:
         )
         return PairSeen(vector, rows, columns)
 
-    def _seen_checked(self, response: FloatArray, given: FloatArray, light: FloatArray | None) -> Seen:
+    def _fit_checked(self, response: FloatArray, given: FloatArray, light: FloatArray | None) -> Seen:
         """The same of a ``response`` that is checked and centred, and of it as it was ``given``."""
         across = self.side == "horizontal"
         vector = (response if across else response.T) @ (self.common / np.dot(self.common, self.common))
@@ -233,7 +233,7 @@ class StripeSums:
             energy += sum_of_squares(block)
         if light is None:
             return Seen(vector, misfit, energy, flux=_flux(given))
-        return Seen(vector, misfit, energy, self._pair_seen(given, light))
+        return Seen(vector, misfit, energy, self._pair_light(given, light))
 
     def put(self, seen: Seen) -> None:
         """Count in what was ``seen`` of the next response."""
@@ -280,7 +280,7 @@ def stripe_sums(
     for sums, checked, response, light in zip(
         (left, right), (first, second), (horizontal, vertical), lights, strict=True
     ):
-        sums.put(sums._seen_checked(checked, np.asarray(response), light))
+        sums.put(sums._fit_checked(checked, np.asarray(response), light))
     return left, right
 
 
@@ -420,7 +420,7 @@ def predicted_error(factor: FloatArray, noise: float, common_norm: float, count:
 def _marginals(frame: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Means of a ``frame`` (rows, columns) over groups of rows, and over groups of columns, ``_BINS`` at most."""
     rows, columns = frame.shape
-    return _grouped(frame @ np.full(columns, 1 / columns)), _grouped(np.full(rows, 1 / rows) @ frame)
+    return _group_means(frame @ np.full(columns, 1 / columns)), _group_means(np.full(rows, 1 / rows) @ frame)
 
 
 def _flux(frame: FloatArray) -> float:
@@ -430,7 +430,7 @@ def _flux(frame: FloatArray) -> float:
     return float(rows @ frame @ columns / (rows.sum() * columns.sum()))
 
 
-def _grouped(values: FloatArray) -> FloatArray:
+def _group_means(values: FloatArray) -> FloatArray:
     if len(values) <= _BINS:
         return values
     starts = np.arange(_BINS) * len(values) // _BINS

@@ -52,7 +52,7 @@ class Factors:
         what they were fitted as, with residual and predicted error; None for factors from a folder.
     lacking
         separable terms [(m, n), (m', n')] of the camera that the factors lack, where a model of it tells them: they
-        foretell what images leave unexplained. Of other pixels, or scaled, factors have none.
+        predict what images leave unexplained. Of other pixels, or scaled, factors have none.
     """
 
     left: FloatArray

@@ -20,12 +20,12 @@ from mitsim.reconstruct.faults import Fault, FrameFault
 from mitsim.reconstruct.leave_one_out import CHANCE, OFF, BoolArray, LeaveOneOut, Pattern
 
 _EXPLAINS = 0.2
-"""Part of what a frame is off by that a fault may leave: chosen, with room for what the others foretell badly."""
+"""Part of what a frame is off by that a fault may leave: chosen, with room for what the others predict badly."""
 _LEFT = 3.0
 """Standard deviations of noise that a fault may leave."""
 _FILL_ROUNDS = 12
-"""Rounds in which patterns left out are foretold from the rest: each brings what overlapping patterns know to a half or
-less of its distance."""
+"""Rounds in which patterns left out are predicted from the rest: each brings what overlapping patterns know to a half
+or less of its distance."""
 _MOST_PAIRS = 6
 """Pairs of which it is tried which half is wrong: 64 images."""
 _LIKELY = 60.0
@@ -34,10 +34,10 @@ searched for among 10^4."""
 _OTHERS = 0.05
 """Of what a frame is off by, the most that all others may be that no fault explains: of two cards beside the calibrated
 distance, which turn the sign of patterns that they move by half a period, others are off by a sixth."""
-_FORETOLD = Fault.SWAPPED, Fault.MISPLACED, Fault.DIM, Fault.BRIGHT, Fault.SHIFTED
-"""Faults that are told by what the other frames foretell alone, and so where the scene fits."""
+_BY_PREDICTION = Fault.SWAPPED, Fault.MISPLACED, Fault.DIM, Fault.BRIGHT, Fault.SHIFTED
+"""Faults that are told by what the other frames predict alone, and so where the scene fits."""
 _DARK = 0.1
-"""Of the light that is foretold, below which a frame or a row of it is black."""
+"""Of the light that is predicted, below which a frame or a row of it is black."""
 _LEAST_LOST = 0.02
 """Part of a frame's rows, or columns, that are lost before it is said; a dead line is less."""
 _REACH = 24
@@ -58,7 +58,7 @@ class _Suspect:
         that it is of.
     raw, frame
         (m, m') its light, and that as the solver takes it.
-    foretold
+    predicted
         (m, m') the same as the other frames tell it; None: they do not.
     variance
         of a datum of ``frame``, and of what it is held against.
@@ -70,7 +70,7 @@ class _Suspect:
     pattern: Pattern
     raw: FloatArray
     frame: FloatArray
-    foretold: FloatArray | None
+    predicted: FloatArray | None
     variance: float
     off: float
 
@@ -96,7 +96,7 @@ class Explanations:
     bad
         the patterns, each with whether its brightness alone is off.
     weights
-        W, with these as the others foretell them.
+        W, with these as the others predict them.
 
     Attributes
     ----------
@@ -108,34 +108,34 @@ class Explanations:
         self._check, self._model, self._bad, self._weights = check, check.prepared, bad, weights
         self._measured = check.measurements(bad)
         self._total = check.noise.light
-        self._foretold = {pattern: self._model.frame(weights, pattern) for pattern in bad}
+        self._predicted = {pattern: self._model.frame(weights, pattern) for pattern in bad}
         self._rest = check.rest(self._measured)
-        self.others_left = self._left({}, weights)
+        self.others_left = self._energy_left({}, weights)
 
     # ---- what frames leave
 
     def _together(self, frames: dict[Pattern, FloatArray]) -> FloatArray:
-        """W of the patterns that are not suspected, and of these ``frames`` of others; of the rest as foretold."""
+        """W of the patterns that are not suspected, and of these ``frames`` of others; of the rest as predicted."""
         weights = self._rest.copy()
-        for pattern, foretold in self._foretold.items():
-            weights[self._model.places(pattern)] += self._model.weights(frames.get(pattern, foretold), pattern)
+        for pattern, predicted in self._predicted.items():
+            weights[self._model.places(pattern)] += self._model.weights(frames.get(pattern, predicted), pattern)
         return np.where(self._check.sigma > 0, weights, 0.0)
 
-    def _left(self, frames: dict[Pattern, FloatArray], weights: FloatArray) -> float:
+    def _energy_left(self, frames: dict[Pattern, FloatArray], weights: FloatArray) -> float:
         """Energy that ``frames`` of suspected patterns leave of all, but for a constant, their W being ``weights``."""
-        light = sum(sum_of_squares(frames.get(pattern, foretold)) for pattern, foretold in self._foretold.items())
+        light = sum(sum_of_squares(frames.get(pattern, predicted)) for pattern, predicted in self._predicted.items())
         return light - sum_of_squares(weights)
 
     def _beyond(self, frames: dict[Pattern, FloatArray], variance: float) -> float:
         """Energy beyond noise that all frames are off by with these, at a ``variance`` of a datum."""
-        left = self._left(frames, self._together(frames)) - self.others_left
+        left = self._energy_left(frames, self._together(frames)) - self.others_left
         return left - sum(frame.size for frame in frames.values()) * variance * self._model.spare
 
-    def _filled(self, one: _Suspect, raw: FloatArray, known: BoolArray) -> float:
+    def _energy_filled(self, one: _Suspect, raw: FloatArray, known: BoolArray) -> float:
         """Energy beyond noise that ``raw`` light in the place of ``one`` leaves where it is ``known``; elsewhere it may
         be anything."""
         known = np.broadcast_to(known, raw.shape)
-        fit, means = self._foretold[one.pattern], np.zeros(())
+        fit, means = self._predicted[one.pattern], np.zeros(())
         if self._model.centre:
             means = np.where(known, raw, np.median(raw[known]))
             means = means - self._model.as_solved(means)
@@ -145,23 +145,23 @@ class Explanations:
             means = filled - frame
             weights = self._together({one.pattern: frame})
             fit = self._model.frame(weights, one.pattern)
-        left = self._left({one.pattern: frame}, weights) - self.others_left
+        left = self._energy_left({one.pattern: frame}, weights) - self.others_left
         # The noise of a frame is that of its mean light, which what is lost makes too little.
         variance = max(one.variance, float(self._check.noise.of(float(raw[known].mean()), 1)))
         return left - float(known.sum()) * variance * self._model.spare
 
     # ---- what was read
 
-    def _plain(self, pattern: Pattern) -> _Suspect:
+    def _plain_suspect(self, pattern: Pattern) -> _Suspect:
         check, light = self._check, self._measured[pattern].frame
         frame, variance = self._model.as_solved(light), float(check.noise.variance[pattern])
         if check.exclusive or len(self._bad) == check.noise.variance.size:
-            foretold, off = None, self._outside(frame, pattern, variance)
+            predicted, off = None, self._outside(frame, pattern, variance)
         else:
-            foretold, off = self._foretold[pattern], self._beyond({pattern: frame}, variance)
-        return _Suspect((check.number[(*pattern, 0)],), pattern, light, frame, foretold, variance, off)
+            predicted, off = self._predicted[pattern], self._beyond({pattern: frame}, variance)
+        return _Suspect((check.number[(*pattern, 0)],), pattern, light, frame, predicted, variance, off)
 
-    def _signed(self) -> list[_Suspect]:
+    def _signed_suspects(self) -> list[_Suspect]:
         """Of patterns whose sum is off the half that is wrong; of others the difference."""
         check = self._check
         good = max(check.noise.variance.size - len(self._bad), 1)
@@ -175,9 +175,9 @@ class Explanations:
                 off[pattern] = beyond
                 continue
             numbers = tuple(check.number[(*pattern, sign)] for sign in (1, -1))
-            foretold, frame = self._foretold[pattern], self._model.as_solved(each.frame)
+            predicted, frame = self._predicted[pattern], self._model.as_solved(each.frame)
             beyond = self._beyond({pattern: frame}, variance)
-            found.append(_Suspect(numbers, pattern, each.frame, frame, foretold, variance, beyond))
+            found.append(_Suspect(numbers, pattern, each.frame, frame, predicted, variance, beyond))
         for pattern, sign in self._wrong_halves(off, mean).items():
             each, variance = self._measured[pattern], float(check.noise.variance[pattern]) * (1 + 1 / good)
             half, other = (each.light + sign * each.frame) / 2, (each.light - sign * each.frame) / 2
@@ -189,7 +189,7 @@ class Explanations:
     def _wrong_halves(self, off: dict[Pattern, float], mean: FloatArray) -> dict[Pattern, int]:
         """Sign of the half that is wrong of each pattern that is ``off``, by that energy, the ``mean`` of halves' sums.
 
-        The other half foretells it either way, and no pattern of +-1 tells another's coefficients. First come those
+        The other half predicts it either way, and no pattern of +-1 tells another's coefficients. First come those
         that explain each other, as frames that are exchanged; then those that make the image vary least from pixel to
         pixel, as coefficients that are wrong are a comb over all of it.
         """
@@ -226,7 +226,7 @@ class Explanations:
 
     # ---- fits
 
-    def _unexplained(self, part: FloatArray, left: FloatArray, right: FloatArray, variance: float) -> float:
+    def _energy_outside(self, part: FloatArray, left: FloatArray, right: FloatArray, variance: float) -> float:
         """Energy of ``part`` of a frame beyond noise that two orthonormal ranges leave."""
         explained = sum_of_squares(left.T @ part @ right)
         return sum_of_squares(part) - explained - self._model.spare * part.size * variance
@@ -234,7 +234,7 @@ class Explanations:
     def _outside(self, frame: FloatArray, pattern: Pattern, variance: float) -> float:
         """Energy of a ``frame`` beyond noise that no light of the pixels of a ``pattern`` explains."""
         left, right = (slab.matrix for slab in self._model.slabs(pattern))
-        return self._unexplained(frame, left, right, variance)
+        return self._energy_outside(frame, left, right, variance)
 
     def _ranges(self, pattern: Pattern, rows: Any, columns: Any) -> tuple[FloatArray, FloatArray]:
         """Orthonormal ranges of a ``pattern`` on part of the sensor's ``rows`` and ``columns``."""
@@ -252,25 +252,25 @@ class Explanations:
         part = one.raw[window]
         # The noise of a frame is that of its mean light, which what is lost makes too little.
         variance = max(one.variance, float(self._check.noise.of(float(part.mean()), 1)))
-        if one.foretold is not None:
-            return sum_of_squares(self._model.as_solved(part - one.foretold[window])) - part.size * variance
-        return self._unexplained(part, *self._ranges(one.pattern, *window), variance)
+        if one.predicted is not None:
+            return sum_of_squares(self._model.as_solved(part - one.predicted[window])) - part.size * variance
+        return self._energy_outside(part, *self._ranges(one.pattern, *window), variance)
 
     def _inside(self, one: _Suspect, window: list[slice], still: list[slice]) -> float:
         """Energy beyond noise of a ``window`` of the sensor, held against the ``still`` middle of it."""
         part = one.raw[window[0], window[1]]
-        if one.foretold is not None:
+        if one.predicted is not None:
             return (
-                sum_of_squares(self._model.as_solved(part - one.foretold[still[0], still[1]]))
+                sum_of_squares(self._model.as_solved(part - one.predicted[still[0], still[1]]))
                 - part.size * one.variance
             )
-        return self._unexplained(part, *self._ranges(one.pattern, *still), one.variance)
+        return self._energy_outside(part, *self._ranges(one.pattern, *still), one.variance)
 
     def faults(self, others_off: float) -> list[FrameFault]:
         """One for each that is found; ``others_off`` is the energy beyond noise by which patterns are off that are not
         suspected."""
         check = self._check
-        seen = self._signed() if check.signed else [self._plain(pattern) for pattern in self._bad]
+        seen = self._signed_suspects() if check.signed else [self._plain_suspect(pattern) for pattern in self._bad]
         repeats = self._repeats(seen)
         explained: list[list[_Named]] = []
         for one in seen:
@@ -278,7 +278,7 @@ class Explanations:
             chance = _LEFT * one.variance * np.sqrt(2 * one.frame.size)
             fits = [
                 each
-                for each in (*same, *self._tried(one))
+                for each in (*same, *self._candidates(one))
                 if each.left <= max(_EXPLAINS * one.off, chance) and one.off - each.left > _LIKELY * one.variance
             ]
             explained.append(sorted(fits, key=lambda each: each.left))
@@ -287,7 +287,7 @@ class Explanations:
             [
                 each
                 for each in fits
-                if each.fault not in _FORETOLD or others_off <= _OTHERS * one.off or each.left == -np.inf
+                if each.fault not in _BY_PREDICTION or others_off <= _OTHERS * one.off or each.left == -np.inf
             ]
             or repeats.get(one.numbers, [])[:1]
             for one, fits in zip(seen, explained, strict=True)
@@ -296,24 +296,24 @@ class Explanations:
 
     # ---- what explains it
 
-    def _tried(self, one: _Suspect) -> Iterable[_Named]:
+    def _candidates(self, one: _Suspect) -> Iterable[_Named]:
         if len(one.numbers) == 2:
-            yield from self._exchanged(one)
+            yield from self._exchange(one)
             return
         if self._is_black(one):
             yield _Named(-np.inf, Fault.BLACK, one.numbers, "holds no light")
-        if one.foretold is None and self._bad[one.pattern]:
+        if one.predicted is None and self._bad[one.pattern]:
             yield from self._by_neighbours(one)
             return
-        yield from self._part_lost(one)
-        yield from self._scaled(one)
+        yield from self._lost_part(one)
+        yield from self._scale(one)
         yield from self._elsewhere(one)
-        yield from self._moved(one)
+        yield from self._shift(one)
 
     def _is_black(self, one: _Suspect) -> bool:
         """Whether a shot is as even, and as dark, as a sensor without light."""
         count = self._check.noise.variance.size
-        light = one.foretold if one.foretold is not None else self._total / count
+        light = one.predicted if one.predicted is not None else self._total / count
         if count == 1 and self._bad[one.pattern]:
             return True
         dark = float(self._check.manifest.digital.variance(0.0))
@@ -330,11 +330,11 @@ class Explanations:
         words = f"holds {ratio:.2f} of the light that its neighbours' pixels tell"
         yield _Named(-np.inf, fault, one.numbers, words)
 
-    def _scaled(self, one: _Suspect) -> Iterable[_Named]:
-        if one.foretold is None:
+    def _scale(self, one: _Suspect) -> Iterable[_Named]:
+        if one.predicted is None:
             return
-        ratio = float(np.vdot(one.frame, one.foretold)) / max(sum_of_squares(one.foretold), 1e-300)
-        left = sum_of_squares(one.frame - ratio * one.foretold) - one.frame.size * one.variance
+        ratio = float(np.vdot(one.frame, one.predicted)) / max(sum_of_squares(one.predicted), 1e-300)
+        left = sum_of_squares(one.frame - ratio * one.predicted) - one.frame.size * one.variance
         if ratio > 0 and not self._check.signed:
             ratio, left = self._least_scale(one, ratio)
         if ratio > 0:
@@ -350,7 +350,7 @@ class Explanations:
         found = minimize_scalar(left, bounds=(0.3 * start, min(3 * start, 10.0)), method="bounded")
         return float(found.x), float(found.fun)
 
-    def _part_lost(self, one: _Suspect) -> Iterable[_Named]:
+    def _lost_part(self, one: _Suspect) -> Iterable[_Named]:
         """Rows, or columns, without light side by side."""
         for axis, name in ((0, "rows"), (1, "columns")):
             lines, usual = one.raw.mean(axis=1 - axis), self._total.mean(axis=1 - axis)
@@ -364,16 +364,16 @@ class Explanations:
                 continue
             kept = np.ones(len(lines), dtype=np.bool_)
             kept[first:last] = False
-            if one.foretold is None or self._check.signed:
+            if one.predicted is None or self._check.signed:
                 left = self._outside_of_part(one, kept, axis)
             else:
-                left = self._filled(one, one.raw, kept[:, None] if axis == 0 else kept[None, :])
+                left = self._energy_filled(one, one.raw, kept[:, None] if axis == 0 else kept[None, :])
             yield _Named(left, Fault.HALF_LOST, one.numbers, f"has no light in sensor {name} {first} to {last - 1}")
 
     def _elsewhere(self, one: _Suspect) -> Iterable[_Named]:
         """Another pattern than that of its place: of all patterns under dots, else of those that are suspected."""
         check = self._check
-        if one.foretold is None:
+        if one.predicted is None:
             others = [other for other in np.ndindex(check.noise.variance.shape) if other != one.pattern]
             if not others:
                 return
@@ -385,16 +385,16 @@ class Explanations:
                 continue
             if not check.signed:  # of two that are suspected each may be the other's
                 there = self._model.as_solved(self._measured[other].frame)
-                yield self._of_pattern(self._crossed(one, other, there), one, check.number[(*other, 0)])
+                yield self._of_pattern(self._exchange_energy(one, other, there), one, check.number[(*other, 0)])
                 continue
             each = self._measured[other]
             for sign in (1, -1):  # the other half of that pattern tells this one
                 partner = (each.light - sign * each.frame) / 2
-                mean = one.foretold + (self._measured[one.pattern].light - one.raw)
+                mean = one.predicted + (self._measured[one.pattern].light - one.raw)
                 left = sum_of_squares(one.frame - (mean - partner)) - one.frame.size * one.variance
                 yield self._of_pattern(left, one, check.number[(*other, sign)])
 
-    def _crossed(self, one: _Suspect, other: Pattern, there: FloatArray) -> float:
+    def _exchange_energy(self, one: _Suspect, other: Pattern, there: FloatArray) -> float:
         """Energy of :attr:`_Suspect.off` that is left when a frame and that of an ``other`` pattern, ``there``, are
         exchanged."""
         variance = (one.variance + float(self._check.noise.variance[other])) / 2
@@ -406,26 +406,28 @@ class Explanations:
         words = f"{'hold' if len(place) > 1 else 'holds'} the light of the pattern of frame {place[0]}"
         return _Named(left, Fault.MISPLACED, one.numbers, words, place)
 
-    def _exchanged(self, one: _Suspect) -> Iterable[_Named]:
+    def _exchange(self, one: _Suspect) -> Iterable[_Named]:
         """Both halves of signed patterns: the two exchanged, or those of another pattern."""
-        if one.foretold is None:
+        if one.predicted is None:
             return
         yield _Named(self._beyond({one.pattern: -one.frame}, one.variance), Fault.SWAPPED, one.numbers, "are exchanged")
         for other in self._bad:
             if other != one.pattern:
                 there = self._model.as_solved(self._measured[other].frame)
-                left = self._crossed(one, other, there)
+                left = self._exchange_energy(one, other, there)
                 yield self._of_pattern(left, one, *(self._check.number[(*other, sign)] for sign in (1, -1)))
 
-    def _moved(self, one: _Suspect) -> Iterable[_Named]:
+    def _shift(self, one: _Suspect) -> Iterable[_Named]:
         """Moved over the sensor by whole pixels."""
         reach = min(_REACH, *(side // 8 for side in one.frame.shape))
         if reach < 1:
             return
-        shift = self._by_range(one, reach) if one.foretold is None else _correlated(one.frame, one.foretold, reach)
+        shift = (
+            self._by_range(one, reach) if one.predicted is None else _correlation_shift(one.frame, one.predicted, reach)
+        )
         if shift == (0, 0):
             return
-        if one.foretold is not None and not self._check.signed:
+        if one.predicted is not None and not self._check.signed:
             # Frames of a smooth mask correlate beside their shift: from there on it is what leaves least.
             left, (rows, columns) = self._put_back(one, shift), shift
             for _ in range(reach):
@@ -436,20 +438,20 @@ class Explanations:
                     break
                 left, (rows, columns) = best, place
             if (rows, columns) != (0, 0):
-                yield _shifted(one, left, rows, columns)
+                yield _shift_fault(one, left, rows, columns)
             return
         ends = [slice(reach + step, size - reach + step) for step, size in zip(shift, one.raw.shape, strict=True)]
         still = [slice(reach, size - reach) for size in one.raw.shape]
         moved, unmoved = (self._inside(one, window, still) for window in (ends, still))
         if unmoved > 0:
-            yield _shifted(one, moved / unmoved * one.off, *shift)
+            yield _shift_fault(one, moved / unmoved * one.off, *shift)
 
     def _put_back(self, one: _Suspect, shift: tuple[int, int]) -> float:
         """Energy beyond noise that a frame leaves that is moved back by a ``shift``, rows and columns."""
         known = [np.zeros(size, dtype=np.bool_) for size in one.raw.shape]
         for line, step in zip(known, shift, strict=True):
             line[max(-step, 0) : len(line) - max(step, 0)] = True
-        return self._filled(one, np.roll(one.raw, (-shift[0], -shift[1]), (0, 1)), np.outer(*known))
+        return self._energy_filled(one, np.roll(one.raw, (-shift[0], -shift[1]), (0, 1)), np.outer(*known))
 
     def _by_range(self, one: _Suspect, reach: int) -> tuple[int, int]:
         """The shift that puts most of a frame into the range of its pattern: of rows, then of columns, as a shift along
@@ -505,15 +507,15 @@ class Explanations:
                 yield self._check.fault(best.fault, best.numbers, best.words)
 
 
-def _shifted(one: _Suspect, left: float, rows: int, columns: int) -> _Named:
+def _shift_fault(one: _Suspect, left: float, rows: int, columns: int) -> _Named:
     words = f"is shifted by {rows} rows and {columns} columns of the sensor"
     return _Named(left, Fault.SHIFTED, one.numbers, words)
 
 
-def _correlated(frame: FloatArray, foretold: FloatArray, reach: int) -> tuple[int, int]:
-    """The shift (rows, columns) by which ``frame`` is most like what was ``foretold``, up to ``reach``."""
+def _correlation_shift(frame: FloatArray, predicted: FloatArray, reach: int) -> tuple[int, int]:
+    """The shift (rows, columns) by which ``frame`` is most like what was ``predicted``, up to ``reach``."""
     shape = [fft.next_fast_len(size + reach) for size in frame.shape]
-    spectra = [fft.rfft2(values - values.mean(), shape) for values in (frame, foretold)]
+    spectra = [fft.rfft2(values - values.mean(), shape) for values in (frame, predicted)]
     alike = fft.irfft2(spectra[0] * spectra[1].conj(), shape)
     steps = np.arange(-reach, reach + 1)
     place = np.unravel_index(int(np.argmax(alike[np.ix_(steps, steps)])), (len(steps),) * 2)

@@ -148,10 +148,10 @@ class FactorOfDepths:
         shift
             1/z - 1/z_0 [1/mm] of all scene pixels, or (n,) of each.
         """
-        column = self._moved(shift)
+        column = self._source_columns(shift)
         row, within, known = self._sources(column)
         shadows = self._shadow.at(row, within) * self._own_brightness
-        passed = self._passed(column)
+        passed = self._transmission(column)
         mean = passed.mean(axis=0)
         # The image stays light relative to the board's, as the sensor as a whole sees it.
         return shadows * np.divide(passed, mean, out=np.zeros_like(passed), where=mean > 0), _whole(known)
@@ -159,20 +159,20 @@ class FactorOfDepths:
     def hidden(self, shift: float) -> FloatArray:
         """(n,) part of each column's light that the field stop keeps from the sensor at another depth: 1/z changed by
         ``shift`` [1/mm]; 0 where the calibration states no stop, or its own window was cut."""
-        return np.asarray(1 - self._passed(self._moved(shift)).mean(axis=0))
+        return np.asarray(1 - self._transmission(self._source_columns(shift)).mean(axis=0))
 
     def noise(self, shift: float) -> float:
         """Standard deviation of noise in columns at 1/z changed by ``shift`` [1/mm], over that of the calibrated ones:
         less, as each number is fitted to many."""
         white = np.random.default_rng(0).standard_normal(self.factor.shape)
-        row, within, _ = self._sources(self._moved(shift))
+        row, within, _ = self._sources(self._source_columns(shift))
         return float(np.sqrt(np.mean(np.square(ColumnSpline(white, self._step).at(row, within)))))
 
-    def _moved(self, shift: float | FloatArray) -> FloatArray:
+    def _source_columns(self, shift: float | FloatArray) -> FloatArray:
         """(m, n) column that each sensor row saw at the calibrated depth where it now sees each scene pixel."""
         return np.arange(self.factor.shape[1]) + (self.edges - self._parallax_pixels[2] * self._place[:, None]) * shift
 
-    def _passed(self, column: FloatArray) -> FloatArray:
+    def _transmission(self, column: FloatArray) -> FloatArray:
         """(m, k) part of the light from each ``column`` (m, k) that the field stop lets through."""
         stop = self.parallax.stop_tan
         if stop is None:
@@ -422,9 +422,9 @@ class ColumnSpline:
         reach = min(_SPLINE_ROWS, (rows - 1) // 2)
         self._coefficients = np.empty((rows, self._last + 3))
         inner, edges = np.arange(reach, rows - reach), np.array([*range(reach), *range(rows - reach, rows)], dtype=int)
-        self._coefficients[inner] = self._fitted(factor, inner, np.arange(-reach, reach + 1))
+        self._coefficients[inner] = self._fit(factor, inner, np.arange(-reach, reach + 1))
         nearest = np.clip(edges - reach, 0, rows - 2 * reach - 1)[:, None] + np.arange(2 * reach + 1)
-        self._coefficients[edges] = self._fitted_each(factor[nearest], nearest - edges[:, None])
+        self._coefficients[edges] = self._fit_each(factor[nearest], nearest - edges[:, None])
 
     def at(self, row: npt.NDArray[np.intp], column: FloatArray) -> FloatArray:
         """Numbers of each ``row`` at each ``column``, from 0 to n - 1, whole or not; the two broadcast."""
@@ -432,7 +432,7 @@ class ColumnSpline:
         first, numbers = row * self._coefficients.shape[1] + start, self._coefficients.ravel()
         return np.asarray(sum(weight * numbers.take(first + k) for k, weight in enumerate(weights)))
 
-    def _fitted(self, factor: FloatArray, rows: npt.NDArray[np.intp], neighbours: npt.NDArray[np.intp]) -> FloatArray:
+    def _fit(self, factor: FloatArray, rows: npt.NDArray[np.intp], neighbours: npt.NDArray[np.intp]) -> FloatArray:
         """(len(``rows``), coefficients) of the spline of each row, from its ``neighbours``' numbers."""
         normal, start, weights = self._normal(neighbours[None])
         data = np.zeros((self._last + 3, len(rows)))
@@ -444,11 +444,11 @@ class ColumnSpline:
                 data[first[inside] + a] += part[inside, None] * seen[inside]
         return np.asarray(solveh_banded(normal[0], data, lower=True).T)
 
-    def _fitted_each(self, seen: FloatArray, neighbours: npt.NDArray[np.intp]) -> FloatArray:
+    def _fit_each(self, seen: FloatArray, neighbours: npt.NDArray[np.intp]) -> FloatArray:
         """(rows, coefficients) of the spline of each row, from what is ``seen`` (rows, k, n) in the ``neighbours``
         (rows, k) of its own."""
         normal, start, weights = self._normal(neighbours)
-        data = np.sum([self._collected(start + a, weight * seen) for a, weight in enumerate(weights)], axis=0)
+        data = np.sum([self._collect(start + a, weight * seen) for a, weight in enumerate(weights)], axis=0)
         found = [solveh_banded(*each, lower=True) for each in zip(normal, data, strict=True)]
         return np.array(found).reshape(len(seen), self._last + 3)
 
@@ -461,11 +461,11 @@ class ColumnSpline:
         normal = np.zeros((len(neighbours), 4, self._last + 3))
         for a, b in product(range(4), repeat=2):
             if b >= a:
-                normal[:, b - a] += self._collected(start + a, weights[a] * weights[b])
+                normal[:, b - a] += self._collect(start + a, weights[a] * weights[b])
                 normal[:, b - a, a : self._last + a] += _STIFFNESS * _THIRD[a] * _THIRD[b]
         return normal, start, weights
 
-    def _collected(self, place: npt.NDArray[np.intp], values: FloatArray) -> FloatArray:
+    def _collect(self, place: npt.NDArray[np.intp], values: FloatArray) -> FloatArray:
         """(fits, coefficients) sums of the ``values`` (fits, k, n) at each ``place`` (fits, k, n)."""
         fits, size = len(place), self._last + 3
         own = (np.arange(fits) * size)[:, None, None] + place

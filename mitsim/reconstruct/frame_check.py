@@ -2,7 +2,7 @@
 
 A frame is suspected where it is off by more than noise, and by more than the other frames are: a scene that does not
 fit has all its frames off. It is named where one fault explains what it is off by. The halves of signed patterns add up
-to the same frame for all of them, which foretells each half by the other without any model.
+to the same frame for all of them, which predicts each half by the other without any model.
 
 *Brightness under dots.* No pixel is in two frames, so that half of a frame's light fits as well; but dots:k are k^2
 samples of one picture.
@@ -65,13 +65,13 @@ class FrameCheck(LeaveOneOut):
         beside_noise
             energy that rendering, the factors' noise and print put into all of them.
         fits
-            whether what frames foretell counts only where they fit; not of a scene whose depths are known to differ.
+            whether what frames predict counts only where they fit; not of a scene whose depths are known to differ.
         """
-        found = [*self._same(sums), *self._clipped(sums), *self._noiseless(sums)]
+        found = [*self._same(sums), *self._clipped_frames(sums), *self._noiseless(sums)]
         suspects = self._suspects(sums, beside_noise)
         if suspects is None:  # too many
             return tuple(found or self._flicker(sums))
-        named = self._explained(sums, beside_noise, fits, *suspects) if suspects[0] else []
+        named = self._explain(sums, beside_noise, fits, *suspects) if suspects[0] else []
         if not named and not found:
             return tuple(self._flicker(sums))
         # What is known without the model is said where that does not say more; of clipped frames it explains the rest.
@@ -81,7 +81,7 @@ class FrameCheck(LeaveOneOut):
         return (*(each for each in found if each.fault is Fault.CLIPPED or not known & set(each.numbers)), *named)
 
     def _suspects(self, sums: FrameSums, beside_noise: float) -> tuple[dict[Pattern, bool], FloatArray] | None:
-        """Patterns that are off, each with whether its brightness alone is, and W with these as the others foretell
+        """Patterns that are off, each with whether its brightness alone is, and W with these as the others predict
         them; None where too many are. The parameters are those of :meth:`faults`."""
         bad: dict[Pattern, bool] = {}
         weights, count = self.weights, self.noise.variance.size
@@ -99,10 +99,10 @@ class FrameCheck(LeaveOneOut):
                 if (left := noise - float(sums.energy[pattern]) - explained) < least:
                     least, found = left, (pattern, by_brightness, rest)
             bad[found[0]], weights = found[1:]
-            sums = self.gathered(weights, bad)
+            sums = self.sums_against(weights, bad)
         return bad, weights
 
-    def _explained(
+    def _explain(
         self, sums: FrameSums, beside_noise: float, fits: bool, bad: dict[Pattern, bool], weights: FloatArray
     ) -> list[FrameFault]:
         """Faults of patterns that are suspected, :meth:`_suspects` as :meth:`faults` takes its parameters."""
@@ -218,7 +218,7 @@ class FrameCheck(LeaveOneOut):
                 numbers = [self.number[(*pattern, (1 - 2 * half) if self.signed else 0)] for pattern, half in shots]
                 yield self.fault(Fault.REPEATED, numbers, "are one and the same")
 
-    def _clipped(self, sums: FrameSums) -> Iterable[FrameFault]:
+    def _clipped_frames(self, sums: FrameSums) -> Iterable[FrameFault]:
         """Shots with many readings at their largest number; where most have, it is the end of the sensor's range."""
         if len(sums.clipped) <= max(1, _MOST_BAD * len(self.shots)):
             for (pattern, half), count in sums.clipped.items():
@@ -279,18 +279,18 @@ class FrameCheck(LeaveOneOut):
 
 _SPREADS, _LEAST, _TIMES_OTHERS = 4.0, 0.08, 2.0
 """Standard deviations, as half of the frames tell them, by which a frame's brightness may differ from what its
-neighbours foretell, the least such part that is named, and times what any other frame differs by: chosen, of 49 normal
+neighbours predict, the least such part that is named, and times what any other frame differs by: chosen, of 49 normal
 numbers one is so far away, and twice as far as any other, once in 800 runs."""
 _FEW = 2.5
 """The least part times the number of frames: half of so few frames do not tell a spread."""
 _BRIGHT_ENOUGH = 0.2
-"""Of the mean foretold reflectance, from which a pixel counts when it is compared with its neighbours."""
+"""Of the mean predicted reflectance, from which a pixel counts when it is compared with its neighbours."""
 _FEWEST_PIXELS = 8
-"""Pixels of a frame that its neighbours foretell, below which their median is chance."""
+"""Pixels of a frame that its neighbours predict, below which their median is chance."""
 
 
 def odd_brightness(check: LeaveOneOut, weights: FloatArray, good: BoolArray) -> Pattern | None:
-    """The ``good`` pattern whose brightness differs most from what its pixels' neighbours foretell, if it does.
+    """The ``good`` pattern whose brightness differs most from what its pixels' neighbours predict, if it does.
 
     The median of its pixels must differ, which highlights and edges do not move, its light as a whole to the same
     side, and by more than the others': stripes as fine as the dots make others differ as well.

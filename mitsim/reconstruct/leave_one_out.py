@@ -30,7 +30,7 @@ OFF = 7e-3
 _ALIKE = 1e-3
 """Square of the sine between sum and difference of a pair's halves, below which one of them is as good as black."""
 _SETTLED, _MOST_STEPS = 0.1, 100
-"""Of :data:`CHANCE`, the energy below which a step of foretelling changes nothing that counts; and the most steps,
+"""Of :data:`CHANCE`, the energy below which a step of predicting changes nothing that counts; and the most steps,
 which patterns that know nothing of each other do not need: chosen."""
 
 
@@ -93,7 +93,7 @@ class FrameSums:
 
 
 class LeaveOneOut:
-    """Foretells each frame of a run from its others.
+    """Predicts each frame of a run from its others.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ class LeaveOneOut:
         filtered = np.divide(self._kept * weights, self.sigma, out=np.zeros_like(weights), where=self.sigma > 0)
         return self.prepared.image(filtered)
 
-    def _seen(self, image: FloatArray) -> FloatArray:
+    def _ideal_weights(self, image: FloatArray) -> FloatArray:
         """W of an ``image`` without noise."""
         return np.asarray(self.sigma * (self.prepared.left.duals.T @ image @ self.prepared.right.duals))
 
@@ -178,7 +178,7 @@ class LeaveOneOut:
         return rest
 
     def without(self, bad: tuple[Pattern, ...]) -> tuple[FloatArray, float]:
-        """W of all patterns, the ``bad`` ones as the others foretell them, and what it explains of these others'
+        """W of all patterns, the ``bad`` ones as the others predict them, and what it explains of these others'
         energy."""
         rest = self.rest(self.measurements(bad))
         image = self.image(self.weights)
@@ -187,7 +187,7 @@ class LeaveOneOut:
             image = uniform_filter(image, self._periods, mode="nearest")
         lit = self.lit(self.all_but(bad))
         image = np.where(lit, image, self.neighbours(image, lit))
-        weights = self._seen(image)
+        weights = self._ideal_weights(image)
         grams = {pattern: [slab.matrix.T @ slab.matrix for slab in self.prepared.slabs(pattern)] for pattern in bad}
 
         def of_bad(values: FloatArray) -> FloatArray:
@@ -219,7 +219,7 @@ class LeaveOneOut:
             step = left_over + squared / before * step
         return weights, float(np.vdot(weights, rest))
 
-    def gathered(self, weights: FloatArray, bad: Iterable[Pattern]) -> FrameSums:
+    def sums_against(self, weights: FloatArray, bad: Iterable[Pattern]) -> FrameSums:
         """Sums of all measurements against other ``weights``; the light of all is that of those not ``bad``."""
         sums = FrameSums((self.noise.variance.shape[0], self.noise.variance.shape[1]))
         total = np.zeros(0)

@@ -88,8 +88,8 @@ class Misfit:
         the likely one of a flagged image.
     signatures
         of a flagged image: the parts of the unexplained energy by which causes are told apart.
-    foretold
-        what the calibration foretells of ``unexplained``, print apart, from what its factors lack of the camera; None
+    predicted
+        what the calibration predicts of ``unexplained``, print apart, from what its factors lack of the camera; None
         where it does not know.
     faults
         frames that are not what they say; with any the image is flagged.
@@ -110,7 +110,7 @@ class Misfit:
     flagged: bool
     cause: Cause | None
     signatures: Signatures | None
-    foretold: float | None = None
+    predicted: float | None = None
     faults: tuple[FrameFault, ...] = ()
     reading: Reading | None = None
     defects: Defects | None = None
@@ -147,7 +147,7 @@ class Misfit:
             "flagged": self.flagged,
             "cause": self.cause.name.lower() if self.cause else None,
             "signatures": asdict(self.signatures) if self.signatures else None,
-            "foretold": self.foretold,
+            "foretold": self.predicted,
             "detail": self.detail,
             "defective_pixels": self.defects.summary() if self.defects else None,
             "reading": self.reading.words if self.reading else None,
@@ -162,17 +162,17 @@ class Misfit:
         if self.faults:
             more = f"; and {len(self.faults) - _SHOWN} more" if len(self.faults) > _SHOWN else ""
             named = "; ".join(map(str, self.faults[:_SHOWN]))
-            return self._flagged(status, f"Faulty frames: {named}{more}", Cause.FRAMES)
+            return self._flag(status, f"Faulty frames: {named}{more}", Cause.FRAMES)
         times = f", {shown(self.chi_square)} times what its noise makes" if self.stated else ""
-        foretold = ""
-        if self.foretold:
-            foretold = f"; its calibration foretells up to {self.foretold:.1%} ({decibels(self.foretold):.1f} dB)"
+        predicted = ""
+        if self.predicted:
+            predicted = f"; its calibration foretells up to {self.predicted:.1%} ({decibels(self.predicted):.1f} dB)"
         sentence = (
-            f"{self.unexplained:.1%} of the measurements fit no image{times}{foretold}; likely cause: {self.reason}"
+            f"{self.unexplained:.1%} of the measurements fit no image{times}{predicted}; likely cause: {self.reason}"
         )
-        return self._flagged(status, f"Misfit: {sentence}", self.cause)
+        return self._flag(status, f"Misfit: {sentence}", self.cause)
 
-    def _flagged(self, status: Status, sentence: str, cause: Cause) -> Status:
+    def _flag(self, status: Status, sentence: str, cause: Cause) -> Status:
         """The ``status`` of a solution with a ``sentence`` and the remedy of a ``cause``."""
         remedy = cause.value[1]
         if not status.verdict.good:
@@ -338,8 +338,8 @@ def find_misfit(
     expected = sums.expected(factor_energy or 0.0)
     balance = Balance(sums.residual, sums.energy, expected, sums.pixels, factor_energy is not None)
     found, excess = balance.misfit(noise, print_energy)
-    if evidence.foretold is not None:
-        found = replace(found, foretold=float(np.sqrt(evidence.foretold / max(float(sums.energy.sum()), _TINY))))
+    if evidence.predicted is not None:
+        found = replace(found, predicted=float(np.sqrt(evidence.predicted / max(float(sums.energy.sum()), _TINY))))
     beside_noise = noise.rendering + (factor_energy or 0.0) + print_energy
     if reading := multiple(noise, found.chi_square) or check.out_of_step(sums.by_pattern):
         return found.read_as(reading)
@@ -370,7 +370,7 @@ def find_misfit(
     of_print = float(np.nan_to_num(signatures.detail)) * (excess + beside_noise)
     fine, _ = balance.misfit(noise, max(print_energy, of_print))
     if not fine.flagged:
-        return replace(fine, foretold=found.foretold, detail=float(np.sqrt(of_print / sums.energy.sum())))
+        return replace(fine, predicted=found.predicted, detail=float(np.sqrt(of_print / sums.energy.sum())))
     return replace(found, cause=likely_cause(signatures, found.unexplained, evidence.of_factors), signatures=signatures)
 
 
@@ -476,11 +476,14 @@ class Lack:
         """(r, r') what they add to the coefficients W of all frames."""
         sides, patterns = self.model.sides, self.model.patterns
         return np.asarray(
-            sum(_seen(sides[0], a, patterns[0]) @ self.image @ _seen(sides[1], b, patterns[1]).T for a, b in self.terms)
+            sum(
+                _term_response(sides[0], a, patterns[0]) @ self.image @ _term_response(sides[1], b, patterns[1]).T
+                for a, b in self.terms
+            )
         )
 
 
-def _seen(side: Side, term: FloatArray, patterns: FloatArray) -> FloatArray:
+def _term_response(side: Side, term: FloatArray, patterns: FloatArray) -> FloatArray:
     """(r, n) sum_i U_i^T L diag(p_i), of one side of a ``term`` L (m, n) and its ``patterns`` (n, K)."""
     seen = np.zeros((len(side.singular), term.shape[1]))
     for slab, lit in zip(side.slabs, patterns.T, strict=True):

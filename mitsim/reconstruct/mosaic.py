@@ -31,6 +31,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
+from mitsim.reconstruct.convolution import conjugate_gradients
 
 if TYPE_CHECKING:
     from scipy.sparse.linalg import LinearOperator
@@ -199,24 +200,18 @@ class JointMosaic:
         """
         if not 0 < lam < np.inf:
             raise MitsimError(f"lambda is {lam}; give a finite number above 0")
-        images = np.zeros(self.shape) if start is None else start.copy()
-        residual = gathered - self.normal(images) - lam * images
-        size = float(np.linalg.norm(gathered)) or 1.0
-        near = self._preconditioned(residual, lam)
-        direction, energy = near, float(np.vdot(residual, near))
-        step = 0
-        while np.linalg.norm(residual) > _TOLERANCE * size and step < _MOST_STEPS:
-            step += 1
-            through = self.normal(direction) + lam * direction
-            length = energy / float(np.vdot(direction, through))
-            images += length * direction
-            residual = residual - length * through
-            near = self._preconditioned(residual, lam)
-            energy, before = float(np.vdot(residual, near)), energy
-            direction = near + energy / before * direction
-        return JointSolution(images, lam, step, float(np.linalg.norm(residual)) / size)
+        found = conjugate_gradients(
+            self.normal,
+            gathered,
+            lam,
+            lambda images: self._precondition(images, lam),
+            _TOLERANCE,
+            _MOST_STEPS,
+            start=start,
+        )
+        return JointSolution(found.image, lam, found.iterations, found.residual)
 
-    def _preconditioned(self, images: FloatArray, lam: float) -> FloatArray:
+    def _precondition(self, images: FloatArray, lam: float) -> FloatArray:
         (rows, left), (columns, right), (lines, mixed) = self._spectra
         turned = np.tensordot(mixed.T, left.T @ images @ right, axes=1)
         turned /= lines[:, None, None] * np.outer(rows, columns) + lam

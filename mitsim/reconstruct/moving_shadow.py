@@ -3,7 +3,7 @@
 Column j of a factor is the mask's shadow from scene line j, which moves over the sensor as the line does: column j + 1
 is column j moved by ``step`` pixels. At each spatial frequency columns are thus a phase that grows with j, times what
 varies slowly from line to line (light falls off, obliquity): a polynomial of j. Detail finer than the pixels shows at a
-frequency of its own, and moves at the step that it has. Least squares in these few numbers foretell each pattern's
+frequency of its own, and moves at the step that it has. Least squares in these few numbers predict each pattern's
 vector u_i = Phi h_i from all others. That columns are alike would not show which way the shadow moves: of two patterns
 that are sine and cosine of one period, exchanged frames of one turn it round.
 """
@@ -23,11 +23,11 @@ _MOVES = (0, -1), (1, -1), (-1, -1), (2, -1)
 _FINE = 0.4
 """Pixels a line from which the lines resolve no 4 pi - k, of 1.5 periods a pixel or more. Without it, good cameras of
 0.25 pixels a line had a deviation of 152 in their finest stripes; with it 18 at most. Of 32 lines it would leave too
-few to foretell with."""
+few to predict with."""
 _DEGREE = 3
 """Of the polynomial, where there are lines enough: falloff and obliquity of 120 mm at 400 mm are even and smooth."""
 _LINES = 8
-"""Scene lines for each of a polynomial's numbers, at least: three of them leave most lines to foretell with."""
+"""Scene lines for each of a polynomial's numbers, at least: three of them leave most lines to predict with."""
 _FREQUENCIES = 64
 """Spatial frequencies that are looked at, of all that there are, evenly: more show the same, and cost time."""
 _TAPER = 0.15
@@ -46,7 +46,7 @@ ComplexArray = npt.NDArray[np.complex128]
 
 
 class MovingShadow:
-    """What patterns' vectors foretell of each other.
+    """What patterns' vectors predict of each other.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class MovingShadow:
     step
         sensor pixels that the shadow moves by from one column to the next.
     deviations
-        (N,) mean squared deviation of a vector from what the others foretell, in that of the median pattern.
+        (N,) mean squared deviation of a vector from what the others predict, in that of the median pattern.
     unlike
         (N,) the same squared deviation as a part of the vector's own square.
     amended
@@ -151,7 +151,7 @@ def _modes(angles: FloatArray, step: float, n: int) -> ComplexArray:
 
 
 def _first_line(modes: ComplexArray, rest: ComplexArray, whole: float) -> tuple[float, float]:
-    """Squared length of the first of columns beyond what the others foretell, and of the median one, of the ``rest``
+    """Squared length of the first of columns beyond what the others predict, and of the median one, of the ``rest``
     (frequencies, n) that modes leave of them; sums times ``whole``."""
     kept = np.maximum(1 - np.square(np.abs(modes)).sum(axis=2), 1e-3)
     lines = whole * np.square(np.abs(rest / kept)).sum(axis=0)

@@ -1,7 +1,7 @@
 """Measurements that fit no image in; out comes how else their frames may be read, where they fit that way.
 
 Each other reading is added up anew by the same factorised model: frames turned or mirrored, shots in another order,
-numbers without a tone curve (:mod:`mitsim.reconstruct.tonecurve`). U of the model is orthonormal, so that
+numbers without a tone curve (:class:`ToneCurves`). U of the model is orthonormal, so that
 |Y|^2 - |W|^2 is what a reading leaves.
 
 *Tone curves.* Curves are compared by the likelihood of the numbers as they were read (Box and Cox, 1964): where light
@@ -89,7 +89,7 @@ class Readings:
             whether most frames are off: then an order counts that leaves one frame of a cycle.
         """
         fits: list[Reading] = []
-        for cause, words, frames, most in self._tried(all_off):
+        for cause, words, frames, most in self._candidates(all_off):
             left_over, expected = self._left_over(frames)
             left = max(left_over - expected - beside_noise, 0.0)
             numbers = self.noise.readings / self.noise.shots * self.prepared.spare
@@ -115,7 +115,7 @@ class Readings:
         energy = max(problem.energy, np.finfo(float).tiny)
         return 1 - explained / energy, noise * self.prepared.spare / energy
 
-    def _tried(self, with_cut: bool) -> Iterator[tuple[Cause, str, Frames, float]]:
+    def _candidates(self, with_cut: bool) -> Iterator[tuple[Cause, str, Frames, float]]:
         """Cause, words and frames of each reading, and the part of the unexplained energy that it may leave;
         ``with_cut`` as ``all_off`` of :meth:`fitting` takes it."""
         shape = self.prepared.left.sensor_size, self.prepared.right.sensor_size
@@ -132,7 +132,7 @@ class Readings:
             else:
                 orders |= {STEPS[0]: lambda number: number - 1, STEPS[1]: lambda number: number + 1}
             for words, order in orders.items():
-                yield Cause.ORDER, f"the frames are {words}", self._ordered(order), cut
+                yield Cause.ORDER, f"the frames are {words}", self._reorder(order), cut
 
     def _each(self, turn: Callable[[FloatArray], FloatArray]) -> Frames:
         for each in self.measured():
@@ -147,7 +147,7 @@ class Readings:
             for sign, light in zip((0,) if each.shots == 1 else (1, -1), shots, strict=True):
                 yield number[each.row, each.column, sign], light
 
-    def _ordered(self, order: Callable[[int], int]) -> Frames:
+    def _reorder(self, order: Callable[[int], int]) -> Frames:
         """Measurements of the shots, each taken for that which ``order`` gives for its number: halves of signed
         patterns as their difference."""
         captures = self.manifest.patterns.captures

@@ -36,7 +36,7 @@ from mitsim.reconstruct.status import Solution, Verdict
 from mitsim.reconstruct.uncertainty import Propagation, Uncertainty, uncertainty
 
 _LAMBDA_BESIDE = 1e-3
-"""Lambda, over the largest sigma^2, by which frames are foretold beside an image whose own weight says nothing of it,
+"""Lambda, over the largest sigma^2, by which frames are predicted beside an image whose own weight says nothing of it,
 as of total variation: chosen, between those of bright and of dim runs."""
 _DEFECT_ROUNDS = 6
 """Times that defective pixels are looked for: beside bright ones dim ones show when these are left out, of a tenth of

@@ -291,7 +291,8 @@ class Halves:
     @cached_property
     def _squares(self) -> tuple[FloatArray, FloatArray]:
         """The squares of :attr:`differences` in units of a number's variance; NaN where halves cannot be told apart."""
-        rows, columns = (_told(half_spread(side.first_half)) for side in (self.left, self.right))
+        spreads = (half_spread(side.first_half) for side in (self.left, self.right))
+        rows, columns = (np.where(spread >= _LEAST_SPREAD, spread, np.nan) for spread in spreads)
         by_row, by_column = self.differences
         return np.square(by_row) / rows[:, None], np.square(by_column) / columns
 
@@ -314,11 +315,6 @@ class Halves:
 def half_spread(half: FloatArray) -> FloatArray:
     """(r,) variance of W_0 - G W for white noise of variance 1, G being ``half``: the diagonal of G (I - G)."""
     return np.asarray(np.diag(half) - np.einsum("ij,ji->i", half, half))
-
-
-def _told(spread: FloatArray) -> FloatArray:
-    """``spread`` where it is not too small; otherwise NaN."""
-    return np.where(spread >= _LEAST_SPREAD, spread, np.nan)
 
 
 def _medians(squares: FloatArray) -> FloatArray:

@@ -65,7 +65,7 @@ class Reconstruction:
         seconds by stage and memory, before it was begun; None where nobody could tell.
     objective, relative_gap
         of ``tv``: what was minimised, and how far above its minimum it may be at most, relative
-        (:class:`mitsim.reconstruct.tv.TVSolution`); None for other methods.
+        (:class:`mitsim.reconstruct.status.Solution`); None for other methods.
     """
 
     image: FloatArray

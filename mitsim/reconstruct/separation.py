@@ -94,7 +94,7 @@ def separate(
     count = model.left.pattern_count * model.right.pattern_count
     measured = (model.sigma > 0).astype(np.float64)
     target = bases[0].T @ total @ bases[1] - lit[0].T @ (measured * weights) @ lit[1]
-    unexplained: FloatArray = np.eye(target.size) - _explained(lit, measured) / count
+    unexplained: FloatArray = np.eye(target.size) - _explained_matrix(lit, measured) / count
     told, modes = np.linalg.eigh(unexplained)
     if told[-1] < _LEAST_TOLD:
         raise MitsimError("separation: these patterns light all pixels in each frame; use dots:K with K of 2 or more")
@@ -121,7 +121,7 @@ def _hats(pixels: int, period: int) -> FloatArray:
     return np.asarray(np.maximum(0.0, 1 - np.abs(place[:, None] - np.arange(count))))
 
 
-def _explained(lit: Sequence[FloatArray], measured: FloatArray) -> FloatArray:
+def _explained_matrix(lit: Sequence[FloatArray], measured: FloatArray) -> FloatArray:
     """(J J', J J') matrix of f -> A_L^T (A_L f A_R^T) A_R, of what is ``measured`` (r, r')."""
     pairs = [(side[:, :, None] * side[:, None, :]).reshape(len(side), -1) for side in lit]
     sizes = [side.shape[1] for side in lit]

@@ -99,7 +99,7 @@ class _Frames:
         unit = float(np.median(shown))
         shown = np.where(np.abs(shown) > DARK * np.abs(unit), shown, unit or 1.0)
         powers = np.vander(places - places.mean(), 3)
-        # A pattern of coarse stripes is hardly foretold by the light of others, but by the shadow.
+        # A pattern of coarse stripes is hardly predicted by the light of others, but by the shadow.
         far = own.far()
 
         def fitted(degree: int) -> tuple[FloatArray, FloatArray, FloatArray, npt.NDArray[np.bool_], float]:

@@ -1,4 +1,4 @@
-"""Sums of a session's pairs in; which are wrong, what their other frame foretells, and the lamp's power, out.
+"""Sums of a session's pairs in; which are wrong, what their other frame predicts, and the lamp's power, out.
 
 The two frames of a pair add up to one frame for all patterns, so that a frame which is black, dim, half lost, a repeat,
 shifted or clipped shows in the sum. What the sums share is the lamp's power, in the order of the session.
@@ -47,7 +47,7 @@ _FITS = 4.0
 """Mean squared deviation, in that of a good pair's sum, up to which a name fits."""
 _BOTH = 36.0
 """Squared deviation of a frame's light from the usual, in four times its robust scatter, that makes it no frame to
-foretell the other by."""
+predict the other by."""
 
 
 class _Frame(NamedTuple):
@@ -240,7 +240,7 @@ class Pairs:
         scale = float(np.sqrt((used[0] + used[self.count]) / 2)) if good[0] and good[self.count] else 1.0
         remaining = 0.0
         for number, own in enumerate(self.sides):
-            self._divided(number, own, self.side_of(number, used), flicker if shakes else 0.0)
+            self._divide(number, own, self.side_of(number, used), flicker if shakes else 0.0)
             own.vectors = own.vectors * scale
             remaining += float(own.extras.sum() / np.sum(np.square(own.vectors)))
         return Lamp(
@@ -252,7 +252,7 @@ class Pairs:
             corrected=True,
         )
 
-    def _divided(self, number: int, own: SideCheck, powers: FloatArray, flicker: float) -> None:
+    def _divide(self, number: int, own: SideCheck, powers: FloatArray, flicker: float) -> None:
         """Divide a side's vectors by the power of their frames; what flicker leaves in them counts as their error.
 
         Y(+1) = (1 + d) g P and Y(-1) = (1 - d) g (U - P) add up to g (U + d u), which tells d by the vector u of the
@@ -277,7 +277,7 @@ class Pairs:
     # ---- which frame of a pair is wrong
 
     def repair(self, lamp: Lamp) -> None:
-        """Name the faulty frames of wrong pairs, and put what their pairs foretell in the place of those; all that is
+        """Name the faulty frames of wrong pairs, and put what their pairs predict in the place of those; all that is
         right is divided by the power of the ``lamp`` where that is corrected for."""
         for place in np.flatnonzero(~self.good):
             self._repair(int(place // self.count), int(place % self.count), lamp)
@@ -286,7 +286,7 @@ class Pairs:
             if self.good[number * self.count] and fluxes[0, 0] < fluxes[0, 1]:
                 own.add(0, "exchanged", "in each other's place", "they count in their right order")
 
-    def _shown(self, frame: _Frame) -> _Parts:
+    def _measured_parts(self, frame: _Frame) -> _Parts:
         """A frame, in deviations of a pair's noise."""
         number, index, sign = frame
         pairs, scale = self.pairs[number], 1 / np.sqrt(self.floor)
@@ -294,10 +294,10 @@ class Pairs:
         rows, columns = pairs.rows[index, frame.half] * scale, pairs.columns[index, frame.half] * scale
         return rows, columns, vector / np.sqrt(self.light_noise[number])
 
-    def _expected(self, frame: _Frame) -> _Parts:
-        """What the other frame of its pair foretells of a frame."""
+    def _predicted_parts(self, frame: _Frame) -> _Parts:
+        """What the other frame of its pair predicts of a frame."""
         number, more = frame.number, self._power(frame) - 1
-        rows, columns, vector = self._shown(frame.other)
+        rows, columns, vector = self._measured_parts(frame.other)
         both = (self.ambient_and_all + more * self.common) * (1 / np.sqrt(self.floor))
         light = (self.lights[number] + more * self.uniforms[number]) / np.sqrt(self.light_noise[number])
         return both[: len(rows)] - rows, both[len(rows) :] - columns, light - vector
@@ -356,7 +356,7 @@ class Pairs:
 
     def _fault(self, frame: _Frame) -> _Fault:
         """The fault that leaves least of a frame unexplained, of those that explain it."""
-        shown, expected = self._shown(frame), self._expected(frame)
+        shown, expected = self._measured_parts(frame), self._predicted_parts(frame)
         seen, told = np.concatenate(shown), np.concatenate(expected)
         size = float(np.dot(told, told))
         part = float(np.dot(seen, told)) / size if size else 0.0
@@ -369,7 +369,7 @@ class Pairs:
         if flux < DARK and all(even):
             return _Fault(1.0, "black", "is black")
         tried = [_Fault(float(np.square(seen - part * told).mean()), *name_by_light(part))]
-        tried += [*_lost(shown, expected), *self._repeats(frame, shown), *_shifted(frame.number, shown, expected)]
+        tried += [*_losses(shown, expected), *self._repeats(frame, shown), *_shifts(frame.number, shown, expected)]
         best = min(tried, key=lambda fault: fault.rest)
         if best.rest > max(_FITS, _EXPLAINED * float(np.square(seen - told).mean())):
             return _Fault(best.rest, "wrong", "is not what the other frame of its pair foretells")
@@ -400,7 +400,7 @@ class Pairs:
                 yield _Fault(float(away[nearest]) / numbers, "repeated", f"repeats {frame_words(other)}", other)
 
 
-def _lost(shown: _Parts, expected: _Parts) -> Iterator[_Fault]:
+def _losses(shown: _Parts, expected: _Parts) -> Iterator[_Fault]:
     """A frame that ends early or begins late, along its rows or columns."""
     for seen, whole, word in zip(shown, expected, ("rows", "columns"), strict=False):
         missing, there = (np.insert(np.cumsum(np.square(each)), 0, 0.0) for each in (seen, seen - whole))
@@ -414,7 +414,7 @@ def _lost(shown: _Parts, expected: _Parts) -> Iterator[_Fault]:
             yield _Fault(float(cost[cut]) / len(seen), "half lost", detail)
 
 
-def _shifted(number: int, shown: _Parts, expected: _Parts) -> Iterator[_Fault]:
+def _shifts(number: int, shown: _Parts, expected: _Parts) -> Iterator[_Fault]:
     """A frame, of the side of a ``number``, that is moved by some rows or columns."""
     vector, whole = shown[2], expected[2]
     for axis, word in ((0, "rows"), (1, "columns")):

@@ -1,8 +1,8 @@
 """Vectors of one side's stripe patterns in; those that are out of their place put back, those that are wrong left out.
 
-What a pattern's vector should be, the others foretell, as all are of one moving shadow
+What a pattern's vector should be, the others predict, as all are of one moving shadow
 (:mod:`mitsim.reconstruct.moving_shadow`). Where that is a shadow of nothing, and columns are independent, nothing is
-foretold and nothing is found.
+predicted and nothing is found.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ of its amplitude."""
 _NOISY = 4.0
 """Robust scatter of misfits, over that by noise, up to which they are noise: of 60 good sides none has 1.5."""
 _FAR = 10.0
-"""Squared deviation of a vector from the foretold one, in that of the median pattern, from which it is suspected."""
+"""Squared deviation of a vector from the predicted one, in that of the median pattern, from which it is suspected."""
 _WRONG, _UNLIKE = 40.0, 0.1
 """The same, and that deviation as a part of the vector's own square, from which it is wrong whatever it shows: of 600
 good sides of 64 and 260 of 128 patterns none has more than 17 and 20 of such a part; nearly all that show other stripes
@@ -63,7 +63,7 @@ _SEEN = 64.0
 _FLOOR = 0.02
 """Relative error of a factor that its columns' covariance is taken to have at least, as it is no exact law; chosen."""
 _TURNS = 8
-"""Steps that foretell left-out patterns with a covariance free of them, which has their foretold variance in their
+"""Steps that predict left-out patterns with a covariance free of them, which has their predicted variance in their
 place; where another pattern of the same period is known, each step takes off half of the error."""
 
 
@@ -83,7 +83,7 @@ class SideCheck:
     uncounted
         responses whose misfit does not count.
     unknown
-        patterns whose vector the others must foretell.
+        patterns whose vector the others must predict.
     extras
         (N,) squared error of each vector beyond its noise.
     parts, errors
@@ -129,11 +129,11 @@ class SideCheck:
 
     @property
     def enough(self) -> bool:
-        """Whether columns are known well enough to foretell patterns."""
+        """Whether columns are known well enough to predict patterns."""
         return self.signs.shape[1] >= _ENOUGH[0] and self.length >= _ENOUGH[1]
 
     def far(self) -> npt.NDArray[np.bool_]:
-        """(N,) whether patterns are not what the others foretell, or left out."""
+        """(N,) whether patterns are not what the others predict, or left out."""
         shadow = MovingShadow(self.vectors, self.signs, self.unknown)
         far = (shadow.deviations > _WRONG) & (shadow.unlike > _UNLIKE)
         far[list(self.unknown)] = True
@@ -158,7 +158,7 @@ class SideCheck:
         )
 
     def check(self, unsteady: bool = False, name: Callable[[Half], str] = frame_words) -> None:
-        """Find patterns that show no stripes, are out of their place or are not what others foretell.
+        """Find patterns that show no stripes, are out of their place or are not what others predict.
 
         Parameters
         ----------
@@ -170,14 +170,12 @@ class SideCheck:
         self._check_misfits()
         count = self.signs.shape[1]
         if not self.enough:
-            for (
-                index
-            ) in self.unknown:  # nothing foretells them: their error is then their size, which the others' tells
+            for index in self.unknown:  # nothing predicts them: their error is then their size, which the others' tells
                 self.extras[index] = self._size(index)
                 self.change(index, np.zeros(self.length))
             return
         if self.unknown:
-            self._foretell_unknown()
+            self._predict_unknown()
         steady = self.pairs or not unsteady
         for _ in range(int(MOST_FAULTS * count) + 2):
             shadow = MovingShadow(self.vectors, self.signs, self.unknown)
@@ -201,7 +199,7 @@ class SideCheck:
             self._do_without(index, "wrong", f"is wrong: {detail}")
 
     def _do_without(self, index: int, kind: str, detail: str, other: Half | None = None) -> None:
-        """A pattern is left out, and what others foretell will come in its place."""
+        """A pattern is left out, and what others predict will come in its place."""
         self.add(index, kind, detail, "it is left out", other)
         self.unknown.add(index)
         self.uncounted.add(index)
@@ -221,7 +219,7 @@ class SideCheck:
             part = misfits[index] / energies[index]
             detail = f"no {self.side} stripes: {part:.0%} of their response is of other shape"
             # One frame for the mean of many is of other noise alone.
-            self._do_without(int(index), *(self._repeated(int(index)) or ("wrong", detail)))
+            self._do_without(int(index), *(self._repeat_of(int(index)) or ("wrong", detail)))
 
     def add(
         self, index: int, kind: str, detail: str, repair: str, other: Half | None = None, sign: int | None = None
@@ -253,7 +251,7 @@ class SideCheck:
         exchanges = np.where(fixed | (shadow.by_exchange < _EXPLAINED * deviations), -np.inf, shadow.by_exchange)
         flip = int(np.argmax(exchanges))
         gain, places = float(exchanges[flip]), [flip]
-        swapped = self._swapped(shadow, np.where(fixed, -np.inf, deviations))
+        swapped = self._best_swap(shadow, np.where(fixed, -np.inf, deviations))
         if swapped is not None and swapped[0] > gain:
             gain, places = swapped
         if gain > max(_GAIN, _EXPLAINED * deviations[worst] if shadow.unlike[worst] > _UNLIKE else 0.0):
@@ -277,7 +275,7 @@ class SideCheck:
             if np.linalg.norm(own + uniform) / 2 < DARK * np.linalg.norm(uniform):
                 self._leave_out(int(index), "black", "is black")
                 return True
-            if repeated := self._repeated(int(index)):
+            if repeated := self._repeat_of(int(index)):
                 self._leave_out(int(index), *repeated)
                 return True
         gains, light = shadow.by_scale(), self.parts
@@ -296,7 +294,7 @@ class SideCheck:
         self.add(index, *name_by_light(part), "its numbers are divided by that")
         return True
 
-    def _repeated(self, index: int) -> tuple[str, str, Half] | None:
+    def _repeat_of(self, index: int) -> tuple[str, str, Half] | None:
         """Kind, words and the other frame where one that is shown against a uniform one is the same as another."""
         own = self.vectors[:, index]
         away = np.square(own[:, None] - self.vectors).sum(axis=0)
@@ -307,7 +305,7 @@ class SideCheck:
         return "repeated", f"repeats {self.side} stripes {nearest}", (self.side, nearest, 1)
 
     @staticmethod
-    def _swapped(shadow: MovingShadow, deviations: FloatArray) -> tuple[float, list[int]] | None:
+    def _best_swap(shadow: MovingShadow, deviations: FloatArray) -> tuple[float, list[int]] | None:
         """What a swap of two that deviate takes off at most, and which two; None where there are no two."""
         far = np.flatnonzero(deviations > _FAR / 2)
         tried = np.sort(far[np.argsort(-deviations[far])[:_TRIED]])
@@ -332,10 +330,10 @@ class SideCheck:
             self.add(first, "swapped", detail, "both count in their right order", (self.side, rest[0], UNIFORM))
         elif not self.pairs:
             self.add(first, "exchanged", "shows black where white should be", "it counts with its sign")
-        elif not self._turned(first):
+        elif not self._turn_fault(first):
             self.add(first, "exchanged", "in each other's place", "they count in their right order")
 
-    def _turned(self, index: int) -> bool:
+    def _turn_fault(self, index: int) -> bool:
         """Whether a pattern's faulty frame is the other one of its pair: a frame may repeat the other, or that it."""
         for place, fault in enumerate(self.faults):
             if fault.index == index and fault.sign is not None:
@@ -348,31 +346,31 @@ class SideCheck:
         return False
 
     def _leave_out(self, index: int, kind: str, detail: str, other: Half | None = None) -> None:
-        """Put what the others foretell in place of a pattern."""
+        """Put what the others predict in place of a pattern."""
         self.faults = [fault for fault in self.faults if fault.index != index]
         self._do_without(index, kind, detail, other)
-        self._foretell_unknown()
+        self._predict_unknown()
 
-    # ---- what others foretell of a pattern ---------------------------------------------------------------------------
+    # ---- what others predict of a pattern ---------------------------------------------------------------------------
 
     def _size(self, index: int) -> float:
         """Mean squared length of the other patterns' vectors, but for the uniform one."""
         others = np.delete(self.vectors, [0, index], axis=1)
         return float(np.square(others).sum(axis=0).mean()) if others.size else 0.0
 
-    def _foretell_unknown(self) -> None:
-        """In place of patterns that are left out comes what others foretell, and the error of that counts.
+    def _predict_unknown(self) -> None:
+        """In place of patterns that are left out comes what others predict, and the error of that counts.
 
-        That is of columns as they are, as a moving shadow foretells nothing at the sensor's ends; where it does, what
+        That is of columns as they are, as a moving shadow predicts nothing at the sensor's ends; where it does, what
         both differ by is an error too: a period that no other pattern has is known by the motion alone.
         """
         for index in sorted(self.unknown):
-            self._foretell(index)
+            self._predict(index)
         amended = MovingShadow(self.vectors, self.signs, self.unknown).amended
         for index in self.unknown:
             self.extras[index] = min(max(self.extras[index], float(amended[index])), self._size(index))
 
-    def _foretell(self, index: int) -> None:
+    def _predict(self, index: int) -> None:
         """The same of one pattern."""
         self.change(index, np.zeros(self.length))
         variance = 0.0

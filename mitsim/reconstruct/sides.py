@@ -200,7 +200,7 @@ def factorise(
         whether frames lose row and column means.
     """
     sensor, scene = phi.shape
-    build = _projected if method == "svd" else _gram
+    build = _factorise_svd if method == "svd" else _factorise_gram
     basis, singular, slabs = build(phi, patterns, groups, structure)
     return Side(
         basis=_frozen(basis),
@@ -214,7 +214,7 @@ def factorise(
     )
 
 
-def _projected(
+def _factorise_svd(
     phi: FloatArray, patterns: FloatArray, groups: tuple[Group, ...], structure: Structure
 ) -> tuple[FloatArray, FloatArray, tuple[Slab, ...]]:
     """SVD of B block by block: basis, singular values, slabs."""
@@ -245,7 +245,7 @@ def _block_svd(phi: FloatArray, group: Group) -> tuple[tuple[FloatArray, ...], F
         norm = float(np.linalg.norm(psi))
         left, singular, right = _svd(phi * weights)
         scale = psi / (norm or 1.0)
-        return tuple(_scaled(left, factor) for factor in scale), singular * norm, right
+        return tuple(_scale(left, factor) for factor in scale), singular * norm, right
     # Phi = Q R once: B = (I (x) Q) [R diag(p_1); R diag(p_2); ...] is then as short as R, and as accurate.
     q, small = np.linalg.qr(phi)
     stacked = np.concatenate([small * column for column in patterns.T])
@@ -253,7 +253,7 @@ def _block_svd(phi: FloatArray, group: Group) -> tuple[tuple[FloatArray, ...], F
     return tuple(q @ slab for slab in np.split(left, patterns.shape[1])), singular, right
 
 
-def _scaled(matrix: FloatArray, factor: float) -> FloatArray:
+def _scale(matrix: FloatArray, factor: float) -> FloatArray:
     """matrix * factor without the work for 1, and with no columns for 0: a dark block is never read."""
     if factor == 0.0:
         return matrix[:, :0]
@@ -281,7 +281,7 @@ def _svd(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return left, singular, right
 
 
-def _gram(
+def _factorise_gram(
     phi: FloatArray, patterns: FloatArray, groups: tuple[Group, ...], structure: Structure
 ) -> tuple[FloatArray, FloatArray, tuple[Slab, ...]]:
     """Eigen-decomposition of A block by block (the paper's way), and slabs Phi diag(p_i)."""

@@ -324,7 +324,7 @@ def prepare(
             )
     same = np.array_equal(factors[0], factors[1]) and np.array_equal(patterns[0], patterns[1])
     if centre:
-        factors = [_centred(factor) for factor in factors]
+        factors = [_centre_factor(factor) for factor in factors]
     for name, factor, pattern in zip(("left", "right"), factors, patterns, strict=True):
         if not (factor.any() and pattern.any()):
             what = " once centred" if centre else ""
@@ -345,7 +345,7 @@ def prepare(
     return Prepared(*sides, method, centre)
 
 
-def _centred(factor: FloatArray) -> FloatArray:
+def _centre_factor(factor: FloatArray) -> FloatArray:
     """The factor without the means of its columns; a column of equal numbers leaves exact zeros, not rounding."""
     centred = centred_columns(factor)
     dust = len(factor) * np.finfo(np.float64).eps * np.abs(factor).max(axis=0)
@@ -434,7 +434,7 @@ class Accumulator:
             index out of range, or a pattern added twice (average repeated shots first).
         """
         self._check_index(row, column)
-        values = self._checked(frame, row, column)
+        values = self._check_frame(frame, row, column)
         if self._centre:
             values = centred(values)
         flat = values.ravel()
@@ -458,7 +458,7 @@ class Accumulator:
         if self._seen[row, column]:
             raise MitsimError(f"frame of pattern ({row}, {column}) was added before; average repeated captures first")
 
-    def _checked(self, frame: npt.ArrayLike, row: int, column: int) -> FloatArray:
+    def _check_frame(self, frame: npt.ArrayLike, row: int, column: int) -> FloatArray:
         values = np.asarray(frame)
         expected = (self._left.sensor_size, self._right.sensor_size)
         if values.shape != expected or values.dtype.kind not in "buif":

@@ -137,7 +137,7 @@ def scene_spectrum(sides: tuple[Side, Side], problem: DiagonalProblem, noise: fl
 
     brightness, variance = mean(usual * _GREY**2)
     detail = np.square(problem.projected - sigma * brightness * even)
-    groups = _grouped((np.square(sigma) / level)[measured], shares[:, measured], (detail / level)[measured])
+    groups = _group((np.square(sigma) / level)[measured], shares[:, measured], (detail / level)[measured])
     same_octave = np.where(np.equal.outer(*2 * [np.arange(len(nodes)) < len(nodes) // 2]), 1.0, _ALIKE)
     before = _DEPARTURE**2 * np.exp(-np.abs(place[:, None] - place) / _MEMORY) * same_octave
     level_of_detail = np.log(usual * max(brightness**2, variance))
@@ -177,7 +177,7 @@ def _nodes(down: FloatArray, across: FloatArray) -> tuple[FloatArray, float]:
     return np.concatenate([nodes * along, nodes * (1 - along)]), top / (count - 1)
 
 
-def _grouped(seen: FloatArray, shares: FloatArray, data: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _group(seen: FloatArray, shares: FloatArray, data: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Means over coefficients that are seen alike (by half octaves of ``seen``) and hold the same frequencies.
 
     Parameters
@@ -207,7 +207,7 @@ def _likeliest(
     Parameters
     ----------
     told, counts, found
-        of :func:`_grouped`.
+        of :func:`_group`.
     usual, precision
         (J,) and (J, J) of log S before.
     """

@@ -87,11 +87,11 @@ def solve_tv(
         measured = problem.sigma > 0
         least = np.divide(problem.projected, problem.sigma, out=np.zeros_like(problem.sigma), where=measured)
         return _solution(prepared, problem, prepared.image(least), 0.0, 0, 0.0, True)
-    image, spent, gap = _minimised(prepared, problem, float(weight), iterations, tolerance)
+    image, spent, gap = _minimise(prepared, problem, float(weight), iterations, tolerance)
     return _solution(prepared, problem, image, float(weight), spent, gap, gap <= tolerance)
 
 
-def _minimised(
+def _minimise(
     prepared: Prepared, problem: DiagonalProblem, weight: float, iterations: int, tolerance: float
 ) -> tuple[FloatArray, int, float]:
     """The image (n, n') whose relative gap is at most ``tolerance``, or that after ``iterations`` steps; the steps; its

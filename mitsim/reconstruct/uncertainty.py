@@ -255,10 +255,10 @@ class Propagation:
         energy = spectrum.energy * np.exp(spread / 2)  # the mean of what has a logarithm of that variance
         part = seen_part(energy)
         told = np.divide(part * detail, self._sigma, out=np.zeros_like(power), where=power > 0)
-        squares = self._seen(np.square(lost) * (np.square(told) + energy * (1 - part)))
+        squares = self._pixel_variance(np.square(lost) * (np.square(told) + energy * (1 - part)))
         of_mean = (spectrum.mean**2 + spectrum.mean_variance) * np.square(image(lost * spectrum.even))
         seen = gaussian_filter(np.square(image(lost * told)), _NEAR, mode="nearest")
-        usual = gaussian_filter(self._seen(np.square(lost) * energy * part), _NEAR, mode="nearest")
+        usual = gaussian_filter(self._pixel_variance(np.square(lost) * energy * part), _NEAR, mode="nearest")
         doubt = max(_UNSURE * float(usual.mean()), 1e-300)
         near = (seen + doubt) / (usual + doubt)
         placed = squares * near
@@ -290,9 +290,9 @@ class Propagation:
 
     def _spread(self, variances: FloatArray) -> FloatArray:
         """(n, n') variance of the image, that of each coefficient of W being ``variances`` (r, r')."""
-        return self._seen(np.square(self.gain) * variances)
+        return self._pixel_variance(np.square(self.gain) * variances)
 
-    def _seen(self, variances: FloatArray) -> FloatArray:
+    def _pixel_variance(self, variances: FloatArray) -> FloatArray:
         """(n, n') variance of the image, that of each of its coefficients being ``variances`` (r, r')."""
         left, right = (np.square(side.basis) for side in self.model.sides)
         return np.asarray(left @ variances @ right.T)

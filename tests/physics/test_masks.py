@@ -307,7 +307,7 @@ def test_a_sessions_factors_foretell_the_misfit_behind_flatcam(small_scene: Call
     image = reconstruct(shots, factors)
     assert image.misfit is not None and image.uncertainties is not None and shots.truth is not None
     assert image.misfit.cause is Cause.MASK
-    assert image.misfit.foretold == pytest.approx(image.misfit.unexplained, rel=0.05)
+    assert image.misfit.predicted == pytest.approx(image.misfit.unexplained, rel=0.05)
     assert (np.abs(image.image - shots.truth) < 1.96 * image.uncertainties.total).mean() > 0.9
 
 

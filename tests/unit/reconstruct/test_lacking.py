@@ -76,17 +76,17 @@ def test_what_factors_explain_is_no_lack() -> None:
 
 @pytest.mark.parametrize("patterns", ["dots:4", "hadamard:8"])
 def test_misfit_is_foretold_and_the_mask_named(patterns: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Scenes without print within pixels, to 5 %: it is foretold from an image that is itself off, by 0.02 rms at
-    `dots:4`. (Planted: the cause never told by what is foretold.)"""
+    """Scenes without print within pixels, to 5 %: it is predicted from an image that is itself off, by 0.02 rms at
+    `dots:4`. (Planted: the cause never told by what is predicted.)"""
     monkeypatch.setattr(importlib.import_module("mitsim.reconstruct.reconstruct"), "print_energy", lambda *_: 0.0)
     camera, factors = doubled()
     shots = camera.run(patterns, picture(), 0)
     found, unaware = (reconstruct(shots, each) for each in (factors, replace(factors, lacking=())))
     assert found.misfit is not None and unaware.misfit is not None
-    assert found.misfit.foretold == pytest.approx(found.misfit.unexplained, rel=0.05)
+    assert found.misfit.predicted == pytest.approx(found.misfit.unexplained, rel=0.05)
     assert found.misfit.cause is Cause.MASK and "foretells up to" in str(found.status) and " dB" in str(found.status)
     assert unaware.misfit.flagged and unaware.misfit.cause is not Cause.MASK
-    assert unaware.misfit.unexplained == found.misfit.unexplained and unaware.misfit.foretold is None
+    assert unaware.misfit.unexplained == found.misfit.unexplained and unaware.misfit.predicted is None
 
 
 def test_what_a_mask_explains_little_of_has_another_cause() -> None:

@@ -95,7 +95,7 @@ def test_a_good_session_is_left_as_it_is_to_the_bit() -> None:
 def test_a_wrong_frame_is_named_and_foretold_by_the_other_of_its_pair(
     kind: str, change: Callable[[np.ndarray], np.ndarray], half: Half
 ) -> None:
-    """(Planted: the other frame of the pair is named; the sign of the vector that it foretells is not turned.)"""
+    """(Planted: the other frame of the pair is named; the sign of the vector that it predicts is not turned.)"""
     shown = frames()
     shown[half] = change(shown[half])
     (fault,) = (found := judged(shown)).faults
@@ -132,7 +132,7 @@ def test_exchanged_frames_of_the_finest_stripes_are_put_back(index: int) -> None
 
 
 def test_a_wrong_frame_without_pairs_is_named_and_left_out() -> None:
-    """Each error that is left is that which is stated. (Planted: no error of the foretold pattern; a dim frame's scale
+    """Each error that is left is that which is stated. (Planted: no error of the predicted pattern; a dim frame's scale
     turned over.)"""
     good = frames()
     clean = judged(good, pairs=False)
@@ -155,7 +155,7 @@ def test_a_wrong_frame_without_pairs_is_named_and_left_out() -> None:
 
 
 def test_a_coarse_pattern_that_is_dim_without_a_pair_is_no_flicker() -> None:
-    """Its light is hardly foretold by that of others. (Planted: patterns far from the shadow count for the lamp.)"""
+    """Its light is hardly predicted by that of others. (Planted: patterns far from the shadow count for the lamp.)"""
     good = frames()
     for index in (16, 8, 24):
         half = "horizontal", index, 1
