@@ -35,7 +35,8 @@ from skimage.transform import resize
 from mitsim.acquire.capture import expose
 from mitsim.api.bench import Bench, open_bench
 from mitsim.calibrate.calibrate import estimate
-from mitsim.calibrate.session import LitSession, Session
+from mitsim.calibrate.lit_session import LitSession
+from mitsim.calibrate.session import Session
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.devices.camera import centred_edges
@@ -255,7 +256,7 @@ def main() -> None:
         benches = {kind: opened(*kind, options.n, Path(folder)) for kind in kinds}
         lights = {kind: bench.light(options.families[-1], accuracy=3e-4) for kind, bench in benches.items()}
         camera = Session(benches[kinds[0]], load_recipe(), 0)
-        board = camera.lit(camera.trace(camera.plan(2e-4, Job()), Job()), Job())
+        board = LitSession.of(camera, camera.trace(camera.plan(2e-4, Job()), Job()), Job())
         for seed in range(options.sessions):
             factors: Factors | None = None
             for name in options.prints:

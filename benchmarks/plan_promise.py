@@ -20,11 +20,12 @@ from typing import Any
 import numpy as np
 
 import mitsim as ms
-from mitsim.acquire.capture import digital_scale
 from mitsim.calibrate.calibrate import estimate
+from mitsim.calibrate.lit_session import LitSession
 from mitsim.calibrate.session import Session
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
+from mitsim.devices.sensor import digital_of
 from mitsim.reconstruct.factors import Factors
 
 HEAD = (
@@ -38,12 +39,12 @@ def session_psnrs(bench: Any, patterns: str, recipe: Any, seeds: range) -> list[
     `reconstruct` make them; responses without noise, which `calibrate` forms for its report alone, are left out."""
     shots = bench.capture(patterns, seed=seeds[0])
     session = Session(bench, recipe, seeds[0])
-    lit = session.lit(session.trace(session.plan(1e-3, Job()), Job()), Job())
+    lit = LitSession.of(session, session.trace(session.plan(1e-3, Job()), Job()), Job())
     manifest = CalibrationManifest(
         camera=bench.identity(),
         centre=session.centre,
         board_reflectance=recipe.board_reflectance,
-        digital=digital_scale(bench, lit.exposure_s),
+        digital=digital_of(bench.sensor, lit.exposure_s),
     )
     found = []
     for seed in seeds:

@@ -20,12 +20,12 @@ from typing import TYPE_CHECKING
 from mitsim.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from mitsim.acquire.capture import Light as Light
     from mitsim.acquire.reference import Rendered as Rendered
     from mitsim.api.bench import Bench as Bench
     from mitsim.api.bench import open_bench as open_bench
-    from mitsim.api.light import Light as Light
     from mitsim.bench.request import Request as Request
-    from mitsim.calibrate.model_fit import calibrate_model as calibrate_model
+    from mitsim.calibrate.model import calibrate_model as calibrate_model
     from mitsim.calibrate.plan import CalibrationPlan as CalibrationPlan
     from mitsim.calibrate.plan import plan_calibration as plan_calibration
     from mitsim.core.errors import ArgumentError as ArgumentError
@@ -52,21 +52,21 @@ if TYPE_CHECKING:
 _HOMES = {
     name: home
     for home, names in {
+        "acquire.capture": "Light",
         "acquire.reference": "Rendered",
-        "api.bench": "open_bench Bench",
-        "api.light": "Light",
+        "api.bench": "Bench open_bench",
         "bench.request": "Request",
-        "calibrate.model_fit": "calibrate_model",
-        "calibrate.plan": "plan_calibration CalibrationPlan",
-        "core.errors": "MitsimError ArgumentError",
-        "core.job": "Job Clock",
+        "calibrate.model": "calibrate_model",
+        "calibrate.plan": "CalibrationPlan plan_calibration",
+        "core.errors": "ArgumentError MitsimError",
+        "core.job": "Clock Job",
         "core.resources": "Limits",
-        "core.runs": "load_run load_mosaic Capture MosaicCapture",
-        "devices.session": "load_recipe Modelling",
+        "core.runs": "Capture MosaicCapture load_mosaic load_run",
+        "devices.session": "Modelling load_recipe",
         "light.plan": "Plan",
         "metrics": "psnr ssim",
         "reconstruct.captured_session": "calibrate_frames",
-        "reconstruct.factors": "load_calibration Factors",
+        "reconstruct.factors": "Factors load_calibration",
         "reconstruct.reconstruct": "reconstruct",
         "reconstruct.result": "Reconstruction",
         "report.colour.by_line": "reconstruct_colours",

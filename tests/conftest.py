@@ -147,11 +147,11 @@ def shared_scene(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path
 def variant() -> str:
     """``llvm_ad_mono`` selected and the plugin registered, for tests that use Mitsuba themselves."""
     from mitsim.core.environment import load_variant
-    from mitsim.transport.plugins import all
+    from mitsim.transport import plugins
 
     mi = load_variant("llvm_ad_mono")
     mi.set_log_level(mi.LogLevel.Error)
-    all.register()
+    plugins.register()
     return "llvm_ad_mono"
 
 

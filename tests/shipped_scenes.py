@@ -18,9 +18,9 @@ def opened(name: str) -> tuple[Any, Any]:
     """Mitsuba and the scene, through mitsim's own checks."""
     mi = load_variant("llvm_ad_mono")
     from mitsim.scene.load import load_scene
-    from mitsim.transport.plugins import all
+    from mitsim.transport import plugins
 
-    all.register()
+    plugins.register()
     return mi, load_scene(SCENES / name / "scene.xml").scene
 
 

@@ -463,8 +463,8 @@ def test_no_module_but_core_knows_a_backend() -> None:
 def test_lanes_are_not_added_up_in_32_bits() -> None:
     """Light is added up on the device in whole numbers or floats of 64 bits, or on the host in double precision."""
     assert not [name for name, path in modules() if sums_lanes(name, path.read_text(encoding="utf-8"))]
-    assert sums_lanes("mitsim.transport.flux", "total = dr.sum(light)") == ["sum"]
-    assert not sums_lanes("mitsim.transport.flux", "total = dr.block_sum(mi.Float64(light), 4)")
+    assert sums_lanes("mitsim.transport.direct", "total = dr.sum(light)") == ["sum"]
+    assert not sums_lanes("mitsim.transport.direct", "total = dr.block_sum(mi.Float64(light), 4)")
 
 
 # ---- sizes and names -------------------------------------------------------------------------------------------------

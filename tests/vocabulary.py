@@ -211,12 +211,12 @@ def outcome(path: Path, variant: str) -> dict[str, str]:
 
 def main() -> None:
     from mitsim.core.environment import load_variant
-    from mitsim.transport.plugins import all
+    from mitsim.transport import plugins
 
     variant, folder, names = sys.argv[1], Path(sys.argv[2]), sys.argv[3:]
     mi = load_variant(variant)
     mi.set_log_level(mi.LogLevel.Error)
-    all.register()
+    plugins.register()
     all_found = {}
     for tag, plugin in cases():
         if not names or f"{tag}_{plugin}" in names:

@@ -1,41 +1,43 @@
-"""A capture: from a bench and a request to one noisy frame for each shot, in memory or in a folder as they are made."""
+"""A capture: from a bench and a request to one noisy frame for each shot, in memory or in a folder as they are made.
+
+One path for light that is not told apart, for the lines of a projector one after the other, and for all of them at once
+behind colour filters: :class:`mitsim.acquire.spectral.SpectralBench` says which lines are traced and how they are read.
+"""
 
 from __future__ import annotations
 
-import math
 import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mitsim.acquire.exposure import AmbientFrame, Exposer, NoiseTarget, camera_warnings, in_chunks, is_taken, shots_for
+from mitsim.acquire.exposure import AmbientFrame, Exposer, Shooting, Totals, camera_warnings, is_taken, shots_for
+from mitsim.acquire.spectral import SpectralBench
 from mitsim.bench.bench import Apparatus
-from mitsim.bench.request import Request
-from mitsim.core.arrays import FloatArray, sum_of_squares
+from mitsim.bench.request import Request, Task
+from mitsim.core.arguments import checked
 from mitsim.core.environment import deciding_versions, versions
 from mitsim.core.errors import ArgumentError, cut
 from mitsim.core.exr import Channel
-from mitsim.core.files import FRAMES
+from mitsim.core.files import FRAMES, output_folder
 from mitsim.core.job import Job
-from mitsim.core.manifests import MANIFEST, AmbientFile, Patterns, RunHead, RunManifest
-from mitsim.core.manifests import Digital as DigitalScale
-from mitsim.core.parallel import Behind, in_threads, single_threaded_blas
-from mitsim.core.runs import AMBIENT, Capture, Recorder, RunMemory, check_same, claimed, frame_name
-from mitsim.devices.patterns import Lighting, PatternFamily, Shot
+from mitsim.core.manifests import Patterns, RunHead, RunManifest
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.runs import AMBIENT, Capture, LineTruth, MosaicCapture, Recorder, RunMemory, claimed, frame_name
+from mitsim.core.spectral_manifests import MOSAIC, RUN, ColourManifest, MosaicManifest, write_colours
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import load_recipe
-from mitsim.light.light import SampledLight, Sampling, trace_light
+from mitsim.light.light import SampledLight, trace_light, trace_lines
+from mitsim.light.light_file import write_light
 from mitsim.light.plan import Plan
-from mitsim.light.settings import GROUPS, Estimate, Settings
-from mitsim.optics.frames import ExpectedFrames, Frame, bound_of
+from mitsim.light.settings import GROUPS, Settings
+from mitsim.light.truth import Truth
 from mitsim.planner.explain import known_losses
 from mitsim.planner.memory import frame_seconds, frames_cost
-from mitsim.planner.planner import make_plan, plan_within
-from mitsim.sensor.chain import Digital
 
 _FIREFLIES = 0.72
 """Part of the variance in one of four groups: a single heavy path gives 0.75, and ordinary noise 0.3 to 0.5.
@@ -56,38 +58,46 @@ _NEGLIGIBLE = 0.1
 """Part of the accuracy below which it does not matter what the Monte Carlo error is made of."""
 
 
-def plan_request(bench: Apparatus, request: Request, lines: int = 1) -> Plan:
-    """The plan of a capture, with the request that it is for and what it takes on this bench.
+class Light(SampledLight):
+    """Sampled light of one scene, ready to be exposed; its attributes are those of
+    :class:`mitsim.light.light.SampledLight`."""
 
-    Parameters
-    ----------
-    bench, request
-        what is asked for.
-    lines
-        that share the paths, of which the bench shows one; what it takes is told of all.
+    @checked
+    def expose(
+        self, patterns: str = "dots:7", output: Path | str | None = None, job: Job | None = None, **request: Any
+    ) -> Capture:
+        """One noisy frame for each shot of a family in this light.
 
-    Raises
-    ------
-    MitsimError
-        when the request does not fit the bench, or no light of the projector reaches the camera.
-    """
-    lighting = bench.family(request.patterns, request.seed).lighting
-    plan = _planned(bench, lighting, request, lines)
-    cost = frames_cost(bench, plan.settings, lighting, plan.predicted_seconds, lines=lines)
-    return replace(plan, request=request, cost=cost)
+        Parameters
+        ----------
+        patterns
+            the family.
+        output
+            folder that the frames are written to; None keeps them in memory.
+        job
+            clock, progress and limits.
+        **request
+            ``seed``, ``exposure`` or ``exposure_fraction`` other than those that the light was traced with.
+
+        Raises
+        ------
+        MitsimError
+            for patterns that do not fit, an output that cannot be written, or a field that would need other light.
+        """
+        return expose(self, patterns, output, job, **request)
+
+    @checked
+    def save(self, path: Path | str) -> Path:
+        """Write the light to the HDF5 file ``path``, which is replaced; returns it. Frames are formed of it without
+        mitsim, as docs/exchange.md shows.
+
+        MitsimError for light that was traced by class, or where the file cannot be written.
+        """
+        write_light(Path(path), self)
+        return Path(path)
 
 
-def _planned(bench: Apparatus, lighting: Lighting, request: Request, lines: int) -> Plan:
-    """The plan of a capture, with what exposing and writing its frames takes."""
-    exposing, effects = frame_seconds(bench, lines * len(lighting.weights)), request.effects
-    if request.seconds is None:
-        plan = make_plan(bench, lighting, request.accuracy, request.seed, effects, lines)
-    else:
-        plan = plan_within(bench, lighting, request.seconds, request.seed, effects)
-    return plan.taking(**exposing)
-
-
-def trace_request(bench: Apparatus, plan: Plan, job: Job | None = None) -> SampledLight:
+def trace_request(bench: Apparatus, plan: Plan, job: Job | None = None) -> Light:
     """Light by projector pixel, as a plan asks.
 
     Parameters
@@ -102,7 +112,8 @@ def trace_request(bench: Apparatus, plan: Plan, job: Job | None = None) -> Sampl
         plan.cost.check(request.patterns, job.limits)
     lighting = bench.family(request.patterns, request.seed).lighting
     with job.clock.stage("transport"):
-        return trace_light(bench, plan, lighting, request.seed, progress=job.progress)
+        light = trace_light(bench, plan, lighting, request.seed, progress=job.progress)
+    return Light(**{each.name: getattr(light, each.name) for each in fields(light)})
 
 
 def expose(
@@ -115,10 +126,11 @@ def expose(
     light
         that the family is shown in.
     patterns, output, job, request
-        as for :meth:`mitsim.api.light.Light.expose`, which has the errors raised as well.
+        as for :meth:`Light.expose`, which has the errors raised as well.
     """
     own = replace(light.plan, request=request_of(light.plan, {}).changed(patterns=patterns))
-    return capture(light.bench, request_of(own, request), job, output, light=light)
+    bench = SpectralBench(light.bench)
+    return capture(bench, request_of(own, request), Task.of(output, job=job), lights=[light]).runs[0]
 
 
 def request_of(plan: Plan | str, changes: Mapping[str, Any]) -> Request:
@@ -145,121 +157,139 @@ def _request(plan: Plan) -> Request:
     return plan.request
 
 
+@dataclass(frozen=True, eq=False)
+class Captured:
+    """What a capture leaves: a run of each reading, and the truth of each line."""
+
+    runs: tuple[Capture, ...]
+    truths: tuple[Truth, ...]
+
+
 @single_threaded_blas()
 def capture(
-    bench: Apparatus,
+    bench: SpectralBench,
     request: Request,
-    job: Job | None = None,
-    output: Path | str | None = None,
-    resume: bool = False,
+    task: Task | None = None,
     plan: Plan | None = None,
-    light: SampledLight | None = None,
-) -> Capture:
+    lights: Sequence[SampledLight] = (),
+) -> Captured:
     """Render and expose every shot of a pattern family; see :meth:`mitsim.api.bench.Bench.capture`.
 
     Nothing is written before all input has been checked.
 
     Parameters
     ----------
-    bench, request, job, output, resume
-        as there.
+    bench, request, task
+        what is captured, and where it goes: of one reading a RUN folder, else a folder of those.
     plan
         made already.
-    light
-        traced already, by pixel or for this family.
+    lights
+        of each line, traced already, by pixel or for this family.
 
     Raises
     ------
     MitsimError
         as there.
     """
-    job = job or Job()
-    spent = job.clock.seconds()
+    task = task or Task()
+    job, spent = task.job, task.job.clock.seconds()
     starting = spent["total"] - spent.get("plan", 0.0)  # a plan that was made already has its own seconds
-    request.timing.check(bench.sensor, bench.rig.camera_file)
+    bench.check(request)
+    bench = bench.lit_by_lamps(request.effects, request.seed)
+    lighting = bench.whole.family(request.patterns, request.seed).lighting
+    lines, readings = len(bench.benches), bench.readings
+    colours = None if bench.whole.filters else bench.manifest  # of a folder of each line's
+    exposing = sum(frame_seconds(bench.whole, len(readings) * len(lighting.weights)).values())
+    with ExitStack() as places:
+        names = bench.names if colours else ("",)
+        folders = [task.output and task.output / name for name in names]
+        kept = [path for place in folders if place and task.resume for path in place.glob(FRAMES)]
+        on_disk = sum(path.stat().st_size for path in kept)
+
+        def check(settings: Settings, seconds: float) -> None:
+            cost = frames_cost(readings[0], settings, lighting, seconds, on_disk, lines)
+            cost.check(request.patterns, job.limits, task.output)
+
+        check(Settings(bench.whole.geometry.scene_distance), exposing)
+        if colours:
+            places.enter_context(colour_folder(task, colours))
+        heads = [RunHead.of(_configuration(each, request)) for each in readings]
+        recorders = [
+            places.enter_context(claimed(place, head, task.resume)) if place else RunMemory()
+            for place, head in zip(folders, heads, strict=True)
+        ]
+        with job.planning(request.patterns):
+            plan = (lights[0].plan if lights else plan or bench.plan(request)).taking(start=starting)
+        check(plan.settings, exposing if lights else plan.predicted_seconds)
+        if not lights:
+            with job.clock.stage("transport"):
+                sampling = bench.sampling(request)
+                lights = trace_lines(bench.whole, bench.benches, plan, lighting, request.seed, sampling, job.progress)
+            with job.clock.stage("truth"):
+                lights = bench.with_truths(lights, request.seed)
+        runs = [
+            _run(each, light, plan, request, job, head, recorder)
+            for each, light, head, recorder in zip(readings, bench.read(lights), heads, recorders, strict=True)
+        ]
+    return Captured(tuple(runs), tuple(light.apparent for light in lights))
+
+
+def _run(
+    bench: Apparatus, light: SampledLight, plan: Plan, request: Request, job: Job, head: RunHead, recorder: Recorder
+) -> Capture:
+    """The run of one reading: a ``light`` is exposed, and kept by a ``recorder`` under a ``head``."""
     family = bench.family(request.patterns, request.seed)
     patterns = Patterns.of(family, [frame_name(index) for index in range(len(family.shots))])
-    lighting = family.lighting
-    on_disk = sum(path.stat().st_size for path in Path(output).glob(FRAMES)) if output and resume else 0
-    place = Path(output) if output else None
-    exposing = sum(frame_seconds(bench, len(family.shots)).values())
-    first_look = frames_cost(bench, Settings(bench.geometry.scene_distance), lighting, exposing, on_disk)
-    first_look.check(request.patterns, job.limits, place)
-    head = RunHead.of(_configuration(bench, request))
-    with _recorder(place, head, resume) as recorder:
-        with job.planning(request.patterns):
-            plan = light.plan if light else plan
-            plan = (plan or _planned(bench, lighting, request, 1)).taking(start=starting)
-        seconds = exposing if light else plan.predicted_seconds
-        cost = frames_cost(bench, plan.settings, lighting, seconds, on_disk)
-        cost.check(request.patterns, job.limits, place)
-        with job.clock.stage("transport"):
-            light = light or trace_light(bench, plan, lighting, request.seed, sampling_of(bench, request), job.progress)
-        with job.clock.stage("truth"):
-            truth = light.apparent
-        with job.clock.stage("optics"):
-            expected = light.frames(lighting, request.seed)
-            # Forming the frames once finds the brightest pixel; a family with few classes keeps them for later.
-            totals = Totals.of(expected)
-        exposure_s = request.timing.choose(bench.rig, totals.peak)
-        exposer = Exposer(bench.rig, exposure_s, request.seed, light.speckle(family))
-        digital = digital_scale(bench, exposure_s)
-        with job.clock.stage("write"):
-            recorder.begin()
-            recorder.write_truth(truth.reflectance, load_recipe().board_reflectance, truth.standard_error)
-        with job.clock.stage("ambient frame"):
-            ambient = _ambient(request, family, expected, exposer)
-        if ambient:
-            _record_ambient(recorder, ambient, exposer)
-        shooting = Shooting(family, recorder, exposer, ambient, exposer.electrons(expected.projector_off))
-        shooting.shoot(expected, job)
-        total = light.plan.total(totals.noise)
-        manifest = RunManifest(
-            configuration=head.configuration,
-            configuration_sha256=head.configuration_sha256,
-            camera=bench.identity(),
-            digital=digital,
-            patterns=patterns,
-            ambient_frame=shooting.ambient_file,
-            plan=plan.block(),
-            mc_error=totals.mc_error,
-            total_error=total.value,
-            total_error_bound=total.bound,
-            total_error_of_projector=total.bound * shooting.dilution,
-            mc_to_sensor_noise=shooting.noise_ratio,
-            sensor_noise=shooting.sensor_noise,
-            heaviest_group=totals.heaviest,
-            truth_error=truth.error,
-            light_error=truth.error_of(light.flux_error),
-            paths=light.paths,
-            lost_light=light.lost,
-            seconds=job.clock.seconds(),
-            predicted_memory_bytes=cost.memory_bytes,
-            warnings=light.warnings + tuple(_warnings(light, totals, shooting, request)),
-            versions=versions(),
-        )
-        foreign = _foreign(light, totals, request)
-        if foreign and not manifest.warnings:  # within the accuracy: said, but no reason to flag the run
-            warnings.warn(foreign, stacklevel=4)
-        return Capture.recorded(recorder, manifest)
-
-
-def check_run(bench: Apparatus, request: Request, output: Path | None, resume: bool) -> None:
-    """Refuse, before any work, to go on with a run of another configuration; the rest is for :func:`capture`.
-
-    Parameters
-    ----------
-    bench, request, output, resume
-        as there.
-
-    Raises
-    ------
-    MitsimError
-        for another configuration, and an exposure that the camera cannot have.
-    """
-    request.timing.check(bench.sensor, bench.rig.camera_file)
-    if output is not None and resume and (output / MANIFEST).is_file():
-        check_same(output, RunHead.of(_configuration(bench, request)))
+    with job.clock.stage("truth"):
+        truth = light.apparent
+    with job.clock.stage("optics"):
+        expected = light.frames(family.lighting, request.seed)
+        # Forming the frames once finds the brightest pixel; a family with few classes keeps them for later.
+        totals = Totals.of(expected)
+    exposure_s = request.timing.choose(bench.rig, totals.peak)
+    exposer = Exposer(bench.rig, exposure_s, request.seed, light.speckle(family))
+    with job.clock.stage("write"):
+        recorder.begin()
+        recorder.write_truth(truth.reflectance, load_recipe().board_reflectance, truth.standard_error)
+    ambient = None
+    with job.clock.stage("ambient frame"):
+        if is_taken(request.ambient_frame, family, expected):
+            ambient = AmbientFrame.exposed(exposer, expected, request.ambient_shots or shots_for(family))
+    if ambient:
+        single = {"DN": ambient.digital, "electrons": ambient.electrons}
+        channels: dict[str, Channel] = {name: values.astype(np.float32) for name, values in single.items()}
+        recorder.write(AMBIENT, channels, {"shots": ambient.shots, "exposure_s": exposure_s, "seed": request.seed})
+    shooting = Shooting(family, recorder, exposer, ambient, exposer.electrons(expected.projector_off))
+    shooting.shoot(expected, job)
+    total = light.plan.total(totals.noise)
+    manifest = RunManifest(
+        configuration=head.configuration,
+        configuration_sha256=head.configuration_sha256,
+        camera=bench.identity(),
+        digital=digital_of(bench.sensor, exposure_s),
+        patterns=patterns,
+        ambient_frame=shooting.ambient_file,
+        plan=plan.block(),
+        mc_error=totals.mc_error,
+        total_error=total.value,
+        total_error_bound=total.bound,
+        total_error_of_projector=total.bound * shooting.dilution,
+        mc_to_sensor_noise=shooting.noise_ratio,
+        sensor_noise=shooting.sensor_noise,
+        heaviest_group=totals.heaviest,
+        truth_error=truth.error,
+        light_error=truth.error_of(light.flux_error),
+        paths=light.paths,
+        lost_light=light.lost,
+        seconds=job.clock.seconds(),
+        predicted_memory_bytes=frames_cost(bench, plan.settings, family.lighting).memory_bytes,
+        warnings=light.warnings + tuple(_warnings(light, totals, shooting, request)),
+        versions=versions(),
+    )
+    foreign = _foreign(light, totals, request)
+    if foreign and not manifest.warnings:  # within the accuracy: said, but no reason to flag the run
+        warnings.warn(foreign, stacklevel=5)
+    return Capture.recorded(recorder, manifest)
 
 
 def _configuration(bench: Apparatus, request: Request) -> dict[str, Any]:
@@ -268,37 +298,61 @@ def _configuration(bench: Apparatus, request: Request) -> dict[str, Any]:
 
 
 @contextmanager
-def _recorder(output: Path | None, head: RunHead, resume: bool) -> Iterator[Recorder]:
-    if output is None:
-        yield RunMemory()
+def colour_folder(task: Task, manifest: ColourManifest) -> Iterator[Path | None]:
+    """The folder that lines' folders are in; colour.json is written when all of them are finished.
+
+    Parameters
+    ----------
+    task
+        whose output it is; None in memory.
+    manifest
+        of the lines.
+
+    Raises
+    ------
+    MitsimError
+        where the output cannot be written.
+    """
+    if task.output is None:
+        yield None
         return
-    with claimed(output, head, resume) as folder:
+    again = task.resume and any((task.output / name).is_dir() for name in manifest.names)
+    with output_folder(task.output, overwrite=again) as folder:
         yield folder
+        write_colours(folder, manifest)
 
 
-def sampling_of(bench: Apparatus, request: Request) -> Sampling:
-    """How light of a ``bench`` is sampled for one family's frames by a ``request``."""
-    fraction = request.noise_fraction
-    return Sampling(by_pixel=False, target=NoiseTarget(bench.rig, request.timing, fraction) if fraction else None)
+def capture_lines(bench: Apparatus, request: Request, task: Task, plan: Plan | None = None) -> dict[str, Capture]:
+    """A run for each line, by its name.
+
+    Parameters
+    ----------
+    bench, request, task, plan
+        as for :meth:`mitsim.api.bench.Bench.capture_lines`, which has the errors raised as well.
+    """
+    lines = SpectralBench.of(bench, RUN)
+    return dict(zip(lines.names, capture(lines, request, task, plan).runs, strict=True))
 
 
-def _ambient(
-    request: Request, family: PatternFamily, expected: ExpectedFrames, exposer: Exposer
-) -> AmbientFrame | None:
-    if not is_taken(request.ambient_frame, family, expected):
-        return None
-    return AmbientFrame.exposed(exposer, expected, request.ambient_shots or shots_for(family))
+def capture_mosaic(bench: Apparatus, request: Request, task: Task) -> MosaicCapture:
+    """A run of all lines at once.
+
+    Parameters
+    ----------
+    bench, request, task
+        as for :meth:`mitsim.api.bench.Bench.capture_mosaic`, which has the errors raised as well.
+    """
+    lines = SpectralBench.of(bench, MOSAIC)
+    assert isinstance(lines.manifest, MosaicManifest)
+    captured, board = capture(lines, request, task), load_recipe().board_reflectance
+    each = [LineTruth(truth.reflectance, truth.standard_error, board) for truth in captured.truths]
+    found = MosaicCapture(captured.runs[0], lines.manifest, dict(zip(lines.names, each, strict=True)))
+    if found.shots.folder is not None:
+        found.write_lines(found.shots.folder)
+    return found
 
 
-def _record_ambient(recorder: Recorder, ambient: AmbientFrame, exposer: Exposer) -> None:
-    single = {"DN": ambient.digital, "electrons": ambient.electrons}
-    channels: dict[str, Channel] = {name: values.astype(np.float32) for name, values in single.items()}
-    recorder.write(AMBIENT, channels, {"shots": ambient.shots, "exposure_s": exposer.exposure_s, "seed": exposer.seed})
-
-
-def digital_scale(bench: Apparatus, exposure_s: float) -> DigitalScale:
-    """How digital numbers of the ``bench``'s camera become electrons a second at an exposure of ``exposure_s``."""
-    return digital_of(bench.sensor, exposure_s)
+# -------- Why a run is flagged
 
 
 def _warnings(light: SampledLight, totals: Totals, shooting: Shooting, request: Request) -> Iterator[str]:
@@ -367,195 +421,3 @@ def _of_ambient_light(shooting: Shooting, accuracy: float, of_projector: float) 
             f"{part}: noise is {shooting.noise_to_signal:.2g} times the projector's light in the frames, so little of "
             "an image will be left; darken the room, or expose longer on a sensor of a larger full well"
         )
-
-
-# -------- Expected frames of a family in
-
-
-@dataclass(frozen=True)
-class Totals:
-    """Over all expected frames: brightest pixel [W m^-2], relative Monte Carlo error, most light below zero.
-
-    ``heaviest``: the largest part of the Monte Carlo variance that one group of the light brings; ``mc_bound``: what
-    that error is below, at 95 %.
-    """
-
-    peak: float
-    mc_error: float
-    removed: float
-    heaviest: float
-    mc_bound: float
-
-    @property
-    def noise(self) -> Estimate:
-        """The Monte Carlo error, and its bound."""
-        return Estimate(self.mc_error, self.mc_bound)
-
-    @classmethod
-    def of(cls, expected: ExpectedFrames) -> Totals:
-        """Those of all ``expected`` frames, which are formed for it."""
-        peak = energy = variance = removed = heaviest = 0.0
-        parts = np.zeros(GROUPS)
-        for chunk in in_chunks((frame,) for frame in expected):
-            for (frame,), (brightest, squares) in zip(chunk, in_threads(_seen, chunk), strict=True):
-                removed = max(removed, frame.removed)
-                peak = max(peak, brightest)
-                energy += squares
-                variance += frame.variance * frame.irradiance.size
-                heaviest += frame.heaviest * frame.variance * frame.irradiance.size
-                parts += np.asarray(frame.by_group or (0.0,)) * frame.irradiance.size
-        mc_error = float(np.sqrt(variance / energy)) if energy else 0.0
-        return cls(peak, mc_error, removed, heaviest / variance if variance else 0.0, bound_of(parts, energy))
-
-
-def _seen(item: tuple[Frame]) -> tuple[float, float]:
-    """Irradiance of the brightest pixel of a frame, and the sum of its squares."""
-    (frame,) = item
-    return float(frame.irradiance.max()), sum_of_squares(frame.irradiance)
-
-
-@dataclass(frozen=True, eq=False)
-class _Exposed:
-    """One exposed shot: expected electrons, digital numbers, the two noises [electrons, rms], sums over its pixels.
-
-    ``light``, ``energy`` and ``signal``: of the electrons, of their squares, and of the squares without ambient light.
-    """
-
-    index: int
-    shot: Shot
-    electrons: FloatArray
-    digital: Digital
-    rendering_noise: float
-    sensor_noise: float
-    saturated: bool
-    light: float
-    energy: float
-    signal: float
-
-
-class Shooting:
-    """Turns expected frames into noisy ones and records them; frames that a resumed run has already are kept."""
-
-    def __init__(
-        self,
-        family: PatternFamily,
-        recorder: Recorder,
-        exposer: Exposer,
-        ambient: AmbientFrame | None,
-        always: FloatArray,
-    ) -> None:
-        """Nothing is exposed yet.
-
-        Parameters
-        ----------
-        family, recorder, exposer
-            the shots, where they are kept, and the camera.
-        ambient
-            what is taken off the frames.
-        always
-            (m, m') expected electrons of ambient light, which is in every frame.
-        """
-        self.family, self.recorder, self.exposer = family, recorder, exposer
-        self.ambient, self.always = ambient, always
-        self._has_ambient = bool(always.any())
-        self.saturated, self.noise_ratio = 0, 0.0
-        self._noise_energy = self._energy = self._signal = self._light = 0.0
-
-    @property
-    def sensor_noise(self) -> float:
-        """Relative noise of the sensor, ||noise|| / ||expected||, over all frames, from its closed form."""
-        return math.sqrt(self._noise_energy / self._energy) if self._energy else 0.0
-
-    @property
-    def dilution(self) -> float:
-        """Norm of the frames' light over that of the projector's: by so much lamps dilute an error relative to all."""
-        return math.sqrt(self._energy / self._signal) if self._signal else 1.0
-
-    @property
-    def ambient_part(self) -> float:
-        """Ambient light in all light of the frames."""
-        return float(self.always.sum()) * len(self.family.shots) / self._light if self._light else 0.0
-
-    @property
-    def noise_to_signal(self) -> float:
-        """Noise of the frames less the ambient frame, ||noise|| / ||light of the projector||, over all frames."""
-        own = 0.0
-        if self.ambient is not None and not self.family.signed:
-            own = self.exposer.sensor_noise(self.always) ** 2 / self.ambient.shots
-            own *= self.always.size * len(self.family.shots)
-        return math.sqrt((self._noise_energy + own) / self._signal) if self._signal else math.inf
-
-    @property
-    def ambient_file(self) -> AmbientFile | None:
-        """What the manifest says of the ambient frame."""
-        if self.ambient is None:
-            return None
-        return AmbientFile(file=AMBIENT, shots=self.ambient.shots, part=self.ambient_part, noise=self.noise_to_signal)
-
-    def shoot(self, expected: ExpectedFrames, job: Job) -> None:
-        """Expose and record the ``expected`` frames in chunks, one thread a processor; the ``job`` times its stages.
-
-        Files are written while the next chunk is formed and exposed: ``write`` is the time that work waits for them.
-        """
-        chunks = in_chunks(zip(range(len(expected)), self.family.shots, expected, strict=True))
-        with Behind(self._record) as writing:
-            while True:
-                with job.clock.stage("optics"):
-                    chunk = next(chunks, None)
-                if chunk is None:
-                    break
-                with job.clock.stage("sensor"):
-                    exposed = in_threads(self._expose, chunk)
-                with job.clock.stage("write"):
-                    writing.give(exposed)
-                for shot in exposed:
-                    self._count(shot)
-                job.progress("frames", (chunk[-1][0] + 1) / len(expected))
-            with job.clock.stage("write"):
-                writing.wait()
-
-    def _count(self, shot: _Exposed) -> None:
-        """Add what a ``shot`` says to what all say."""
-        if shot.rendering_noise:
-            ratio = shot.rendering_noise / shot.sensor_noise if shot.sensor_noise else np.inf
-            self.noise_ratio = max(self.noise_ratio, ratio)
-        self.saturated += shot.saturated
-        self._noise_energy += shot.sensor_noise**2 * shot.electrons.size
-        self._energy += shot.energy
-        self._signal += shot.signal
-        self._light += shot.light
-
-    def _expose(self, item: tuple[int, Shot, Frame]) -> _Exposed:
-        index, shot, frame = item
-        electrons = self.exposer.lit(frame, *shot.names)
-        digital = self.exposer.digital(electrons, *shot.names)
-        energy = sum_of_squares(electrons)
-        return _Exposed(
-            index=index,
-            shot=shot,
-            electrons=electrons,
-            digital=digital,
-            rendering_noise=self.exposer.rendering_noise(frame),
-            sensor_noise=self.exposer.sensor_noise(electrons),
-            saturated=self.exposer.saturated(digital, electrons),
-            light=float(electrons.sum()),
-            energy=energy,
-            signal=sum_of_squares(electrons - self.always) if self._has_ambient else energy,
-        )
-
-    def _record(self, exposed: _Exposed) -> None:
-        if self.recorder.keeps(exposed.index):
-            return
-        metadata: dict[str, str | int | float] = {
-            "row": exposed.shot.row,
-            "column": exposed.shot.column,
-            "sign": exposed.shot.sign,
-            "exposure_s": self.exposer.exposure_s,
-            "rendering_noise_e": exposed.rendering_noise,
-            "seed": self.exposer.seed,
-        }
-        electrons = exposed.electrons.astype(np.float32)
-        # EXR has no 64-bit numbers: the real-valued output of a sensor without an ADC is kept in single precision.
-        whole = exposed.digital.dtype == np.uint32
-        dn: Channel = exposed.digital.astype(np.uint32, copy=False) if whole else exposed.digital.astype(np.float32)
-        self.recorder.write_frame(exposed.index, {"DN": dn, "electrons": electrons}, metadata)

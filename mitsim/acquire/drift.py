@@ -3,7 +3,8 @@
 Light is traced up to the mask, so a mask that moved, turned or shakes changes the optics of traced light alone
 (:meth:`mitsim.light.light.SampledLight.behind`): a moved shadow is averaged over the same cells, so cells that hold
 frames to an accuracy hold what the drift changes in them as well. A moved projector lights other places: its light is
-traced anew. All else - power, lamps, temperature, exposure time, black level - is in the exposure."""
+traced anew. All else - power, lamps, temperature, exposure time, black level - is in the exposure.
+"""
 
 from __future__ import annotations
 

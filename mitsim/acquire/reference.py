@@ -16,7 +16,7 @@ from mitsim.bench.bench import Apparatus
 from mitsim.bench.request import FEWEST_PASSES, REFERENCE, check_accuracy, check_samples
 from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
-from mitsim.core.environment import versions
+from mitsim.core.environment import DEFAULT_VARIANT, load_variant, versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.job import Job
@@ -263,3 +263,24 @@ def render(
         "notes": bench.loaded.notes,
     }
     return Rendered(mean, error, facts, warnings)
+
+
+def rendered_psf(
+    shape: tuple[int, int], pitch_mm: float, variant: str = DEFAULT_VARIANT, rays: int = 4096, seed: int = 0
+) -> FloatArray:
+    """Light of a distant point behind the default diffuser of :mod:`mitsim.transport.plugins.diffuser`, of sum 1.
+
+    Parameters
+    ----------
+    shape, pitch_mm
+        rows and columns of the sensor, and its pixels' distance.
+    variant
+        of Mitsuba; it is selected for the process.
+    rays, seed
+        as for :func:`mitsim.transport.plugins.diffuser.point_spread`.
+    """
+    load_variant(variant)
+    from mitsim.transport.plugins.diffuser import Diffuser, point_spread
+
+    light = point_spread(Diffuser(), shape, pitch_mm, rays=rays, seed=seed)
+    return np.asarray(light / light.sum())

@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from mitsim.acquire.sense_options import check_ending, check_f_number, check_image, check_wavelength
-from mitsim.bench.request import Exposure
+from mitsim.bench.request import Exposure, check_ending, check_f_number, check_image, check_wavelength
 from mitsim.core.arrayfile import Npy
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import versions

@@ -1,61 +1,52 @@
-"""Sequential colour: a bench of several spectral lines in; a run for each line alone out.
+"""A bench by the spectral lines of its light: a bench in; the plan of all lines together, and light of each, out.
 
-A camera without colours sees one line of the projector at a time. Light of all lines is traced on the same paths
-(:func:`mitsim.light.light.trace_lines`), which carry a wavelength for each; from there on every line is a bench of
-its own, with the line's power, diffraction and photons, and what is made of it is an ordinary run. Calibrations are in
-:mod:`mitsim.calibrate.spectral`.
+Wavelength is an axis of light. Paths carry a wavelength for each line (:func:`mitsim.light.light.trace_lines`); from
+there on every line is a bench of its own, with the line's power, diffraction and photons. Light that is not told apart
+is one line. A camera without colours sees one line of the projector at a time, and each is a run of its own; one under
+colour filters reads all of them in one run.
+
+With w_pl the electrons that a pixel of plane p of the 2 x 2 filters makes of a photon of line l, its expected electrons
+are
+
+    e_p = t A sum_l w_pl E_l lambda_l / (h c),
+
+those of a pixel without a filter, one electron a photon, in an irradiance sum_l w_pl E_l lambda_l / lambda of the
+projector's effective wavelength lambda. Frames of that irradiance go through the sensor as any other's. Lamps shine at
+wavelengths of their own, which each colour of filters counts for itself (:mod:`mitsim.devices.lamps`): a count c is an
+irradiance c / lambda.
 """
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from pathlib import Path
-from typing import TYPE_CHECKING, Generic
+from typing import Any
 
 import numpy as np
 
-from mitsim.acquire.capture import capture, check_run, plan_request, sampling_of
-from mitsim.bench.open import Opened, reopened
-from mitsim.bench.request import check_untimed
+from mitsim.acquire.exposure import NoiseTarget
+from mitsim.bench.bench import Apparatus
+from mitsim.bench.open import Opened
+from mitsim.bench.request import Request, check_untimed
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import ArgumentError
-from mitsim.core.files import output_folder
-from mitsim.core.job import Job
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.seeds import integer
-from mitsim.core.spectral_manifests import (
-    BANDS,
-    LINES,
-    MONO,
-    MOST_LINES,
-    RUN,
-    ColourManifest,
-    Line,
-    bands_of,
-    check_undecided,
-    spectral_of,
-    write_colours,
-)
-from mitsim.devices.patterns import Lighting
+from mitsim.core.spectral_manifests import MOSAIC, ColourManifest, Line, MosaicManifest, spectral_of
+from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.devices.projector import Lines
-from mitsim.light.cost_model import traced_for
 from mitsim.light.lamps import lit_by_lamps
-from mitsim.light.light import SampledLight, Sampling, trace_lines
+from mitsim.light.light import SampledLight, Sampling
 from mitsim.light.passes import Simulation
-from mitsim.light.plan import ColourCandidate, ColourChoice, Plan
+from mitsim.light.plan import Plan
 from mitsim.light.settings import Settings
-from mitsim.light.truth import trace_truths
+from mitsim.light.truth import Truth, trace_truths
+from mitsim.optics.frames import ExpectedFrames, Frame
+from mitsim.planner.memory import frame_seconds, frames_cost
+from mitsim.planner.planner import make_plan, plan_within
+from mitsim.reconstruct.mosaic import PLANES, behind
 from mitsim.transport.records import Deposits
-
-if TYPE_CHECKING:
-    from mitsim.bench.bench import Apparatus
-    from mitsim.bench.request import Request
-    from mitsim.core.runs import Capture
-
 
 _RAYS, _ALIKE = 4, 0.9
 """Rays of each pixel that tell how rough a line's light is, and paths of each cell that tell lamps' light, a tenth of a
@@ -64,7 +55,7 @@ their root, of which this is a twentieth."""
 
 
 @dataclass(frozen=True)
-class ColourBench:
+class SpectralBench:
     """A bench by the lines of its projector.
 
     Attributes
@@ -72,34 +63,79 @@ class ColourBench:
     whole
         all lines, which paths carry together.
     manifest
-        names of the lines.
+        names of the lines; None: light is not told apart, and ``whole`` is the one line.
     """
 
     whole: Apparatus
-    manifest: ColourManifest
+    manifest: ColourManifest | None = None
 
     @classmethod
-    def of(cls, bench: Apparatus, kind: str) -> ColourBench:
-        """Of a ``bench``, for folders of a ``kind``. MitsimError where its light cannot be traced by line."""
+    def of(cls, bench: Apparatus, kind: str) -> SpectralBench:
+        """Of all lines of a ``bench``, for folders of a ``kind``. MitsimError where its light cannot be traced by line,
+        and for :data:`MOSAIC` where its camera has no colour filters that pass the lines."""
+        if kind == MOSAIC:
+            bench = without_filters(bench)
         if not bench.variant.endswith("_spectral"):
             needed = spectral_of(bench.variant)
             raise ArgumentError("variant", f"{bench.variant}: knows no wavelengths; open the bench with {needed}")
         lines = bench.projector.traced_lines
-        named = [
+        named = tuple(
             Line(name=f"{wavelength:g}nm", wavelength_nm=wavelength, radiant_share=share)
             for wavelength, share in zip(lines.wavelengths_nm, lines.shares, strict=True)
-        ]
-        manifest = ColourManifest.model_validate({"kind": kind, "channels": tuple(named)})
-        return cls(replace(bench, lines=lines), manifest)
+        )
+        said: dict[str, Any] = {"kind": kind, "channels": named}
+        if kind == MOSAIC:
+            said |= {"mosaic": bench.counting.mosaic, "weights": bench.counting.planes(lines.wavelengths_nm)}
+        model = MosaicManifest if kind == MOSAIC else ColourManifest
+        return cls(replace(bench, lines=lines), model.model_validate(said))
 
     @cached_property
     def benches(self) -> tuple[Apparatus, ...]:
         """The bench of each line alone."""
-        assert self.whole.lines is not None, "of the projector"
+        if self.manifest is None or self.whole.lines is None:
+            return (self.whole,)
         return tuple(line_alone(self.whole, line) for line in self.whole.lines.single)
 
-    def lit_by_lamps(self, effects: Mapping[str, bool], seed: int) -> ColourBench:
-        """The same with lamps that shine at wavelengths of their own; itself where they do.
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the lines; none where light is not told apart."""
+        return self.manifest.names if self.manifest else ()
+
+    @property
+    def readings(self) -> tuple[Apparatus, ...]:
+        """The bench of each run of frames: all lines at once behind colour filters, else each line's."""
+        return (self.whole,) if self.whole.filters else self.benches
+
+    def read(self, lights: Sequence[SampledLight]) -> Sequence[SampledLight]:
+        """The light of each of :attr:`readings`, from ``lights`` of the lines."""
+        if self.whole.filters is None or self.manifest is None:
+            return lights
+        return [MosaicLight.of(self.whole, lights, self.manifest.wavelengths_nm)]
+
+    def sampling(self, request: Request) -> Sampling:
+        """How light is sampled for one family's frames by a ``request``."""
+        fraction = request.noise_fraction
+        target = NoiseTarget(self.whole.rig, request.timing, fraction) if fraction else None
+        return Sampling(by_pixel=False, target=target, excess=excess_behind_filters if self.whole.filters else None)
+
+    def check(self, request: Request) -> None:
+        """MitsimError for what of a ``request`` the camera cannot have, or is not simulated in colour."""
+        request.timing.check(self.whole.sensor, self.whole.rig.camera_file)
+        if self.manifest is None:
+            return
+        check_untimed(request.seconds)
+        projector = self.whole.projector
+        speckled = request.effects.get("speckle", True) and (projector.speckle_contrast or projector.speckle)
+        if self.whole.filters and speckled:  # each line has its own, and each filter another mixture of them
+            raise ArgumentError(
+                "effects",
+                f"projector {projector.name} has speckle, which is not simulated behind colour filters; switch it "
+                "off with -speckle",
+            )
+
+    def lit_by_lamps(self, effects: Mapping[str, bool], seed: int) -> SpectralBench:
+        """The same with lamps that shine at wavelengths of their own; itself where they do, and where light is not told
+        apart.
 
         Parameters
         ----------
@@ -111,9 +147,25 @@ class ColourBench:
         MitsimError
             as there.
         """
-        if self.whole.lamplight is not None:
+        if self.manifest is None or self.whole.lamplight is not None:
             return self
         return replace(self, whole=lit_by_lamps(self.whole, effects, seed))
+
+    def plan(self, request: Request) -> Plan:
+        """The plan of all lines together, which is that of the roughest, for a ``request``. MitsimError as
+        :func:`plan_request`, and for what is not simulated in colour."""
+        if self.manifest is None:
+            return plan_request(self.whole, request)
+        self.check(request)
+        lighting = self.whole.family(request.patterns, request.seed).lighting
+        lit = float(np.mean(lighting.weights.mean(axis=0)[lighting.labels]))
+        roughest = self.lit_by_lamps(request.effects, request.seed).roughest(request.seed, lit)
+        plan = plan_request(roughest, request, len(self.benches))
+        if roughest.lamplight is not None and "ambient" not in plan.settings.effects:
+            # Beside a weaker line lamps may count.
+            request = request.changed(effects={**request.effects, "ambient": True})
+            plan = plan_request(roughest, request, len(self.benches))
+        return plan
 
     def roughest(self, seed: int, lit: float = 1.0) -> Apparatus:
         """The line that is planned for: that whose light differs most between neighbouring pixels of the projector,
@@ -127,60 +179,30 @@ class ColourBench:
         seed
             of a few rays for each pixel.
         lit
-            part of the pixels that a shot lights, beside which lamps shine.
+            part of the pixels that a shot lights in the mean, beside which lamps shine.
         """
-        bench = self.whole
+        bench, count = self.whole, len(self.benches)
         simulation = Simulation(bench, Settings(bench.geometry.scene_distance, effects=frozenset({"ambient"})))
         stream = integer(seed, "colour")
         deposits, lamps = simulation.direct.trace(stream, 0, _RAYS), Deposits.none()
         if bench.lamplight is not None and simulation.from_camera is not None:
             lamps = simulation.from_camera.trace(stream, 0, _RAYS)
-        wavelengths = [line.wavelength_nm for line in self.manifest.channels]
         steps = []
-        pairs = zip(deposits.by_line(len(wavelengths)), lamps.by_line(len(wavelengths)), strict=True)
-        for light, ambient in pairs:
+        for light, ambient in zip(deposits.by_line(count), lamps.by_line(count), strict=True):
             flux = np.bincount(light.pixel, light.value, bench.n**2).reshape(bench.n, bench.n)
             differences = sum(float(np.square(np.diff(flux, axis=axis)).sum()) for axis in (0, 1))
             energy = float(np.square(flux).sum())
             own = lit * float(flux.sum())
             part = own / (own + float(ambient.value.sum())) if own else 0.0
             steps.append(differences / energy * part**2 if energy else 0.0)
-        alike = [line for line, step in enumerate(steps) if step >= _ALIKE * max(steps)]
-        return self.benches[max(alike, key=lambda line: wavelengths[line])]
+        alike = [each for each, step in zip(self.benches, steps, strict=True) if step >= _ALIKE * max(steps)]
+        return max(alike, key=lambda each: each.projector.effective_wavelength_nm)
 
-
-def capture_lines(
-    bench: Apparatus,
-    request: Request,
-    job: Job | None = None,
-    output: Path | str | None = None,
-    resume: bool = False,
-    plan: Plan | None = None,
-) -> dict[str, Capture]:
-    """A run for each line, by its name; see :meth:`mitsim.api.bench.Bench.capture_lines`.
-
-    Parameters
-    ----------
-    bench, request, job, output, resume
-        as there.
-    plan
-        of all lines together, made already.
-
-    Raises
-    ------
-    MitsimError
-        as there.
-    """
-    job = job or Job()
-    colours = ColourBench.of(bench, RUN)
-    check_untimed(request.seconds)
-    colours = colours.lit_by_lamps(request.effects, request.seed)
-    with claimed(output, colours.manifest, resume) as places:
-        for each, place in zip(colours.benches, places, strict=True):
-            check_run(each, request, place, resume)
-        lights = traced_lines(colours, request, job, plan)
-        runs = zip(colours.manifest.names, colours.benches, lights, places, strict=True)
-        return {name: capture(each, request, job, place, resume, light=light) for name, each, light, place in runs}
+    def with_truths(self, lights: Sequence[SampledLight], seed: int) -> list[SampledLight]:
+        """The ``lights`` of the lines with their truths, traced on the same paths from a ``seed``."""
+        errors = np.stack([light.flux_error for light in lights])
+        truths = trace_truths(self.whole, lights[0].plan.settings, seed, errors)
+        return [replace(light, known_truth=truth) for light, truth in zip(lights, truths, strict=True)]
 
 
 def line_alone(bench: Apparatus, line: Lines) -> Apparatus:
@@ -189,291 +211,235 @@ def line_alone(bench: Apparatus, line: Lines) -> Apparatus:
     return replace(bench, rig=rig, lines=line)
 
 
-def plan_lines(colours: ColourBench, request: Request) -> Plan:
-    """The plan of all lines of ``colours`` together, which is that of the roughest, for a ``request``. MitsimError for
-    what is not simulated in colour."""
-    check_untimed(request.seconds)
-    lighting = colours.whole.family(request.patterns, request.seed).lighting
-    roughest = colours.lit_by_lamps(request.effects, request.seed).roughest(request.seed, _lit(lighting))
-    lines = len(colours.manifest.channels)
-    plan = plan_request(roughest, request, lines)
-    if roughest.lamplight is not None and "ambient" not in plan.settings.effects:
-        # Beside a weaker line lamps may count.
-        plan = plan_request(roughest, request.changed(effects={**request.effects, "ambient": True}), lines)
-    return plan
-
-
-def traced_lines(
-    colours: ColourBench, request: Request, job: Job, plan: Plan | None = None, sampling: Sampling | None = None
-) -> list[SampledLight]:
-    """Light of each line with its truth, traced on the same paths.
-
-    Parameters
-    ----------
-    colours
-        bench and lines.
-    request, job
-        what is asked for; clock, progress and limits.
-    plan
-        made already.
-    sampling
-        other than the request's.
-
-    Raises
-    ------
-    MitsimError
-        for what is not simulated in colour, and work beyond the limits.
-    """
-    lighting = colours.whole.family(request.patterns, request.seed).lighting
-    with job.planning(request.patterns):
-        plan = plan or plan_lines(colours, request)
-    if plan.cost:
-        plan.cost.check(request.patterns, job.limits)
-    with job.clock.stage("transport"):
-        sampling = sampling or sampling_of(colours.whole, request)
-        lights = trace_lines(colours.whole, colours.benches, plan, lighting, request.seed, sampling, job.progress)
-    with job.clock.stage("truth"):
-        errors = np.stack([light.flux_error for light in lights])
-        truths = trace_truths(colours.whole, plan.settings, request.seed, errors)
-    return [replace(light, known_truth=truth) for light, truth in zip(lights, truths, strict=True)]
-
-
-def _lit(lighting: Lighting) -> float:
-    """Part of the projector's pixels that a shot of a ``lighting`` lights, in the mean."""
-    return float(np.mean(lighting.weights.mean(axis=0)[lighting.labels]))
-
-
-@contextmanager
-def claimed(output: Path | str | None, manifest: ColourManifest, resume: bool) -> Iterator[Sequence[Path | None]]:
-    """Places for the lines' folders, None in memory; colour.json is written when all of them are finished.
-
-    Parameters
-    ----------
-    output, resume
-        as for :meth:`mitsim.api.bench.Bench.capture_lines`.
-    manifest
-        of the lines.
-
-    Raises
-    ------
-    MitsimError
-        where the output cannot be written.
-    """
-    if output is None:
-        yield [None] * len(manifest.names)
-        return
-    path = Path(output)
-    again = resume and any((path / name).is_dir() for name in manifest.names)
-    with output_folder(path, overwrite=again) as folder:
-        yield [folder / name for name in manifest.names]
-        write_colours(folder, manifest)
-
-
-# -------- Which colours a scene calls for
-
-_RAYS_OF_BANDS, _SHOTS = 4, 4
-"""Rays of each pixel, a tenth of a second, and shots that are compared, as the pilot's."""
-_NONE = 1e-6
-"""Difference that single precision may leave of none (photograph: 3e-8)."""
-_PART = 0.5
-"""Part of the accuracy that colours may take: the rest of the frames then keeps 0.87 of it, at a third more paths."""
-_ONCE, _TRACED = ("start", "plan"), ("transport", "truth")
-"""Stages of a prediction that lines share, and those in which they share paths; of the others each has its own."""
-
-
-@dataclass(frozen=True)
-class Coloured(Generic[Opened]):
-    """What was chosen, ready to be captured.
-
-    Attributes
-    ----------
-    plan
-        of the frames, with what was weighed (:attr:`Plan.colour`). Its accuracy is what the colours leave of the one
-        that was asked for.
-    bench
-        in the variant that the choice is traced in, its projector in the bands chosen.
-    """
-
-    plan: Plan
-    bench: Opened
-
-    @property
-    def mono(self) -> bool:
-        """Whether light is not told apart."""
-        return self.plan.colour is not None and self.plan.colour.chosen == MONO
-
-
-def choose_colour(bench: Opened, request: Request) -> Coloured[Opened]:
-    """The cheapest of mono, bands and lines that is predicted to keep the accuracy; see
-    :meth:`mitsim.api.bench.Bench.choose_colour`.
+def plan_request(bench: Apparatus, request: Request, lines: int = 1) -> Plan:
+    """The plan of a capture, with the request that it is for and what it takes on this bench.
 
     Parameters
     ----------
     bench, request
-        as there.
+        what is asked for.
+    lines
+        that share the paths, of which the bench shows one; what it takes is told of all.
 
     Raises
     ------
     MitsimError
-        as there.
+        when the request does not fit the bench, or no light of the projector reaches the camera.
     """
-    check_untimed(request.seconds)
-    check_undecided(bench.variant)
-    started, runs = time.perf_counter(), _runs(bench)
-    if _in_greys(bench):
-        errors, spectral = {name: 0.0 for name in runs if name in (MONO, LINES)}, None
+    lighting, effects = bench.family(request.patterns, request.seed).lighting, request.effects
+    exposing = frame_seconds(bench, lines * len(lighting.weights))
+    if request.seconds is None:
+        plan = make_plan(bench, lighting, request.accuracy, request.seed, effects, lines)
     else:
-        look = _Look(bench, request)
-        errors, spectral = look.errors(runs), look.spectral
-    most = _PART * request.accuracy
-    chosen = next((name for name in errors if errors[name] <= most), min(errors, key=lambda name: errors[name]))
-    looked = time.perf_counter() - started
-    left = request
-    if 0 < errors[chosen] <= most:
-        left = request.changed(accuracy=math.sqrt(request.accuracy**2 - errors[chosen] ** 2))
-    if chosen == MONO:
-        own = reopened(bench, bench.variant) if spectral else bench
-        plan = plan_request(own, left)
-    else:
-        whole = spectral or reopened(bench, spectral_of(bench.variant))
-        own = whole if chosen == LINES else whole.in_bands(bands_of(chosen))
-        plan = plan_lines(ColourBench.of(own, RUN), left)
-    plan = plan.taking(plan=plan.predicted["plan"] + looked)
-    candidates = tuple(
-        ColourCandidate(name, error, _seconds(plan.predicted, runs[chosen], runs[name], bool(bench.loaded.parting)))
-        for name, error in errors.items()
-    )
-    return Coloured(_told(plan, ColourChoice(chosen, candidates), request), own)
+        plan = plan_within(bench, lighting, request.seconds, request.seed, effects)
+    plan = plan.taking(**exposing)
+    cost = frames_cost(bench, plan.settings, lighting, plan.predicted_seconds, lines=lines)
+    return replace(plan, request=request, cost=cost)
 
 
-def _runs(bench: Apparatus) -> dict[str, int]:
-    """Runs that each candidate takes of a ``bench``, the fewest first."""
-    lines = bench.projector.lines
-    bands = range(1, min(len(lines.shining.shares) - 1, MOST_LINES) + 1)
-    every = {LINES: len(lines.shares)} if len(lines.shares) <= MOST_LINES else {}
-    return {MONO: 1} | {f"{BANDS}:{count}": count for count in bands} | every
+# -------- All lines at once behind colour filters
 
 
-def _in_greys(bench: Apparatus) -> bool:
-    """Whether nothing of a ``bench`` but the mask's shadow differs by wavelength, which mono frames have in them."""
-    return not bench.loaded.coloured and bench.sensor.quantum_efficiency_curve is None
+def without_filters(bench: Opened) -> Opened:
+    """A ``bench`` whose frames are formed without its colour filters, which are kept beside.
 
-
-def _seconds(predicted: Mapping[str, float], runs: int, others: int, parted: bool) -> float:
-    """Seconds of so many other runs, from those of some.
-
-    Parameters
-    ----------
-    predicted
-        seconds by stage.
-    runs, others
-        that they are of, and that are asked for.
-    parted
-        whether they share no paths.
+    MitsimError for a camera that has none, or an odd number of pixels.
     """
-    shared = sum(predicted.get(stage, 0.0) for stage in _ONCE)
-    traced = sum(predicted.get(stage, 0.0) for stage in _TRACED)
-    own = sum(predicted.values()) - shared - traced
-    return shared + traced_for(others, parted) / traced_for(runs, parted) * traced + others / runs * own
-
-
-def _told(plan: Plan, choice: ColourChoice, request: Request) -> Plan:
-    """A plan that says what was chosen.
-
-    Parameters
-    ----------
-    plan
-        of the choice.
-    choice
-        what was weighed.
-    request
-        what was asked for.
-    """
-    error, mono = choice.taken.error or 0.0, choice.candidates[0].error
-    warnings = plan.warnings
-    if error > _PART * request.accuracy:
-        warnings = (
-            *warnings,
-            f"colour: {choice.chosen} leaves {error:.1e} of a band's light, more than half of the accuracy "
-            f"{request.accuracy:g}, and no more than {MOST_LINES} bands are traced; ask for less, or give a projector "
-            "of fewer lines",
+    sensor = bench.sensor
+    if sensor.mosaic is None:
+        raise MitsimError(
+            f"camera {bench.rig.camera_file}: has no mosaic of colour filters, and colour mosaic was asked for; "
+            "use a camera that has one, such as imx249_rggb, or colour lines"
         )
-    rows = tuple(
-        replace(row, reason=f"{choice.chosen} leaves {error:.1e}, mono {mono:.1e}", error_if_off=mono)
-        if row.name == "spectrum" and mono
-        else row
-        for row in plan.effects
-    )
-    return replace(plan, colour=choice, effects=rows, warnings=warnings)
+    (rows, columns), first = bench.geometry.frame_shape, (bench.geometry.roi or (0, 0))[:2]
+    if rows % 2 or columns % 2 or any(at % 2 for at in first):
+        raise MitsimError(
+            f"camera {bench.rig.camera_file}: frames of {rows} x {columns} pixels from row {first[0]} and column "
+            f"{first[1]} do not hold whole filters of 2 x 2; give the scene's film even numbers"
+        )
+    bare = sensor.model_copy(update={"mosaic": None, "mosaic_curves": None, "quantum_efficiency": 1.0})
+    return replace(bench, rig=replace(bench.rig, sensor=bare), filters=sensor)
 
 
-class _Look(Generic[Opened]):
-    """Frames of few rays by candidate, in electrons but for a factor that all share."""
+@dataclass(frozen=True, eq=False)
+class MosaicLight(SampledLight):
+    """Light of all lines together behind the filters.
 
-    def __init__(self, bench: Opened, request: Request) -> None:
-        family = bench.family(request.patterns, request.seed).lighting
-        shots = len(family.weights)
-        chosen = np.unique(np.linspace(0, shots - 1, min(shots, _SHOTS)).astype(int))
-        # Pixels that these shots light alike are one class.
-        weights, classes = np.unique(family.weights[chosen], axis=1, return_inverse=True)
-        self._lighting = Lighting(classes.ravel()[family.labels], weights)
-        self._bench, self._seed = bench, integer(request.seed, "colour")
-        diffracts = bench.geometry.diffracts and request.effects.get("diffraction", True)
-        effects = frozenset({"diffraction"} if diffracts else ())
-        self._settings = Settings(bench.geometry.scene_distance, effects=effects)
+    Attributes
+    ----------
+    by_line
+        light of each, traced on the same paths.
+    passed
+        (lines, m, m') part of each line's irradiance that counts, as that of the effective wavelength.
+    """
 
-    @cached_property
-    def spectral(self) -> Opened:
-        """The bench in the variant that knows wavelengths, which is set from then on."""
-        return reopened(self._bench, spectral_of(self._bench.variant))
+    by_line: tuple[SampledLight, ...] = ()
+    passed: FloatArray | None = None
 
-    def errors(self, names: Iterable[str]) -> dict[str, float]:
-        """What each candidate leaves, by the ``names``."""
-        mono = self._electrons(self._bench, self._deposits(self._bench)[0])  # before another variant is set
-        lines = self._bench.projector.lines.shining
-        cut = {name: lines.bands(bands_of(name)) for name in names if name.startswith(BANDS)}
-        bands = {band for each in cut.values() for band in each if band.several}
-        sums = {band: np.zeros_like(mono) for band in bands | {lines}}
-        for line, frames in self._of_lines(lines.single):
-            for band, whole in sums.items():
-                if line.wavelengths_nm[0] in band.wavelengths_nm:
-                    whole += frames
-        merged = {Lines((band.mean_nm,), (sum(band.shares),)): band for band in bands}
-        left = {merged[line]: _relative(frames, sums[merged[line]]) for line, frames in self._of_lines(tuple(merged))}
-        errors = {name: max(left.get(band, 0.0) for band in each) for name, each in cut.items()}
-        known = {MONO: _relative(mono, sums[lines]), **errors, LINES: 0.0}
-        return {name: known[name] for name in names}
+    @classmethod
+    def of(cls, bench: Apparatus, lights: Sequence[SampledLight], wavelengths_nm: Sequence[float]) -> MosaicLight:
+        """Of all lines together.
 
-    def _of_lines(self, lines: tuple[Lines, ...]) -> Iterator[tuple[Lines, FloatArray]]:
-        """Frames of single ``lines``, traced as many at a time as paths carry."""
-        for first in range(0, len(lines), MOST_LINES):
-            some = lines[first : first + MOST_LINES]
-            together = Lines(tuple(line.wavelengths_nm[0] for line in some), tuple(line.shares[0] for line in some))
-            lit = self._deposits(replace(self.spectral, lines=together))
-            for line, deposits in zip(some, lit, strict=True):
-                yield line, self._electrons(line_alone(self.spectral, line), deposits)
+        Parameters
+        ----------
+        bench
+            with all lines, as :func:`without_filters` makes it.
+        lights, wavelengths_nm
+            of each line.
+        """
+        weights = np.array(bench.counting.planes(wavelengths_nm))
+        counted = weights * np.asarray(wavelengths_nm) / bench.projector.effective_wavelength_nm
+        first = lights[0]
+        own = {
+            "simulation": Simulation(bench, first.plan.settings),
+            "flux": np.tensordot(counted.mean(axis=0), [light.flux for light in lights], axes=1),
+            "flux_error": np.tensordot(counted.mean(axis=0), [light.flux_error for light in lights], axes=1),
+            "sampling_error": max(light.sampling_error for light in lights),
+            "reached": all(light.reached for light in lights),
+            "looked": None,
+            "known_truth": _truth_of_all(lights, counted.mean(axis=0)),
+            "by_line": tuple(lights),
+            "passed": behind(counted, bench.geometry.frame_shape),
+        }
+        return cls(**{each.name: getattr(first, each.name) for each in fields(SampledLight)} | own)
 
-    def _deposits(self, bench: Apparatus) -> list[Deposits]:
-        """Direct light of a ``bench`` by line, on the same paths whatever the variant."""
-        found = Simulation(bench, self._settings).direct.trace(self._seed, 0, _RAYS_OF_BANDS)
-        return found.by_line(1 if bench.lines is None else len(bench.lines.shares))
+    @property
+    def lost(self) -> float:
+        """The largest of any line."""
+        return max(light.lost for light in self.by_line)
 
-    def _electrons(self, bench: Apparatus, deposits: Deposits) -> FloatArray:
-        """(shots, rows, columns) of the light in ``deposits``, by the photons and the efficiency of a ``bench``."""
-        simulation, lighting = Simulation(bench, self._settings), self._lighting
-        filed = simulation.accumulate("direct", deposits, lighting.labels, _RAYS_OF_BANDS)
-        rows = np.arange(lighting.weights.shape[1])
-        frames = simulation.expected([filed], rows, lighting, self._seed, leaking=False)
-        wavelength = bench.projector.effective_wavelength_nm
-        each = bench.sensor.efficiency(wavelength) * wavelength
-        return np.stack([frame.irradiance for frame in frames]) * each
+    def frames(self, lighting: Lighting, seed: int, leaking: bool = True) -> ExpectedFrames:
+        """Expected frames of all lines together; see :meth:`Light.frames`.
 
+        Parameters
+        ----------
+        lighting, seed, leaking
+            as there.
+        """
+        assert self.passed is not None, "made by of()"
+        lines = [light.frames(lighting, seed, leaking).of_projector for light in self.by_line]
+        return MosaicFrames(lines, self.passed, self._lamps(seed), self.by_line[0].simulation.lamps_apart)
 
-def _relative(found: FloatArray, true: FloatArray) -> float:
-    """||found - true|| / ||true||, rounded up to two digits, so that what follows does not hang on a sum's order."""
-    whole = float(np.linalg.norm(true))
-    error = float(np.linalg.norm(found - true)) / whole if whole else 0.0
-    if error < _NONE:
+    def _lamps(self, seed: int) -> Frame | None:
+        """Lamps' light behind the filters, with its error by probes of a ``seed``; None without lamps."""
+        lamplight = self.bench.lamplight
+        if lamplight is None:
+            return None
+        each = [lamplight.units_of(light.bench.projector.lines)[0] for light in self.by_line]
+        unit, line = max((unit, line) for line, unit in enumerate(each))
+        light = self.by_line[line]
+        frames, counted = list[Frame](), np.zeros((len(PLANES), len(lamplight.responses)))
+        for number, response in enumerate(lamplight.responses):
+            frames += _lamps_alone(light, lamplight.rows(number), seed)
+            # Filed is the mean over all pixels, of which the response's have it all.
+            scale = response.part * unit * self.bench.projector.effective_wavelength_nm
+            counted[list(response.planes), number] = 1 / scale
+        shape = self.bench.geometry.frame_shape
+        irradiance = np.einsum("fij,fij->ij", behind(counted, shape), np.stack([each.irradiance for each in frames]))
+        parts = np.square(counted).mean(axis=0) @ np.array([each.by_group for each in frames])  # no pixel has two
+        variance = float(parts.sum())
+        heaviest = float(parts.max()) / variance if variance else 0.0
+        return Frame(irradiance, variance, max(each.removed for each in frames), heaviest, tuple(parts))
+
+    def speckle(self, family: PatternFamily | None = None) -> float:
+        """None, of any ``family``: a projector with speckle is refused."""
         return 0.0
-    digit = 10.0 ** (math.floor(math.log10(error)) - 1)
-    return float(f"{math.ceil(round(error / digit, 6)) * digit:.1e}")
+
+
+def _lamps_alone(light: SampledLight, bands: slice, seed: int) -> ExpectedFrames:
+    """One frame of lamps of a ``light``, of some ``bands`` of theirs; a ``seed`` of its probes."""
+    lamplight = light.bench.lamplight
+    assert lamplight is not None, "asked before"
+    filed = light.simulation.of_lamps(light.groups, light.groups[0].rows - len(lamplight.bands), bands)
+    return ExpectedFrames(filed, Lighting(np.zeros(1, np.int64), np.ones((1, 1))), seed)
+
+
+def excess_behind_filters(lights: Sequence[SampledLight]) -> float:
+    """By how much the error of lamps' light behind filters exceeds that of their mean over all pixels, which is in
+    every line's light; 1 without ``lights`` of lamps.
+
+    A filter's few wavelengths are sampled worse than all. Its frames weigh by their energy, which for the same scene is
+    that of what a pixel counts.
+    """
+    light, lamplight = lights[0], lights[0].bench.lamplight
+    if lamplight is None or lamplight.shares is None:
+        return 1.0
+    whole, _ = _lamps_alone(light, slice(None), light.seed).sampling_error()
+    energy = variance = 0.0
+    for number, response in enumerate(lamplight.responses):
+        rows = lamplight.rows(number)
+        error, _ = _lamps_alone(light, rows, light.seed).sampling_error()
+        own = float(lamplight.shares[rows].sum()) ** 2 / response.part
+        energy, variance = energy + own, variance + own * error**2
+    return max(1.0, math.sqrt(variance / energy) / whole) if whole else 1.0
+
+
+class MosaicFrames(ExpectedFrames):
+    """Frames of every shot behind the filters; iterate as often as needed.
+
+    Lines are traced on the same paths, so their errors go together: that of the sum is at most the sum of theirs.
+    So do they with that of lamps' light, but where no other light is on lamps' paths.
+
+    Parameters
+    ----------
+    lines
+        frames of each line, of the projector's light alone.
+    passed
+        (lines, m, m') part of its irradiance that counts.
+    lamps
+        their light, as it counts, which is in every frame.
+    independent
+        whether no other light is on their paths.
+    """
+
+    def __init__(
+        self, lines: Sequence[ExpectedFrames], passed: FloatArray, lamps: Frame | None = None, independent: bool = False
+    ) -> None:
+        self._lines, self._passed, self._lamps, self._independent = tuple(lines), passed, lamps, independent
+        self._spread = np.sqrt(np.square(passed).mean(axis=(1, 2)))
+
+    def __len__(self) -> int:
+        return len(self._lines[0])
+
+    @property
+    def has_ambient(self) -> bool:
+        """Whether lamps shine."""
+        return self._lamps is not None
+
+    @property
+    def projector_off(self) -> Frame:
+        """The frame of lamps alone, dark where there are none; its Monte Carlo error is that of all frames."""
+        return self._lines[0].projector_off if self._lamps is None else replace(self._lamps, variance=0.0, by_group=())
+
+    def __iter__(self) -> Iterator[Frame]:
+        always = () if self._lamps is None else (self._lamps,)
+        for shot in zip(*self._lines, strict=True):
+            light = np.einsum("lij,lij->ij", self._passed, np.stack([frame.irradiance for frame in shot]))
+            if self._lamps is not None:
+                light += self._lamps.irradiance
+            groups = zip(*(frame.by_group or (frame.variance,) for frame in (*shot, *always)), strict=True)
+            parts = tuple(self._sum_of_variances(each) for each in groups)
+            variance, removed = sum(parts), max(frame.removed for frame in (*shot, *always))
+            heaviest = max(parts) / variance if variance else 0.0
+            yield Frame(light, variance, removed, heaviest, parts if shot[0].by_group else ())
+
+    def _sum_of_variances(self, variances: Sequence[float]) -> float:
+        """Variance of the sum of all lines' light and lamps', from a group's of each."""
+        lines, lamps = variances[: len(self._lines)], sum(variances[len(self._lines) :])
+        own = float(self._spread @ np.sqrt(lines))
+        return own**2 + lamps if self._independent else (own + math.sqrt(lamps)) ** 2
+
+
+def _truth_of_all(lights: Sequence[SampledLight], counted: FloatArray) -> Truth:
+    """What a perfect image of all pixels together would show: the lines' truths by the light that is ``counted``
+    (lines,) of each on the board."""
+    truths = [light.apparent for light in lights]
+    shape = truths[0].reflectance.shape
+    board = counted[:, None] * np.stack([truth.board_flux for truth in truths])
+    whole = board.sum(axis=0)
+    shares = np.divide(board, whole, out=np.zeros_like(board), where=whole > 0).reshape(-1, *shape)
+    reflectance, error = (
+        (shares * np.stack([getattr(truth, name) for truth in truths])).sum(axis=0)
+        for name in ("reflectance", "standard_error")
+    )
+    return Truth(reflectance, error, whole, truths[0].rays)

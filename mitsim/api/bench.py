@@ -6,23 +6,23 @@ The objects below this floor are data; here they have their verbs, each of which
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from mitsim.bench.bench import Apparatus
-from mitsim.bench.open import open_apparatus
+from mitsim.bench.open import open_apparatus, reopened
+from mitsim.bench.request import Request, SessionRequest, Task
 from mitsim.core.arguments import checked
 from mitsim.core.environment import DEFAULT_VARIANT
+from mitsim.core.job import Job
 
 # What needs numpy, or the renderer, is imported where it is used: what opens a bench refuses a misspelt name first.
 if TYPE_CHECKING:
     from typing import Self
 
+    from mitsim.acquire.capture import Light
+    from mitsim.acquire.choose_colour import Coloured
     from mitsim.acquire.reference import Rendered
-    from mitsim.acquire.spectral import Coloured
-    from mitsim.api.light import Light
-    from mitsim.core.job import Job
     from mitsim.core.runs import Capture, MosaicCapture
     from mitsim.devices.session import BoardShape, SessionRecipe
     from mitsim.light.plan import Plan
@@ -63,8 +63,8 @@ def open_bench(
         for anything wrong with the files, a camera file whose pixel pitch is not the scene's, or a mask of the
         scene's where the camera file has one.
     """
-    apparatus = open_apparatus(scene, variant, camera, projector, allow_outside_files, for_render, **parameters)
-    return Bench(**{each.name: getattr(apparatus, each.name) for each in fields(apparatus)})
+    opened = open_apparatus(scene, variant, camera, projector, allow_outside_files, for_render, **parameters)
+    return Bench(**vars(opened))
 
 
 class Bench(Apparatus):
@@ -92,14 +92,14 @@ class Bench(Apparatus):
         MitsimError
             for a request that cannot be served, or when no light of the projector reaches the camera.
         """
-        from mitsim.acquire.capture import plan_request
-        from mitsim.bench.request import Request
+        from mitsim.acquire.spectral import plan_request
 
         return plan_request(self, Request.of(patterns=patterns, **request))
 
     @checked
     def light(self, patterns: str = "dots:7", job: Job | None = None, **request: Any) -> Light:
-        """Light of the scene by projector pixel, traced once, from which any family can be exposed.
+        """Light of the scene by projector pixel, traced once, from which any family can be exposed. MitsimError as
+        :meth:`plan`.
 
         Parameters
         ----------
@@ -109,21 +109,13 @@ class Bench(Apparatus):
             clock, progress and limits.
         **request
             other fields of :class:`mitsim.bench.request.Request`.
-
-        Raises
-        ------
-        MitsimError
-            as :meth:`plan`.
         """
         from mitsim.acquire.capture import trace_request
-        from mitsim.api.light import Light
-        from mitsim.core.job import Job
 
         job = job or Job()
         with job.planning(patterns):
             plan = self.plan(patterns, **request)
-        traced = trace_request(self, plan, job)
-        return Light(**{each.name: getattr(traced, each.name) for each in fields(traced)})
+        return trace_request(self, plan, job)
 
     @checked
     def capture(
@@ -155,14 +147,13 @@ class Bench(Apparatus):
             for a request that cannot be served, an output that cannot be written or holds something else, or more
             memory, disk or time than the job's limits allow.
         """
-        from mitsim.core.job import Job
-
-        job = job or Job()
-        with job.clock.stage("imports"):
+        task = Task.of(output, resume, job)
+        with task.importing():
             from mitsim.acquire.capture import capture, request_of
+            from mitsim.acquire.spectral import SpectralBench
 
         known = None if isinstance(plan, str) else plan
-        return capture(self, request_of(plan, request), job, output, resume, known)
+        return capture(SpectralBench(self), request_of(plan, request), task, known).runs[0]
 
     @checked
     def capture_lines(
@@ -195,15 +186,12 @@ class Bench(Apparatus):
             as :meth:`capture`; for another variant, a projector of more than four lines, and lamps where the camera's
             efficiency is not known.
         """
-        from mitsim.core.job import Job
-
-        job = job or Job()
-        with job.clock.stage("imports"):
-            from mitsim.acquire.capture import request_of
-            from mitsim.acquire.spectral import capture_lines
+        task = Task.of(output, resume, job)
+        with task.importing():
+            from mitsim.acquire.capture import capture_lines, request_of
 
         known = None if isinstance(patterns, str) else patterns
-        return capture_lines(self, request_of(patterns, request), job, output, resume, known)
+        return capture_lines(self, request_of(patterns, request), task, known)
 
     @checked
     def choose_colour(self, patterns: str = "dots:7", **request: Any) -> Coloured[Self]:
@@ -223,8 +211,7 @@ class Bench(Apparatus):
         MitsimError
             as :meth:`capture_lines` where lines or bands are called for; for a bench in a spectral variant.
         """
-        from mitsim.acquire.spectral import choose_colour
-        from mitsim.bench.request import Request
+        from mitsim.acquire.choose_colour import choose_colour
 
         return choose_colour(self, Request.of(patterns=patterns, **request))
 
@@ -232,8 +219,6 @@ class Bench(Apparatus):
     def in_variant(self, variant: str) -> Bench:
         """The same bench loaded anew into a ``variant``, which is set from then on; objects of the variant before must
         not be used with it. MitsimError as :func:`mitsim.open_bench`."""
-        from mitsim.bench.open import reopened
-
         return reopened(self, variant)
 
     @checked
@@ -260,13 +245,11 @@ class Bench(Apparatus):
         MitsimError
             as :meth:`calibrate`, for a variant that is not spectral, and a projector of more than four lines.
         """
-        from mitsim.core.job import Job
+        task = Task.of(output, resume, job)
+        with task.importing():
+            from mitsim.calibrate.calibrate import calibrate_lines
 
-        job = job or Job()
-        with job.clock.stage("imports"):
-            from mitsim.calibrate.spectral import calibrate_lines
-
-        return calibrate_lines(self, seed, accuracy, recipe, output, resume, job)
+        return calibrate_lines(self, SessionRequest(seed, accuracy, recipe), task)
 
     @checked
     def capture_mosaic(
@@ -298,14 +281,11 @@ class Bench(Apparatus):
             as :meth:`capture_lines`, for a camera without a mosaic, lines that its curves do not hold, a sensor of an
             odd number of pixels, and a projector with speckle, which is not simulated behind filters.
         """
-        from mitsim.core.job import Job
+        task = Task.of(output, resume, job)
+        with task.importing():
+            from mitsim.acquire.capture import capture_mosaic
 
-        job = job or Job()
-        with job.clock.stage("imports"):
-            from mitsim.acquire.mosaic import capture_mosaic
-            from mitsim.bench.request import Request
-
-        return capture_mosaic(self, Request.of(patterns=patterns, **request), job, output, resume)
+        return capture_mosaic(self, Request.of(patterns=patterns, **request), task)
 
     @checked
     def calibrate_mosaic(
@@ -334,13 +314,11 @@ class Bench(Apparatus):
         MitsimError
             as :meth:`calibrate_lines` and :meth:`capture_mosaic`, and for a filter that passes nothing of a line.
         """
-        from mitsim.core.job import Job
+        task = Task.of(output, resume, job)
+        with task.importing():
+            from mitsim.calibrate.calibrate import calibrate_mosaic
 
-        job = job or Job()
-        with job.clock.stage("imports"):
-            from mitsim.calibrate.spectral import calibrate_mosaic
-
-        return calibrate_mosaic(self, seed, accuracy, recipe, output, resume, job)
+        return calibrate_mosaic(self, SessionRequest(seed, accuracy, recipe), task)
 
     @checked
     def calibrate(
@@ -374,13 +352,11 @@ class Bench(Apparatus):
         MitsimError
             as :meth:`capture`.
         """
-        from mitsim.core.job import Job
-
-        job = job or Job()
-        with job.clock.stage("imports"):
+        task = Task.of(output, resume, job)
+        with task.importing():
             from mitsim.calibrate.calibrate import calibrate
 
-        return calibrate(self, seed, accuracy, recipe, output, resume, job)
+        return calibrate(self, SessionRequest(seed, accuracy, recipe), task)
 
     @checked
     def calibrate_depths(
@@ -392,7 +368,8 @@ class Bench(Apparatus):
         resume: bool = False,
         job: Job | None = None,
     ) -> dict[float, Factors]:
-        """The camera's two factors at each of a recipe's depths, by depth [mm].
+        """The camera's two factors at each of a recipe's depths, by depth [mm]. MitsimError as :meth:`calibrate`, and
+        for a recipe without depths, or with one at which the mask is.
 
         Parameters
         ----------
@@ -400,15 +377,10 @@ class Bench(Apparatus):
             as :meth:`calibrate`.
         output
             folder of a CAL folder for each depth, called by its millimetres; None keeps the factors in memory.
-
-        Raises
-        ------
-        MitsimError
-            as :meth:`calibrate`, and for a recipe without depths, or with one at which the mask is.
         """
         from mitsim.calibrate.calibrate import calibrate_depths
 
-        return calibrate_depths(self, seed, accuracy, recipe, output, resume, job)
+        return calibrate_depths(self, SessionRequest(seed, accuracy, recipe), Task.of(output, resume, job))
 
     @checked
     def write_session(
@@ -421,7 +393,8 @@ class Bench(Apparatus):
         job: Job | None = None,
     ) -> Factors:
         """What :meth:`calibrate` does; and the session's frames, as a real camera's user has them, in a folder from
-        which :func:`mitsim.calibrate_frames` makes the same factors.
+        which :func:`mitsim.calibrate_frames` makes the same factors. MitsimError as :meth:`calibrate`, for a recipe
+        with depths, and a folder that holds something or has no room.
 
         Parameters
         ----------
@@ -429,15 +402,10 @@ class Bench(Apparatus):
             new or empty folder.
         output, seed, accuracy, recipe, job
             as :meth:`calibrate`.
-
-        Raises
-        ------
-        MitsimError
-            as :meth:`calibrate`, for a recipe with depths, and a folder that holds something or has no room.
         """
         from mitsim.calibrate.calibrate import write_session
 
-        return write_session(self, frames, output, seed, accuracy, recipe, job)
+        return write_session(self, frames, SessionRequest(seed, accuracy, recipe), Task.of(output, job=job))
 
     @checked
     def render(
@@ -475,7 +443,7 @@ class Bench(Apparatus):
 
     @checked
     def with_board(self, reflectance: float, shape: BoardShape | None = None, depth: float | None = None) -> Self:
-        """The same rig before a diffuse board.
+        """The same devices before a diffuse board. MitsimError for a reflectance or a depth that no board has.
 
         Parameters
         ----------
@@ -485,11 +453,6 @@ class Bench(Apparatus):
             its size, bow and tilt; None: flat, and larger than the view.
         depth
             distance of its middle [mm]; None: on the aligned plane.
-
-        Raises
-        ------
-        MitsimError
-            for a reflectance or a depth that no board has.
         """
         from mitsim.bench.board import before_board
 

@@ -53,6 +53,9 @@ class Apparatus:
         lines of the projector's light that spectral variants trace; None: wavelengths drawn from all.
     lamplight
         how the camera counts lamps' light of all wavelengths; None: as light of the projector's effective wavelength.
+    filters
+        the camera with its colour filters, which are put over frames; the sensor in ``rig`` then has none, and
+        makes one electron of a photon. None: frames are as the sensor has them.
     """
 
     loaded: LoadedScene
@@ -61,6 +64,7 @@ class Apparatus:
     defines: dict[str, str]
     lines: Lines | None = None
     lamplight: Lamplight | None = None
+    filters: SensorModel | None = None
 
     @property
     def geometry(self) -> CameraGeometry:
@@ -75,7 +79,7 @@ class Apparatus:
     @property
     def counting(self) -> SensorModel:
         """The electronics whose efficiency counts lamps' light, with their colour filters."""
-        return self.sensor
+        return self.filters or self.sensor
 
     @property
     def projector(self) -> ProjectorModel:
@@ -236,16 +240,21 @@ class Apparatus:
         """What must be equal for a calibration to fit a capture: camera geometry, electronics, projector grid, and the
         lines of its light, of which the mask's diffraction depends."""
         grid, lines = self.loaded.pixels, self.projector.lines
+        of_lines: dict[str, Any] = {
+            "lines_nm": list(lines.wavelengths_nm),
+            "radiant_shares": [round(share, 7) for share in lines.shares],
+        }
+        if self.filters and self.lines and self.lines.several:
+            of_lines = {}  # colour.json has them
         return {
             "geometry": self.geometry.identity,
-            "sensor": self.sensor.identity,
+            "sensor": self.counting.identity,
             "projector": {
                 "name": self.projector.name,
                 "n": grid.n,
                 "row_tan": [round(value, 7) for value in grid.row_tan],
                 "column_tan": [round(value, 7) for value in grid.column_tan],
-                "lines_nm": list(lines.wavelengths_nm),
-                "radiant_shares": [round(share, 7) for share in lines.shares],
+                **of_lines,
             },
         }
 

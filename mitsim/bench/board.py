@@ -16,8 +16,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError
 from mitsim.devices.session import CELLS, BoardShape
 from mitsim.scene.guard.estimators import Unfit
-from mitsim.transport.coordinates import turn_and_origin
-from mitsim.transport.plugins.base import per_lane
+from mitsim.transport.plugins.base import per_lane, turn_and_origin
 from mitsim.transport.projector import PinholeRays
 
 if TYPE_CHECKING:
@@ -71,7 +70,7 @@ def board_object(bench: Apparatus, reflectance: float, shape: BoardShape, depth:
     place = middle @ mi.ScalarAffineTransform4f(turned.tolist())
     world = mi.ScalarAffineTransform4f(camera.tolist())
     if shape.bow_mm:
-        return _bowed(shape, half, np.array((world @ place).matrix, dtype=np.float64), bsdf)
+        return _bowed_mesh(shape, half, np.array((world @ place).matrix, dtype=np.float64), bsdf)
     return {"type": "rectangle", "to_world": world @ place.rotate([0, 1, 0], 180).scale([half, half, 1]), "bsdf": bsdf}
 
 
@@ -96,7 +95,7 @@ def camera_place(bench: Apparatus) -> tuple[FloatArray, FloatArray]:
     return turn_and_origin(bench.loaded.camera.world_transform())
 
 
-def _bowed(shape: BoardShape, half: float, place: FloatArray, bsdf: dict[str, Any]) -> mi.Mesh:
+def _bowed_mesh(shape: BoardShape, half: float, place: FloatArray, bsdf: dict[str, Any]) -> mi.Mesh:
     """A bowed board.
 
     Parameters

@@ -141,9 +141,9 @@ class Effect:
         for name, value in self.neutral.items():
             owner, _, last = name.rpartition(".")
             if not owner:
-                physics = _changed(physics, name, value)
+                physics = _with_value(physics, name, value)
             else:
-                physics = _changed(physics, owner, _changed(getattr(physics, owner), last, value))
+                physics = _with_value(physics, owner, _with_value(getattr(physics, owner), last, value))
         return physics
 
 
@@ -154,7 +154,7 @@ def _value(physics: Physics, name: str) -> object:
     return value
 
 
-def _changed(owner: Any, name: str, value: object) -> Any:
+def _with_value(owner: Any, name: str, value: object) -> Any:
     if getattr(owner, name) == value:
         return owner  # with what it remembers
     return owner.model_copy(update={name: value}) if isinstance(owner, BaseModel) else replace(owner, **{name: value})

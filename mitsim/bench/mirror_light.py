@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from functools import lru_cache
 
 import numpy as np
 
@@ -31,7 +32,7 @@ class Glint:
 
     def __init__(self, beams: Beams) -> None:
         self.beams, self.seconds = beams, 0.0
-        self._frames: dict[tuple[bytes, CameraGeometry, Spectrum | None], ClassFrames] = {}
+        self._kept = lru_cache(_KEPT)(self._form)
 
     def frames(self, labels: Labels, geometry: CameraGeometry, spectrum: Spectrum | None) -> ClassFrames | None:
         """Frames by class of projector pixels; None where no beam reaches the sensor.
@@ -47,12 +48,7 @@ class Glint:
         """
         if not len(self.beams):
             return None
-        key = labels.tobytes(), geometry, spectrum
-        if key not in self._frames:
-            while len(self._frames) >= _KEPT:
-                del self._frames[next(iter(self._frames))]
-            self._frames[key] = self._form(labels, geometry, spectrum)
-        return self._frames[key]
+        return self._kept(np.asarray(labels, np.int64).tobytes(), geometry, spectrum)
 
     def irradiance(self, geometry: CameraGeometry) -> tuple[float, float]:
         """Mean irradiance on the sensor without its mask, and what of it lacks or may be off in each pixel [W m^-2].
@@ -69,9 +65,9 @@ class Glint:
         unsure = math.hypot(beams.unresolved, beams.error * math.sqrt(pixels))
         return float(beams.delivered[met].sum()) / area / pixels, unsure / area / pixels
 
-    def _form(self, labels: Labels, geometry: CameraGeometry, spectrum: Spectrum | None) -> ClassFrames:
-        started = time.perf_counter()
-        found = glint_frames(self.beams, geometry, self._terms(geometry, spectrum), labels)
+    def _form(self, labels: bytes, geometry: CameraGeometry, spectrum: Spectrum | None) -> ClassFrames:
+        started, terms = time.perf_counter(), self._terms(geometry, spectrum)
+        found = glint_frames(self.beams, geometry, terms, np.frombuffer(labels, np.int64))
         self.seconds = time.perf_counter() - started
         return found
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mitsim.devices.mask_profile import MaskProfile
     from mitsim.devices.projector import ProjectorModel
     from mitsim.scene.load import LoadedScene
-    from mitsim.transport.contact import Contact
+    from mitsim.transport.transmission import Contact
 
 Opened = TypeVar("Opened", bound=Apparatus)
 _PITCH_TOLERANCE = 1e-3
@@ -108,7 +108,7 @@ def open_apparatus(
             fits = f"it goes with scenes whose pixel_pitch is {sensor.superpixel_pitch_um * 1e-3:g} mm"
             raise MitsimError(f"camera {sensor_path}: {error}; {fits}") from None
     # Only now, with all else checked: the renderer takes a second to import.
-    loaded = _loaded(variant, path, defines, needs_projector=not for_render, outside=allow_outside_files)
+    loaded = _load(variant, path, defines, needs_projector=not for_render, outside=allow_outside_files)
     row_um = (sensor.row_pitch_um or sensor.pixel_pitch_um) * sensor.binning
     of_rows, of_columns = zip((row_um, sensor.superpixel_pitch_um), loaded.camera.geometry.pitches, strict=True)
     for name, (um, stated) in (("pixel_pitch", of_columns), ("row_pitch", of_rows)):
@@ -129,7 +129,7 @@ def reopened(bench: Opened, variant: str) -> Opened:
     from mitsim.devices.mask_profile import load_mask
 
     camera = Path(bench.rig.camera_file)
-    loaded = _loaded(variant, bench.loaded.path, bench.defines, outside=True)
+    loaded = _load(variant, bench.loaded.path, bench.defines, outside=True)
     _wear(loaded, load_mask(camera), camera)
     _tune(loaded, bench.projector)
     return replace(bench, loaded=loaded, variant=variant)
@@ -149,19 +149,19 @@ def _tune(loaded: LoadedScene, projector: ProjectorModel) -> None:
         tune(loaded.scene, projector.effective_wavelength_nm)
 
 
-def _loaded(variant: str, path: Path, defines: Mapping[str, str], **options: bool) -> LoadedScene:
+def _load(variant: str, path: Path, defines: Mapping[str, str], **options: bool) -> LoadedScene:
     """A scene in a variant that is set from then on, as :func:`mitsim.scene.load.load_scene` takes it."""
     mitsuba = load_variant(variant)
     from mitsim.scene.load import load_scene
-    from mitsim.transport.contact import contacts
-    from mitsim.transport.plugins import all
+    from mitsim.transport import plugins
+    from mitsim.transport.transmission import contacts
 
     mitsuba.set_log_level(mitsuba.LogLevel.Error)
-    all.register()
+    plugins.register()
     loaded = load_scene(path, defines, **options)
     of_factored, of_reference = contacts(loaded.scene)
-    factored = _in_contact(loaded, of_factored, "the factored estimator")
-    reference = _in_contact(loaded, of_reference, "the reference")
+    factored = _refusal_of(loaded, of_factored, "the factored estimator")
+    reference = _refusal_of(loaded, of_reference, "the reference")
     if factored is not None and options.get("needs_projector", True):
         raise factored
     unfit = replace(
@@ -170,7 +170,7 @@ def _loaded(variant: str, path: Path, defines: Mapping[str, str], **options: boo
     return replace(loaded, unfit=unfit)
 
 
-def _in_contact(loaded: LoadedScene, contact: Contact | None, estimator: str) -> MitsimError | None:
+def _refusal_of(loaded: LoadedScene, contact: Contact | None, estimator: str) -> MitsimError | None:
     """The refusal of a scene with a ``contact`` by an ``estimator``."""
     if contact is None:
         return None

@@ -1,23 +1,32 @@
-"""What is asked of a bench: one model for the command line's options, the arguments of Python, and the manifest."""
+"""What is asked of a bench: one model for the command line's options, the arguments of Python, and the manifest.
+
+Arguments that travel together are one value: :class:`Request` is what a capture is to show, :class:`SessionRequest`
+what a calibration is to find, and :class:`Task` where results go and who watches the work.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from mitsim.bench.effects import check_switches, parse_switches
 from mitsim.core.configuration import refusal, validated
 from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.files import check_plain
+from mitsim.core.job import Job
 from mitsim.core.seeds import check_root
 from mitsim.devices.patterns import pattern_names, read_name
 from mitsim.devices.sensor import EXPOSURE_FRACTION, EXPOSURE_S, SensorModel
 
 if TYPE_CHECKING:
     from mitsim.devices.camera import Rig
+    from mitsim.devices.session import SessionRecipe
 
 LOWEST_ACCURACY, HIGHEST_ACCURACY = 1e-6, 0.3
 """Below, single precision in the renderer (6e-8 a connection) and the pilot's samples tell nothing; above, no frame is
@@ -34,6 +43,61 @@ MOST_SAMPLES = 2**20
 """An error of a thousandth of one sample's: an hour a pixel row, beyond use."""
 _LEAST_NOISE = 1e-3
 """Rendering noise of a thousandth of the sensor's adds a millionth to its variance: sampling beyond buys nothing."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """Where the results of a work go, and how it is watched; of no influence on them.
+
+    Attributes
+    ----------
+    output
+        folder that is written; None keeps them in memory.
+    resume
+        whether to go on with what an interrupted work left there.
+    job
+        clock, progress and limits.
+    """
+
+    output: Path | None = None
+    resume: bool = False
+    job: Job = field(default_factory=Job)
+
+    @classmethod
+    def of(cls, output: Path | str | None = None, resume: bool = False, job: Job | None = None) -> Task:
+        """Of the Python face's arguments.
+
+        Parameters
+        ----------
+        output, resume, job
+            as there.
+        """
+        return cls(None if output is None else Path(output), resume, job or Job())
+
+    @contextmanager
+    def importing(self) -> Iterator[None]:
+        """The stage "imports" of the job's clock."""
+        with self.job.clock.stage("imports"):
+            yield
+
+
+@dataclass(frozen=True)
+class SessionRequest:
+    """Which factors are wanted, and how well.
+
+    Attributes
+    ----------
+    seed
+        root of every random stream.
+    accuracy
+        relative rms error of the expected responses.
+    recipe
+        how the session is run; None: the shipped one.
+    """
+
+    seed: int = 0
+    accuracy: float = 1e-3
+    recipe: SessionRecipe | None = None
 
 
 @dataclass(frozen=True)
@@ -68,7 +132,8 @@ class Exposure:
             )
 
     def choose(self, rig: Rig, peak_irradiance: float) -> float:
-        """Exposure time [s] of ``rig`` for frames whose brightest expected pixel has ``peak_irradiance`` [W m^-2]."""
+        """Exposure time [s] of a ``rig`` for frames whose brightest expected pixel has ``peak_irradiance``
+        [W m^-2]."""
         if self.seconds is not None:
             return self.seconds
         from mitsim.sensor.chain import exposure_for_peak  # here: it needs numpy, and checking a request does not
@@ -110,21 +175,58 @@ def check_untimed(seconds: float | None) -> None:
         )
 
 
+def _of_a_family(patterns: str) -> str:
+    read_name(patterns)
+    return patterns
+
+
+def _some_time(seconds: float) -> float:
+    if not 0 < seconds <= LONGEST_S:
+        raise ArgumentError("seconds", f"{seconds:g}: give a number above 0, at most {LONGEST_S:g}")
+    return seconds
+
+
+def _worth_it(fraction: float) -> float:
+    if not _LEAST_NOISE <= fraction <= 1:
+        raise ArgumentError(
+            "noise_fraction", f"{fraction}: give a part of the sensor's noise from {_LEAST_NOISE:g} to 1"
+        )
+    return fraction
+
+
+def _some_shots(shots: int) -> int:
+    from mitsim.core.manifests import MOST_SHOTS  # here: it takes 7 ms to import, and most requests have no shots
+
+    if not 1 <= shots <= MOST_SHOTS:
+        raise ArgumentError("ambient_shots", f"{shots}: give 1 to {MOST_SHOTS} shots, or none for the patterns' own")
+    return shots
+
+
 class Request(BaseModel):
     """Which shots of a scene are wanted, and how well."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
-    patterns: str = Field("dots:7", description=pattern_names())
-    accuracy: float = Field(1e-3, description="relative rms error of the expected frames")
-    seconds: float | None = Field(None, description="take the finest accuracy that a run of so many seconds buys")
-    seed: int = Field(0, description="root of every random stream")
+    patterns: Annotated[str, AfterValidator(_of_a_family)] = Field("dots:7", description=pattern_names())
+    accuracy: Annotated[float, AfterValidator(check_accuracy)] = Field(
+        1e-3, description="relative rms error of the expected frames"
+    )
+    seconds: Annotated[float, AfterValidator(_some_time)] | None = Field(
+        None, description="take the finest accuracy that a run of so many seconds buys"
+    )
+    seed: Annotated[int, AfterValidator(check_root)] = Field(0, description="root of every random stream")
     exposure: float | Literal["auto"] = Field("auto", description="seconds a frame, or auto")
     exposure_fraction: float = Field(0.8, description="brightest pixel, as a part of full well")
-    effects: dict[str, bool] = Field({}, description="effects switched on or off, whatever they are worth")
-    noise_fraction: float | None = Field(None, description="stop sampling at this part of the sensor's noise")
+    effects: Annotated[dict[str, bool], AfterValidator(check_switches)] = Field(
+        {}, description="effects switched on or off, whatever they are worth"
+    )
+    noise_fraction: Annotated[float, AfterValidator(_worth_it)] | None = Field(
+        None, description="stop sampling at this part of the sensor's noise"
+    )
     ambient_frame: Literal["auto", "yes", "no"] = Field("auto", description="whether a frame of ambient light is taken")
-    ambient_shots: int | None = Field(None, description="shots of that frame; None: by the patterns")
+    ambient_shots: Annotated[int, AfterValidator(_some_shots)] | None = Field(
+        None, description="shots of that frame; None: by the patterns"
+    )
 
     def __init__(self, **values: Any) -> None:
         """Of the fields' ``values``, as they are; MitsimError as :meth:`of`."""
@@ -155,62 +257,12 @@ class Request(BaseModel):
         """What is asked, as the manifest's configuration holds it: an accuracy or seconds."""
         return self.model_dump(mode="json", exclude={"accuracy" if self.seconds is not None else "seconds"})
 
-    @field_validator("patterns")
-    @classmethod
-    def _of_a_family(cls, patterns: str) -> str:
-        read_name(patterns)
-        return patterns
-
-    @field_validator("accuracy")
-    @classmethod
-    def _promised(cls, accuracy: float) -> float:
-        return check_accuracy(accuracy)
-
-    @field_validator("seconds")
-    @classmethod
-    def _some_time(cls, seconds: float | None) -> float | None:
-        if seconds is not None and not 0 < seconds <= LONGEST_S:
-            raise ArgumentError("seconds", f"{seconds:g}: give a number above 0, at most {LONGEST_S:g}")
-        return seconds
-
-    @field_validator("seed")
-    @classmethod
-    def _a_root(cls, seed: int) -> int:
-        return check_root(seed)
-
-    @field_validator("effects")
-    @classmethod
-    def _known(cls, effects: dict[str, bool]) -> dict[str, bool]:
-        return check_switches(effects)
-
-    @field_validator("noise_fraction")
-    @classmethod
-    def _worth_it(cls, fraction: float | None) -> float | None:
-        if fraction is not None and not _LEAST_NOISE <= fraction <= 1:
-            raise ArgumentError(
-                "noise_fraction", f"{fraction}: give a part of the sensor's noise from {_LEAST_NOISE:g} to 1"
-            )
-        return fraction
-
     @field_validator("ambient_frame", mode="before")
     @classmethod
     def _a_choice(cls, choice: object) -> object:
         if choice not in ("auto", "yes", "no"):
             raise ArgumentError("ambient_frame", f"{choice!r}: use auto, yes or no")
         return choice
-
-    @field_validator("ambient_shots")
-    @classmethod
-    def _a_number_of_shots(cls, shots: int | None) -> int | None:
-        if shots is None:
-            return None
-        from mitsim.core.manifests import MOST_SHOTS  # here: it takes 7 ms to import, and most requests have no shots
-
-        if not 1 <= shots <= MOST_SHOTS:
-            raise ArgumentError(
-                "ambient_shots", f"{shots}: give 1 to {MOST_SHOTS} shots, or none for the patterns' own"
-            )
-        return shots
 
     def model_post_init(self, _: object) -> None:
         """MitsimError for an exposure that no camera has, and for seconds beside what they decide."""
@@ -231,3 +283,45 @@ class Request(BaseModel):
     def timing(self) -> Exposure:
         """How the exposure time is found."""
         return Exposure(None if self.exposure == "auto" else self.exposure, self.exposure_fraction)
+
+
+# ---- What `mitsim sense` takes ----
+
+IMAGES, ENDINGS = (".exr", ".npy"), (".png", ".exr", ".npy")
+"""Files that an image is read from, and digital numbers are written to."""
+_LARGEST_PNG = 2**16 - 1
+"""What 16 bits of grey hold."""
+_WAVELENGTHS_NM = 1.0, 1e6
+"""As a projector's."""
+
+
+def check_image(path: Path) -> None:
+    """MitsimError for a ``path`` that no image is read from."""
+    if path.suffix.lower() not in IMAGES:
+        raise MitsimError(f"image {path}: give an OpenEXR (.exr) or NumPy (.npy) file")
+    check_plain(path, "image")
+
+
+def check_wavelength(wavelength_nm: float) -> None:
+    """ArgumentError for light of a ``wavelength_nm`` [nm] that there is not."""
+    low, high = _WAVELENGTHS_NM
+    if not low <= wavelength_nm <= high:
+        raise ArgumentError("wavelength", f"{wavelength_nm:g}: give {low:g} to {high:g} nm")
+
+
+def check_f_number(f_number: float) -> None:
+    """ArgumentError for an ``f_number`` that no lens has."""
+    if not 0.5 <= f_number < math.inf:
+        raise ArgumentError("f_number", f"{f_number:g}: no lens in air is below 0.5; give its f-number")
+
+
+def check_ending(path: Path, sensor: SensorModel) -> None:
+    """MitsimError for a ``path`` that no frame is written to, or whose kind cannot hold a ``sensor``'s numbers."""
+    ending = path.suffix.lower()
+    if ending not in ENDINGS:
+        raise MitsimError(f"output {path}: give a name that ends in {', '.join(ENDINGS)}")
+    if ending == ".png" and (sensor.largest_dn is None or sensor.largest_dn > _LARGEST_PNG):
+        numbers = "real numbers" if sensor.largest_dn is None else f"numbers up to {sensor.largest_dn}"
+        raise MitsimError(
+            f"output {path}: sensor {sensor.name!r} gives {numbers}, 16 bits end at {_LARGEST_PNG}; use .exr"
+        )

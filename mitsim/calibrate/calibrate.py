@@ -2,52 +2,51 @@
 
 from __future__ import annotations
 
-import hashlib
-import io
-import json
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-from scipy import sparse
 
-from mitsim.acquire.capture import digital_scale
+from mitsim.acquire.capture import colour_folder
+from mitsim.acquire.spectral import SpectralBench, without_filters
 from mitsim.bench.bench import Apparatus
-from mitsim.bench.request import Exposure
-from mitsim.calibrate.session import MOST_TIFF, KeptFrames, LitSession, Response, Session
+from mitsim.bench.request import Exposure, SessionRequest, Task
+from mitsim.calibrate.checkpoint import (
+    MOST_TIFF,
+    Checkpoint,
+    KeptFrames,
+    SessionSums,
+    claimed_session,
+    is_finished,
+    keep_light,
+    kept_light,
+)
+from mitsim.calibrate.lit_session import LitSession, Response
+from mitsim.calibrate.session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import deciding_versions, versions
 from mitsim.core.errors import MitsimError
-from mitsim.core.files import PARTS, output_folder, plain, read_json, sweep, whole_file, whole_folder, write_json
+from mitsim.core.files import output_folder, whole_folder
 from mitsim.core.job import Clock, Job
-from mitsim.core.manifests import MANIFEST, CalibrationManifest, resumable
+from mitsim.core.manifests import CalibrationManifest
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.resources import Cost, Limits
 from mitsim.core.seeds import integer
-from mitsim.devices.session import SIDES, SessionRecipe, load_recipe
-from mitsim.light.grids import GRIDS, LightEstimate
+from mitsim.core.spectral_manifests import CALIBRATION
+from mitsim.devices.sensor import digital_of
+from mitsim.devices.session import SIDES, load_recipe
 from mitsim.light.light import SampledLight
-from mitsim.light.passes import Simulation
 from mitsim.light.plan import Plan
 from mitsim.optics.frames import Frame
 from mitsim.optics.separable import Lacking, lacking
-from mitsim.reconstruct.estimate_factors import (
-    SEPARABLE_RESIDUAL,
-    Estimate,
-    PairSeen,
-    PairSums,
-    Seen,
-    StripeSums,
-    stripe_sums,
-)
+from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, Estimate, Seen, StripeSums, stripe_sums
 from mitsim.reconstruct.factors import Factors, load_calibration
+from mitsim.reconstruct.mosaic import behind
 from mitsim.reconstruct.session_faults import Checked, Circumstances, check_session
 from mitsim.reconstruct.faults import frame_words
 
@@ -56,63 +55,45 @@ NOISY, NOISE_FREE = "noisy", "noise_free"
 _SAVED_EVERY, _SAVED_AFTER_S = 8, 0.5
 """Responses between two checkpoints, half of those that are looked at at once, or twice as many at 2048 pixels; and
 seconds, as each takes some ten milliseconds."""
-_STRIPES = "stripes"
-"""The part of a checkpoint that holds the sums over finished responses."""
+_REPEATS_BEHIND_FILTERS = 4
+"""Of every shot of a session behind filters, unless a recipe says otherwise: most pixels see a tenth of a line that
+fills others, and of single shots some directions of the OV5647's filters over the IMX249 are not above the noise."""
 
 
-def calibrate(
-    bench: Apparatus,
-    seed: int = 0,
-    accuracy: float = 1e-3,
-    recipe: SessionRecipe | None = None,
-    output: Path | str | None = None,
-    resume: bool = False,
-    job: Job | None = None,
-) -> Factors:
+def calibrate(bench: Apparatus, request: SessionRequest, task: Task) -> Factors:
     """Run a calibration session and estimate the camera's factors; see :meth:`mitsim.api.bench.Bench.calibrate`.
-
-    Where the recipe has ``depths``, see :func:`calibrate_depths`.
 
     Parameters
     ----------
     bench
         whose camera and projector are calibrated; its scene is replaced by the board.
-    seed, accuracy, recipe, output, resume, job
-        as there.
+    request, task
+        what is wanted, and where it goes.
 
     Raises
     ------
     MitsimError
         as there.
     """
-    session = Session(bench, (recipe or load_recipe()).of_one_depth(), seed)
-    return calibrate_session(session, accuracy, output, resume, job or Job())
+    session = Session(bench, (request.recipe or load_recipe()).of_one_depth(), request.seed)
+    return _run_sessions([session], request, task, [task.output])[0]
 
 
-def calibrate_depths(
-    bench: Apparatus,
-    seed: int = 0,
-    accuracy: float = 1e-3,
-    recipe: SessionRecipe | None = None,
-    output: Path | str | None = None,
-    resume: bool = False,
-    job: Job | None = None,
-) -> dict[float, Factors]:
+def calibrate_depths(bench: Apparatus, request: SessionRequest, task: Task) -> dict[float, Factors]:
     """The camera's factors at each of a recipe's ``depths``, by depth [mm].
 
     Parameters
     ----------
-    bench, seed, accuracy, recipe, resume, job
-        as for :func:`calibrate`. Each depth has light and noise of its own, whatever others there are.
-    output
-        folder of a CAL folder for each depth, called by its millimetres; None keeps the factors in memory.
+    bench, request, task
+        as for :func:`calibrate`; of a folder for each depth, called by its millimetres. Each depth has light and noise
+        of its own, whatever others there are.
 
     Raises
     ------
     MitsimError
         as :func:`calibrate`, for a recipe without depths, and for one at which the mask or no light is.
     """
-    recipe, job = recipe or load_recipe(), job or Job()
+    recipe, found = request.recipe or load_recipe(), {}
     if not recipe.depths:
         raise MitsimError("recipe: has no depths; give depths = [350, 400, 450], or use calibrate")
     nearest = bench.geometry.mask_distance + bench.geometry.mask_thickness
@@ -120,29 +101,20 @@ def calibrate_depths(
         raise MitsimError(
             f"recipe: depths has {min(recipe.depths):g}, and the mask ends {nearest:g} mm from the sensor; give more"
         )
-    found = {}
-    with nullcontext() if output is None else output_folder(output, overwrite=resume) as folder:
+    with nullcontext() if task.output is None else output_folder(task.output, overwrite=task.resume) as folder:
         for depth in recipe.depths:
-            session = Session(bench, recipe, integer(seed, "depth", f"{depth:g}"), depth)
-            place = None if folder is None else folder / f"{depth:g}"
-            found[depth] = calibrate_session(session, accuracy, place, resume, replace(job, clock=Clock()))
+            session = Session(bench, recipe, integer(request.seed, "depth", f"{depth:g}"), depth)
+            own = replace(task, job=replace(task.job, clock=Clock()))
+            (found[depth],) = _run_sessions([session], request, own, [folder and folder / f"{depth:g}"])
     return found
 
 
-def write_session(
-    bench: Apparatus,
-    frames: Path | str,
-    output: Path | str | None = None,
-    seed: int = 0,
-    accuracy: float = 1e-3,
-    recipe: SessionRecipe | None = None,
-    job: Job | None = None,
-) -> Factors:
+def write_session(bench: Apparatus, frames: Path | str, request: SessionRequest, task: Task) -> Factors:
     """What :func:`calibrate` does, and its frames in a folder as `mitsim calibrate --frames` reads it.
 
     Parameters
     ----------
-    bench, output, seed, accuracy, recipe, job
+    bench, request, task
         as there.
     frames
         new or empty folder.
@@ -152,93 +124,165 @@ def write_session(
     MitsimError
         as there, for a recipe with depths, a folder that holds something, and a disk without room.
     """
-    session = Session(bench, (recipe or load_recipe()).of_one_depth(), seed)
+    session = Session(bench, (request.recipe or load_recipe()).of_one_depth(), request.seed)
     with whole_folder(frames) as folder:
         number_bytes = 2 if (bench.sensor.largest_dn or math.inf) <= MOST_TIFF else 8
         size = Cost(disk_bytes=float(session.shots * math.prod(bench.geometry.frame_shape) * number_bytes))
         size.check("frames", Limits(), folder)
-        return calibrate_session(session, accuracy, output, False, job or Job(), folder)
+        return _run_sessions([session], request, task, [task.output], folder)[0]
 
 
-def calibrate_session(
-    session: Session, accuracy: float, output: Path | str | None, resume: bool, job: Job, frames: Path | None = None
-) -> Factors:
-    """Run a ``session`` and estimate the camera's factors.
+def calibrate_lines(bench: Apparatus, request: SessionRequest, task: Task) -> dict[str, Factors]:
+    """Factors at each line, by its name.
 
     Parameters
     ----------
-    session
-        what is shown.
-    accuracy, output, resume, job
-        as for :func:`calibrate`.
-    frames
-        folder that its frames are written to.
+    bench, request, task
+        as for :meth:`mitsim.api.bench.Bench.calibrate_lines`, which has the errors raised as well.
     """
-    bench, recipe = session.bench, session.recipe
-    Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.rig.camera_file)
-    configuration = {
-        **bench.provenance(),
-        **bench.identity(),
-        "accuracy": accuracy,
-        "seed": session.seed,
-        **({} if session.depth is None else {"depth_mm": session.depth}),
-        "recipe": recipe.model_dump(exclude_defaults=True, exclude={"depths"}),
-        "versions": deciding_versions(),
-    }
-    if session.depth is not None and resume and output is not None and is_finished(output, configuration):
-        return load_calibration(output)
-    with claimed_session(output, configuration, resume) as checkpoint:
-        plan = session.plan(accuracy, job)
-        checkpoint.begin()
-        lit = session.lit(_light(session, plan, checkpoint, job), job)
-        if frames is not None:
-            lit = replace(lit, kept=KeptFrames(session, frames))
-        (noisy, clean), saturated, found = checked_estimates(lit, job, (NOISY, NOISE_FREE), checkpoint)
-        if lit.kept is not None:
-            lit.kept.finish(digital_scale(bench, lit.exposure_s))
-        lacks = _lacking(lit, clean)
-        warnings = lit.light.warnings + session.warnings + (() if noisy.ok else (str(noisy.status),))
-        warnings += found.warnings(frame_words)
-        if saturated:
-            warnings += (
-                f"saturation: {saturated} of {session.shots} frames have pixels at the full well or the ADC's end, "
-                "so responses are not linear; lower the recipe's exposure_fraction",
+    return _by_line(SpectralBench.of(bench, CALIBRATION), request, task)
+
+
+def calibrate_mosaic(bench: Apparatus, request: SessionRequest, task: Task) -> dict[str, Factors]:
+    """Factors at each line behind filters, by its name.
+
+    Parameters
+    ----------
+    bench, request, task
+        as for :meth:`mitsim.api.bench.Bench.calibrate_mosaic`, which has the errors raised as well.
+    """
+    lines = SpectralBench.of(without_filters(bench), CALIBRATION)
+    if request.recipe is None:
+        request = replace(request, recipe=load_recipe().model_copy(update={"repeats": _REPEATS_BEHIND_FILTERS}))
+    return _by_line(lines, request, task)
+
+
+def _by_line(bench: SpectralBench, request: SessionRequest, task: Task) -> dict[str, Factors]:
+    """Factors at each line of a ``bench``, by its name: a session of each, dimmed by filters where there are such, in
+    light that is traced with the others'."""
+    assert bench.manifest is not None
+    names, filters = bench.names, bench.whole.filters
+    passed: Sequence[FloatArray | None] = [None] * len(names)
+    if filters is not None:
+        weights = np.array(filters.planes(bench.manifest.wavelengths_nm))
+        if (dark := np.argwhere(weights == 0)).size:
+            plane, line = dark[0]
+            raise MitsimError(
+                f"camera {bench.whole.rig.camera_file}: its {str(filters.mosaic)[plane]} filters "
+                f"pass nothing of {names[line]}, so a calibration in this line alone does not see all "
+                "pixels; use a projector whose lines all filters pass"
             )
-        result = {
-            "n": bench.n,
-            "depth_mm": session.distance,
-            "frames": session.shots,
-            "separability_residual": noisy.separability_residual,
-            "unexplained_residual": noisy.unexplained,
-            "noise_free_residual": clean.separability_residual,
-            "phi_error": _factor_error(noisy, clean),
-            "faults": found.listed(frame_words),
-            "lamp": found.lamp.listed(),
-            "shadow_residual": lacks and lacks.residual,
-            "condition": noisy.condition,
-            "exposure_s": lit.exposure_s,
-            "seconds": job.clock.seconds(),
-            "predicted": plan.predicted,
-            "predicted_seconds": plan.predicted_seconds,
-            "predicted_memory_bytes": plan.cost and plan.cost.memory_bytes,
-            "warnings": warnings,
+        passed = list(behind(weights, bench.whole.geometry.frame_shape))
+    whole = Session(bench.whole, (request.recipe or load_recipe()).of_one_depth(), request.seed)
+    sessions = [
+        replace(whole, bench=each, filters=own, whole=whole) for each, own in zip(bench.benches, passed, strict=True)
+    ]
+    with colour_folder(task, bench.manifest) as folder:
+        places = [folder and folder / name for name in names]
+        return dict(zip(names, _run_sessions(sessions, request, task, places), strict=True))
+
+
+def _run_sessions(
+    lines: Sequence[Session],
+    request: SessionRequest,
+    task: Task,
+    places: Sequence[Path | None],
+    frames: Path | None = None,
+) -> list[Factors]:
+    """Factors of each line, whose light is traced with the others' when the first session has none kept.
+
+    Parameters
+    ----------
+    lines
+        the session of each; one where light is not told apart.
+    request, task
+        accuracy; job, and whether places may hold unfinished sessions.
+    places
+        CAL folder of each; None in memory.
+    frames
+        folder that the frames of a single one are written to.
+    """
+    found, job, whole = list[Factors](), task.job, lines[0].whole or lines[0]
+    plan: Plan | None = None
+    lights: list[SampledLight] = []
+    for number, (session, place) in enumerate(zip(lines, places, strict=True)):
+        bench, recipe = session.bench, session.recipe
+        Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.rig.camera_file)
+        configuration = {
+            **bench.provenance(),
+            **bench.identity(),
+            "accuracy": request.accuracy,
+            "seed": session.seed,
+            **({} if session.depth is None else {"depth_mm": session.depth}),
+            "recipe": recipe.model_dump(exclude_defaults=True, exclude={"depths"}),
+            "versions": deciding_versions(),
         }
-        manifest = CalibrationManifest(
-            configuration=configuration,
-            camera=bench.identity(),
-            centre=session.centre,
-            board_reflectance=recipe.board_reflectance,
-            digital=digital_scale(bench, lit.exposure_s),
-            parallax=bench.parallax_from(session.distance),
-            result=result,
-            warnings=warnings,
-            versions=versions(),
+        if session.depth is not None and task.resume and place is not None and is_finished(place, configuration):
+            return [load_calibration(place)]
+        with claimed_session(place, configuration, task.resume) as checkpoint:
+            plan = plan or whole.plan(request.accuracy, job)
+            checkpoint.begin()
+            light = kept_light(checkpoint, session, plan)
+            if light is None:
+                lights = lights or whole.trace_lines([each.board for each in lines], plan, job)
+                light = lights[number]
+                keep_light(checkpoint, light)
+            lit = LitSession.of(session, light, job)
+            lit = replace(lit, kept=KeptFrames(session, frames) if frames else None)
+            found.append(_factors(lit, checkpoint, job))
+    return found
+
+
+def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
+    """Factors of a session, written where its ``checkpoint`` is."""
+    session, plan = lit.session, lit.light.plan
+    bench, digital = session.bench, digital_of(session.bench.sensor, lit.exposure_s)
+    (noisy, clean), saturated, faults = estimates(lit, job, (NOISY, NOISE_FREE), checkpoint)
+    if lit.kept is not None:
+        lit.kept.finish(digital)
+    lacks = _lacking(lit, clean)
+    warnings = lit.light.warnings + session.warnings + (() if noisy.ok else (str(noisy.status),))
+    warnings += faults.warnings(frame_words)
+    if saturated:
+        warnings += (
+            f"saturation: {saturated} of {session.shots} frames have pixels at the full well or the ADC's end, "
+            "so responses are not linear; lower the recipe's exposure_fraction",
         )
-        much = lacks is not None and lacks.residual > SEPARABLE_RESIDUAL
-        factors = Factors.of(noisy, manifest, lacks.terms if lacks and much else ())
-        if checkpoint.folder is not None:
-            factors.write(checkpoint.folder)
-            checkpoint.clear()
+    result = {
+        "n": bench.n,
+        "depth_mm": session.distance,
+        "frames": session.shots,
+        "separability_residual": noisy.separability_residual,
+        "unexplained_residual": noisy.unexplained,
+        "noise_free_residual": clean.separability_residual,
+        "phi_error": _factor_error(noisy, clean),
+        "faults": faults.listed(frame_words),
+        "lamp": faults.lamp.listed(),
+        "shadow_residual": lacks and lacks.residual,
+        "condition": noisy.condition,
+        "exposure_s": lit.exposure_s,
+        "seconds": job.clock.seconds(),
+        "predicted": plan.predicted,
+        "predicted_seconds": plan.predicted_seconds,
+        "predicted_memory_bytes": plan.cost and plan.cost.memory_bytes,
+        "warnings": warnings,
+    }
+    manifest = CalibrationManifest(
+        configuration=checkpoint.configuration,
+        camera=bench.identity(),
+        centre=session.centre,
+        board_reflectance=session.recipe.board_reflectance,
+        digital=digital,
+        parallax=bench.parallax_from(session.distance),
+        result=result,
+        warnings=warnings,
+        versions=versions(),
+    )
+    much = lacks is not None and lacks.residual > SEPARABLE_RESIDUAL
+    factors = Factors.of(noisy, manifest, lacks.terms if lacks and much else ())
+    if checkpoint.folder is not None:
+        factors.write(checkpoint.folder)
+        checkpoint.clear()
     return factors
 
 
@@ -249,101 +293,91 @@ def estimate(
 
     Parameters
     ----------
-    lit
-        the session, its light traced.
-    job
-        takes the time and is told how far the session is.
+    lit, job, checkpoint
+        as for :func:`session_sums`.
     noise_free
         whether to take the expected frames instead of noisy ones.
-    checkpoint
-        where finished stripes are kept, and those of an interrupted session found.
     """
-    (found,), saturated = estimates(lit, job, (NOISE_FREE if noise_free else NOISY,), checkpoint)
-    return found, saturated
-
-
-def estimates(
-    lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Checkpoint | None = None
-) -> tuple[list[Estimate], int]:
-    """Factors from each kind of responses to a session, and its saturated shots.
-
-    Parameters
-    ----------
-    lit, job, kinds, checkpoint
-        as for :func:`checked_estimates`.
-    """
-    found, saturated, _ = checked_estimates(lit, job, kinds, checkpoint)
+    (found,), saturated, _ = estimates(lit, job, (NOISE_FREE if noise_free else NOISY,), checkpoint)
     return found, saturated
 
 
 @single_threaded_blas()
-def checked_estimates(
+def estimates(
     lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Checkpoint | None = None
 ) -> tuple[list[Estimate], int, Checked]:
-    """Factors from each kind of responses to a session, whose frames are formed once, its saturated shots, and what its
-    noisy frames show of faults.
+    """Factors from each kind of responses to a session, its saturated shots, and what noisy frames show of faults.
 
     Parameters
     ----------
-    lit, job, checkpoint
-        as for :func:`estimate`.
-    kinds
-        of ``NOISY`` and ``NOISE_FREE``, one or both.
+    lit, job, kinds, checkpoint
+        as for :func:`session_sums`.
     """
-    session, checkpoint = lit.session, checkpoint or Checkpoint()
-    count = session.signs.shape[1]
-    stripes = _restored(checkpoint.load(_STRIPES), kinds, session)
-    if stripes is None:
-        with job.clock.stage("sensor"):
-            first = [list(_responses(lit, kinds, side, 0, lit.white)) for side in SIDES]
-        both = [
-            stripe_sums(left.rate, right.rate, count, session.centre, lights=(left.light, right.light))
-            for left, right in zip(*first, strict=True)
-        ]
-        stripes = _Stripes(dict(zip(kinds, both, strict=True)), sum(each.saturated for side in first for each in side))
-        del first
-    saved = time.monotonic()
-    for side, sums in zip(SIDES, zip(*stripes.sums.values(), strict=True), strict=True):
-        for looked in lit.each(side, partial(_looked, lit, kinds, sums), job, sums[0].done):
-            for own, (seen, saturated) in zip(sums, looked, strict=True):
-                own.put(seen)
-                stripes.saturated += saturated
-            due = sums[0].done % _SAVED_EVERY == 0 and time.monotonic() >= saved + _SAVED_AFTER_S
-            if due or sums[0].done == count:
-                checkpoint.save(_STRIPES, stripes.arrays())
-                saved = time.monotonic()
-    drift = session.recipe.drift
-    # Who states that the lamp drifts asks what that costs, which is gone once it is divided out.
-    unsteady = bool(drift.session_ramp or drift.session_flicker)
-    sensor = session.bench.sensor
-    step = 0.0 if sensor.largest_dn is None else 1 / sensor.gain_dn_per_e / lit.exposure_s
-    taken = Circumstances(session.order, saturated=bool(stripes.saturated), unsteady=unsteady, step=step)
+    session, found = lit.session, session_sums(lit, job, kinds, checkpoint)
+    sensor, drift = session.bench.sensor, session.recipe.drift
+    taken = Circumstances(
+        session.order,
+        saturated=bool(found.saturated),
+        # Who states that the lamp drifts asks what that costs, which is gone once it is divided out.
+        unsteady=bool(drift.session_ramp or drift.session_flicker),
+        step=0.0 if sensor.largest_dn is None else 1 / sensor.gain_dn_per_e / lit.exposure_s,
+    )
     with job.clock.stage("estimate"):
         judged = [
-            check_session(stripes.sums[kind], session.signs, taken) if kind == NOISY else Checked(stripes.sums[kind])
-            for kind in kinds
+            check_session(sums, session.signs, taken) if kind == NOISY else Checked(sums)
+            for kind, sums in found.sums.items()
         ]
-        found = [
+        factors = [
             each.estimate(session.signs, lit.response_noise if kind == NOISY else None)
             for kind, each in zip(kinds, judged, strict=True)
         ]
-    return found, stripes.saturated, judged[0]
+    return factors, found.saturated, judged[0]
 
 
-def _responses(lit: LitSession, kinds: Sequence[str], side: str, number: int, frame: Frame) -> Iterator[Response]:
-    """Each of the ``kinds`` of responses to a pattern, as :meth:`LitSession.each` has it."""
-    for kind in kinds:
-        yield lit.noisy(side, number, frame) if kind == NOISY else Response(lit.noise_free(frame))
+def session_sums(lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Checkpoint | None = None) -> SessionSums:
+    """Sums over all responses to a session, whose frames are formed once.
 
+    Parameters
+    ----------
+    lit
+        the session, its light traced.
+    job
+        takes the time and is told how far the session is.
+    kinds
+        of ``NOISY`` and ``NOISE_FREE``, one or both.
+    checkpoint
+        where finished stripes are kept, and those of an interrupted session found.
+    """
+    session, checkpoint = lit.session, checkpoint or Checkpoint()
+    count = session.signs.shape[1]
 
-def _looked(
-    lit: LitSession, kinds: Sequence[str], sums: Sequence[StripeSums], shown: tuple[int, Frame]
-) -> list[tuple[Seen, int]]:
-    """What the responses to a pattern add to the ``sums`` of each kind, and their saturated shots."""
-    responses = _responses(lit, kinds, sums[0].side, *shown)
-    return [
-        (own.seen(each.rate, shown[0], each.light), each.saturated) for own, each in zip(sums, responses, strict=True)
-    ]
+    def response(kind: str, side: str, number: int, frame: Frame) -> Response:
+        return lit.noisy(side, number, frame) if kind == NOISY else Response(lit.noise_free(frame))
+
+    def seen(sums: Sequence[StripeSums], shown: tuple[int, Frame]) -> list[tuple[Seen, int]]:
+        each = [response(kind, sums[0].side, *shown) for kind in kinds]
+        return [(own.seen(one.rate, shown[0], one.light), one.saturated) for own, one in zip(sums, each, strict=True)]
+
+    stripes = SessionSums.kept(checkpoint, kinds, session)
+    if stripes is None:
+        stripes = SessionSums({}, 0)
+        with job.clock.stage("sensor"):
+            for kind in kinds:
+                one, other = (response(kind, side, 0, lit.white) for side in SIDES)
+                lights = one.light, other.light
+                stripes.sums[kind] = stripe_sums(one.rate, other.rate, count, session.centre, lights=lights)
+                stripes.saturated += one.saturated + other.saturated
+    saved = time.monotonic()
+    for side, sums in zip(SIDES, zip(*stripes.sums.values(), strict=True), strict=True):
+        for looked in lit.each(side, partial(seen, sums), job, sums[0].done):
+            for own, (vectors, saturated) in zip(sums, looked, strict=True):
+                own.put(vectors)
+                stripes.saturated += saturated
+            due = sums[0].done % _SAVED_EVERY == 0 and time.monotonic() >= saved + _SAVED_AFTER_S
+            if due or sums[0].done == count:
+                stripes.save(checkpoint)
+                saved = time.monotonic()
+    return stripes
 
 
 def _lacking(lit: LitSession, clean: Estimate) -> Lacking | None:
@@ -364,201 +398,3 @@ def _factor_error(noisy: Estimate, clean: Estimate) -> float:
     left = np.linalg.norm(sign * noisy.left - clean.left) / np.linalg.norm(clean.left)
     right = np.linalg.norm(sign * noisy.right - clean.right) / np.linalg.norm(clean.right)
     return float(np.hypot(left, right))
-
-
-# ---- what a checkpoint holds -----------------------------------------------------------------------------------------
-
-
-def _light(session: Session, plan: Plan, checkpoint: Checkpoint, job: Job) -> SampledLight:
-    """The board's light, from the checkpoint if it is there."""
-    arrays = checkpoint.load("light")
-    if arrays is not None:
-        by_grid = {
-            name: sparse.csr_array(
-                tuple(arrays[f"{row.key}_{part}"] for part in ("data", "indices", "indptr")),
-                shape=tuple(arrays[f"{row.key}_shape"]),
-            )
-            for name, row in GRIDS.items()
-        }
-        return SampledLight(
-            groups=(LightEstimate(by_grid, float(arrays["received"]), float(arrays["outside"])),),
-            simulation=Simulation(session.board, plan.settings),
-            plan=plan,
-            seed=session.seed,
-            labels=arrays["labels"],
-            flux=arrays["flux"],
-            flux_error=arrays["flux_error"],
-            paths=int(arrays["paths"]),
-            sampling_error=float(arrays["sampling_error"]),
-            reached=bool(arrays["reached"]),
-        )
-    light = session.trace(plan, job)
-    facts = {
-        name: getattr(light, name) for name in ("labels", "flux", "flux_error", "paths", "sampling_error", "reached")
-    }
-    facts |= {name: getattr(light.groups[0], name) for name in ("received", "outside")}
-    for name, row in GRIDS.items():
-        matrix = light.groups[0][name]
-        facts |= {f"{row.key}_{part}": getattr(matrix, part) for part in ("data", "indices", "indptr", "shape")}
-    checkpoint.save("light", facts)
-    return light
-
-
-@dataclass
-class _Stripes:
-    """Sums over finished stripes by kind, horizontal and vertical ones, and ``saturated`` shots so far."""
-
-    sums: dict[str, tuple[StripeSums, StripeSums]]
-    saturated: int
-
-    def arrays(self) -> dict[str, npt.ArrayLike]:
-        """What a checkpoint holds of them."""
-        arrays: dict[str, npt.ArrayLike] = {"saturated": self.saturated}
-        for kind, both in self.sums.items():
-            for sums in both:
-                name = f"{kind}_{sums.side}"
-                arrays[f"{name}_common"], arrays[f"{name}_vectors"] = sums.common, sums.vectors[:, : sums.done]
-                arrays[f"{name}_sums"] = [sums.misfit, sums.energy]
-                arrays[f"{name}_each"] = [each[: sums.done] for each in (sums.misfits, sums.energies, sums.fluxes)]
-                if sums.pairs is not None:
-                    pairs = sums.pairs
-                    arrays[f"{name}_light"] = pairs.light[:, : sums.done]
-                    arrays[f"{name}_rows"], arrays[f"{name}_columns"] = (
-                        pairs.rows[: sums.done],
-                        pairs.columns[: sums.done],
-                    )
-        return arrays
-
-
-def _restored(arrays: Mapping[str, FloatArray] | None, kinds: Sequence[str], session: Session) -> _Stripes | None:
-    """What :meth:`_Stripes.arrays` put down of these ``kinds``."""
-    if arrays is None:
-        return None
-
-    def restored(kind: str, side: str) -> StripeSums:
-        finished = arrays[f"{kind}_{side}_vectors"]
-        vectors = np.empty((len(finished), session.signs.shape[1]))
-        vectors[:, : finished.shape[1]] = finished
-        misfit, energy = map(float, arrays[f"{kind}_{side}_sums"])
-        common = arrays[f"{kind}_{side}_common"]
-        sums = StripeSums(side, session.centre, common, vectors, misfit, energy, finished.shape[1])
-        for own, finished in zip(
-            (sums.misfits, sums.energies, sums.fluxes), arrays[f"{kind}_{side}_each"], strict=True
-        ):
-            own[: sums.done] = finished
-        if f"{kind}_{side}_light" in arrays:
-            light, rows, columns = (arrays[f"{kind}_{side}_{part}"] for part in ("light", "rows", "columns"))
-            seen = [PairSeen(*parts) for parts in zip(light.T, rows, columns, strict=True)]
-            sums.pairs = PairSums.empty(seen[0], vectors.shape[1])
-            for number, each in enumerate(seen):
-                sums.pairs.put(number, each)
-        return sums
-
-    return _Stripes(
-        {kind: (restored(kind, SIDES[0]), restored(kind, SIDES[1])) for kind in kinds}, int(arrays["saturated"])
-    )
-
-
-# -------- What is finished of a calibration session, in its CAL folder until the whole is
-
-KIND = "calibration"
-_SUFFIX = PARTS.removeprefix("*")
-_DIGEST = hashlib.sha256().digest_size
-
-
-class Checkpoint:
-    """Parts of one session; without a folder nothing is kept."""
-
-    def __init__(self, folder: Path | None = None, configuration: Mapping[str, Any] | None = None) -> None:
-        """Parts in ``folder``, of the session with this ``configuration``."""
-        self.folder, self._configuration = folder, plain(configuration or {})
-        self._session = json.dumps(self._configuration, sort_keys=True).encode()
-
-    def begin(self) -> None:
-        """Mark the folder as an unfinished session, and clear what a killed process left half-written."""
-        if self.folder is not None:
-            sweep(self.folder)
-            head = {"kind": KIND, "status": "incomplete", "configuration": self._configuration}
-            write_json(self.folder / MANIFEST, head)
-
-    def save(self, name: str, arrays: Mapping[str, npt.ArrayLike]) -> None:
-        """Write ``arrays`` as the part ``name``, whole or not at all. MitsimError when it cannot be written."""
-        if self.folder is None:
-            return
-        memory = io.BytesIO()
-        np.savez(memory, allow_pickle=False, **{key: np.asarray(value) for key, value in arrays.items()})
-        with whole_file(self.folder / f"{name}{_SUFFIX}") as part, part.open("wb") as file:
-            file.write(memory.getbuffer())
-            file.write(self._digest(memory.getbuffer()))
-
-    def load(self, name: str) -> dict[str, npt.NDArray[Any]] | None:
-        """The arrays of the part ``name``; None when it is not there, damaged, or of another session."""
-        path = None if self.folder is None else self.folder / f"{name}{_SUFFIX}"
-        if path is None or not path.is_file():
-            return None
-        data = memoryview(path.read_bytes())
-        if self._digest(data[:-_DIGEST]) != data[-_DIGEST:]:
-            return None
-        with np.load(io.BytesIO(data[:-_DIGEST]), allow_pickle=False) as arrays:
-            return dict(arrays)
-
-    def clear(self) -> None:
-        """Remove the parts of a session that is complete."""
-        if self.folder is not None:
-            for path in self.folder.glob(PARTS):
-                path.unlink()
-
-    def _digest(self, data: memoryview) -> bytes:
-        return hashlib.sha256(hashlib.sha256(self._session).digest() + data).digest()
-
-
-@contextmanager
-def claimed_session(
-    output: Path | str | None, configuration: Mapping[str, Any], resume: bool = False
-) -> Iterator[Checkpoint]:
-    """The place for a session's parts, checked before any work; if the session fails before writing, a new folder is
-    removed.
-
-    Parameters
-    ----------
-    output
-        CAL folder; None keeps nothing.
-    configuration
-        all that decides the factors.
-    resume
-        whether the folder may hold a session of the same configuration.
-
-    Raises
-    ------
-    MitsimError
-        for a place that cannot be written, or that holds something else or another configuration.
-    """
-    if output is None:
-        yield Checkpoint()
-        return
-    path = Path(output)
-    again = resume and (path / MANIFEST).is_file()
-    if again:
-        _check_same(path, plain(configuration))
-    with output_folder(path, overwrite=again) as folder:
-        yield Checkpoint(folder, configuration)
-
-
-def is_finished(output: Path | str, configuration: Mapping[str, Any]) -> bool:
-    """Whether the folder ``output`` holds a finished session; MitsimError when its ``configuration`` is another."""
-    path = Path(output)
-    if not (path / MANIFEST).is_file():
-        return False
-    _check_same(path, plain(configuration))
-    return bool(read_json(path / MANIFEST).get("status") == "complete")
-
-
-def _check_same(path: Path, configuration: Mapping[str, Any]) -> None:
-    before = resumable(path, KIND).get("configuration")
-    before = before if isinstance(before, dict) else {}
-    changed = [key for key in {**configuration, **before} if before.get(key) != configuration.get(key)]
-    if changed:
-        raise MitsimError(
-            f"resume=True: {path} holds a session of another configuration ({', '.join(changed)} differ); "
-            "use the same options, or another folder"
-        )

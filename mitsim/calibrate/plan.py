@@ -1,10 +1,17 @@
 """A bench, patterns of a capture to come and a wanted PSNR in; the calibration session that its image needs, out.
 
 A calibration's noise is its exposure's and its repeats'. The capture is simulated, the session's light traced and its
-responses formed, all once; then factors with the noise of any exposure are drawn in closed form
-(:mod:`mitsim.calibrate.predict`), the image is solved with them as a user would, and judged by the truth. PSNR rises
-with the light of a session until the noise of the capture, or what the camera cannot resolve, is all that is left: the
-least light that reaches the wanted PSNR is found between two sessions of which one does and one does not.
+responses formed, all once; then factors with the noise of any exposure are drawn in closed form, the image is solved
+with them as a user would, and judged by the truth. PSNR rises with the light of a session until the noise of the
+capture, or what the camera cannot resolve, is all that is left: the least light that reaches the wanted PSNR is found
+between two sessions of which one does and one does not.
+
+Noise of a session's frames is independent from pixel to pixel and shot to shot, and factors are linear in responses:
+u_i = Y_i v / |v|^2, Phi_L = U H^T / N. With V[k, l] the variance of a response at a pixel, a number of row k of Phi_L
+has variance sum_l V[k, l] v_l^2 / (N |v|^4), and numbers are uncorrelated, since the rows of H are orthogonal. So
+factors are drawn without drawing a frame. Where each +-1 pattern is taken from one shot and a uniform one that all
+share, the noise of the latter comes into column p of Phi_L by sum_i H[p, i] / N: all of it into the column whose signs
+are all +1. The noise of v enters at second order and is left out, as are noise that a sensor row shares, and speckle.
 """
 
 from __future__ import annotations
@@ -17,22 +24,28 @@ import numpy as np
 
 from mitsim.acquire.capture import capture
 from mitsim.acquire.exposure import Exposer
+from mitsim.acquire.spectral import SpectralBench
 from mitsim.bench.bench import Apparatus
 from mitsim.bench.request import Exposure, Request, check_psnr
-from mitsim.calibrate.predict import Foreseen
+from mitsim.calibrate.calibrate import NOISE_FREE, session_sums
+from mitsim.calibrate.lit_session import LitSession
 from mitsim.calibrate.session import Session, session_seconds
 from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.core.job import Job
+from mitsim.core.job import Clock, Job
+from mitsim.core.manifests import CalibrationManifest
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
-from mitsim.devices.sensor import EXPOSURE_FRACTION
-from mitsim.devices.session import MOST_REPEATS, SessionRecipe, load_recipe
+from mitsim.core.seeds import stream
+from mitsim.devices.sensor import EXPOSURE_FRACTION, digital_of
+from mitsim.devices.session import MOST_REPEATS, SIDES, SessionRecipe, load_recipe
 from mitsim.metrics import psnr as psnr_of
 from mitsim.metrics import truth_for
+from mitsim.reconstruct.estimate_factors import Estimate, StripeSums, factors_of_sums
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.reconstruct.result import Reconstruction
+from mitsim.sensor.moments import frame_moments
 
 _DRAWS = 8
 """Sessions whose mean PSNR is taken: single ones scatter by 0.4 dB, as few directions of an image carry most of what
@@ -199,23 +212,32 @@ def plan_calibration(
         for another PSNR than 1 to 100 dB, patterns that do not fit, and as :meth:`mitsim.api.bench.Bench.capture`.
     """
     check_psnr(psnr)
-    recipe, job = _foreseeable((recipe or load_recipe()).of_one_depth()), job or Job()
+    recipe, job = (recipe or load_recipe()).of_one_depth(), job or Job()
+    if len(recipe.exposure_ladder) > 1 or recipe.dark_frames:
+        raise MitsimError(
+            f"recipe: has {len(recipe.exposure_ladder)} exposures of a frame and {recipe.dark_frames} dark frames; a "
+            "plan knows sessions of one exposure without dark frames, so leave exposure_ladder and dark_frames out"
+        )
     Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.rig.camera_file)
     job.progress("capture", 0.0)
     with job.clock.stage("capture"):
-        shots = capture(bench, Request.of(patterns=patterns, seed=seed, accuracy=accuracy))
+        request = Request.of(patterns=patterns, seed=seed, accuracy=accuracy)
+        shots = capture(SpectralBench(bench), request).runs[0]
     session = Session(bench, recipe, seed)
     job.progress("session", 0.2)
     with job.clock.stage("session"):
-        own = replace(job, clock=Job().clock)
+        own = replace(job, clock=Clock())
         plan = session.plan(accuracy, own)
-        foreseen = Foreseen.of(session.lit(session.trace(plan, own), own), own)
-    search = _Search(shots, foreseen, recipe, job)
+        predicted = PredictedSession.of(LitSession.of(session, session.trace(plan, own), own), own)
+    search = _Search(shots, predicted, recipe, job)
     with job.clock.stage("solve"):
         ceiling = search.trial(None)
         trial = search.least(psnr, ceiling)
-    lit = foreseen.by(trial.recipe or recipe)
+    lit = predicted.by(trial.recipe or recipe)
     taken = session_seconds(session.board, session.signs.shape[1], lit.session.shots, plan.settings)
+    contrast, unknown = lit.speckle, list[str]()
+    if contrast:
+        unknown = [f"speckle of contrast {contrast:g}: it is in every frame, and not in the plan's calibration"]
     # Half of the projector's pixels are lit in every frame but the uniform ones.
     electrons = float(Exposer(bench.rig, lit.exposure_s, seed).electrons(lit.white).mean()) / 2
     return CalibrationPlan(
@@ -230,40 +252,23 @@ def plan_calibration(
         photons=electrons / bench.sensor.efficiency(bench.projector.effective_wavelength_nm),
         simulation_s=plan.taking(start=0.0, **taken).predicted_seconds,
         seconds=job.clock.seconds(),
-        flags=(*shots.warnings, *session.warnings, *_unknown(foreseen)),
+        flags=(*shots.warnings, *session.warnings, *unknown),
     )
-
-
-def _foreseeable(recipe: SessionRecipe) -> SessionRecipe:
-    """The ``recipe``; MitsimError where it has what a plan does not know."""
-    if len(recipe.exposure_ladder) > 1 or recipe.dark_frames:
-        raise MitsimError(
-            f"recipe: has {len(recipe.exposure_ladder)} exposures of a frame and {recipe.dark_frames} dark frames; a "
-            "plan knows sessions of one exposure without dark frames, so leave exposure_ladder and dark_frames out"
-        )
-    return recipe
-
-
-def _unknown(foreseen: Foreseen) -> tuple[str, ...]:
-    """What sessions do that the plan does not know."""
-    if not foreseen.lit.speckle:
-        return ()
-    return (f"speckle of contrast {foreseen.lit.speckle:g}: it is in every frame, and not in the plan's calibration",)
 
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """Images of ``shots`` by factors of ``foreseen`` sessions of a ``recipe`` with another exposure or repeats."""
+    """Images of ``shots`` by factors of ``predicted`` sessions of a ``recipe`` with another exposure or repeats."""
 
     shots: Capture
-    foreseen: Foreseen
+    predicted: PredictedSession
     recipe: SessionRecipe
     job: Job
 
     def trial(self, recipe: SessionRecipe | None) -> Trial:
         """Images by sessions of a ``recipe``; None: without noise."""
         draws = range(_DRAWS if recipe else 1)
-        images = [self._image(self.foreseen.factors(recipe, draw)) for draw in draws]
+        images = [reconstruct(self.shots, self.predicted.factors(recipe, draw)) for draw in draws]
         found = [psnr_of(image.image, self._truth) for image in images]
         budget = images[0].uncertainties.budget if images[0].uncertainties else {}
         largest = max(budget, key=lambda name: budget[name], default="").replace("_", " ")
@@ -289,9 +294,6 @@ class _Search:
         truth = truth_for(self.shots, self.recipe.board_reflectance)
         assert truth is not None
         return truth
-
-    def _image(self, factors: Factors) -> Reconstruction:
-        return reconstruct(self.shots, factors)
 
     def _by(self, dose: float) -> SessionRecipe:
         """The recipe with so many times the light of one shot of each frame, or of that part of one."""
@@ -322,18 +324,18 @@ def least_dose(quality: Callable[[float], float], wanted: float, smallest: float
         if high == MOST_REPEATS:
             return high
         low, high = high, min(high * _STEP, float(MOST_REPEATS))
-    while not _found(low, high, quality(high) - wanted):
-        dose = _between(low, high, quality(low) - wanted, quality(high) - wanted)
+    while not _is_close(low, high, quality(high) - wanted):
+        dose = _next_dose(low, high, quality(low) - wanted, quality(high) - wanted)
         low, high = (low, dose) if quality(dose) >= wanted else (dose, high)
     return high
 
 
-def _found(low: float, high: float, beyond_db: float) -> bool:
+def _is_close(low: float, high: float, beyond_db: float) -> bool:
     """Whether no dose between ``low`` and ``high`` is worth a look; ``beyond_db`` is what the latter has too much."""
     return (low >= 1 and high - low <= 1) or beyond_db <= _NEAR_DB or high / low < 1 + 10.0 ** (1 - _DIGITS)
 
 
-def _between(low: float, high: float, under_db: float, over_db: float) -> float:
+def _next_dose(low: float, high: float, under_db: float, over_db: float) -> float:
     """The dose at which a straight line over log dose meets what is wanted, well within; whole repeats.
 
     Parameters
@@ -346,3 +348,100 @@ def _between(low: float, high: float, under_db: float, over_db: float) -> float:
     part = min(max((_NEAR_DB / 2 - under_db) / (over_db - under_db), 0.2), 0.8)
     dose = float(low * (high / low) ** part)
     return min(max(float(round(dose)), low + 1), high - 1) if low >= 1 else dose
+
+
+# ---- A session whose responses are known without noise; factors as any exposure and repeats would leave them ----
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedSession:
+    """A session whose responses are known without noise.
+
+    Attributes
+    ----------
+    lit
+        the session in its light, by any recipe of its board and way of capturing signed patterns.
+    sums
+        of its noise-free responses, all of them in.
+    """
+
+    lit: LitSession
+    sums: tuple[StripeSums, StripeSums]
+
+    @classmethod
+    @single_threaded_blas()
+    def of(cls, lit: LitSession, job: Job) -> PredictedSession:
+        """Those of a session ``lit``; ``job`` takes the time of forming its responses, and is told how far it is."""
+        return cls(lit, session_sums(lit, job, (NOISE_FREE,)).sums[NOISE_FREE])
+
+    def by(self, recipe: SessionRecipe) -> LitSession:
+        """The session with the exposure and the repeats of a ``recipe``, whose other fields are those it was lit by."""
+        lit = self.lit
+        exposure = Exposure(None, recipe.exposure_fraction).choose(
+            lit.session.bench.rig, float(lit.white.irradiance.max())
+        )
+        return replace(lit, session=replace(lit.session, recipe=recipe), exposure_s=exposure)
+
+    def estimate(self, lit: LitSession | None, draw: int = 0) -> Estimate:
+        """What the noise of a session leaves.
+
+        Parameters
+        ----------
+        lit
+            the session, as :meth:`by` gives it; None: no noise at all.
+        draw
+            number of the noise: equal numbers draw equal noise, larger or smaller by the recipe.
+        """
+        signs = self.lit.session.signs
+        if lit is None:
+            return factors_of_sums(*self.sums, signs, 0.0)
+        left, right = (_noisy(lit, sums, draw) for sums in self.sums)
+        return factors_of_sums(left, right, signs, lit.response_noise)
+
+    def factors(self, recipe: SessionRecipe | None, draw: int = 0) -> Factors:
+        """The same by a ``recipe``, or None, as factors of the camera; ``draw`` as for :meth:`estimate`."""
+        lit = None if recipe is None else self.by(recipe)
+        session, exposure_s = self.lit.session, (lit or self.lit).exposure_s
+        manifest = CalibrationManifest(
+            camera=session.bench.identity(),
+            centre=session.centre,
+            board_reflectance=session.recipe.board_reflectance,
+            digital=digital_of(session.bench.sensor, exposure_s),
+            parallax=session.bench.parallax,
+        )
+        return Factors.of(self.estimate(lit, draw), manifest)
+
+
+def _noisy(lit: LitSession, sums: StripeSums, draw: int) -> StripeSums:
+    """The ``sums`` with noise of a session ``lit``."""
+    own, shared = _variances(lit)
+    weights = np.square(sums.common / np.dot(sums.common, sums.common))
+    by_row = own if sums.side == SIDES[0] else own.T
+    random = stream(lit.session.seed, "foreseen", sums.side, draw)
+    noise = np.sqrt(by_row @ weights)[:, None] * random.standard_normal(sums.vectors.shape)
+    if shared is not None:
+        by_row = shared if sums.side == SIDES[0] else shared.T
+        noise += np.sqrt(by_row @ weights)[:, None] * random.standard_normal((len(sums.vectors), 1))
+        own = own + shared
+    # One number a row (or column) of each response was fitted.
+    energy, fitted = sums.done * float(own.sum()), 1 - 1 / len(sums.common)
+    return replace(
+        sums,
+        vectors=sums.vectors + noise,
+        misfit=sums.misfit + fitted * energy,
+        energy=sums.energy + energy,
+    )
+
+
+def _variances(lit: LitSession) -> tuple[FloatArray, FloatArray | None]:
+    """(m, m') noise variance of a +-1 response [(electrons/s)^2]: its own, and what all of a side share.
+
+    Shots of a pattern are taken for half as bright as uniform light: over all patterns, and over a pair, that is exact.
+    """
+    bench, time, recipe = lit.session.bench, lit.exposure_s, lit.session.recipe
+    white = Exposer(bench.rig, time, lit.session.seed).electrons(lit.white)
+    unit = recipe.repeats * (bench.sensor.gain_dn_per_e * time) ** 2
+    half = frame_moments(white / 2, time, bench.sensor)[1] / unit
+    if lit.session.pairs:
+        return 2 * half, None
+    return 4 * half, frame_moments(white, time, bench.sensor)[1] / unit

@@ -8,32 +8,24 @@ noise. When n is no Hadamard order the next one is used and its first n rows: ro
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
-from PIL import Image
 
 from mitsim.acquire.drift import levels
-from mitsim.acquire.exposure import Exposer, camera_warnings, in_chunks
+from mitsim.acquire.exposure import camera_warnings
 from mitsim.bench.bench import Apparatus
 from mitsim.bench.board import before_board, missed_pixels
-from mitsim.bench.request import Exposure
 from mitsim.core.arrays import FloatArray
-from mitsim.core.files import whole_file, write_json
 from mitsim.core.job import Job
-from mitsim.core.manifests import Digital
 from mitsim.core.parallel import in_threads
 from mitsim.core.resources import Cost
 from mitsim.devices.camera import CameraGeometry, side_of
-from mitsim.devices.framelist import LISTS, DarkFile, FrameList, StripeFile
-from mitsim.devices.patterns import Lighting, PatternFamily, stripe_signs
+from mitsim.devices.patterns import Lighting, stripe_signs
 from mitsim.devices.projector import Spectrum
-from mitsim.devices.sensor import digital_of
-from mitsim.devices.session import SIDES, UNIFORM, BoardShape, Half, SessionRecipe, taken
+from mitsim.devices.session import UNIFORM, BoardShape, Half, SessionRecipe, taken
 from mitsim.light.cost_model import FIXED, Numbers, forming_seconds
 from mitsim.light.light import SampledLight, Sampling, trace_lines
 from mitsim.light.passes import Simulation
@@ -46,9 +38,7 @@ from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import shadow_terms
 from mitsim.planner.memory import frame_seconds, frames_at_once, light_bytes
 from mitsim.planner.planner import make_plan
-from mitsim.reconstruct.captured_session import Chosen, Ladder
 from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, decibels
-from mitsim.sensor.chain import Digital as DigitalNumbers
 
 _IN_RAYS = 0.5
 """Part of what no separable camera has, rms, that rays leave where the rest, three quarters of its energy, is said to
@@ -71,6 +61,8 @@ class Session:
         of the board [mm]; None: on the aligned plane.
     filters
         (pixels, pixels) part of the light that colour filters over them pass, which readings are divided by; None: all.
+    whole
+        the session of all lines, of whose light this is one; None: itself.
     """
 
     bench: Apparatus
@@ -78,6 +70,7 @@ class Session:
     seed: int = 0
     depth: float | None = None
     filters: FloatArray | None = None
+    whole: Session | None = None
 
     @property
     def distance(self) -> float:
@@ -87,6 +80,8 @@ class Session:
     @cached_property
     def board(self) -> Apparatus:
         """The bench with the white board instead of its scene."""
+        if self.whole is not None:
+            return replace(self.bench, loaded=self.whole.board.loaded)
         return before_board(self.bench, self.recipe.board_reflectance, self.recipe.board, self.depth)
 
     @property
@@ -184,12 +179,12 @@ class Session:
         drift, order = self.recipe.drift, self.order
         each = len(order), len(self.recipe.exposure_ladder), self.recipe.repeats
         found = levels(self.seed, "session", math.prod(each), drift.session_ramp, drift.session_flicker).reshape(each)
+        return {self.shot(half): power for half, power in zip(order, found, strict=True)}
 
-        def shot(half: Half) -> tuple[str, int]:
-            side, number, sign = half
-            return side, 2 * number + (sign < 0) if self.pairs else number + (sign != UNIFORM)
-
-        return {shot(half): power for half, power in zip(order, found, strict=True)}
+    def shot(self, half: Half) -> tuple[str, int]:
+        """Side and number of the shot that shows a ``half``, which name its noise."""
+        side, number, sign = half
+        return side, 2 * number + (sign < 0) if self.pairs else number + (sign != UNIFORM)
 
     def plan(self, accuracy: float, job: Job) -> Plan:
         """What to simulate for responses of this relative ``accuracy``, and what the session takes.
@@ -230,15 +225,6 @@ class Session:
             lights = trace_lines(self.board, boards, plan, lighting, self.seed, sampling, job.progress)
         return [light.merged() for light in lights]
 
-    def lit(self, light: SampledLight, job: Job) -> LitSession:
-        """The session in the ``light`` that :meth:`trace` gave; ``job`` takes the time of choosing the exposure."""
-        with job.clock.stage("optics"):
-            white = next(iter(light.frames(Lighting.uniform(self.bench.n), self.seed)))
-            exposure = Exposure(None, self.recipe.exposure_fraction)
-            exposure_s = exposure.choose(self.bench.rig, float(self.filtered(white.irradiance).max()))
-        stripes = PatternFamily("stripes", self.signs[:, 1:2].astype(np.int8), np.ones((self.bench.n, 1), np.int8))
-        return LitSession(self, light, white, exposure_s, light.speckle(stripes))
-
 
 def _lines(n: int) -> Lighting:
     """Shots of one row or one column of pixels each, evenly spread.
@@ -251,446 +237,6 @@ def _lines(n: int) -> Lighting:
     rows = np.zeros((len(chosen), n, n))
     rows[np.arange(len(chosen)), chosen] = 1
     return Lighting(np.arange(n * n), np.concatenate([rows, rows.transpose(0, 2, 1)]).reshape(-1, n * n))
-
-
-# -------- A simulated session's frames in
-
-MOST_TIFF = 2**16 - 1
-"""Largest digital number of a 16-bit TIFF; frames of larger or real numbers become NPY."""
-
-
-@dataclass(frozen=True, eq=False)
-class KeptFrames:
-    """Frames of a ``session`` in a ``folder`` that is held, called by the number at which they are taken."""
-
-    session: Session
-    folder: Path
-
-    def write(self, names: tuple[str | int, ...], numbers: DigitalNumbers) -> None:
-        """Write one frame.
-
-        Parameters
-        ----------
-        names
-            of its noise: side and number of the shot, or ``dark`` and numbers of exposure and frame; then ``exposure``
-            and ``repeat``, each with its number where that is not 0.
-        numbers
-            (rows, columns) as read.
-        """
-        if names[0] == "dark":
-            place = self._dark(int(names[1]), int(names[2]))
-        else:
-            options = dict(zip(names[2::2], names[3::2], strict=True))
-            half = self._half(str(names[0]), int(names[1]))
-            place = self._lit(half, int(options.get("exposure", 0)), int(options.get("repeat", 0)))
-        with whole_file(self.folder / place) as part, part.open("wb") as file:
-            if self._tiff:
-                Image.fromarray(numbers.astype(np.uint16)).save(file, "TIFF")
-            else:
-                np.save(file, numbers)
-
-    def finish(self, digital: Digital) -> None:
-        """Write the list, when all frames are there; ``digital`` is of the shortest exposure."""
-        recipe, exposures = self.session.recipe, range(len(self.session.recipe.exposure_ladder))
-        listed = FrameList(
-            camera=self.session.bench.identity(),
-            n=self.session.bench.n,
-            signed_capture=recipe.signed_capture,
-            repeats=recipe.repeats,
-            exposure_ladder=recipe.exposure_ladder,
-            ladder_merge=recipe.ladder_merge,
-            digital=digital,
-            centre=self.session.centre,
-            board_reflectance=recipe.board_reflectance,
-            frames=tuple(
-                StripeFile(
-                    file=self._lit(half, exposure, repeat),
-                    side=half[0],
-                    index=half[1],
-                    sign=half[2],
-                    exposure=exposure,
-                    repeat=repeat,
-                )
-                for half in self.session.order
-                for exposure in exposures
-                for repeat in range(recipe.repeats)
-            ),
-            dark=tuple(
-                DarkFile(file=self._dark(exposure, number), exposure=exposure)
-                for exposure in exposures
-                for number in range(recipe.dark_frames)
-            ),
-        )
-        write_json(self.folder / LISTS[1], listed.model_dump(mode="json", exclude_defaults=True))
-
-    @cached_property
-    def _tiff(self) -> bool:
-        largest = self.session.bench.sensor.largest_dn
-        return largest is not None and largest <= MOST_TIFF
-
-    @cached_property
-    def _numbers(self) -> dict[Half, int]:
-        """At which number each is taken, of those with one exposure and no repeats."""
-        return {half: number for number, half in enumerate(self.session.order)}
-
-    def _half(self, side: str, index: int) -> Half:
-        """What shot number ``index`` of a ``side`` shows."""
-        (own,) = (known for known in SIDES if known == side)
-        if self.session.pairs:
-            return own, index // 2, -1 if index % 2 else 1
-        return (own, index - 1, 1) if index else (own, 0, UNIFORM)
-
-    def _lit(self, half: Half, exposure: int, repeat: int) -> str:
-        recipe = self.session.recipe
-        number = (self._numbers[half] * len(recipe.exposure_ladder) + exposure) * recipe.repeats + repeat
-        return f"frame_{number:05d}{self._ending}"
-
-    def _dark(self, exposure: int, number: int) -> str:
-        return f"dark_{exposure * self.session.recipe.dark_frames + number:05d}{self._ending}"
-
-    @property
-    def _ending(self) -> str:
-        return ".tif" if self._tiff else ".npy"
-
-
-# -------- A calibration session whose light is traced in
-
-Result = TypeVar("Result")
-_NUMBERS_AT_ONCE = 2**15
-"""Numbers of frames that become a response at a time: so few stay in the cache. Whole frames of a sensor of 2048 pixels
-took ten times as long."""
-SHOT, DARK, READ, ROUNDING = "shot noise", "dark current", "read noise", "quantisation"
-"""Sources of a frame's noise."""
-
-
-@dataclass(frozen=True)
-class Response:
-    """Response (m, m') to a +-1 pattern [electrons / s], how many of its shots had saturated pixels, and, of a pair,
-    the sum of its two shots."""
-
-    rate: FloatArray
-    saturated: int = 0
-    light: FloatArray | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class LitSession:
-    """A session whose light is traced: its responses, with noise or without.
-
-    Attributes
-    ----------
-    session
-        what is shown.
-    light
-        of the board, by projector pixel.
-    white
-        expected frame of the uniform shot.
-    exposure_s
-        of every shot [s], the shortest where there are several.
-    speckle
-        contrast of laser speckle in the frames.
-    kept
-        where its frames are written to; None: nowhere.
-    """
-
-    session: Session
-    light: SampledLight
-    white: Frame
-    exposure_s: float
-    speckle: float
-    kept: KeptFrames | None = None
-
-    @property
-    def response_noise(self) -> float:
-        """Root mean square noise of a +-1 response [electrons / s], from the sensor's closed form."""
-        return float(np.sqrt(np.mean([self.response_variance(side).mean() for side in SIDES])))
-
-    def response_variance(self, side: str) -> FloatArray:
-        """(m, m') mean noise variance of the responses of a ``side`` [(electrons / s)^2], in closed form."""
-        variance: FloatArray = np.zeros(self.uniform_rate.shape)
-        for parts in self.response_variances(side):
-            for part in parts.values():
-                variance += part
-        return variance
-
-    def response_variances(self, side: str) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
-        """The same by source, (m, m') or one number each: what each response has of its own, and what all of
-        the ``side`` share.
-
-        Two shots of a pair share the uniform light L: variance (L + 2 D) / t + 2 R / t^2 with dark electrons D and the
-        variance R of reading and rounding. 2 Y(positive) - Y(uniform) of a part p of the lines, about half, has
-        (4 p L + 4 D) / t + 4 R / t^2 of its own; the uniform shot's (L + D) / t + R / t^2 is shared, and that of a dark
-        frame's mean. Means of repeated shots have their number's part of it. Of several exposures each pixel has the
-        sum of these by the squares of its weights.
-        """
-        sensor, recipe, ladder = self.session.bench.sensor, self.session.recipe, self.ladders[side]
-        rounding = 0.0 if sensor.largest_dn is None else 1 / (12 * sensor.gain_dn_per_e**2)
-        # As many times a uniform shot's light, and another shot's other noise, as a response has.
-        lines, own_shots, shared_shots = (0.5, 2.0, 0.0) if self.session.pairs else (self.session.lit_lines, 4.0, 1.0)
-        own, shared = (dict.fromkeys((SHOT, DARK, READ, ROUNDING), np.zeros(1)) for _ in range(2))
-        for number, time in enumerate(self.exposures_s):
-            weight: FloatArray | float = 1.0 if ladder.weights is None else np.square(ladder.weights[number])
-            if self.session.filters is not None:
-                weight = weight / np.square(self.session.filters)
-            single: dict[str, FloatArray | float] = {
-                SHOT: self.session.filtered(self.uniform_rate) / time,
-                DARK: sensor.superpixel_dark_current_e_per_s / time,
-                READ: sensor.superpixel_reading_noise_e**2 / time**2,
-                ROUNDING: rounding / time**2,
-            }
-            for source, one in single.items():
-                part = lines if source == SHOT else 1.0
-                own[source] = own[source] + own_shots * part * weight * one / recipe.repeats
-                shots = shared_shots / recipe.repeats
-                if source != SHOT and recipe.dark_frames:
-                    shots += 1 / recipe.dark_frames
-                shared[source] = shared[source] + shots * weight * one
-        return own, shared
-
-    def each(self, side: str, use: Callable[[tuple[int, Frame]], Result], job: Job, first: int = 0) -> Iterator[Result]:
-        """What a function makes of the +-1 patterns of a side, in order, some at a time in a thread each.
-
-        Parameters
-        ----------
-        side
-            ``horizontal`` or ``vertical`` stripes.
-        use
-            of a pattern's number and the expected frame of its +1 pixels. Number 0 is the uniform pattern.
-        job
-            takes the time and is told how far it is.
-        first
-            number of the first pattern.
-        """
-
-        def used(item: tuple[int, Frame]) -> Result:
-            number, frame = item
-            return use((number, self._leaking(frame) if number else frame))
-
-        chunks = in_chunks(self._formed(side, first))
-        while True:
-            with job.clock.stage("optics"):
-                chunk = next(chunks, None)
-            if chunk is None:
-                return
-            with job.clock.stage("sensor"):
-                results = in_threads(used, chunk)
-            job.progress(f"{side} stripes", (chunk[-1][0] + 1) / self.session.signs.shape[1])
-            yield from results
-
-    def _formed(self, side: str, first: int) -> Iterator[tuple[int, Frame]]:
-        """Numbers and frames from ``first`` on, without what black pixels leak; none is formed for number 0."""
-        if first == 0:
-            yield 0, self.white
-        n = self.session.bench.n
-        row, column = np.divmod(np.arange(n * n), n)
-        stripes = Lighting(row if side == "horizontal" else column, (1.0 + self.session.signs.T) / 2)
-        shape = self.session.bench.geometry.frame_shape
-        yield from stripe_frames(self.light, stripes, self.session.seed, shape, max(first, 1))
-
-    def _leaking(self, frame: Frame) -> Frame:
-        """The ``frame`` with the light of black pixels: to form it with them would be twice the work."""
-        black = self.light.simulation.physics.black_level
-        if not black:
-            return frame
-        light = (1 - black) * frame.irradiance
-        light += self._leaked
-        return replace(frame, irradiance=light)
-
-    @cached_property
-    def _leaked(self) -> FloatArray:
-        """(m, m') light of all pixels when they are black [W m^-2]."""
-        return np.asarray(self.light.simulation.physics.black_level * self.white.irradiance)
-
-    def noisy(self, side: str, number: int, frame: Frame) -> Response:
-        """Response to a +-1 pattern as a user of noisy frames has it.
-
-        Parameters
-        ----------
-        side
-            ``horizontal`` or ``vertical`` stripes.
-        number, frame
-            of the pattern, as :meth:`each` has them.
-        """
-        if not self.session.pairs:
-            shot, uniform = self._exposed(frame.irradiance, side, number + 1), self._uniform[side]
-            rate = self._rates(lambda rows: 2 * self._rate(shot, rows) - uniform.rate[rows], shot)
-            if self._dark is not None:
-                rate -= self._dark[side]
-            return Response(rate, shot.saturated + (uniform.saturated if number == 0 else 0))
-        negative = self._both - frame.irradiance
-        shots = (
-            self._exposed(frame.irradiance, side, 2 * number),
-            # Rounding leaves pixels that see the +1 stripes alone a little below zero.
-            self._exposed(np.maximum(negative, 0.0, out=negative), side, 2 * number + 1),
-        )
-        light: FloatArray = np.empty(frame.irradiance.shape)
-
-        def difference(rows: slice) -> FloatArray:
-            one, other = self._rate(shots[0], rows), self._rate(shots[1], rows)
-            np.add(one, other, out=light[rows])
-            return one - other
-
-        rate = self._rates(difference, shots[0])
-        return Response(rate, sum(shot.saturated for shot in shots), light)
-
-    def noise_free(self, frame: Frame) -> FloatArray:
-        """(m, m') the same of the expected ``frame``: 2 Y((1 + P)/2) - Y(1)."""
-        rate = self._second.electrons(frame)
-        rate *= 2
-        rate -= self.uniform_rate
-        return rate
-
-    @property
-    def _second(self) -> Exposer:
-        """An exposure of one second, whose electrons are rates."""
-        return Exposer(self.session.bench.rig, 1.0, self.session.seed)
-
-    @cached_property
-    def exposures_s(self) -> tuple[float, ...]:
-        """Every exposure of a frame [s]."""
-        return tuple(self.exposure_s * factor for factor in self.session.recipe.exposure_ladder)
-
-    @cached_property
-    def _exposers(self) -> tuple[Exposer, ...]:
-        bench = self.session.bench
-        return tuple(Exposer(bench.rig, time, self.session.seed, self.speckle) for time in self.exposures_s)
-
-    @cached_property
-    def ladders(self) -> Mapping[str, Ladder]:
-        """How frames of several exposures of a side are merged: by the first uniform frame of the other one, which
-        shares no noise with them."""
-        digitals = tuple(digital_of(self.session.bench.sensor, time) for time in self.exposures_s)
-        if len(digitals) == 1:
-            return {side: Ladder(digitals) for side in SIDES}
-        recipe, found = self.session.recipe, dict[str, Ladder]()
-        for side, other in zip(SIDES, reversed(SIDES), strict=True):
-            uniform, _ = self._repeated(self._lit(self.white.irradiance, 0, other, 0), 0, True, other, 0)
-            rate = self._exposers[0].rate(uniform)
-            found[side] = Ladder.of(digitals, rate, recipe.repeats, recipe.ladder_merge)
-        return found
-
-    @cached_property
-    def _dark(self) -> Mapping[str, FloatArray] | None:
-        """(m, m') rate of the mean dark frame, as each side's frames are merged; None where none is taken."""
-        number = self.session.recipe.dark_frames
-        if not number:
-            return None
-        still = np.zeros(self.white.irradiance.shape)
-        rates = []
-        for exposure, exposer in enumerate(self._exposers):
-            total = np.zeros(still.shape)
-            for index in range(number):
-                total += self._read(exposer, still, "dark", exposure, index)
-            rates.append(exposer.rate(total / number))
-        return {side: self._unfiltered(ladder.merged(rates)) for side, ladder in self.ladders.items()}
-
-    @cached_property
-    def uniform_rate(self) -> FloatArray:
-        """(m, m') expected photoelectrons a second of the uniform frame."""
-        return self._second.electrons(self.white)
-
-    @cached_property
-    def _both(self) -> FloatArray:
-        """(m, m') light of a pair's two shots together [W m^-2]: all of it, and what black pixels leak."""
-        n = self.session.bench.n
-        off = Lighting(np.zeros(n * n, dtype=np.int64), np.zeros((1, 1)))
-        (dark,) = self.light.frames(off, self.session.seed)
-        return np.asarray(self.white.irradiance + dark.irradiance)
-
-    @cached_property
-    def _uniform(self) -> Mapping[str, Response]:
-        """Noisy uniform frames, from which each side's responses are taken where they are no pairs."""
-        shots = {side: self._exposed(self.white.irradiance, side, 0) for side in SIDES}
-        return {side: Response(self._rate(shot, slice(None)), shot.saturated) for side, shot in shots.items()}
-
-    def _exposed(self, irradiance: FloatArray, side: str, index: int) -> _Shot:
-        """The noisy frames of shot number ``index`` of a ``side``, of expected ``irradiance`` (m, m')."""
-        ladder = self.ladders[side]
-        found = [
-            self._repeated(self._lit(irradiance, exposure, side, index), exposure, ladder.used(exposure), side, index)
-            for exposure in range(len(self._exposers))
-        ]
-        return _Shot(ladder, tuple(digital for digital, _ in found), sum(saturated for _, saturated in found))
-
-    def _lit(self, irradiance: FloatArray, exposure: int, *names: str | int) -> FloatArray:
-        """Expected electrons of a shot. Speckle of a board at rest is the same in all repeats and exposures."""
-        passed = Frame(self.session.filtered(irradiance), 0.0, 0.0, 0.0)
-        return self._exposers[exposure].lit(passed, "calibration", *names)
-
-    def _repeated(
-        self, lit: FloatArray, exposure: int, used: Chosen, side: str, index: int
-    ) -> tuple[DigitalNumbers, int]:
-        """The mean of all repeats of a shot at one exposure, and how many have saturated pixels that are used.
-
-        Parameters
-        ----------
-        lit
-            expected electrons.
-        exposure, side, index
-            numbers of the exposure and of the shot.
-        used
-            pixels that count.
-        """
-        exposer, repeats = self._exposers[exposure], self.session.recipe.repeats
-        names: tuple[str | int, ...] = (side, index)
-        names += ("exposure", exposure) if exposure else ()
-
-        powers = self.session.powers[side, index][exposure]
-
-        def read(repeat: int) -> tuple[DigitalNumbers, int]:
-            light = powers[repeat] * lit
-            digital = self._read(exposer, light, *names, *(("repeat", repeat) if repeat else ()))
-            if used is True:
-                return digital, int(exposer.saturated(digital, light))
-            return digital, int(exposer.saturated(np.where(used, digital, 0), np.where(used, light, 0.0)))
-
-        digital, count = read(0)
-        if repeats == 1:
-            return digital, count
-        mean = digital.astype(np.float64)
-        for repeat in range(1, repeats):
-            digital, saturated = read(repeat)
-            count += saturated
-            mean += digital
-        mean /= repeats
-        return mean, count
-
-    def _read(self, exposer: Exposer, lit: FloatArray, *names: str | int) -> DigitalNumbers:
-        """One noisy frame, which is kept where frames are; ``names`` find its noise."""
-        digital = exposer.digital(lit, "calibration", *names)
-        if self.kept is not None:
-            self.kept.write(names, digital)
-        return digital
-
-    def _rate(self, shot: _Shot, rows: slice) -> FloatArray:
-        """Rates of some ``rows`` of a ``shot``."""
-        each = zip(self._exposers, shot.digital, strict=True)
-        merged = shot.ladder.merged((exposer.rate(digital[rows]) for exposer, digital in each), rows)
-        return self._unfiltered(merged, rows)
-
-    def _unfiltered(self, rate: FloatArray, rows: slice = slice(None)) -> FloatArray:
-        """What pixels without filters would read, from the ``rate`` of some ``rows``."""
-        return rate if self.session.filters is None else rate / self.session.filters[rows]
-
-    @staticmethod
-    def _rates(of: Callable[[slice], FloatArray], shot: _Shot) -> FloatArray:
-        """(m, m') rates of all rows by those ``of`` some, a few at a time: their arrays stay in the cache."""
-        rates: FloatArray = np.empty(shot.digital[0].shape)
-        step = max(1, _NUMBERS_AT_ONCE // rates.shape[1])
-        for start in range(0, len(rates), step):
-            rows = slice(start, start + step)
-            rates[rows] = of(rows)
-        return rates
-
-
-@dataclass(frozen=True, eq=False)
-class _Shot:
-    """Noisy frames (m, m'), of each exposure the mean of its repeats, which a ``ladder`` merges; how many of
-    all have ``saturated`` pixels."""
-
-    ladder: Ladder
-    digital: tuple[DigitalNumbers, ...]
-    saturated: int
 
 
 # -------- What a calibration session takes
@@ -816,7 +362,7 @@ def stripe_frames(
         if lines is None:
             frames: Iterator[Frame] = iter(light.frames(stripes.shots(numbers), seed, leaking=False))
         else:
-            frames = (Frame(frame, 0.0, 0.0, 0.0) for frame in _mixed(stripes.weights[numbers], lines, shape))
+            frames = (Frame(frame, 0.0, 0.0, 0.0) for frame in _mix(stripes.weights[numbers], lines, shape))
         yield from (item for item in zip(numbers.tolist(), frames, strict=True) if item[0] >= first)
 
 
@@ -832,7 +378,7 @@ def _stripe_lines(light: SampledLight, lines: Lighting, seed: int, shape: tuple[
     return frames
 
 
-def _mixed(weights: FloatArray, lines: FloatArray, shape: tuple[int, int]) -> FloatArray:
+def _mix(weights: FloatArray, lines: FloatArray, shape: tuple[int, int]) -> FloatArray:
     """(patterns, m, m') sums of ``lines`` (lines, m m') by ``weights`` (patterns, lines), for frames of a ``shape``."""
     mixed = np.empty((len(weights), lines.shape[1]))
 

@@ -307,7 +307,7 @@ def _fit(
         devices.check_exposure(Exposure(None, recipe.exposure_fraction))
     with limited.job() as job:
         bench = devices.open(scene, limited.variant, job)
-        from mitsim.calibrate.model_fit import calibrate_model
+        from mitsim.calibrate.model import calibrate_model
 
         factors = calibrate_model(bench, modelling, frames, recipe, seed, folder, job)
     result = factors.manifest.result

@@ -22,6 +22,7 @@ from mitsim.core.spectral_manifests import (
     read_colours,
     spectral_of,
 )
+from mitsim.core.spectral_manifests import MOSAIC as MOSAIC_RUN
 
 if TYPE_CHECKING:
     from mitsim.api.bench import Bench
@@ -136,15 +137,11 @@ def plan_of(bench: Bench, colour: str, request: dict[str, Any]) -> Plan:
         return bench.choose_colour(**request).plan
     if colour == NO:
         return bench.plan(**request)
+    from mitsim.acquire.spectral import SpectralBench
     from mitsim.bench.request import Request
 
-    if colour == MOSAIC:
-        from mitsim.acquire.mosaic import plan_mosaic
-
-        return plan_mosaic(bench, Request.of(**request))
-    from mitsim.acquire.spectral import ColourBench, plan_lines
-
-    return plan_lines(ColourBench.of(in_colour(bench, colour), RUN), Request.of(**request))
+    kind = MOSAIC_RUN if colour == MOSAIC else RUN
+    return SpectralBench.of(in_colour(bench, colour), kind).plan(Request.of(**request))
 
 
 # ---- what the terminal shows -----------------------------------------------------------------------------------------

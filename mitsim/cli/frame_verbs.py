@@ -282,8 +282,7 @@ def sense(
     common: Common,
 ) -> int:
     """Put an image of any renderer behind a camera's sensor: digital numbers with its noise."""
-    from mitsim.acquire.sense_options import check_ending, check_f_number, check_image, check_wavelength
-    from mitsim.bench.request import Exposure
+    from mitsim.bench.request import Exposure, check_ending, check_f_number, check_image, check_wavelength
     from mitsim.core.configuration import locate
     from mitsim.core.files import check_apart, output_file
     from mitsim.core.seeds import check_root

@@ -19,7 +19,7 @@ from mitsim.core.seeds import integer
 from mitsim.devices.session import load_recipe
 from mitsim.light.cost_model import BOARD_SAMPLES, MOST_RAYS, MOST_SAMPLES, TRUTH_GROUPS, TRUTH_PART, TRUTH_SAMPLES
 from mitsim.light.settings import Settings
-from mitsim.transport.flux import FluxTracer, IntArray
+from mitsim.transport.direct import FluxTracer, IntArray
 
 _FINEST = 1e-4
 """Standard error below which the truth is not refined: 80 dB, where no image of a sensor with a full well comes."""

@@ -27,8 +27,7 @@ from mitsim.planner.pilot_direct import SMOOTH, DirectRuns, occluded_pixels, sha
 from mitsim.planner.pilot_effects import EffectRuns
 from mitsim.planner.pilot_samples import GOOD_ENOUGH, Sample
 from mitsim.scene.darkness import why_dark
-from mitsim.transport.highlights import highlights
-from mitsim.transport.missed import LeftOut, left_out_light
+from mitsim.transport.missed import LeftOut, highlights, left_out_light
 from mitsim.transport.sharp_lobes import SharpLight, sharp_light, with_neighbours
 
 RUNS = ("cells", "effects", "anchors", "followed", "occluded")

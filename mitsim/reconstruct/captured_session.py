@@ -277,7 +277,7 @@ class _Readings:
     """Frames of a ``session`` as electrons a second; names of those that are ``saturated`` are noted as they are read,
     how frames ``compared`` that should be alike, and which dark ones are ``odd``, in words.
 
-    Measurements of all patterns are as in a simulated session: :meth:`mitsim.calibrate.session.LitSession.noisy`.
+    Measurements of all patterns are as in a simulated session: :meth:`mitsim.calibrate.lit_session.LitSession.noisy`.
     """
 
     session: SessionFrames

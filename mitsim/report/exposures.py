@@ -21,7 +21,7 @@ from scipy import sparse
 from mitsim.acquire.exposure import Exposer, is_taken, peak_irradiance, taken_off
 from mitsim.bench.bench import Apparatus
 from mitsim.bench.request import Exposure
-from mitsim.calibrate.session import DARK, READ, ROUNDING, SHOT
+from mitsim.calibrate.lit_session import DARK, READ, ROUNDING, SHOT
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas

@@ -22,7 +22,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from mitsim.calibrate.session import LitSession
+from mitsim.calibrate.lit_session import LitSession
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.drift import WORDS, Drift, amount_in_words

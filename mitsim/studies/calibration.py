@@ -17,11 +17,11 @@ from typing import Any, ClassVar
 import numpy as np
 from matplotlib.figure import Figure
 
-from mitsim.acquire.capture import digital_scale
 from mitsim.api.bench import Bench
 from mitsim.bench.request import Exposure, Request
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimate, estimates
-from mitsim.calibrate.session import LitSession, Session
+from mitsim.calibrate.lit_session import LitSession
+from mitsim.calibrate.session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
@@ -29,6 +29,7 @@ from mitsim.core.manifests import SIDES as FACTORS
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.drift import WORDS, Drift
+from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import SIDES, BoardShape, SessionRecipe, load_recipe
 from mitsim.light.light import SampledLight
 from mitsim.reconstruct.estimate_factors import Estimate, decibels
@@ -76,8 +77,8 @@ def measure(bench: Bench, request: Request, job: Job, recipe: SessionRecipe | No
     Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.rig.camera_file)
     session = Session(bench, recipe.model_copy(update={"drift": Drift()}), request.seed)
     plan = session.plan(request.accuracy, job)
-    lit = session.lit(session.trace(plan, job), job)
-    (noisy, clean), _ = estimates(lit, job, (NOISY, NOISE_FREE))
+    lit = LitSession.of(session, session.trace(plan, job), job)
+    (noisy, clean), _, _ = estimates(lit, job, (NOISY, NOISE_FREE))
     found = judged(lit, noisy, clean, tuple(_by_cause(lit, noisy, clean, job)))
     scene = LitScene(bench.light(request.patterns, job, accuracy=request.accuracy, seed=request.seed))
     stand = DriftStand(scene, _factors(lit, noisy), recipe, family, request.seed)
@@ -93,7 +94,7 @@ def _factors(lit: LitSession, estimate: Estimate) -> Factors:
         camera=session.bench.identity(),
         centre=session.centre,
         board_reflectance=session.recipe.board_reflectance,
-        digital=digital_scale(session.bench, lit.exposure_s),
+        digital=digital_of(session.bench.sensor, lit.exposure_s),
         parallax=session.bench.parallax,
     )
     return Factors.of(estimate, manifest)
@@ -246,7 +247,7 @@ def _by_cause(lit: LitSession, noisy: Estimate, clean: Estimate, job: Job) -> It
 
 
 def _residual(session: Session, light: SampledLight, job: Job) -> float:
-    return estimate(session.lit(light, job), job, noise_free=True)[0].separability_residual
+    return estimate(LitSession.of(session, light, job), job, noise_free=True)[0].separability_residual
 
 
 def _row(cause: str, residual: float, left: float) -> CauseRow:

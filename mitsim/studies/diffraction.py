@@ -24,6 +24,7 @@ from mitsim.acquire.exposure import Exposer
 from mitsim.api.bench import Bench
 from mitsim.bench.request import Exposure, Request
 from mitsim.calibrate.calibrate import estimate
+from mitsim.calibrate.lit_session import LitSession
 from mitsim.calibrate.session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
@@ -211,7 +212,7 @@ class _Trials:
         assumed = IdealCamera(bench, mask).calibrated(self.flux)
         for name, absent in ((PROJECTOR, frozenset[str]()), (GEOMETRIC, frozenset({"diffraction"}))):
             scene = reformed(light, absent).merged()
-            fitted, _ = estimate(session.lit(reformed(board, absent), job), job)
+            fitted, _ = estimate(LitSession.of(session, reformed(board, absent), job), job)
             known = {ASSUMED: assumed, CALIBRATED: (fitted.left, fitted.right)}
             for family in self.families:
                 expected = scene.frames(family.lighting, self.seed)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from mitsim.acquire.sense_options import check_wavelength
+from mitsim.bench.request import check_wavelength
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.seeds import check_root
 from mitsim.devices.sensor import SensorModel

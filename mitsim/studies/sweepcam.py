@@ -22,6 +22,7 @@ from mitsim.acquire.exposure import Exposer, peak_irradiance, taken_off
 from mitsim.bench.bench import Apparatus
 from mitsim.bench.request import Exposure
 from mitsim.calibrate.calibrate import estimate
+from mitsim.calibrate.lit_session import LitSession
 from mitsim.calibrate.session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
@@ -97,7 +98,7 @@ def calibrated_places(bench: Apparatus, places_mm: Sequence[float], seed: int, a
         return Session(moved(bench, row, column), recipe, seed)
 
     def white(row: float, column: float) -> Frame:
-        return at(row, column).lit(light.behind(at(row, column).board), Job()).white
+        return LitSession.of(at(row, column), light.behind(at(row, column).board), Job()).white
 
     return _consistent({place: _calibrated(at(place, place), light, place) for place in places_mm}, bench, white)
 
@@ -128,7 +129,7 @@ def _consistent(factors: Places, bench: Apparatus, white: Callable[[float, float
 
 def _calibrated(session: Session, light: SampledLight, place: float) -> Pair:
     """Both factors of a ``session`` before the board's ``light``, its noise found by the ``place``."""
-    lit = session.lit(light.behind(session.board), Job())
+    lit = LitSession.of(session, light.behind(session.board), Job())
     clean, _ = estimate(lit, Job(), noise_free=True)
     count = np.sqrt(session.signs.shape[1])
     sides = {"left": (clean.left, clean.right), "right": (clean.right, clean.left)}

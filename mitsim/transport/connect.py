@@ -1,5 +1,6 @@
-"""The bare sensor as a receiver: from a lit surface point to the irradiance that it casts on a point of the sensor.
+"""Connections: from a lit surface point to the irradiance that it casts on the sensor, and to the projector's lens.
 
+The bare sensor is a receiver.
 A surface point P that receives the flux phi irradiates the sensor point with::
 
     E = f(P) cos_s / cos_g  phi  cos_P cos_a / r^2  r(t)        [W m^-2]
@@ -24,8 +25,8 @@ from mitsim.core.arrays import FloatArray
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Lines
 from mitsim.optics.image_formation import anchor_positions
-from mitsim.transport.coordinates import rows_columns, x_y
-from mitsim.transport.projector import ProjectorRays, line_wavelengths
+from mitsim.transport.plugins.base import rows_columns, x_y
+from mitsim.transport.projector import ProjectorOptics, ProjectorRays, line_wavelengths
 from mitsim.transport.records import Sightings
 from mitsim.transport.sampler import generator, panchromatic
 from mitsim.transport.transmission import Passage, refracted_way
@@ -266,6 +267,9 @@ def sampled_wavelengths(camera: mi.Sensor, rng: mi.PCG32, lines: Lines | None = 
 
 
 # -------- Where light lands that leaves surfaces in known directions
+#
+# Light that is sampled from a surface goes where its lobe sends it, through flat glass bent by Snell's law, until it
+# crosses the plane of the sensor.
 
 
 @dataclass
@@ -313,3 +317,136 @@ def landing(receiver: Receiver, si: mi.SurfaceInteraction3f, direction: mi.Vecto
     reach = -place.z / onward.z
     arrives = active & (onward.z < 0) & (reach > 0)
     return Landing(place.x + onward.x * reach, place.y + onward.y * reach, -onward.z, length + reach, arrives)
+
+
+# -------- Connections to the projector
+#
+# Each has the projector pixel that it used. A pinhole is the stock Mitsuba ``projector``. With a lens of finite radius,
+# a point q of the lens shows the pattern that is sharp on the focus plane: a ray from q through surface point p
+# carries the projector pixel whose image lies where the ray meets that plane. Radiance is pi scale texture /
+# (A cos^4 theta), so that a small lens of area A casts the pinhole's irradiance. A blurred spot moves each connection
+# by a normal deviate in projector pixels.
+
+
+@dataclass
+class Connection:
+    """From a scene point to the projector: unit direction, lens point, weight (radiance / pdf), pdf [1/sr], pixel.
+
+    ``pdf`` is 0 for a pinhole, which no sampled direction can find.
+    """
+
+    direction: mi.Vector3f
+    target: mi.Point3f
+    weight: mi.Spectrum
+    pdf: mi.Float
+    pixel: mi.UInt32
+    valid: mi.Bool
+
+
+@dataclass
+class LensHit:
+    """A ray that met the lens: radiance, pdf [1/sr] of a :class:`Connection` along it, pixel, and whether it did."""
+
+    radiance: mi.Spectrum
+    pdf: mi.Float
+    pixel: mi.UInt32
+    met: mi.Bool
+
+
+class ProjectorConnector:
+    """Connections to one ``projector``; prepared once."""
+
+    def __init__(self, projector: ProjectorOptics) -> None:
+        self.projector, self.emitter = projector, projector.emitter
+        if not projector.ideal:
+            self._to_world = self.emitter.world_transform()
+            self._pixel_at_unit = projector.pixel_size()
+
+    def lens_point(self, rng: mi.PCG32) -> mi.Point3f:
+        """A point of the lens in the projector's frame, drawn by ``rng``; the pinhole where there is none."""
+        if self.projector.aperture == 0:
+            return mi.Point3f(0)
+        disk = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(rng.next_float32(), rng.next_float32()))
+        return mi.Point3f(disk.x, disk.y, 0) * dr.opaque(mi.Float, self.projector.aperture)
+
+    def connect(
+        self, si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Bool, lens: mi.Point3f | None = None
+    ) -> Connection:
+        """Connect surface points to the projector; visibility is the caller's.
+
+        Parameters
+        ----------
+        si
+            the points.
+        rng
+            random numbers for lens and spot, if there are any.
+        active
+            lanes that count.
+        lens
+            points of the lens; None: random ones.
+        """
+        if self.projector.ideal:
+            ds, weight = self.emitter.sample_direction(si, mi.Point2f(0.5), active)
+            return Connection(ds.d, ds.p, weight, mi.Float(0), self.projector.pixel_at(ds.uv), active & (ds.pdf > 0))
+        local = self._to_world.inverse() @ si.p
+        lens = self.lens_point(rng) if lens is None else lens
+        offset = local - lens
+        pixel, power, valid = self._pixel_power(lens, offset, rng, active & (local.z > 0))
+        distance = dr.norm(offset)
+        cosine = offset.z / distance
+        # Irradiance on a plane z = const is pi scale texture / z^2 from every point of the lens.
+        weight = power / (dr.square(local.z) * cosine)
+        target = self._to_world @ lens
+        pdf = dr.square(distance) / (cosine * self._area) if self.projector.aperture > 0 else mi.Float(0)
+        return Connection(dr.normalize(target - si.p), target, weight, pdf, pixel, valid)
+
+    def hit(
+        self, ray: mi.Ray3f, reach: mi.Float, rng: mi.PCG32, active: mi.Bool, since: mi.Float | float = 0.0
+    ) -> LensHit:
+        """Rays of random directions that meet the lens; needs a finite aperture.
+
+        Parameters
+        ----------
+        ray
+            in world coordinates.
+        reach
+            distance [mm] to what the ray meets in the scene: the lens must lie before it.
+        rng
+            random numbers for the spot, if it is blurred.
+        active
+            lanes that count.
+        since
+            distance [mm] from the surface that the direction was drawn at to where the ray starts.
+        """
+        inverse = self._to_world.inverse()
+        origin, direction = inverse @ ray.o, inverse @ ray.d
+        distance = -origin.z / direction.z
+        lens = origin + direction * distance
+        radius = dr.opaque(mi.Float, self.projector.aperture)
+        met = active & (origin.z > 0) & (direction.z < 0) & (distance < reach)
+        met &= dr.square(lens.x) + dr.square(lens.y) <= dr.square(radius)
+        pixel, power, met = self._pixel_power(lens, -direction, rng, met)
+        cosine = -direction.z
+        radiance = power / (self._area * dr.square(dr.square(cosine)))
+        return LensHit(radiance, dr.square(distance + since) / (cosine * self._area), pixel, met)
+
+    @property
+    def _area(self) -> mi.Float:
+        return dr.pi * dr.square(dr.opaque(mi.Float, self.projector.aperture))
+
+    def _pixel_power(
+        self, lens: mi.Point3f, direction: mi.Vector3f, rng: mi.PCG32, active: mi.Bool
+    ) -> tuple[mi.UInt32, mi.Spectrum, mi.Bool]:
+        """Pixel, pi scale texture, and validity of the light that leaves a lens point in a direction (both local)."""
+        focus = dr.opaque(mi.Float, self.projector.focus)
+        image = lens + direction * (focus / direction.z)
+        if self.projector.blur > 0:
+            spot = mi.warp.square_to_std_normal(mi.Point2f(rng.next_float32(), rng.next_float32()))
+            step = dr.opaque(mi.Float, self.projector.blur) * focus
+            image += mi.Vector3f(spot.x * self._pixel_at_unit[0], spot.y * self._pixel_at_unit[1], 0) * step
+        at = dr.zeros(mi.SurfaceInteraction3f)
+        # A point plus a vector is a vector to Mitsuba, and vectors are not moved.
+        at.p = self._to_world @ mi.Point3f(image)
+        ds, weight = self.emitter.sample_direction(at, mi.Point2f(0.5), active)
+        power = weight * (dr.square(image.z) * image.z / dr.norm(image))
+        return self.projector.pixel_at(ds.uv), power, active & (ds.pdf > 0)

@@ -22,8 +22,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -32,10 +32,19 @@ import numpy as np
 from mitsim.core.spectral_manifests import MOST_LINES
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.lamps import SPECTRA_NM, Band, Response
-from mitsim.transport.connect import SensorPoints, sampled_wavelengths
-from mitsim.transport.connection import Connection, ProjectorConnector
-from mitsim.transport.coordinates import rows_columns, x_y
-from mitsim.transport.integrator import FollowingTracer, Walk, camera_part, is_delta
+from mitsim.transport.connect import Connection, ProjectorConnector, SensorPoints, sampled_wavelengths
+from mitsim.transport.integrator import (
+    KINDS,
+    FollowingTracer,
+    InFlight,
+    PathIntegrator,
+    PathRules,
+    PathState,
+    Turn,
+    camera_part,
+    is_delta,
+)
+from mitsim.transport.plugins.base import rows_columns, x_y
 from mitsim.transport.projector import ProjectorOptics
 from mitsim.transport.records import CellAxis, CellGrid, Deposits, Sightings
 from mitsim.transport.sampler import shuffled, stratified, streams
@@ -121,241 +130,269 @@ class FromCameraTracer(FollowingTracer):
         """
         return sampled_wavelengths(self.camera, rng, self.projector.lines)
 
-    def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
-        further = self.paths.mirrors or self.paths.interreflection or self.passage.open
-        return CameraWalk(self, seed, sample, lane).deposits(further)
+    @property
+    def rules(self) -> PathRules:
+        """Which paths are followed."""
+        return PathRules(self.passage, self.paths.mirrors, self.paths.interreflection, self.orders, self.by_line)
+
+    def _launch(self, flight: InFlight) -> list[Deposits]:
+        return self._paths(flight).deposits()
+
+    def _paths(self, flight: InFlight) -> CameraPaths[Any]:
+        return CameraPaths(self, CameraState, flight)
 
 
-class CameraWalk(Walk):
-    """Paths from the camera, with light of the projector, direct or indirect, and of lamps."""
+@dataclass(kw_only=True)
+class CameraState(PathState):
+    """Paths from the camera under way.
 
-    STATE: ClassVar[tuple[str, ...]] = (
-        *("active", "ray", "strength", "part", "bounce", "surfaces", "in_mirror", "mirrored", "by_delta", "travelled"),
-        *("straight", "since", "behind_glass", "rng", "inverse_depth", "came_from", "came_pdf", "kept"),
-    )
+    Attributes
+    ----------
+    inverse_depth
+        1/z [1/mm] of the point that their light is seen at.
+    part
+        of the light over the turn before the sensor that is theirs.
+    in_mirror
+        whether a mirror made that turn.
+    travelled, since
+        length of the way [mm], and of that since the last turn.
+    behind_glass
+        whether glass has bent the way since.
+    came_from, came_pdf, by_delta
+        point of the last turn, its density [1/sr], and whether it was a mirror's.
+    """
 
-    def __init__(self, tracer: FromCameraTracer, seed: int | mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> None:
+    inverse_depth: mi.Float = field(default_factory=lambda: mi.Float(0))
+    part: mi.Float = field(default_factory=lambda: mi.Float(1))
+    in_mirror: mi.Bool = field(default_factory=lambda: mi.Bool(False))
+    travelled: mi.Float = field(default_factory=lambda: mi.Float(0))
+    since: mi.Float = field(default_factory=lambda: mi.Float(0))
+    behind_glass: mi.Bool = field(default_factory=lambda: mi.Bool(False))
+    came_from: mi.Point3f = field(default_factory=lambda: dr.zeros(mi.Point3f))
+    came_pdf: mi.Float = field(default_factory=lambda: mi.Float(0))
+    by_delta: mi.Bool = field(default_factory=lambda: mi.Bool(True))
+
+
+State = TypeVar("State", bound=CameraState)
+
+
+class CameraPaths(PathIntegrator[State]):
+    """Paths from the camera, with light of the projector, direct or indirect, and of lamps.
+
+    Of each kind of light one connection a path is kept.
+    """
+
+    IMPORTANCE = False
+
+    def __init__(self, tracer: FromCameraTracer, state: type[State], flight: InFlight) -> None:
         """Paths before their first surface.
 
         Parameters
         ----------
         tracer
             the scene, and what is followed.
-        seed, sample, lane
-            of the random numbers, and of every path.
+        state
+            what is known of paths.
+        flight
+            the samples in flight.
         """
-        super().__init__(
-            tracer.passage, tracer.paths.mirrors, tracer.paths.interreflection, tracer.orders, tracer.by_line
-        )
-        cell, row, column = tracer.points.of(lane, tracer.grid.shape[0] * tracer.grid.shape[1])
+        super().__init__(tracer.rules)
+        cell, row, column = tracer.points.of(flight.index, tracer.grid.shape[0] * tracer.grid.shape[1])
         self.anchor = row, column
-        self.tracer, self.paths, self.geometry = tracer, tracer.paths, tracer.geometry
-        self.connector = tracer.connector
+        self.tracer, self.geometry, self.connector = tracer, tracer.geometry, tracer.connector
+        self.emitters, self.lens = tracer.paths.emitters, tracer.projector.aperture > 0
+        # What a path runs into has been turned once less than what it is connected to.
+        self.reach = 0 if self.emitters or self.lens else 1
+
+        # ---- Rays from the sensor through the cells
+        grid, columns = tracer.grid, dr.opaque(mi.UInt32, tracer.grid.shape[1])
+        shared, rng = streams(flight.seed, cell, flight.sample)
         # A path that leaves a cell's very edge could be filed in the next cell by rounding.
-        shared, self.rng = streams(seed, cell, sample)
-        jitter = _MARGIN + (1 - 2 * _MARGIN) * stratified(sample, shared)
-        self.strength, self.part = mi.Spectrum(1), mi.Float(1)
-        self.travelled, self.bounce, self.surfaces = mi.Float(0), mi.UInt32(0), mi.UInt32(1)
-        self.by_delta, self.mirrored, self.in_mirror = mi.Bool(True), mi.Bool(True), mi.Bool(False)
-        self.came_from, self.came_pdf = dr.zeros(mi.Point3f), mi.Float(0)
-        self.since, self.behind_glass = mi.Float(0), mi.Bool(False)
-        self._aim(cell, jitter, sample, shared)
-
-    # ---- the camera's side ------------------------------------------------------------------------------------------
-
-    def _aim(self, cell: mi.UInt32, jitter: mi.Point2f, sample: mi.UInt32, shared: mi.PCG32) -> None:
-        """Rays from the sensor through the cells, and the weight of each.
-
-        Parameters
-        ----------
-        cell, jitter
-            where each ray goes through.
-        sample, shared
-            number of each path's sample, and the numbers that all samples of its cell share.
-        """
-        tracer, grid = self.tracer, self.tracer.grid
-        columns = dr.opaque(mi.UInt32, grid.shape[1])
-        sensor = tracer.points.at(*self.anchor, self.rng)
-        self.start, nearness = rows_columns(sensor.x, sensor.y), dr.opaque(mi.Float, 1 / tracer.points.distance)
-        self.row = _place(grid.rows, cell // columns, jitter.x) - self.start[0] * nearness
-        self.column = _place(grid.columns, cell % columns, jitter.y) - self.start[1] * nearness
+        jitter = _MARGIN + (1 - 2 * _MARGIN) * stratified(flight.sample, shared)
+        sensor = tracer.points.at(*self.anchor, rng)
+        self.origin, nearness = rows_columns(sensor.x, sensor.y), dr.opaque(mi.Float, 1 / tracer.points.distance)
+        self.row = _place(grid.rows, cell // columns, jitter.x) - self.origin[0] * nearness
+        self.column = _place(grid.columns, cell % columns, jitter.y) - self.origin[1] * nearness
         squared = 1 + dr.square(self.row) + dr.square(self.column)
         self.slope = dr.rsqrt(squared)
-        wavelengths, spectral = tracer.wavelengths(self.rng, sample, shared)
+        wavelengths, spectral = tracer.wavelengths(rng, flight.sample, shared)
         to_world = tracer.camera.world_transform()
         direction = mi.Vector3f(*x_y(self.row, self.column), 1) * self.slope
-        self.ray = mi.Ray3f(to_world @ sensor, to_world @ direction, 0.0, wavelengths)
+        ray = mi.Ray3f(to_world @ sensor, to_world @ direction, 0.0, wavelengths)
         stop = dr.opaque(mi.Float, self.geometry.tan_half_fov)
-        self.active = (dr.abs(self.row) <= stop) & (dr.abs(self.column) <= stop)
-        # dt of a cell times (1 + t^2)^-2, and a pixel's response cos^n.
+        active = (dr.abs(self.row) <= stop) & (dr.abs(self.column) <= stop)
+
+        # ---- Their weight: dt of a cell times (1 + t^2)^-2, and a pixel's response cos^n
         solid = dr.opaque(mi.Float, grid.rows.size * grid.columns.size) / dr.square(squared)
         if self.geometry.angular_exponent > 0:
             solid *= dr.power(squared, -0.5 * dr.opaque(mi.Float, self.geometry.angular_exponent))
         self.weight = spectral * solid
-        self.inverse_depth = mi.Float(0)
+        sightings = {kind: Sightings.none(tracer.by_line) for kind in KINDS}
+        self.paths = state(active=active, ray=ray, rng=rng, sightings=sightings)
 
-    # ---- one vertex -------------------------------------------------------------------------------------------------
+    def deposits(self) -> list[Deposits]:
+        """Light on the host of every path."""
+        kept = self.follow(self.paths).sightings
+        dr.eval(kept)
+        return [Deposits.fetched(seen, KINDS[kind], self.anchor) for kind, seen in kept.items()]
 
-    def vertex(self, first: bool) -> None:
-        """Find the next vertex of every path, the ``first`` or a later one, connect it to the lights, and leave it."""
-        si = self.scene.ray_intersect(mi.RayDifferential3f(self.ray), mi.RayFlags.All, first, self.active)
-        if first or self.paths.mirrors or self.passage.open:
+    # ---- lights that paths run into ---------------------------------------------------------------------------------
+
+    def _run_into(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
+        """Keep light of lamps and of the projector's lens that paths have run into on their way to ``si``."""
+        if first or self.rules.mirrors or self.passage.open:
             # Where the camera sees this vertex, unless an earlier one that is no mirror has settled it.
-            self.inverse_depth = dr.select(
-                self.mirrored, dr.rcp((self.travelled + si.t) * self.slope), self.inverse_depth
-            )
+            depth = dr.rcp((paths.travelled + si.t) * self.slope)
+            paths.inverse_depth = dr.select(paths.scattered == 0, depth, paths.inverse_depth)
         if first:
-            self.active &= self.inverse_depth < 1 / dr.opaque(mi.Float, self.geometry.mask_distance)
-        elif self.tracer.of_projector and self.tracer.projector.aperture > 0:
-            self._projector_hit(si)
-        if self.paths.emitters:
-            self._emitter_hit(si)
-        self.active &= si.is_valid()
+            paths.active &= paths.inverse_depth < 1 / dr.opaque(mi.Float, self.geometry.mask_distance)
+        elif self.tracer.of_projector and self.lens:
+            self._hit_lens(paths, si)
+        if self.emitters:
+            self._hit_lamp(paths, si)
+
+    def _hit_lens(self, paths: State, si: mi.SurfaceInteraction3f) -> None:
+        """Keep light of the projector's lens.
+
+        Over mirrors alone it is the beams' (:mod:`mitsim.transport.specular`); over one other surface, unless that is
+        seen in a mirror, it is the projector's side's.
+        """
+        hit = self.connector.hit(paths.ray, si.t, paths.rng, self._is_foreign(paths), paths.since)
+        share = dr.select(paths.by_delta, 1, _share(paths.came_pdf, hit.pdf))
+        light = self._irradiance(paths, hit.radiance) * share
+        self._keep_projector(paths, hit.met, light, hit.pixel, paths.scattered)
+
+    def _is_foreign(self, paths: State) -> mi.Bool:
+        """Paths that would bring light of the projector's lens which neither beams nor the projector's side bring."""
+        return paths.active & (paths.scattered > dr.select(paths.in_mirror, mi.UInt32(0), mi.UInt32(1)))
+
+    def _hit_lamp(self, paths: State, si: mi.SurfaceInteraction3f) -> None:
+        emitter = si.emitter(self.scene, paths.active)
+        before = dr.zeros(mi.Interaction3f)
+        before.p = paths.came_from
+        lamp = paths.active & (emitter != None)  # noqa: E711 - a Dr.Jit comparison, lane by lane
+        ds = mi.DirectionSample3f(self.scene, si, before)
+        unconnected = paths.by_delta | paths.behind_glass
+        pdf = emitter.pdf_direction(before, ds, lamp & ~unconnected)
+        share = dr.select(unconnected, 1, _share(paths.came_pdf, pdf))
+        light = self._irradiance(paths, emitter.eval(si, lamp)) * share
+        self._keep(paths, "ambient", lamp & self._is_wanted(paths.scattered), light, self._lamps)
+
+    # ---- connections ------------------------------------------------------------------------------------------------
+
+    def _connect(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
+        """Keep light of the projector and of lamps that surfaces send on along their paths."""
         bsdf = si.bsdf()
         if not first and self.tracer.of_projector:
-            self._connect(si, bsdf)
-        for emitter in self.paths.emitters:
-            self._light(si, bsdf, emitter)
-        if self.paths.mirrors or self.paths.interreflection or self.passage.open:
-            self._leave(si, first)
+            self._connect_projector(paths, si, bsdf)
+        for emitter in self.emitters:
+            self._connect_lamp(paths, si, bsdf, emitter)
 
-    def _connect(self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF) -> None:
-        """Light of the projector that this vertex sends on along its path."""
+    def _connect_projector(self, paths: State, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF) -> None:
         # A vertex that is seen straight is the projector's side's.
-        connection, passed = self._connection(si, self.active & ~self.straight)
+        connection, passed = self._connection(paths, si, paths.active & ~paths.straight)
         active = connection.valid
         toward = si.to_local(connection.direction)
-        if self.tracer.projector.aperture > 0 and self.paths.interreflection:
+        if self.lens and self.rules.interreflection:
             value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, toward, active)
-            value *= self._share(connection.pdf, pdf)
+            value *= _share(connection.pdf, pdf)
         else:
             value = bsdf.eval(mi.BSDFContext(), si, toward, active)
-        self._keep_of_projector(
-            active, self._radiance(value * connection.weight * passed), connection.pixel, self.surfaces
-        )
+        light = self._irradiance(paths, value * connection.weight * passed)
+        self._keep_projector(paths, active, light, connection.pixel, paths.scattered + 1)
 
-    def _connection(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[Connection, mi.Spectrum]:
+    def _connection(self, paths: State, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[Connection, mi.Spectrum]:
         """A connection to the projector that nothing blocks, and the part of its light that arrives."""
         if not self.passage.panes:
-            connection = self.connector.connect(si, self.rng, active)
+            connection = self.connector.connect(si, paths.rng, active)
             seen, passed = self.passage.between(si, connection.target, connection.valid)
             connection.valid = connection.valid & seen
             return connection, passed
-        lens = self.connector.lens_point(self.rng)
+        lens = self.connector.lens_point(paths.rng)
         way = refracted_way(self.passage, si, self.connector.projector.emitter.world_transform() @ lens, active)
-        apparent = mi.SurfaceInteraction3f(si)
-        apparent.p = way.apparent
-        connection = self.connector.connect(apparent, self.rng, active & way.open, lens)
+        connection = self.connector.connect(_seen_at(si, way.apparent), paths.rng, active & way.open, lens)
         # As a path that runs into the lens counts it: by the way's length.
         connection.pdf *= dr.square(way.length) / dr.squared_norm(connection.target - way.apparent)
         connection.direction = way.direction
         return connection, way.part / dr.square(way.eta)
 
-    def _light(self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF, emitter: mi.Emitter) -> None:
-        """The same for another light of the scene."""
-        point = mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
-        ds, light = emitter.sample_direction(si, point, self.active)
-        active, direction = self.active & (ds.pdf > 0), ds.d
+    def _connect_lamp(self, paths: State, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF, emitter: mi.Emitter) -> None:
+        point = mi.Point2f(paths.rng.next_float32(), paths.rng.next_float32())
+        ds, light = emitter.sample_direction(si, point, paths.active)
+        active, direction = paths.active & (ds.pdf > 0), ds.d
         if self.passage.panes and mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition):
             # No path runs into such a lamp behind glass, but there is one way to it.
             way = refracted_way(self.passage, si, ds.p, active)
-            apparent = mi.SurfaceInteraction3f(si)
-            apparent.p = way.apparent
-            ds, light = emitter.sample_direction(apparent, point, active & way.open)
+            ds, light = emitter.sample_direction(_seen_at(si, way.apparent), point, active & way.open)
             seen, passed, direction = way.open, way.part / dr.square(way.eta), way.direction
         else:
             seen, passed = self.passage.between(si, ds.p, active)
         active &= seen
         value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(direction), active)
         # A path that does not go on cannot run into the lamp, so connecting is the only way to find it.
-        share = dr.select(ds.delta, 1, self._share(ds.pdf, pdf)) if self.paths.interreflection else 1
-        active &= self._wanted(self.surfaces)
-        self._keep_seen("ambient", active, self._radiance(value * light * passed) * share, self._lamps())
+        share = dr.select(ds.delta, 1, _share(ds.pdf, pdf)) if self.rules.interreflection else 1
+        active &= self._is_wanted(paths.scattered + 1)
+        self._keep(paths, "ambient", active, self._irradiance(paths, value * light * passed) * share, self._lamps)
 
-    def _emitter_hit(self, si: mi.SurfaceInteraction3f) -> None:
-        """Light of a lamp that the path has run into."""
-        emitter = si.emitter(self.scene, self.active)
-        before = dr.zeros(mi.Interaction3f)
-        before.p = self.came_from
-        lamp = self.active & (emitter != None)  # noqa: E711 - a Dr.Jit comparison, lane by lane
-        ds = mi.DirectionSample3f(self.scene, si, before)
-        unconnected = self.by_delta | self.behind_glass
-        pdf = emitter.pdf_direction(before, ds, lamp & ~unconnected)
-        share = dr.select(unconnected, 1, self._share(self.came_pdf, pdf))
-        light = self._radiance(emitter.eval(si, lamp)) * share
-        self._keep_seen("ambient", lamp & self._wanted(self.surfaces - 1), light, self._lamps())
+    # ---- turns ------------------------------------------------------------------------------------------------------
 
-    def _projector_hit(self, si: mi.SurfaceInteraction3f) -> None:
-        """Light of a projector's lens that the path has run into.
-
-        Over mirrors alone it is the beams' (:mod:`mitsim.transport.specular`); over one other surface, unless that is
-        seen in a mirror, it is the projector's side's.
-        """
-        hit = self.connector.hit(self.ray, si.t, self.rng, self._foreign, self.since)
-        share = dr.select(self.by_delta, 1, self._share(self.came_pdf, hit.pdf))
-        self._keep_of_projector(hit.met, self._radiance(hit.radiance) * share, hit.pixel, self.surfaces - 1)
-
-    @property
-    def _foreign(self) -> mi.Bool:
-        """Paths that would bring light of the projector's lens which neither beams nor the projector's side bring."""
-        return self.active & (self.surfaces > dr.select(self.in_mirror, mi.UInt32(1), mi.UInt32(2)))
-
-    def _leave(self, si: mi.SurfaceInteraction3f, first: bool) -> mi.Bool:
-        """Sample where each path goes on, and end some of them; tells which only pass."""
-        sample, value, going = self._sampled(si, mi.TransportMode.Radiance)
-        passing = self.passage.passes(si, sample)
-        delta = is_delta(sample) & ~passing
+    def _note_turn(self, paths: State, si: mi.SurfaceInteraction3f, turn: Turn, first: bool) -> mi.Bool:
+        """Note a ``turn`` at ``si``; tells which paths may bring light that is not connected."""
+        passing, pdf, going = turn.passing, turn.sample.pdf, mi.Bool(True)
         if first or self.passage.open:
-            turned = self.straight & ~passing
-            self.in_mirror = dr.select(turned, delta, self.in_mirror)
-            self.part = dr.select(turned, dr.select(delta, 1, camera_part(sample.pdf)), self.part)
-            if not self.paths.emitters:
-                going &= self.part > 0
-            self.straight &= passing
-        self.strength *= value
-        self._end_some(going, self.mirrored, passing, first)
-        self.mirrored &= delta | passing
-        self.surfaces = dr.select(delta | passing, self.surfaces, self.surfaces + 1)
-        # What a path runs into has been turned once less than what it is connected to.
-        runs_into_light = bool(self.paths.emitters) or self.tracer.projector.aperture > 0
-        self.active &= self._goes_on(self.surfaces - (1 if runs_into_light else 0))
-        self.travelled += si.t
-        self.since = dr.select(passing, self.since + si.t, 0)
-        self.behind_glass = passing & (self.behind_glass | is_delta(sample))
-        self.came_from = dr.select(passing, self.came_from, si.p)
-        self.came_pdf = dr.select(passing, self.came_pdf, sample.pdf)
-        self.by_delta = dr.select(passing, self.by_delta, delta)
-        self.ray = self.passage.leaving(si, si.to_world(sample.wo))
-        return passing
+            before_sensor = paths.straight & ~passing
+            paths.in_mirror = dr.select(before_sensor, turn.delta, paths.in_mirror)
+            paths.part = dr.select(before_sensor, dr.select(turn.delta, 1, camera_part(pdf)), paths.part)
+            if not self.emitters:
+                going = paths.part > 0
+        paths.travelled += si.t
+        paths.since = dr.select(passing, paths.since + si.t, 0)
+        paths.behind_glass = passing & (paths.behind_glass | is_delta(turn.sample))
+        paths.came_from = dr.select(passing, paths.came_from, si.p)
+        paths.came_pdf = dr.select(passing, paths.came_pdf, pdf)
+        paths.by_delta = dr.select(passing, paths.by_delta, turn.delta)
+        return going
 
     # ---- light that is kept -----------------------------------------------------------------------------------------
 
-    def _radiance(self, light: mi.Spectrum) -> mi.UnpolarizedSpectrum:
-        """The light of a connection, as irradiance where the path started."""
-        return mi.unpolarized_spectrum(light) * self.strength * self.weight
+    def _irradiance(self, paths: State, radiance: mi.Spectrum) -> mi.UnpolarizedSpectrum:
+        """What ``radiance`` of a vertex along its path casts where the path started."""
+        return mi.unpolarized_spectrum(radiance) * paths.throughput * self.weight
 
+    @property
     def _lamps(self) -> mi.UInt32:
+        """The pixel that lamps' light goes by."""
         return mi.UInt32(self.tracer.projector.n**2)
 
-    @staticmethod
-    def _share(own: mi.Float, rival: mi.Float) -> mi.Float:
-        """Balance heuristic of two ways to find the same light; a pdf of 0 means that a way cannot find it."""
-        return dr.select(own > 0, own / (own + rival), 1)
-
-    def _keep_of_projector(
-        self, active: mi.Bool, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32, surfaces: mi.UInt32
+    def _keep_projector(
+        self, paths: State, active: mi.Bool, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32, order: mi.UInt32
     ) -> None:
-        """``surfaces``: those on the light's way that are no mirrors."""
-        active &= self._wanted(surfaces)
-        self._keep_seen("direct", active & (surfaces == 1), light * self.part, pixel)
-        if self.paths.interreflection:
-            self._keep_seen("indirect", active & (surfaces > 1), light * self.part, pixel)
+        active &= self._is_wanted(order)
+        self._keep(paths, "direct", active & (order == 1), light * paths.part, pixel)
+        if self.rules.interreflection:
+            self._keep(paths, "indirect", active & (order > 1), light * paths.part, pixel)
 
-    def _keep_seen(self, kind: str, active: mi.Bool, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32) -> None:
+    def _keep(self, paths: State, kind: str, active: mi.Bool, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32) -> None:
         # Filed as the sensor's centre sees it.
-        row, column = (t + s * self.inverse_depth for t, s in zip((self.row, self.column), self.start, strict=True))
+        row, column = (t + s * paths.inverse_depth for t, s in zip((self.row, self.column), self.origin, strict=True))
         lit = dr.select(active, light, 0)
-        self._keep(kind, Sightings.of(lit, self.by_line, pixel, row, column, self.inverse_depth))
+        self._join(paths, kind, Sightings.of(lit, self.rules.by_line, pixel, row, column, paths.inverse_depth))
+
+    def _join(self, paths: State, kind: str, seen: Sightings) -> None:
+        """Keep light of one connection a path, or that of an earlier one of its kind, which then stands for both."""
+        paths.sightings[kind] = paths.sightings[kind].joined_by(seen, paths.rng.next_float32())
+
+
+def _share(own: mi.Float, rival: mi.Float) -> mi.Float:
+    """Balance heuristic of two ways to find the same light; a pdf of 0 means that a way cannot find it."""
+    return dr.select(own > 0, own / (own + rival), 1)
+
+
+def _seen_at(si: mi.SurfaceInteraction3f, point: mi.Point3f) -> mi.SurfaceInteraction3f:
+    """The vertices at ``si``, at another ``point``."""
+    apparent = mi.SurfaceInteraction3f(si)
+    apparent.p = point
+    return apparent
 
 
 def _place(axis: CellAxis, index: mi.UInt32, jitter: mi.Float) -> mi.Float:
@@ -365,6 +402,13 @@ def _place(axis: CellAxis, index: mi.UInt32, jitter: mi.Float) -> mi.Float:
 
 
 # -------- Lamps' light by their own spectra
+#
+# A path carries four wavelengths, one of each band, all at the same place in theirs. Places of a cell's paths follow a
+# scrambled Sobol sequence, so that their mean is the integral over all wavelengths, unbiased for every spectrum:
+#
+#     sum over bands of L(lambda_b) counts(lambda_b) width_b / 470 nm
+#
+# A spectrum that is 1 everywhere is 1 W m^-2 (sr^-1) over the 470 nm from 360 to 830 nm, so L / 470 nm is spectral.
 
 
 @dataclass(frozen=True, eq=False)
@@ -411,7 +455,7 @@ class LampTracer(FromCameraTracer):
         self._alone: mi.UInt32 | None = None
 
     @property
-    def apart(self) -> Sequence[LampTracer]:
+    def per_wavelength(self) -> Sequence[LampTracer]:
         """Itself, or where glass parts wavelengths, the same for each band alone."""
         if not self.projector.parted:
             return [self]
@@ -455,8 +499,8 @@ class LampTracer(FromCameraTracer):
             wavelengths = [sum(own, mi.Float(0))] * len(own)
         return type(dr.zeros(mi.Ray3f).wavelengths)(*wavelengths), mi.Spectrum(*weights)
 
-    def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
-        return [self._by_band(found) for found in super()._launch(seed, sample, lane)]
+    def _launch(self, flight: InFlight) -> list[Deposits]:
+        return [self._by_band(found) for found in super()._launch(flight)]
 
     def _by_band(self, found: Deposits) -> Deposits:
         """An entry for each band of those that were ``found``, path by path."""

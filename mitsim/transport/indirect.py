@@ -19,6 +19,7 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -29,9 +30,17 @@ from mitsim.core.arrays import FloatArray, mean_of_neighbours
 from mitsim.devices.camera import CameraGeometry
 from mitsim.transport.accumulator import Ledger
 from mitsim.transport.connect import Receiver, SensorPoints, Way, sampled_wavelengths
-from mitsim.transport.integrator import KINDS, FollowingTracer, Walk, camera_part, is_delta
+from mitsim.transport.integrator import (
+    KINDS,
+    FollowingTracer,
+    InFlight,
+    PathIntegrator,
+    PathRules,
+    PathState,
+    camera_part,
+)
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
-from mitsim.transport.records import DIRECT, Deposits, Sightings
+from mitsim.transport.records import Deposits, Sightings
 from mitsim.transport.sampler import stratified, streams
 
 _ROOMS = (4**2, 12**2)
@@ -68,33 +77,39 @@ class IndirectTracer(FollowingTracer):
         self.scene, self.projector, self.mirrors, self.interreflection = scene, projector, mirrors, interreflection
         self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
         self.points = points or SensorPoints(self.receiver.geometry.half_width)
-        self.turns: Turns | None = None
+        self.adaptive: AdaptiveSamples | None = None
 
     def repeating(self, repeats: Sequence[int]) -> IndirectTracer:
         """The same to one point of the sensor, blocks of pixels (:mod:`mitsim.transport.indirect`) as often as
         ``repeats`` (blocks^2,) say."""
-        return self._taking(by_pixel(repeats, self.projector.n))
+        return self._with_counts(by_pixel(repeats, self.projector.n))
 
-    def _taking(self, repeats: npt.NDArray[np.int64]) -> IndirectTracer:
+    def _with_counts(self, repeats: npt.NDArray[np.int64]) -> IndirectTracer:
         """The same with ``repeats`` of single pixels, or of what else it counts."""
         again = copy(self)
-        again.turns = Turns.of(repeats)
+        again.adaptive = AdaptiveSamples.of(repeats)
         return again
 
     @property
     def lanes(self) -> int:
         """Paths of one sample: one per projector pixel and anchor, or as often as they are repeated."""
-        return len(self.turns) if self.turns else self.projector.n**2 * self.points.count
+        return len(self.adaptive) if self.adaptive else self.projector.n**2 * self.points.count
 
     @property
-    def per_lane(self) -> int:
-        """Anchors that each lane follows its path to: all of them."""
+    def connections_per_path(self) -> int:
+        """Anchors that each path is connected to: all of them."""
         return self.points.count
 
     @cached_property
     def board(self) -> float:
         """Irradiance [W m^-2] that light compares to."""
         return self.receiver.of_board(self.rays)
+
+    @property
+    def rules(self) -> PathRules:
+        """Which paths are followed."""
+        passage, by_line = self.receiver.passage, self.projector.by_line
+        return PathRules(passage, self.mirrors, self.interreflection, self.orders, by_line)
 
     def trace_into(self, ledgers: Sequence[Ledger], seed: int, first: int, samples: int) -> Deposits:
         """The same as :meth:`trace`, indirect light filed in ledgers as far as it can be: the rest, on the host.
@@ -106,234 +121,236 @@ class IndirectTracer(FollowingTracer):
         seed, first, samples
             as for :meth:`trace`.
         """
-        launched = [
-            tracer._walk(seed, *launch).file(ledgers)
-            for tracer in self.apart
-            for launch in self._launches(first, samples)
-        ]
-        return Deposits.joined([deposits for parts in launched for deposits in parts])
-
-    def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
-        return self._walk(seed, sample, lane).deposits(further=True)
-
-    def _walk(self, seed: int | mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> IndirectWalk:
-        return (IndirectWalk if self.points.count == 1 else AnchorsWalk)(self, seed, sample, lane)
-
-
-class IndirectWalk(Walk):
-    """Paths from the projector's pixels."""
-
-    STATE = ("active", "ray", "strength", "bounce", "scattered", "straight", "rng", "kept")
-
-    def __init__(self, tracer: IndirectTracer, seed: int | mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> None:
-        """Paths before their first surface.
-
-        Parameters
-        ----------
-        tracer
-            what is followed.
-        seed, sample, lane
-            of the random numbers; the lane tells pixel and anchor.
-        """
-        super().__init__(
-            tracer.receiver.passage, tracer.mirrors, tracer.interreflection, tracer.orders, tracer.projector.by_line
+        flights = (
+            (tracer, flight) for tracer in self.per_wavelength for flight in self._in_flight([seed], first, samples)
         )
-        self.tracer = tracer
-        weight = self._place(sample, lane)
-        self._begin(seed)
-        wavelengths, spectral = sampled_wavelengths(tracer.receiver.camera, self.rng, tracer.projector.lines)
-        jitter = mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
-        self.ray = tracer.rays.sample(self.pixel, jitter, self.rng, wavelengths)
-        self.flux = tracer.rays.flux(self.pixel, wavelengths) * spectral * weight
-        self.strength, self.active = mi.Spectrum(1), mi.Bool(True)
-        self.bounce, self.scattered = mi.UInt32(0), mi.UInt32(0)
-        self.sensor = tracer.points.at(*self.anchor, self.rng)
+        return Deposits.joined(
+            [part for tracer, flight in flights for part in tracer._paths(tracer._emission(flight)).accumulate(ledgers)]
+        )
 
-    def _place(self, sample: mi.UInt32, lane: mi.UInt32) -> mi.Float | float:
-        """Pixel, anchor and sample of each path; its weight."""
-        weight: mi.Float | float = 1.0
-        if self.tracer.turns:
-            lane, sample, weight = self.tracer.turns.at(lane, sample)
-        self.pixel, row, column = self.tracer.points.of(lane, self.tracer.projector.n**2)
-        self.anchor, self.sample = (row, column), sample
-        return weight
+    def _launch(self, flight: InFlight) -> list[Deposits]:
+        return self._paths(self._emission(flight)).deposits()
 
-    def _begin(self, seed: int | mi.UInt32) -> None:
-        """Random numbers of each path, and the points that its first turn is drawn by."""
+    def _emission(self, flight: InFlight) -> Emission:
+        """Where each path leaves the projector."""
+        index, sample, weight = flight.index, flight.sample, 1.0
+        if self.adaptive:
+            index, sample, weight = self.adaptive.at(index, sample)
+        pixel, row, column = self.points.of(index, self.projector.n**2)
         # Stratified where it tells most: a pixel is small, but its light goes every way from the first surface.
-        shared, self.rng = streams(seed, self.pixel, self.sample)
-        self.first_turn = stratified(self.sample, shared)
+        shared, rng = streams(flight.seed, pixel, sample)
+        return Emission(pixel, (row, column), rng, stratified(sample, shared), weight)
 
-    def file(self, ledgers: Sequence[Ledger]) -> list[Deposits]:
-        """Follow all paths; indirect light goes into ``ledgers``, caustics to the host."""
-        self.follow(further=True)
-        seen = self.kept["indirect"]
-        place = ledgers[0].place(seen, self.rng.next_float32(), self.anchor)
-        for ledger, light in zip(ledgers, seen.by_line(len(ledgers)), strict=True):
-            ledger.add(light, seen.pixel, place, ~(light == 0))  # not a number is light to be refused
-        caustics = self.kept["direct"] if self.tracer.mirrors else None
-        # Together: apart, each would follow all paths again.
-        dr.eval(caustics, [ledger.sums for ledger in ledgers])
-        return [Deposits.fetched(caustics, DIRECT, self.anchor)] if caustics else []
+    def _paths(self, emission: Emission) -> ProjectorPaths:
+        return ProjectorPaths(self, emission)
 
-    def vertex(self, first: bool) -> None:
-        """Find, connect and leave the next surface, as :meth:`mitsim.transport.integrator.Walk.vertex` does; ``first``
-        is not connected."""
-        # To the first surface rays of neighbouring pixels go side by side, which take half the time of others.
-        si = self.scene.ray_intersect(self.ray, mi.RayFlags.All, first, self.active)
-        self.active &= si.is_valid()
-        if not first:
-            self._connect(si)
-        self._leave(si, first)
 
-    def _connect(self, si: mi.SurfaceInteraction3f) -> None:
-        """Light that this surface sends to the sensor."""
-        self._take(si, self._way(si))
+@dataclass
+class Emission:
+    """Where paths leave the projector.
 
-    def _way(self, si: mi.SurfaceInteraction3f) -> Way:
+    Attributes
+    ----------
+    pixel
+        of the projector.
+    anchor
+        row and column of that which each path is followed to.
+    rng
+        random numbers of each path.
+    first_turn
+        point of the unit square that its first turn is drawn by.
+    weight
+        of its light.
+    """
+
+    pixel: mi.UInt32
+    anchor: tuple[mi.UInt32, mi.UInt32]
+    rng: mi.PCG32
+    first_turn: mi.Point2f
+    weight: mi.Float | float
+
+
+class ProjectorPaths(PathIntegrator[PathState]):
+    """Paths from the projector's pixels; of each kind of light one connection a path and anchor is kept."""
+
+    IMPORTANCE = True
+
+    def __init__(self, tracer: IndirectTracer, emission: Emission) -> None:
+        """Of what a ``tracer`` follows, from an ``emission``."""
+        super().__init__(tracer.rules)
+        self.receiver, self.pixel, self.anchor = tracer.receiver, emission.pixel, emission.anchor
+        self.first_turn, rng = emission.first_turn, emission.rng
+        wavelengths, spectral = sampled_wavelengths(tracer.receiver.camera, rng, tracer.projector.lines)
+        jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
+        ray = tracer.rays.sample(self.pixel, jitter, rng, wavelengths)
+        self.flux = tracer.rays.flux(self.pixel, wavelengths) * spectral * emission.weight
+        connections = _OneConnection if tracer.points.count == 1 else _AnchorConnections
+        self.connections = connections(tracer.points, emission)
+        sightings = self.connections.none(("direct", "indirect") if tracer.mirrors else ("indirect",), tracer.rules)
+        self.paths = PathState(active=mi.Bool(True), ray=ray, rng=rng, sightings=sightings)
+
+    def _connect(self, paths: PathState, si: mi.SurfaceInteraction3f, first: bool) -> None:
+        """Keep light that surfaces send to the sensor; that of the ``first`` is the direct tracer's."""
+        if first:
+            return
+        drawn = self._draw_numbers(paths)
+
+        def connect(held: Held, number: mi.UInt32) -> None:
+            way = self._way(paths, si, self.connections.sensor(number))
+            self._keep_light(paths, si, way, drawn, (held, number))
+
+        paths.sightings = self.connections.at_each(paths.sightings, paths.active, connect)
+
+    @staticmethod
+    def _draw_numbers(paths: PathState) -> dict[str, mi.Float]:
+        """Those that choose which connection of each kind of light is kept: the same for every anchor."""
+        return {kind: paths.rng.next_float32() for kind in ("direct", "indirect")}
+
+    def _way(self, paths: PathState, si: mi.SurfaceInteraction3f, sensor: mi.Point3f) -> Way:
         """To the sensor, for light that is kept."""
         # Light that has met nothing but what it passes is the direct tracer's.
-        active = self.active & ~self.straight & self._wanted(self.scattered + 1)
-        return self.tracer.receiver.way(si, self.sensor, active)
+        active = paths.active & ~paths.straight & self._is_wanted(paths.scattered + 1)
+        return self.receiver.way(si, sensor, active)
 
-    def _take(self, si: mi.SurfaceInteraction3f, way: Way) -> None:
-        """Keep the light that a surface sends by a ``way``."""
-        reception = self.tracer.receiver.received(si, -self.ray.d, way)
-        light = reception.irradiance * self.flux * self.strength
-        caustic = self.scattered == 0
+    def _keep_light(
+        self,
+        paths: PathState,
+        si: mi.SurfaceInteraction3f,
+        way: Way,
+        drawn: dict[str, mi.Float],
+        at: tuple[Held, mi.UInt32],
+    ) -> None:
+        """Keep light that surfaces send by a ``way``, or that of an earlier connection, as the numbers ``drawn`` say;
+        either stands for both. ``at``: what is held of an anchor, and its number."""
+        reception = self.receiver.received(si, -paths.ray.d, way)
+        light = reception.irradiance * self.flux * paths.throughput
+        caustic = paths.scattered == 0
         light *= dr.select(caustic, 1, 1 - camera_part(reception.pdf))
+        held, number = at
         for kind, chosen in (("direct", caustic), ("indirect", ~caustic)):
-            self._keep(kind, reception.sightings(dr.select(chosen, light, 0), self.pixel, self.by_line))
+            if kind in held:
+                seen = reception.sightings(dr.select(chosen, light, 0), self.pixel, self.rules.by_line)
+                joined = self.connections.load(held, kind, number).joined_by(seen, drawn[kind])
+                self.connections.save(held, kind, number, joined)
 
-    def _leave(self, si: mi.SurfaceInteraction3f, first: bool) -> None:
-        """Sample where each path goes on, and end some of them."""
-        toward = -self.ray.d
-        si.wi = si.to_local(toward)
-        sample, value, going = self._sampled(si, mi.TransportMode.Importance, self.first_turn if first else None)
-        passing = self.passage.passes(si, sample)
-        delta = is_delta(sample) & ~passing
-        onward = si.to_world(sample.wo)
-        # Light that is followed forward sees shading normals the other way round (Veach 1997, 5.3).
-        turned = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, onward)
-        turned /= mi.Frame3f.cos_theta(sample.wo) * dr.dot(si.n, toward)
-        self.strength *= value * dr.select(dr.isfinite(turned), dr.abs(turned), 0)
-        self._end_some(going, (self.scattered == 0) & delta, passing, first)
-        self.scattered += dr.select(delta | passing, mi.UInt32(0), mi.UInt32(1))
-        self.active &= self._goes_on(self.scattered + 1)
-        self.straight &= passing
-        self.ray = self.passage.leaving(si, onward)
+    def deposits(self) -> list[Deposits]:
+        """Light on the host of every path at every anchor."""
+        held = self.follow(self.paths).sightings
+        return self.connections.fetched(held, tuple(held))
+
+    def accumulate(self, ledgers: Sequence[Ledger]) -> list[Deposits]:
+        """Follow all paths; indirect light goes into ``ledgers``, caustics to the host."""
+        paths = self.follow(self.paths)
+        drawn = paths.rng.next_float32()
+
+        def add(held: Held, number: mi.UInt32) -> None:
+            seen = self.connections.load(held, "indirect", number)
+            place = ledgers[0].place(seen, drawn, self.connections.anchor(number))
+            for ledger, light in zip(ledgers, seen.by_line(len(ledgers)), strict=True):
+                ledger.add(light, seen.pixel, place, ~(light == 0))  # not a number is light to be refused
+
+        held = self.connections.at_each(paths.sightings, mi.Bool(True), add)
+        caustics = tuple(kind for kind in held if kind == "direct")
+        return self.connections.fetched(held, caustics, [ledger.sums for ledger in ledgers])
 
 
-class AnchorsWalk(IndirectWalk):
-    """Paths to several anchors: each is followed once, and connected to one anchor after the other.
+# -------- Connections of a path: to one point of the sensor, or to every anchor
+
+Held = dict[str, Any]
+"""What is kept of each kind of light."""
+
+
+class _OneConnection:
+    """Each path is connected to one point: its anchor, the sensor's centre, or a random one."""
+
+    def __init__(self, points: SensorPoints, emission: Emission) -> None:
+        self._anchor, self._sensor = emission.anchor, points.at(*emission.anchor, emission.rng)
+
+    def none(self, kinds: Sequence[str], rules: PathRules) -> Held:
+        """No light yet."""
+        return {kind: Sightings.none(rules.by_line) for kind in kinds}
+
+    def anchor(self, number: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
+        """Row and column of an anchor by its number."""
+        return self._anchor
+
+    def sensor(self, number: mi.UInt32) -> mi.Point3f:
+        """Its point, in the camera's frame."""
+        return self._sensor
+
+    def load(self, held: Held, kind: str, number: mi.UInt32) -> Sightings:
+        """Light of a ``kind`` that is held of it."""
+        found: Sightings = held[kind]
+        return found
+
+    def save(self, held: Held, kind: str, number: mi.UInt32, seen: Sightings) -> None:
+        """Hold light that was ``seen`` there."""
+        held[kind] = seen
+
+    def at_each(self, held: Held, active: mi.Bool, visit: Callable[[Held, mi.UInt32], None]) -> Held:
+        """What is held when every anchor was visited, by its number, one after the other, where ``active``."""
+        visit(held, mi.UInt32(0))
+        return held
+
+    def fetched(self, held: Held, kinds: Sequence[str], also: object = ()) -> list[Deposits]:
+        """Light of some ``kinds`` on the host; what it takes is worked out with that of ``also``: apart, each would
+        follow all paths again."""
+        dr.eval([held[kind] for kind in kinds], also)
+        return [Deposits.fetched(held[kind], KINDS[kind], self._anchor) for kind in kinds]
+
+
+class _AnchorConnections(_OneConnection):
+    """Each path is followed once, and connected to one anchor after the other.
 
     Each anchor's light is what it would be alone: the same random numbers choose which connection is handed out.
     """
 
-    STATE = (*IndirectWalk.STATE[:-1], "held")
+    def __init__(self, points: SensorPoints, emission: Emission) -> None:
+        self._points, self._pixel, self._rng = points, emission.pixel, emission.rng
+        self._side, self._count = (dr.opaque(mi.UInt32, each) for each in (points.anchors, points.count))
 
-    def __init__(self, tracer: IndirectTracer, seed: int | mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> None:
-        """Paths before their first surface.
+    def none(self, kinds: Sequence[str], rules: PathRules) -> Held:
+        self._numbers = len(_differing(Sightings.none(rules.by_line)))
+        anchors = next((room for room in _ROOMS if room >= self._points.count), self._points.count)
+        return {kind: dr.alloc_local(mi.Float, self._numbers * anchors, mi.Float(0)) for kind in kinds}
 
-        Parameters
-        ----------
-        tracer, seed, sample, lane
-            as for :class:`IndirectWalk`; the lane tells the pixel.
-        """
-        super().__init__(tracer, seed, sample, lane)
-        self._side, self._count = (dr.opaque(mi.UInt32, each) for each in (tracer.points.anchors, tracer.points.count))
-        kinds = ("direct", "indirect") if tracer.mirrors else ("indirect",)
-        self._numbers = len(_differing(Sightings.none(self.by_line)))
-        size = self._numbers * next((room for room in _ROOMS if room >= tracer.points.count), tracer.points.count)
-        self.held = {kind: dr.alloc_local(mi.Float, size, mi.Float(0)) for kind in kinds}
-
-    def file(self, ledgers: Sequence[Ledger]) -> list[Deposits]:
-        """Follow all paths; indirect light goes into ``ledgers``, caustics to the host."""
-        self.follow(further=True)
-        drawn = self.rng.next_float32()
-
-        def filed(number: mi.UInt32) -> None:
-            seen = self._held("indirect", number)
-            place = ledgers[0].place(seen, drawn, self._anchor(number))
-            for ledger, light in zip(ledgers, seen.by_line(len(ledgers)), strict=True):
-                ledger.add(light, seen.pixel, place, ~(light == 0))  # not a number is light to be refused
-
-        self._at_each(filed, mi.Bool(True))
-        return self._fetched(("direct",) if self.tracer.mirrors else (), [ledger.sums for ledger in ledgers])
-
-    def deposits(self, further: bool) -> list[Deposits]:
-        """Light on the host of every path at every anchor, those of a path one after the other.
-
-        Parameters
-        ----------
-        further
-            as for :meth:`mitsim.transport.integrator.Walk.deposits`.
-        """
-        self.follow(further)
-        return self._fetched(tuple(self.held))
-
-    def _connect(self, si: mi.SurfaceInteraction3f) -> None:
-        """Light that this surface sends to every anchor."""
-        rng, drawn = self.rng, {kind: self.rng.next_float32() for kind in ("direct", "indirect")}
-
-        def connected(number: mi.UInt32) -> None:
-            self._at, self._drawn = number, drawn
-            self.sensor = self.tracer.points.at(*self._anchor(number), rng)
-            self._take(si, self._way(si))
-
-        self._at_each(connected, self.active)
-
-    def _keep(self, kind: str, seen: Sightings) -> None:
-        if kind in self.held:
-            joined = self._held(kind, self._at).joined_by(seen, self._drawn[kind])
-            for place, value in enumerate(_differing(joined)):
-                self.held[kind][self._at * self._numbers + place] = value
-
-    def _held(self, kind: str, number: mi.UInt32) -> Sightings:
-        """Light of a ``kind`` at an anchor of each path."""
-        value, row, column, inverse_depth, *lines = (
-            self.held[kind][number * self._numbers + place] for place in range(self._numbers)
-        )
-        by_line = mi.UnpolarizedSpectrum(*lines) if lines else None
-        return Sightings(value, self.pixel, row, column, inverse_depth, by_line)
-
-    def _anchor(self, number: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
-        """Row and column of an anchor by its number."""
+    def anchor(self, number: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
         return number // self._side, number % self._side
 
-    def _at_each(self, visit: Callable[[mi.UInt32], None], active: mi.Bool) -> None:
-        """Visit every anchor, by its number, one after the other, where ``active``."""
+    def sensor(self, number: mi.UInt32) -> mi.Point3f:
+        return self._points.at(*self.anchor(number), self._rng)
 
-        def one(number: mi.UInt32, held: dict[str, dr.Local[mi.Float]]) -> tuple[mi.UInt32, object]:
-            self.held = held
-            visit(number)
-            return number + 1, self.held
+    def load(self, held: Held, kind: str, number: mi.UInt32) -> Sightings:
+        return _sightings(self._pixel, [held[kind][number * self._numbers + place] for place in range(self._numbers)])
 
-        state = mi.UInt32(0), self.held
-        _, self.held = dr.while_loop(state, lambda number, _: active & (number < self._count), one)
+    def save(self, held: Held, kind: str, number: mi.UInt32, seen: Sightings) -> None:
+        for place, value in enumerate(_differing(seen)):
+            held[kind][number * self._numbers + place] = value
 
-    def _fetched(self, kinds: Sequence[str], also: object = ()) -> list[Deposits]:
-        """Light of some ``kinds`` on the host; what it takes is worked out with that of ``also``: apart, each would
-        follow all paths again."""
-        size = dr.width(self.pixel) * self.tracer.points.count
+    def at_each(self, held: Held, active: mi.Bool, visit: Callable[[Held, mi.UInt32], None]) -> Held:
+        def step(number: mi.UInt32, held: Held) -> tuple[mi.UInt32, Held]:
+            visit(held, number)
+            return number + 1, held
+
+        found: Held = dr.while_loop((mi.UInt32(0), held), lambda number, _: active & (number < self._count), step)[1]
+        return found
+
+    def fetched(self, held: Held, kinds: Sequence[str], also: object = ()) -> list[Deposits]:
+        paths = dr.width(self._pixel)
+        size, first = paths * self._points.count, dr.arange(mi.UInt32, paths) * self._count
         found = {kind: [dr.zeros(mi.Float, size) for _ in range(self._numbers)] for kind in kinds}
-        lane = dr.arange(mi.UInt32, dr.width(self.pixel)) * self._count
 
-        def unpacked(number: mi.UInt32) -> None:
+        def unpack(held: Held, number: mi.UInt32) -> None:
             for kind, values in found.items():
-                for into, value in zip(values, _differing(self._held(kind, number)), strict=True):
-                    dr.scatter(into, value, lane + number)
+                for into, value in zip(values, _differing(self.load(held, kind, number)), strict=True):
+                    dr.scatter(into, value, first + number)
 
         if kinds:
-            self._at_each(unpacked, mi.Bool(True))
-        dr.eval(found, self.pixel, also)
-        index, deposits = dr.arange(mi.UInt32, size), []
-        pixel, anchor = dr.gather(mi.UInt32, self.pixel, index // self._count), self._anchor(index % self._count)
-        for kind, (value, row, column, inverse_depth, *lines) in found.items():
-            by_line = mi.UnpolarizedSpectrum(*lines) if lines else None
-            seen = Sightings(value, pixel, row, column, inverse_depth, by_line)
-            deposits.append(Deposits.fetched(seen, KINDS[kind], anchor))
-        return deposits
+            self.at_each(held, mi.Bool(True), unpack)
+        dr.eval(found, self._pixel, also)
+        index = dr.arange(mi.UInt32, size)
+        pixel, anchor = dr.gather(mi.UInt32, self._pixel, index // self._count), self.anchor(index % self._count)
+        return [Deposits.fetched(_sightings(pixel, values), KINDS[kind], anchor) for kind, values in found.items()]
 
 
 def _differing(seen: Sightings) -> list[mi.Float]:
@@ -342,7 +359,17 @@ def _differing(seen: Sightings) -> list[mi.Float]:
     return [seen.value, seen.row, seen.column, seen.inverse_depth, *lines]
 
 
-# -------- Blocks of projector pixels whose indirect light is followed more often than that of others
+def _sightings(pixel: mi.UInt32, differing: Sequence[mi.Float]) -> Sightings:
+    """Those of a ``pixel`` that differ so."""
+    value, row, column, inverse_depth, *lines = differing
+    return Sightings(value, pixel, row, column, inverse_depth, mi.UnpolarizedSpectrum(*lines) if lines else None)
+
+
+# -------- Adaptive sampling: blocks of projector pixels whose light is followed more often than that of others
+#
+# From how noisy each block's light is to how many paths each takes in a sample, and from a lane to its block. With m_b
+# the second moment of a path's light, paths in proportion to sqrt(m_b) leave the least variance for their number; a
+# sample holds the mean of a block's paths, so that the light stays what it is whatever the numbers.
 
 SIDE = 4
 """Pixels a side of a block, below the 7 of usual shifting dots, whose classes then differ."""
@@ -395,7 +422,7 @@ def effect_of(repeats: npt.NDArray[np.int64], moments: FloatArray) -> tuple[floa
 
 
 @dataclass(frozen=True, eq=False)
-class Turns:
+class AdaptiveSamples:
     """Which block, or pixel, each of a sample's units of paths belongs to.
 
     Attributes
@@ -409,7 +436,7 @@ class Turns:
     count: mi.UInt32
 
     @classmethod
-    def of(cls, repeats: npt.NDArray[np.int64]) -> Turns:
+    def of(cls, repeats: npt.NDArray[np.int64]) -> AdaptiveSamples:
         """Those of units that have so many ``repeats`` (units,)."""
         unit = np.repeat(np.arange(len(repeats)), repeats)
         starts = np.cumsum(repeats) - repeats

@@ -1,17 +1,25 @@
-"""What paths from the projector and paths from the camera share: launches, who finds which light, how they end."""
+"""The path loop: from a scene, and where paths start and connect, to the light that they bring to the camera.
+
+Paths from the projector (:mod:`~mitsim.transport.indirect`; with common vertices, :mod:`~mitsim.transport.path_reuse`)
+and from the camera (:mod:`~mitsim.transport.from_camera`) go through one loop, :class:`PathIntegrator`. Direct light
+(:mod:`~mitsim.transport.direct`) does not: at its points no direction is drawn, it is split where a surface lets it
+pass, and its random numbers are others. Nor do specular chains, which are traced on the host in double precision
+(:mod:`~mitsim.transport.specular_rays`).
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from copy import copy
+from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 
-from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT, Deposits, Sightings
+from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT, Deposits
 from mitsim.transport.transmission import Passage
 
 if TYPE_CHECKING:
@@ -20,7 +28,7 @@ if TYPE_CHECKING:
     from mitsim.transport.projector import ProjectorOptics
 
 KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT, "ambient": AMBIENT})
-"""Kinds of light by their names in a walk."""
+"""Kinds of light by their names in the loop."""
 LANES_PER_LAUNCH = 2**22
 """Paths of one kernel: at some 100 bytes of state each, 0.4 GB; and a launch's fixed cost is small beside its work."""
 _TOGETHER, _ALL = 4, 2**30
@@ -42,7 +50,7 @@ finite only while rho^2 < chance. A chance of 0.95 at most lost 10 % of the ligh
 ANY = 2**31
 """More surfaces than any path meets; one more fits 32 bits."""
 _LEAST_CHANCE = 1e-6
-"""Strength is divided by no less than this: paths of chance 0 have ended, and 1/0 must not be worked out for them."""
+"""Throughput is divided by no less than this: paths of chance 0 have ended, and 1/0 must not be worked out for them."""
 
 
 def launches(
@@ -67,32 +75,31 @@ def launches(
         yield mi.UInt32(index // per_sample), mi.UInt32(index % per_sample)
 
 
-def _seeds(few: Sequence[int], samples: int, sample: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
-    """Seed of each path, and the number of its sample, where ``samples`` of each of a ``few`` seeds follow each other.
+@dataclass(frozen=True, eq=False)
+class InFlight:
+    """Samples in flight, those of one kernel: of each its ``seed``, the number of its ``sample`` of that, and the
+    ``index`` of its path in the sample, which tells pixel or cell, and anchor."""
 
-    No division, and one kernel for one seed and for several.
-    """
-    count, look = dr.opaque(mi.UInt32, samples), mi.UInt32(0)
-    for before in range(1, _TOGETHER):
-        look += dr.select(sample >= before * count, mi.UInt32(1), 0)
-    seeds = mi.UInt32([*few, *[0] * (_TOGETHER - len(few))])
-    return dr.gather(mi.UInt32, seeds, look), sample - look * count
+    seed: mi.UInt32
+    sample: mi.UInt32
+    index: mi.UInt32
 
+    @classmethod
+    def of(cls, seeds: Sequence[int], samples: int, sample: mi.UInt32, index: mi.UInt32) -> InFlight:
+        """Those of a few seeds one after the other: no division, and one kernel for one seed and for several.
 
-def camera_part(pdf: mi.Float) -> mi.Float:
-    """Part of the light over the last turn before the sensor that is followed from the camera; the rest is connected.
-
-    ``pdf`` [1/sr] is that of sampling the turn from the camera's side, which both sides know, so the parts add up to
-    one. A connection to a lobe sharper than ``_SHARP`` keeps ``_SHARP / pdf`` of its light: it is bounded however sharp
-    the lobe. What is matt is never followed from the camera.
-    """
-    return dr.select(pdf > _SHARP, 1 - _SHARP * dr.rcp(pdf), 0)
-
-
-def is_delta(sample: mi.BSDFSample3f) -> mi.Bool:
-    """Whether the direction of ``sample`` is a mirror's, reflected or refracted."""
-    mirror = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
-    return (sample.sampled_type & mirror) != 0
+        Parameters
+        ----------
+        seeds, samples
+            a few, and the samples of each.
+        sample, index
+            number of each among the samples of all seeds, and of its path.
+        """
+        count, number = dr.opaque(mi.UInt32, samples), mi.UInt32(0)
+        for before in range(1, _TOGETHER):
+            number += dr.select(sample >= before * count, mi.UInt32(1), 0)
+        padded = mi.UInt32([*seeds, *[0] * (_TOGETHER - len(seeds))])
+        return cls(dr.gather(mi.UInt32, padded, number), sample - number * count, index)
 
 
 class Tracer(ABC):
@@ -113,18 +120,22 @@ class Tracer(ABC):
         """Paths, or connections, of one sample."""
 
     @property
-    def per_lane(self) -> int:
-        """Paths, or connections, that each lane of a kernel stands for."""
+    def connections_per_path(self) -> int:
+        """Of those, how many each path of a kernel stands for."""
         return 1
 
-    def _launches(self, first: int, samples: int) -> Iterator[tuple[mi.UInt32, mi.UInt32]]:
-        """As :func:`launches`, ``lanes_per_launch`` paths of all lanes together."""
-        return launches(self.lanes // self.per_lane, first, samples, max(1, self.lanes_per_launch // self.per_lane))
+    def _in_flight(self, seeds: Sequence[int], first: int, samples: int) -> Iterator[InFlight]:
+        """Samples ``first`` .. ``first + samples - 1`` of a seed, or of several from the first on, one kernel's at a
+        time."""
+        each, count = samples if len(seeds) > 1 else _ALL, self.connections_per_path
+        at_once = max(1, self.lanes_per_launch // count)
+        for sample, index in launches(self.lanes // count, first, samples * len(seeds), at_once):
+            yield InFlight.of(seeds, each, sample, index)
 
     @property
-    def apart(self) -> Sequence[Self]:
+    def per_wavelength(self) -> Sequence[Self]:
         """Itself, or where glass parts light of several wavelengths, the same for each of them alone."""
-        projectors = self.projector.apart
+        projectors = self.projector.per_wavelength
         return [self] if len(projectors) == 1 else [self._lit_by(projector) for projector in projectors]
 
     def _lit_by(self, projector: ProjectorOptics) -> Self:
@@ -133,8 +144,8 @@ class Tracer(ABC):
         return again
 
     @abstractmethod
-    def _launch(self, seed: mi.UInt32, sample: mi.UInt32, lane: mi.UInt32) -> list[Deposits]:
-        """Light of the paths of one kernel, a ``seed`` for each."""
+    def _launch(self, flight: InFlight) -> list[Deposits]:
+        """Light of the paths of one kernel."""
 
     def trace(self, seed: int, first: int = 0, samples: int = 1) -> Deposits:
         """Light of some samples, their sum.
@@ -151,26 +162,23 @@ class Tracer(ABC):
         MitsimError
             when the scene sends NaN or infinite light to the camera.
         """
-        launched = [
-            tracer._launch(_seeds([seed], _ALL, sample)[0], sample, lane)
-            for tracer in self.apart
-            for sample, lane in self._launches(first, samples)
-        ]
-        return Deposits.joined([deposits for parts in launched for deposits in parts])
+        flights = (
+            (tracer, flight) for tracer in self.per_wavelength for flight in self._in_flight([seed], first, samples)
+        )
+        return Deposits.joined([part for tracer, flight in flights for part in tracer._launch(flight)])
 
     def trace_looks(self, seeds: Sequence[int], samples: int = 1) -> list[Deposits]:
         """``samples`` as :meth:`trace` finds them for each of some ``seeds``, in as few kernels as may be."""
-        each, found, tracers = self.lanes * samples, list[Deposits](), self.apart
+        each, found = self.lanes * samples, list[Deposits]()
         together = min(self.lanes_per_launch // each, _TOGETHER)
         if together < 2:
             return [self.trace(seed, 0, samples) for seed in seeds]
         for start in range(0, len(seeds), together):
             few = seeds[start : start + together]
-            ((sample, lane),) = self._launches(0, samples * len(few))
-            launched = [tracer._launch(*_seeds(few, samples, sample), lane) for tracer in tracers]
-            parts = [deposits for of_one in launched for deposits in of_one]
-            for look in range(len(few)):
-                found.append(Deposits.joined([part.of_lanes(look * each, (look + 1) * each) for part in parts]))
+            (flight,) = self._in_flight(few, 0, samples)
+            parts = [part for tracer in self.per_wavelength for part in tracer._launch(flight)]
+            for start_of_one in range(0, each * len(few), each):
+                found.append(Deposits.joined([part.of_lanes(start_of_one, start_of_one + each) for part in parts]))
         return found
 
 
@@ -191,123 +199,231 @@ class FollowingTracer(Tracer):
         return again
 
 
-class Walk(ABC):
-    """The paths of one launch, a lane each: the first surface apart, and all others in a loop of one kernel.
+# -------- The path loop
 
-    Of each kind of light one connection a path is kept. ``STATE`` names the attributes that change on the way; the
-    first tells which paths still go on. ``straight`` are those that have only passed surfaces so far
-    (:mod:`mitsim.transport.transmission`): their light is direct light's own. ``anchor`` is the row and the column of
-    that which each path is followed to."""
 
-    STATE: ClassVar[tuple[str, ...]]
+@dataclass(kw_only=True)
+class PathState:
+    """A buffer of paths under way, one entry a path.
+
+    Attributes
+    ----------
+    active
+        which paths still go on.
+    ray
+        toward their next vertex.
+    rng
+        random numbers of each.
+    sightings
+        light that is kept of each, by its kind in :data:`KINDS`.
+    throughput
+        part of their light, or of their weight, that is left.
+    depth
+        vertices that turned them, mirrors with them.
+    scattered
+        those of them that are no mirrors.
+    straight
+        which have only passed surfaces so far (:mod:`mitsim.transport.transmission`): theirs is direct light's own.
+    """
 
     active: mi.Bool
-    strength: mi.Spectrum
-    bounce: mi.UInt32
-    straight: mi.Bool
+    ray: mi.Ray3f
     rng: mi.PCG32
-    anchor: tuple[mi.UInt32, mi.UInt32]
+    sightings: Any
+    throughput: mi.Spectrum = field(default_factory=lambda: mi.Spectrum(1))
+    depth: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
+    scattered: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
+    straight: mi.Bool = field(default_factory=lambda: mi.Bool(True))
 
-    def __init__(
-        self,
-        passage: Passage,
-        mirrors: bool,
-        interreflection: bool,
-        orders: tuple[int, int] | None = None,
-        by_line: bool = False,
-    ) -> None:
-        """Paths before their first surface.
+
+State = TypeVar("State", bound=PathState)
+
+
+@dataclass
+class Turn:
+    """Where paths go on from a vertex: the sample of its BSDF, whether it only passes the surface, and whether a mirror
+    turns it."""
+
+    sample: mi.BSDFSample3f
+    passing: mi.Bool
+    delta: mi.Bool
+
+
+@dataclass(frozen=True, eq=False)
+class PathRules:
+    """Which paths are followed.
+
+    Attributes
+    ----------
+    passage
+        the scene, and what light passes in it.
+    mirrors, interreflection
+        paths over delta reflections and transmissions, and over other surfaces.
+    orders
+        of :class:`FollowingTracer`; None: all.
+    by_line
+        whether light is told apart by line.
+    """
+
+    passage: Passage
+    mirrors: bool
+    interreflection: bool
+    orders: tuple[int, int] | None = None
+    by_line: bool = False
+
+
+class PathIntegrator(ABC, Generic[State]):
+    """The paths of one launch, followed from vertex to vertex: the first apart, all others in a loop of one kernel.
+
+    A subclass says where paths start, what light they bring from a vertex, and whose light they carry: the projector's
+    (``IMPORTANCE``), or that which the camera sees.
+    """
+
+    IMPORTANCE: ClassVar[bool]
+
+    first_turn: mi.Point2f | None = None
+    """Point that the first turn is drawn by, in place of a random one."""
+    reach: int = 1
+    """How many more surfaces that are no mirrors turn the light of a path that goes on, at least."""
+
+    def __init__(self, rules: PathRules) -> None:
+        """Of what ``rules`` say."""
+        self.rules, self.passage, self.scene = rules, rules.passage, rules.passage.scene
+        self.followed = rules.mirrors or rules.interreflection or rules.passage.open
+        self._orders = [dr.opaque(mi.UInt32, order) for order in rules.orders or ()]
+
+    def follow(self, paths: State) -> State:
+        """``paths`` at their end, all light of them kept."""
+        self.vertex(paths, first=True)
+        return self.follow_on(paths) if self.followed else paths
+
+    def follow_on(self, paths: State) -> State:
+        """The same of ``paths`` from a later vertex than the first."""
+
+        def further(paths: State) -> tuple[State]:
+            self.vertex(paths, first=False)
+            return (paths,)
+
+        return dr.while_loop((paths,), lambda paths: paths.active, further)[0]  # type: ignore[no-any-return]
+
+    def vertex(self, paths: State, first: bool) -> None:
+        """Take all ``paths`` over their next vertex: their ``first``, or a later one."""
+        # ---- Surface interaction: to the first one rays of neighbours go side by side, in half the time of others
+        si = self.scene.ray_intersect(paths.ray, mi.RayFlags.All, first, paths.active)
+
+        # ---- Lights that paths have run into
+        self._run_into(paths, si, first)
+        paths.active &= si.is_valid()
+
+        # ---- Connections to the sensor, or to lights
+        self._connect(paths, si, first)
+
+        # ---- On to the next vertex
+        if self.followed:
+            self.scatter(paths, si, first)
+
+    def scatter(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
+        """Turn paths as the BSDFs of their vertices say, and end some of them.
 
         Parameters
         ----------
-        passage
-            the scene, and what light passes in it.
-        mirrors, interreflection
-            paths over delta reflections and transmissions, and over other surfaces.
-        orders
-            of :class:`FollowingTracer`; None: all.
-        by_line
-            whether light is told apart by line.
+        paths, si
+            their state, and the surfaces that they have met.
+        first
+            whether these are their first vertices.
         """
-        self.passage, self.scene, self.straight = passage, passage.scene, mi.Bool(True)
-        self.mirrors, self.interreflection = mirrors, interreflection
-        self.by_line = by_line
-        self.kept = {kind: Sightings.none(by_line) for kind in KINDS}
-        self._orders = [dr.opaque(mi.UInt32, order) for order in orders or ()]
+        # ---- BSDF sample; the connection may have looked at the surface from elsewhere
+        toward, rules = -paths.ray.d, self.rules
+        si.wi = si.to_local(toward)
+        number, point = paths.rng.next_float32(), mi.Point2f(paths.rng.next_float32(), paths.rng.next_float32())
+        if first and self.first_turn is not None:
+            point = self.first_turn
+        mode = mi.TransportMode.Importance if self.IMPORTANCE else mi.TransportMode.Radiance
+        sample, value = si.bsdf().sample(mi.BSDFContext(mode), si, number, point, paths.active)
+        onward, weight = si.to_world(sample.wo), mi.unpolarized_spectrum(value)
+        passing, mirrored = self.passage.passes(si, sample), is_delta(sample)
+        going = paths.active & (sample.pdf > 0)
+        if not rules.interreflection:
+            going &= (mirrored & rules.mirrors) | passing
+        elif not rules.mirrors:
+            going &= ~mirrored | passing
+        turn = Turn(sample, passing, mirrored & ~passing)
+        going &= self._note_turn(paths, si, turn, first)
+
+        # ---- Throughput
+        if self.IMPORTANCE:
+            corrected = shading_correction(si, sample.wo, onward, toward)
+            weight *= dr.select(dr.isfinite(corrected), dr.abs(corrected), 0)
+        paths.throughput *= weight
+
+        # ---- Russian roulette; chains of mirrors are short and full of light, and what only passes a surface goes on
+        paths.depth += dr.select(passing, mi.UInt32(0), mi.UInt32(1))
+        if not first:
+            chain = paths.scattered == 0
+            if self.IMPORTANCE:
+                chain &= turn.delta
+            carried = dr.minimum(dr.max(paths.throughput), _LONGEST)
+            chance = dr.select((chain & (paths.depth < _MIRRORS)) | passing, 1, carried)
+            going &= paths.rng.next_float32() < chance
+            paths.throughput *= dr.rcp(dr.maximum(chance, _LEAST_CHANCE))
+        paths.active = going & (dr.max(paths.throughput) > 0)
+
+        # ---- Order of the light, and the next ray
+        paths.scattered += dr.select(turn.delta | passing, mi.UInt32(0), mi.UInt32(1))
+        if self._orders:
+            paths.active &= paths.scattered + self.reach <= self._orders[1]
+        if first or self.passage.open:
+            paths.straight &= passing
+        paths.ray = self.passage.leaving(si, onward)
+
+    def _run_into(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
+        """Keep light that paths have run into on their way to ``si``; none from the projector's side."""
 
     @abstractmethod
-    def vertex(self, first: bool) -> None:
-        """Find the next surface of every path (its ``first`` or a later one), connect it, and leave it."""
+    def _connect(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
+        """Keep light that the vertices at ``si`` send to the sensor, or along their paths to it."""
 
-    def _keep(self, kind: str, seen: Sightings) -> None:
-        """Keep light of one connection a path, or that of an earlier one of its kind, which then stands for both."""
-        self.kept[kind] = self.kept[kind].joined_by(seen, self.rng.next_float32())
+    def _note_turn(self, paths: State, si: mi.SurfaceInteraction3f, turn: Turn, first: bool) -> mi.Bool:
+        """Note a ``turn`` at ``si``; tells which paths may go on."""
+        return mi.Bool(True)
 
-    def _wanted(self, order: mi.UInt32) -> mi.Bool:
+    def _is_wanted(self, order: mi.UInt32) -> mi.Bool:
         """Whether light of an ``order`` is kept."""
         if not self._orders:
             return mi.Bool(True)
         fewest, most = self._orders
         return (order >= fewest) & (order <= most)
 
-    def _goes_on(self, least: mi.UInt32) -> mi.Bool:
-        """Whether a path may bring light that is kept, of which the ``least`` order is to come."""
-        return least <= self._orders[1] if self._orders else mi.Bool(True)
 
-    def _sampled(
-        self, si: mi.SurfaceInteraction3f, mode: mi.TransportMode, chosen: mi.Point2f | None = None
-    ) -> tuple[mi.BSDFSample3f, mi.Spectrum, mi.Bool]:
-        """Where each path could go on, the light it would keep, and whether such turns are followed.
+def is_delta(sample: mi.BSDFSample3f) -> mi.Bool:
+    """Whether the direction of ``sample`` is a mirror's, reflected or refracted."""
+    mirror = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
+    return (sample.sampled_type & mirror) != 0
 
-        The point ``chosen`` stands in for a random one.
-        """
-        number, point = self.rng.next_float32(), mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
-        point = point if chosen is None else chosen
-        sample, value = si.bsdf().sample(mi.BSDFContext(mode), si, number, point, self.active)
-        going = self.active & (sample.pdf > 0)
-        if not self.interreflection:
-            going &= (is_delta(sample) & self.mirrors) | self.passage.passes(si, sample)
-        elif not self.mirrors:
-            going &= ~is_delta(sample) | self.passage.passes(si, sample)
-        return sample, mi.unpolarized_spectrum(value), going
 
-    def _end_some(self, going: mi.Bool, mirrored: mi.Bool, passing: mi.Bool, first: bool) -> None:
-        """Go on with a chance: what a path still carries; but chains of mirrors are short and full of light.
+def shading_correction(
+    si: mi.SurfaceInteraction3f, local: mi.Vector3f, onward: mi.Vector3f, toward: mi.Vector3f
+) -> mi.Float:
+    """Factor of light that is followed forward and so sees shading normals the other way round (Veach 1997, 5.3).
 
-        What only passes a surface goes on.
-        """
-        self.bounce += dr.select(passing, mi.UInt32(0), mi.UInt32(1))
-        if not first:
-            carried = dr.minimum(dr.max(self.strength), _LONGEST)
-            chance = dr.select((mirrored & (self.bounce < _MIRRORS)) | passing, 1, carried)
-            going &= self.rng.next_float32() < chance
-            self.strength *= dr.rcp(dr.maximum(chance, _LEAST_CHANCE))
-        self.active = going & (dr.max(self.strength) > 0)
+    Parameters
+    ----------
+    si
+        points of surfaces.
+    local, onward
+        direction in which it goes on, in the shading frame and in the world.
+    toward
+        that in which it came from, in the world.
+    """
+    correction = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, onward)
+    return correction / (mi.Frame3f.cos_theta(local) * dr.dot(si.n, toward))
 
-    def deposits(self, further: bool) -> list[Deposits]:
-        """Light on the host of every path, followed to its end or, unless ``further``, to the first surface only."""
-        self.follow(further)
-        dr.eval(self.kept)
-        return [Deposits.fetched(seen, KINDS[kind], self.anchor) for kind, seen in self.kept.items()]
 
-    def follow(self, further: bool) -> None:
-        """Follow every path to its end or, unless ``further``, to the first surface only."""
-        self.vertex(first=True)
-        if further:
-            self._follow_on()
+def camera_part(pdf: mi.Float) -> mi.Float:
+    """Part of the light over the last turn before the sensor that is followed from the camera; the rest is connected.
 
-    def _follow_on(self) -> None:
-        """Follow every path from where it is."""
-        self._load(dr.while_loop(self._values(), lambda *values: values[0], self._body, labels=self.STATE))
-
-    def _body(self, *values: object) -> tuple[object, ...]:
-        self._load(values)
-        self.vertex(first=False)
-        return self._values()
-
-    def _values(self) -> tuple[object, ...]:
-        return tuple(getattr(self, name) for name in self.STATE)
-
-    def _load(self, values: tuple[object, ...]) -> None:
-        for name, value in zip(self.STATE, values, strict=True):
-            setattr(self, name, value)
+    ``pdf`` [1/sr] is that of sampling the turn from the camera's side, which both sides know, so the parts add up to
+    one. A connection to a lobe sharper than ``_SHARP`` keeps ``_SHARP / pdf`` of its light: it is bounded however sharp
+    the lobe. What is matt is never followed from the camera.
+    """
+    return dr.select(pdf > _SHARP, 1 - _SHARP * dr.rcp(pdf), 0)

@@ -35,10 +35,17 @@ import numpy as np
 
 from mitsim.transport.accumulator import Ledger
 from mitsim.transport.connect import Way
-from mitsim.transport.indirect import MEMBERS, SIDE, IndirectTracer, IndirectWalk, blocks_of
-from mitsim.transport.integrator import KINDS, camera_part
+from mitsim.transport.indirect import (
+    MEMBERS,
+    SIDE,
+    Emission,
+    IndirectTracer,
+    ProjectorPaths,
+    blocks_of,
+)
+from mitsim.transport.integrator import InFlight, camera_part, shading_correction
 from mitsim.transport.records import INDIRECT, Deposits, Sightings, check_finite
-from mitsim.transport.sampler import generator, seed_of, stratified, told_apart
+from mitsim.transport.sampler import generator, split_by_line, stratified
 
 if TYPE_CHECKING:
     ByLine = list[mi.Float]
@@ -65,11 +72,11 @@ class NeighbourTracer(IndirectTracer):
     @property
     def lanes(self) -> int:
         """Paths of one sample: one for each pixel of whole blocks, or as often as these are repeated."""
-        return MEMBERS * (len(self.turns) if self.turns else blocks_of(self.projector.n) ** 2)
+        return MEMBERS * (len(self.adaptive) if self.adaptive else blocks_of(self.projector.n) ** 2)
 
     def repeating(self, repeats: Sequence[int]) -> IndirectTracer:
         """The same, as :meth:`IndirectTracer.repeating`; ``repeats`` (blocks^2,)."""
-        return self._taking(np.asarray(repeats, dtype=np.int64))
+        return self._with_counts(np.asarray(repeats, dtype=np.int64))
 
     def trace_looks(self, seeds: Sequence[int], samples: int = 1) -> list[Deposits]:
         """``samples`` of each of some ``seeds``, one after the other: pairs of paths have no lane of their own."""
@@ -98,8 +105,24 @@ class NeighbourTracer(IndirectTracer):
         """Whether all surfaces are: pairs then take no look at a material."""
         return len(self.diffuse) == len(self.scene.shapes())
 
-    def _walk(self, seed: int, sample: mi.UInt32, lane: mi.UInt32) -> _Block:
-        return (_DiffuseBlock if self.all_diffuse else _Block)(self, seed, sample, lane)
+    def _emission(self, flight: InFlight) -> Emission:
+        """Of whole blocks of pixels, the members of each one after the other."""
+        block, member, sample, weight = flight.index // MEMBERS, flight.index % MEMBERS, flight.sample, 1.0
+        if self.adaptive:
+            block, sample, weight = self.adaptive.at(block, sample)
+        n, blocks = (dr.opaque(mi.UInt32, count) for count in (self.projector.n, blocks_of(self.projector.n)))
+        row = (block // blocks) * SIDE + member // SIDE
+        column = (block % blocks) * SIDE + member % SIDE
+        inside = (row < n) & (column < n)
+        pixel = dr.minimum(row, n - 1) * n + dr.minimum(column, n - 1)
+        none, seed = dr.zeros(mi.UInt32, dr.width(flight.index)), flight.seed
+        rng = generator(seed ^ (sample * 0x9E3779B9 + 1), pixel)
+        place = (member + sample * _STEP + sample // _TURN) % MEMBERS
+        first_turn = stratified(sample * MEMBERS + place, generator(seed, block))
+        return Emission(pixel, (none, none), rng, first_turn, dr.select(inside, mi.Float(weight), 0))
+
+    def _paths(self, emission: Emission) -> ReusedPaths:
+        return (DiffuseReusedPaths if self.all_diffuse else ReusedPaths)(self, emission)
 
 
 def _is_diffuse(bsdf: mi.BSDF | None) -> bool:
@@ -109,31 +132,18 @@ def _is_diffuse(bsdf: mi.BSDF | None) -> bool:
     return all(_REFLECTANCE.match(name) for name in mi.traverse(bsdf).keys())  # noqa: SIM118 - no dictionary
 
 
-class _Block(IndirectWalk):
-    """Paths of whole blocks of pixels, the members of each one after the other."""
+class ReusedPaths(ProjectorPaths):
+    """Paths of whole blocks of pixels, each with the second points of its block."""
 
     tracer: NeighbourTracer
 
-    def _place(self, sample: mi.UInt32, lane: mi.UInt32) -> mi.Float | float:
-        tracer, weight = self.tracer, 1.0
-        self.block, self.member, self.sample = lane // MEMBERS, lane % MEMBERS, sample
-        if tracer.turns:
-            self.block, self.sample, weight = tracer.turns.at(self.block, sample)
-        n, blocks = (dr.opaque(mi.UInt32, count) for count in (tracer.projector.n, blocks_of(tracer.projector.n)))
-        row = (self.block // blocks) * SIDE + self.member // SIDE
-        column = (self.block % blocks) * SIDE + self.member % SIDE
-        inside = (row < n) & (column < n)
-        self.pixel = dr.minimum(row, n - 1) * n + dr.minimum(column, n - 1)
-        self.anchor = dr.zeros(mi.UInt32, dr.width(lane)), dr.zeros(mi.UInt32, dr.width(lane))
-        return dr.select(inside, mi.Float(weight), 0)
+    def __init__(self, tracer: NeighbourTracer, emission: Emission) -> None:
+        """Of what a ``tracer`` follows, from an ``emission``."""
+        super().__init__(tracer, emission)
+        self.tracer = tracer
+        self.member = dr.arange(mi.UInt32, dr.width(self.pixel)) % MEMBERS
 
-    def _begin(self, seed: int | mi.UInt32) -> None:
-        shared, sample = seed_of(seed), self.sample
-        self.rng = generator(shared ^ (sample * 0x9E3779B9 + 1), self.pixel)
-        place = (self.member + sample * _STEP + sample // _TURN) % MEMBERS
-        self.first_turn = stratified(sample * MEMBERS + place, generator(shared, self.block))
-
-    def deposits(self, further: bool) -> list[Deposits]:
+    def deposits(self) -> list[Deposits]:
         """Light on the host: of each pixel's own paths, and of all pairs of pixels and second points."""
         own, count = self._own(), dr.width(self.lit) * MEMBERS
         values = [[dr.zeros(mi.Float, count) for _ in range(self.tracer.lines)] for _ in range(2)]
@@ -143,15 +153,15 @@ class _Block(IndirectWalk):
                 for each, value in zip(kept, by_line, strict=True):
                     dr.scatter(each, value, place, active)
 
-        self._hand_on(*self._weights(), store)
+        self._pair_light(*self._weights(), store)
         dr.eval(values)
-        return [*own, self._paired(values[0], self.way), self._paired(values[1], self.further)]
+        return [*own, self._pair_samples(values[0], self.to_sensor_way), self._pair_samples(values[1], self.further)]
 
-    def file(self, ledgers: Sequence[Ledger]) -> list[Deposits]:
+    def accumulate(self, ledgers: Sequence[Ledger]) -> list[Deposits]:
         """Light of each pixel's own paths on the host; that of pairs in ``ledgers``, one for each line."""
-        own = self._own()
-        seen = Sightings(self.way.geometric, self.pixel, self.way.row, self.way.column, self.way.inverse_depth)
-        places = [ledgers[0].place(each, self.rng.next_float32()) for each in (seen, self.further)]
+        own, way = self._own(), self.to_sensor_way
+        seen = Sightings(way.geometric, self.pixel, way.row, way.column, way.inverse_depth)
+        places = [ledgers[0].place(each, self.paths.rng.next_float32()) for each in (seen, self.further)]
         dr.eval(places)
 
         def store(place: mi.UInt32, at: mi.UInt32, light: tuple[ByLine, ByLine], active: mi.Bool) -> None:
@@ -160,15 +170,17 @@ class _Block(IndirectWalk):
                     lit = active & ~(value == 0)  # not a number is light to be refused
                     ledger.add(value, self.pixel, dr.gather(mi.UInt32, each, at, lit), lit)
 
-        self._hand_on(*self._weights(), store)
+        self._pair_light(*self._weights(), store)
         return own
+
+    # ---- the paths themselves ---------------------------------------------------------------------------------------
 
     def _own(self) -> list[Deposits]:
         """Follow all paths; on the host the light that is not shared."""
-        self._first()
-        self._second()
-        self._follow_on()
-        kept = self.kept["indirect"]
+        self._first_vertex()
+        self._second_vertex()
+        self.paths = self.follow_on(self.paths)
+        kept = self.paths.sightings["indirect"]
         place = kept.pixel, kept.row, kept.column, kept.inverse_depth
         self.further = Sightings(dr.select(self.follows, kept.value, 0), *place)
         # Of unit light, whose mean over wavelengths the sightings hold.
@@ -178,35 +190,39 @@ class _Block(IndirectWalk):
             self.beyond = [unit[line] for line in range(self.tracer.lines)]
         kept.value = dr.select(self.follows, 0, kept.value)
         dr.eval(vars(self))
-        return [Deposits.fetched(seen, KINDS[kind], self.anchor) for kind, seen in self.kept.items()]
+        return self.connections.fetched(self.paths.sightings, tuple(self.paths.sightings))
 
-    def _first(self) -> None:
+    def _first_vertex(self) -> None:
         """The first surface, and each path's turn there."""
-        self.lit_by, self.power = mi.Ray3f(self.ray), told_apart(self.flux, self.tracer.lines)
-        self.lit_at = self.scene.ray_intersect_preliminary(self.ray, True, active=self.active)
-        si = self.lit_at.compute_surface_interaction(self.ray, active=self.active)
-        self.active &= si.is_valid()
-        self.lit = mi.Bool(self.active)
-        self._leave(si, True)
+        paths = self.paths
+        self.first_ray, self.power = mi.Ray3f(paths.ray), split_by_line(self.flux, self.tracer.lines)
+        self.first_hit = self.scene.ray_intersect_preliminary(paths.ray, True, active=paths.active)
+        si = self.first_hit.compute_surface_interaction(paths.ray, active=paths.active)
+        paths.active &= si.is_valid()
+        self.lit = mi.Bool(paths.active)
+        self.scatter(paths, si, True)
 
-    def _second(self) -> None:
+    def _second_vertex(self) -> None:
         """The second surface, its way to the sensor, and each path's turn there: of unit light where it is shared."""
-        self.arrived_by = mi.Ray3f(self.ray)
-        self.arrived_at = self.scene.ray_intersect_preliminary(self.ray, active=self.active)
-        si = self.arrived_at.compute_surface_interaction(self.ray, active=self.active)
-        self.active &= si.is_valid()
-        self.shared = self.active & (self.scattered == 1)
+        paths = self.paths
+        self.second_ray = mi.Ray3f(paths.ray)
+        self.second_hit = self.scene.ray_intersect_preliminary(paths.ray, active=paths.active)
+        si = self.second_hit.compute_surface_interaction(paths.ray, active=paths.active)
+        paths.active &= si.is_valid()
+        self.shared = paths.active & (paths.scattered == 1)
         self.point, self.normal = mi.Point3f(si.p), mi.Normal3f(si.n)
-        self.way = self._way(si)
-        self._take(si, replace(self.way, open=self.way.open & ~self.shared))
+        number = mi.UInt32(0)
+        self.to_sensor_way = self._way(paths, si, self.connections.sensor(number))
+        own = replace(self.to_sensor_way, open=self.to_sensor_way.open & ~self.shared)
+        self._keep_light(paths, si, own, self._draw_numbers(paths), (paths.sightings, number))
         self.follows = self.shared & self._diffuse(si)
         self.shading = mi.Normal3f(si.sh_frame.n)
-        self.side = dr.sign(dr.dot(self.shading, -self.arrived_by.d))
-        self.strength = dr.select(self.follows, 1, self.strength)
+        self.side = dr.sign(dr.dot(self.shading, -self.second_ray.d))
+        paths.throughput = dr.select(self.follows, 1, paths.throughput)
         self.flux = dr.select(self.follows, 1, self.flux)
-        self._leave(si, False)
-        self.turned = self._turn(si, -self.arrived_by.d, self.ray.d, self.active & self.follows)
-        self.onward = mi.Vector3f(self.ray.d)
+        self.scatter(paths, si, False)
+        self.own_turn = self._turn(si, -self.second_ray.d, paths.ray.d, paths.active & self.follows)
+        self.onward = mi.Vector3f(paths.ray.d)
 
     def _diffuse(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
         """Whether the surfaces at ``si`` are diffuse; of very many materials none counts as such."""
@@ -272,17 +288,10 @@ class _Block(IndirectWalk):
             whole, same_side = whole + dr.abs(each), same_side + dr.maximum(each, 0)
         return sent, whole, same_side
 
-    def _hand_on(self, sent: ByLine, whole: mi.Float, same_side: mi.Float, store: Store) -> None:
-        """Light of each pixel by each second point of its block, straight to the sensor and further on.
-
-        Parameters
-        ----------
-        sent, whole, same_side
-            as :meth:`_weights` has them.
-        store
-            takes the light of pairs: their place among all, the lane of the second point, the two lights, and which
-            lanes count.
-        """
+    def _pair_light(self, sent: ByLine, whole: mi.Float, same_side: mi.Float, store: Store) -> None:
+        """Light of each pixel by each second point of its block, straight to the sensor and further on, by what
+        :meth:`_weights` has. ``store`` takes, of pairs, the place among all, the path of the second point, the two
+        lights, and which count."""
         index, si = dr.arange(mi.UInt32, dr.width(self.lit)), self._first_points()
         first = index - self.member
         dr.eval(whole, same_side)
@@ -309,14 +318,13 @@ class _Block(IndirectWalk):
 
     def _sender(self, si: mi.SurfaceInteraction3f) -> Sender:
         """What first surfaces at ``si`` send in a direction [1/sr], and the density [1/sr] of sampling that."""
-        context, toward = mi.BSDFContext(mi.TransportMode.Importance), -self.lit_by.d
+        context, toward = mi.BSDFContext(mi.TransportMode.Importance), -self.first_ray.d
 
         def send(direction: mi.Vector3f, active: mi.Bool) -> tuple[ByLine, mi.Float]:
             local = si.to_local(direction)
             reflected, pdf = si.bsdf().eval_pdf(context, si, local, active)
-            turned = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, direction)
-            turned /= mi.Frame3f.cos_theta(local) * dr.dot(si.n, toward)
-            return self._factors(mi.unpolarized_spectrum(reflected) * dr.abs(turned)), pdf
+            correction = dr.abs(shading_correction(si, local, direction, toward))
+            return self._factors(mi.unpolarized_spectrum(reflected) * correction), pdf
 
         return send
 
@@ -325,14 +333,14 @@ class _Block(IndirectWalk):
         are followed further."""
 
         def turn(at: mi.UInt32, active: mi.Bool) -> tuple[ByLine, ByLine]:
-            met, ray = (dr.gather(type(each), each, at, active) for each in (self.arrived_at, self.arrived_by))
+            met, ray = (dr.gather(type(each), each, at, active) for each in (self.second_hit, self.second_ray))
             second = met.compute_surface_interaction(ray, active=active)
             toward = dr.normalize(si.p - second.p)
-            way = dr.gather(Way, self.way, at, active)
+            way = dr.gather(Way, self.to_sensor_way, at, active)
             reception = self.tracer.receiver.received(second, toward, replace(way, open=way.open & active))
             connected = self._factors(reception.irradiance * (1 - camera_part(reception.pdf)))
             beyond, turned = (
-                [dr.gather(mi.Float, each, at, active) for each in lines] for lines in (self.beyond, self.turned)
+                [dr.gather(mi.Float, each, at, active) for each in lines] for lines in (self.beyond, self.own_turn)
             )
             handed = [active & (light > 0) & (own > 0) for light, own in zip(beyond, turned, strict=True)]
             onward = dr.gather(mi.Vector3f, self.onward, at, active)
@@ -343,9 +351,9 @@ class _Block(IndirectWalk):
         return turn
 
     def _first_points(self) -> mi.SurfaceInteraction3f:
-        return self.lit_at.compute_surface_interaction(self.lit_by, active=self.lit)
+        return self.first_hit.compute_surface_interaction(self.first_ray, active=self.lit)
 
-    def _paired(self, values: ByLine, seen: Way | Sightings) -> Deposits:
+    def _pair_samples(self, values: ByLine, seen: Way | Sightings) -> Deposits:
         """Light on the host of pairs of pixels and second points."""
         by_line = np.array(values)
         light = by_line.sum(axis=0)
@@ -353,12 +361,12 @@ class _Block(IndirectWalk):
         pairs = np.flatnonzero(light)
         lines = np.zeros((len(mi.Spectrum()), len(pairs)), np.float32)
         lines[: len(by_line)] = by_line[:, pairs]
-        lane, other = np.divmod(pairs, MEMBERS)
-        at = lane - lane % MEMBERS + other
+        index, other = np.divmod(pairs, MEMBERS)
+        at = index - index % MEMBERS + other
         none = np.zeros(len(pairs), np.int64)
         row, column, inverse = (np.array(part)[at] for part in (seen.row, seen.column, seen.inverse_depth))
         return Deposits(
-            pixel=np.array(self.pixel)[lane].astype(np.int64),
+            pixel=np.array(self.pixel)[index].astype(np.int64),
             anchor_row=none,
             anchor_column=none,
             row=row.astype(np.float64),
@@ -366,11 +374,11 @@ class _Block(IndirectWalk):
             inverse_depth=inverse.astype(np.float64),
             value=light[pairs].astype(np.float64),
             kind=np.full(len(pairs), INDIRECT, dtype=np.int16),
-            lines=lines if self.by_line else None,
+            lines=lines if self.rules.by_line else None,
         )
 
 
-class _DiffuseBlock(_Block):
+class DiffuseReusedPaths(ReusedPaths):
     """The same where all surfaces are diffuse: what they turn hangs on two cosines, and on no material.
 
     A diffuse surface of shading normal s and geometric normal n turns light from w by rho / pi |s w| / |n w|, whatever
@@ -379,20 +387,20 @@ class _DiffuseBlock(_Block):
 
     sends = 1
 
-    def _first(self) -> None:
-        super()._first()
+    def _first_vertex(self) -> None:
+        super()._first_vertex()
         si = self._first_points()
         self.facing = dr.sign(mi.Frame3f.cos_theta(si.wi))
-        turned = self._turn(si, -self.lit_by.d, si.sh_frame.n * self.facing, self.lit)
+        turned = self._turn(si, -self.first_ray.d, si.sh_frame.n * self.facing, self.lit)
         self.lit &= reduce(dr.maximum, turned) > 0
         self.power = [power * own for power, own in zip(self.power, turned, strict=True)]
 
-    def _second(self) -> None:
-        super()._second()
-        second = self.arrived_at.compute_surface_interaction(self.arrived_by, active=self.shared)
-        self.sensor_side = dr.sign(dr.dot(self.shading, self.way.direction))
+    def _second_vertex(self) -> None:
+        super()._second_vertex()
+        second = self.second_hit.compute_surface_interaction(self.second_ray, active=self.shared)
+        self.sensor_side = dr.sign(dr.dot(self.shading, self.to_sensor_way.direction))
         facing = self.shading * self.sensor_side
-        way = replace(self.way, open=self.way.open & self.shared)
+        way = replace(self.to_sensor_way, open=self.to_sensor_way.open & self.shared)
         reception = self.tracer.receiver.received(second, facing, way)
         self.to_sensor = self._factors(reception.irradiance * dr.abs(dr.dot(self.normal, facing)))
 
@@ -405,7 +413,7 @@ class _DiffuseBlock(_Block):
         return send
 
     def _turner(self, si: mi.SurfaceInteraction3f) -> Turner:
-        own = self._cosines(self.shading, self.normal, -self.arrived_by.d)
+        own = self._cosines(self.shading, self.normal, -self.second_ray.d)
         further = [dr.select(own > 0, light / own, 0) for light in self.beyond]
         dr.eval(further)
 

@@ -23,8 +23,7 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.projector import Lines
-from mitsim.transport.coordinates import Numbers, turn_and_origin
-from mitsim.transport.plugins.base import channels, lanes_of, per_lane
+from mitsim.transport.plugins.base import Numbers, channels, lanes_of, per_lane, turn_and_origin
 
 _WAVELENGTH_SETS = 8
 """Sets of four wavelengths: 15 nm apart, finer than any measured spectrum that a scene would hold."""
@@ -60,7 +59,7 @@ class ProjectorOptics:
     parted: bool = False
 
     @property
-    def apart(self) -> tuple[ProjectorOptics, ...]:
+    def per_wavelength(self) -> tuple[ProjectorOptics, ...]:
         """Itself, or where its lines part, one for each line, of which a path carries that alone.
 
         MitsimError where wavelengths that part would be drawn.
@@ -135,7 +134,7 @@ class CanvasMap:
         for _ in range(2):  # first near the axis, to learn the field of view, then over all of it
             x, y = (part.ravel() for part in np.meshgrid(*[np.linspace(-reach, reach, _PROBES)] * 2))
             local = np.stack([x, y, np.ones(x.size)], axis=1)
-            uv = _asked(emitter, turn, origin, local, None)[0].uv
+            uv = _direction_samples(emitter, turn, origin, local, None)[0].uv
             fits = [
                 np.linalg.lstsq(np.stack([per_lane(part, x.size), np.ones(x.size)], axis=1), tangent, rcond=None)[0]
                 for part, tangent in ((uv.x, x), (uv.y, y))
@@ -290,13 +289,13 @@ class PinholeRays:
 
     def _irradiance(self, points: FloatArray, wavelengths: mi.Color0f | None) -> FloatArray:
         """(k, channels) irradiance on the plane at unit distance that window points (k, 2) cast [W m^-2]."""
-        _, emitted, depth, cosine = _asked(
+        _, emitted, depth, cosine = _direction_samples(
             self._projector.emitter, self._map.turn, self.origin, self._local(points), wavelengths
         )
         return channels(mi.unpolarized_spectrum(emitted), len(points)) * (cosine * depth**2)[:, None]
 
 
-def _asked(
+def _direction_samples(
     emitter: mi.Emitter, turn: FloatArray, origin: FloatArray, local: FloatArray, wavelengths: mi.Color0f | None
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum, float, FloatArray]:
     """A projector's direction sample at points in ``local`` directions (k, 3): sample, light, depth [mm], cosines."""

@@ -43,8 +43,8 @@ def seed_of(seed: int | mi.UInt32) -> mi.UInt32:
 
 def stratified(index: mi.UInt32, rng: mi.PCG32) -> mi.Point2f:
     """Point ``index`` of a Sobol sequence in the unit square, scrambled by numbers drawn from ``rng``."""
-    first = _scrambled(dr.brev(index), rng.next_uint32())
-    second = _scrambled(_second_dimension(index), rng.next_uint32())
+    first = _scramble(dr.brev(index), rng.next_uint32())
+    second = _scramble(_second_dimension(index), rng.next_uint32())
     return mi.Point2f(_unit(first), _unit(second))
 
 
@@ -54,7 +54,7 @@ def shuffled(index: mi.UInt32, rng: mi.PCG32) -> mi.UInt32:
     :func:`stratified` points of them are as even as those of ``index`` and independent of these, so two pairs of
     dimensions pad to four (Burley 2020, "Practical hash-based Owen scrambling", section 4).
     """
-    return _scrambled(index, rng.next_uint32())
+    return _scramble(index, rng.next_uint32())
 
 
 def _second_dimension(index: mi.UInt32) -> mi.UInt32:
@@ -66,7 +66,7 @@ def _second_dimension(index: mi.UInt32) -> mi.UInt32:
     return result
 
 
-def _scrambled(bits: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
+def _scramble(bits: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
     """Nested uniform scrambling: each bit is flipped by a hash of those above it."""
     x = dr.brev(bits) + seed
     for multiplier in (0x6C50B47C, 0xB82F1E52, 0xC7AFE638, 0x8D22F6E6):
@@ -85,7 +85,7 @@ def panchromatic(radiance: mi.UnpolarizedSpectrum) -> mi.Float:
     return dr.mean(radiance)
 
 
-def told_apart(light: mi.UnpolarizedSpectrum, lines: int) -> list[mi.Float]:
+def split_by_line(light: mi.UnpolarizedSpectrum, lines: int) -> list[mi.Float]:
     """Light of each of several ``lines``, or of all in one, whose weights ``light`` has as :func:`panchromatic` takes
     them."""
     return [panchromatic(light)] if lines == 1 else [light[line] / len(light) for line in range(lines)]

@@ -90,16 +90,16 @@ def trace_glint(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, 
     if max_depth < 1:
         raise MitsimError(f"max_depth of glints is {max_depth}; give at least 1")
     if not has_mirrors(scene):
-        return _joined([], np.zeros(2))
+        return _join([], np.zeros(2))
     parts, left = [], np.zeros(2)
-    for each in projector.apart:
-        beams, lost = _of(GlintRays(scene, camera, each, max_depth), projector.n, camera.geometry)
+    for each in projector.per_wavelength:
+        beams, lost = _projector_beams(GlintRays(scene, camera, each, max_depth), projector.n, camera.geometry)
         parts += beams
         left += lost
-    return _joined(parts, left)
+    return _join(parts, left)
 
 
-def _of(tracer: GlintRays, n: int, geometry: CameraGeometry) -> tuple[list[Beams], FloatArray]:
+def _projector_beams(tracer: GlintRays, n: int, geometry: CameraGeometry) -> tuple[list[Beams], FloatArray]:
     """Beams of the pixels of a window of ``n`` a side, and (2,) the flux that none has and their variance."""
     step = _UNIT // min(_UNIT, 2 ** max(0, int(np.ceil(np.log2(_COARSE / n)))))
     arcs, close = grazing(tracer, geometry.half_width, _UNIT)
@@ -117,7 +117,7 @@ def _search(
     tracer: GlintRays, row: IntArray, column: IntArray, size: int, n: int, geometry: CameraGeometry
 ) -> tuple[list[Beams], FloatArray]:
     """The same of all chains in squares of the lattice (first row and column, ``size``)."""
-    crossings, place = _traced(tracer, row, column, np.array([0, size]))
+    crossings, place = _trace_squares(tracer, row, column, np.array([0, size]))
     # Squares that a chain has a corner of, one for each chain; corners (row, column) by the ray that they are.
     chains, number = np.unique(crossings.chain, return_inverse=True)
     order = np.argsort(place.ravel(), kind="stable")
@@ -156,7 +156,7 @@ class _Nodes:
         return self.take((slice(None), slice(i, i + 2), slice(j, j + 2)))
 
 
-def _traced(tracer: GlintRays, row: IntArray, column: IntArray, steps: IntArray) -> tuple[Crossings, IntArray]:
+def _trace_squares(tracer: GlintRays, row: IntArray, column: IntArray, steps: IntArray) -> tuple[Crossings, IntArray]:
     """Rays through the points of squares at ``steps`` from their first corner, shared ones traced once; and which ray
     (q, k, k) each point is."""
     rows, columns = np.broadcast_arrays(row[:, None, None] + steps[:, None], column[:, None, None] + steps)
@@ -222,7 +222,7 @@ def _refine(
         variance += points.variance
         thin, way = _thinness(nodes)
         for i, j in np.ndindex(2, 2):
-            corners = _stretched(nodes.quarter(i, j).take(done), way[done], stands_for[done])
+            corners = _stretch(nodes.quarter(i, j).take(done), way[done], stands_for[done])
             at = row[done] + i * half, column[done] + j * half
             quarter = stands_for[done] * _fluxes(tracer, *at, half, n)
             parts.append(Beams(_pixel(*at, n), quarter, corners.sensor, corners.tangent, corners.throughput, 0.0))
@@ -260,7 +260,7 @@ def _thinness(nodes: _Nodes) -> tuple[FloatArray, FloatArray]:
         return np.where(most > _MANY * least, least, np.inf), way
 
 
-def _stretched(corners: _Nodes, way: FloatArray, factor: IntArray) -> _Nodes:
+def _stretch(corners: _Nodes, way: FloatArray, factor: IntArray) -> _Nodes:
     """``corners`` (q, 2, 2) of squares that stand for a ``factor`` (q,) of them along a ``way`` (q, 2)."""
     wide = np.flatnonzero(factor > 1)
     if not len(wide):
@@ -312,7 +312,7 @@ def _points(nodes: _Nodes, flux: FloatArray, pixel: IntArray, geometry: CameraGe
 
 def _nodes_of(tracer: GlintRays, chain: Chains, row: IntArray, column: IntArray, half: int) -> _Nodes:
     """Nodes (q, 3, 3) at corners, edge middles and centre of squares."""
-    crossings, place = _traced(tracer, row, column, half * np.arange(3))
+    crossings, place = _trace_squares(tracer, row, column, half * np.arange(3))
     return _nodes(crossings, chain, place)
 
 
@@ -379,7 +379,7 @@ def _pixel(row: IntArray, column: IntArray, n: int) -> IntArray:
     return (row // _UNIT) * n + column // _UNIT
 
 
-def _joined(parts: list[Beams], left: FloatArray) -> Beams:
+def _join(parts: list[Beams], left: FloatArray) -> Beams:
     pair = np.zeros((0, 2, 2, 2))
     none = Beams(np.zeros(0, np.int64), np.zeros(0), pair, pair, np.zeros((0, 2, 2)), 0.0)
     names = ("pixel", "flux", "sensor", "tangent", "throughput")

@@ -4,13 +4,14 @@ Rays are traced in Mitsuba's float32, which is good to about 1e-4 mm at the sens
 in a masked frame. So each hit is polished in float64: the ray is met with the tangent plane of the surface that was
 hit, and reflection or refraction is worked out again there. What is left is the surface's own place and normal in
 float32: nothing for a mirror that faces the axis squarely; round ones and smooth meshes are met in float64
-(:mod:`mitsim.transport.exact_hits`).
+(:mod:`mitsim.transport.specular_rays`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -18,9 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
-from mitsim.transport.coordinates import rows_columns, turn_and_origin
-from mitsim.transport.exact_hits import ExactHits, Hits
-from mitsim.transport.plugins.base import channels, lanes_of, per_lane, vectors
+from mitsim.transport.plugins.base import channels, lanes_of, per_lane, rows_columns, turn_and_origin, vectors
 from mitsim.transport.projector import PinholeRays, ProjectorOptics, wavelength_sets
 from mitsim.transport.transmission import CLEAR, Passage, transmits
 
@@ -118,7 +117,9 @@ class GlintRays:
         self.rays = PinholeRays(projector, self._wavelengths)
         mean = self.rays.power.mean(axis=0)
         self._colour = mean / mean.sum() if mean.sum() > 0 else np.full(len(mean), 1 / len(mean))
-        self._lobes = _by_choice(lobe for bsdf in delta_bsdfs(scene, int(mi.BSDFFlags.Delta)) for lobe in _lobes(bsdf))
+        self._lobes = _group_lobes(
+            lobe for bsdf in delta_bsdfs(scene, int(mi.BSDFFlags.Delta)) for lobe in _lobes(bsdf)
+        )
         polished = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
         self.mirrors = [s for s in scene.shapes() if s.bsdf() is not None and s.bsdf().flags() & polished]
         self._exact = ExactHits(self.mirrors)
@@ -177,8 +178,8 @@ class GlintRays:
     def _bounce(self, rays: _Rays, si: mi.SurfaceInteraction3f, active: Mask) -> list[_Rays]:
         """The rays that go on, polished, by lobe; see the module."""
         count = len(active)
-        hits = _polished(rays, si)
-        shaded = hits.normal.copy()
+        hits = _plane_hits(rays, si)
+        shading = hits.normal.copy()
         shapes = per_lane(dr.reinterpret_array(mi.UInt32, si.shape), count).astype(np.uint64)
         numbers = shapes.astype(np.int64), per_lane(si.prim_index, count).astype(np.int64)
         self._exact.refine(rays.origin, rays.direction, hits, *numbers)
@@ -186,20 +187,20 @@ class GlintRays:
         onward: list[_Rays] = []
         materials = per_lane(dr.reinterpret_array(mi.UInt32, si.bsdf()), count)
         for lobe, own in self._lobes:
-            met = active & np.isin(materials, own)
-            if not met.any():
+            own_lobe = active & np.isin(materials, own)
+            if not own_lobe.any():
                 continue
-            here = mi.Bool(met)
-            sample, weight = self._sampled(lobe, si, here)
+            here = mi.Bool(own_lobe)
+            sample, weight = self._sample_lobe(lobe, si, here)
             kind, eta = per_lane(sample.sampled_type, count), per_lane(sample.eta, count)
             single = (kind & int(mi.BSDFFlags.Delta)) != 0
             spectrum = rays.spectrum * np.nan_to_num(weight)
-            chosen = np.flatnonzero(met & single & ((spectrum @ self._colour) > _FAINTEST))
+            chosen = np.flatnonzero(own_lobe & single & ((spectrum @ self._colour) > _FAINTEST))
             traced = vectors(si.to_world(sample.wo), count)[chosen]
             turn = kind[chosen], eta[chosen], rays.direction[chosen]
             # What Mitsuba did with its own normal tells which law it is; the better normal is for where light goes.
-            lawful = np.linalg.norm(_redirected(shaded[chosen], *turn) - traced, axis=1) < _AGREEMENT
-            direction = np.where(lawful[:, None], _redirected(normal[chosen], *turn), traced)
+            as_by_law = np.linalg.norm(_redirect(shading[chosen], *turn) - traced, axis=1) < _AGREEMENT
+            direction = np.where(as_by_law[:, None], _redirect(normal[chosen], *turn), traced)
             direction /= np.linalg.norm(direction, axis=1, keepdims=True)
             slope = np.abs((direction * geometric[chosen]).sum(axis=1))
             clear = self._clear * (1 + np.abs(point[chosen]).max(axis=1, initial=0)) / np.maximum(slope, _GRAZING)
@@ -212,7 +213,9 @@ class GlintRays:
                 onward.append(_Rays(rays.index[chosen], point[chosen], direction, start, chain, spectrum[chosen]))
         return onward
 
-    def _sampled(self, lobe: _Lobe, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.BSDFSample3f, FloatArray]:
+    def _sample_lobe(
+        self, lobe: _Lobe, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[mi.BSDFSample3f, FloatArray]:
         """Direction sample, and weights (k, channels) over all wavelength sets."""
         weights = []
         choice = lobe.choice * (1 - dr.max(Passage.straight(si, active))) if lobe.by_chance else lobe.choice
@@ -244,7 +247,7 @@ class _Lobe:
     by_chance: bool = False
 
 
-def _by_choice(lobes: Iterable[_Lobe]) -> list[tuple[_Lobe, list[int]]]:
+def _group_lobes(lobes: Iterable[_Lobe]) -> list[tuple[_Lobe, list[int]]]:
     """One of all ``lobes`` that are chosen alike, and the numbers of their materials in Dr.Jit's registry."""
     found: dict[tuple[object, ...], tuple[_Lobe, list[int]]] = {}
     for lobe in lobes:
@@ -285,7 +288,7 @@ def _context() -> mi.BSDFContext:
     return mi.BSDFContext(mi.TransportMode.Importance)
 
 
-def _polished(rays: _Rays, si: mi.SurfaceInteraction3f) -> Hits:
+def _plane_hits(rays: _Rays, si: mi.SurfaceInteraction3f) -> Hits:
     """Where rays met surfaces, in float64 with the tangent plane of each."""
     count = len(rays.index)
     hit, geometric, normal = (vectors(v, count) for v in (si.p, si.n, si.sh_frame.n))
@@ -298,7 +301,7 @@ def _polished(rays: _Rays, si: mi.SurfaceInteraction3f) -> Hits:
     return Hits(np.where(good[:, None], point, hit), geometric, normal)
 
 
-def _redirected(normal: FloatArray, kind: IntArray, eta: FloatArray, direction: FloatArray) -> FloatArray:
+def _redirect(normal: FloatArray, kind: IntArray, eta: FloatArray, direction: FloatArray) -> FloatArray:
     """(k, 3) directions after a surface in float64: reflected, refracted by ``eta`` (Snell) or straight on."""
     cosine = (direction * normal).sum(axis=1, keepdims=True)
     reflected = direction - 2 * cosine * normal
@@ -311,3 +314,133 @@ def _redirected(normal: FloatArray, kind: IntArray, eta: FloatArray, direction: 
 def _rows_columns(points: FloatArray) -> FloatArray:
     """(k, 2) index coordinates of points (k, 3) of the camera's frame."""
     return np.stack(rows_columns(points[:, 0], points[:, 1]), axis=1)
+
+
+# -------- Curved mirrors in double precision
+#
+# A float32 place at 400 mm is good to 3e-5 mm. On a mirror ball of 1 mm that turns the normal by 3e-5, and the light by
+# half a sensor pixel; so each ray is met once more with the sphere, cylinder or triangle that it hit. Flat surfaces
+# need none of it: their normal is the same all over.
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """Points and normals (k, 3) where rays met surfaces, geometric and for shading."""
+
+    point: FloatArray
+    geometric: FloatArray
+    normal: FloatArray
+
+    def put(self, chosen: IntArray, other: Hits) -> None:
+        """Take the ``other`` hits for those ``chosen``, where they are finite."""
+        good = np.isfinite(other.point).all(axis=1) & np.isfinite(other.normal).all(axis=1)
+        for name in vars(self):
+            getattr(self, name)[chosen[good]] = getattr(other, name)[good]
+
+
+class _Surface(Protocol):
+    def meet(self, origin: FloatArray, direction: FloatArray, hits: Hits, face: IntArray) -> Hits: ...
+
+
+class ExactHits:
+    """The spheres, cylinders and smooth meshes among some ``shapes``."""
+
+    def __init__(self, shapes: Sequence[mi.Shape]) -> None:
+        self._surfaces: dict[int, _Surface] = {}
+        for shape in shapes:
+            surface = _surface(shape)
+            if surface is not None:
+                number = int(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))).ravel()[0])
+                self._surfaces[number] = surface
+
+    def refine(self, origin: FloatArray, direction: FloatArray, hits: Hits, shape: IntArray, face: IntArray) -> None:
+        """Replace ``hits`` on the surfaces that are known.
+
+        Parameters
+        ----------
+        origin, direction
+            (k, 3) of the rays.
+        hits
+            in float32's precision.
+        shape, face
+            (k,) numbers of the shapes in Dr.Jit's registry, and of their faces.
+        """
+        for number in np.intersect1d(shape, list(self._surfaces)) if self._surfaces else ():
+            mine = np.flatnonzero(shape == number)
+            old = Hits(*(getattr(hits, name)[mine] for name in vars(hits)))
+            with np.errstate(all="ignore"):
+                hits.put(mine, self._surfaces[int(number)].meet(origin[mine], direction[mine], old, face[mine]))
+
+
+def _surface(shape: mi.Shape) -> _Surface | None:
+    if shape.is_mesh():
+        data = mi.traverse(shape)
+        smooth = shape.has_vertex_normals() and not shape.has_face_normals() and "faces" in data
+        return _Mesh.of(data) if smooth else None
+    kind = shape.class_name()
+    if kind not in ("Sphere", "Cylinder"):
+        return None
+    turn, origin = turn_and_origin(mi.traverse(shape)["to_world"])
+    radius = float(np.linalg.norm(turn[:, 0]))
+    axis = turn[:, 2] / np.linalg.norm(turn[:, 2]) if kind == "Cylinder" else np.zeros(3)
+    return _Round(origin, axis, radius)
+
+
+@dataclass(frozen=True, eq=False)
+class _Round:
+    """All points at the ``radius`` from a centre, or from the line along an ``axis`` through it."""
+
+    centre: FloatArray
+    axis: FloatArray
+    radius: float
+
+    def meet(self, origin: FloatArray, direction: FloatArray, hits: Hits, face: IntArray) -> Hits:
+        start, way = (self._across(vectors) for vectors in (origin - self.centre, direction))
+        a, b = np.square(way).sum(axis=1), (start * way).sum(axis=1)
+        root = np.sqrt(b**2 - a * (np.square(start).sum(axis=1) - self.radius**2))
+        near = ((hits.point - origin) * direction).sum(axis=1)
+        # Of the two, the crossing that was hit: b and a root of the other sign cancel only where it is far from both.
+        first, second = (-b - root) / a, (-b + root) / a
+        distance = np.where(np.abs(first - near) < np.abs(second - near), first, second)
+        point = origin + direction * distance[:, None]
+        normal = self._across(point - self.centre) / self.radius
+        normal *= np.sign((normal * hits.normal).sum(axis=1))[:, None]
+        return Hits(point, normal, normal)
+
+    def _across(self, vectors: FloatArray) -> FloatArray:
+        return np.asarray(vectors - (vectors @ self.axis)[:, None] * self.axis)
+
+
+@dataclass(frozen=True, eq=False)
+class _Mesh:
+    """Triangles, (k, 3, 3) each, and the normals of their corners."""
+
+    places: FloatArray
+    normals: FloatArray
+
+    @classmethod
+    def of(cls, data: mi.SceneParameters) -> _Mesh:
+        corners = np.array(data["faces"]).reshape(-1, 3)
+        of_vertices = (data["vertex_positions"], data["vertex_normals"])
+        return cls(*(np.array(values, dtype=np.float64).reshape(-1, 3)[corners] for values in of_vertices))
+
+    def meet(self, origin: FloatArray, direction: FloatArray, hits: Hits, face: IntArray) -> Hits:
+        corner, along, across = _edges(self.places[face])
+        geometric = np.cross(along, across)
+        scale = (direction * geometric).sum(axis=1)
+        offset = origin - corner
+        turned = np.cross(offset, direction)
+        b, c = (across * turned).sum(axis=1) / -scale, (along * turned).sum(axis=1) / scale
+        normals = self.normals[face]
+        weights = np.stack([1 - b - c, b, c], axis=1)
+        normal = (normals * weights[:, :, None]).sum(axis=1)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        normal *= np.sign((normal * hits.normal).sum(axis=1))[:, None]
+        geometric /= np.linalg.norm(geometric, axis=1, keepdims=True)
+        geometric *= np.sign((geometric * hits.geometric).sum(axis=1))[:, None]
+        return Hits(corner + along * b[:, None] + across * c[:, None], geometric, normal)
+
+
+def _edges(triangles: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """First corner, and the edges from it to the others."""
+    return triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
-from mitsim.transport.coordinates import turn_and_origin
+from mitsim.transport.plugins.base import turn_and_origin
 from mitsim.transport.projector import PinholeRays
 
 if TYPE_CHECKING:
@@ -86,13 +86,13 @@ def first_squares(
     line = np.arange(0, n * unit, size)
     row, column = (axis.ravel() for axis in np.meshgrid(line, line, indexing="ij"))
     cell = size / unit * np.sqrt(rays.area)  # side of a square at unit distance
-    spots = [_seen(_spots(shape, rays, cell), rays, unit) for shape in mirrors]
+    spots = [_window_boxes(_spots(shape, rays, cell), rays, unit) for shape in mirrors]
     spots = [(low, high, np.maximum(step, least)) for low, high, step in spots]
     low, high, step = (np.concatenate(parts) for parts in zip(*spots, *more, strict=True))
     while len(row):
         small = step < size
         low, high, step = low[small], high[small], step[small]
-        divided = _covered(row // size, column // size, low / size, high / size)
+        divided = _squares_in_boxes(row // size, column // size, low / size, high / size)
         yield size, row[~divided], column[~divided]
         size //= 2
         row, column = (
@@ -133,9 +133,11 @@ def grazing(tracer: GlintRays, half_width: float, unit: int) -> tuple[list[Boxes
         one, other = order[:-1], order[1:]
         beside = (met.ray[other] == met.ray[one] + 1) & (met.ray[other] % _ACROSS != 0)
         one, other = one[beside], other[beside]
-        apart = np.linalg.norm(met.sensor[other] - met.sensor[one], axis=1)
-        near = np.linalg.norm((met.sensor[one] + met.sensor[other]) / 2, axis=1) < apart / 2 + math.sqrt(2) * half_width
-        for first, width in zip(one[near], apart[near], strict=True):
+        distance = np.linalg.norm(met.sensor[other] - met.sensor[one], axis=1)
+        near = (
+            np.linalg.norm((met.sensor[one] + met.sensor[other]) / 2, axis=1) < distance / 2 + math.sqrt(2) * half_width
+        )
+        for first, width in zip(one[near], distance[near], strict=True):
             ball, place = divmod(int(met.ray[first]), _ACROSS)
             plane, part = planes[ball], across[place : place + 2]
             arc = plane.arc(part, half_width, tracer.rays, unit)
@@ -183,7 +185,7 @@ class _Plane:
 
     def arc(self, across: FloatArray, half_width: float, rays: PinholeRays, unit: int) -> Boxes:
         """Boxes that find what rays ``across`` (2,) send to the sensor, and those beside the plane."""
-        step, wide = _TO_RIM * (1 - float(np.abs(across).max())), self._turned(half_width)
+        step, wide = _TO_RIM * (1 - float(np.abs(across).max())), self._half_angle(half_width)
         low, high = float(across.min()) - step, float(across.max()) + step
         count = min(math.ceil(2 * wide / (_PIECE * step)), _MOST_PIECES)
         ends = np.linspace(-wide, wide, count + 1)
@@ -200,14 +202,14 @@ class _Plane:
     def flux(self, across: FloatArray, half_width: float, rays: PinholeRays) -> float:
         """Flux between the arcs of two rays ``across`` (2,)."""
         ring = abs(across[1] ** 2 - across[0] ** 2) / 2 * (self.radius / self.distance) ** 2
-        return float(rays.power.mean() * ring * 2 * self._turned(half_width))
+        return float(rays.power.mean() * ring * 2 * self._half_angle(half_width))
 
-    def _turned(self, half_width: float) -> float:
+    def _half_angle(self, half_width: float) -> float:
         """Angle to either side, about the line from the projector to the ball, that light on the sensor leaves at."""
         return min(math.pi, math.sqrt(2) * half_width / max(self.aside, half_width / 4))
 
 
-def _covered(row: IntArray, column: IntArray, low: FloatArray, high: FloatArray) -> BoolArray:
+def _squares_in_boxes(row: IntArray, column: IntArray, low: FloatArray, high: FloatArray) -> BoolArray:
     """(q,) whether squares (row, column) meet one of the boxes from ``low`` to ``high`` (k, 2), in squares."""
     found = np.zeros(len(row), dtype=bool)
     if not len(low):
@@ -231,7 +233,7 @@ def _covered(row: IntArray, column: IntArray, low: FloatArray, high: FloatArray)
     return found
 
 
-def _seen(spots: _Spots, rays: PinholeRays, unit: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _window_boxes(spots: _Spots, rays: PinholeRays, unit: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Boxes (k, 2) that hold ``spots`` in the window, and steps, in points of the lattice."""
     place, depth = rays.points(spots.centre)
     front = (depth > 0) & np.isfinite(place).all(axis=1)

@@ -8,7 +8,7 @@ hole as before it. Scenes without such surfaces keep a plain test of visibility.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -16,7 +16,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsim.core.arrays import FloatArray
 from mitsim.transport.plugins.glass import is_glass
+from mitsim.transport.sampler import generator
 
 CLEAR = 32 * 2.0**-24
 """How far a ray starts beyond a surface, for each mm of its coordinates, where a scene transmits light: 32 roundings of
@@ -44,6 +46,27 @@ def transmits(scene: mi.Scene) -> bool:
 
 def _instanced(scene: mi.Scene) -> bool:
     return any(shape.class_name() == "Instance" for shape in scene.shapes())
+
+
+@dataclass
+class Arrival:
+    """Light that comes to points of surfaces: in a ``direction``, and which samples in flight count."""
+
+    si: mi.SurfaceInteraction3f
+    direction: mi.Vector3f
+    light: mi.Spectrum
+    active: mi.Bool
+
+    def turn(self, number: mi.Float, point: mi.Point2f) -> mi.BSDFSample3f:
+        """Where it goes on, sampled as the surfaces scatter by a random ``number`` and ``point``."""
+        self.si.wi = self.si.to_local(-self.direction)
+        context = mi.BSDFContext(mi.TransportMode.Importance)
+        return self.si.bsdf().sample(context, self.si, number, point, self.active)[0]
+
+    def density(self, local: mi.Vector3f) -> mi.Float:
+        """Density [1/sr] of such a turn to ``local`` directions."""
+        self.si.wi = self.si.to_local(-self.direction)
+        return self.si.bsdf().pdf(mi.BSDFContext(mi.TransportMode.Importance), self.si, local, self.active)
 
 
 @dataclass
@@ -96,7 +119,7 @@ class Passage:
             return ~self.scene.ray_test(self.leaving_to(si, target), active), mi.Spectrum(1)
         ray = self.leaving_to(si, target)
 
-        def further(active: mi.Bool, ray: mi.Ray3f, part: mi.Spectrum) -> tuple[mi.Bool, mi.Ray3f, mi.Spectrum]:
+        def advance(active: mi.Bool, ray: mi.Ray3f, part: mi.Spectrum) -> tuple[mi.Bool, mi.Ray3f, mi.Spectrum]:
             met = self.next_surface(ray, active)
             active &= met.is_valid()
             part = dr.select(active, part * self.straight(met, active), part)
@@ -107,7 +130,7 @@ class Passage:
             return active, ray, part
 
         state = mi.Bool(active), ray, mi.Spectrum(1)
-        _, _, part = dr.while_loop(state, lambda active, *_: active, further, labels=("active", "ray", "part"))
+        _, _, part = dr.while_loop(state, lambda active, *_: active, advance, labels=("active", "ray", "part"))
         return dr.max(part) > 0, part
 
     def along(
@@ -115,11 +138,11 @@ class Passage:
         ray: mi.Ray3f,
         light: mi.Spectrum,
         state: State,
-        visit: Callable[[mi.SurfaceInteraction3f, mi.Vector3f, mi.Spectrum, mi.Bool, State], State],
+        visit: Callable[[Arrival, State], State],
     ) -> State:
         """What is made of all surfaces that rays meet one behind another, as far as these let light pass.
 
-        Rays of neighbouring lanes are taken for coherent, which are found faster.
+        Neighbouring rays are taken for coherent, which are found faster.
 
         Parameters
         ----------
@@ -128,25 +151,24 @@ class Passage:
         state
             before that.
         visit
-            of points of surfaces, the direction and the light that come to them, and the lanes that count, makes
-            another state of one.
+            of what comes to a surface, and a state, makes another state.
         """
         if not self.open:
             si = self.scene.ray_intersect(ray, mi.RayFlags.All, True)
-            return visit(si, ray.d, light, si.is_valid(), state)
+            return visit(Arrival(si, ray.d, light, si.is_valid()), state)
 
-        def further(active: mi.Bool, ray: mi.Ray3f, light: mi.Spectrum, *state: object) -> tuple[object, ...]:
+        def advance(active: mi.Bool, ray: mi.Ray3f, light: mi.Spectrum, *state: object) -> tuple[object, ...]:
             si = self.next_surface(ray, active, coherent=True)
             active &= si.is_valid()
             # Before the visit, which may turn the surface to where it is seen from.
             passed = self.through(si, ray.d, active)
             onward = self.onward(si, passed.direction)
-            state = visit(si, ray.d, light, active, state)  # type: ignore[arg-type]
+            state = visit(Arrival(si, ray.d, light, active), state)  # type: ignore[arg-type]
             light = light * passed.part
             return active & (dr.max(light) > 0), onward, light, *state
 
         begun = mi.Bool(True), ray, light, *state
-        return dr.while_loop(begun, lambda active, *_: active, further)[3:]  # type: ignore[no-any-return]
+        return dr.while_loop(begun, lambda active, *_: active, advance)[3:]  # type: ignore[no-any-return]
 
     def next_surface(self, ray: mi.Ray3f, active: mi.Bool, coherent: bool = False) -> mi.SurfaceInteraction3f:
         """Where a ray that goes on meets the next surface: never behind its start, so that it gets on.
@@ -248,6 +270,17 @@ class Passage:
 
 
 # -------- Flat panes of glass
+#
+# A window, an aquarium's wall, a cover glass: between a surface and the sensor or the projector stand flat faces that
+# bend light. A straight connection misses; but for planes there is one direction that arrives, and Newton's method
+# finds it from the straight one. A ray is traced with its two differentials (Igehy 1999), which planes keep exact:
+# where it crosses the target's plane, and how the crossing moves with the direction. After three or four corrections
+# the same differentials give the solid angle dw that the target's area dA fills, seen from the point, in place of cos /
+# r^2.
+#
+# Seen from the target, the point seems to lie at distance R = (dA / dw)^(1/2) on the line that its light arrives by:
+# with this *apparent* point all else is as without glass, and light is weaker by the faces' transmittance. Reflections
+# inside of a pane are found by paths that are followed.
 
 _STEPS = 8
 """Most corrections of a ray's direction: each squares the error, so that four bring 100 mm to float32's rounding."""
@@ -339,13 +372,13 @@ class _Ray:
     part: mi.Spectrum
     eta: mi.Float
 
-    def moved(self, distance: mi.Float, normal: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f]:
+    def move_crossing(self, distance: mi.Float, normal: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f]:
         """How its crossing moves with the plane of a ``normal`` at a ``distance``."""
-        moved = []
+        moves = []
         for place, direction in ((self.place_a, self.direction_a), (self.place_b, self.direction_b)):
             at = place + direction * distance
-            moved.append(at - self.direction * (dr.dot(at, normal) / dr.dot(self.direction, normal)))
-        return moved[0], moved[1]
+            moves.append(at - self.direction * (dr.dot(at, normal) / dr.dot(self.direction, normal)))
+        return moves[0], moves[1]
 
 
 @dataclass
@@ -383,7 +416,7 @@ def refracted_way(passage: Passage, si: mi.SurfaceInteraction3f, target: mi.Poin
         mi.Bool(active), search.facing, mi.UInt32(0), mi.Float(dr.inf), search.facing, nothing, nothing, mi.Spectrum(0),
         mi.Float(1),
     )  # fmt: skip
-    (aim,) = dr.while_loop((start,), lambda aim: aim.active, lambda aim: (search.corrected(aim),))
+    (aim,) = dr.while_loop((start,), lambda aim: aim.active, lambda aim: (search.correct(aim),))
     seen = active & (aim.miss < _MET) & (dr.max(aim.part) > 0)
     apparent = target - aim.arriving * dr.sqrt(aim.squared)
     return Way(aim.direction, apparent, aim.length, aim.part, aim.eta, seen)
@@ -398,7 +431,7 @@ class _Search:
     target: mi.Point3f
     facing: mi.Vector3f
 
-    def corrected(self, aim: _Aim) -> _Aim:
+    def correct(self, aim: _Aim) -> _Aim:
         """What the ray of ``aim`` does at the target's plane, and a better direction."""
         facing, (a, b) = self.facing, mi.coordinate_system(aim.direction)
         zero, clear = mi.Vector3f(0), self.passage.clear(self.si, aim.direction)
@@ -406,12 +439,12 @@ class _Search:
             mi.Bool(aim.active), self.si.p, aim.direction, clear, zero, zero, a, b, mi.Float(0), mi.Spectrum(1),
             mi.Float(1),
         )  # fmt: skip
-        (ray,) = dr.while_loop((ray,), lambda ray: ray.active, lambda ray: (self.further(ray),))
+        (ray,) = dr.while_loop((ray,), lambda ray: ray.active, lambda ray: (self.advance(ray),))
         distance = self.reach(ray)
         error = self.target - (ray.place + ray.direction * distance)
         u, v = mi.coordinate_system(facing)
         (au, av), (bu, bv), (eu, ev) = (
-            (dr.dot(moved, u), dr.dot(moved, v)) for moved in (*ray.moved(distance, facing), error)
+            (dr.dot(move, u), dr.dot(move, v)) for move in (*ray.move_crossing(distance, facing), error)
         )
         area = au * bv - av * bu
         step = a * ((eu * bv - ev * bu) / area) + b * ((au * ev - av * eu) / area)
@@ -435,28 +468,111 @@ class _Search:
         """Distance [mm] of a ``ray`` to the target's plane."""
         return dr.dot(self.target - ray.place, self.facing) / dr.dot(ray.direction, self.facing)
 
-    def further(self, ray: _Ray) -> _Ray:
+    def advance(self, ray: _Ray) -> _Ray:
         """A ``ray`` beyond the next surface before the target; what is opaque stops its light, not the search."""
         origin = ray.place + ray.direction * ray.clear
         onward = mi.Ray3f(origin, ray.direction, self.si.time, self.si.wavelengths)
         met = self.passage.next_surface(onward, ray.active)
         distance = met.t + ray.clear
         before = ray.active & met.is_valid() & (distance < self.reach(ray))
-        place_a, place_b = ray.moved(distance, met.n)
+        place_a, place_b = ray.move_crossing(distance, met.n)
         passed = self.passage.through(met, ray.direction, before)
         # Snell: d' = d / eta + (c / eta - c') n, c and c' the cosines to the normal that faces the ray.
         normal = met.n * -dr.sign(dr.dot(met.n, ray.direction))
         cosine, inside = -dr.dot(normal, ray.direction), -dr.dot(normal, passed.direction)
         ratio = dr.rcp(passed.eta)
 
-        def turned(direction: mi.Vector3f) -> mi.Vector3f:
+        def turn(direction: mi.Vector3f) -> mi.Vector3f:
             change = -dr.dot(normal, direction)
             return direction * ratio + normal * (ratio * change - dr.square(ratio) * cosine * change / inside)
 
-        changed = _Ray(
+        refracted = _Ray(
             before, met.p, passed.direction, self.passage.clear(met, passed.direction), place_a, place_b,
-            turned(ray.direction_a), turned(ray.direction_b), ray.length + distance, ray.part * passed.part,
+            turn(ray.direction_a), turn(ray.direction_b), ray.length + distance, ray.part * passed.part,
             ray.eta * passed.eta,
         )  # fmt: skip
-        chosen = {name: dr.select(before, getattr(changed, name), getattr(ray, name)) for name in vars(ray)}
+        chosen = {name: dr.select(before, getattr(refracted, name), getattr(ray, name)) for name in vars(ray)}
         return _Ray(**{**chosen, "active": before})
+
+
+# -------- Surfaces in contact with what lets light through
+#
+# A ray that has passed a surface starts a little beyond it, and does not see what stands closer: a print in contact
+# with glass comes out black. Mitsuba's own integrators start 9e-5 of the coordinates beyond, 0.036 mm at 400 mm, the
+# tracers of this room CLEAR.
+
+_OWN, _MITSUBA = 2 * CLEAR, 1.1 * 1500 * 2.0**-24
+"""Gaps, for each mm of coordinates, that our tracers and Mitsuba's integrators still see: their own offsets, with what
+rounding leaves of both surfaces."""
+_POINTS, _FEWEST = 2**16, 8
+"""Points of each surface that are looked at, and how many make a contact: a ball that rests on a pane touches none."""
+_PARALLEL = 0.999
+"""Cosine between normals of two surfaces in contact; where cards cross they come close, and hide nothing there."""
+_MOST = 16
+"""Surfaces that are looked at; with more of them contacts of the others are not found."""
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Number of a shape that lets light through, its distance [mm] to what stands too close, and the least allowed."""
+
+    shape: int
+    gap: float
+    least: float
+
+    def words(self, estimator: str) -> tuple[str, str]:
+        """What was found, and what an ``estimator`` allows."""
+        rule = (
+            f"{estimator} sees what stands at least {self.least:.2g} mm from a surface that lets light through; leave "
+            "a gap of air, or take one surface with the material of both"
+        )
+        return f"another surface at a distance of {self.gap:.2g} mm", rule
+
+
+def contacts(scene: mi.Scene) -> tuple[Contact | None, Contact | None]:
+    """Why the factored estimator and the reference must not be given a ``scene``; None where they may."""
+    shapes = [shape for shape in scene.shapes() if shape.bsdf() is not None]
+    clear = [shape for shape in shapes if lets_through(shape.bsdf())]
+    found: list[Contact | None] = [None, None]
+    for shape in clear[:_MOST]:
+        gap, size = _gaps(shape, [other for other in shapes if other is not shape and _close(shape, other)])
+        at = np.argsort(gap / size)[_FEWEST - 1]
+        for which, limit in enumerate((_OWN, _MITSUBA)):
+            if found[which] is None and gap[at] < limit * size[at]:
+                index = list(scene.shapes()).index(shape)
+                found[which] = Contact(index, float(gap[at]), float(limit * size[at]))
+    return found[0], found[1]
+
+
+def _close(shape: mi.Shape, other: mi.Shape) -> bool:
+    """Whether the boxes of two shapes meet, but for a gap that is looked for."""
+    (low, high), (first, last) = ([np.array(box.min), np.array(box.max)] for box in (shape.bbox(), other.bbox()))
+    reach = _MITSUBA * (1 + max(np.abs(low).max(), np.abs(high).max()))
+    return bool((first - reach <= high).all() and (low - reach <= last).all())
+
+
+def _gaps(shape: mi.Shape, others: Sequence[mi.Shape]) -> tuple[FloatArray, FloatArray]:
+    """Distances [mm] of points of a ``shape`` to the next parallel surface of its own or of ``others``, inf where none
+    is close, and the points' coordinates."""
+    named = {f"shape{i}": other for i, other in enumerate(others)}
+    # Surfaces that coincide with the shape's own are found without it.
+    scenes = [(mi.load_dict({"type": "scene", **named, "own": shape}), 2 * CLEAR)]
+    if named:
+        scenes.append((mi.load_dict({"type": "scene", **named}), -CLEAR))
+    rng = generator(mi.UInt32(0), dr.arange(mi.UInt32, _POINTS))
+    sample = shape.sample_position(0, mi.Point2f(rng.next_float32(), rng.next_float32()))
+    size = 1 + dr.max(dr.abs(sample.p))
+    # A disk in its own plane has one normal for all points. Of a single direction for many rays Dr.Jit 1.5.0 writes a
+    # kernel that LLVM cannot parse, and ends the process.
+    normal = mi.Vector3f(sample.n) + 0 * sample.p
+    gap = mi.Float(dr.inf)
+    for sign in (1, -1):
+        direction = normal * sign
+        for among, first in scenes:
+            ray = mi.Ray3f(sample.p + direction * (first * size), direction)
+            ray.maxt = (_MITSUBA - first) * size
+            met = among.ray_intersect(ray)
+            parallel = met.is_valid() & (dr.abs(dr.dot(met.n, normal)) > _PARALLEL)
+            gap = dr.minimum(gap, dr.select(parallel, dr.abs(met.t + first * size), dr.inf))
+    dr.eval(gap, size)
+    return np.array(gap, dtype=np.float64), np.array(size, dtype=np.float64)

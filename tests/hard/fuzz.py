@@ -306,11 +306,11 @@ def main() -> None:
     kind, first, count, seconds = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4])
     if kind in ("load", "mesh", "image"):
         from mitsim.core.environment import load_variant
-        from mitsim.transport.plugins import all
+        from mitsim.transport import plugins
 
         mi = load_variant("llvm_ad_mono")
         mi.set_log_level(mi.LogLevel.Error)
-        all.register()
+        plugins.register()
     else:
         resource.setrlimit(resource.RLIMIT_AS, (_ROOM, resource.RLIM_INFINITY))
     signal.signal(signal.SIGALRM, _hangs)

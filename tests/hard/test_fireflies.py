@@ -64,7 +64,7 @@ def test_a_capture_tells_of_fireflies(
     bench = open_bench(small_scene(**glossy(1e-3)))
     plan = make_plan(bench, Lighting.uniform(N), 2e-2, 1, {"diffraction": False})
     plan = replace(plan, settings=Settings(Z, samples={"direct": 32}), sampling_target=1e9, warnings=())
-    monkeypatch.setattr("mitsim.acquire.capture.make_plan", lambda *_: plan)
+    monkeypatch.setattr("mitsim.acquire.spectral.make_plan", lambda *_: plan)
     for seed, fireflies in ((27, True), (4, False)):
         result = bench.capture("uniform", tmp_path / f"run{seed}", accuracy=2e-2, seed=seed)
         heaviest = result.manifest.heaviest_group

@@ -18,14 +18,13 @@ import numpy as np
 import pytest
 
 from mitsim.acquire.reference import reference
-from mitsim.acquire.spectral import ColourBench, line_alone
+from mitsim.acquire.spectral import SpectralBench, line_alone
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
 from mitsim.core.spectral_manifests import RUN
 from mitsim.light.lamps import lit_by_lamps
 from mitsim.transport.accumulator import Ledger
-from mitsim.transport.direct import DirectTracer
-from mitsim.transport.flux import FluxTracer
+from mitsim.transport.direct import DirectTracer, FluxTracer
 from mitsim.transport.from_camera import Counted, FromCameraTracer, LampTracer, Paths
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.path_reuse import NeighbourTracer
@@ -133,7 +132,7 @@ def lamps(bench: Bench) -> list[list[float]]:
 def both(name: str, opened: Callable[[str, str], Bench]) -> dict[str, Any]:
     """Light of a scene by the way that it is followed: of several lines in dispersive glass, and of each in plain
     glass."""
-    whole = ColourBench.of(opened(name, GLASS), RUN).whole
+    whole = SpectralBench.of(opened(name, GLASS), RUN).whole
     assert whole.lines is not None
     pairs = zip(LINES, whole.lines.single, strict=True)
     alone = [line_alone(opened(name, PLAIN.format(index(nm))), line) for nm, line in pairs]

@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from mitsim.api.bench import open_bench
 from mitsim.bench.effects import EFFECTS
-from mitsim.calibrate.model_fit import model_of
+from mitsim.calibrate.model import model_of
 from mitsim.calibrate.session import Session
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError

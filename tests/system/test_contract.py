@@ -266,7 +266,7 @@ def test_a_fault_of_the_program_is_one_line_and_its_traceback_is_kept(
     def broken(*arguments: object) -> None:
         raise ZeroDivisionError("planted\x1b[31m\nand more")
 
-    monkeypatch.setattr("mitsim.acquire.capture.make_plan", broken)
+    monkeypatch.setattr("mitsim.acquire.spectral.make_plan", broken)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     line = call("plan", *lab.rig).refusal
     assert line.startswith("a fault of mitsim's own, ZeroDivisionError: planted [31m and more; its traceback is in /")

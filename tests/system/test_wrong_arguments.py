@@ -68,13 +68,13 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     import mitsuba as mi
 
     from mitsim.light import passes
-    from mitsim.transport import flux
+    from mitsim.transport import direct
 
     def works(*_: object, **__: object) -> None:
         raise Worked
 
     monkeypatch.setattr(passes.Stage, "trace", works)
-    monkeypatch.setattr(flux.FluxTracer, "sums", works)
+    monkeypatch.setattr(direct.FluxTracer, "sums", works)
     monkeypatch.setattr(mi, "render", works)
     yield
 

@@ -46,8 +46,8 @@ from mitsim.light.truth import Truth
 from mitsim.optics.frames import ClassFrames, ExpectedFrames
 from mitsim.scene.projector import straightening
 from mitsim.transport.accumulator import DeviceSums, Ledger
-from mitsim.transport.coordinates import rows_columns, turn_and_origin
 from mitsim.transport.integrator import ANY, FollowingTracer
+from mitsim.transport.plugins.base import rows_columns, turn_and_origin
 from mitsim.transport.projector import CanvasMap
 from mitsim.transport.records import DIRECT, Deposits
 

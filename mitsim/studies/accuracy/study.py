@@ -26,9 +26,10 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from mitsim.acquire.capture import capture
+from mitsim.acquire.spectral import SpectralBench
 from mitsim.bench.bench import Apparatus
 from mitsim.bench.effects import present
-from mitsim.bench.request import Request
+from mitsim.bench.request import Request, Task
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.core.runs import Capture
@@ -215,7 +216,8 @@ class Runs:
             """Seconds of the run."""
             job = Job()
             with TemporaryDirectory(prefix="mitsim-study-") as folder:
-                shots = capture(self._stand.bench, request, job, Path(folder) / "run")
+                task = Task(Path(folder) / "run", job=job)
+                shots = capture(SpectralBench(self._stand.bench), request, task).runs[0]
                 seconds = job.clock.seconds()
                 if not found:
                     error = self._judge.error(self._irradiance(shots))

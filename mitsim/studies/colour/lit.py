@@ -16,17 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from mitsim.acquire.capture import plan_request
 from mitsim.acquire.exposure import Exposer
-from mitsim.acquire.spectral import ColourBench
+from mitsim.acquire.spectral import SpectralBench, plan_request
 from mitsim.api.bench import Bench, open_bench
-from mitsim.bench.request import Request
-from mitsim.calibrate.spectral import calibrate_lines
+from mitsim.bench.request import Request, SessionRequest, Task
+from mitsim.calibrate.calibrate import calibrate_lines
 from mitsim.core import spectral_manifests
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import load_model, locate
 from mitsim.core.errors import MitsimError
-from mitsim.core.job import Job
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.core.spectral_manifests import RUN
@@ -98,15 +96,15 @@ def lit_lines(setup: Setup, seed: int) -> tuple[LitLine, ...]:
     MitsimError
         as :meth:`mitsim.bench.bench.Bench.capture_lines`.
     """
-    colours = ColourBench.of(_opened(setup, locate(setup.scene, "scenes", "scene.xml")), RUN)
+    colours = SpectralBench.of(_opened(setup, locate(setup.scene, "scenes", "scene.xml")), RUN)
     request = Request.of(accuracy=setup.accuracy, seed=seed)
     plan = plan_request(colours.whole, request)
     lighting = colours.whole.family(request.patterns, seed).lighting
     lights = trace_lines(colours.whole, colours.benches, plan, lighting, seed)
-    factors = calibrate_lines(colours.whole, seed, setup.accuracy, None, None, False, Job())
+    factors = calibrate_lines(colours.whole, SessionRequest(seed, setup.accuracy), Task())
     return tuple(
-        LitLine(line.name, line.wavelength_nm, LitScene(light), factors[line.name])
-        for line, light in zip(colours.manifest.channels, lights, strict=True)
+        LitLine(name, light.bench.projector.effective_wavelength_nm, LitScene(light), factors[name])
+        for name, light in zip(colours.names, lights, strict=True)
     )
 
 

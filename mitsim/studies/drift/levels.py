@@ -20,11 +20,13 @@ from functools import cached_property
 
 import numpy as np
 
-from mitsim.acquire.capture import capture, digital_scale
+from mitsim.acquire.capture import capture
 from mitsim.acquire.exposure import Exposer
+from mitsim.acquire.spectral import SpectralBench
 from mitsim.bench.bench import Apparatus
 from mitsim.bench.request import Exposure
 from mitsim.calibrate.calibrate import estimate
+from mitsim.calibrate.lit_session import LitSession
 from mitsim.calibrate.session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import versions
@@ -32,7 +34,7 @@ from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.patterns import Lighting
-from mitsim.devices.sensor import SensorModel
+from mitsim.devices.sensor import SensorModel, digital_of
 from mitsim.devices.session import load_recipe
 from mitsim.reconstruct.estimate_factors import Estimate, factors_of_sums, stripe_sums
 from mitsim.reconstruct.factors import Factors
@@ -76,7 +78,7 @@ class Sessions:
         self._session, job = Session(bench, load_recipe(), seed), Job()
         light = self._session.trace(self._session.plan(1e-3, job), job)
         self._anatomy = Anatomy(light, light.flux, light.flux, "calibration")
-        self._lit = self._session.lit(light, job)
+        self._lit = LitSession.of(self._session, light, job)
         self._kept: dict[frozenset[str], Estimate] = {}
         self._effects = _OF_SESSIONS & frozenset(self._anatomy.effects)
 
@@ -117,7 +119,7 @@ class Sessions:
             camera=bench.identity(),
             centre=self._session.centre,
             board_reflectance=self._session.recipe.board_reflectance,
-            digital=digital_scale(bench, self._lit.exposure_s),
+            digital=digital_of(bench.sensor, self._lit.exposure_s),
             parallax=bench.parallax,
             versions=versions(),
         )
@@ -180,7 +182,7 @@ class Levels:
         request = light.plan.request
         assert request is not None
         asked = request.changed(patterns=self._patterns, seed=self._seed, exposure_fraction=fraction)
-        shots = capture(bench, asked, light=self._anatomy.without(off))
+        shots = capture(SpectralBench(bench), asked, lights=[self._anatomy.without(off)]).runs[0]
         calibrated = self._sessions.factors(off, CALIBRATION_NOISE not in off)
         found = {}
         for model, factors in zip(MODELS, (self._assumed, calibrated), strict=True):

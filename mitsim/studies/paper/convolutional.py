@@ -17,7 +17,7 @@ from functools import cache
 import numpy as np
 from matplotlib.figure import Figure
 
-from mitsim.bench.diffuser import rendered_psf
+from mitsim.acquire.reference import rendered_psf
 from mitsim.core.arrays import FloatArray
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.mask_profile import load_psf

@@ -3,7 +3,7 @@
 The camera is not built as it was to be: its mask is 50 um too far from the sensor, and 37 and -21 um off the axis. A
 model starts from the plan and is fitted to the first frames of a session; measured factors need all patterns of it, and
 more frames by taking each several times, or fewer by one uniform shot instead of a second half of each pair. Measured
-factors have the noise of their session in closed form (:mod:`mitsim.calibrate.predict`), so that one session is formed.
+factors have the noise of their session in closed form (:mod:`mitsim.calibrate.plan`), so one session is formed.
 """
 
 from __future__ import annotations
@@ -15,9 +15,11 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from mitsim.api.bench import Bench
-from mitsim.calibrate.model_fit import fit_placement, model_of, modelled_factors, simulated
-from mitsim.calibrate.predict import Foreseen
-from mitsim.calibrate.session import LitSession, Session
+from mitsim.calibrate.lit_session import LitSession
+from mitsim.calibrate.model import model_of, modelled_factors, simulated
+from mitsim.calibrate.placement import fit_placement
+from mitsim.calibrate.plan import PredictedSession
+from mitsim.calibrate.session import Session
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.devices.session import Modelling, SessionRecipe, load_recipe
@@ -101,18 +103,18 @@ def _measure(studio: Studio, point: Point) -> Found:
     return found(point, None, **image.row(), frames=frames, **told)
 
 
-def _session(studio: Studio, setup: Setup, recipe: SessionRecipe) -> Foreseen:
+def _session(studio: Studio, setup: Setup, recipe: SessionRecipe) -> PredictedSession:
     """The session of the camera as built, by a recipe's way of signed patterns; its light and responses are kept."""
 
-    def formed() -> Foreseen:
+    def formed() -> PredictedSession:
         bench, job = studio.bench(setup.printed(None)), Job()
         planned = Session(bench, load_recipe(), 0)
         light = planned.trace(planned.plan(setup.accuracy, job), job)
         session = Session(as_built(bench), load_recipe(), 0)
-        return Foreseen.of(session.lit(light.behind(session.board), job), job)
+        return PredictedSession.of(LitSession.of(session, light.behind(session.board), job), job)
 
-    kept: Foreseen = studio.once("session as built", 1, setup.printed(None), formed)
-    return Foreseen(kept.by(recipe), kept.sums)
+    kept: PredictedSession = studio.once("session as built", 1, setup.printed(None), formed)
+    return PredictedSession(kept.by(recipe), kept.sums)
 
 
 def _modelled(bench: Bench, lit: LitSession, point: Point) -> Factors:

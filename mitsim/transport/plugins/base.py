@@ -1,14 +1,20 @@
-"""Plugins of our own and Mitsuba's variants: registration once for each."""
+"""What plugins and tracers share: registration once for each variant, coordinates, and arrays on the host.
+
+Index coordinates grow as rows and columns of images do: row = -y, column = -x in Mitsuba's camera frame, as lengths or
+as tan-angles.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
+from pydantic import BaseModel
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
@@ -41,6 +47,37 @@ def register_once(kind: str, plugin: str, build: Callable[[], type]) -> None:
         _REGISTERED.add((variant, plugin))
 
 
+def numbers(text: str) -> list[float]:
+    """Those of a list in a scene file, a ``text`` with commas or blanks between them; ValueError where one is none."""
+    return [float(word) for word in re.split(r"[\s,]+", text.strip()) if word]
+
+
+def bsdf_class() -> type:
+    """Base of our BSDFs for the variant in use.
+
+    ``name`` is the plugin's, ``model`` holds its checked parameters; without ``eval_pdf`` of its own a BSDF is a delta,
+    which no given direction meets.
+    """
+
+    class ModelBSDF(mi.BSDF):  # type: ignore[misc]
+        name: str
+        model: BaseModel
+
+        def eval_pdf(self, *turn: Any) -> tuple[mi.Spectrum, mi.Float]:
+            return mi.Spectrum(0), mi.Float(0)
+
+        def eval(self, *turn: Any) -> mi.Spectrum:
+            return self.eval_pdf(*turn)[0]
+
+        def pdf(self, *turn: Any) -> mi.Float:
+            return self.eval_pdf(*turn)[1]
+
+        def to_string(self) -> str:
+            return f"{self.name}[{self.model}]"
+
+    return ModelBSDF
+
+
 # -------- Between Dr.Jit and NumPy
 
 
@@ -71,3 +108,32 @@ def lanes_of(vectors: FloatArray) -> tuple[mi.Float, mi.Float, mi.Float]:
     first = 3 * dr.arange(mi.UInt32, len(vectors))
     x, y, z = (dr.gather(mi.Float, flat, first + part) for part in range(3))
     return x, y, z
+
+
+# -------- Coordinates
+
+Numbers: TypeAlias = "mi.Float | FloatArray"
+"""What the formulas of this room take: the renderer's numbers, a lane each, or NumPy's."""
+RIGID = 1e-4
+"""Largest :func:`rigidity_error` of a rigid transform: matrices of five digits pass, a scale of 1.0001 does not."""
+
+
+def rows_columns(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
+    """Index coordinates (row, column) of a point ``x``, ``y`` of the camera's frame, in their unit."""
+    return -y, -x
+
+
+def x_y(row: Numbers, column: Numbers) -> tuple[Numbers, Numbers]:
+    """Camera coordinates (x, y) of index coordinates ``row``, ``column``, in their unit."""
+    return -column, -row
+
+
+def turn_and_origin(transform: mi.AffineTransform4f) -> tuple[FloatArray, FloatArray]:
+    """(3, 3) linear part and (3,) origin [mm] of a ``transform``, in double precision."""
+    matrix = np.array(transform.matrix, dtype=np.float64).reshape(4, 4, -1)[..., 0]
+    return matrix[:3, :3], matrix[:3, 3]
+
+
+def rigidity_error(turn: FloatArray) -> float:
+    """Largest entry of R^T R - 1 for the linear part ``turn`` (3, 3) of a transform: 0 where it only turns."""
+    return float(np.abs(turn.T @ turn - np.eye(3)).max())

@@ -183,7 +183,7 @@ def point_spread(
         x = ((np.arange(first, first + count)[:, None] + jitter[0]) / rays - 0.5) * side
         y = ((np.arange(rays)[None, :] + jitter[1]) / rays - 0.5) * side
         places = np.stack([x.ravel() + start[0], y.ravel() + start[1], np.full(x.size, diffuser.distance_mm + above)])
-        place, part = _landed(scene, places, np.array([*tilt, -1.0]))
+        place, part = _landing(scene, places, np.array([*tilt, -1.0]))
         row = np.floor(rows / 2 - place[:, 1] / pitch_mm)
         column = np.floor(columns / 2 - place[:, 0] / pitch_mm)
         seen = (row >= 0) & (row < rows) & (column >= 0) & (column < columns) & (part > 0)
@@ -192,7 +192,7 @@ def point_spread(
     return np.asarray(light.reshape(shape) * (side / rays / pitch_mm) ** 2)
 
 
-def _landed(scene: mi.Scene, places: FloatArray, along: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _landing(scene: mi.Scene, places: FloatArray, along: FloatArray) -> tuple[FloatArray, FloatArray]:
     """(k, 3) where rays from ``places`` (3, k) ``along`` a direction cross z = 0, and (k,) the part of their light."""
     unit = along / np.linalg.norm(along)
     ray = mi.Ray3f(mi.Point3f(places.astype(np.float32)), mi.Vector3f(*unit.tolist()))

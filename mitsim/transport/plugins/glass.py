@@ -23,7 +23,8 @@ parameter        unit  default      meaning
 
 Mono variants have one wavelength: the projector's effective one, which a bench sets (:func:`tune`), or the one given.
 In spectral variants light of several wavelengths on one path would part at the glass. A face refracts by the path's
-first wavelength, so each path must carry one alone (:attr:`mitsim.transport.projector.ProjectorOptics.apart`). Glass
+first wavelength, so each path must carry one alone
+(:attr:`mitsim.transport.projector.ProjectorOptics.per_wavelength`). Glass
 absorbs nothing. No polarisation. ``mi.traverse`` shows ``wavelength``.
 
 XML, a prism's material::
@@ -35,7 +36,6 @@ Python: ``register(); mi.load_dict({"type": "mitsim_glass", "index": 1.62, "abbe
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from types import MappingProxyType
 from typing import Any, TypeVar
@@ -47,7 +47,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from mitsim.core.configuration import read_toml, shipped, validated
 from mitsim.core.errors import MitsimError
-from mitsim.transport.plugins.base import register_once
+from mitsim.transport.plugins.base import bsdf_class, numbers, register_once
 
 PLUGIN = "mitsim_glass"
 _USUAL = "n-bk7"
@@ -140,7 +140,7 @@ def _model(props: mi.Properties) -> GlassModel:
     text = values.get("sellmeier")
     if text is not None:
         try:
-            values["sellmeier"] = [float(word) for word in re.split(r"[\s,]+", str(text).strip(" []")) if word]
+            values["sellmeier"] = numbers(str(text).strip(" []"))
         except ValueError:
             raise MitsimError(f"{PLUGIN}: sellmeier: got {text!r}; give numbers separated by commas") from None
     return GlassModel.checked(**values)
@@ -171,7 +171,9 @@ def tune(scene: mi.Scene, wavelength_nm: float) -> None:
 def _bsdf_class() -> type:
     """The plugin for the variant in use: Mitsuba's base classes exist per variant."""
 
-    class DispersiveGlass(mi.BSDF):  # type: ignore[misc]
+    class DispersiveGlass(bsdf_class()):  # type: ignore[misc]
+        name = PLUGIN
+
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
             self.model = _model(props)
@@ -215,23 +217,5 @@ def _bsdf_class() -> type:
                 # Radiance over the square of the index is what a face keeps (E. Veach 1997, 5.2).
                 weight *= dr.select(reflected, 1, dr.square(eta_ti))
             return bs, mi.depolarizer(mi.Spectrum(dr.select(active & (bs.pdf > 0), weight, 0)))
-
-        def eval(
-            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> mi.Spectrum:
-            return mi.Spectrum(0)
-
-        def pdf(
-            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> mi.Float:
-            return mi.Float(0)
-
-        def eval_pdf(
-            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> tuple[mi.Spectrum, mi.Float]:
-            return mi.Spectrum(0), mi.Float(0)
-
-        def to_string(self) -> str:
-            return f"{PLUGIN}[{self.model}]"
 
     return DispersiveGlass

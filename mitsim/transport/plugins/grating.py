@@ -61,7 +61,6 @@ Python: ``register(); mi.load_dict({"type": "mitsim_grating", "grooves": "linear
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Any, Literal
 
@@ -72,7 +71,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from mitsim.core.configuration import read_toml, shipped, validated
 from mitsim.core.errors import MitsimError
-from mitsim.transport.plugins.base import register_once
+from mitsim.transport.plugins.base import bsdf_class, numbers, register_once
 
 PLUGIN = "mitsim_grating"
 _ORDERS = 16
@@ -155,7 +154,7 @@ def _numbers(name: str, value: Any) -> object:
         return [value] if name in ("efficiencies", "negative_efficiencies", "wavelengths", "shares") else value
     try:
         if isinstance(value, str):
-            return [float(word) for word in re.split(r"[\s,]+", value.strip()) if word]
+            return numbers(value)
         return [float(number) for number in np.array(value, dtype=np.float64).ravel()]
     except (TypeError, ValueError):
         raise MitsimError(f"{PLUGIN}: {name}: got {value!r}; give numbers separated by commas") from None
@@ -164,7 +163,9 @@ def _numbers(name: str, value: Any) -> object:
 def _bsdf_class() -> type:
     """The plugin for the variant in use: Mitsuba's base classes exist per variant."""
 
-    class Grating(mi.BSDF):  # type: ignore[misc]
+    class Grating(bsdf_class()):  # type: ignore[misc]
+        name = PLUGIN
+
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
             self.model = _model(props)
@@ -262,16 +263,6 @@ def _bsdf_class() -> type:
             pdf = dr.select(active & (total > 0), dr.mean(density) / total, 0)
             return mi.depolarizer(dr.select(active, self.reflectance * density, 0)), pdf
 
-        def eval(
-            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> mi.Spectrum:
-            return self.eval_pdf(ctx, si, wo, active)[0]
-
-        def pdf(
-            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> mi.Float:
-            return self.eval_pdf(ctx, si, wo, active)[1]
-
         def sample(
             self,
             ctx: mi.BSDFContext,
@@ -302,8 +293,5 @@ def _bsdf_class() -> type:
             bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
             bs.sampled_component = 0
             return bs, dr.select(bs.pdf > 0, value / bs.pdf, 0)
-
-        def to_string(self) -> str:
-            return f"{PLUGIN}[{self.model}]"
 
     return Grating

@@ -50,8 +50,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.errors import MitsimError
-from mitsim.transport.coordinates import RIGID, rigidity_error
-from mitsim.transport.plugins.base import register_once
+from mitsim.transport.plugins.base import RIGID, register_once, rigidity_error
 from mitsim.transport.projector import CanvasMap
 
 PLUGIN = "mitsim_projector"

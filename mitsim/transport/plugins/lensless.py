@@ -68,8 +68,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import BoolArray, Flaws, Mask
 from mitsim.devices.plate import Plate
-from mitsim.transport.coordinates import RIGID, rigidity_error, rows_columns, turn_and_origin, x_y
-from mitsim.transport.plugins.base import register_once
+from mitsim.transport.plugins.base import RIGID, register_once, rigidity_error, rows_columns, turn_and_origin, x_y
 from mitsim.transport.sampler import generator, shuffled, stratified
 
 PLUGIN = "mitsim_lensless"
@@ -281,6 +280,10 @@ def _sensor_class() -> type:
 
 
 # -------- Where a mask is open
+#
+# A mask is a sum of grids that do not overlap (mitsim.devices.mask.Mask.openings): open where both its row and its
+# column are. On each axis the open length up to a coordinate is piecewise linear and so is its inverse, which makes a
+# random number a place: whatever rows are open, those within the range are met in proportion to their length.
 
 
 class OpenAxis:

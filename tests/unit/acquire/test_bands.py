@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from mitsim.acquire import spectral as bands
+from mitsim.acquire import choose_colour as bands
 from mitsim.api.bench import Bench
 from mitsim.bench.request import Request
 from mitsim.core.errors import MitsimError
@@ -57,8 +57,11 @@ def chosen(monkeypatch: pytest.MonkeyPatch) -> Callable[..., bands.Coloured]:
         monkeypatch.setattr(bands._Look, "errors", found)
         monkeypatch.setattr(bands, "reopened", lambda of, variant: of.reopened(variant))
         monkeypatch.setattr(bands, "plan_request", planned)
-        monkeypatch.setattr(bands, "plan_lines", planned)
-        monkeypatch.setattr(bands.ColourBench, "of", lambda whole, kind: {RUN: whole}[kind])
+
+        def of_lines(whole: Any, kind: str) -> Any:
+            return SimpleNamespace(plan=lambda request: planned({RUN: whole}[kind], request))
+
+        monkeypatch.setattr(bands.SpectralBench, "of", of_lines)
         return bands.choose_colour(of, Request.of(accuracy=accuracy))
 
     return choose
@@ -260,10 +263,10 @@ def test_a_look_is_at_few_rays_of_four_shots(monkeypatch: pytest.MonkeyPatch) ->
     assert look._deposits(of) == ["light"]
     of.lines = LASERS
     assert look._deposits(of) == ["light"] * 3
-    assert asked["traced"] == (integer(3, "colour"), 0, bands._RAYS) and asked["settings"] == look._settings
+    assert asked["traced"] == (integer(3, "colour"), 0, bands._RAYS_OF_BANDS) and asked["settings"] == look._settings
     found = look._electrons(of, "light")  # type: ignore[arg-type]
     assert found.shape == (2, 2, 2) and (found[1] == 250).all() and not found[0].any()
-    assert asked["filed"] == ("light", bands._RAYS) and asked["labels"] is look._lighting.labels
+    assert asked["filed"] == ("light", bands._RAYS_OF_BANDS) and asked["labels"] is look._lighting.labels
     assert asked["rows"] == list(range(look._lighting.weights.shape[1])) and not asked["leaking"]
     for diffracts, effects in ((False, {}), (True, {"diffraction": False})):
         of.geometry.diffracts = diffracts

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.acquire import mosaic
-from mitsim.acquire.mosaic import MosaicBench, MosaicFrames, MosaicLight
+from mitsim.acquire import spectral
+from mitsim.acquire.spectral import MosaicFrames, MosaicLight, without_filters
 from mitsim.api.bench import Bench, open_bench
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimates
+from mitsim.calibrate.lit_session import LitSession
 from mitsim.calibrate.session import Session
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
@@ -97,14 +98,14 @@ def test_sampling_looks_at_lamps_behind_each_filter(monkeypatch: pytest.MonkeyPa
     def alone(light: Any, bands: slice, seed: int) -> Any:
         return SimpleNamespace(sampling_error=lambda: (errors[bands.start], 0.0))
 
-    monkeypatch.setattr(mosaic, "_lamps_alone", alone)
+    monkeypatch.setattr(spectral, "_lamps_alone", alone)
     light: Any = SimpleNamespace(bench=SimpleNamespace(lamplight=lamplight), seed=0)
     energy = np.array([16.0, 2 * 4.0, 1.0])
     expected = np.sqrt(np.dot(energy, [1, 4, 9]) / energy.sum())
-    assert mosaic._excess([light, light]) == pytest.approx(expected)
+    assert spectral.excess_behind_filters([light, light]) == pytest.approx(expected)
     errors[None] = 0.05
     dark: Any = SimpleNamespace(bench=SimpleNamespace(lamplight=None))
-    assert mosaic._excess([light]) == mosaic._excess([dark]) == 1
+    assert spectral.excess_behind_filters([light]) == spectral.excess_behind_filters([dark]) == 1
 
 
 @pytest.fixture(scope="module")
@@ -129,8 +130,8 @@ def test_a_session_behind_filters_tells_the_bare_camera(bench: Bench, kept_plans
     job, recipe = Job(), load_recipe()
     session = Session(bench, recipe, 0, filters=passed)
     plan = session.plan(1e-2, job)
-    lit = session.lit(session.trace(plan, job), job)
-    (noisy, clean), saturated = estimates(lit, job, (NOISY, NOISE_FREE))
+    lit = LitSession.of(session, session.trace(plan, job), job)
+    (noisy, clean), saturated, _ = estimates(lit, job, (NOISY, NOISE_FREE))
     assert saturated == 0
     for name, predicted in zip(("left", "right"), noisy.predicted_error, strict=True):
         found, exact = getattr(noisy, name), getattr(clean, name)
@@ -141,7 +142,7 @@ def test_a_session_behind_filters_tells_the_bare_camera(bench: Bench, kept_plans
     assert noisy.noise == pytest.approx(lit.response_noise, rel=0.02)
     # The brightest pixel behind its filter fills the well, so light is gathered longer than without.
     bare = Session(bench, recipe, 0)
-    assert lit.exposure_s == pytest.approx(2 * bare.lit(lit.light, job).exposure_s, rel=0.1)
+    assert lit.exposure_s == pytest.approx(2 * LitSession.of(bare, lit.light, job).exposure_s, rel=0.1)
 
 
 def test_only_a_camera_with_filters_has_a_mosaic(bench: Bench) -> None:
@@ -160,7 +161,7 @@ def test_lamps_are_seen_by_each_pixel_through_its_filter(shared_scene: Callable[
     all.)
     """
     scene = shared_scene("lit mosaic", extra='<emitter type="constant"/>')
-    seen = MosaicBench.of(coloured(open_bench(scene, variant)))
+    seen = without_filters(coloured(open_bench(scene, variant)))
     responses = Response.of_each(seen.counting)
     assert [response.planes for response in responses] == [(0,), (1, 2), (3,)]
     spectra = tuple(Spectrum(np.array([nm]), np.ones(1)) for nm in np.linspace(420.0, 690.0, 12))
@@ -204,7 +205,7 @@ def test_lamps_are_seen_by_each_pixel_through_its_filter(shared_scene: Callable[
     assert frames.projector_off.irradiance == pytest.approx(expected, rel=1e-9, abs=1e-12 * expected.max())
     (lit,), off = frames, [light.frames(lighting, 0) for light in lights]
     lines = [next(iter(each)).irradiance - each.projector_off.irradiance for each in off]
-    weights = np.array(seen.mosaic.planes([nm for nm, _ in units])) * [nm for nm, _ in units]
+    weights = np.array(seen.counting.planes([nm for nm, _ in units])) * [nm for nm, _ in units]
     passed = behind(weights / seen.projector.effective_wavelength_nm, expected.shape)
     assert lit.irradiance - expected == pytest.approx(np.einsum("lij,lij->ij", passed, np.array(lines)), rel=1e-6)
 
@@ -215,11 +216,11 @@ def test_frames_that_cut_through_filters_are_refused(bench: Bench, part: dict[st
     seen = coloured(bench)
     rig = replace(seen.rig, camera=seen.rig.camera.model_copy(update=part))
     with pytest.raises(MitsimError, match=r"do not hold whole filters of 2 x 2; give the scene's film even numbers"):
-        MosaicBench.of(replace(seen, rig=rig))
+        without_filters(replace(seen, rig=rig))
 
 
 def test_a_bench_behind_filters_says_which_camera_it_has(bench: Bench) -> None:
     """The sensor's own identity, filters and all, though frames are formed of bare pixels."""
-    seen = MosaicBench.of(coloured(bench))
+    seen = without_filters(coloured(bench))
     assert seen.identity()["sensor"]["mosaic"] == "RGGB" and seen.sensor.quantum_efficiency == 1.0
     assert seen.identity()["geometry"] == bench.identity()["geometry"]

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.acquire import capture
+from mitsim.acquire import capture, spectral
 from mitsim.acquire.exposure import Exposer
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.request import Exposure, Request
@@ -52,7 +52,7 @@ def captured(bench: Bench, tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 def test_a_plan_that_takes_too_long_is_refused(bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its own seconds count, and nothing is left of the run."""
-    monkeypatch.setattr(capture, "make_plan", lambda *_: time.sleep(60))
+    monkeypatch.setattr(spectral, "make_plan", lambda *_: time.sleep(60))
     job = Job(limits=Limits(seconds=1.0))
     with pytest.raises(MitsimError, match=r"dots:3: was not planned within the 1 s that are allowed"):
         bench.capture("dots:3", tmp_path / "run", job=job)
@@ -247,7 +247,7 @@ def test_a_plan_is_made_of_what_is_asked(
     def planned(seen: Bench, lighting: object, *rest: object) -> None:
         raise MitsimError(repr((seen is bench, *rest)))
 
-    monkeypatch.setattr(capture, maker, planned)
+    monkeypatch.setattr(spectral, maker, planned)
     for begin in (bench.plan, bench.light, bench.capture):
         with pytest.raises(MitsimError) as caught:
             begin("dots:3", seed=5, effects="-blur", **asked)
@@ -330,7 +330,7 @@ def test_a_folder_in_use_is_refused_before_any_work(
     def work(*_: object) -> None:
         raise AssertionError("work was done first")
 
-    monkeypatch.setattr(capture, "make_plan", work)
+    monkeypatch.setattr(spectral, "make_plan", work)
     with pytest.raises(MitsimError, match="holds files already"):
         bench.capture("dots:3", captured.folder, accuracy=ACCURACY, seed=5)
 
@@ -486,7 +486,7 @@ def test_noise_fractions_that_make_no_sense(bench: Bench, tmp_path: Path, fracti
 def test_what_frames_alone_take_is_looked_at_before_the_plan(
     bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limits: Limits
 ) -> None:
-    monkeypatch.setattr(capture, "make_plan", lambda *_: pytest.fail("work was begun"))
+    monkeypatch.setattr(spectral, "make_plan", lambda *_: pytest.fail("work was begun"))
     with pytest.raises(MitsimError, match="dots:3: would take about"):
         bench.capture("dots:3", tmp_path / "run", accuracy=ACCURACY, job=Job(limits=limits))
     assert not list(tmp_path.iterdir())

@@ -9,8 +9,7 @@ import pytest
 from PIL import Image
 
 from mitsim.acquire.sense import irradiance_behind_lens, read_image, sense
-from mitsim.acquire.sense_options import check_ending
-from mitsim.bench.request import Exposure
+from mitsim.bench.request import Exposure, check_ending
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame, write_frame

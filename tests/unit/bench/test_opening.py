@@ -41,7 +41,7 @@ class Loader:
 @pytest.fixture
 def loader(monkeypatch: pytest.MonkeyPatch) -> Iterator[Loader]:
     found = Loader()
-    monkeypatch.setattr(opening, "_loaded", found.loaded)
+    monkeypatch.setattr(opening, "_load", found.loaded)
     monkeypatch.setattr(mask_profile, "load_mask", lambda path: found.mask)
     yield found
 

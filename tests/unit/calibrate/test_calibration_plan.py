@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 
 import mitsim as ms
-from mitsim.acquire.capture import digital_scale
 from mitsim.calibrate.calibrate import estimate
+from mitsim.calibrate.lit_session import LitSession
 from mitsim.calibrate.plan import least_dose
 from mitsim.calibrate.session import Session
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
+from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import MOST_REPEATS, SessionRecipe, load_recipe, recipe_text
 from mitsim.reconstruct.factors import Factors
 
@@ -148,8 +149,8 @@ def test_the_promise_is_kept_within_half_a_decibel(scene: str, wanted: float, va
     plan = ms.plan_calibration(bench, wanted, patterns)
     assert plan.reached
     shots, session = bench.capture(patterns, seed=11), Session(bench, plan.recipe, 11)
-    lit = session.lit(session.trace(session.plan(1e-3, Job()), Job()), Job())
-    manifest = CalibrationManifest(camera=bench.identity(), digital=digital_scale(bench, lit.exposure_s))
+    lit = LitSession.of(session, session.trace(session.plan(1e-3, Job()), Job()), Job())
+    manifest = CalibrationManifest(camera=bench.identity(), digital=digital_of(bench.sensor, lit.exposure_s))
     found = []
     for seed in range(11, 15):
         estimated, _ = estimate(replace(lit, session=replace(session, seed=seed)), Job())

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mitsim.calibrate.calibrate import estimate
-from mitsim.calibrate.predict import Foreseen
-from mitsim.calibrate.session import LitSession
+from mitsim.calibrate.lit_session import LitSession
+from mitsim.calibrate.plan import PredictedSession
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.reconstruct.estimate_factors import Estimate
@@ -45,7 +45,7 @@ def test_drawn_noise_is_that_of_exposed_frames_number_by_number(mode: str, n: in
     the first column of 8 would have a ninth. All numbers together are known to 3 %.
     """
     lit = lit_session(n, mode, repeats=repeats)
-    foreseen = Foreseen.of(lit, Job())
+    foreseen = PredictedSession.of(lit, Job())
     clean = foreseen.estimate(None)
     drawn, found = [foreseen.estimate(lit, draw) for draw in range(DRAWS)], exposed(lit)
     for side in ("left", "right"):
@@ -62,7 +62,7 @@ def test_drawn_noise_is_that_of_exposed_frames_number_by_number(mode: str, n: in
 
 def test_without_noise_it_is_the_noise_free_session() -> None:
     lit = lit_session(7, "uniform")
-    clean, direct = Foreseen.of(lit, Job()).estimate(None), estimate(lit, Job(), noise_free=True)[0]
+    clean, direct = PredictedSession.of(lit, Job()).estimate(None), estimate(lit, Job(), noise_free=True)[0]
     np.testing.assert_allclose(clean.left, direct.left, rtol=1e-12)
     np.testing.assert_allclose(clean.right, direct.right, rtol=1e-12)
     assert clean.ok and clean.separability_residual < 1e-12
@@ -70,7 +70,7 @@ def test_without_noise_it_is_the_noise_free_session() -> None:
 
 def test_equal_numbers_draw_equal_noise_which_falls_with_the_repeats() -> None:
     lit = lit_session(4)
-    foreseen = Foreseen.of(lit, Job())
+    foreseen = PredictedSession.of(lit, Job())
     often = replace(lit, session=replace(lit.session, recipe=lit.session.recipe.model_copy(update={"repeats": 16})))
     clean, once, many = foreseen.estimate(None), foreseen.estimate(lit, 3), foreseen.estimate(often, 3)
     np.testing.assert_allclose(many.left - clean.left, (once.left - clean.left) / 4, rtol=1e-9, atol=1e-9)

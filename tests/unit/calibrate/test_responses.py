@@ -16,15 +16,16 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from mitsim.acquire.capture import digital_scale
 from mitsim.acquire.exposure import Exposer
-from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, Checkpoint, estimate, estimates
-from mitsim.calibrate.session import LitSession, Session, _Shot
+from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimate, estimates
+from mitsim.calibrate.checkpoint import Checkpoint
+from mitsim.calibrate.lit_session import LitSession, _Shot
+from mitsim.calibrate.session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.devices.camera import Rig
 from mitsim.devices.patterns import Lighting
-from mitsim.devices.sensor import SensorModel
+from mitsim.devices.sensor import SensorModel, digital_of
 from mitsim.devices.session import SIDES, load_recipe
 from mitsim.optics.frames import Frame
 from mitsim.reconstruct.captured_session import Ladder, calibrate_frames
@@ -234,7 +235,7 @@ class Kept(Checkpoint):
 def test_a_resumed_estimate_is_the_same_to_the_bit(mode: str, kinds: tuple[str, ...]) -> None:
     """16 responses a side are kept after 8 and after 16: interrupted after each of the four parts, and finished."""
     lit = lit_session(13, mode)
-    whole, _ = estimates(lit, Job(), kinds)
+    whole, _, _ = estimates(lit, Job(), kinds)
     kept = Kept()
     for life in range(4):
         kept.left = 1
@@ -243,7 +244,7 @@ def test_a_resumed_estimate_is_the_same_to_the_bit(mode: str, kinds: tuple[str, 
         for kind in kinds:
             done = [kept.parts["stripes"][f"{kind}_{side}_vectors"].shape[1] for side in SIDES]
             assert done == [[8, 1], [16, 1], [16, 8], [16, 16]][life]
-    again, _ = estimates(lit, Job(), kinds, kept)
+    again, _, _ = estimates(lit, Job(), kinds, kept)
     for ours, theirs in zip(again, whole, strict=True):
         for name in ("left", "right", "noise", "separability_residual", "unexplained", "predicted_error", "status"):
             assert np.array_equal(getattr(ours, name), getattr(theirs, name)), name
@@ -257,7 +258,7 @@ def test_stripes_that_are_formed_in_lots_are_all_there(monkeypatch: pytest.Monke
     monkeypatch.setattr("mitsim.calibrate.session.lines_held", lambda *_: False)
     monkeypatch.setattr("mitsim.calibrate.session.at_once", lambda _: 4)
     lit, formed = lit_session(13), []
-    whole = {number: frame.irradiance for number, frame in lit._formed("vertical", 0)}
+    whole = {number: frame.irradiance for number, frame in lit._stripes("vertical", 0)}
     frames = ToyLight.frames
 
     def counted(self: ToyLight, lighting: Lighting, seed: int, leaking: bool = True) -> list[Frame]:
@@ -265,7 +266,7 @@ def test_stripes_that_are_formed_in_lots_are_all_there(monkeypatch: pytest.Monke
         return frames(self, lighting, seed, leaking)
 
     monkeypatch.setattr(ToyLight, "frames", counted)
-    found = dict(lit._formed("vertical", first))
+    found = dict(lit._stripes("vertical", first))
     assert list(found) == list(range(first, 16)) and all(
         np.array_equal(frame.irradiance, whole[number]) for number, frame in found.items()
     )
@@ -319,7 +320,7 @@ def played(pairs: bool, monkeypatch: pytest.MonkeyPatch) -> LitSession:
     monkeypatch.setattr(LitSession, "_exposers", (SimpleNamespace(rate=lambda digital: digital),))
     monkeypatch.setattr(LitSession, "_dark", None)
     monkeypatch.setattr(
-        LitSession, "_exposed", lambda self, light, side, index: _Shot(Ladder(()), (RATES[index],), index + 1)
+        LitSession, "_expose", lambda self, light, side, index: _Shot(Ladder(()), (RATES[index],), index + 1)
     )
     return lit
 
@@ -401,7 +402,7 @@ def test_frames_of_a_session_in_a_folder_give_its_factors_bit_for_bit(
 
     monkeypatch.setattr(Exposer, "digital", kept)
     simulated, _ = estimate(lit, Job())
-    digital = digital_scale(lit.session.bench, EXPOSURE_S).model_dump(mode="json")
+    digital = digital_of(lit.session.bench.sensor, EXPOSURE_S).model_dump(mode="json")
     listed = {"camera": "toy", "n": 7, "signed_capture": mode, "digital": digital, "dark": dark}
     shared = {name: value for name, value in more.items() if name != "dark_frames"}
     (tmp_path / "session.json").write_text(json.dumps({**listed, **shared}))
@@ -458,7 +459,7 @@ def test_responses_have_the_mean_and_the_noise_of_the_closed_form(mode: str, mor
     total, squares, saturated = 0.0, 0.0, 0
     for seed in range(seeds):
         own = replace(lit, session=replace(lit.session, seed=seed))
-        responses = [(own.noisy(side, *it), own.noise_free(it[1])) for side in SIDES for it in own._formed(side, 0)]
+        responses = [(own.noisy(side, *it), own.noise_free(it[1])) for side in SIDES for it in own._stripes(side, 0)]
         off = np.array([response.rate - clean for response, clean in responses])
         total, squares = total + off, squares + np.square(off)
         saturated += sum(response.saturated for response, _ in responses)

@@ -16,7 +16,7 @@ import pytest
 from mitsim.acquire.exposure import Exposer
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.effects import EFFECTS
-from mitsim.calibrate.calibrate import Checkpoint, calibrate
+from mitsim.calibrate.checkpoint import Checkpoint
 from mitsim.calibrate.session import Session, session_cost
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import checksum, read_frame
@@ -362,7 +362,7 @@ def test_a_session_killed_at_every_checkpoint_gives_the_same_bits(
 ) -> None:
     """Each of the five processes but the last gets one checkpoint further; nothing that is kept is computed again."""
     bench = open_bench(shared_scene("resumed16", n=16))
-    whole = calibrate(bench, recipe=recipe(mode), seed=3)
+    whole = bench.calibrate(recipe=recipe(mode), seed=3)
     exposures: list[object] = []
     digital = Exposer.digital
 
@@ -375,14 +375,14 @@ def test_a_session_killed_at_every_checkpoint_gives_the_same_bits(
     for life in range(5):
         kill_after(1)
         with pytest.raises(Killed):
-            calibrate(bench, recipe=recipe(mode), seed=3, output=calibration, resume=True)
+            bench.calibrate(recipe=recipe(mode), seed=3, output=calibration, resume=True)
         assert json.loads((calibration / "manifest.json").read_text())["status"] == "incomplete"
         monkeypatch.setattr(Session, "trace", lambda *_: pytest.fail("light is traced again"))
         assert [path.name for path in sorted(calibration.glob("*.npz"))] == [
             name for name, since in zip(PARTS, (0, 1), strict=True) if life >= since
         ]
     kill_after(0)  # nothing is left to be saved
-    resumed = calibrate(bench, recipe=recipe(mode), seed=3, output=calibration, resume=True)
+    resumed = bench.calibrate(recipe=recipe(mode), seed=3, output=calibration, resume=True)
     assert_equal(resumed, whole)
     assert sorted(path.name for path in calibration.iterdir()) == ["left.exr", "manifest.json", "right.exr"]
     # Shots that were exposed with those of a checkpoint are exposed again, at most one chunk of each side a life.
@@ -405,9 +405,9 @@ def test_damaged_and_foreign_parts_are_computed_again(
     for name, seed in (("ours", 3), ("theirs", 4)):
         kill_after(3)
         with pytest.raises(Killed):
-            calibrate(bench, recipe=recipe("pair"), seed=seed, output=tmp_path / name)
+            bench.calibrate(recipe=recipe("pair"), seed=seed, output=tmp_path / name)
     monkeypatch.setattr(Checkpoint, "save", save)
-    whole = calibrate(bench, recipe=recipe("pair"), seed=3)
+    whole = bench.calibrate(recipe=recipe("pair"), seed=3)
 
     def flipped(spot: float) -> Callable[[bytes], bytes]:
         def flip(data: bytes) -> bytes:
@@ -422,7 +422,7 @@ def test_damaged_and_foreign_parts_are_computed_again(
         part = folder / PARTS[index % len(PARTS)]
         source = part if damage else tmp_path / "theirs" / part.name
         part.write_bytes((damage or bytes)(source.read_bytes()))
-        assert_equal(calibrate(bench, recipe=recipe("pair"), seed=3, output=folder, resume=True), whole)
+        assert_equal(bench.calibrate(recipe=recipe("pair"), seed=3, output=folder, resume=True), whole)
 
 
 @pytest.mark.usefixtures("geometric_sessions")
@@ -432,7 +432,7 @@ def test_only_the_same_session_is_resumed(
     bench = open_bench(shared_scene("other16", n=16))
     kill_after(1)
     with pytest.raises(Killed):
-        calibrate(bench, recipe=recipe("pair"), output=tmp_path / "cal")
+        bench.calibrate(recipe=recipe("pair"), output=tmp_path / "cal")
     for change, words in (
         ({"seed": 5}, "seed differ"),
         ({"accuracy": 1e-2, "recipe": recipe("uniform")}, "accuracy, recipe differ"),
@@ -440,19 +440,19 @@ def test_only_the_same_session_is_resumed(
         with pytest.raises(
             MitsimError, match=rf"resume=True: .*cal holds a session of another configuration \({words}\)"
         ):
-            calibrate(bench, **{"recipe": recipe("pair"), "output": tmp_path / "cal", "resume": True, **change})
+            bench.calibrate(**{"recipe": recipe("pair"), "output": tmp_path / "cal", "resume": True, **change})
     with pytest.raises(MitsimError, match="holds files already"):
-        calibrate(bench, recipe=recipe("pair"), output=tmp_path / "cal")
+        bench.calibrate(recipe=recipe("pair"), output=tmp_path / "cal")
     (tmp_path / "cal" / "manifest.json").write_text('{"kind": "capture"}')
     with pytest.raises(MitsimError, match=r"resume=True: .* is not that of a calibration"):
-        calibrate(bench, recipe=recipe("pair"), output=tmp_path / "cal", resume=True)
+        bench.calibrate(recipe=recipe("pair"), output=tmp_path / "cal", resume=True)
 
 
 @pytest.mark.usefixtures("geometric_sessions")
 def test_saving_from_memory_is_the_same_folder(shared_scene: Callable[..., Path], tmp_path: Path) -> None:
     bench = open_bench(shared_scene("memory16", n=16))
-    calibrate(bench, recipe=recipe("pair"), output=tmp_path / "streamed")
-    calibrate(bench, recipe=recipe("pair")).save(tmp_path / "saved")
+    bench.calibrate(recipe=recipe("pair"), output=tmp_path / "streamed")
+    bench.calibrate(recipe=recipe("pair")).save(tmp_path / "saved")
     manifests = []
     for name in ("streamed", "saved"):
         manifest = json.loads((tmp_path / name / "manifest.json").read_text())
@@ -461,7 +461,7 @@ def test_saving_from_memory_is_the_same_folder(shared_scene: Callable[..., Path]
         manifests.append(manifest)
     assert manifests[0] == manifests[1]
     with pytest.raises(MitsimError, match="holds files already"):
-        calibrate(bench, recipe=recipe("pair")).save(tmp_path / "saved")
+        bench.calibrate(recipe=recipe("pair")).save(tmp_path / "saved")
 
 
 def test_describing_a_session_traces_nothing(

@@ -20,10 +20,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from mitsim.acquire import spectral as colour
 from mitsim.acquire.capture import _of_unknown_light
-from mitsim.acquire.mosaic import MosaicBench
-from mitsim.acquire.spectral import ColourBench
+from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import open_bench
 from mitsim.bench.request import Request
 from mitsim.core.spectral_manifests import MOSAIC, RUN
@@ -118,7 +116,7 @@ def traced(folder: str) -> list[dict[str, Any]]:
         path = write_small_scene(place, lamp, mask="open", extra=emitter)
         camera = place / ("curve.toml" if curve else "number.toml")
         bench = open_bench(path, "llvm_ad_spectral", camera, place / "lines.toml", albedo=SHEETS[sheet])
-        whole = ColourBench.of(bench, RUN).lit_by_lamps({}, 0).whole
+        whole = SpectralBench.of(bench, RUN).lit_by_lamps({}, 0).whole
         assert whole.lamplight is not None
         simulation = Simulation(whole, Settings(depth=400.0, effects=frozenset({"ambient"})))
         assert isinstance(simulation.from_camera, LampTracer)
@@ -151,7 +149,7 @@ def through_filters(place: Path, scene: Path, lamp: str) -> dict[str, Any]:
     """Light of a ``lamp`` behind filters: by band and line of all lines, and of the second line alone."""
     sheet = SHEETS["coloured" if lamp == "d65" else "grey"]
     bench = open_bench(scene, "llvm_ad_spectral", place / "filters.toml", place / "lines.toml", albedo=sheet)
-    colours = ColourBench.of(MosaicBench.of(bench), MOSAIC).lit_by_lamps({}, 0)
+    colours = SpectralBench.of(bench, MOSAIC).lit_by_lamps({}, 0)
     lamplight, found = colours.whole.lamplight, {}
     assert lamplight is not None
     for name, each in {"lines": colours.whole, "alone": colours.benches[1]}.items():
@@ -310,8 +308,10 @@ def test_lines_are_planned_with_their_lamps_lit(monkeypatch: pytest.MonkeyPatch)
     )
     lit = SimpleNamespace(roughest=lambda seed, part: alone)
     colours: Any = SimpleNamespace(
-        manifest=SimpleNamespace(channels=(1, 2, 3)),
+        manifest=object(),
+        benches=(1, 2, 3),
         whole=whole,
+        check=lambda request: None,
         lit_by_lamps=lambda effects, seed: lit,
         roughest=lambda seed, part: SimpleNamespace(lamplight=None),
     )
@@ -320,6 +320,6 @@ def test_lines_are_planned_with_their_lamps_lit(monkeypatch: pytest.MonkeyPatch)
         planned.append((bench, dict(request.effects), lines))
         return SimpleNamespace(settings=SimpleNamespace(effects=frozenset()))
 
-    monkeypatch.setattr(colour, "plan_request", plan_request)
-    colour.plan_lines(colours, Request.of(patterns="uniform"))
+    monkeypatch.setattr("mitsim.acquire.spectral.plan_request", plan_request)
+    SpectralBench.plan(colours, Request.of(patterns="uniform"))
     assert planned == [(alone, {}, 3), (alone, {"ambient": True}, 3)]

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy import sparse
 
+from mitsim.acquire.capture import Light
 from mitsim.api.bench import Bench, open_bench
-from mitsim.api.light import Light
 from mitsim.bench.effects import EFFECTS
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import Lighting

@@ -56,7 +56,7 @@ def test_errors_of_factors_are_those_that_are_predicted(mode: str) -> None:
     found_errors, stated_errors, columns = [], [], []
     for seed in range(SEEDS):
         own = replace(lit, session=replace(lit.session, seed=seed))
-        (noisy, clean), _ = estimates(own, Job(), (NOISY, NOISE_FREE))
+        (noisy, clean), _, _ = estimates(own, Job(), (NOISY, NOISE_FREE))
         report = judged(own, noisy, clean)
         columns.append(np.square(report.maps["left"]).mean(axis=0))
         for row in report.entries:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mitsim.bench.diffuser import rendered_psf
+from mitsim.acquire.reference import rendered_psf
 from mitsim.report.exposures import EQUAL_FRAME, EQUAL_PEAK
 from mitsim.report.table import Table
 from mitsim.studies import find_experiment

@@ -64,6 +64,7 @@ def test_the_scene_is_traced_once_and_a_speckled_projector_shows_in_every_family
         return light.trace_light(*arguments, **options)
 
     monkeypatch.setattr(capture, "trace_light", counted)
+    monkeypatch.setattr(capture, "trace_lines", lambda *_: pytest.fail("traced anew"))
     calibrate = Bench.calibrate
 
     def without_figures(*arguments: Any, **options: Any) -> Factors:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mitsim.calibrate.calibrate import estimate
+from mitsim.calibrate.lit_session import LitSession
 from mitsim.calibrate.session import Session
 from mitsim.core.job import Job
 from mitsim.devices.session import load_recipe
@@ -141,7 +142,7 @@ def test_factors_have_the_noise_of_a_session(lit: dict[str, LitScene]) -> None:
     bench = lit["separable"].bench
     ((left, right),) = calibrated_places(bench, [0.42], 3).values()
     session = Session(moved(bench, 0.42, 0.42), load_recipe(), 3)
-    frames = session.lit(session.trace(session.plan(1e-3, Job()), Job()), Job())
+    frames = LitSession.of(session, session.trace(session.plan(1e-3, Job()), Job()), Job())
     noisy, clean = (estimate(frames, Job(), noise_free=free)[0] for free in (False, True))
     for ours, theirs, exact in ((left, noisy.left, clean.left), (right, noisy.right, clean.right)):
         assert np.std(ours - exact) == pytest.approx(np.std(theirs - exact), rel=0.1)

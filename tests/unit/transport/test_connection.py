@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsim.transport.connection import Connection, LensHit, ProjectorConnector
+from mitsim.transport.connect import Connection, LensHit, ProjectorConnector
 from mitsim.transport.plugins import lens as aperture
 from mitsim.transport.plugins.lens import aperture_scene_parts
 from mitsim.transport.projector import ProjectorOptics

@@ -13,7 +13,7 @@ import pytest
 from mitsim.api.bench import Bench, open_bench
 from mitsim.light.settings import Settings
 from mitsim.light.truth import trace_truth
-from mitsim.transport.flux import FluxTracer
+from mitsim.transport.direct import FluxTracer
 from tests.hard.hard_light import gauss, glossy, lobe
 
 N, SEEDS, SEVEN, HALF_SENSOR = 16, 8, 7.0, 3.2

@@ -97,7 +97,7 @@ def test_a_bench_s_glass_has_its_projectors_wavelength(small_scene: Callable[...
     for opened in (bench, reopened(bench, "llvm_ad_mono")):
         found = {name: value for name, value in mi.traverse(opened.loaded.scene) if name.endswith("bsdf.wavelength")}
         assert [float(value[0]) for value in found.values()] == [638]
-        assert opened.projector_optics.parted and opened.projector_optics.apart == (opened.projector_optics,)
+        assert opened.projector_optics.parted and opened.projector_optics.per_wavelength == (opened.projector_optics,)
     assert not open_bench(small_scene("plain")).projector_optics.parted
 
 

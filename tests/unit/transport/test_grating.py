@@ -241,8 +241,8 @@ from mitsim.core.environment import load_variant
 mi = load_variant({other!r})
 mi.set_log_level(mi.LogLevel.Error)
 import drjit as dr, numpy as np
-from mitsim.transport.plugins import all
-all.register()
+from mitsim.transport import plugins
+plugins.register()
 bsdf = mi.load_dict({{"type": "mitsim_grating", "efficiencies": "0, 0.5", "negative_efficiencies": "0"}})
 si = dr.zeros(mi.SurfaceInteraction3f, 1)
 si.sh_frame = mi.Frame3f(mi.Vector3f(0, 0, 1))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsim.transport.highlights import Highlights, highlights
+from mitsim.transport.missed import Highlights, highlights
 from mitsim.transport.projector import ProjectorOptics
 from tests.physics.test_mirror import SCALE, N, Rig
 

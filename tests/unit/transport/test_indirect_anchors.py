@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from mitsim.acquire.spectral import ColourBench
+from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.spectral_manifests import RUN
 from mitsim.transport.accumulator import Ledger, fetched
@@ -96,7 +96,7 @@ def in_lines(folder: str) -> tuple[int, list[str], list[list[float]]]:
     opened = open_bench(
         write_small_scene(place, "lit", n=N, extra=extra), "llvm_ad_spectral", None, place / "lines.toml"
     )
-    bench = ColourBench.of(opened, RUN).whole
+    bench = SpectralBench.of(opened, RUN).whole
     tracer, labels = anchored(bench, SensorPoints(bench.geometry.half_width, 3)), np.arange(N**2) % 5
     bundle = Bundle(aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov), 3, (400.0,))
     ledgers = Ledger.of_lines(len(LINES), bundle, labels, tracer.board)

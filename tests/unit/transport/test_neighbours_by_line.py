@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.acquire.spectral import ColourBench
+from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import open_bench
 from mitsim.core.spectral_manifests import RUN
 from mitsim.transport.accumulator import Ledger
@@ -84,7 +84,7 @@ def traced(folder: str, names: Sequence[str]) -> dict[str, Any]:
         extra = SCENES[name]
         far = {"sheet_z": 3000} if "sphere" in name else {}
         path = write_small_scene(place, name, n=N, extra=extra, **far)
-        bench = ColourBench.of(open_bench(path, "llvm_ad_spectral", None, place / "lines.toml"), RUN).whole
+        bench = SpectralBench.of(open_bench(path, "llvm_ad_spectral", None, place / "lines.toml"), RUN).whole
         own, shared = tracers(bench)
         assert shared.shares() and shared.all_diffuse == ("shiny" not in name)
         looks = [[side.trace(seed, 0, SAMPLES) for seed in range(SEEDS)] for side in (own, shared)]

@@ -8,8 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsim.transport.connection import ProjectorConnector
-from mitsim.transport.coordinates import RIGID, rigidity_error, rows_columns, turn_and_origin, x_y
+from mitsim.transport.connect import ProjectorConnector
+from mitsim.transport.plugins.base import RIGID, rigidity_error, rows_columns, turn_and_origin, x_y
 from mitsim.transport.projector import PinholeRays, ProjectorOptics, ProjectorRays
 from mitsim.transport.sampler import generator
 from tests.unit.transport.closed_forms import stock_projector

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import open_bench
-from mitsim.transport.indirect import Turns, block_moments, blocks_of, by_pixel, chosen_repeats, effect_of
+from mitsim.transport.indirect import AdaptiveSamples, block_moments, blocks_of, by_pixel, chosen_repeats, effect_of
 from tests.unit.transport.test_neighbours import SCENES, SIGMAS, summed, tracers
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -42,7 +42,7 @@ def test_repeated_light_is_the_same_light(shared_scene: Callable[..., Path], sha
 
 def test_every_unit_takes_its_turns() -> None:
     counts = np.array([2, 1, 3])
-    turns = Turns.of(counts)
+    turns = AdaptiveSamples.of(counts)
     unit, turn, count = (np.array(each) for each in (turns.unit, turns.turn, turns.count))
     assert len(turns) == 6
     assert unit.tolist() == [0, 0, 1, 2, 2, 2] and turn.tolist() == [0, 1, 0, 0, 1, 2]

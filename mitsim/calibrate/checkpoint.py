@@ -1,0 +1,333 @@
+"""What a calibration session leaves on disk: finished parts in its CAL folder until the whole is, and its frames where
+a user wants them."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import itertools
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+from scipy import sparse
+
+from mitsim.calibrate.session import Session
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.core.files import PARTS, output_folder, plain, read_json, sweep, whole_file, write_json
+from mitsim.core.manifests import MANIFEST, Digital, resumable
+from mitsim.devices.framelist import LISTS, DarkFile, FrameList, StripeFile
+from mitsim.devices.session import SIDES, Side
+from mitsim.light.grids import GRIDS, LightEstimate
+from mitsim.light.light import SampledLight
+from mitsim.light.passes import Simulation
+from mitsim.light.plan import Plan
+from mitsim.reconstruct.estimate_factors import PairSeen, PairSums, StripeSums
+from mitsim.sensor.chain import Digital as DigitalNumbers
+
+KIND = "calibration"
+_SUFFIX = PARTS.removeprefix("*")
+_DIGEST = hashlib.sha256().digest_size
+
+
+class Checkpoint:
+    """Parts of one session; without a folder nothing is kept."""
+
+    def __init__(self, folder: Path | None = None, configuration: Mapping[str, Any] | None = None) -> None:
+        """Parts in ``folder``, of the session with this ``configuration``."""
+        self.folder, self.configuration = folder, dict(configuration or {})
+        self._session = json.dumps(plain(self.configuration), sort_keys=True).encode()
+
+    def begin(self) -> None:
+        """Mark the folder as an unfinished session, and clear what a killed process left half-written."""
+        if self.folder is not None:
+            sweep(self.folder)
+            head = {"kind": KIND, "status": "incomplete", "configuration": plain(self.configuration)}
+            write_json(self.folder / MANIFEST, head)
+
+    def save(self, name: str, arrays: Mapping[str, npt.ArrayLike]) -> None:
+        """Write ``arrays`` as the part ``name``, whole or not at all. MitsimError when it cannot be written."""
+        if self.folder is None:
+            return
+        memory = io.BytesIO()
+        np.savez(memory, allow_pickle=False, **{key: np.asarray(value) for key, value in arrays.items()})
+        with whole_file(self.folder / f"{name}{_SUFFIX}") as part, part.open("wb") as file:
+            file.write(memory.getbuffer())
+            file.write(self._digest(memory.getbuffer()))
+
+    def load(self, name: str) -> dict[str, npt.NDArray[Any]] | None:
+        """The arrays of the part ``name``; None when it is not there, damaged, or of another session."""
+        path = None if self.folder is None else self.folder / f"{name}{_SUFFIX}"
+        if path is None or not path.is_file():
+            return None
+        data = memoryview(path.read_bytes())
+        if self._digest(data[:-_DIGEST]) != data[-_DIGEST:]:
+            return None
+        with np.load(io.BytesIO(data[:-_DIGEST]), allow_pickle=False) as arrays:
+            return dict(arrays)
+
+    def clear(self) -> None:
+        """Remove the parts of a session that is complete."""
+        if self.folder is not None:
+            for path in self.folder.glob(PARTS):
+                path.unlink()
+
+    def _digest(self, data: memoryview) -> bytes:
+        return hashlib.sha256(hashlib.sha256(self._session).digest() + data).digest()
+
+
+@contextmanager
+def claimed_session(
+    output: Path | None, configuration: Mapping[str, Any], resume: bool = False
+) -> Iterator[Checkpoint]:
+    """The place for a session's parts, checked before any work; if the session fails before writing, a new folder is
+    removed.
+
+    Parameters
+    ----------
+    output
+        CAL folder; None keeps nothing.
+    configuration
+        all that decides the factors.
+    resume
+        whether the folder may hold a session of the same configuration.
+
+    Raises
+    ------
+    MitsimError
+        for a place that cannot be written, or that holds something else or another configuration.
+    """
+    if output is None:
+        yield Checkpoint(None, configuration)
+        return
+    again = resume and (output / MANIFEST).is_file()
+    if again:
+        _check_same(output, plain(configuration))
+    with output_folder(output, overwrite=again) as folder:
+        yield Checkpoint(folder, configuration)
+
+
+def is_finished(output: Path, configuration: Mapping[str, Any]) -> bool:
+    """Whether the folder ``output`` holds a finished session; MitsimError when its ``configuration`` is another."""
+    if not (output / MANIFEST).is_file():
+        return False
+    _check_same(output, plain(configuration))
+    return bool(read_json(output / MANIFEST).get("status") == "complete")
+
+
+def _check_same(path: Path, configuration: Mapping[str, Any]) -> None:
+    before = resumable(path, KIND).get("configuration")
+    before = before if isinstance(before, dict) else {}
+    changed = [key for key in {**configuration, **before} if before.get(key) != configuration.get(key)]
+    if changed:
+        raise MitsimError(
+            f"resume=True: {path} holds a session of another configuration ({', '.join(changed)} differ); "
+            "use the same options, or another folder"
+        )
+
+
+# ---- Light and sums of responses as parts of a checkpoint ----
+
+
+def kept_light(checkpoint: Checkpoint, session: Session, plan: Plan) -> SampledLight | None:
+    """The light of a session's board; None where there is none.
+
+    Parameters
+    ----------
+    checkpoint
+        that may hold it.
+    session, plan
+        whose light it is.
+    """
+    arrays = checkpoint.load("light")
+    if arrays is None:
+        return None
+    by_grid = {
+        name: sparse.csr_array(
+            tuple(arrays[f"{row.key}_{part}"] for part in ("data", "indices", "indptr")),
+            shape=tuple(arrays[f"{row.key}_shape"]),
+        )
+        for name, row in GRIDS.items()
+    }
+    return SampledLight(
+        groups=(LightEstimate(by_grid, float(arrays["received"]), float(arrays["outside"])),),
+        simulation=Simulation(session.board, plan.settings),
+        plan=plan,
+        seed=session.seed,
+        labels=arrays["labels"],
+        flux=arrays["flux"],
+        flux_error=arrays["flux_error"],
+        paths=int(arrays["paths"]),
+        sampling_error=float(arrays["sampling_error"]),
+        reached=bool(arrays["reached"]),
+    )
+
+
+def keep_light(checkpoint: Checkpoint, light: SampledLight) -> None:
+    """Save a ``light`` of one group in a ``checkpoint``."""
+    (group,) = light.groups
+    own = ("labels", "flux", "flux_error", "paths", "sampling_error", "reached")
+    facts = {name: getattr(light, name) for name in own}
+    facts |= {name: getattr(group, name) for name in ("received", "outside")}
+    for name, row in GRIDS.items():
+        matrix = group[name]
+        facts |= {f"{row.key}_{part}": getattr(matrix, part) for part in ("data", "indices", "indptr", "shape")}
+    checkpoint.save("light", facts)
+
+
+@dataclass
+class SessionSums:
+    """Sums over finished stripes by kind, horizontal and vertical ones, and ``saturated`` shots so far."""
+
+    sums: dict[str, tuple[StripeSums, StripeSums]]
+    saturated: int
+
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Put them down in a ``checkpoint``."""
+        arrays: dict[str, npt.ArrayLike] = {"saturated": self.saturated}
+        for kind, both in self.sums.items():
+            for sums in both:
+                name, done = f"{kind}_{sums.side}", sums.done
+                arrays[f"{name}_common"], arrays[f"{name}_vectors"] = sums.common, sums.vectors[:, :done]
+                arrays[f"{name}_sums"] = [sums.misfit, sums.energy]
+                arrays[f"{name}_each"] = [each[:done] for each in (sums.misfits, sums.energies, sums.fluxes)]
+                if sums.pairs is not None:
+                    arrays[f"{name}_light"] = sums.pairs.light[:, :done]
+                    arrays[f"{name}_rows"], arrays[f"{name}_columns"] = (
+                        sums.pairs.rows[:done],
+                        sums.pairs.columns[:done],
+                    )
+        checkpoint.save("stripes", arrays)
+
+    @classmethod
+    def kept(cls, checkpoint: Checkpoint, kinds: Sequence[str], session: Session) -> SessionSums | None:
+        """Those of an interrupted session; None where there are none.
+
+        Parameters
+        ----------
+        checkpoint
+            that may hold them.
+        kinds, session
+            of responses, and what they are responses to.
+        """
+        arrays = checkpoint.load("stripes")
+        if arrays is None:
+            return None
+        by_kind = {
+            kind: (_kept_sums(arrays, f"{kind}_", SIDES[0], session), _kept_sums(arrays, f"{kind}_", SIDES[1], session))
+            for kind in kinds
+        }
+        return cls(by_kind, int(arrays["saturated"]))
+
+
+def _kept_sums(arrays: Mapping[str, FloatArray], kind: str, side: Side, session: Session) -> StripeSums:
+    """Sums of one ``kind`` and ``side`` of a ``session``, from what :meth:`SessionSums.save` put down."""
+    own = {name.removeprefix(f"{kind}{side}_"): values for name, values in arrays.items()}
+    done = own["vectors"].shape[1]
+    vectors = np.empty((len(own["vectors"]), session.signs.shape[1]))
+    vectors[:, :done] = own["vectors"]
+    misfit, energy = map(float, own["sums"])
+    sums = StripeSums(side, session.centre, own["common"], vectors, misfit, energy, done)
+    for each, finished in zip((sums.misfits, sums.energies, sums.fluxes), own["each"], strict=True):
+        each[:done] = finished
+    if "light" in own:
+        seen = [PairSeen(*parts) for parts in zip(own["light"].T, own["rows"], own["columns"], strict=True)]
+        sums.pairs = PairSums.empty(seen[0], vectors.shape[1])
+        for number, pair in enumerate(seen):
+            sums.pairs.put(number, pair)
+    return sums
+
+
+# ---- Frames as a real camera's user has them ----
+
+MOST_TIFF = 2**16 - 1
+"""Largest digital number of a 16-bit TIFF; frames of larger or real numbers become NPY."""
+
+
+Names = tuple[str | int, ...]
+"""Of a frame's noise: side and number of its shot, or ``dark`` and numbers of exposure and frame; of a shot then
+``exposure`` and ``repeat``, each with its number where that is not 0."""
+
+
+def repeat_names(shot: tuple[str, int], exposure: int, repeat: int) -> Names:
+    """Names of a frame of a shot.
+
+    Parameters
+    ----------
+    shot
+        as :meth:`Session.shot` has it.
+    exposure, repeat
+        numbers of the frame.
+    """
+    own: Names = ("exposure", exposure) if exposure else ()
+    return (*shot, *own, "repeat", repeat) if repeat else (*shot, *own)
+
+
+@dataclass(frozen=True, eq=False)
+class KeptFrames:
+    """Frames of a ``session`` in a ``folder`` that is held, called by the number at which they are taken."""
+
+    session: Session
+    folder: Path
+
+    def write(self, names: Names, numbers: DigitalNumbers) -> None:
+        """Write one frame, by ``names`` of its noise; ``numbers`` (rows, columns) as read."""
+        place = (self._dark if names[0] == "dark" else self._lit)[names].file
+        with whole_file(self.folder / place) as part, part.open("wb") as file:
+            if self._tiff:
+                Image.fromarray(numbers.astype(np.uint16)).save(file, "TIFF")
+            else:
+                np.save(file, numbers)
+
+    def finish(self, digital: Digital) -> None:
+        """Write the list, when all frames are there; ``digital`` is of the shortest exposure."""
+        session, recipe = self.session, self.session.recipe
+        listed = FrameList(
+            camera=session.bench.identity(),
+            n=session.bench.n,
+            signed_capture=recipe.signed_capture,
+            repeats=recipe.repeats,
+            exposure_ladder=recipe.exposure_ladder,
+            ladder_merge=recipe.ladder_merge,
+            digital=digital,
+            centre=session.centre,
+            board_reflectance=recipe.board_reflectance,
+            frames=tuple(self._lit.values()),
+            dark=tuple(self._dark.values()),
+        )
+        write_json(self.folder / LISTS[1], listed.model_dump(mode="json", exclude_defaults=True))
+
+    @cached_property
+    def _tiff(self) -> bool:
+        largest = self.session.bench.sensor.largest_dn
+        return largest is not None and largest <= MOST_TIFF
+
+    def _name(self, kind: str, number: int) -> str:
+        return f"{kind}_{number:05d}{'.tif' if self._tiff else '.npy'}"
+
+    @cached_property
+    def _lit(self) -> dict[Names, StripeFile]:
+        """Frames of stripes, as they are taken."""
+        found: dict[Names, StripeFile] = {}
+        exposures, repeats = range(len(self.session.recipe.exposure_ladder)), range(self.session.recipe.repeats)
+        for half, exposure, repeat in itertools.product(self.session.order, exposures, repeats):
+            names, (side, index, sign) = repeat_names(self.session.shot(half), exposure, repeat), half
+            file = self._name("frame", len(found))
+            found[names] = StripeFile(file=file, side=side, index=index, sign=sign, exposure=exposure, repeat=repeat)
+        return found
+
+    @cached_property
+    def _dark(self) -> dict[Names, DarkFile]:
+        found: dict[Names, DarkFile] = {}
+        recipe = self.session.recipe
+        for exposure, number in itertools.product(range(len(recipe.exposure_ladder)), range(recipe.dark_frames)):
+            found["dark", exposure, number] = DarkFile(file=self._name("dark", len(found)), exposure=exposure)
+        return found

@@ -1,0 +1,381 @@
+"""A calibration session whose light is traced in; its responses, as a user of noisy frames has them or without noise,
+out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+
+from mitsim.acquire.exposure import Exposer, in_chunks
+from mitsim.bench.request import Exposure
+from mitsim.calibrate.checkpoint import KeptFrames, repeat_names
+from mitsim.calibrate.session import Session, stripe_frames
+from mitsim.core.arrays import FloatArray
+from mitsim.core.job import Job
+from mitsim.core.parallel import in_threads
+from mitsim.devices.patterns import Lighting, PatternFamily
+from mitsim.devices.sensor import digital_of
+from mitsim.devices.session import SIDES
+from mitsim.light.light import SampledLight
+from mitsim.optics.frames import Frame
+from mitsim.reconstruct.captured_session import Chosen, Ladder
+from mitsim.sensor.chain import Digital as DigitalNumbers
+
+Result = TypeVar("Result")
+_NUMBERS_AT_ONCE = 2**15
+"""Numbers of frames that become a response at a time: so few stay in the cache. Whole frames of a sensor of 2048 pixels
+took ten times as long."""
+SHOT, DARK, READ, ROUNDING = "shot noise", "dark current", "read noise", "quantisation"
+"""Sources of a frame's noise."""
+
+
+@dataclass(frozen=True)
+class Response:
+    """Response (m, m') to a +-1 pattern [electrons / s], how many of its shots had saturated pixels, and, of a pair,
+    the sum of its two shots."""
+
+    rate: FloatArray
+    saturated: int = 0
+    light: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class LitSession:
+    """A session whose light is traced: its responses, with noise or without.
+
+    Attributes
+    ----------
+    session
+        what is shown.
+    light
+        of the board, by projector pixel.
+    white
+        expected frame of the uniform shot.
+    exposure_s
+        of every shot [s], the shortest where there are several.
+    speckle
+        contrast of laser speckle in the frames.
+    kept
+        where its frames are written to; None: nowhere.
+    """
+
+    session: Session
+    light: SampledLight
+    white: Frame
+    exposure_s: float
+    speckle: float
+    kept: KeptFrames | None = None
+
+    @classmethod
+    def of(cls, session: Session, light: SampledLight, job: Job) -> LitSession:
+        """The session in its light.
+
+        Parameters
+        ----------
+        session, light
+            what is shown, and the board's light.
+        job
+            takes the time of choosing the exposure.
+        """
+        with job.clock.stage("optics"):
+            n, signs = session.bench.n, session.signs
+            white = next(iter(light.frames(Lighting.uniform(n), session.seed)))
+            exposure = Exposure(None, session.recipe.exposure_fraction)
+            exposure_s = exposure.choose(session.bench.rig, float(session.filtered(white.irradiance).max()))
+        stripes = PatternFamily("stripes", signs[:, 1:2].astype(np.int8), np.ones((n, 1), np.int8))
+        return cls(session, light, white, exposure_s, light.speckle(stripes))
+
+    @property
+    def response_noise(self) -> float:
+        """Root mean square noise of a +-1 response [electrons / s], from the sensor's closed form."""
+        return float(np.sqrt(np.mean([self.response_variance(side).mean() for side in SIDES])))
+
+    def response_variance(self, side: str) -> FloatArray:
+        """(m, m') mean noise variance of the responses of a ``side`` [(electrons / s)^2], in closed form."""
+        variance: FloatArray = np.zeros(self.uniform_rate.shape)
+        for parts in self.response_variances(side):
+            for part in parts.values():
+                variance += part
+        return variance
+
+    def response_variances(self, side: str) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+        """The same by source, (m, m') or one number each: what each response has of its own, and what all of
+        the ``side`` share.
+
+        Two shots of a pair share the uniform light L: variance (L + 2 D) / t + 2 R / t^2 with dark electrons D and the
+        variance R of reading and rounding. 2 Y(positive) - Y(uniform) of a part p of the lines, about half, has
+        (4 p L + 4 D) / t + 4 R / t^2 of its own; the uniform shot's (L + D) / t + R / t^2 is shared, and that of a dark
+        frame's mean. Means of repeated shots have their number's part of it. Of several exposures each pixel has the
+        sum of these by the squares of its weights.
+        """
+        sensor, recipe, ladder = self.session.bench.sensor, self.session.recipe, self.ladders[side]
+        rounding = 0.0 if sensor.largest_dn is None else 1 / (12 * sensor.gain_dn_per_e**2)
+        # As many times a uniform shot's light, and another shot's other noise, as a response has.
+        lines, own_shots, shared_shots = (0.5, 2.0, 0.0) if self.session.pairs else (self.session.lit_lines, 4.0, 1.0)
+        own, shared = (dict.fromkeys((SHOT, DARK, READ, ROUNDING), np.zeros(1)) for _ in range(2))
+        for number, time in enumerate(self.exposures_s):
+            weight: FloatArray | float = 1.0 if ladder.weights is None else np.square(ladder.weights[number])
+            if self.session.filters is not None:
+                weight = weight / np.square(self.session.filters)
+            single: dict[str, FloatArray | float] = {
+                SHOT: self.session.filtered(self.uniform_rate) / time,
+                DARK: sensor.superpixel_dark_current_e_per_s / time,
+                READ: sensor.superpixel_reading_noise_e**2 / time**2,
+                ROUNDING: rounding / time**2,
+            }
+            for source, one in single.items():
+                part = lines if source == SHOT else 1.0
+                own[source] = own[source] + own_shots * part * weight * one / recipe.repeats
+                shots = shared_shots / recipe.repeats
+                if source != SHOT and recipe.dark_frames:
+                    shots += 1 / recipe.dark_frames
+                shared[source] = shared[source] + shots * weight * one
+        return own, shared
+
+    def each(self, side: str, use: Callable[[tuple[int, Frame]], Result], job: Job, first: int = 0) -> Iterator[Result]:
+        """What a function makes of the +-1 patterns of a side, in order, some at a time in a thread each.
+
+        Parameters
+        ----------
+        side
+            ``horizontal`` or ``vertical`` stripes.
+        use
+            of a pattern's number and the expected frame of its +1 pixels. Number 0 is the uniform pattern.
+        job
+            takes the time and is told how far it is.
+        first
+            number of the first pattern.
+        """
+
+        def used(item: tuple[int, Frame]) -> Result:
+            number, frame = item
+            return use((number, self._with_leak(frame) if number else frame))
+
+        chunks = in_chunks(self._stripes(side, first))
+        while True:
+            with job.clock.stage("optics"):
+                chunk = next(chunks, None)
+            if chunk is None:
+                return
+            with job.clock.stage("sensor"):
+                results = in_threads(used, chunk)
+            job.progress(f"{side} stripes", (chunk[-1][0] + 1) / self.session.signs.shape[1])
+            yield from results
+
+    def _stripes(self, side: str, first: int) -> Iterator[tuple[int, Frame]]:
+        """Numbers and frames from ``first`` on, without what black pixels leak; none is formed for number 0."""
+        if first == 0:
+            yield 0, self.white
+        n = self.session.bench.n
+        row, column = np.divmod(np.arange(n * n), n)
+        stripes = Lighting(row if side == "horizontal" else column, (1.0 + self.session.signs.T) / 2)
+        shape = self.session.bench.geometry.frame_shape
+        yield from stripe_frames(self.light, stripes, self.session.seed, shape, max(first, 1))
+
+    def _with_leak(self, frame: Frame) -> Frame:
+        """The ``frame`` with the light of black pixels: to form it with them would be twice the work."""
+        black = self.light.simulation.physics.black_level
+        if not black:
+            return frame
+        light = (1 - black) * frame.irradiance
+        light += self._leak
+        return replace(frame, irradiance=light)
+
+    @cached_property
+    def _leak(self) -> FloatArray:
+        """(m, m') light of all pixels when they are black [W m^-2]."""
+        return np.asarray(self.light.simulation.physics.black_level * self.white.irradiance)
+
+    def noisy(self, side: str, number: int, frame: Frame) -> Response:
+        """Response to a +-1 pattern as a user of noisy frames has it.
+
+        Parameters
+        ----------
+        side
+            ``horizontal`` or ``vertical`` stripes.
+        number, frame
+            of the pattern, as :meth:`each` has them.
+        """
+        if not self.session.pairs:
+            shot, uniform = self._expose(frame.irradiance, side, number + 1), self._uniform[side]
+            rate = self._rates(lambda rows: 2 * self._rate(shot, rows) - uniform.rate[rows], shot)
+            if self._dark is not None:
+                rate -= self._dark[side]
+            return Response(rate, shot.saturated + (uniform.saturated if number == 0 else 0))
+        negative = self._both - frame.irradiance
+        shots = (
+            self._expose(frame.irradiance, side, 2 * number),
+            # Rounding leaves pixels that see the +1 stripes alone a little below zero.
+            self._expose(np.maximum(negative, 0.0, out=negative), side, 2 * number + 1),
+        )
+        light: FloatArray = np.empty(frame.irradiance.shape)
+
+        def difference(rows: slice) -> FloatArray:
+            one, other = self._rate(shots[0], rows), self._rate(shots[1], rows)
+            np.add(one, other, out=light[rows])
+            return one - other
+
+        rate = self._rates(difference, shots[0])
+        return Response(rate, sum(shot.saturated for shot in shots), light)
+
+    def noise_free(self, frame: Frame) -> FloatArray:
+        """(m, m') the same of the expected ``frame``: 2 Y((1 + P)/2) - Y(1)."""
+        rate = self._second.electrons(frame)
+        rate *= 2
+        rate -= self.uniform_rate
+        return rate
+
+    @property
+    def _second(self) -> Exposer:
+        """An exposure of one second, whose electrons are rates."""
+        return Exposer(self.session.bench.rig, 1.0, self.session.seed)
+
+    @cached_property
+    def exposures_s(self) -> tuple[float, ...]:
+        """Every exposure of a frame [s]."""
+        return tuple(self.exposure_s * factor for factor in self.session.recipe.exposure_ladder)
+
+    @cached_property
+    def _exposers(self) -> tuple[Exposer, ...]:
+        bench = self.session.bench
+        return tuple(Exposer(bench.rig, time, self.session.seed, self.speckle) for time in self.exposures_s)
+
+    @cached_property
+    def ladders(self) -> Mapping[str, Ladder]:
+        """How frames of several exposures of a side are merged: by the first uniform frame of the other one, which
+        shares no noise with them."""
+        digitals = tuple(digital_of(self.session.bench.sensor, time) for time in self.exposures_s)
+        if len(digitals) == 1:
+            return {side: Ladder(digitals) for side in SIDES}
+        recipe, found = self.session.recipe, dict[str, Ladder]()
+        for side, other in zip(SIDES, reversed(SIDES), strict=True):
+            uniform, _ = self._mean_of_repeats(self._lit(self.white.irradiance, 0, other, 0), 0, True, other, 0)
+            rate = self._exposers[0].rate(uniform)
+            found[side] = Ladder.of(digitals, rate, recipe.repeats, recipe.ladder_merge)
+        return found
+
+    @cached_property
+    def _dark(self) -> Mapping[str, FloatArray] | None:
+        """(m, m') rate of the mean dark frame, as each side's frames are merged; None where none is taken."""
+        number = self.session.recipe.dark_frames
+        if not number:
+            return None
+        still = np.zeros(self.white.irradiance.shape)
+        rates = []
+        for exposure, exposer in enumerate(self._exposers):
+            total = np.zeros(still.shape)
+            for index in range(number):
+                total += self._read(exposer, still, "dark", exposure, index)
+            rates.append(exposer.rate(total / number))
+        return {side: self._without_filters(ladder.merged(rates)) for side, ladder in self.ladders.items()}
+
+    @cached_property
+    def uniform_rate(self) -> FloatArray:
+        """(m, m') expected photoelectrons a second of the uniform frame."""
+        return self._second.electrons(self.white)
+
+    @cached_property
+    def _both(self) -> FloatArray:
+        """(m, m') light of a pair's two shots together [W m^-2]: all of it, and what black pixels leak."""
+        n = self.session.bench.n
+        off = Lighting(np.zeros(n * n, dtype=np.int64), np.zeros((1, 1)))
+        (dark,) = self.light.frames(off, self.session.seed)
+        return np.asarray(self.white.irradiance + dark.irradiance)
+
+    @cached_property
+    def _uniform(self) -> Mapping[str, Response]:
+        """Noisy uniform frames, from which each side's responses are taken where they are no pairs."""
+        shots = {side: self._expose(self.white.irradiance, side, 0) for side in SIDES}
+        return {side: Response(self._rate(shot, slice(None)), shot.saturated) for side, shot in shots.items()}
+
+    def _expose(self, irradiance: FloatArray, side: str, index: int) -> _Shot:
+        """The noisy frames of shot number ``index`` of a ``side``, of expected ``irradiance`` (m, m')."""
+        ladder = self.ladders[side]
+        found = [
+            self._mean_of_repeats(
+                self._lit(irradiance, exposure, side, index), exposure, ladder.used(exposure), side, index
+            )
+            for exposure in range(len(self._exposers))
+        ]
+        return _Shot(ladder, tuple(digital for digital, _ in found), sum(saturated for _, saturated in found))
+
+    def _lit(self, irradiance: FloatArray, exposure: int, *names: str | int) -> FloatArray:
+        """Expected electrons of a shot. Speckle of a board at rest is the same in all repeats and exposures."""
+        passed = Frame(self.session.filtered(irradiance), 0.0, 0.0, 0.0)
+        return self._exposers[exposure].lit(passed, "calibration", *names)
+
+    def _mean_of_repeats(
+        self, lit: FloatArray, exposure: int, used: Chosen, side: str, index: int
+    ) -> tuple[DigitalNumbers, int]:
+        """The mean of all repeats of a shot at one exposure, and how many have saturated pixels that are used.
+
+        Parameters
+        ----------
+        lit
+            expected electrons.
+        exposure, side, index
+            numbers of the exposure and of the shot.
+        used
+            pixels that count.
+        """
+        exposer, repeats = self._exposers[exposure], self.session.recipe.repeats
+        powers = self.session.powers[side, index][exposure]
+
+        def read(repeat: int) -> tuple[DigitalNumbers, int]:
+            light = powers[repeat] * lit
+            digital = self._read(exposer, light, *repeat_names((side, index), exposure, repeat))
+            if used is True:
+                return digital, int(exposer.saturated(digital, light))
+            return digital, int(exposer.saturated(np.where(used, digital, 0), np.where(used, light, 0.0)))
+
+        digital, count = read(0)
+        if repeats == 1:
+            return digital, count
+        mean = digital.astype(np.float64)
+        for repeat in range(1, repeats):
+            digital, saturated = read(repeat)
+            count += saturated
+            mean += digital
+        mean /= repeats
+        return mean, count
+
+    def _read(self, exposer: Exposer, lit: FloatArray, *names: str | int) -> DigitalNumbers:
+        """One noisy frame, which is kept where frames are; ``names`` find its noise."""
+        digital = exposer.digital(lit, "calibration", *names)
+        if self.kept is not None:
+            self.kept.write(names, digital)
+        return digital
+
+    def _rate(self, shot: _Shot, rows: slice) -> FloatArray:
+        """Rates of some ``rows`` of a ``shot``."""
+        each = zip(self._exposers, shot.digital, strict=True)
+        merged = shot.ladder.merged((exposer.rate(digital[rows]) for exposer, digital in each), rows)
+        return self._without_filters(merged, rows)
+
+    def _without_filters(self, rate: FloatArray, rows: slice = slice(None)) -> FloatArray:
+        """What pixels without filters would read, from the ``rate`` of some ``rows``."""
+        return rate if self.session.filters is None else rate / self.session.filters[rows]
+
+    @staticmethod
+    def _rates(of: Callable[[slice], FloatArray], shot: _Shot) -> FloatArray:
+        """(m, m') rates of all rows by those ``of`` some, a few at a time: their arrays stay in the cache."""
+        rates: FloatArray = np.empty(shot.digital[0].shape)
+        step = max(1, _NUMBERS_AT_ONCE // rates.shape[1])
+        for start in range(0, len(rates), step):
+            rows = slice(start, start + step)
+            rates[rows] = of(rows)
+        return rates
+
+
+@dataclass(frozen=True, eq=False)
+class _Shot:
+    """Noisy frames (m, m'), of each exposure the mean of its repeats, which a ``ladder`` merges; how many of
+    all have ``saturated`` pixels."""
+
+    ladder: Ladder
+    digital: tuple[DigitalNumbers, ...]
+    saturated: int
