@@ -469,9 +469,9 @@ def test_lanes_are_not_added_up_in_32_bits() -> None:
 
 # ---- sizes and names -------------------------------------------------------------------------------------------------
 
-MOST_FILES, MOST_LINES_OF_CODE = 285, 41_300
-"""What the house was when its rooms were last counted, and room for an extension or two: a change that needs more says so
-here. A new file or line is one more that the next reader has to know."""
+MOST_FILES, MOST_LINES_OF_CODE = 276, 41_000
+"""What the house was when its rooms were last counted, and room for an extension or two: a change that needs more says
+so here. A new file or line is one more that the next reader has to know."""
 LONG = 450
 """Lines of a file that a reader does not scroll without headings; chosen: some six screens."""
 HEADING = re.compile(r"^\s*# -{4,} ?\w", flags=re.M)
@@ -481,7 +481,6 @@ ALIKE: set[str] = {
     "colour",
     "depth",
     "diffraction",
-    "diffuser",
     "drift",
     "exposure",
     "lamps",
@@ -497,14 +496,10 @@ ALIKE: set[str] = {
     "separation",
     "session",
     "solver",
-    "spectral",
 }
 """Names that files of several rooms have still: a change takes some away, and adds none."""
 WITHOUT_HEADINGS: set[str] = {
-    "mitsim.acquire.capture",
-    "mitsim.acquire.spectral",
     "mitsim.api.bench",
-    "mitsim.calibrate.model_fit",
     "mitsim.core.manifests",
     "mitsim.exchange.pictures",
     "mitsim.reconstruct.captured_session",
@@ -515,7 +510,7 @@ WITHOUT_HEADINGS: set[str] = {
     "mitsim.report.exposures",
     "mitsim.studies.calibration",
     "mitsim.transport.records",
-    "mitsim.transport.transmission",
+    "mitsim.transport.sharp_lobes",
 }
 """Long files that have none still."""
 PARTICIPLE = re.compile(
@@ -523,7 +518,7 @@ PARTICIPLE = re.compile(
     "|given|gone|grown|held|hidden|kept|known|laid|led|left|lent|lit|lost|made|meant|met|paid|said|seen|sent|shown"
     "|spent|split|spoken|struck|sunk|swept|taken|thought|thrown|told|understood|worn|written|[a-z]+[^e]ed"
 )
-MOST_PARTICIPLES = 416
+MOST_PARTICIPLES = 303
 """Functions that are named by a participle alone: what was done is no name of what a function does or gives. A change
 takes some away, and adds none."""
 TOKENS_WITHOUT_CODE = {
