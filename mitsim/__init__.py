@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.factors import load_calibration as load_calibration
     from mitsim.reconstruct.reconstruct import reconstruct as reconstruct
     from mitsim.reconstruct.result import Reconstruction as Reconstruction
-    from mitsim.report.colour.by_line import reconstruct_colours as reconstruct_colours
+    from mitsim.report.line_images import reconstruct_colours as reconstruct_colours
 
 _HOMES = {
     name: home
@@ -69,7 +69,7 @@ _HOMES = {
         "reconstruct.factors": "Factors load_calibration",
         "reconstruct.reconstruct": "reconstruct",
         "reconstruct.result": "Reconstruction",
-        "report.colour.by_line": "reconstruct_colours",
+        "report.line_images": "reconstruct_colours",
     }.items()
     for name in names.split()
 }

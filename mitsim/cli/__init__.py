@@ -161,7 +161,7 @@ def demo(
     common: Common,
 ) -> int:
     """The main job: plan, capture, calibrate and reconstruct under five pattern families, and report.html."""
-    from mitsim.studies.framework.folder import check_study_folder
+    from mitsim.studies.framework.run import check_study_folder
 
     request = mitsim.Request.of(**vars(asked))
     check_study_folder(output, "demo")

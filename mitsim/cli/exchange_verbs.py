@@ -98,7 +98,7 @@ def import_(
     ] = None,
 ) -> int:
     """Make a run folder of a real camera's frames, or of a file that `mitsim export` wrote."""
-    from mitsim.exchange.loaders import READERS, import_file
+    from mitsim.exchange.formats import READERS, import_file
 
     if output is None and calibration_output is None:
         raise MitsimError("import: nothing to make; give -o RUN, --calibration-output CAL, or both")
@@ -125,7 +125,7 @@ def import_(
 
 def _import_frames(context: typer.Context, source: Path, output: Path, frames: Frames) -> dict[str, Any]:
     from mitsim.core.imagelist import BARE, Raw
-    from mitsim.exchange.formats import RealCapture
+    from mitsim.exchange.real_capture import RealCapture
 
     if frames.patterns is None or frames.camera is None or frames.exposure is None:
         missing = next(name for name in ("patterns", "camera", "exposure") if getattr(frames, name) is None)
@@ -191,7 +191,7 @@ def patterns(
     given = {"camera": stripes.camera, "exposure": stripes.exposure}
     payload: dict[str, Any]
     if family == "stripes":
-        from mitsim.exchange.pictures import SESSION, draw_stripes, session_of
+        from mitsim.exchange.png_files import SESSION, draw_stripes, session_of
 
         refuse_unused(context, ["seed"], "on patterns that are not drawn at random")
         if stripes.camera is None or stripes.exposure is None:
@@ -204,7 +204,7 @@ def patterns(
         )
     else:
         read_name(family, screen.projector_pixels)  # refused before numpy is imported
-        from mitsim.exchange.pictures import draw_family
+        from mitsim.exchange.png_files import draw_family
 
         refuse_unused(context, ["signed_capture"], "on patterns, whose signed ones are pairs; it is for stripes")
         if not takes_seed(family):
@@ -214,12 +214,12 @@ def patterns(
                 raise ArgumentError(name, f"{value}: goes with stripes; give it to `mitsim import`")
         payload = {**draw_family(output, family, screen.projector_pixels, screen.projector, seed), "session": None}
         after = f"Their frames are read by: mitsim import FRAMES --patterns {output / 'patterns.json'} -o RUN"
-    from mitsim.exchange.pictures import cells_told
+    from mitsim.exchange.png_files import describe_cells
 
     where = payload["projector"]
     lines = [
         f"{payload['pictures']} pictures of {where['rows']}x{where['columns']}, {payload['n']}x{payload['n']} cells of "
-        f"{cells_told(where)}: {output}",
+        f"{describe_cells(where)}: {output}",
         after,
     ]
     return finish(common.as_json, payload, lines, ())

@@ -186,7 +186,7 @@ def _reconstruct_colours(
     # What it holds is looked into later: an image of the same inputs may be replaced.
     check_output(output, overwrite=is_coloured(output))
     from mitsim.core.resources import memory_from_here, memory_since
-    from mitsim.report.colour.by_line import reconstruct_colours
+    from mitsim.report.line_images import reconstruct_colours
 
     held = memory_from_here()
     found = reconstruct_colours(run, calibration, output, place, **options)
@@ -234,7 +234,7 @@ def characterise(
     from mitsim.core.configuration import locate
     from mitsim.devices.sensor import load_sensor
     from mitsim.studies import emva_options
-    from mitsim.studies.framework.folder import check_study_folder
+    from mitsim.studies.framework.run import check_study_folder
 
     sensor = load_sensor(locate(camera, "calibration", ".toml"))
     procedure = emva_options.Procedure(asked.pixels, asked.steps, asked.frames, asked.seed, asked.wavelength)

@@ -75,9 +75,9 @@ def study(
     knob; what `accuracy` costs in time, on a scene and, of none, in the `solver`; what `diffraction` at the mask does;
     how good a `calibration` session is, and why; `merge` joins the parts of --shard.
     """
-    from mitsim.studies import find_study, is_experiment
-    from mitsim.studies.framework.folder import check_study_folder
-    from mitsim.studies.names import EXPOSED, OF_NO_SCENE
+    from mitsim.studies import EXPOSED, OF_NO_SCENE
+    from mitsim.studies.framework.experiment import is_experiment
+    from mitsim.studies.framework.run import check_study_folder, find_study
 
     if name == "merge":
         others = [each for each in context.params if each not in _OF_MERGE]
@@ -140,8 +140,7 @@ def _scope(scene: str | None, devices: Devices, variant: str, quick: bool) -> Sc
     """How much of a study a command line asks for: eight test images on the photograph's sheet (two, where it is
     ``quick``), or one ``scene``."""
     from mitsim.studies.framework.experiment import Scope
-    from mitsim.studies.framework.pictures import QUICK_IMAGES, TEST_IMAGES
-    from mitsim.studies.framework.setup import Setup
+    from mitsim.studies.framework.setup import QUICK_IMAGES, TEST_IMAGES, Setup
 
     parameters = tuple(sorted(devices.parameters.items()))
     where = devices.camera, devices.projector, variant, devices.outside
@@ -165,7 +164,7 @@ def scope_of(name: str, scope: Scope, patterns: str, over: Sequence[str], measur
         for options that the study does not have, or that cannot be read.
     """
     from mitsim.devices.patterns import read_name
-    from mitsim.report.study_options import check_drifts, check_sweep, measures_of, values_of
+    from mitsim.studies.framework.experiment import check_drifts, check_sweep, measures_of, values_of
 
     varied = tuple(values_of(text) for text in over)
     if name == "sweep":
@@ -189,7 +188,7 @@ def _check_setup(scope: Scope, scene: str | None) -> None:
     from mitsim.bench.request import Exposure
     from mitsim.core.configuration import load_model
     from mitsim.devices.sensor import load_sensor
-    from mitsim.report.study_options import NO_SCENE
+    from mitsim.studies.framework.experiment import NO_SCENE
 
     camera, projector = check_devices(scope.setup.camera, scope.setup.projector)
     # A study in colour may see through colour filters; all fill a part of the full well.
