@@ -49,6 +49,7 @@ lint: $(LINT_READY)
 	@$(VENV)/bin/ruff format --check .
 	@$(VENV)/bin/ruff check .
 	@$(VENV)/bin/mypy
+	@$(VENV)/bin/vulture
 
 # Warnings are errors; nothing is fetched and no notebook is run.
 docs: $(DOCS_READY)

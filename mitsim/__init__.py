@@ -20,85 +20,61 @@ from typing import TYPE_CHECKING
 from mitsim.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from mitsim.acquire.capture import Light
-    from mitsim.acquire.reference import Rendered
-    from mitsim.api.bench import Bench, open_bench
-    from mitsim.bench.request import Request
-    from mitsim.calibrate.model import calibrate_model
-    from mitsim.calibrate.plan import CalibrationPlan, plan_calibration
-    from mitsim.core.errors import ArgumentError, MitsimError
-    from mitsim.core.job import Clock, Job
-    from mitsim.core.resources import Limits
-    from mitsim.core.runs import Capture, MosaicCapture, load_mosaic, load_run
-    from mitsim.devices.session import Modelling, load_recipe
-    from mitsim.light.plan import Plan
-    from mitsim.metrics import psnr, ssim
-    from mitsim.reconstruct.captured_session import calibrate_frames
-    from mitsim.reconstruct.factors import Factors, load_calibration
-    from mitsim.reconstruct.reconstruct import reconstruct
-    from mitsim.reconstruct.result import Reconstruction
-    from mitsim.report.line_images import reconstruct_colours
+    from mitsim.acquire.capture import Light as Light
+    from mitsim.acquire.reference import Rendered as Rendered
+    from mitsim.api.bench import Bench as Bench
+    from mitsim.api.bench import open_bench as open_bench
+    from mitsim.bench.request import Request as Request
+    from mitsim.calibrate.model import calibrate_model as calibrate_model
+    from mitsim.calibrate.plan import CalibrationPlan as CalibrationPlan
+    from mitsim.calibrate.plan import plan_calibration as plan_calibration
+    from mitsim.core.errors import ArgumentError as ArgumentError
+    from mitsim.core.errors import MitsimError as MitsimError
+    from mitsim.core.job import Clock as Clock
+    from mitsim.core.job import Job as Job
+    from mitsim.core.resources import Limits as Limits
+    from mitsim.core.runs import Capture as Capture
+    from mitsim.core.runs import MosaicCapture as MosaicCapture
+    from mitsim.core.runs import load_mosaic as load_mosaic
+    from mitsim.core.runs import load_run as load_run
+    from mitsim.devices.session import Modelling as Modelling
+    from mitsim.devices.session import load_recipe as load_recipe
+    from mitsim.light.plan import Plan as Plan
+    from mitsim.metrics import psnr as psnr
+    from mitsim.metrics import ssim as ssim
+    from mitsim.reconstruct.captured_session import calibrate_frames as calibrate_frames
+    from mitsim.reconstruct.factors import Factors as Factors
+    from mitsim.reconstruct.factors import load_calibration as load_calibration
+    from mitsim.reconstruct.reconstruct import reconstruct as reconstruct
+    from mitsim.reconstruct.result import Reconstruction as Reconstruction
+    from mitsim.report.line_images import reconstruct_colours as reconstruct_colours
 
 _HOMES = {
-    "open_bench": "api.bench",
-    "load_run": "core.runs",
-    "load_mosaic": "core.runs",
-    "load_calibration": "reconstruct.factors",
-    "load_recipe": "devices.session",
-    "calibrate_frames": "reconstruct.captured_session",
-    "calibrate_model": "calibrate.model",
-    "plan_calibration": "calibrate.plan",
-    "reconstruct": "reconstruct.reconstruct",
-    "reconstruct_colours": "report.line_images",
-    "psnr": "metrics",
-    "ssim": "metrics",
-    "Bench": "api.bench",
-    "Plan": "light.plan",
-    "Request": "bench.request",
-    "Light": "acquire.capture",
-    "Capture": "core.runs",
-    "MosaicCapture": "core.runs",
-    "CalibrationPlan": "calibrate.plan",
-    "Factors": "reconstruct.factors",
-    "Reconstruction": "reconstruct.result",
-    "Rendered": "acquire.reference",
-    "Modelling": "devices.session",
-    "Job": "core.job",
-    "Clock": "core.job",
-    "Limits": "core.resources",
-    "MitsimError": "core.errors",
-    "ArgumentError": "core.errors",
+    name: home
+    for home, names in {
+        "acquire.capture": "Light",
+        "acquire.reference": "Rendered",
+        "api.bench": "Bench open_bench",
+        "bench.request": "Request",
+        "calibrate.model": "calibrate_model",
+        "calibrate.plan": "CalibrationPlan plan_calibration",
+        "core.errors": "ArgumentError MitsimError",
+        "core.job": "Clock Job",
+        "core.resources": "Limits",
+        "core.runs": "Capture MosaicCapture load_mosaic load_run",
+        "devices.session": "Modelling load_recipe",
+        "light.plan": "Plan",
+        "metrics": "psnr ssim",
+        "reconstruct.captured_session": "calibrate_frames",
+        "reconstruct.factors": "Factors load_calibration",
+        "reconstruct.reconstruct": "reconstruct",
+        "reconstruct.result": "Reconstruction",
+        "report.line_images": "reconstruct_colours",
+    }.items()
+    for name in names.split()
 }
-__all__ = [
-    "ArgumentError",
-    "Bench",
-    "CalibrationPlan",
-    "Capture",
-    "Clock",
-    "Factors",
-    "Job",
-    "Light",
-    "Limits",
-    "MitsimError",
-    "Modelling",
-    "MosaicCapture",
-    "Plan",
-    "Reconstruction",
-    "Rendered",
-    "Request",
-    "calibrate_frames",
-    "calibrate_model",
-    "load_calibration",
-    "load_mosaic",
-    "load_recipe",
-    "load_run",
-    "open_bench",
-    "plan_calibration",
-    "psnr",
-    "reconstruct",
-    "reconstruct_colours",
-    "ssim",
-]
+"""Module of each name of the face."""
+__all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> object:

@@ -5,10 +5,13 @@ between files. Imports in functions and those for type checkers count. docs/arch
 """
 
 import ast
+import io
 import pkgutil
 import re
 import subprocess
 import sys
+import tokenize
+from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -461,3 +464,102 @@ def test_lanes_are_not_added_up_in_32_bits() -> None:
     assert not [name for name, path in modules() if sums_lanes(name, path.read_text(encoding="utf-8"))]
     assert sums_lanes("mitsim.transport.direct", "total = dr.sum(light)") == ["sum"]
     assert not sums_lanes("mitsim.transport.direct", "total = dr.block_sum(mi.Float64(light), 4)")
+
+
+# ---- sizes and names -------------------------------------------------------------------------------------------------
+
+MOST_FILES, MOST_LINES_OF_CODE = 254, 40_800
+"""What the house was when its rooms were last counted, and room for an extension or two: a change that needs more says
+so here. A new file or line is one more that the next reader has to know."""
+LONG = 450
+"""Lines of a file that a reader does not scroll without headings; chosen: some six screens."""
+HEADING = re.compile(r"^\s*# -{4,} ?\w", flags=re.M)
+UNNAMED = {"__init__", "__main__"}
+ALIKE: set[str] = {"bench", "drift", "lamps", "plan", "projector", "request", "session"}
+"""Names that files of several rooms have still: a change takes some away, and adds none."""
+WITHOUT_HEADINGS: set[str] = {
+    "mitsim.api.bench",
+    "mitsim.core.manifests",
+    "mitsim.exchange.png_files",
+    "mitsim.reconstruct.captured_session",
+    "mitsim.reconstruct.depth",
+    "mitsim.reconstruct.estimate_factors",
+    "mitsim.reconstruct.focus",
+    "mitsim.reconstruct.misfit",
+    "mitsim.report.mosaic_images",
+    "mitsim.studies.calibration_study",
+    "mitsim.studies.convolutional_study",
+    "mitsim.studies.perturbation",
+    "mitsim.transport.records",
+    "mitsim.transport.sharp_lobes",
+}
+"""Long files that have none still."""
+PARTICIPLE = re.compile(
+    "begun|bent|bound|broken|brought|built|caught|chosen|done|drawn|driven|fallen|felt|filed|forgotten|formed|found"
+    "|given|gone|grown|held|hidden|kept|known|laid|led|left|lent|lit|lost|made|meant|met|paid|said|seen|sent|shown"
+    "|spent|split|spoken|struck|sunk|swept|taken|thought|thrown|told|understood|worn|written|[a-z]+[^e]ed"
+)
+MOST_PARTICIPLES = 226
+"""Functions that are named by a participle alone: what was done is no name of what a function does or gives. A change
+takes some away, and adds none."""
+TOKENS_WITHOUT_CODE = {
+    *(tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER)
+}
+
+
+def lines_of_code(source: str) -> int:
+    """Lines that hold more than a docstring, a comment or nothing."""
+    texts: set[int] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            texts |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    lines: set[int] = set()
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type not in TOKENS_WITHOUT_CODE:
+            lines |= set(range(token.start[0], token.end[0] + 1))
+    return len(lines - texts)
+
+
+def rooms_by_file(names: list[str]) -> dict[str, set[str]]:
+    """Rooms that have a file of a name, by that name."""
+    rooms: dict[str, set[str]] = defaultdict(set)
+    for name in names:
+        if (file := name.rpartition(".")[2]) not in UNNAMED and name.count(".") > 1:
+            rooms[file].add(room_of(name))
+    return rooms
+
+
+def participles(source: str) -> list[str]:
+    """Functions and methods of one word, which is a participle; properties are what they give."""
+    found = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef)]
+    plain = (node for node in found if not any("property" in ast.unparse(each) for each in node.decorator_list))
+    return [node.name for node in plain if PARTICIPLE.fullmatch(node.name.strip("_"))]
+
+
+def test_the_house_has_no_more_files_and_lines_than_it_had() -> None:
+    texts = [text for text, _ in sources().values()]
+    assert len(texts) <= MOST_FILES
+    assert sum(map(lines_of_code, texts)) <= MOST_LINES_OF_CODE
+    assert lines_of_code('"""Text."""\n\nx = (\n    1,  # one\n)\n# two\n"""More."""\ny = """a\nb"""\n') == 5
+
+
+def test_long_files_have_headings() -> None:
+    texts = {name: text for name, (text, _) in sources().items() if text.count("\n") > LONG}
+    without = {name for name, text in texts.items() if len(HEADING.findall(text)) < 2}
+    assert without == WITHOUT_HEADINGS, without ^ WITHOUT_HEADINGS
+    assert HEADING.findall("# ---- Anchors\n\n    # -------- anchors of it\n") and not HEADING.findall("# --\n#----")
+
+
+def test_a_file_name_means_one_thing() -> None:
+    """In all rooms; a room inside a room is the same."""
+    shared = {file for file, rooms in rooms_by_file([*sources()]).items() if len(rooms) > 1}
+    assert shared == ALIKE, shared ^ ALIKE
+    planted = rooms_by_file(["mitsim.cli.run", "mitsim.core.run", "mitsim.core", "mitsim.cli.inner.run", "mitsim.run"])
+    assert planted == {"run": {"cli", "core"}}
+
+
+def test_no_more_functions_are_named_by_participles() -> None:
+    found = [name for text, _ in sources().values() for name in participles(text)]
+    assert len(found) <= MOST_PARTICIPLES, len(found)
+    planted = "def _told(): ...\ndef weighed(): ...\ndef tell(): ...\ndef feed(): ...\ndef kept_plans(): ..."
+    assert participles(planted) == ["_told", "weighed"]

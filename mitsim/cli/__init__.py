@@ -1,7 +1,7 @@
 """The command line: parse, call the Python face, print. No physics; heavy imports happen in the verb that needs them.
 
 Options that make up a request come from :class:`mitsim.bench.request.Request`, so that they are the same in Python.
-Errors of the library speak of arguments; :func:`~mitsim.cli.options.spoken` writes them as options.
+Errors of the library speak of arguments; :func:`~mitsim.cli.options.message_of` writes them as options.
 """
 
 from __future__ import annotations
@@ -9,63 +9,56 @@ from __future__ import annotations
 import errno
 import signal
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 import mitsim
-from mitsim.cli import calibration, exchange, image, sensor, study
-from mitsim.cli.colour import (
+from mitsim.cli.calibrate_verb import calibrate
+from mitsim.cli.colour_option import (
     AUTO,
     MOSAIC,
     NO,
-    Colour,
+    Coloured,
     ambient_of,
     by_line,
-    check_colour,
-    chosen_of,
     in_colour,
     of_capture,
     of_mosaic,
     plan_of,
-    variant_for,
     weighed,
 )
+from mitsim.cli.exchange_verbs import export, import_, patterns, transport
+from mitsim.cli.frame_verbs import characterise, reconstruct, sense
 from mitsim.cli.options import (
-    DAY,
     Accuracy,
-    AccuracyOrSeconds,
-    Camera,
-    Defines,
+    Common,
+    Devices,
     Effects,
-    Json,
-    MaxMemory,
-    MaxSeconds,
-    Outside,
+    ExposureFraction,
+    Limited,
+    LitScene,
+    OfPatterns,
     Patterns,
-    Projector,
-    Quiet,
     Resume,
+    Sampling,
     Scene,
-    Seconds,
     Seed,
-    Variant,
-    bench_of,
-    check_camera,
-    check_shown,
     check_work,
     is_given,
-    job_of,
+    message_of,
     number_of,
+    option,
     refuse_unused,
     request_of,
-    spoken,
+    verb,
 )
 from mitsim.cli.screen import finish, print_plan
-from mitsim.core.environment import DEFAULT_VARIANT
+from mitsim.cli.study_verb import study
 from mitsim.core.errors import MitsimError, printable
+from mitsim.core.spectral_manifests import LINES
 from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped, end_uncaught, stopped
 
 app = typer.Typer(
@@ -96,7 +89,7 @@ def run() -> None:
             sys.exit(128 + signal.SIGPIPE)
         raise
     except MitsimError as error:
-        _fail(spoken(error))
+        _fail(message_of(error))
     except (typer.Abort, KeyboardInterrupt) as error:
         if isinstance(error.__cause__, EOFError):  # which click takes for Control-D
             end_uncaught(error.__cause__)
@@ -146,148 +139,118 @@ def _root(
         raise typer.Exit
 
 
-@app.command()
+# ---- verbs of a scene ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class DemoRequest:
+    """What the demo's captures are asked for."""
+
+    patterns: Patterns = "dots:7"
+    accuracy: Accuracy = 1e-3
+    seed: Seed = 0
+
+
+@verb
 def demo(
+    *,
     scene: Annotated[str, typer.Argument(help="scene XML, or the name of a shipped scene")] = "photograph",
     output: Annotated[Path, typer.Option("-o", "--output", help="folder of the demo")] = Path("demo-output"),
-    patterns: Patterns = "dots:7",
-    accuracy: Accuracy = 1e-3,
-    seed: Seed = 0,
-    camera: Camera = None,
-    projector: Projector = None,
-    define: Defines = None,
-    outside: Outside = False,
-    variant: Variant = DEFAULT_VARIANT,
-    as_json: Json = False,
-    quiet: Quiet = False,
+    asked: DemoRequest,
+    devices: Devices,
+    common: Common,
 ) -> int:
     """The main job: plan, capture, calibrate and reconstruct under five pattern families, and report.html."""
     from mitsim.studies.framework.run import check_study_folder
 
-    request = mitsim.Request.of(patterns=patterns, accuracy=accuracy, seed=seed)
+    request = mitsim.Request.of(**vars(asked))
     check_study_folder(output, "demo")
-    check_camera(camera, request.timing)
-    check_shown([patterns], scene, define, outside)
-    with job_of(quiet or as_json) as job:
-        with job.clock.stage("open scene"):
-            bench = bench_of(scene, variant, camera, projector, define, outside)
+    devices.check_exposure(request.timing)
+    devices.check(scene, request.patterns)
+    with common.job() as job:
+        bench = devices.open(scene, common.variant, job)
         from mitsim.studies.demo import demo as run_demo  # only now: it takes seconds to import
 
         result = run_demo(bench, output, request, job)
-    return finish(as_json, result.payload(), result.lines(), result.warnings)
+    return finish(common.as_json, result.payload(), result.lines(), result.warnings)
 
 
-@app.command()
-def plan(
-    scene: Scene,
-    patterns: Patterns = "dots:7",
-    accuracy: AccuracyOrSeconds = None,
-    seconds: Seconds = None,
-    seed: Seed = 0,
-    camera: Camera = None,
-    projector: Projector = None,
-    define: Defines = None,
-    outside: Outside = False,
-    effects: Effects = "",
-    variant: Variant = DEFAULT_VARIANT,
-    colour: Colour = NO,
-    as_json: Json = False,
-    quiet: Quiet = False,
-) -> int:
+@verb
+def plan(scene: Scene, sampling: OfPatterns, devices: Coloured, common: Common) -> int:
     """What will be simulated, why, and what it costs, before any long work."""
     from mitsim.core.resources import running_seconds
 
-    request = request_of(patterns=patterns, accuracy=accuracy, seconds=seconds, seed=seed, effects=effects)
-    check_colour(colour, variant, projector, seconds)
-    check_shown([patterns], scene, define, outside)
-    bench = bench_of(scene, variant_for(colour, variant, camera), camera, projector, define, outside)
+    request = request_of(sampling)
+    devices.check_colour(common.variant, sampling.seconds)
+    devices.check(scene, sampling.patterns)
+    bench = devices.open(scene, devices.traced_in(common.variant))
     starting = running_seconds()
-    plan = plan_of(bench, colour, request).taking(start=starting)
-    if not as_json:
-        print_plan(plan)
-    return finish(as_json, plan.payload(), [], plan.warnings)
+    found = plan_of(bench, devices.colour, request).taking(start=starting)
+    if not common.as_json:
+        print_plan(found)
+    return finish(common.as_json, found.payload(), [], found.warnings)
 
 
-@app.command()
+@dataclass(frozen=True, kw_only=True)
+class Capturing(Sampling):
+    """What is captured, and how long it is exposed: fields of a request."""
+
+    patterns: Patterns
+    exposure: str = option("auto", "seconds a frame, or auto", metavar="auto|SECONDS")
+    exposure_fraction: ExposureFraction = 0.8
+    noise_fraction: float | None = option(None, "stop sampling at this part of the sensor's noise", metavar="PART")
+    ambient_frame: str = option("auto", "take a frame with the projector off and lamps on", metavar="auto|yes|no")
+    ambient_shots: int | None = option(None, "shots of that frame; by the patterns if not given", metavar="N")
+
+
+@verb
 def capture(
+    *,
     context: typer.Context,
     scene: Scene,
     output: Annotated[Path, typer.Option("-o", "--output", help="run folder to make", metavar="RUN")],
-    patterns: Patterns,
-    accuracy: AccuracyOrSeconds = None,
-    seconds: Seconds = None,
-    camera: Camera = None,
-    projector: Projector = None,
-    exposure: Annotated[str, typer.Option(help="seconds a frame, or auto", metavar="auto|SECONDS")] = "auto",
-    exposure_fraction: Annotated[float, typer.Option(help="brightest pixel, as a part of full well")] = 0.8,
-    effects: Effects = "",
-    noise_fraction: Annotated[
-        float | None, typer.Option(help="stop sampling at this part of the sensor's noise", metavar="PART")
-    ] = None,
-    ambient_frame: Annotated[
-        str, typer.Option(help="take a frame with the projector off and lamps on", metavar="auto|yes|no")
-    ] = "auto",
-    ambient_shots: Annotated[
-        int | None, typer.Option(help="shots of that frame; by the patterns if not given", metavar="N")
-    ] = None,
-    seed: Seed = 0,
-    define: Defines = None,
-    outside: Outside = False,
+    capturing: Capturing,
+    devices: Coloured,
     resume: Resume = False,
-    variant: Variant = DEFAULT_VARIANT,
-    colour: Colour = NO,
-    max_seconds: MaxSeconds = DAY,
-    max_memory: MaxMemory = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
+    limited: Limited,
 ) -> int:
     """Render, expose and write one frame for each pattern; in colour, for each pattern and line of the projector."""
     from mitsim.core.manifests import MANIFEST
     from mitsim.core.resources import memory_from_here, memory_since
 
-    if exposure != "auto":
+    if capturing.exposure != "auto":
         refuse_unused(context, ["exposure_fraction"], "on an --exposure in seconds")
-    if ambient_frame == "no":
+    if capturing.ambient_frame == "no":
         refuse_unused(context, ["ambient_shots"], "with --ambient-frame no")
-    request = request_of(
-        patterns=patterns,
-        accuracy=accuracy,
-        seconds=seconds,
-        seed=seed,
-        exposure=number_of("exposure", exposure),
-        exposure_fraction=exposure_fraction,
-        effects=effects,
-        noise_fraction=noise_fraction,
-        ambient_frame=ambient_frame,
-        ambient_shots=ambient_shots,
-    )
-    traced_in = variant_for(colour, variant, camera)
+    exposure, colour = number_of("exposure", capturing.exposure), devices.colour
+    request = request_of(replace(capturing, exposure=exposure))
+    variant = devices.traced_in(limited.variant)
     begun_in_one = (output / MANIFEST).is_file()  # which auto may decide for
     check_work(output, resume, "capture", several=by_line(colour) or (colour == AUTO and not begun_in_one))
-    check_colour(colour, variant, projector, seconds)
+    devices.check_colour(limited.variant, capturing.seconds)
     if colour != MOSAIC:
-        check_camera(camera, mitsim.Request.of(**request).timing)
-    check_shown([patterns], scene, define, outside)
+        devices.check_exposure(mitsim.Request.of(**request).timing)
+    devices.check(scene, capturing.patterns)
     advise(RESUME)
-    with job_of(quiet or as_json, max_seconds, max_memory) as job:
-        with job.clock.stage("open scene"):
-            bench = bench_of(scene, traced_in, camera, projector, define, outside)
+    with limited.job() as job:
+        bench = devices.open(scene, variant, job)
         held = memory_from_here()
+        what, options = request.pop("patterns"), request
         if colour == MOSAIC:
-            seen = bench.capture_mosaic(request.pop("patterns"), output, resume, job, **request)
+            seen = bench.capture_mosaic(what, output, resume, job, **options)
             payload, lines = of_mosaic(seen)
             payload["memory_bytes"] = memory_since(held)
-            return finish(as_json, payload, lines, seen.warnings)
-        what, more = request.pop("patterns"), request
+            return finish(limited.as_json, payload, lines, seen.warnings)
         if colour == AUTO:
-            bench, what, colour = chosen_of(bench, {"patterns": what, **request}, job)
-            more = {}
+            with job.planning(what):
+                chosen = bench.choose_colour(patterns=what, **options)
+            bench, what, options, colour = chosen.bench, chosen.plan, {}, NO if chosen.mono else LINES
         if by_line(colour):
-            runs = in_colour(bench, colour).capture_lines(what, output, resume, job, **more)
+            runs = in_colour(bench, colour).capture_lines(what, output, resume, job, **options)
             payload, lines = of_capture(runs, output)
             payload["memory_bytes"] = memory_since(held)
-            return finish(as_json, payload, lines, payload["warnings"])
-        shots = bench.capture(what, output, resume, job, **more)
+            return finish(limited.as_json, payload, lines, payload["warnings"])
+        shots = bench.capture(what, output, resume, job, **options)
     payload = {**shots.summary(), "memory_bytes": memory_since(held)}
     taken = payload["seconds"]
     lines = [
@@ -299,38 +262,34 @@ def capture(
         f"of at most {payload['predicted_memory_bytes'] / 2**30:.2g} predicted",
     ]
     lines += weighed(payload)
-    if seconds is not None:
+    if capturing.seconds is not None:
         lines.append(
-            f"Asked for {seconds:g} s, predicted {payload['predicted_seconds']:.1f}, taken {taken['total']:.1f}: "
-            f"accuracy {payload['accuracy']:g}, total error up to {payload['total_error_bound']:.1e}"
+            f"Asked for {capturing.seconds:g} s, predicted {payload['predicted_seconds']:.1f}, taken "
+            f"{taken['total']:.1f}: accuracy {payload['accuracy']:g}, total error up to "
+            f"{payload['total_error_bound']:.1e}"
         )
-    return finish(as_json, payload, [*lines, *ambient_of(payload)], shots.warnings)
+    return finish(limited.as_json, payload, [*lines, *ambient_of(payload)], shots.warnings)
 
 
-app.registered_commands += calibration.app.registered_commands + image.app.registered_commands
+@dataclass(frozen=True)
+class Estimating:
+    """What estimates the irradiance, and how finely."""
+
+    estimator: str = option("reference", "reference or factored")
+    spp: int | None = option(None, "samples a pixel of the reference", show_default="the scene's sample_count, or 64")
+    accuracy: Accuracy = 1e-3
+    seed: Seed = 0
+    effects: Effects = ""
 
 
-@app.command()
+@verb
 def render(
     context: typer.Context,
     scene: Scene,
     output: Annotated[Path, typer.Option("-o", "--output", help="frame to write", metavar="FRAME.exr")],
-    estimator: Annotated[str, typer.Option(help="reference or factored")] = "reference",
-    spp: Annotated[
-        int | None,
-        typer.Option(help="samples a pixel of the reference", show_default="the scene's sample_count, or 64"),
-    ] = None,
-    accuracy: Accuracy = 1e-3,
-    seed: Seed = 0,
-    projector: Projector = None,
-    define: Defines = None,
-    outside: Outside = False,
-    effects: Effects = "",
-    variant: Variant = DEFAULT_VARIANT,
-    max_seconds: MaxSeconds = DAY,
-    max_memory: MaxMemory = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
+    estimating: Estimating,
+    lit: LitScene,
+    limited: Limited,
 ) -> int:
     """Expected irradiance under the scene's own light, by either estimator."""
     from mitsim.bench.request import check_samples
@@ -338,36 +297,29 @@ def render(
 
     if output.suffix.lower() != ".exr":
         raise MitsimError(f"--output {output}: the frame is an OpenEXR file; give a name that ends in .exr")
-    request = request_of(accuracy=accuracy, seed=seed, effects=effects)
-    check_samples(estimator, spp)
-    ignored = [f"--{name} has no effect on the {estimator}" for name in _OF_OTHER[estimator] if is_given(context, name)]
+    method: Any = estimating.estimator
+    accuracy, seed = estimating.accuracy, estimating.seed
+    effects = request_of(accuracy=accuracy, seed=seed, effects=estimating.effects)["effects"]
+    check_samples(method, estimating.spp)
+    ignored = [f"--{name} has no effect on the {method}" for name in _OF_OTHER[method] if is_given(context, name)]
     check_output(output, overwrite=True, kind="file")
-    method: Any = estimator
-    with job_of(quiet or as_json, max_seconds, max_memory) as job:
-        bench = bench_of(scene, variant, None, projector, define, outside, for_render=True)
+    with limited.job() as job:
+        bench = lit.open_for_render(scene, limited.variant)
         check_apart(output, bench.loaded.files)
         with output_file(output, overwrite=True) as place:
-            frame = bench.render(method, spp, accuracy, seed, request["effects"], job)
+            frame = bench.render(method, estimating.spp, accuracy, seed, effects, job)
             payload = {**frame.summary(), "output": str(frame.save(place))}
     payload["notes"] = [*payload["notes"], *ignored]
     lines = [
-        f"{estimator}: mean irradiance {payload['mean']:.4e} W/m^2, relative noise {payload['mc_error']:.1e}, "
+        f"{method}: mean irradiance {payload['mean']:.4e} W/m^2, relative noise {payload['mc_error']:.1e}, "
         f"{payload['seconds']:.2f} s: {payload['output']}",
         *payload["notes"],
     ]
-    return finish(as_json, payload, lines, frame.warnings)
+    return finish(limited.as_json, payload, lines, frame.warnings)
 
 
-app.registered_commands += study.app.registered_commands
-app.registered_commands += exchange.app.registered_commands + sensor.app.registered_commands
-
-
-@app.command()
-def doctor(
-    variant: Variant = DEFAULT_VARIANT,
-    as_json: Json = False,
-    quiet: Quiet = False,
-) -> int:
+@verb
+def doctor(common: Common) -> int:
     """What works on this machine, and the one command that mends what does not."""
     from mitsim.core.environment import doctor as run_doctor
 
@@ -378,4 +330,10 @@ def doctor(
         for check in checks
     ]
     bad = tuple(f"{check.name}: {check.detail}" for check in checks if not check.ok)
-    return finish(as_json, {"checks": [asdict(check) for check in checks], "ok": not bad}, lines, bad)
+    return finish(common.as_json, {"checks": [asdict(check) for check in checks], "ok": not bad}, lines, bad)
+
+
+# In the order of the help.
+_SCENE = demo, plan, capture, calibrate, reconstruct, render, study
+for _verb in (*_SCENE, export, import_, patterns, transport, characterise, sense, doctor):
+    app.command(_verb.__name__.rstrip("_"))(_verb)

@@ -1,76 +1,111 @@
-"""Options that several commands share: words of a command line in, a bench, a request or a job out, or a refusal."""
+"""Options that several commands share: words of a command line in, a bench, a request or a job out, or a refusal.
+
+Options that go together are one frozen dataclass, whose fields are the options; :func:`verb` decorates a function of
+such groups.
+"""
 
 from __future__ import annotations
 
+import functools
+import inspect
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import MISSING, dataclass, field, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
 import mitsim
 from mitsim.cli.screen import showing_progress
+from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.devices.patterns import pattern_names, read_name
+from mitsim.core.resources import Limits, running_seconds
+from mitsim.devices.patterns import pattern_names
 
 if TYPE_CHECKING:
     from mitsim.api.bench import Bench
     from mitsim.bench.request import Exposure
     from mitsim.core.job import Job
-    from mitsim.devices.session import SessionRecipe
-    from mitsim.studies.framework.experiment import Scope
 
-_OPTIONS = {"lam": "lambda"}
-"""Options that are not called like the argument."""
-SPELLED = {"scene": "SCENE", "define": "-D", "outside": "--allow-outside-files", "planning": "--plan"}
+_SPELLED = {
+    "scene": "SCENE",
+    "define": "-D",
+    "outside": "--allow-outside-files",
+    "planning": "--plan",
+    "as_json": "--json",
+    "lam": "--lambda",
+}
 """Options that are not called like their parameter."""
 _BENCH_ARGUMENTS = ("scene", "variant", "camera", "projector", "allow_outside_files", "for_render")
 
 Scene = Annotated[str, typer.Argument(help="scene XML, or the name of a shipped scene", metavar="SCENE")]
-SceneOrFrames = Annotated[
-    str | None, typer.Argument(help="scene XML, or the name of a shipped scene; none with --frames", metavar="[SCENE]")
-]
-Json = Annotated[bool, typer.Option("--json", help="one JSON object on stdout, nothing else there")]
-Quiet = Annotated[bool, typer.Option("--quiet", help="no progress")]
-Variant = Annotated[
-    str,
-    typer.Option(
-        help="Mitsuba variant: llvm_ad_mono, llvm_ad_rgb or llvm_ad_spectral; with a GPU, cuda_ for llvm_",
-        callback=lambda name: variant_of(name),
-    ),
-]
 Patterns = Annotated[str, typer.Option(help=pattern_names())]
 Accuracy = Annotated[float, typer.Option(help="relative rms error of the expected frames")]
-AccuracyOrSeconds = Annotated[
-    float | None, typer.Option("--accuracy", help="relative rms error of the expected frames", show_default="0.001")
-]
-Seconds = Annotated[
-    float | None, typer.Option("--seconds", help="the finest accuracy that a run of so long buys", metavar="S")
-]
 Seed = Annotated[int, typer.Option(help="root of every random stream")]
 Effects = Annotated[str, typer.Option("--effects", help="override the plan: +NAME,-NAME", metavar="+NAME,-NAME")]
 Camera = Annotated[str | None, typer.Option(help="camera electronics: name or TOML file", metavar="NAME|FILE")]
 Projector = Annotated[str | None, typer.Option(help="projector: name or TOML file", metavar="NAME|FILE")]
-Defines = Annotated[list[str] | None, typer.Option("-D", help="set a <default> of the scene", metavar="NAME=VALUE")]
-Outside = Annotated[bool, typer.Option("--allow-outside-files", help="let the scene read files outside its own folder")]
+ExposureFraction = Annotated[float, typer.Option(help="brightest pixel, as a part of full well")]
 Resume = Annotated[bool, typer.Option("--resume", help="go on where an interrupted one of the same options stopped")]
-MaxSeconds = Annotated[float, typer.Option("--max-seconds", help="refuse work that would take longer")]
-MaxMemory = Annotated[
-    float | None,
-    typer.Option(
-        "--max-memory", help="refuse work that would take more; nine tenths of what is free if not given", metavar="GIB"
-    ),
-]
-MAIN_PATTERNS, MAIN_MEASURE = "dots:7", "psnr"
-"""What `mitsim study` takes where nothing is said."""
-DAY = 86400.0
-"""Work that would take longer is a mistake, unless it is asked for."""
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace the file")]
 
 
-def variant_of(name: str) -> str:
+# ---- groups of options -----------------------------------------------------------------------------------------------
+
+
+def option(default: Any, help: str, *names: str, **more: Any) -> Any:
+    """A field of a group of options.
+
+    Parameters
+    ----------
+    default
+        its value where it is not given; ``...``: it must be given.
+    help
+        what the help says of it.
+    names
+        of the option, where they are not the field's.
+    more
+        arguments of :class:`typer.Option`.
+    """
+    metadata = {"option": typer.Option(*names, help=help, **more)}
+    return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
+
+
+def verb(function: Callable[..., int]) -> Callable[..., int]:
+    """The ``function`` of a verb with the fields of its groups of options for parameters, as typer reads them. A
+    group's own fields stand before those that it inherits."""
+    hints = get_type_hints(function, include_extras=True)
+    groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
+    options: list[inspect.Parameter] = []
+    for name, parameter in inspect.signature(function).parameters.items():
+        options += _options_of(groups[name]) if name in groups else [_option(name, hints[name], parameter.default)]
+
+    @functools.wraps(function)
+    def ungrouped(**values: Any) -> int:
+        for name, group in groups.items():
+            values[name] = group(**{field: values.pop(field) for field in group.__dataclass_fields__})
+        return function(**values)
+
+    ungrouped.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
+    ungrouped.__annotations__ = {option.name: option.annotation for option in options}
+    return ungrouped
+
+
+def _options_of(group: Any) -> Iterator[inspect.Parameter]:
+    hints, fields = get_type_hints(group, include_extras=True), group.__dataclass_fields__
+    for name in (name for base in group.__mro__ for name in inspect.get_annotations(base)):
+        declared = fields[name].metadata.get("option")
+        default = inspect.Parameter.empty if fields[name].default is MISSING else fields[name].default
+        yield _option(name, Annotated[hints[name], declared] if declared else hints[name], default)
+
+
+def _option(name: str, hint: Any, default: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=hint)
+
+
+def _variant(name: str) -> str:
     """The ``name``, refused when it is none that light can be traced in; every verb checks it alike."""
     from mitsim.core.environment import VARIANTS, check_driver
 
@@ -81,113 +116,163 @@ def variant_of(name: str) -> str:
     return name
 
 
-def request_of(**values: object) -> dict[str, Any]:
-    """Checked ``values`` of a request's fields, without an accuracy that was not given; refused before work."""
+@dataclass(frozen=True)
+class Common:
+    """Options that every verb has."""
+
+    variant: str = option(
+        DEFAULT_VARIANT,
+        "Mitsuba variant: llvm_ad_mono, llvm_ad_rgb or llvm_ad_spectral; with a GPU, cuda_ for llvm_",
+        callback=_variant,
+    )
+    as_json: bool = option(False, "one JSON object on stdout, nothing else there", "--json")
+    quiet: bool = option(False, "no progress", "--quiet")
+
+    @contextmanager
+    def job(self) -> Iterator[Job]:
+        """A job of the verb's limits, with progress on stderr while the context lasts."""
+        from mitsim.core.job import Clock, Job
+
+        limits = self.limits
+        with showing_progress(self.quiet or self.as_json) as progress:
+            yield Job(Clock(running_seconds()), progress, limits)
+
+    @property
+    def limits(self) -> Limits:
+        """Longest time and most memory of the job."""
+        return Limits()
+
+
+@dataclass(frozen=True)
+class Limited(Common):
+    """Options of verbs that may work for long."""
+
+    max_seconds: float = option(Limits().seconds, "refuse work that would take longer")
+    max_memory: float | None = option(
+        None, "refuse work that would take more; nine tenths of what is free if not given", metavar="GIB"
+    )
+
+    @property
+    def limits(self) -> Limits:
+        """Those that are asked for."""
+        return Limits(self.max_seconds, None if self.max_memory is None else self.max_memory * 2**30)
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How finely light is sampled."""
+
+    accuracy: float | None = option(None, "relative rms error of the expected frames", show_default="0.001")
+    seconds: float | None = option(None, "the finest accuracy that a run of so long buys", metavar="S")
+    seed: Seed = 0
+    effects: Effects = ""
+
+
+@dataclass(frozen=True)
+class OfPatterns(Sampling):
+    """The same of frames under patterns."""
+
+    patterns: Patterns = "dots:7"
+
+
+@dataclass(frozen=True)
+class LitScene:
+    """What opens a scene, under its own light."""
+
+    projector: Projector = None
+    define: list[str] | None = option(None, "set a <default> of the scene", "-D", metavar="NAME=VALUE")
+    outside: bool = option(False, "let the scene read files outside its own folder", "--allow-outside-files")
+
+    def open_for_render(self, scene: str, variant: str) -> Bench:
+        """The bench of a ``scene`` in a ``variant``; MitsimError as :func:`mitsim.open_bench`."""
+        return mitsim.open_bench(scene, variant, None, self.projector, self.outside, True, **self.parameters)
+
+    def check(self, scene: str, *patterns: str) -> None:
+        """MitsimError, before the renderer is imported, for ``patterns`` that the ``scene``'s projector has too few
+        pixels for."""
+        from mitsim.bench.open import check_scene
+
+        check_scene(scene, self.parameters, self.outside, patterns)
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """The scene's parameters, by NAME=VALUE of each -D; MitsimError for what is not written so."""
+        parameters = {}
+        for text in self.define or ():
+            name, equals, value = text.partition("=")
+            if not (name and equals):
+                raise MitsimError(f"-D {text!r}: give NAME=VALUE")
+            if name in _BENCH_ARGUMENTS:
+                raise MitsimError(
+                    f"-D {text!r}: mitsim itself uses the name {name}; give the scene's <default> another"
+                )
+            parameters[name] = value
+        return parameters
+
+
+@dataclass(frozen=True)
+class Devices(LitScene):
+    """What opens a bench: a scene with its camera and projector."""
+
+    camera: Camera = None
+
+    def open(self, scene: str, variant: str, job: Job | None = None) -> Bench:
+        """The bench that the options describe; MitsimError as :func:`mitsim.open_bench`.
+
+        Parameters
+        ----------
+        scene, variant
+            as there.
+        job
+            whose clock takes the seconds.
+        """
+        with nullcontext() if job is None else job.clock.stage("open scene"):
+            return mitsim.open_bench(scene, variant, self.camera, self.projector, self.outside, **self.parameters)
+
+    def check_exposure(self, exposure: Exposure) -> None:
+        """MitsimError, before the renderer is imported, for an ``exposure`` that the camera cannot have."""
+        from mitsim.bench.open import check_devices
+        from mitsim.devices.sensor import load_sensor
+
+        path, _ = check_devices(self.camera, None)
+        exposure.check(load_sensor(path), path)
+
+
+# ---- what words say --------------------------------------------------------------------------------------------------
+
+
+def request_of(options: object | None = None, **values: object) -> dict[str, Any]:
+    """Checked fields of a request, without an accuracy that was not given; refused before work.
+
+    Parameters
+    ----------
+    options, values
+        a group of options, and single ones.
+    """
     from mitsim.bench.request import Request
 
+    values |= {} if options is None else vars(options)
     values = {name: value for name, value in values.items() if name != "accuracy" or value is not None}
     request = Request.of(**values).model_dump()
     return {name: request[name] for name in values}
 
 
-def scope_of(
-    scene: str | None,
-    variant: str,
-    camera: str | None,
-    projector: str | None,
-    define: Sequence[str] | None,
-    outside: bool,
-    quick: bool,
-) -> Scope:
-    """How much of a study a command line asks for: eight test images on the photograph's sheet, or one ``scene``.
+def number_of(argument: str, text: str, words: Sequence[str] = ("auto",)) -> Any:
+    """The number in a text, or one of a few words.
 
     Parameters
     ----------
-    scene, variant, camera, projector, define, outside
-        as for :func:`bench_of`; no scene: the test images.
-    quick
-        a few points and two images.
-
-    Raises
-    ------
-    MitsimError
-        for a define that is none.
+    argument
+        what a refusal names.
+    text, words
+        what was given, and the words that are allowed instead of a number.
     """
-    from mitsim.studies.framework.experiment import Scope
-    from mitsim.studies.framework.setup import QUICK_IMAGES, TEST_IMAGES, Setup
-
-    parameters = tuple(sorted(defines_of(define).items()))
-    setup = Setup(scene or "photograph", None, parameters, camera, projector, variant, outside)
-    pictures: tuple[str | None, ...] = (None,) if scene else QUICK_IMAGES if quick else TEST_IMAGES
-    return Scope(setup, pictures, quick=quick)
-
-
-def swept(name: str, scope: Scope, patterns: str, over: Sequence[str], measure: str) -> Scope:
-    """The ``scope`` of a study with what a sweep varies and shows; other studies take nothing of it.
-
-    Parameters
-    ----------
-    name, scope
-        of the study.
-    patterns, over, measure
-        as the options say.
-
-    Raises
-    ------
-    MitsimError
-        for options that the study does not have, or that cannot be read.
-    """
-    from mitsim.studies.framework.experiment import check_drifts, check_sweep, measures_of, values_of
-
-    varied = tuple(values_of(text) for text in over)
-    if name == "sweep":
-        check_sweep(varied, len(scope.pictures))
-        read_name(patterns)
-        return replace(scope, sweep=varied, measures=measures_of(measure), patterns=patterns)
-    if name == "drift" and measure == MAIN_MEASURE:
-        check_drifts(varied)
-        read_name(patterns)
-        return replace(scope, sweep=varied, patterns=patterns)
-    if over or patterns != MAIN_PATTERNS or measure != MAIN_MEASURE:
-        others = "--measure is for sweep, --over and --patterns for drift and sweep"
-        raise MitsimError(f"study {name}: has its own points and measures; {others}")
-    return scope
-
-
-def check_setup(scope: Scope, scene: str | None) -> None:
-    """MitsimError where the files that a ``scope`` names cannot be used, before the renderer is imported; a study
-    without a ``scene`` of its own may take others."""
-    from mitsim.bench.open import check_devices, check_scene
-    from mitsim.bench.request import Exposure
-    from mitsim.core.configuration import load_model
-    from mitsim.devices.sensor import load_sensor
-    from mitsim.studies.framework.experiment import NO_SCENE
-
-    camera, projector = check_devices(scope.setup.camera, scope.setup.projector)
-    # A study in colour may see through colour filters; all fill a part of the full well.
-    Exposure().check(load_sensor(camera).model_copy(update={"mosaic": None}), camera)
-    if scene or scope.measures:
-        knobs = dict(scope.sweep) if scope.measures else {}
-        varied = {name: values[0] for name, values in knobs.items() if name not in NO_SCENE}
-        shown = knobs.get("patterns", (scope.patterns,) if scope.measures else ())
-        check_scene(scope.setup.scene, {**dict(scope.setup.parameters), **varied}, scope.setup.outside, shown)
-    from mitsim.devices.projector import ProjectorModel  # last: it imports numpy
-
-    load_model(projector, ProjectorModel)
-
-
-def recipe_for(name: str, recipe: Path | None) -> SessionRecipe | None:
-    """The session in the file ``recipe`` that the study ``name`` is of, where one is given.
-
-    MitsimError for a study that takes none, and for a file that is no recipe.
-    """
-    from mitsim.devices.session import load_recipe
-
-    if recipe is None:
-        return None
-    if name not in ("calibration", "drift"):
-        raise MitsimError(f"study {name}: has no session of its own; --recipe is for calibration and drift")
-    return load_recipe(recipe)
+    if text in words:
+        return text
+    try:
+        return float(text)
+    except ValueError:
+        raise ArgumentError(argument, f"{text!r}: give a number or {' or '.join(words)}") from None
 
 
 def check_work(output: Path, resume: bool, kind: str, several: bool = False) -> None:
@@ -211,87 +296,12 @@ def check_work(output: Path, resume: bool, kind: str, several: bool = False) -> 
     check_output(output, overwrite=resume and begun != several)
 
 
-def check_shown(patterns: Sequence[str], scene: str, define: Sequence[str] | None, outside: bool) -> None:
-    """MitsimError, before the renderer is imported, for ``patterns`` that the scene's projector has too few pixels for.
-
-    Parameters
-    ----------
-    patterns
-        names of families.
-    scene, define, outside
-        as for :func:`bench_of`.
-    """
-    from mitsim.bench.open import check_scene
-
-    check_scene(scene, defines_of(define), outside, patterns)
+# ---- options that are not to be given --------------------------------------------------------------------------------
 
 
-def check_camera(camera: str | None, exposure: Exposure) -> None:
-    """MitsimError, before the renderer is imported, for a ``camera`` that cannot have an ``exposure``."""
-    from mitsim.bench.open import check_devices
-    from mitsim.devices.sensor import load_sensor
-
-    path, _ = check_devices(camera, None)
-    exposure.check(load_sensor(path), path)
-
-
-def bench_of(
-    scene: str,
-    variant: str,
-    camera: str | None,
-    projector: str | None,
-    define: Sequence[str] | None,
-    outside: bool,
-    for_render: bool = False,
-) -> Bench:
-    """The bench that a command line describes; see :func:`mitsim.open_bench`.
-
-    Parameters
-    ----------
-    scene, variant, camera, projector, outside, for_render
-        as there.
-    define
-        NAME=VALUE of the scene's parameters.
-
-    Raises
-    ------
-    MitsimError
-        as there, and for a parameter that is not written so.
-    """
-    parameters: dict[str, Any] = defines_of(define)
-    return mitsim.open_bench(scene, variant, camera, projector, outside, for_render, **parameters)
-
-
-def defines_of(define: Sequence[str] | None) -> dict[str, str]:
-    """The scene's parameters in ``define``, NAME=VALUE each; MitsimError for what is not written so."""
-    parameters = {}
-    for text in define or ():
-        name, equals, value = text.partition("=")
-        if not (name and equals):
-            raise MitsimError(f"-D {text!r}: give NAME=VALUE")
-        if name in _BENCH_ARGUMENTS:
-            raise MitsimError(f"-D {text!r}: mitsim itself uses the name {name}; give the scene's <default> another")
-        parameters[name] = value
-    return parameters
-
-
-def number_of(argument: str, text: str, words: Sequence[str] = ("auto",)) -> Any:
-    """The number in a text, or one of a few words.
-
-    Parameters
-    ----------
-    argument
-        what a refusal names.
-    text, words
-        what was given, and the words that are allowed instead of a number.
-    """
-    if text in words:
-        return text
-    try:
-        return float(text)
-    except ValueError:
-        told = f"{text!r}: give a number or {' or '.join(words)}"
-        raise ArgumentError("lam" if argument == "lambda" else argument, told) from None
+def spelled(name: str) -> str:
+    """The option of the parameter ``name``."""
+    return _SPELLED.get(name, f"--{name.replace('_', '-')}")
 
 
 def is_given(context: typer.Context, name: str) -> bool:
@@ -319,34 +329,14 @@ def refuse_unused(context: typer.Context, names: Sequence[str], where: str) -> N
     """
     for name in names:
         if is_given(context, name):
-            option = SPELLED.get(name, f"--{name.replace('_', '-')}")
-            raise MitsimError(f"{option}: has no effect {where}; leave it out")
+            raise MitsimError(f"{spelled(name)}: has no effect {where}; leave it out")
 
 
-@contextmanager
-def job_of(silent_progress: bool, seconds: float = DAY, gibibytes: float | None = None) -> Iterator[Job]:
-    """A job with limits, and progress on stderr while the context lasts.
-
-    Parameters
-    ----------
-    silent_progress
-        no progress.
-    seconds, gibibytes
-        longest time [s]; most memory [GiB], nine tenths of what is free if None.
-    """
-    from mitsim.core.job import Clock, Job
-    from mitsim.core.resources import Limits, running_seconds
-
-    limits = Limits(seconds, None if gibibytes is None else gibibytes * 2**30)
-    with showing_progress(silent_progress) as progress:
-        yield Job(Clock(running_seconds()), progress, limits)
-
-
-def spoken(error: MitsimError) -> str:
+def message_of(error: MitsimError) -> str:
     """The message of an ``error`` with its arguments written as options."""
     text = str(error)
     if isinstance(error, ArgumentError):
-        option = _OPTIONS.get(error.argument, error.argument).replace("_", "-")
+        option = "lambda" if error.argument == "lam" else error.argument.replace("_", "-")
         text = f"--{option}{text.removeprefix(error.argument)}"
     text = re.sub(r"^parameter (?=\w+=)", "-D ", text)
     return re.sub(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 import subprocess
 import sys
@@ -22,6 +21,7 @@ from mitsim.core.errors import ArgumentError
 from mitsim.devices.patterns import Lighting
 from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
+from tests.extended import Section, Step
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, Z = 16, 400.0
@@ -36,7 +36,23 @@ LAMP_AND_MIRROR = """<emitter type="constant"><spectrum name="radiance" value="0
     <translate x="-90" z="300"/></transform><bsdf type="conductor"/></shape>"""
 ALWAYS = ("interreflection", "diffraction")
 """Light turns at several surfaces and bends at masks wherever there are any."""
-TOY = Path(__file__).with_name("toy_effect.patch")
+_EFFECTS, _PASSES = "mitsim/bench/effects.py", "mitsim/light/passes.py"
+TOY = (
+    Step(_EFFECTS, "below", "interreflection: bool", "    lamp: float\n"),
+    Step(
+        *(_EFFECTS, "below", "interreflection=True,"),
+        '            lamp=0.9 if "dimmed" in bench.projector.name else 1.0,\n',
+    ),
+    Step(
+        *(_EFFECTS, "below", "EFFECTS: Mapping[str, Effect] = _registry("),
+        '    Effect("dimming", {"lamp": 1.0}, absent="the projector\'s lamp gives all that it can", in_truth=True),\n',
+    ),
+    Step(
+        *(_PASSES, "below", "black = physics.black_level if leaking else 0.0"),
+        "    lighting = Lighting(lighting.labels, physics.lamp * lighting.weights)\n",
+    ),
+)
+"""An effect as docs/extending.md has one: power of the projector's lamp, as a part of its full power."""
 
 
 def device(tmp_path_factory: pytest.TempPathFactory, text: str) -> Path:
@@ -153,22 +169,16 @@ for arguments in json.loads(sys.argv[1]):
 
 
 def test_a_new_effect_is_an_entry_and_its_physics(small_scene: Callable[..., Path], tmp_path: Path) -> None:
-    """`dimming`: a lamp at 90 % where the projector's name says so, added to a copy of the package by a patch.
+    """`dimming`: a lamp at 90 % where the projector's name says so, added to a copy of the package.
 
     Plan, pilot, command line and capture follow without a change. Leaving it out makes frames 1/0.9 as bright.
     """
-    patch = TOY.read_text()
-    assert re.findall(r"^\+\+\+ b/(.*)$", patch, re.MULTILINE) == [
-        "mitsim/bench/effects.py",
-        "mitsim/light/passes.py",
-    ]
-    assert len(re.findall(r"^\+(?!\+)", patch, re.MULTILINE)) <= 8, "lines that a new effect takes"
     package = Path(mitsim.__file__).parent
     copy = tmp_path / "copy"
     shutil.copytree(package, copy / "mitsim")  # with its byte code: modules that stay as they are load at once
     for shelf in ("scenes", "calibration"):
         (copy / shelf).symlink_to(package.parent / shelf)
-    subprocess.run(["git", "apply", str(TOY)], cwd=copy, check=True)
+    Section("dimming", [*TOY]).edit(copy)
     dimmed, full = tmp_path / "dimmed.toml", tmp_path / "full.toml"
     dimmed.write_text('name = "dimmed"\neffective_wavelength_nm = 562.0\n')
     full.write_text('name = "full"\neffective_wavelength_nm = 562.0\n')

@@ -99,8 +99,16 @@ def test_a_plan_says_how_large_the_spots_of_a_lens_are(bench: Bench) -> None:
     assert EFFECTS["aperture"].note(bench) == "a lens of radius 3 mm, sharp at 300 mm: spots of 2 mm at 400 mm"
 
 
-@pytest.mark.parametrize("effect", [name for name in EFFECTS if name != "speckle"])
+PARTS = (
+    *("interreflection", "mirrors", "ambient", "diffraction", "mask-thickness", "pixel-response", "aperture", "blur"),
+    "black-level",
+)
+"""Effects that are told by what is simulated here."""
+
+
+@pytest.mark.parametrize("effect", PARTS)
 def test_each_effect_changes_its_own_part(bench: Bench, effect: str) -> None:
+    """That no other effect's values change is held of all of them: tests/unit/bench/test_effects.py."""
     on, off = simulation(bench, effect), simulation(bench)
     changed = {
         "mask-thickness": on.physics.geometry.mask_thickness == 0.05,

@@ -18,7 +18,7 @@ TAKEN = [
     *(("auto", "tikhonov", None, margin) for margin in (1, 2)),
 ]
 REFUSED = [
-    *((("auto", method, None, 0), "method", "use tikhonov, markov or tv") for method in ("gram", "")),
+    *((("auto", method, None, 0), "method", "use tikhonov, markov") for method in ("gram", "")),
     *(((lam, "tv", None, 0), "lam", "at least 0, or auto") for lam in (-1e-300, math.inf, math.nan, "none")),
     *((("auto", "tv", focus, 0), "focus", "above 0 mm") for focus in (0.0, -1.0, math.inf, math.nan, "near")),
     *((("auto", method, "map", 0), "method", "tikhonov alone") for method in ("markov", "tv")),

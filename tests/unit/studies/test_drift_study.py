@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from mitsim.acquire.drift import drifted, projecting
-from mitsim.cli.options import recipe_for, swept
+from mitsim.cli.study_verb import recipe_for, scope_of
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
 from mitsim.devices.drift import UNITS, Drift
@@ -214,12 +214,12 @@ def test_points_are_every_kind_alone() -> None:
 def test_options_of_the_study() -> None:
     """(Planted: a recipe for any study; a ripple without a frequency refused.)"""
     scope = Scope(Setup(), (None,))
-    assert swept("drift", scope, "dots:7", ["power=0.1,0.2"], "psnr").sweep == (("power", ("0.1", "0.2")),)
-    assert swept("drift", scope, "hadamard:8", (), "psnr").patterns == "hadamard:8"
+    assert scope_of("drift", scope, "dots:7", ["power=0.1,0.2"], "psnr").sweep == (("power", ("0.1", "0.2")),)
+    assert scope_of("drift", scope, "hadamard:8", (), "psnr").patterns == "hadamard:8"
     # Whose frequency the recipe states.
-    assert swept("drift", scope, "dots:7", ["lamp_ripple=0.3"], "psnr").sweep == (("lamp_ripple", ("0.3",)),)
+    assert scope_of("drift", scope, "dots:7", ["lamp_ripple=0.3"], "psnr").sweep == (("lamp_ripple", ("0.3",)),)
     with pytest.raises(MitsimError, match="--over and --patterns for drift and sweep"):
-        swept("patterns", scope, "dots:7", ["power=0.1"], "psnr")
+        scope_of("patterns", scope, "dots:7", ["power=0.1"], "psnr")
     with pytest.raises(MitsimError, match="--recipe is for calibration and drift"):
         recipe_for("sweep", Path("any.toml"))
     with pytest.raises(MitsimError, match="there is no such kind"):

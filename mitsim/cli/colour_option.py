@@ -1,15 +1,16 @@
-"""Colour of `mitsim capture`, `calibrate` and `reconstruct`: runs and calibrations of a projector's lines in, what the
-terminal shows of them out."""
+"""--colour of `mitsim plan`, `capture` and `calibrate`: the option in; a bench, and what the terminal shows of runs and
+calibrations of a projector's lines, out."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
-from mitsim.cli.screen import finish
+from mitsim.cli.options import Devices, option
 from mitsim.core.errors import MitsimError
 from mitsim.core.spectral_manifests import (
     BANDS,
@@ -18,18 +19,13 @@ from mitsim.core.spectral_manifests import (
     RUN,
     bands_of,
     check_undecided,
-    check_way,
-    is_coloured,
-    is_mosaic,
     read_colours,
-    read_mosaic,
     spectral_of,
 )
 from mitsim.core.spectral_manifests import MOSAIC as MOSAIC_RUN
 
 if TYPE_CHECKING:
     from mitsim.api.bench import Bench
-    from mitsim.core.job import Job
     from mitsim.core.runs import Capture, MosaicCapture
     from mitsim.light.plan import Plan
     from mitsim.reconstruct.factors import Factors
@@ -48,86 +44,75 @@ def _choice(context: typer.Context, name: str) -> str:
     return name
 
 
-Colour = Annotated[
-    str,
-    typer.Option(
-        help="lines: sequential colour, each line of the projector in a folder of its own; bands:K: the same of K "
+@dataclass(frozen=True)
+class Coloured(Devices):
+    """What opens a bench, and which of its projector's light is told apart."""
+
+    colour: str = option(
+        NO,
+        "lines: sequential colour, each line of the projector in a folder of its own; bands:K: the same of K "
         "bands of its lines; mosaic: all lines at once, by a camera under colour filters; auto: no, bands or "
         "lines, as the accuracy needs (not calibrate); no: light that is not told apart",
         metavar="no|lines|bands:K|mosaic|auto",
         callback=_choice,
-    ),
-]
+    )
 
+    def traced_in(self, variant: str) -> str:
+        """The variant that light is traced in: told apart, by the backend of ``variant`` that knows wavelengths.
 
-def variant_for(colour: str, variant: str, camera: str | None) -> str:
-    """The variant that light is traced in.
+        MitsimError for colour that the camera cannot have.
+        """
+        if self.colour == NO:
+            return variant
+        from mitsim.bench.open import check_devices
+        from mitsim.devices.sensor import load_sensor
 
-    Parameters
-    ----------
-    colour, variant
-        as asked for; light is told apart by the same backend's variant that knows wavelengths.
-    camera
-        name or file; None: the default one.
+        path, _ = check_devices(self.camera, None)
+        mosaic = load_sensor(path).mosaic
+        if self.colour == MOSAIC and mosaic is None:
+            raise MitsimError(
+                f"--colour mosaic: camera {path} has no mosaic of colour filters; give one that has, such as "
+                "--camera imx249_rggb, or use --colour lines"
+            )
+        if self.colour != MOSAIC and mosaic is not None:
+            raise MitsimError(
+                f"--colour {self.colour}: camera {path} has a mosaic {mosaic}, whose frames show all lines at once; "
+                "use --colour mosaic"
+            )
+        return variant if self.colour == AUTO else spectral_of(variant)
 
-    Raises
-    ------
-    MitsimError
-        for colour that the camera cannot have.
-    """
-    if colour == NO:
-        return variant
-    from mitsim.bench.open import check_devices
-    from mitsim.devices.sensor import load_sensor
+    def check_colour(self, variant: str, seconds: float | None = None) -> None:
+        """Refuse colour that a bench would refuse, before the renderer is imported.
 
-    path, _ = check_devices(camera, None)
-    mosaic = load_sensor(path).mosaic
-    if colour == MOSAIC and mosaic is None:
-        raise MitsimError(
-            f"--colour mosaic: camera {path} has no mosaic of colour filters; give one that has, such as "
-            "--camera imx249_rggb, or use --colour lines"
-        )
-    if colour != MOSAIC and mosaic is not None:
-        raise MitsimError(
-            f"--colour {colour}: camera {path} has a mosaic {mosaic}, whose frames show all lines at once; use "
-            "--colour mosaic"
-        )
-    return variant if colour == AUTO else spectral_of(variant)
+        Parameters
+        ----------
+        variant
+            as asked for.
+        seconds
+            that a capture is to take; None: not said.
 
+        Raises
+        ------
+        MitsimError
+            for seconds, a variant that colours cannot be weighed from, and lines or bands that the projector does not
+            have.
+        """
+        if self.colour == NO:
+            return
+        from mitsim.bench.open import check_devices
+        from mitsim.bench.request import check_untimed
+        from mitsim.core.configuration import load_model
 
-def check_colour(colour: str, variant: str, projector: str | None, seconds: float | None = None) -> None:
-    """Refuse colour that a bench would refuse, before the renderer is imported.
+        check_untimed(seconds)
+        _, path = check_devices(None, self.projector)
+        if self.colour == AUTO:
+            check_undecided(variant)
+            return
+        from mitsim.devices.projector import ProjectorModel
 
-    Parameters
-    ----------
-    colour, variant
-        as asked for.
-    projector
-        name or file; None: the default one.
-    seconds
-        that a capture is to take; None: not said.
-
-    Raises
-    ------
-    MitsimError
-        for seconds, a variant that colours cannot be weighed from, and lines or bands that the projector does not have.
-    """
-    if colour == NO:
-        return
-    from mitsim.bench.open import check_devices
-    from mitsim.bench.request import check_untimed
-    from mitsim.core.configuration import load_model
-
-    check_untimed(seconds)
-    _, path = check_devices(None, projector)
-    if colour == AUTO:
-        check_undecided(variant)
-        return
-    from mitsim.devices.projector import ProjectorModel
-
-    model = load_model(path, ProjectorModel)
-    lit = model.in_bands(bands_of(colour)) if colour.startswith(BANDS) else model
-    lit.traced_lines  # noqa: B018 - checks itself
+        model = load_model(path, ProjectorModel)
+        lit = model.in_bands(bands_of(self.colour)) if self.colour.startswith(BANDS) else model
+        lit.traced_lines  # noqa: B018 - checks itself
 
 
 def by_line(colour: str) -> bool:
@@ -146,7 +131,7 @@ def plan_of(bench: Bench, colour: str, request: dict[str, Any]) -> Plan:
     Parameters
     ----------
     bench, colour, request
-        what it names.
+        what it names; of the request, its fields.
     """
     if colour == AUTO:
         return bench.choose_colour(**request).plan
@@ -159,40 +144,7 @@ def plan_of(bench: Bench, colour: str, request: dict[str, Any]) -> Plan:
     return SpectralBench.of(in_colour(bench, colour), kind).plan(Request.of(**request))
 
 
-def chosen_of(bench: Bench, request: dict[str, Any], job: Job) -> tuple[Bench, Plan, str]:
-    """What ``--colour auto`` of `mitsim capture` is captured with: a bench, its plan, and :data:`NO` or lines.
-
-    Parameters
-    ----------
-    bench, request, job
-        what the command line names.
-
-    Raises
-    ------
-    MitsimError
-        as :meth:`Bench.choose_colour`.
-    """
-    with job.planning(request["patterns"]):
-        chosen = bench.choose_colour(**request)
-    return chosen.bench, chosen.plan, NO if chosen.mono else LINES
-
-
-def mosaic_options(options: Mapping[str, Any], way: str) -> dict[str, Any]:
-    """Those ``options`` of `mitsim reconstruct` that images behind colour filters have, and their ``way``.
-
-    MitsimError for a way that there is not, and for options that these images have not.
-    """
-    from mitsim.reconstruct.request import check_joint
-
-    check_way(way)
-    check_joint(options["lam"])
-    for name, neutral in (("focus", None), ("method", "tikhonov"), ("margin", 0), ("depth_range", None)):
-        if options[name] != neutral:
-            raise MitsimError(
-                f"--{name.replace('_', '-')} {options[name]}: runs behind colour filters are solved by tikhonov at the "
-                "calibrated depth; leave it out"
-            )
-    return {"lam": options["lam"], "overwrite": options["overwrite"], "way": way}
+# ---- what the terminal shows -----------------------------------------------------------------------------------------
 
 
 def of_capture(runs: Mapping[str, Capture], output: Path) -> tuple[dict[str, Any], list[str]]:
@@ -254,43 +206,6 @@ def of_calibration(factors: Mapping[str, Factors], output: Path) -> tuple[dict[s
         for part in payload["channels"]
     ]
     return payload, [*lines, _last(payload)]
-
-
-def reconstruct_lines(
-    run: Path, calibration: Path, output: Path, chart: str | None, options: dict[str, Any], as_json: bool
-) -> int:
-    """The image of every line of a coloured run, and one in colour.
-
-    Parameters
-    ----------
-    run, calibration, output, chart, as_json
-        as the options of `mitsim reconstruct`.
-    options
-        those that every line is solved with.
-    """
-    from mitsim.core.files import check_output
-    from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
-    from mitsim.devices.chart import load_chart
-
-    # Refused before the solver and colour-science are imported.
-    if is_mosaic(run):
-        read_mosaic(run)
-        read_manifest(run, RunManifest)
-    else:
-        for name in read_colours(run, RUN).names:
-            read_manifest(run / name, RunManifest)
-    for name in read_colours(calibration, CALIBRATION).names:
-        read_manifest(calibration / name, CalibrationManifest)
-    place = None if chart is None else load_chart(chart)
-    # What it holds is looked into later: an image of the same inputs may be replaced.
-    check_output(output, overwrite=is_coloured(output))
-    from mitsim.core.resources import memory_from_here, memory_since
-    from mitsim.report.line_images import reconstruct_colours
-
-    held = memory_from_here()
-    found = reconstruct_colours(run, calibration, output, place, **options)
-    payload = {**found.summary(), "memory_bytes": memory_since(held)}
-    return finish(as_json, payload, [*found.sentences, found.output], found.warnings)
 
 
 def _percent(part: float | None) -> str:

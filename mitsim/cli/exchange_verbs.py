@@ -1,0 +1,260 @@
+"""Verbs that exchange runs and light with other programs and real cameras: words of a command line in, files or
+folders out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from mitsim.cli.options import (
+    Common,
+    Devices,
+    Limited,
+    OfPatterns,
+    Overwrite,
+    Projector,
+    Scene,
+    Seed,
+    option,
+    refuse_unused,
+    request_of,
+    verb,
+)
+from mitsim.cli.screen import finish
+from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.seeds import check_root
+from mitsim.devices.patterns import pattern_names, read_name, takes_seed
+
+_OF_BARE = ("shape", "bits", "byte_order")
+"""Options of `mitsim import` for files without a header."""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What a run is written as."""
+
+    format: str = option(..., "hdf5, mat, flatcam, deepinv, torch or png", metavar="FORMAT")
+    output: Path = option(..., "file to make; of png, a folder", "-o", "--output", metavar="FILE")
+    calibration: Path | None = option(None, "folder of `mitsim calibrate` that goes with it", metavar="CAL")
+    overwrite: Overwrite = False
+    projector: Projector = None
+
+
+@verb
+def export(
+    context: typer.Context,
+    run: Annotated[Path, typer.Argument(help="folder of `mitsim capture`", metavar="RUN")],
+    exported: Exported,
+    common: Common,
+) -> int:
+    """Write a run in a format that other programs read."""
+    from mitsim.exchange.formats import export_run
+
+    if exported.format == "png":
+        refuse_unused(context, ["overwrite"], "on a folder of pictures, which takes the place of none")
+    payload = export_run(run, **vars(exported))
+    with_it = f" with {payload['calibration']}" if payload["calibration"] else ""
+    lines = [f"{payload['frames']} frames{with_it} as {exported.format}: {payload['output']}", *payload["notes"]]
+    return finish(common.as_json, payload, lines, ())
+
+
+@dataclass(frozen=True)
+class Frames:
+    """What a person knows of a real camera's frames."""
+
+    patterns: str | None = option(None, "of frames: the family, or patterns.json of export", metavar="NAME|FILE")
+    camera: str | None = option(None, "of frames: camera electronics, name or TOML file", metavar="NAME|FILE")
+    exposure: float | None = option(None, "of frames: seconds of each", metavar="SECONDS")
+    calibration: Path | None = option(
+        None, "of frames: calibration of the same camera, for its identity", metavar="CAL"
+    )
+    projector_pixels: int | None = option(
+        None, "of frames: projector pixels a side, without a calibration", metavar="N"
+    )
+    black_level: float | None = option(None, "of frames: number of a pixel without charge; the camera's if not given")
+    ambient_frame: Path | None = option(None, "frame, or folder of frames, with the projector off", metavar="PATH")
+    ambient_shots: int | None = option(None, "shots that a single such frame is the mean of", metavar="N")
+    shape: str | None = option(None, "of files without header (.raw, .bin, .dat)", metavar="ROWSxCOLUMNS")
+    bits: int | None = option(None, "of a number in such a file", metavar="N")
+    byte_order: str = option("little", "of such a file: little or big")
+    channel: str | None = option(None, "plane of a colour sensor, as FlatCam names it", metavar="r|gb|gr|b")
+    seed: Seed = 0
+
+
+@verb
+def import_(
+    context: typer.Context,
+    source: Annotated[
+        Path, typer.Argument(help="file of `mitsim export`, or frames: a folder of them, or one file", metavar="SOURCE")
+    ],
+    frames: Frames,
+    common: Common,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="run folder to make", metavar="RUN")] = None,
+    calibration_output: Annotated[
+        Path | None, typer.Option(help="folder to make of the file's calibration", metavar="CAL")
+    ] = None,
+) -> int:
+    """Make a run folder of a real camera's frames, or of a file that `mitsim export` wrote."""
+    from mitsim.exchange.formats import READERS, import_file
+
+    if output is None and calibration_output is None:
+        raise MitsimError("import: nothing to make; give -o RUN, --calibration-output CAL, or both")
+    payload: dict[str, Any]
+    if source.suffix.lower() in READERS:
+        others = [name for name in vars(frames) if name != "channel"]
+        refuse_unused(context, others, f"on {source}, which says itself what its frames are")
+        payload = import_file(source, output, calibration_output, frames.channel)
+    elif output is None or calibration_output is not None:
+        raise MitsimError(f"{source}: frames hold no calibration; give -o RUN, and no --calibration-output")
+    else:
+        payload = _import_frames(context, source, output, frames)
+    lines = []
+    if payload["output"]:
+        lines.append(f"{payload['frames']} frames: {payload['output']}")
+    if payload["calibration_output"]:
+        lines.append(f"calibration: {payload['calibration_output']}")
+    elif "calibration" in payload["holds"]:
+        lines.append("The file holds a calibration too; give --calibration-output to have it")
+    if payload["left_out"]:
+        lines.append(f"Not known, and left out: {', '.join(payload['left_out'])}")
+    return finish(common.as_json, payload, lines, payload["warnings"])
+
+
+def _import_frames(context: typer.Context, source: Path, output: Path, frames: Frames) -> dict[str, Any]:
+    from mitsim.core.imagelist import BARE, Raw
+    from mitsim.exchange.real_capture import RealCapture
+
+    if frames.patterns is None or frames.camera is None or frames.exposure is None:
+        missing = next(name for name in ("patterns", "camera", "exposure") if getattr(frames, name) is None)
+        raise ArgumentError(missing, "is not given, and frames do not say it; give it")
+    bare = any(path.suffix.lower() in BARE for path in (source, *(source.iterdir() if source.is_dir() else ())))
+    if frames.shape is None or not bare:
+        refuse_unused(context, _OF_BARE, "on files that have a header, or without --shape")
+    if not takes_seed(frames.patterns):
+        refuse_unused(context, ["seed"], "on patterns that are not drawn at random")
+    known = RealCapture(
+        frames.patterns,
+        frames.camera,
+        frames.exposure,
+        calibration=frames.calibration,
+        n=frames.projector_pixels,
+        black_level_dn=frames.black_level,
+        ambient=frames.ambient_frame,
+        ambient_shots=frames.ambient_shots,
+        raw=None if frames.shape is None else Raw.of(frames.shape, frames.bits, frames.byte_order),
+        channel=frames.channel,
+        seed=frames.seed,
+    )
+    known.check(source)  # refused before numpy is imported
+    from mitsim.exchange.real import import_frames
+
+    return import_frames(source, output, known)
+
+
+@dataclass(frozen=True)
+class Screen:
+    """A projector that patterns are drawn for."""
+
+    projector: str = option("mp_cl1", "projector of known rows and columns: name or TOML file", metavar="NAME|FILE")
+    projector_pixels: int = option(128, "projector pixels a side of the patterns", min=1, max=4096, metavar="N")
+
+
+@dataclass(frozen=True)
+class Stripes:
+    """What a calibration's stripes need beside it."""
+
+    camera: str | None = option(None, "of stripes: camera electronics, name or TOML file", metavar="NAME|FILE")
+    exposure: float | None = option(None, "of stripes: seconds of each frame", metavar="SECONDS")
+    signed_capture: str = option(
+        "pair", "of stripes: both halves of each, or one and a uniform frame", metavar="pair|uniform"
+    )
+
+
+@verb
+def patterns(
+    *,
+    context: typer.Context,
+    family: Annotated[
+        str, typer.Argument(help=f"{pattern_names()}; or stripes, those of a calibration", metavar="PATTERNS|stripes")
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="folder to make", metavar="DIR")],
+    screen: Screen,
+    stripes: Stripes,
+    seed: Seed = 0,
+    common: Common,
+) -> int:
+    """Draw patterns, or a calibration's stripes, as pictures to show on a real projector."""
+    check_root(seed)
+    given = {"camera": stripes.camera, "exposure": stripes.exposure}
+    payload: dict[str, Any]
+    if family == "stripes":
+        from mitsim.exchange.png_files import SESSION, draw_stripes, session_of
+
+        refuse_unused(context, ["seed"], "on patterns that are not drawn at random")
+        if stripes.camera is None or stripes.exposure is None:
+            missing = next(name for name, value in given.items() if value is None)
+            raise ArgumentError(missing, "is not given, and the list of a calibration's frames needs it; give it")
+        session = session_of(stripes.camera, stripes.exposure, screen.projector_pixels, stripes.signed_capture)
+        payload = {**draw_stripes(output, screen.projector, session), "session": str(output / SESSION)}
+        after = (
+            f"Copy {output / SESSION} into the folder of their frames; then: mitsim calibrate --frames FRAMES -o CAL"
+        )
+    else:
+        read_name(family, screen.projector_pixels)  # refused before numpy is imported
+        from mitsim.exchange.png_files import draw_family
+
+        refuse_unused(context, ["signed_capture"], "on patterns, whose signed ones are pairs; it is for stripes")
+        if not takes_seed(family):
+            refuse_unused(context, ["seed"], "on patterns that are not drawn at random")
+        for name, value in given.items():
+            if value is not None:
+                raise ArgumentError(name, f"{value}: goes with stripes; give it to `mitsim import`")
+        payload = {**draw_family(output, family, screen.projector_pixels, screen.projector, seed), "session": None}
+        after = f"Their frames are read by: mitsim import FRAMES --patterns {output / 'patterns.json'} -o RUN"
+    from mitsim.exchange.png_files import describe_cells
+
+    where = payload["projector"]
+    lines = [
+        f"{payload['pictures']} pictures of {where['rows']}x{where['columns']}, {payload['n']}x{payload['n']} cells of "
+        f"{describe_cells(where)}: {output}",
+        after,
+    ]
+    return finish(common.as_json, payload, lines, ())
+
+
+@verb
+def transport(
+    *,
+    scene: Scene,
+    output: Annotated[Path, typer.Option("-o", "--output", help="HDF5 file to make", metavar="FILE.h5")],
+    sampling: OfPatterns,
+    devices: Devices,
+    overwrite: Overwrite = False,
+    limited: Limited,
+) -> int:
+    """Trace a scene's light by projector pixel and write it, for frames of any pattern without mitsim."""
+    from mitsim.core.configuration import locate
+    from mitsim.core.files import check_apart, output_file
+
+    request = request_of(sampling)
+    devices.check(scene, sampling.patterns)
+    with limited.job() as job, output_file(output, overwrite) as output:
+        bench = devices.open(scene, limited.variant, job)
+        models = (locate(each, "calibration", ".toml") for each in (devices.camera, devices.projector) if each)
+        check_apart(output, (*bench.loaded.files, *models))
+        light = bench.light(request.pop("patterns"), job, **request)
+        with job.clock.stage("write"):
+            light.save(output)
+    size = output.stat().st_size
+    payload = {**light.summary(), "bytes": size, "seconds": job.clock.seconds(), "output": str(output)}
+    shape, taken = payload["shape"], payload["seconds"]
+    lines = [
+        f"Light of {payload['n']}x{payload['n']} projector pixels to {shape[0]}x{shape[1]} of the sensor in "
+        f"{taken['total']:.1f} s, {payload['entries']} numbers, {size / 2**20:.3g} MiB: {output}",
+        f"Monte Carlo error {payload['mc_error']:.1e} of the frames of {sampling.patterns}, total error up to "
+        f"{payload['total_error_bound']:.1e}",
+    ]
+    return finish(limited.as_json, payload, lines, payload["warnings"])

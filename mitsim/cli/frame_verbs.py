@@ -1,0 +1,320 @@
+"""Verbs on frames alone, without a scene: `mitsim reconstruct`, `characterise` and `sense`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from mitsim.cli.options import (
+    Common,
+    ExposureFraction,
+    Seed,
+    number_of,
+    option,
+    refuse_unused,
+    spelled,
+    verb,
+)
+from mitsim.cli.screen import finish
+from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.spectral_manifests import (
+    CALIBRATION,
+    JOINT,
+    RUN,
+    check_way,
+    is_coloured,
+    is_mosaic,
+    read_colours,
+    read_mosaic,
+)
+from mitsim.reconstruct.request import MARKOV, METHODS, TIKHONOV
+
+# ---- `mitsim reconstruct` --------------------------------------------------------------------------------------------
+
+
+def method_names() -> str:
+    """Methods of solving, as the help lists them."""
+    notes = {MARKOV: f"{MARKOV} (neighbouring pixels alike: for noisy frames)"}
+    *others, last = (notes.get(name, name) for name in METHODS)
+    return f"{', '.join(others)} or {last}"
+
+
+@dataclass(frozen=True)
+class Solving:
+    """How an image is solved for."""
+
+    lam: str = option("auto", "regularisation, or auto", "--lambda", metavar="auto|VALUE")
+    method: str = option(TIKHONOV, method_names())
+    focus: str | None = option(
+        None,
+        "depth of the scene; auto: found; map: one for each pixel, by dots; the calibrated one if not given",
+        metavar="auto|MM|map",
+    )
+    depth_range: str | None = option(
+        None,
+        "nearest and farthest depth that auto and map look for; 1/z within a quarter of the calibrated one's "
+        "if not given",
+        metavar="A:B",
+    )
+    margin: int = option(
+        0, "cells round the window that are solved for too: they take up light from outside it", min=0, metavar="K"
+    )
+
+    def read(self) -> dict[str, Any]:
+        """The options as the solver takes them, with numbers for words; MitsimError for words that are none."""
+        return {
+            "lam": number_of("lam", self.lam),
+            "method": self.method,
+            "focus": None if self.focus is None else number_of("focus", self.focus, ("auto", "map")),
+            "depth_range": None if self.depth_range is None else _two_depths(self.depth_range),
+            "margin": self.margin,
+        }
+
+
+@dataclass(frozen=True)
+class ColouredImage:
+    """How an image in colour is made."""
+
+    chart: str | None = option(
+        None,
+        "of a coloured run: the chart in the image that colours are fitted on, a scene's name or a file",
+        metavar="NAME|FILE.json",
+    )
+    mosaic: str | None = option(
+        None,
+        "of a run behind colour filters: how its images are found",
+        metavar="joint|half|demosaic",
+        show_default="joint",
+    )
+
+
+@verb
+def reconstruct(
+    *,
+    run: Annotated[Path, typer.Argument(help="folder of `mitsim capture`", metavar="RUN")],
+    calibration: Annotated[Path, typer.Option(help="folder of `mitsim calibrate`", metavar="CAL")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="folder for the image; RUN/reconstruction if not given")
+    ] = None,
+    solving: Solving,
+    colours: ColouredImage,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an earlier image in the folder")] = False,
+    common: Common,
+) -> int:
+    """Recover the image from frames and a calibration alone; of coloured folders, one of each line, and in colour."""
+    from mitsim.core.files import check_output
+    from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
+    from mitsim.reconstruct.request import IMAGE_FILE, ImageRequest, check_parallax
+
+    options = solving.read()
+    output = output or run / "reconstruction"
+    if not is_mosaic(run):
+        ImageRequest(**options)
+    if is_coloured(run):
+        options["overwrite"] = overwrite
+        if is_mosaic(run):
+            options = _mosaic_options(options, colours.mosaic or JOINT)
+        elif colours.mosaic is not None:
+            raise MitsimError(f"--mosaic {colours.mosaic}: {run} has a run for each line; leave out --mosaic")
+        return _reconstruct_colours(run, calibration, output, colours.chart, options, common.as_json)
+    for name, value in vars(colours).items():
+        if value is not None:
+            raise MitsimError(f"--{name} {value}: {run} is not coloured; leave out --{name}")
+    # Refused before the solver is imported, which takes half a second.
+    read_manifest(run, RunManifest)
+    manifest = read_manifest(calibration, CalibrationManifest)
+    if solving.focus is not None or solving.margin:
+        check_parallax(manifest.parallax, str(calibration))
+    check_output(output, overwrite=(output / IMAGE_FILE).is_file())
+    from mitsim.core.resources import memory_from_here, memory_since
+    from mitsim.report.quality import reconstruct as reconstruct_folder
+
+    held = memory_from_here()
+    result = reconstruct_folder(run, calibration, output, **options, overwrite=overwrite)
+    payload = {**result.summary(), "memory_bytes": memory_since(held)}
+    lines = [
+        payload["status"],
+        *([] if result.quality is None else [str(result.quality)]),
+        f"lambda {payload['lambda']:.3g}, rank {payload['rank']}, condition {payload['condition_whole']:.3g}, "
+        f"residual {payload['residual']:.1e}: {payload['output']}",
+        *([] if result.reconstruction.focus is None else [str(result.reconstruction.focus)]),
+        *result.reconstruction.trust,
+    ]
+    return finish(common.as_json, payload, lines, () if result.reconstruction.ok else (payload["status"],))
+
+
+def _mosaic_options(options: dict[str, Any], way: str) -> dict[str, Any]:
+    """Those ``options`` of `mitsim reconstruct` that images behind colour filters have, and their ``way``.
+
+    MitsimError for a way that there is not, and for options that these images have not.
+    """
+    from mitsim.reconstruct.request import check_joint
+
+    check_way(way)
+    check_joint(options["lam"])
+    for name, neutral in (("focus", None), ("method", "tikhonov"), ("margin", 0), ("depth_range", None)):
+        if options[name] != neutral:
+            raise MitsimError(
+                f"{spelled(name)} {options[name]}: runs behind colour filters are solved by tikhonov at the "
+                "calibrated depth; leave it out"
+            )
+    return {"lam": options["lam"], "overwrite": options["overwrite"], "way": way}
+
+
+def _reconstruct_colours(
+    run: Path, calibration: Path, output: Path, chart: str | None, options: dict[str, Any], as_json: bool
+) -> int:
+    """The image of every line of a coloured run, each solved with ``options``, and one in colour."""
+    from mitsim.core.files import check_output
+    from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
+    from mitsim.devices.chart import load_chart
+
+    # Refused before the solver and colour-science are imported.
+    if is_mosaic(run):
+        read_mosaic(run)
+        read_manifest(run, RunManifest)
+    else:
+        for name in read_colours(run, RUN).names:
+            read_manifest(run / name, RunManifest)
+    for name in read_colours(calibration, CALIBRATION).names:
+        read_manifest(calibration / name, CalibrationManifest)
+    place = None if chart is None else load_chart(chart)
+    # What it holds is looked into later: an image of the same inputs may be replaced.
+    check_output(output, overwrite=is_coloured(output))
+    from mitsim.core.resources import memory_from_here, memory_since
+    from mitsim.report.line_images import reconstruct_colours
+
+    held = memory_from_here()
+    found = reconstruct_colours(run, calibration, output, place, **options)
+    payload = {**found.summary(), "memory_bytes": memory_since(held)}
+    return finish(as_json, payload, [*found.sentences, found.output], found.warnings)
+
+
+def _two_depths(text: str) -> tuple[float, float]:
+    """The two numbers of A:B."""
+    near, colon, far = text.partition(":")
+    try:
+        if colon:
+            return float(near), float(far)
+    except ValueError:
+        pass
+    raise ArgumentError("depth_range", f"{text!r}: give the nearest and the farthest depth [mm], such as 350:450")
+
+
+# ---- a camera's sensor alone -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Procedure:
+    """How a camera is characterised."""
+
+    pixels: int = option(256, "rows and columns of the frames")
+    steps: int = option(50, "steps of light, from dark to beyond saturation")
+    frames: int = option(100, "frames of each stack")
+    wavelength: float = option(550.0, "of the light, for a curve of quantum efficiency [nm]")
+    seed: Seed = 0
+
+
+@verb
+def characterise(
+    *,
+    context: typer.Context,
+    camera: Annotated[str, typer.Argument(help="camera electronics: name or TOML file", metavar="CAMERA")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="folder of JSON and plots")] = Path(
+        "characterise-output"
+    ),
+    asked: Procedure,
+    common: Common,
+) -> int:
+    """Measure a camera after EMVA 1288 on simulated frames; figures found beside those that its file sets."""
+    from mitsim.core.configuration import locate
+    from mitsim.devices.sensor import load_sensor
+    from mitsim.studies import emva_options
+    from mitsim.studies.framework.run import check_study_folder
+
+    sensor = load_sensor(locate(camera, "calibration", ".toml"))
+    procedure = emva_options.Procedure(asked.pixels, asked.steps, asked.frames, asked.seed, asked.wavelength)
+    emva_options.capacity_of(sensor)
+    emva_options.efficiency_of(sensor, procedure)
+    if sensor.quantum_efficiency_curve is None:
+        refuse_unused(context, ["wavelength"], f"on {camera}, whose file has no curve of quantum efficiency")
+    check_study_folder(output, "characterise")
+    from mitsim.studies.characterise import characterise as run_characterise
+
+    with common.job() as job:
+        done = run_characterise(sensor, procedure, output, job)
+    return finish(common.as_json, done.payload(), done.lines(), done.warnings)
+
+
+@dataclass(frozen=True)
+class Exposed:
+    """A camera and how long it is exposed."""
+
+    camera: str = option(..., "camera electronics: name or TOML file", metavar="NAME|FILE")
+    exposure: str = option("auto", "seconds, or auto", metavar="auto|SECONDS")
+    exposure_fraction: ExposureFraction = 0.8
+    seed: Seed = 0
+
+
+@dataclass(frozen=True)
+class Irradiance:
+    """How an image's numbers are light on the sensor."""
+
+    f_number: float | None = option(
+        None, "the image is radiance [W/m^2/sr] before a lens of this f-number", metavar="N"
+    )
+    scale: float = option(1.0, "what its numbers are multiplied by")
+    channel: str | None = option(None, "of several channels, the one to take", metavar="NAME")
+    wavelength: float = option(550.0, "of the light [nm]")
+
+
+@verb
+def sense(
+    context: typer.Context,
+    image: Annotated[Path, typer.Argument(help="irradiance [W/m^2], OpenEXR or NPY", metavar="IMAGE.exr")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="frame to write", metavar="FRAME.png|exr|npy")],
+    exposed: Exposed,
+    irradiance: Irradiance,
+    common: Common,
+) -> int:
+    """Put an image of any renderer behind a camera's sensor: digital numbers with its noise."""
+    from mitsim.bench.request import Exposure, check_ending, check_f_number, check_image, check_wavelength
+    from mitsim.core.configuration import locate
+    from mitsim.core.files import check_apart, output_file
+    from mitsim.core.seeds import check_root
+    from mitsim.devices.sensor import load_sensor
+
+    sensor = load_sensor(locate(exposed.camera, "calibration", ".toml"))
+    seconds = number_of("exposure", exposed.exposure)
+    if seconds != "auto":
+        refuse_unused(context, ["exposure_fraction"], "on an --exposure in seconds")
+    asked = Exposure(None if seconds == "auto" else seconds, exposed.exposure_fraction)
+    if not 0 < irradiance.scale < math.inf:
+        raise MitsimError(f"--scale {irradiance.scale:g}: give a finite number above 0")
+    check_ending(output, sensor)
+    check_wavelength(irradiance.wavelength)
+    if irradiance.f_number is not None:
+        check_f_number(irradiance.f_number)
+    check_root(exposed.seed)
+    check_image(image)
+    check_apart(output, [image])
+    with output_file(output, overwrite=True) as place:
+        from mitsim.acquire.sense import irradiance_behind_lens, read_image
+        from mitsim.acquire.sense import sense as run_sense
+
+        light, notes = read_image(image, irradiance.channel)
+        light = light * irradiance.scale
+        if irradiance.f_number is not None:
+            light = irradiance_behind_lens(light, irradiance.f_number)
+        frame = run_sense(light, sensor, asked, exposed.seed, irradiance.wavelength, notes)
+        payload = {**frame.summary(), "output": str(frame.save(place))}
+    lines = [
+        f"{sensor.name}: {payload['shape'][0]}x{payload['shape'][1]} pixels, exposure {frame.exposure_s:.3g} s, "
+        f"mean {payload['mean_dn']:.5g} DN, largest {payload['largest_dn']:.5g}: {payload['output']}",
+        *frame.notes,
+    ]
+    return finish(common.as_json, payload, lines, frame.warnings)
