@@ -57,6 +57,16 @@ def _never_enough(image: FloatArray) -> bool:
     return False
 
 
+@dataclass(frozen=True)
+class Ending:
+    """When iterations end: at a relative residual of ``tolerance``, after ``most`` steps, or where ``watch``, which is
+    called with the image after each step, says True."""
+
+    tolerance: float = 1e-6
+    most: int = 500
+    watch: Watch = _never_enough
+
+
 @dataclass(frozen=True, eq=False)
 class ConvolutionalCamera:
     """A point spread function over a scene of n x n pixels.
@@ -199,7 +209,9 @@ def solve_iteratively(
     def normal(image: FloatArray) -> FloatArray:
         return camera.projected(family, camera.frames(family, image))
 
-    return conjugate_gradients(normal, camera.projected(family, frames), lam, None, tolerance, iterations, watch)
+    return conjugate_gradients(
+        normal, camera.projected(family, frames), lam, None, Ending(tolerance, iterations, watch)
+    )
 
 
 def conjugate_gradients(
@@ -207,9 +219,7 @@ def conjugate_gradients(
     target: FloatArray,
     lam: float,
     inverse: Operator | None = None,
-    tolerance: float = 1e-6,
-    most: int = 500,
-    watch: Watch = _never_enough,
+    ending: Ending = Ending(),
     start: FloatArray | None = None,
 ) -> Solution:
     """Solve (``normal`` + lambda) X = ``target`` (Hestenes and Stiefel 1952).
@@ -224,10 +234,8 @@ def conjugate_gradients(
         lambda >= 0.
     inverse
         something near the inverse of normal + lambda, symmetric and positive, which saves steps.
-    tolerance, most
-        relative residual at which it ends, and the most steps.
-    watch
-        called with the image after each step; where it says True, that was the last.
+    ending
+        when it ends.
     start
         X to begin with; None: 0.
     """
@@ -238,21 +246,21 @@ def conjugate_gradients(
     turned = inverse(left) if inverse else left
     direction, power, spent = turned, float(np.vdot(left, turned)), 0
     residual = float(np.linalg.norm(left)) / size
-    while residual > tolerance and spent < most:
+    while residual > ending.tolerance and spent < ending.most:
         spent += 1
         moved = normal(direction) + lam * direction
         step = power / float(np.vdot(direction, moved))
         image, left = image + step * direction, left - step * moved
         residual = float(np.linalg.norm(left)) / size
-        if watch(image):
+        if ending.watch(image):
             break
         turned = inverse(left) if inverse else left
         before, power = power, float(np.vdot(left, turned))
         direction = turned + power / before * direction
     figures = f"Residual of the normal equations {residual:.0e} after {spent} iterations."
-    if residual > tolerance:
+    if residual > ending.tolerance:
         remedy = "allow more iterations, a larger tolerance or a larger lambda"
-        status = Status(Verdict.NOT_CONVERGED, f"Not converged to {tolerance:g}", remedy, figures)
+        status = Status(Verdict.NOT_CONVERGED, f"Not converged to {ending.tolerance:g}", remedy, figures)
     else:
         status = Status(Verdict.SOLVED, "Solved", "", figures)
     return Solution(image, lam, residual, status, iterations=spent)
@@ -483,7 +491,7 @@ class FactorisedClasses:
         if self.factors is None:
             # On a section's small grids the division would take longer than the steps that it saves.
             inverse = classes.inverse(self.lam) if classes.camera.cropped else None
-            return conjugate_gradients(classes.normal, projected, self.lam, inverse, tolerance)
+            return conjugate_gradients(classes.normal, projected, self.lam, inverse, Ending(tolerance))
         targets = classes._split(projected)
         image = np.empty_like(targets)
         for index, factor in enumerate(self.factors):

@@ -31,7 +31,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.reconstruct.convolution import conjugate_gradients
+from mitsim.reconstruct.convolution import Ending, conjugate_gradients
 
 if TYPE_CHECKING:
     from scipy.sparse.linalg import LinearOperator
@@ -205,9 +205,8 @@ class JointMosaic:
             gathered,
             lam,
             lambda images: self._precondition(images, lam),
-            _TOLERANCE,
-            _MOST_STEPS,
-            start=start,
+            Ending(_TOLERANCE, _MOST_STEPS),
+            start,
         )
         return JointSolution(found.image, lam, found.iterations, found.residual)
 
