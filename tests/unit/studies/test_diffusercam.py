@@ -10,8 +10,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import parse_patterns
 from mitsim.devices.sensor import load_sensor
 from mitsim.metrics import psnr
-from mitsim.reconstruct.convolution import ConvolutionalCamera
-from mitsim.reconstruct.convolution import Classes
+from mitsim.reconstruct.convolution import Classes, ConvolutionalCamera
 from mitsim.report.exposures import CONVENTIONS
 from mitsim.studies.diffusercam import best_image, race, take
 
