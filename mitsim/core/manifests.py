@@ -85,6 +85,9 @@ class _Part(BaseModel):
         return data
 
 
+# ---- How numbers become electrons, and what was projected ----
+
+
 class Digital(_Part):
     """How digital numbers become photoelectrons a second: (DN - black level) / gain / exposure - dark current."""
 
@@ -243,6 +246,9 @@ class Patterns(_Part):
         return self
 
 
+# ---- Runs ----
+
+
 class _Head(_Part):
     format: int = Field(default=FORMAT, ge=1, le=FORMAT)
     """Version of this format; without it unknown fields are ignored, as by version 0.3.0."""
@@ -333,6 +339,9 @@ class RunManifest(RunHead):
         if ambient and any(shot.file == ambient for shot in self.patterns.captures):
             raise ValueError(f"ambient_frame: names {cut(ambient)!r}, a capture's file; give the frame without light")
         return self
+
+
+# ---- Calibrations ----
 
 
 class FactorNoise(_Part):
@@ -439,6 +448,8 @@ class CalibrationManifest(_Head):
     verdict: str | None = None
     """The estimator's verdict, one of `mitsim.reconstruct.status.Verdict`."""
 
+
+# ---- Reading and writing ----
 
 Manifest = TypeVar("Manifest", RunManifest, CalibrationManifest)
 
