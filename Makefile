@@ -1,4 +1,4 @@
-# make setup | demo | paper | test | test-all | lint | docs | robustness | mutants | wheel.  Everything lives in .venv;
+# make setup | demo | paper | test | test-all | lint | docs | figures | robustness | mutants | wheel.  Everything lives in .venv;
 # PYTHON=python3.12 picks another Python.
 VENV := .venv
 PYTHON ?= python3
@@ -16,7 +16,7 @@ test test-all robustness: export OMP_NUM_THREADS := 1
 # One test process a processor.
 PARALLEL := -n logical --maxprocesses 8 --dist worksteal
 
-.PHONY: setup demo paper test test-all lint docs robustness mutants wheel
+.PHONY: setup demo paper test test-all lint docs figures robustness mutants wheel
 
 setup: $(READY)
 
@@ -54,6 +54,10 @@ lint: $(LINT_READY)
 docs: $(DOCS_READY)
 	@$(VENV)/bin/python -m sphinx -q -W --keep-going -b html -c docs . docs/_build/html
 	@echo docs/_build/html/index.html
+
+# The figures that pages state, README's pictures and all drawings, by mitsim's own commands: five minutes.
+figures: setup
+	@$(VENV)/bin/python docs/figures.py
 
 # All figures of docs/robustness.md anew, by all tests that are marked with `robustness`.
 robustness: setup

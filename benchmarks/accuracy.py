@@ -43,7 +43,7 @@ from mitsim.light.settings import Estimate
 from mitsim.optics.frames import monte_carlo_bound, monte_carlo_error
 from mitsim.planner.choose import predicted
 from mitsim.planner.planner import make_plan
-from mitsim.studies.framework.knobs import Stand
+from mitsim.studies.accuracy_parts import Stand
 
 SCENES = (
     *("photograph", "colour_chart", "resolution_target", "keystone", "gift_card", "corner", "cards", "metal_blade"),

@@ -23,7 +23,7 @@ from skimage import color, data
 
 from mitsim.metrics import psnr
 from mitsim.reconstruct.solver import prepare
-from mitsim.studies.solver import dots, paper_factor
+from mitsim.studies.solver_study import dots, paper_factor
 
 N = 128
 PHOTOGRAPHS = ("astronaut", "camera", "coffee", "chelsea", "rocket", "moon", "hubble_deep_field", "coins")

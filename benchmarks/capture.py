@@ -22,7 +22,7 @@ from pathlib import Path
 
 import mitsim as ms
 from mitsim.core.environment import versions
-from mitsim.studies import find_study
+from mitsim.studies.framework.run import find_study
 
 SCENE, PATTERNS, ACCURACY = "photograph", "dots:7", 1e-3
 

@@ -9,7 +9,7 @@ x 128 pixels; the sensor is as large as the picture (cropped), or gets all light
 calibration/imx249.toml.
 
 Quality: PSNR at the best lambda to a quarter of a decade, peak 1, no gain or offset fit; under equal peak and equal
-frame exposure (mitsim.report.exposures).
+frame exposure (mitsim.report.lit_scene).
 
 Speed: CPU seconds on one thread, all within this run. Iterative: conjugate gradients on frames, to two marks: an error
 against the truth within 1 % of the direct solution's (0.09 dB; residual 1e-6), and a difference from it below 1e-6
@@ -40,8 +40,8 @@ from mitsim.devices.sensor import load_sensor
 from mitsim.metrics import psnr
 from mitsim.reconstruct.convolution import Classes, ConvolutionalCamera
 from mitsim.reconstruct.solver import prepare
-from mitsim.report.exposures import CONVENTIONS
-from mitsim.studies.diffusercam import best_image, race, take
+from mitsim.report import CONVENTIONS
+from mitsim.studies.convolutional_study import best_image, race, take
 
 N = 128
 PERIODS = (1, 2, 3, 5, 7)
@@ -77,7 +77,7 @@ def quality(psf: np.ndarray, case: Case, seed: int) -> Iterator[Row]:
 
 
 def speed(psf: np.ndarray, case: Case, seed: int) -> Iterator[Row]:
-    """CPU seconds of both solvers (mitsim.studies.diffusercam.race)."""
+    """CPU seconds of both solvers (mitsim.studies.convolutional_study.race)."""
     sensor, truth = load_sensor(shipped("calibration", "imx249.toml")), photograph(PHOTOGRAPHS[0], False)
     classes, whole = (Classes(camera_of(psf, cropped), case[1]) for cropped in (case[0], False))
     row = race(classes, whole, truth, sensor, seed)

@@ -26,7 +26,7 @@ import numpy as np
 
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
-from mitsim.studies.solver import dots, paper_factor
+from mitsim.studies.solver_study import dots, paper_factor
 
 N, K = 128, 7
 EPS = float(np.finfo(np.float64).eps)

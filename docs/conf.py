@@ -1,7 +1,7 @@
 """The site that `make docs` builds: pages in Markdown, the API from docstrings, notebooks as they are stored.
 
 The repository's root is the source folder, so that links lead to the same places here as on disk. Nothing is fetched
-and no notebook is run: a test does that.
+and no notebook is run: a test does that. A browser fetches MathJax to show the formulas.
 """
 
 import ast
@@ -28,9 +28,9 @@ include_patterns = ["README.md", "CHANGELOG.md", "CONTRIBUTING.md", "docs/**"]
 exclude_patterns = [".*", "mitsim", "tests", "scenes", "docs/_build", "docs/conf.py", "docs/images", "**/.*"]
 
 nb_execution_mode = "off"
-myst_enable_extensions = ["substitution"]
-myst_heading_anchors = 3
-myst_fence_as_directive = ["mermaid"]
+myst_enable_extensions = ["dollarmath", "substitution"]
+myst_heading_anchors = 4
+myst_fence_as_directive = ["math", "mermaid"]
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"
@@ -47,6 +47,9 @@ CONTENTS = """
 docs/notebooks/index
 docs/architecture
 docs/physics
+docs/rare_light
+docs/reconstruction
+docs/glossary
 docs/formats
 docs/exchange
 docs/bench
@@ -100,7 +103,7 @@ def gallery() -> str:
 
 def plugins() -> str:
     """Markdown that shows the manuals of mitsim's own Mitsuba plugins as they stand in their modules."""
-    sources = [ROOT / "mitsim" / "transport" / f"{name}.py" for name in ("lensless", "grating", "glass", "aperture")]
+    sources = [ROOT / "mitsim/transport/plugins" / f"{name}.py" for name in ("lensless", "grating", "glass", "lens")]
     manuals = [ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) for path in sources]
     return "\n\n".join(f"```text\n{manual}\n```" for manual in manuals)
 

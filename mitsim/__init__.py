@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.factors import Factors, load_calibration
     from mitsim.reconstruct.reconstruct import reconstruct
     from mitsim.reconstruct.result import Reconstruction
-    from mitsim.report.colour.by_line import reconstruct_colours
+    from mitsim.report.line_images import reconstruct_colours
 
 _HOMES = {
     "open_bench": "api.bench",
@@ -49,7 +49,7 @@ _HOMES = {
     "calibrate_model": "calibrate.model",
     "plan_calibration": "calibrate.plan",
     "reconstruct": "reconstruct.reconstruct",
-    "reconstruct_colours": "report.colour.by_line",
+    "reconstruct_colours": "report.line_images",
     "psnr": "metrics",
     "ssim": "metrics",
     "Bench": "api.bench",

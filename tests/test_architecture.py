@@ -48,7 +48,6 @@ MITSUBA_ROOMS = (
     "mitsim.light",
     "mitsim.planner",
     "mitsim.acquire",
-    "mitsim.studies.accuracy",
     "mitsim.core.environment",
 )
 RENDERER = {"mitsuba", "drjit"}
@@ -61,7 +60,7 @@ CHECKS_A_REQUEST = (
     "mitsim.devices.session",
     "mitsim.devices.framelist",
     "mitsim.exchange.formats",
-    "mitsim.exchange.loaders",
+    "mitsim.exchange.real_capture",
 )
 """What looks at words, manifests and lists before work begins."""
 
@@ -172,7 +171,7 @@ def test_every_room_has_a_floor() -> None:
         ("mitsim.reconstruct.factors", "from mitsim.exchange.packed import Packed"),
         ("mitsim.devices.session", "def f():\n    from mitsim.bench import bench"),
         ("mitsim.scene.load", "if TYPE_CHECKING:\n    from mitsim.bench.bench import Apparatus"),
-        ("mitsim.report.report", "from mitsim.studies import find_study"),
+        ("mitsim.report.demo_page", "from mitsim.studies.demo import demo"),
         ("mitsim.core.files", "import mitsim"),
         ("mitsim", "if TYPE_CHECKING:\n    from mitsim.cli import app"),
         ("mitsim", "if TYPE_CHECKING:\n    import mitsuba"),

@@ -46,9 +46,9 @@ from mitsim.optics.frames import Frame
 from mitsim.optics.separable import Lacking, lacking
 from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, Estimate, Seen, StripeSums, stripe_sums
 from mitsim.reconstruct.factors import Factors, load_calibration
+from mitsim.reconstruct.faults import frame_words
 from mitsim.reconstruct.mosaic import behind
 from mitsim.reconstruct.session_faults import Checked, Circumstances, check_session
-from mitsim.reconstruct.faults import frame_words
 
 NOISY, NOISE_FREE = "noisy", "noise_free"
 """Kinds of responses that factors are estimated from."""

@@ -162,7 +162,7 @@ def demo(
     quiet: Quiet = False,
 ) -> int:
     """The main job: plan, capture, calibrate and reconstruct under five pattern families, and report.html."""
-    from mitsim.studies.framework.folder import check_study_folder
+    from mitsim.studies.framework.run import check_study_folder
 
     request = mitsim.Request.of(patterns=patterns, accuracy=accuracy, seed=seed)
     check_study_folder(output, "demo")

@@ -120,7 +120,7 @@ def import_(
     quiet: Quiet = False,
 ) -> int:
     """Make a run folder of a real camera's frames, or of a file that `mitsim export` wrote."""
-    from mitsim.exchange.loaders import READERS, import_file
+    from mitsim.exchange.formats import READERS, import_file
 
     if output is None and calibration_output is None:
         raise MitsimError("import: nothing to make; give -o RUN, --calibration-output CAL, or both")
@@ -131,7 +131,7 @@ def import_(
         payload = import_file(source, output, calibration_output, channel)
     else:
         from mitsim.core.imagelist import BARE, Raw
-        from mitsim.exchange.formats import RealCapture
+        from mitsim.exchange.real_capture import RealCapture
 
         if output is None or calibration_output is not None:
             raise MitsimError(f"{source}: frames hold no calibration; give -o RUN, and no --calibration-output")
@@ -193,7 +193,7 @@ def patterns(
     check_root(seed)
     if family != "stripes":
         read_name(family, projector_pixels)  # refused before numpy is imported
-    from mitsim.exchange.pictures import SESSION, cells_told, draw_family, draw_stripes, session_of
+    from mitsim.exchange.png_files import SESSION, describe_cells, draw_family, draw_stripes, session_of
 
     if family != "stripes":
         refuse_unused(context, ["signed_capture"], "on patterns, whose signed ones are pairs; it is for stripes")
@@ -220,7 +220,7 @@ def patterns(
     where = payload["projector"]
     lines = [
         f"{payload['pictures']} pictures of {where['rows']}x{where['columns']}, {payload['n']}x{payload['n']} cells of "
-        f"{cells_told(where)}: {output}",
+        f"{describe_cells(where)}: {output}",
         after,
     ]
     return finish(as_json, payload, lines, ())

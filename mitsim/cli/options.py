@@ -114,8 +114,7 @@ def scope_of(
         for a define that is none.
     """
     from mitsim.studies.framework.experiment import Scope
-    from mitsim.studies.framework.pictures import QUICK_IMAGES, TEST_IMAGES
-    from mitsim.studies.framework.setup import Setup
+    from mitsim.studies.framework.setup import QUICK_IMAGES, TEST_IMAGES, Setup
 
     parameters = tuple(sorted(defines_of(define).items()))
     setup = Setup(scene or "photograph", None, parameters, camera, projector, variant, outside)
@@ -138,7 +137,7 @@ def swept(name: str, scope: Scope, patterns: str, over: Sequence[str], measure: 
     MitsimError
         for options that the study does not have, or that cannot be read.
     """
-    from mitsim.report.study_options import check_drifts, check_sweep, measures_of, values_of
+    from mitsim.studies.framework.experiment import check_drifts, check_sweep, measures_of, values_of
 
     varied = tuple(values_of(text) for text in over)
     if name == "sweep":
@@ -162,7 +161,7 @@ def check_setup(scope: Scope, scene: str | None) -> None:
     from mitsim.bench.request import Exposure
     from mitsim.core.configuration import load_model
     from mitsim.devices.sensor import load_sensor
-    from mitsim.report.study_options import NO_SCENE
+    from mitsim.studies.framework.experiment import NO_SCENE
 
     camera, projector = check_devices(scope.setup.camera, scope.setup.projector)
     # A study in colour may see through colour filters; all fill a part of the full well.

@@ -36,7 +36,7 @@ def characterise(
     from mitsim.core.configuration import locate
     from mitsim.devices.sensor import load_sensor
     from mitsim.studies.emva_options import Procedure, capacity_of, efficiency_of
-    from mitsim.studies.framework.folder import check_study_folder
+    from mitsim.studies.framework.run import check_study_folder
 
     sensor = load_sensor(locate(camera, "calibration", ".toml"))
     procedure = Procedure(pixels, steps, frames, seed, wavelength)

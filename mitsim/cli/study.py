@@ -84,9 +84,9 @@ def study(
     knob; what `accuracy` costs in time, on a scene and, of none, in the `solver`; what `diffraction` at the mask does;
     how good a `calibration` session is, and why; `merge` joins the parts of --shard.
     """
-    from mitsim.studies import find_study, is_experiment
-    from mitsim.studies.framework.folder import check_study_folder
-    from mitsim.studies.names import EXPOSED, OF_NO_SCENE
+    from mitsim.studies import EXPOSED, OF_NO_SCENE
+    from mitsim.studies.framework.experiment import is_experiment
+    from mitsim.studies.framework.run import check_study_folder, find_study
 
     if name == "merge":
         others = [each for each in context.params if each not in _OF_MERGE]

@@ -32,7 +32,7 @@ MOST_LINES = 4
 """Lines that light is traced at together: wavelengths that a path carries in Mitsuba's spectral variants."""
 JOINT, HALF, DEMOSAIC = WAYS = ("joint", "half", "demosaic")
 """Ways to images of lines from frames behind colour filters, that of most PSNR first
-(:mod:`mitsim.report.colour.ways`)."""
+(:mod:`mitsim.report.mosaic_images`)."""
 Weight = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 

@@ -1,19 +1,20 @@
-"""A RUN folder, and perhaps a CAL folder, in; one file, or one folder, of a format that other programs read out."""
+"""RUN and CAL folders in, a file or folder of a format that other programs read out; and such a file back to folders.
+
+Each format is a row of :data:`FORMATS`. Its module is imported when it is used: what a request says is checked before.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
-from mitsim.core.configuration import locate
 from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.files import check_apart, check_plain, output_file
-from mitsim.core.imagelist import Raw, Wanted, image_files
+from mitsim.core.files import check_apart, check_plain, output_file, whole_folder
 from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
-from mitsim.core.seeds import check_root
 from mitsim.core.spectral_manifests import (
     RUN,
     check_lines,
@@ -23,21 +24,7 @@ from mitsim.core.spectral_manifests import (
     read_mosaic,
     same_lines,
 )
-from mitsim.devices.patterns import read_name
-from mitsim.devices.sensor import check_exposure, load_sensor
-from mitsim.exchange.planes import check_channel
-
-if TYPE_CHECKING:
-    from mitsim.exchange.packed import Coloured, Filtered, Packed
-
-    Run = Packed[RunManifest]
-    Calibration = Packed[CalibrationManifest]
-    ColouredRun = Coloured[RunManifest] | Filtered
-    ColouredCalibration = Coloured[CalibrationManifest]
-
-
-Written = tuple[str, ...]
-"""Sentences on what of the run the format does not hold, or how it is used."""
+from mitsim.exchange.real_capture import check_channel
 
 
 @dataclass(frozen=True)
@@ -52,10 +39,10 @@ class Format:
         whether it is one file or a folder.
     calibration
         whether a calibration is needed, or may be given.
-    write
-        from the place, the run, the calibration and a projector's name to what is said about them.
-    write_lines
-        the same of a coloured run, but for the calibration where there may be none.
+    writer
+        module of this room and function: from the place, the run (of one line, coloured or behind filters), and its
+        ``calibration`` or, where the format has none, a ``projector``'s name, to sentences on what of the run the
+        format does not hold, or how it is used.
     filters
         whether it holds runs behind colour filters.
     """
@@ -63,128 +50,32 @@ class Format:
     what: str
     kind: Literal["file", "folder"]
     calibration: Literal["needed", "optional", "none"]
-    write: Callable[[Path, Run, Calibration | None, str | None], Written]
-    write_lines: Callable[[Path, Any, ColouredCalibration | None, str | None], Written]
+    writer: str
     filters: bool = True
 
 
-def _hdf5(path: Path, run: Run, calibration: Calibration | None, projector: str | None) -> Written:
-    from mitsim.exchange.hdf5 import write_hdf5
-
-    write_hdf5(path, run, calibration)
-    return ()
-
-
-def _hdf5_lines(
-    path: Path, run: ColouredRun, calibration: ColouredCalibration | None, projector: str | None
-) -> Written:
-    from mitsim.exchange.hdf5 import write_hdf5_lines
-
-    write_hdf5_lines(path, run, calibration)
-    return ()
-
-
-def _mat(path: Path, run: Run, calibration: Calibration | None, projector: str | None) -> Written:
-    from mitsim.exchange.matlab import ELECTRONS, write_matlab
-
-    write_matlab(path, run, calibration)
-    without = () if calibration else ("phi_left and phi_right are left out: no calibration was given",)
-    return (*without, f"Left out: {ELECTRONS}")
-
-
-def _mat_lines(path: Path, run: ColouredRun, calibration: ColouredCalibration | None, projector: str | None) -> Written:
-    from mitsim.exchange.matlab import ELECTRONS, write_matlab_lines
-
-    write_matlab_lines(path, run, calibration)
-    without = () if calibration else ("phi_left and phi_right are left out: no calibration was given",)
-    return (*without, f"Left out: {ELECTRONS}")
-
-
-def _flatcam(path: Path, run: Run, calibration: Calibration | None, projector: str | None) -> Written:
-    from mitsim.exchange.flatcam import write_flatcam
-    from mitsim.exchange.matlab import ELECTRONS
-
-    if calibration is not None:  # what export_run has seen to
-        write_flatcam(path, run, calibration)
-    return (f"Left out: {ELECTRONS}",)
-
-
-def _flatcam_lines(
-    path: Path, run: Coloured[RunManifest], calibration: ColouredCalibration | None, projector: str | None
-) -> Written:
-    from mitsim.exchange.flatcam import write_flatcam_lines
-    from mitsim.exchange.matlab import ELECTRONS
-
-    if calibration is not None:  # what export_run has seen to
-        write_flatcam_lines(path, run, calibration)
-    return (f"Left out: {ELECTRONS}",)
-
-
-def _png(path: Path, run: Run, calibration: Calibration | None, projector: str | None) -> Written:
-    from mitsim.exchange.pictures import write_pngs
-
-    return write_pngs(path, run, projector)
-
-
-def _png_lines(
-    path: Path, run: Coloured[RunManifest], calibration: ColouredCalibration | None, projector: str | None
-) -> Written:
-    from mitsim.exchange.pictures import write_pngs_lines
-
-    return write_pngs_lines(path, run, projector)
-
-
-def _torch(path: Path, run: Run, calibration: Calibration | None, projector: str | None) -> Written:
-    from mitsim.exchange.tensors import write_tensors
-
-    write_tensors(path, run, calibration)
-    return ()
-
-
-def _torch_lines(
-    path: Path, run: ColouredRun, calibration: ColouredCalibration | None, projector: str | None
-) -> Written:
-    from mitsim.exchange.tensors import write_tensors_lines
-
-    write_tensors_lines(path, run, calibration)
-    return ()
-
-
-def _deepinv(path: Path, run: Run, calibration: Calibration | None, projector: str | None) -> Written:
-    from mitsim.exchange.tensors import extra, write_tensors
-
-    extra("deepinv")
-    write_tensors(path, run, calibration)
-    return _read_by(path)
-
-
-def _deepinv_lines(
-    path: Path, run: ColouredRun, calibration: ColouredCalibration | None, projector: str | None
-) -> Written:
-    from mitsim.exchange.tensors import extra
-
-    extra("deepinv")
-    _torch_lines(path, run, calibration, projector)
-    return _read_by(path)
-
-
-def _read_by(path: Path) -> Written:
-    return (f"Read it by mitsim.exchange.tensors.load_physics({str(path)!r})",)
-
-
 FORMATS: dict[str, Format] = {
-    "hdf5": Format("one HDF5 file, all of RUN and CAL", "file", "optional", _hdf5, _hdf5_lines),
-    "mat": Format("the paper's variables, for MATLAB and Octave", "file", "optional", _mat, _mat_lines),
-    "flatcam": Format("FlatCam's variables, for its scripts", "file", "needed", _flatcam, _flatcam_lines, False),
-    "deepinv": Format("tensors of a deepinv physics", "file", "needed", _deepinv, _deepinv_lines),
-    "torch": Format("tensors for torch.load", "file", "optional", _torch, _torch_lines),
-    "png": Format("pictures of frames, patterns for a real projector", "folder", "none", _png, _png_lines, False),
+    "hdf5": Format("one HDF5 file, all of RUN and CAL", "file", "optional", "hdf5.write_hdf5"),
+    "mat": Format("the paper's variables, for MATLAB and Octave", "file", "optional", "matlab.write_matlab"),
+    "flatcam": Format("FlatCam's variables, for its scripts", "file", "needed", "flatcam.write_flatcam", False),
+    "deepinv": Format("tensors of a deepinv physics", "file", "needed", "tensors.write_deepinv"),
+    "torch": Format("tensors for torch.load", "file", "optional", "tensors.write_tensors"),
+    "png": Format("pictures of frames, patterns for a real projector", "folder", "none", "png_files.write_pngs", False),
 }
 """Formats by the name that `--format` takes."""
-
-
+READERS = {".h5": "hdf5.load_hdf5", ".hdf5": "hdf5.load_hdf5", ".mat": "flatcam.load_mat"}
+"""What opens a file that `mitsim import` takes, by the end of its name: from the place and a channel to a context of
+:class:`mitsim.exchange.packed.Loaded`."""
 _ENDINGS = {".h5": ("hdf5",), ".hdf5": ("hdf5",), ".mat": ("mat", "flatcam")}
 """Formats by how names end that `mitsim import` takes them by."""
+_CALLED = {"output": "run", "calibration_output": "calibration"}
+"""What the folder of an argument is, in messages."""
+
+
+def _function(name: str) -> Callable[..., Any]:
+    module, _, function = name.partition(".")
+    found: Callable[..., Any] = getattr(import_module(f"mitsim.exchange.{module}"), function)
+    return found
 
 
 def export_run(
@@ -248,30 +139,18 @@ def export_run(
             read_manifest(factors / line, CalibrationManifest)
     check_apart(place, [folder, *([factors] if factors else [])])
     with output_file(place, overwrite) if chosen.kind == "file" else nullcontext():
-        shots, notes = _write(place, chosen, folder, factors, lines, projector)
+        from mitsim.exchange.packed import any_calibration, any_run, run_parts
+
+        shots, calibrated = any_run(folder), None if factors is None else any_calibration(factors)
+        options = {"projector": projector} if chosen.calibration == "none" else {"calibration": calibrated}
+        notes = _function(chosen.writer)(place, shots, **options)
     return {
         "format": format,
-        "frames": sum(len(part.manifest.patterns.captures) for part in shots),
+        "frames": sum(len(part.manifest.patterns.captures) for part in run_parts(shots).values()),
         "calibration": None if calibration is None else str(calibration),
         "notes": list(notes),
         "output": str(place),
     }
-
-
-def _write(
-    place: Path, chosen: Format, folder: Path, factors: Path | None, lines: Sequence[str], projector: str | None
-) -> tuple[list[Run], Written]:
-    """Write a run of these ``lines`` to ``place``; returns its parts, and what is said about them."""
-    if lines:
-        from mitsim.exchange.packed import coloured_calibration, coloured_run, filtered_run, run_parts
-
-        coloured = filtered_run(folder) if is_mosaic(folder) else coloured_run(folder)
-        calibrated = None if factors is None else coloured_calibration(factors)
-        return [*run_parts(coloured).values()], chosen.write_lines(place, coloured, calibrated, projector)
-    from mitsim.exchange.packed import packed_calibration, packed_run
-
-    shots = packed_run(folder)
-    return [shots], chosen.write(place, shots, None if factors is None else packed_calibration(factors), projector)
 
 
 def _lines(run: Path, calibration: Path | None) -> tuple[str, ...]:
@@ -288,80 +167,59 @@ def _lines(run: Path, calibration: Path | None) -> tuple[str, ...]:
     return (read_colours(run, RUN) if calibration is None else same_lines(run, calibration)).names
 
 
-# -------- What a person knows of a real capture in
+def import_file(
+    source: Path, output: Path | None, calibration_output: Path | None = None, channel: str | None = None
+) -> dict[str, Any]:
+    """Write the folders that a file of `mitsim export` holds, each whole or not at all.
 
-
-@dataclass(frozen=True)
-class RealCapture:
-    """What a person knows of a real capture.
-
-    Attributes
+    Parameters
     ----------
-    patterns
-        name of the family, or `patterns.json` of `mitsim export --format png`.
-    camera
-        electronics: name of a shipped file, or a TOML file.
-    exposure_s
-        of every frame [s].
-    calibration
-        CAL folder of the same camera, which tells its identity and the projector's pixels.
-    n
-        projector pixels a side, without a calibration.
-    black_level_dn
-        digital number of a (binned) pixel without charge, where it is another than the camera file's.
-    ambient
-        frame, or folder of frames, with the projector off.
-    ambient_shots
-        that the single frame is the mean of.
-    raw
-        how files without a header are read.
+    source
+        the file.
+    output
+        RUN folder to make; None: only the calibration is wanted.
+    calibration_output
+        CAL folder to make; None: the file's calibration, if it has one, is not wanted.
     channel
-        plane of a colour sensor's frames that is taken, a key of :data:`mitsim.exchange.planes.PLANES`.
-    seed
-        of patterns of a `random` family.
+        plane of a real FlatCam's calibration that is taken.
+
+    Returns
+    -------
+    dict
+        `frames` (of all lines), `output`, `calibration_output`, `holds`, `left_out`, `warnings`: what the command line
+        prints.
+
+    Raises
+    ------
+    MitsimError
+        for a file that is none or is damaged, a part that it does not hold, or a place that holds something.
     """
+    check_plain(source)  # refused before numpy is imported
+    if channel is not None:
+        check_channel(channel)
+    with _function(READERS[source.suffix.lower()])(source, channel) as loaded:
+        wanted = {"output": (output, loaded.run), "calibration_output": (calibration_output, loaded.calibration)}
+        for argument, (place, held) in wanted.items():
+            if place is not None and held is None:
+                raise ArgumentError(argument, f"{place}: {source} holds no {_CALLED[argument]}; leave this out")
+        with ExitStack() as stack:
+            folders = [(stack.enter_context(whole_folder(place)), held) for place, held in wanted.values() if place]
+            for folder, held in folders:
+                held.fill(folder)
+    from mitsim.exchange.packed import parts_of, run_parts
 
-    patterns: str
-    camera: str
-    exposure_s: float
-    calibration: Path | None = None
-    n: int | None = None
-    black_level_dn: float | None = None
-    ambient: Path | None = None
-    ambient_shots: int | None = None
-    raw: Raw | None = None
-    channel: str | None = None
-    seed: int = 0
-
-    @property
-    def wanted(self) -> Wanted:
-        """How its files are read."""
-        return Wanted(raw=self.raw)
-
-    @property
-    def in_file(self) -> bool:
-        """Whether the patterns stand in a file."""
-        return Path(self.patterns).suffix == ".json"
-
-    def check(self, source: Path) -> None:
-        """MitsimError for values that cannot be, and a ``source`` without frames, before any frame is opened."""
-        check_exposure(self.exposure_s)
-        check_root(self.seed)
-        if self.n is not None and self.n < 1:
-            raise ArgumentError("projector_pixels", f"{self.n}: give 1 or more, those a side")
-        if self.channel is not None:
-            check_channel(self.channel)
-        if self.ambient_shots is not None and (self.ambient is None or self.ambient_shots < 1):
-            raise ArgumentError("ambient_shots", f"{self.ambient_shots}: give 1 or more, of an ambient frame")
-        load_sensor(locate(self.camera, "calibration", ".toml"))
-        if self.calibration is not None:
-            read_manifest(self.calibration, CalibrationManifest)
-        elif self.n is None:
-            raise ArgumentError(
-                "calibration", "is not given, and patterns need its projector; give it, or --projector-pixels"
-            )
-        if self.in_file:
-            check_plain(self.patterns)
-        else:
-            read_name(self.patterns, self.n)
-        image_files(source, self.wanted)
+    runs = {} if loaded.run is None else run_parts(loaded.run)
+    calibrations = {} if loaded.calibration is None else parts_of(loaded.calibration)
+    return {
+        "frames": sum(len(part.manifest.patterns.captures) for part in runs.values()) if runs else None,
+        "output": None if output is None else str(output),
+        "calibration_output": None if calibration_output is None else str(calibration_output),
+        "holds": [name for name, (_, held) in zip(("run", "calibration"), wanted.values(), strict=True) if held],
+        "left_out": list(loaded.left_out),
+        "warnings": [
+            f"{line}{text}"
+            for line, part in calibrations.items()
+            for text in part.manifest.warnings
+            if calibration_output is not None
+        ],
+    }

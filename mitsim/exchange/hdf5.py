@@ -25,18 +25,21 @@ from mitsim.core.runs import TRUTH, Capture
 from mitsim.core.spectral_manifests import CALIBRATION, MOSAIC, RUN, ColourManifest
 from mitsim.exchange.packed import (
     FACTORS,
+    Calibration,
     Coloured,
     Filtered,
+    Loaded,
     Packed,
-    checked_channel,
+    Run,
+    as_channel,
     line_of,
     manifest_text,
     run_parts,
     shots_of,
-    unpacked,
-    unpacked_colours,
-    unpacked_filters,
-    unpacked_run,
+    unpack,
+    unpack_colours,
+    unpack_filters,
+    unpack_run,
 )
 from mitsim.version import __version__
 
@@ -45,8 +48,6 @@ if TYPE_CHECKING:
 
     from mitsim.reconstruct.factors import Factors
 
-Run = Packed[RunManifest] | Coloured[RunManifest] | Filtered
-Calibration = Packed[CalibrationManifest] | Coloured[CalibrationManifest]
 _LINES = "lines"
 """Group that has a group of each line."""
 _MOST_CHUNK = 4 * MOST_PIXELS
@@ -58,32 +59,8 @@ _PACKED: dict[str, Any] = {"shuffle": True, "compression": "gzip", "compression_
 that does not get smaller."""
 
 
-def write_hdf5(path: Path, run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None = None) -> None:
-    """Write a run to one file, whole or not at all.
-
-    Parameters
-    ----------
-    path
-        of the file.
-    run
-        with shots of one shape.
-    calibration
-        that goes with it.
-
-    Raises
-    ------
-    MitsimError
-        for shots that differ in shape or channels, or a file that cannot be read or written.
-    """
-    with _begun(path) as file:
-        _write_run(file, run)
-        _write_calibration(file, calibration)
-
-
-def write_hdf5_lines(
-    path: Path, run: Coloured[RunManifest] | Filtered, calibration: Coloured[CalibrationManifest] | None = None
-) -> None:
-    """Write a run of several lines to one file, whole or not at all.
+def write_hdf5(path: Path, run: Run, calibration: Calibration | None = None) -> tuple[str, ...]:
+    """Write a run to one file, whole or not at all; nothing is left out.
 
     Parameters
     ----------
@@ -92,16 +69,20 @@ def write_hdf5_lines(
     run
         with shots of one shape, each line's where they are told apart.
     calibration
-        of the same lines.
+        that goes with it, of the same lines.
 
     Raises
     ------
     MitsimError
-        as for :func:`write_hdf5`.
+        for shots that differ in shape or channels, or a file that cannot be read or written.
     """
-    with _begun(path) as file:
+    with _begin_file(path) as file:
+        if isinstance(run, Packed):
+            _write_run(file, run)
+            _write_calibration(file, line_of(calibration, ""))
+            return ()
         _write_text(file, run.colours.kind, run.text)
-        if calibration is not None:
+        if isinstance(calibration, Coloured):
             _write_text(file, CALIBRATION, calibration.text)
         if isinstance(run, Filtered):
             _write_run(file, run.shots)
@@ -113,6 +94,7 @@ def write_hdf5_lines(
             elif name in run.truths:
                 _write_frame(line.create_group("truth"), *run.truths[name])
             _write_calibration(line, line_of(calibration, name))
+    return ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,8 +129,8 @@ class ExchangeFile:
 
 @contextmanager
 def open_hdf5(path: Path | str, line: str | None = None) -> Iterator[ExchangeFile]:
-    """The file ``path`` of :func:`write_hdf5`, or one ``line`` of that of :func:`write_hdf5_lines`, while the context
-    lasts. Behind colour filters the run is that of all lines, and a ``line`` is needed for its calibration alone.
+    """The file ``path`` of :func:`write_hdf5`, or one ``line`` of it where it holds several, while the context lasts.
+    Behind colour filters the run is that of all lines, and a ``line`` is needed for its calibration alone.
 
     MitsimError for a file that is missing or damaged, is none of these, or leads to other files; and for a line that it
     does not have.
@@ -173,17 +155,30 @@ def open_folders(path: Path | str) -> Iterator[tuple[Run, Calibration | None]]:
 
     path = Path(path)
     check_plain(path)
-    with _told(path):
+    with _in_one_line(path):
         file = h5py.File(path, "r")
     with file:
-        with _told(path):
+        with _in_one_line(path):
             layout = file.attrs.get("mitsim_exchange")
             if not isinstance(layout, (int, np.integer)) or not 1 <= layout <= LAYOUT:
                 raise MitsimError(
                     f"{path}: is no HDF5 file of `mitsim export` (mitsim_exchange is {layout}, 1 to {LAYOUT} are read)"
                 )
-            held = _of_lines(file, path) if _LINES in file else _of_one(file, path)
-        yield held
+            if _LINES in file:
+                run, calibration = _of_lines(file, path)
+            else:
+                run, calibration = _run(file, path), _calibration(file, path) if "calibration" in file else None
+        yield run, calibration
+
+
+@contextmanager
+def load_hdf5(path: Path, channel: str | None) -> Iterator[Loaded]:
+    """All of the file ``path``, while the context lasts. MitsimError as :func:`open_hdf5`, and for a ``channel``: its
+    frames have one."""
+    if channel is not None:
+        raise ArgumentError("channel", f"{channel}: {path} has frames of one; leave it out")
+    with open_folders(path) as (run, calibration):
+        yield Loaded(run, calibration)
 
 
 class _Lazily(Mapping[str, tuple[Channels, Metadata]]):
@@ -205,7 +200,7 @@ class _Lazily(Mapping[str, tuple[Channels, Metadata]]):
 
 
 @contextmanager
-def _begun(path: Path) -> Iterator[h5py.File]:
+def _begin_file(path: Path) -> Iterator[h5py.File]:
     """A file of this layout that takes its place at ``path`` when all is written."""
     with whole_hdf5(path) as file:
         file.attrs["mitsim_exchange"] = LAYOUT
@@ -271,18 +266,12 @@ def _strings() -> Any:
     return h5py.string_dtype("utf-8")
 
 
-def _of_one(place: h5py.Group, path: Path) -> tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]:
-    return _run(place, path), _calibration(place, path) if "calibration" in place else None
-
-
-def _of_lines(
-    file: h5py.File, path: Path
-) -> tuple[Coloured[RunManifest] | Filtered, Coloured[CalibrationManifest] | None]:
-    group, run = _group(file, _LINES, path), _coloured(file, path) if RUN in file else _filtered(file, path)
+def _of_lines(file: h5py.File, path: Path) -> tuple[Run, Calibration | None]:
+    group, run = _group(file, _LINES, path), _coloured_run(file, path) if RUN in file else _filtered_run(file, path)
     if CALIBRATION not in file:
         return run, None
     text = _text_in(file, CALIBRATION, path)
-    colours, calibrations = unpacked_colours(text, CALIBRATION, path), {}
+    colours, calibrations = unpack_colours(text, CALIBRATION, path), {}
     for name in colours.names:
         if name not in run.colours.names or "calibration" not in group[name]:
             raise MitsimError(f"{path}: has no calibration of {name}; export it again")
@@ -290,15 +279,15 @@ def _of_lines(
     return run, Coloured(colours, text, calibrations)
 
 
-def _coloured(file: h5py.File, path: Path) -> Coloured[RunManifest]:
+def _coloured_run(file: h5py.File, path: Path) -> Coloured[RunManifest]:
     text = _text_in(file, RUN, path)
-    colours = unpacked_colours(text, RUN, path)
+    colours = unpack_colours(text, RUN, path)
     return Coloured(colours, text, {name: _run(line, path) for name, line in _lines_of(file, colours, path).items()})
 
 
-def _filtered(file: h5py.File, path: Path) -> Filtered:
+def _filtered_run(file: h5py.File, path: Path) -> Filtered:
     text, shots = _text_in(file, MOSAIC, path), _run(file, path)
-    colours = unpacked_filters(text, shots, path)
+    colours = unpack_filters(text, shots, path)
     lines = _lines_of(file, colours, path)
     truths = {name: _frame(_group(line, "truth", path), path) for name, line in lines.items() if "truth" in line}
     return Filtered(colours, text, shots, truths)
@@ -313,7 +302,7 @@ def _lines_of(file: h5py.File, colours: ColourManifest, path: Path) -> dict[str,
 def _run(file: h5py.Group, path: Path) -> Packed[RunManifest]:
     group = _group(file, "run", path)
     text = _text_in(group, "manifest", path)
-    manifest = unpacked_run(text, path)
+    manifest = unpack_run(text, path)
     captures, ambient = manifest.patterns.captures, manifest.ambient_frame
     stacks = _group(group, "shots", path)
     channels = {name: _dataset(stacks, name, path) for name in stacks}
@@ -328,13 +317,11 @@ def _run(file: h5py.Group, path: Path) -> Packed[RunManifest]:
     others = ({ambient.file: "ambient"} if ambient else {}) | ({TRUTH: "truth"} if "truth" in group else {})
 
     def read(name: str) -> tuple[Channels, Metadata]:
-        with _told(path):
+        with _in_one_line(path):
             if name in others:
                 return _frame(_group(group, others[name], path), path)
             number = index[name]
-            frame = {
-                key: checked_channel(values[number], f"/run/shots/{key}", path) for key, values in channels.items()
-            }
+            frame = {key: as_channel(values[number], f"/run/shots/{key}", path) for key, values in channels.items()}
             return frame, _metadata(metadata, number, path)
 
     return Packed(manifest, text, (*(shot.file for shot in captures), *others), read, path)
@@ -345,10 +332,10 @@ def _calibration(file: h5py.Group, path: Path) -> Packed[CalibrationManifest]:
     text = _text_in(group, "manifest", path)
 
     def read(name: str) -> tuple[Channels, Metadata]:
-        with _told(path):
+        with _in_one_line(path):
             return _frame(_group(group, Path(name).stem, path), path)
 
-    return Packed(unpacked(text, CalibrationManifest, path), text, FACTORS, read, path)
+    return Packed(unpack(text, CalibrationManifest, path), text, FACTORS, read, path)
 
 
 def _text_in(group: h5py.Group, name: str, path: Path) -> str:
@@ -363,9 +350,7 @@ def _text_in(group: h5py.Group, name: str, path: Path) -> str:
 def _frame(group: h5py.Group, path: Path) -> tuple[Channels, Metadata]:
     names = [name for name in group if name != "metadata"]
     arrays = {name: _dataset(group, name, path) for name in names}
-    channels = {
-        name: checked_channel(_whole(array, path), f"{group.name}/{name}", path) for name, array in arrays.items()
-    }
+    channels = {name: as_channel(_whole(array, path), f"{group.name}/{name}", path) for name, array in arrays.items()}
     return channels, _metadata(_dataset(group, "metadata", path), 0, path)
 
 
@@ -437,7 +422,7 @@ def _inside(parent: h5py.Group, name: str, kind: Callable[..., Any], path: Path)
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
+def _in_one_line(path: Path) -> Iterator[None]:
     """What h5py finds wrong with a file, in one line."""
     try:
         yield

@@ -28,98 +28,80 @@ from mitsim.core.runs import TRUTH
 from mitsim.core.spectral_manifests import CALIBRATION, RUN
 from mitsim.exchange.packed import (
     FACTORS,
+    Calibration,
     Coloured,
     Filtered,
     Packed,
-    checked_channel,
+    Run,
+    as_channel,
     line_of,
     manifest_text,
     shots_of,
-    unpacked,
-    unpacked_colours,
-    unpacked_filters,
-    unpacked_run,
+    unpack,
+    unpack_colours,
+    unpack_filters,
+    unpack_run,
 )
 
 ELECTRONS = "expected electrons of the frames"
 """What such a file does not hold of a simulated run."""
 
 
-def write_matlab(path: Path, run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None) -> None:
-    """Write a run with the paper's variables, whole or not at all.
+def write_matlab(path: Path, run: Run, calibration: Calibration | None) -> tuple[str, ...]:
+    """Write a run with the paper's variables, whole or not at all; returns sentences on what is left out.
+
+    Of several lines, the variables of each end in its name: `phi_left_638nm`. Behind colour filters the frames are
+    those of all lines, only the truths and factors of each line end in its name, and `weights` is (4, lines) of what
+    each filter passes.
 
     Parameters
     ----------
     path
         of the file.
     run
-        of whole shots, or of signed pairs.
+        of whole shots, or of signed pairs; with lines called as `mitsim capture` calls them.
     calibration
-        that goes with it; without one `phi_left` and `phi_right` are left out.
+        that goes with it, of the same lines; without one `phi_left` and `phi_right` are left out.
 
     Raises
     ------
     MitsimError
-        for a run that mixes whole shots and pairs, or is larger than such a file may be.
+        for a run that mixes whole shots and pairs, or is larger than such a file may be, and for lines whose names
+        cannot end one of a variable.
     """
-    write_variables(path, _variables(run, calibration))
-
-
-def write_matlab_lines(
-    path: Path, run: Coloured[RunManifest] | Filtered, calibration: Coloured[CalibrationManifest] | None
-) -> None:
-    """Write a run of several lines with the paper's variables, those of a line ending in its name: `phi_left_638nm`.
-
-    Parameters
-    ----------
-    path
-        of the file.
-    run
-        with lines called as `mitsim capture` calls them. Behind colour filters the frames are those of all lines, and
-        only the truths and factors of each line end in its name; `weights` is (4, lines) of what each filter passes.
-    calibration
-        of the same lines; without one `phi_left_638nm` and so on are left out.
-
-    Raises
-    ------
-    MitsimError
-        for lines whose names cannot end one of a variable, and as for :func:`write_matlab`.
-    """
-    ends, variables = endings(run.colours.names, path), colours_in(run, calibration)
-    if isinstance(run, Filtered):
-        variables.update({**_variables(run.shots, None), "weights": np.array(run.colours.weights)})
-    for name, end in ends.items():
+    if isinstance(run, Packed):
+        variables = _variables(run, line_of(calibration, ""))
+    else:
+        ends, variables = endings(run.colours.names, path), colours_in(run, calibration)
         if isinstance(run, Filtered):
-            held = truth_variables(*run.truths[name]) if name in run.truths else {}
-            held.update(calibration_variables(line_of(calibration, name), run.shots.manifest.digital))
-        else:
-            held = _variables(run.lines[name], line_of(calibration, name))
-        variables.update({f"{key}{end}": values for key, values in held.items()})
+            variables.update({**_variables(run.shots, None), "weights": np.array(run.colours.weights)})
+        for name, end in ends.items():
+            if isinstance(run, Filtered):
+                held = truth_variables(*run.truths[name]) if name in run.truths else {}
+                held.update(calibration_variables(line_of(calibration, name), run.shots.manifest.digital))
+            else:
+                held = _variables(run.lines[name], line_of(calibration, name))
+            variables.update({f"{key}{end}": values for key, values in held.items()})
     write_variables(path, variables)
+    without = () if calibration else ("phi_left and phi_right are left out: no calibration was given",)
+    return (*without, f"Left out: {ELECTRONS}")
 
 
-def read_matlab(path: Path) -> tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]:
-    """Run and calibration in the file ``path`` of :func:`write_matlab`.
-
-    MitsimError for a file that is none, or is damaged.
-    """
-    return _folders_in(read_variables(path), path)
-
-
-def read_matlab_lines(path: Path) -> tuple[Coloured[RunManifest] | Filtered, Coloured[CalibrationManifest] | None]:
-    """Run and calibration in the file ``path`` of :func:`write_matlab_lines`.
+def folders_of(variables: Variables, path: Path) -> tuple[Run, Calibration | None]:
+    """Run and calibration in the ``variables`` of the file ``path`` of :func:`write_matlab`.
 
     MitsimError for a file that is none, or is damaged.
     """
-    variables = read_variables(path)
     if FILTERED in variables:
         return _filtered_in(variables, path)
-    return lines_in(variables, lambda name, own: _folders_in(own, path), path)
+    if COLOURED in variables:
+        return lines_in(variables, lambda name, own: _folders_in(own, path), path)
+    return _folders_in(variables, path)
 
 
 def _filtered_in(variables: Variables, path: Path) -> tuple[Filtered, Coloured[CalibrationManifest] | None]:
     text, (shots, _) = text_in(variables, FILTERED, path), _folders_in(variables, path)
-    colours = unpacked_filters(text, shots, path)
+    colours = unpack_filters(text, shots, path)
     lines = by_line(variables, colours.names, path)
     truths = {name: truth_in(own, path) for name, own in lines.items() if "truth" in own}
     digital = shots.manifest.digital
@@ -128,12 +110,11 @@ def _filtered_in(variables: Variables, path: Path) -> tuple[Filtered, Coloured[C
 
 
 def _variables(run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None) -> dict[str, Any]:
-    variables = _frames(run)
-    return {**variables, **of_folders(run, calibration)}
+    return {**_frames(run), **of_folders(run, calibration)}
 
 
 def _folders_in(variables: Variables, path: Path) -> tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]:
-    manifest = unpacked_run(text_in(variables, "run_manifest", path), path)
+    manifest = unpack_run(text_in(variables, "run_manifest", path), path)
     return _run(variables, manifest, path), calibration_in(variables, manifest.digital, path)
 
 
@@ -234,11 +215,6 @@ def write_variables(path: Path, variables: Variables) -> None:
         savemat(file, dict(variables), do_compression=True, long_field_names=True)
 
 
-def names_in(path: Path) -> frozenset[str]:
-    """Names of the arrays and texts in the MATLAB file ``path``; MitsimError as for :func:`read_variables`."""
-    return frozenset(_looked_into(path, _arrays_in))
-
-
 def read_variables(path: Path) -> dict[str, Any]:
     """The arrays of real numbers and the texts of the MATLAB file ``path``, by name; cells, structures and objects,
     which files of `mitsim export` and FlatCam have none of, are not looked into.
@@ -247,9 +223,20 @@ def read_variables(path: Path) -> dict[str, Any]:
     """
     from scipy.io import loadmat
 
-    arrays = _looked_into(path, _arrays_in)
-    Cost(memory_bytes=_COPIES * sum(arrays.values())).check(f"{path}", Limits())
-    return dict(_looked_into(path, lambda file: loadmat(file, variable_names=[*arrays])))
+    check_plain(path)
+    try:
+        with open(path, "rb") as file:
+            arrays = _arrays_in(file)
+            Cost(memory_bytes=_COPIES * sum(arrays.values())).check(f"{path}", Limits())
+            file.seek(0)
+            return dict(loadmat(file, variable_names=[*arrays]))
+    except MitsimError:
+        raise
+    except NotImplementedError:
+        raise MitsimError(f"{path}: is HDF5 (version 7.3); save it in MATLAB with -v7, or name an export .h5") from None
+    except Exception as error:  # SciPy's reader raises of all kinds
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise MitsimError(f"{path}: damaged, or no MATLAB file ({reason}); write or copy it again") from error
 
 
 def _arrays_in(file: BinaryIO) -> dict[str, int]:
@@ -326,18 +313,6 @@ def _element(data: bytes, place: int, order: str) -> tuple[bytes, int]:
     return data[start : start + length], place + 8 if start == place + 4 else start + -(-length // 8) * 8
 
 
-def _looked_into(path: Path, look: Callable[..., Any]) -> Any:
-    check_plain(path)
-    try:
-        with open(path, "rb") as file:
-            return look(file)
-    except NotImplementedError:
-        raise MitsimError(f"{path}: is HDF5 (version 7.3); save it in MATLAB with -v7, or name an export .h5") from None
-    except Exception as error:  # SciPy's reader raises of all kinds
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise MitsimError(f"{path}: damaged, or no MATLAB file ({reason}); write or copy it again") from error
-
-
 def text_in(variables: Variables, name: str, path: Path) -> str:
     """A text of a file.
 
@@ -383,8 +358,8 @@ def array_in(variables: Variables, name: str, shape: tuple[int, ...], path: Path
     """
     array = np.asarray(variables.get(name))
     if array.dtype.kind not in "uif" or array.size != math.prod(shape):
-        told = f"is {array.dtype} of shape {array.shape}" if name in variables else "is missing"
-        raise MitsimError(f"{path}: {name} {told}; numbers of shape {shape} are needed")
+        reported = f"is {array.dtype} of shape {array.shape}" if name in variables else "is missing"
+        raise MitsimError(f"{path}: {name} {reported}; numbers of shape {shape} are needed")
     return array.reshape(shape, order="F")
 
 
@@ -443,7 +418,7 @@ def lines_in(
         for a line that is missing, and as ``folders_in``.
     """
     text = text_in(variables, COLOURED, path)
-    colours = unpacked_colours(text, RUN, path)
+    colours = unpack_colours(text, RUN, path)
     held = {name: folders_in(name, own) for name, own in by_line(variables, colours.names, path).items()}
     run = Coloured(colours, text, {name: shots for name, (shots, _) in held.items()})
     return run, calibrations_in(variables, {name: calibration for name, (_, calibration) in held.items()}, path)
@@ -471,7 +446,7 @@ def calibrations_in(
     if _CALIBRATED not in variables:
         return None
     text = text_in(variables, _CALIBRATED, path)
-    colours = unpacked_colours(text, CALIBRATION, path)
+    colours = unpack_colours(text, CALIBRATION, path)
     lines = {name: calibration for name, calibration in held.items() if calibration is not None}
     if {*lines} != {*colours.names}:
         raise MitsimError(f"{path}: has calibrations of {', '.join(lines)}, not of {', '.join(colours.names)}")
@@ -501,12 +476,10 @@ def by_line(variables: Variables, names: Sequence[str], path: Path) -> dict[str,
     }
 
 
-def colours_in(
-    run: Coloured[RunManifest] | Filtered, calibration: Coloured[CalibrationManifest] | None
-) -> dict[str, Any]:
+def colours_in(run: Coloured[RunManifest] | Filtered, calibration: Calibration | None) -> dict[str, Any]:
     """Variables that say of which lines a file is: the colour.json of ``run`` and ``calibration``."""
     variables = {FILTERED if isinstance(run, Filtered) else COLOURED: run.text}
-    return variables if calibration is None else {**variables, _CALIBRATED: calibration.text}
+    return {**variables, _CALIBRATED: calibration.text} if isinstance(calibration, Coloured) else variables
 
 
 def endings(names: Sequence[str], path: Path) -> dict[str, str]:
@@ -600,7 +573,7 @@ def truth_in(variables: Variables, path: Path) -> tuple[Channels, Metadata]:
 
 def _image_in(variables: Variables, name: str, path: Path) -> Channel:
     """The image called ``name``, (rows, columns) float32."""
-    return checked_channel(matrix_in(variables, name, path).astype(np.float32), name, path)
+    return as_channel(matrix_in(variables, name, path).astype(np.float32), name, path)
 
 
 def dn_per_rate(digital: Digital) -> float:
@@ -644,7 +617,7 @@ def calibration_in(variables: Variables, digital: Digital, path: Path) -> Packed
     if "calibration_manifest" not in variables:
         return None
     text = text_in(variables, "calibration_manifest", path)
-    manifest = unpacked(text, CalibrationManifest, path)
+    manifest = unpack(text, CalibrationManifest, path)
     metadata: Metadata = {"unit": "sqrt(e-/s)"}
     if manifest.board_reflectance is not None:
         metadata = {**metadata, "reflectance": manifest.board_reflectance}
@@ -653,7 +626,7 @@ def calibration_in(variables: Variables, digital: Digital, path: Path) -> Packed
         variable = f"phi_{Path(name).stem}"
         factor = matrix_in(variables, variable, path) / math.sqrt(dn_per_rate(digital))
         # Rounding in double precision is far below half of the last digit in single: the number is the first one.
-        return {"factor": checked_channel(factor.astype(np.float32), variable, path)}, metadata
+        return {"factor": as_channel(factor.astype(np.float32), variable, path)}, metadata
 
     return Packed(manifest, text, FACTORS, read, path)
 
@@ -700,4 +673,4 @@ def _digital(values: npt.NDArray[Any], kind: Any, name: str, path: Path) -> Chan
         digital = np.asarray(values).astype(kind)
     if not np.array_equal(digital.astype(np.float64), values):
         raise MitsimError(f"{path}: {name} has numbers that are no {np.dtype(kind).name}; export it again")
-    return checked_channel(digital, name, path)
+    return as_channel(digital, name, path)

@@ -1,4 +1,7 @@
-"""A RUN or CAL folder in, its manifest and files by name out; or the other way, from wherever they were kept."""
+"""A RUN or CAL folder in, its manifest and files by name out; or the other way, from wherever they were kept.
+
+A run behind colour filters is one RUN folder of all lines; of each there is what a perfect image would show.
+"""
 
 from __future__ import annotations
 
@@ -31,6 +34,8 @@ from mitsim.core.spectral_manifests import (
     MosaicManifest,
     checked_colours,
     checked_mosaic,
+    is_coloured,
+    is_mosaic,
     read_colours,
     read_mosaic,
 )
@@ -95,13 +100,13 @@ class Packed(Generic[Manifest]):
             write_manifest(folder, self.manifest.model_copy(update={"checksums": sums}))
 
 
-def packed_run(folder: Path) -> Packed[RunManifest]:
+def pack_run(folder: Path) -> Packed[RunManifest]:
     """The RUN ``folder``. MitsimError when it is not a complete one."""
     shots = load_run(folder)
     return Packed(shots.manifest, _text_of(folder), shots.files, shots.read, folder)
 
 
-def packed_calibration(folder: Path) -> Packed[CalibrationManifest]:
+def pack_calibration(folder: Path) -> Packed[CalibrationManifest]:
     """The CAL ``folder``. MitsimError when it is not a complete one."""
     manifest = read_manifest(folder, CalibrationManifest)
 
@@ -128,13 +133,13 @@ def shots_of(run: Packed[RunManifest]) -> Iterator[tuple[ShotFile, Channels, Met
         first = first or kinds
         if "DN" not in kinds or kinds != first:
             raise MitsimError(
-                f"{run.place / shot.file}: holds {_told(kinds)}, but the first frame {_told(first)}; frames of one "
-                "shape with the same channels, DN among them, can be exchanged"
+                f"{run.place / shot.file}: holds {_kinds_text(kinds)}, but the first frame {_kinds_text(first)}; "
+                "frames of one shape with the same channels, DN among them, can be exchanged"
             )
         yield shot, channels, metadata
 
 
-def unpacked(text: str, model: type[Manifest], place: Path) -> Manifest:
+def unpack(text: str, model: type[Manifest], place: Path) -> Manifest:
     """The manifest in the ``text`` that an exchanged file holds.
 
     Parameters
@@ -160,10 +165,10 @@ def unpacked(text: str, model: type[Manifest], place: Path) -> Manifest:
     return checked_manifest(data, model, place)
 
 
-def unpacked_run(text: str, place: Path) -> RunManifest:
+def unpack_run(text: str, place: Path) -> RunManifest:
     """The manifest of a run in the ``text`` that an exchanged file holds, found at ``place``; with names of frames that
-    a folder can have. MitsimError as for :func:`unpacked`."""
-    manifest = unpacked(text, RunManifest, place)
+    a folder can have. MitsimError as for :func:`unpack`."""
+    manifest = unpack(text, RunManifest, place)
     ambient = manifest.ambient_frame
     for name in (*(shot.file for shot in manifest.patterns.captures), *([ambient.file] if ambient else [])):
         if name in _OWN or not name.isprintable():
@@ -176,7 +181,7 @@ def manifest_text(manifest: RunManifest | CalibrationManifest, text: str) -> str
     return text or json_text(manifest)
 
 
-def checked_channel(values: object, name: str, place: Path) -> Channel:
+def as_channel(values: object, name: str, place: Path) -> Channel:
     """An array of an exchanged file as a channel of a frame.
 
     Parameters
@@ -205,7 +210,7 @@ def _text_of(folder: Path) -> str:
     return read_text(folder / MANIFEST, MOST_BYTES)
 
 
-def _told(kinds: Mapping[str, tuple[object, ...]]) -> str:
+def _kinds_text(kinds: Mapping[str, tuple[object, ...]]) -> str:
     return ", ".join(f"{name} ({' '.join(map(str, kind))})" for name, kind in kinds.items())
 
 
@@ -268,29 +273,51 @@ class Filtered:
         write_text(folder / COLOUR, self.text)
 
 
-def filtered_run(folder: Path) -> Filtered:
-    """The run behind colour filters in ``folder``. MitsimError when it is not a complete one."""
-    colours = read_mosaic(folder)
-    files = {name: folder / name / TRUTH for name in colours.names}
-    truths = {name: read_frame(path) for name, path in files.items() if path.is_file()}
-    return Filtered(colours, _colour_text_of(folder), packed_run(folder), truths)
+Run = Packed[RunManifest] | Coloured[RunManifest] | Filtered
+Calibration = Packed[CalibrationManifest] | Coloured[CalibrationManifest]
 
 
-def coloured_run(folder: Path) -> Coloured[RunManifest]:
-    """The coloured RUN ``folder``. MitsimError when it, or a line's folder, is not a complete one."""
+@dataclass(frozen=True, eq=False)
+class Loaded:
+    """What an exchanged file holds.
+
+    Attributes
+    ----------
+    run, calibration
+        content of the folders, where the file has them.
+    left_out
+        parts of a run that the file does not hold.
+    """
+
+    run: Run | None
+    calibration: Calibration | None
+    left_out: tuple[str, ...] = ()
+
+
+def any_run(folder: Path) -> Run:
+    """The RUN ``folder``, coloured, behind colour filters, or neither. MitsimError when it, or a line's folder, is not
+    a complete one."""
+    if is_mosaic(folder):
+        filters = read_mosaic(folder)
+        files = {name: folder / name / TRUTH for name in filters.names}
+        truths = {name: read_frame(path) for name, path in files.items() if path.is_file()}
+        return Filtered(filters, _colour_text_of(folder), pack_run(folder), truths)
+    if not is_coloured(folder):
+        return pack_run(folder)
     colours = read_colours(folder, RUN)
-    return Coloured(colours, _colour_text_of(folder), {name: packed_run(folder / name) for name in colours.names})
+    return Coloured(colours, _colour_text_of(folder), {name: pack_run(folder / name) for name in colours.names})
 
 
-def coloured_calibration(folder: Path) -> Coloured[CalibrationManifest]:
-    """The coloured CAL ``folder``. MitsimError when it, or a line's folder, is not a complete one."""
+def any_calibration(folder: Path) -> Calibration:
+    """The CAL ``folder``, coloured or not. MitsimError when it, or a line's folder, is not a complete one."""
+    if not is_coloured(folder):
+        return pack_calibration(folder)
     colours = read_colours(folder, CALIBRATION)
-    return Coloured(
-        colours, _colour_text_of(folder), {name: packed_calibration(folder / name) for name in colours.names}
-    )
+    lines = {name: pack_calibration(folder / name) for name in colours.names}
+    return Coloured(colours, _colour_text_of(folder), lines)
 
 
-def unpacked_colours(text: str, kind: str, place: Path) -> ColourManifest:
+def unpack_colours(text: str, kind: str, place: Path) -> ColourManifest:
     """The lines that an exchanged file has.
 
     Parameters
@@ -307,12 +334,12 @@ def unpacked_colours(text: str, kind: str, place: Path) -> ColourManifest:
     MitsimError
         when the text is not JSON, breaks a rule of its format, or names a folder that cannot be.
     """
-    colours = checked_colours(_parsed(text, place), kind, place)
+    colours = checked_colours(_parse(text, place), kind, place)
     _check_names(colours, place, (COLOUR, LOCK))
     return colours
 
 
-def unpacked_filters(text: str, shots: Packed[RunManifest], place: Path) -> MosaicManifest:
+def unpack_filters(text: str, shots: Packed[RunManifest], place: Path) -> MosaicManifest:
     """The lines and filters that an exchanged file has.
 
     Parameters
@@ -327,14 +354,14 @@ def unpacked_filters(text: str, shots: Packed[RunManifest], place: Path) -> Mosa
     Raises
     ------
     MitsimError
-        as :func:`unpacked_colours`.
+        as :func:`unpack_colours`.
     """
-    colours = checked_mosaic(_parsed(text, place), place)
+    colours = checked_mosaic(_parse(text, place), place)
     _check_names(colours, place, (COLOUR, LOCK, MANIFEST, *shots.names))
     return colours
 
 
-def _parsed(text: str, place: Path) -> Any:
+def _parse(text: str, place: Path) -> Any:
     try:
         return parse_json(text)
     except ValueError as error:
@@ -346,12 +373,12 @@ def _check_names(colours: ColourManifest, place: Path, others: Sequence[str]) ->
         raise MitsimError(f"{place}: a line is called {name}; give it a name of its own")
 
 
-def line_of(held: Coloured[Manifest] | None, name: str) -> Packed[Manifest] | None:
-    """The folder of the line ``name`` of ``held``; None of nothing."""
-    return None if held is None else held.lines[name]
+def line_of(held: Packed[Manifest] | Coloured[Manifest] | None, name: str) -> Packed[Manifest] | None:
+    """The folder of the line ``name`` of ``held``, which is that folder itself where it tells no lines apart."""
+    return held.lines[name] if isinstance(held, Coloured) else held
 
 
-def run_parts(run: Packed[RunManifest] | Coloured[RunManifest] | Filtered) -> dict[str, Packed[RunManifest]]:
+def run_parts(run: Run) -> dict[str, Packed[RunManifest]]:
     """The shots that a ``run`` is of, as :func:`parts_of`."""
     return {"": run.shots} if isinstance(run, Filtered) else parts_of(run)
 

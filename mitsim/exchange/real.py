@@ -27,9 +27,8 @@ from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import AMBIENT, frame_name
 from mitsim.devices.patterns import PatternFamily, parse_patterns
 from mitsim.devices.sensor import SensorModel, digital_of, load_sensor
-from mitsim.exchange.formats import RealCapture
-from mitsim.exchange.packed import FACTORS, Packed, packed_calibration
-from mitsim.exchange.planes import PLANES
+from mitsim.exchange.packed import FACTORS, Packed, pack_calibration
+from mitsim.exchange.real_capture import PLANES, RealCapture
 
 _SECONDS_PER_PIXEL = 1e-7
 """Of an import, which reads every frame twice and writes it once: some 30 s for 256 megapixels on a slow disk."""
@@ -135,7 +134,7 @@ class _Fit:
             if known.n is None:
                 raise AssertionError  # refused by RealCapture.check
             return cls(None, None, (known.n, known.n))
-        calibration: Packed[CalibrationManifest] = packed_calibration(known.calibration)
+        calibration: Packed[CalibrationManifest] = pack_calibration(known.calibration)
         left, right = (calibration.read(name)[0]["factor"].shape for name in FACTORS)
         if known.n is not None and (known.n, known.n) != (left[1], right[1]):
             raise ArgumentError(

@@ -17,7 +17,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.files import whole_file
 from mitsim.core.manifests import SIDES, CalibrationManifest, RunManifest
 from mitsim.core.runs import TRUTH, Capture, load_run
-from mitsim.exchange.packed import FACTORS, Coloured, Filtered, Packed, line_of
+from mitsim.exchange.packed import FACTORS, Calibration, Coloured, Filtered, Packed, Run, line_of
 from mitsim.reconstruct.mosaic import behind
 
 if TYPE_CHECKING:
@@ -37,51 +37,54 @@ def extra(name: str) -> Any:
         raise MitsimError(f"{name} is not installed ({error}); type: pip install 'mitsim[{name}]'") from error
 
 
-def write_tensors(path: Path, run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None) -> None:
+def write_tensors(path: Path, run: Run, calibration: Calibration | None) -> tuple[str, ...]:
     """Write a run as a file of tensors that `torch.load` reads with `weights_only`, whole or not at all.
 
-    Parameters
-    ----------
-    path
-        of the file.
-    run
-        that is exported.
-    calibration
-        that goes with it.
-
-    Raises
-    ------
-    MitsimError
-        where PyTorch is not installed, or a frame cannot be read.
-    """
-    extra("torch")
-    _save(path, _arrays(run, calibration))
-
-
-def write_tensors_lines(
-    path: Path, run: Coloured[RunManifest] | Filtered, calibration: Coloured[CalibrationManifest] | None
-) -> None:
-    """Write a run of several lines as tensors with an axis of lines before the others, whole or not at all.
+    Of several lines the tensors have an axis of lines before the others. Behind colour filters `y` has none, and
+    `weights` (4, lines) is what each filter passes.
 
     Parameters
     ----------
     path
         of the file.
     run
-        whose lines were captured under the same patterns. Behind colour filters `y` has no axis of lines, and
-        `weights` (4, lines) is what each filter passes.
+        that is exported; its lines were captured under the same patterns.
     calibration
-        of the same lines.
+        that goes with it, of the same lines.
 
     Raises
     ------
     MitsimError
-        as for :func:`write_tensors`, and for lines that differ in their patterns or in the shape of a tensor.
+        where PyTorch is not installed, a frame cannot be read, or lines differ in their patterns or in the shape of a
+        tensor.
     """
-    extra("torch")
-    if isinstance(run, Filtered):
-        _save(path, {**_filtered(run, calibration), "wavelengths_nm": np.array(run.colours.wavelengths_nm)})
-        return
+    torch = extra("torch")
+    if isinstance(run, Packed):
+        arrays = _arrays(run, line_of(calibration, ""))
+    else:
+        arrays = (
+            _arrays_behind_filters(run, calibration) if isinstance(run, Filtered) else _join(path, run, calibration)
+        )
+        arrays["wavelengths_nm"] = np.array(run.colours.wavelengths_nm)
+    with whole_file(path) as part:
+        torch.save({name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in arrays.items()}, part)
+    return ()
+
+
+def write_deepinv(path: Path, run: Run, calibration: Calibration | None) -> tuple[str, ...]:
+    """The same as :func:`write_tensors` where deepinv is installed; returns how the file is read.
+
+    Parameters
+    ----------
+    path, run, calibration
+        as there.
+    """
+    extra("deepinv")
+    write_tensors(path, run, calibration)
+    return (f"Read it by mitsim.exchange.tensors.load_physics({str(path)!r})",)
+
+
+def _join(path: Path, run: Coloured[RunManifest], calibration: Calibration | None) -> dict[str, FloatArray]:
     lines = {name: _arrays(run.lines[name], line_of(calibration, name)) for name in run.colours.names}
     first, *others = lines.values()
     for arrays in others:
@@ -93,12 +96,12 @@ def write_tensors_lines(
     for key in first.keys() - joined.keys():
         # The truth has an axis of one channel, which the lines take.
         joined[key] = (np.concatenate if key == "x" else np.stack)([arrays[key] for arrays in lines.values()])
-    _save(path, {**joined, "wavelengths_nm": np.array(run.colours.wavelengths_nm)})
+    return joined
 
 
 def _arrays(run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None) -> dict[str, FloatArray]:
     shots = Capture(run.manifest, None, {name: run.read(name) for name in dict.fromkeys(run.names)})
-    arrays = {"y": measured(shots), **dict(zip(_PATTERNS, shots.patterns, strict=True))}
+    arrays = {"y": measurements(shots), **dict(zip(_PATTERNS, shots.patterns, strict=True))}
     if shots.truth is not None:
         arrays["x"] = shots.truth[None]
     return arrays if calibration is None else {**arrays, **_sides(calibration)}
@@ -109,26 +112,20 @@ def _sides(calibration: Packed[CalibrationManifest]) -> dict[str, FloatArray]:
     return {side: np.asarray(factor, np.float64) for side, factor in factors.items()}
 
 
-def _filtered(run: Filtered, calibration: Coloured[CalibrationManifest] | None) -> dict[str, FloatArray]:
+def _arrays_behind_filters(run: Filtered, calibration: Calibration | None) -> dict[str, FloatArray]:
     names = run.colours.names
     # The truth of the frames is a mixture of the lines', which are given themselves.
     arrays = {key: values for key, values in _arrays(run.shots, None).items() if key != "x"}
     arrays["weights"] = np.array(run.colours.weights)
     if run.truths.keys() >= {*names}:
         arrays["x"] = np.stack([run.truths[name][0]["reflectance"] for name in names]).astype(np.float64)
-    if calibration is not None:
+    if isinstance(calibration, Coloured):
         sides = [_sides(calibration.lines[name]) for name in names]
         arrays.update({side: np.stack([each[side] for each in sides]) for side in SIDES})
     return arrays
 
 
-def _save(path: Path, arrays: Mapping[str, FloatArray]) -> None:
-    torch = extra("torch")
-    with whole_file(path) as part:
-        torch.save({name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in arrays.items()}, part)
-
-
-def measured(shots: Capture) -> FloatArray:
+def measurements(shots: Capture) -> FloatArray:
     """(K K', rows, columns) electrons a second of every pattern of ``shots``, row-major over (i, j): differences of
     signed pairs, others less the ambient frame. MitsimError for a frame that cannot be read."""
     columns = shots.patterns[1].shape[1]
@@ -158,7 +155,7 @@ class RunDataset:
         shots = load_run(self.runs[index].folder or Path())  # anew, so that no item stays in memory
         if shots.truth is None:
             raise MitsimError(f"{shots.name}: has no {TRUTH}")
-        pair = shots.truth[None].astype(np.float32), measured(shots).astype(np.float32)
+        pair = shots.truth[None].astype(np.float32), measurements(shots).astype(np.float32)
         return self._torch.from_numpy(pair[0]), self._torch.from_numpy(pair[1])
 
 

@@ -261,6 +261,13 @@ class Simulation(Tracers):
         return expected_of([(self, groups)], rows, lighting, seed, leaking, probed)
 
 
+def _rows(light: sparse.csr_array, first: int, last: int) -> sparse.csr_array:
+    """Rows ``first`` .. ``last`` - 1 of ``light``, not copied."""
+    start, stop = light.indptr[first], light.indptr[last]
+    entries = light.data[start:stop], light.indices[start:stop], light.indptr[first : last + 1] - start
+    return sparse.csr_array(entries, shape=(last - first, light.shape[1]), copy=False)
+
+
 def expected_of(
     parts: Sequence[tuple[Simulation, Sequence[LightEstimate]]],
     rows: Labels,
@@ -298,10 +305,3 @@ def emitted(physics: Physics, lighting: Lighting, leaking: bool = True) -> Float
     """
     black = physics.black_level if leaking else 0.0
     return np.asarray(black + (1 - black) * lighting.weights)
-
-
-def _rows(light: sparse.csr_array, first: int, last: int) -> sparse.csr_array:
-    """Rows ``first`` .. ``last`` - 1 of ``light``, not copied."""
-    start, stop = light.indptr[first], light.indptr[last]
-    entries = light.data[start:stop], light.indices[start:stop], light.indptr[first : last + 1] - start
-    return sparse.csr_array(entries, shape=(last - first, light.shape[1]), copy=False)

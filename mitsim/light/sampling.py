@@ -115,12 +115,12 @@ class Group:
         return reduce(add, self._means[line].values())
 
     def part(self, name: str, line: int = 0) -> LightEstimate:
-        """The same of one pass by its ``name``."""
+        """The same of one pass by its ``name``, of a ``line``."""
         return self._means[line][name]
 
 
 def trace_groups(groups: Sequence[Group], wanted: Mapping[str, int]) -> None:
-    """Trace until every group has so many samples as are ``wanted`` of each pass by its name, and accumulate them."""
+    """Trace until all ``groups`` have as many samples as are ``wanted`` of each pass by its name, accumulated."""
     with Behind[Accumulation](lambda accumulation: accumulation()) as accumulating:
         for group in groups:
             group.trace(wanted, accumulating)

@@ -200,6 +200,7 @@ class FollowedRuns(AnchorRuns):
         return {**anchors, **self._widths} if len(anchors) > _FOLLOWED_JUDGE + 1 else anchors
 
     def sample_costs(self, light: float) -> dict[str, SampleCost]:
+        """The same, relative to all ``light``, from the projector's side and from the camera's."""
         tracers = self._simulation().at_anchors
         if not self.changes:
             return dict.fromkeys(self.passes, SampleCost.none())

@@ -235,12 +235,20 @@ def _product_seconds() -> float:
 
 
 def shown_pixels(settings: Settings, sample: Sample) -> Labels:
-    """Projector pixels that the shots of a ``sample`` show, but for those that are traced apart."""
+    """Projector pixels that the shots of a ``sample`` show, but for those that ``settings`` trace apart."""
     return np.setdiff1d(sample.shown, settings.sharp.pixels) if settings.sharp else sample.shown
 
 
 def tracer_of(simulation: Simulation, pixels: Labels, anchors: int, spread: bool = False) -> DirectTracer:
-    """Direct light of some projector ``pixels`` to every anchor, or ``spread`` over the sensor."""
+    """What traces direct light of some projector pixels.
+
+    Parameters
+    ----------
+    simulation, pixels
+        what is simulated, and the pixels' numbers.
+    anchors, spread
+        to so many anchors a side, or spread over the sensor.
+    """
     loaded, physics = simulation.bench.loaded, simulation.physics
     parts = loaded.scene, loaded.camera, physics.projector, anchors, physics.geometry
     return DirectTracer(*parts, spread=spread, pixels=pixels)
@@ -280,13 +288,13 @@ def occluded_pixels(simulation: Simulation, accuracy: float, seed: int) -> tuple
     rough, whole = _roughness(simulation, pixels, _FIRST, seed)
     rest = (_LEFT * accuracy) ** 2 * whole
     found = pixels[_most(rough, rest)]
-    every, frame_check = np.zeros(n**2), np.zeros(n**2, dtype=bool)
+    every, looked = np.zeros(n**2), np.zeros(n**2, dtype=bool)
     # Few rays miss what is hidden by a little; it lies beside what is hidden by much.
-    while len(near := np.intersect1d(_beside(found, n), pixels[~frame_check[pixels]])):
-        if frame_check.sum() + len(near) > 9 * _MOST * n**2:
+    while len(near := np.intersect1d(_beside(found, n), pixels[~looked[pixels]])):
+        if looked.sum() + len(near) > 9 * _MOST * n**2:
             return ()
-        every[near], _ = _roughness(simulation, near, _NEAR, integer(seed, "near", int(frame_check.sum())))
-        frame_check[near] = True
+        every[near], _ = _roughness(simulation, near, _NEAR, integer(seed, "near", int(looked.sum())))
+        looked[near] = True
         found = _most(every, rest)
     return tuple(np.sort(found).tolist()) if len(found) <= _MOST * n**2 else ()
 

@@ -259,7 +259,8 @@ class EffectRuns:
         tracer, samples = simulation.sharp, self.sample.sharp(simulation)
         if tracer is None:
             return []
-        return tracer.trace_looks([integer(seed, "sharp") for seed in self.seeds], samples)
+        found: list[Deposits] = tracer.trace_looks([integer(seed, "sharp") for seed in self.seeds], samples)
+        return found
 
     def _form(
         self,

@@ -1,1 +1,22 @@
-"""What people read of a run: pages, plots, tables; the demo."""
+"""What people read of a run: pages, plots, tables; and the exposures and models of a scene that they compare."""
+
+from __future__ import annotations
+
+from mitsim.devices.patterns import FAMILIES
+
+EQUAL_PEAK, EQUAL_FRAME, EQUAL_TOTAL = CONVENTIONS = ("equal peak", "equal frame", "equal total")
+"""Exposures: see :mod:`mitsim.report.lit_scene`."""
+IDEALISED, RENDERED = MODELS = ("idealised", "rendered")
+"""The paper's model of a scene with its own exact factors, and its traced light with calibrated ones."""
+
+
+def label(name: str) -> str:
+    """What people call the patterns ``name``, such as "49 dots" for ``dots:7`` and "7 x 14 dots" for ``dots:7x14``."""
+    kind, _, size = name.partition(":")
+    count = size.replace("x", " x ") if "x" in size else size and str(int(size) ** 2)
+    return f"{count} {FAMILIES[kind].label}" if count else kind.capitalize()
+
+
+def in_text(name: str) -> str:
+    """What people call the patterns ``name`` inside a sentence: "uniform", "49 dots", "64 Hadamard"."""
+    return label(name)[:1].lower() + label(name)[1:]

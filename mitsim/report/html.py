@@ -19,7 +19,7 @@ _DPI, _SHOWN_DPI = 220, 110
 """Figures are 8.6 inches wide at most: 946 pixels of the page, in two dots each."""
 
 
-def rendered(template: str, filters: Mapping[str, Callable[..., str]] | None = None, **shown: Any) -> str:
+def render_page(template: str, filters: Mapping[str, Callable[..., str]] | None = None, **shown: Any) -> str:
     """A page as text.
 
     Parameters
@@ -65,7 +65,7 @@ def write_html(path: Path, text: str) -> Path:
     return path
 
 
-def shown_figure(figure: Figure) -> tuple[str, int]:
+def page_figure(figure: Figure) -> tuple[str, int]:
     """A figure for a page.
 
     Parameters
@@ -116,7 +116,7 @@ def scientific(value: float | None) -> str:
     return typeset(f"{value:.1e}")
 
 
-def rounded(value: float, error: float) -> str:
+def round_to_error(value: float, error: float) -> str:
     """A number to the second digit of its standard error.
 
     Parameters
@@ -145,9 +145,9 @@ def with_error(value: float, error: float, unit: str = "") -> str:
         in one unit, which stands behind both.
     """
     places = min(max(1 - math.floor(math.log10(error)), 0), 2) if error > 0 else 2
-    told = f" \N{PLUS-MINUS SIGN} {error:.{places}f}" if round(error, 2) else ""
+    deviation = f" \N{PLUS-MINUS SIGN} {error:.{places}f}" if round(error, 2) else ""
     # Zero has no sign.
-    return f"{value:z.{places}f}".replace("-", "\N{MINUS SIGN}") + told + unit
+    return f"{value:z.{places}f}".replace("-", "\N{MINUS SIGN}") + deviation + unit
 
 
 def sentence(text: str) -> str:

@@ -1,24 +1,25 @@
-"""Arrays in, matplotlib Figures out: one message a figure, units on every axis.
+"""Arrays and means in, matplotlib Figures out: one message a figure, units on every axis.
 
-Colours are safe for the colour-blind. The caller saves the figure; no pyplot state is touched.
+Colours are safe for the colour-blind. The caller saves the figure; no pyplot state is touched. What one study alone
+draws stands with that study.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from textwrap import fill
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator
 
 from mitsim.core.arrays import FloatArray
-from mitsim.report.html import reflectance, scientific, typeset
+from mitsim.core.pictures import lightness
+from mitsim.report.html import scientific, typeset
 from mitsim.report.table import Mean
 
 BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
@@ -26,55 +27,213 @@ SKY, PURPLE, BLACK = "#56B4E9", "#CC79A7", "#1b1f24"
 """Okabe and Ito's palette: distinct in all common forms of colour blindness, and in grey."""
 _PALETTE = (BLACK, ORANGE, SKY, BLUE, VERMILION, GREEN, PURPLE)
 _STYLES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)))
-_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 """Seven of each, so that as many curves can be told apart."""
-_GRID, LINK, GREY = "#e5e7eb", "#d1d5db", "#6b7280"
-"""Lines behind the data, between them, and beside them: lighter than any curve."""
+_GRID, LINK, GREY, PALE = "#e5e7eb", "#d1d5db", "#6b7280", "#c7d2de"
+"""Lines behind the data, between them, and beside them: lighter than any curve; and bars that others stand beside."""
 FONT = 11.0
 """Points: as large as the text of a page of 8.6 inches."""
-WIDTH, _FRAME_WIDTH = 8.6, 3.6
-"""Inches: a page of text, and three frames side by side with room for their labels."""
-_SHORT_AXIS = 30.0
-"""Range of a logarithmic axis below which powers of ten alone leave one tick or none."""
-_SHOWN_PERCENT = 99.0
-"""Of the errors, those that the scale holds: a normal error's are then within 2.6 deviations."""
-_TITLE_LETTERS = 100
-"""Of a line above a figure of the page's width."""
-_BEST = "best for its time"
+WIDTH = 8.6
+"""Inches: a page of text."""
+_CELL = 1.5
+"""Inches of an image in a grid, at most: six stand on a page."""
+_LABEL = 1.1
+"""Inches beside a grid for the names of its rows."""
+_CAPTION = 0.32
+"""Inches of a row for the captions below its images."""
+_LETTER = 0.085
+"""Inches of a letter of such a name, on the average."""
+ROW = 0.27
+"""Inches of a row of bars: a line of text, and a third of one between two."""
+_UPRIGHT_LETTERS = 36
+"""Of a line along a figure of curves."""
+Curve = Mapping[Any, Mean]
+"""Means by what varies: numbers, or their text."""
 Point = tuple[float, float]
 """Wall seconds, relative error."""
+_SHORT_AXIS = 30.0
+"""Range of a logarithmic axis below which powers of ten alone leave one tick or none."""
 
 
-def frame(values: npt.ArrayLike) -> Figure:
-    """A sensor frame ``values`` (m, m') [DN] with its colour bar; pixel (0, 0) is top left."""
-    # "compressed" makes room around an image of fixed aspect; "constrained" lets the row label run off the figure.
-    figure, axes = figure_of(0.75 * _FRAME_WIDTH, _FRAME_WIDTH, layout="compressed")
-    drawn = axes.imshow(np.asarray(values, dtype=np.float64), cmap="viridis", interpolation="none")
-    bar = figure.colorbar(drawn, ax=axes)
-    bar.set_label("signal [DN]", fontsize=FONT - 1)
-    bar.ax.tick_params(labelsize=FONT - 2)
-    axes.set_xlabel("sensor column [pixel]", fontsize=FONT - 1)
-    axes.set_ylabel("sensor row [pixel]", fontsize=FONT - 1)
-    axes.tick_params(labelsize=FONT - 2)
+def curves(
+    panels: Mapping[str, Mapping[str, Curve]],
+    x: str,
+    y: str = "PSNR [dB]",
+    log: bool = False,
+    ticks: bool = True,
+    title: str = "",
+) -> Figure:
+    """Curves with bars of one standard error, in panels side by side on one scale.
+
+    Parameters
+    ----------
+    panels
+        curves by name, by the panels' titles; one without points has its colour all the same.
+    x, y
+        names of the axes, with units.
+    log
+        whether x is logarithmic.
+    ticks
+        whether every x that was measured has a tick.
+    title
+        of all panels.
+
+    Notes
+    -----
+    A curve alone needs no name: an empty one has no line in the legend.
+    """
+    figure, places = panels_of(1, len(panels), 0.46 * WIDTH, sharex=True, sharey=True)
+    names = list(dict.fromkeys(name for shown in panels.values() for name in shown))
+    for axes, (panel, shown) in zip(places[0], panels.items(), strict=True):
+        for name, curve in ((name, curve) for name, curve in shown.items() if curve):
+            points = sorted((float(number), mean.value, mean.error) for number, mean in curve.items())
+            numbers, means, errors = np.array(points).reshape(-1, 3).T
+            style = {"marker": "o", "ms": 5.0, "capsize": 3, "lw": 1.8, **line_style(names.index(name))}
+            axes.errorbar(numbers, means, _known(errors), label=name, **style)
+        axes.set_title(panel, fontsize=FONT)
+        label_axes(axes, x, fill(y, _UPRIGHT_LETTERS) if axes is places[0][0] else "")
+        if log:
+            axes.set_xscale("log")
+        if ticks:
+            measured = sorted(
+                {float(number) for each in panels.values() for curve in each.values() for number in curve}
+            )
+            axes.xaxis.set_major_locator(FixedLocator(measured))
+            axes.xaxis.set_minor_locator(NullLocator())
+            axes.xaxis.set_major_formatter("{x:g}")
+    shown_by_name: dict[str, Any] = {}
+    for axes in places[0]:  # a panel may lack curves that another has
+        shown_by_name |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
+    labels = [name for name in names if name and name in shown_by_name]
+    if labels:
+        legend_below(figure, min(len(labels), 4), [shown_by_name[name] for name in labels], labels)
+    if title:
+        figure.suptitle(title, fontsize=FONT + 1)
     return figure
 
 
-def stated_and_actual(uncertainty: FloatArray, error: FloatArray) -> Figure:
-    """An image's standard ``uncertainty`` beside its actual ``error``, both (n, n') [reflectance], on one scale."""
-    figure, _ = figure_of(0.46 * WIDTH, layout="compressed")
-    figure.clear()
-    panels: Any = figure.subplots(1, 2, sharex=True, sharey=True)
-    largest = max(float(uncertainty.max()), float(np.percentile(error, _SHOWN_PERCENT)))
-    titled = {"stated: standard uncertainty": uncertainty, "actual: |image \N{MINUS SIGN} truth|": error}
-    for axes, (title, values) in zip(panels, titled.items(), strict=True):
-        drawn = axes.imshow(values, vmin=0, vmax=largest, cmap="viridis", interpolation="none")
-        axes.set_title(f"{title}\nrms {reflectance(float(np.sqrt(np.mean(np.square(values)))))}", fontsize=FONT)
-        axes.set_xlabel("column [projector pixel]", fontsize=FONT - 1)
-        axes.tick_params(labelsize=FONT - 2)
-    panels[0].set_ylabel("row [projector pixel]", fontsize=FONT - 1)
-    bar = figure.colorbar(drawn, ax=panels, extend="max")
-    bar.set_label("reflectance, 1 = board", fontsize=FONT - 1)
-    bar.ax.tick_params(labelsize=FONT - 2)
+def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Sequence[str], title: str = "") -> Figure:
+    """Images (n, n) [reflectance] with a caption below each, cut to 0..1 for display only.
+
+    Parameters
+    ----------
+    rows
+        images and captions by the rows' names.
+    columns
+        titles.
+    title
+        of all.
+    """
+    size = min(_CELL, (WIDTH - _LABEL) / len(columns))
+    inches = (size + _CAPTION) * len(rows) + 0.3, size * len(columns) + _LABEL
+    figure, cells = panels_of(len(rows), len(columns), *inches, layout="compressed")
+    for index, (name, images) in enumerate(rows.items()):
+        line = cells[index]
+        for axes, (image, caption), column in zip(line, images, columns, strict=True):
+            axes.imshow(lightness(image), cmap="gray", vmin=0, vmax=1, interpolation="none")
+            axes.set(xticks=[], yticks=[])
+            axes.spines[:].set_visible(True)
+            axes.set_xlabel(caption, fontsize=FONT - 2)
+            if index == 0:
+                lines = [fill(line, int(size / _LETTER)) for line in column.split("\n")]
+                axes.set_title("\n".join(lines), fontsize=FONT - 1)
+        fits = len(name) * _LETTER <= size + _CAPTION
+        line[0].set_ylabel(name if fits else name.replace(", ", ",\n"), fontsize=FONT - 1)
+    if title:
+        figure.suptitle(title, fontsize=FONT)
+    return figure
+
+
+def pair_chart(values: Mapping[str, tuple[Mean, Mean]], labels: tuple[str, str], x: str) -> Figure:
+    """Two means of each thing beside each other, the first as a bar, the second as a dot, the largest on top.
+
+    Parameters
+    ----------
+    values
+        both means by name.
+    labels
+        of the two.
+    x
+        name of the axis, with its unit.
+    """
+    ordered = sorted(values.items(), key=lambda item: item[1][0].value)
+    figure, axes = figure_of(0.9 + ROW * len(ordered))
+    rows = np.arange(len(ordered))
+    first, second = (
+        np.array([(pair[index].value, pair[index].error) for _, pair in ordered]).reshape(-1, 2).T for index in (0, 1)
+    )
+    axes.barh(rows, first[0], 0.66, xerr=_known(first[1]), color=PALE, capsize=3, label=labels[0])
+    style: dict[str, Any] = {"color": VERMILION, "ms": 5.5, "capsize": 3, "lw": 0, "elinewidth": 1.5}
+    axes.errorbar(second[0], rows, xerr=_known(second[1]), fmt="D", label=labels[1], **style)
+    _name_rows(axes, [name for name, _ in ordered])
+    label_axes(axes, x, "", grid="x")
+    return figure
+
+
+def bars(kinds: Mapping[str, Mapping[str, Mean]], x: str) -> Figure:
+    """A bar and its error for each value, the largest on top.
+
+    Parameters
+    ----------
+    kinds
+        values by name, by what they are: two kinds at most, each in its colour.
+    x
+        name of the axis, with its unit.
+    """
+    values = [(mean, name, kind) for kind, means in kinds.items() for name, mean in means.items()]
+    ordered = sorted(values, key=lambda value: value[0].value)
+    figure, axes = figure_of(1.2 + ROW * len(ordered))
+    for colour, kind in zip((BLUE, PALE), kinds, strict=False):
+        own = [(row, mean) for row, (mean, _, of) in enumerate(ordered) if of == kind]
+        if own:
+            rows, means = zip(*own, strict=True)
+            errors = [mean.error for mean in means]
+            axes.barh(rows, [mean.value for mean in means], 0.66, xerr=errors, color=colour, capsize=3, label=kind)
+    most = max(mean.value + mean.error for mean, _, _ in ordered)
+    least = min([0.0, *(1.1 * (mean.value - mean.error) for mean, _, _ in ordered if mean.value < 0)])
+    axes.set_xlim(least, 1.1 * most or 1.0)
+    _name_rows(axes, [name for _, name, _ in ordered])
+    label_axes(axes, x, "", grid="x")
+    return figure
+
+
+def singular_values(curves: Mapping[str, npt.ArrayLike]) -> Figure:
+    """Singular values of each family's system, {family: values in any order}, log scale over rank in percent.
+
+    Each of the ``curves`` is divided by its own largest value: what remains is the conditioning.
+    """
+    figure, axes = figure_of(0.42 * WIDTH)
+    for index, (name, values) in enumerate(curves.items()):
+        ordered = np.sort(np.asarray(values, dtype=np.float64).ravel())[::-1]
+        share = 100.0 * np.arange(1, ordered.size + 1) / ordered.size
+        axes.semilogy(share, ordered / ordered[0], lw=2.0, label=name, **line_style(index))
+    axes.set_xlim(0, 100)
+    label_axes(axes, "singular value's rank [% of all]", "singular value, relative to the largest [1]")
+    axes.legend(fontsize=FONT - 1, frameon=False, loc="lower left")
+    return figure
+
+
+def singular_errors(factors: Mapping[str, FloatArray]) -> Figure:
+    """Errors of singular values of each of ``factors``, and their standard errors as lines; rows are of (without noise,
+    with noise less its bias, standard error)."""
+    figure, axes = figure_of(0.45 * WIDTH)
+    for index, (name, rows) in enumerate(factors.items()):
+        exact, noisy, error = rows.T
+        # Dashes over a line: the two may coincide.
+        style = {"color": _PALETTE[index + 1], "ls": _STYLES[index], "lw": 3.0 - 1.2 * index}
+        axes.plot(np.arange(len(rows)), error / exact, label=f"{name}: standard error", **style)
+        axes.plot(
+            np.arange(len(rows)),
+            np.abs(noisy - exact) / exact,
+            MARKERS[index],
+            ms=4,
+            mfc="none",
+            color=_PALETTE[index + 1],
+            label=f"{name}: found, less bias",
+        )
+    axes.set_yscale("log")
+    label_axes(axes, "number of the singular value", "relative error [1]")
+    legend_below(figure, 4, *axes.get_legend_handles_labels())
     return figure
 
 
@@ -101,46 +260,6 @@ def deviations(values: npt.ArrayLike, largest: float, title: str) -> Figure:
     return figure
 
 
-def singular_errors(factors: Mapping[str, FloatArray]) -> Figure:
-    """Errors of singular values of each of ``factors``, and their standard errors as lines; rows are of (without noise,
-    with noise less its bias, standard error)."""
-    figure, axes = figure_of(0.45 * WIDTH)
-    for index, (name, rows) in enumerate(factors.items()):
-        exact, noisy, error = rows.T
-        # Dashes over a line: the two may coincide.
-        style = {"color": _PALETTE[index + 1], "ls": _STYLES[index], "lw": 3.0 - 1.2 * index}
-        axes.plot(np.arange(len(rows)), error / exact, label=f"{name}: standard error", **style)
-        axes.plot(
-            np.arange(len(rows)),
-            np.abs(noisy - exact) / exact,
-            _MARKERS[index],
-            ms=4,
-            mfc="none",
-            color=_PALETTE[index + 1],
-            label=f"{name}: found, less bias",
-        )
-    axes.set_yscale("log")
-    label_axes(axes, "number of the singular value", "relative error [1]")
-    _legend_below(figure, 4, *axes.get_legend_handles_labels())
-    return figure
-
-
-def singular_values(curves: Mapping[str, npt.ArrayLike]) -> Figure:
-    """Singular values of each family's system, {family: values in any order}, log scale over rank in percent.
-
-    Each of the ``curves`` is divided by its own largest value: what remains is the conditioning.
-    """
-    figure, axes = figure_of(0.42 * WIDTH)
-    for index, (name, values) in enumerate(curves.items()):
-        ordered = np.sort(np.asarray(values, dtype=np.float64).ravel())[::-1]
-        share = 100.0 * np.arange(1, ordered.size + 1) / ordered.size
-        axes.semilogy(share, ordered / ordered[0], lw=2.0, label=name, **line_style(index))
-    axes.set_xlim(0, 100)
-    label_axes(axes, "singular value's rank [% of all]", "singular value, relative to the largest [1]")
-    axes.legend(fontsize=FONT - 1, frameon=False, loc="lower left")
-    return figure
-
-
 def quality_bars(quality: Mapping[str, tuple[Mean, Mean]], title: str = "") -> Figure:
     """PSNR [dB] by family, a pair of bars each, with one standard error where there is one.
 
@@ -153,11 +272,10 @@ def quality_bars(quality: Mapping[str, tuple[Mean, Mean]], title: str = "") -> F
     """
     figure, axes = figure_of(0.36 * WIDTH)
     place = np.arange(len(quality), dtype=np.float64)
-    looks = (-0.2, "#c7d2de", "idealised model, ideal factors"), (0.2, BLUE, "rendered light, calibrated factors")
+    looks = (-0.2, PALE, "idealised model, ideal factors"), (0.2, BLUE, "rendered light, calibrated factors")
     for means, (shift, colour, label) in zip(zip(*quality.values(), strict=True), looks, strict=True):
         values, errors = (np.array([getattr(mean, part) for mean in means]) for part in ("value", "error"))
-        known = None if np.isnan(errors).all() else errors
-        bars = axes.bar(place + shift, values, 0.38, color=colour, label=label, yerr=known, capsize=3)
+        bars = axes.bar(place + shift, values, 0.38, color=colour, label=label, yerr=_known(errors), capsize=3)
         axes.bar_label(bars, fmt="%.1f", fontsize=FONT - 1, padding=2)
     if title:
         figure.suptitle(title, fontsize=FONT)
@@ -181,7 +299,7 @@ def error_bars(errors: Mapping[str, float], limit: float | None = None) -> Figur
     axes.hlines(seen, left, values[seen], color=LINK, lw=2)
     axes.plot(values[seen], seen, "o", color=BLUE, ms=8, zorder=3)
     for row, (_, value) in enumerate(ordered):
-        _beside(axes, row, 8, scientific(value))
+        beside(axes, row, 8, scientific(value))
     if limit is not None:
         axes.axvline(limit, color=VERMILION, lw=1.5, ls="--")
         where: Any = axes.get_xaxis_transform()
@@ -204,120 +322,44 @@ def pareto_front(points: Sequence[Point]) -> list[Point]:
     return front
 
 
-class CostRow(Protocol):
-    """A row of :func:`solver_costs`: a form of the solution, its seconds and its error."""
-
-    @property
-    def method(self) -> str: ...
-    @property
-    def layout(self) -> str: ...
-    @property
-    def precision(self) -> str: ...
-    @property
-    def lambda_rel(self) -> float: ...
-    @property
-    def seconds(self) -> float: ...
-    @property
-    def error(self) -> float: ...
+# -------- Parts of figures
 
 
-def solver_costs(rows: Sequence[CostRow]) -> Figure:
-    """Error of the image against seconds of the solver in ``rows``, a panel for each lambda, the best ringed."""
-    lambdas = sorted({row.lambda_rel for row in rows}, reverse=True)
-    figure, _ = figure_of(0.55 * WIDTH)
-    figure.clear()
-    panels: Any = figure.subplots(1, len(lambdas), sharex=True, sharey=True, squeeze=False)[0]
-    colours = (BLUE, ORANGE, VERMILION, GREEN)
-    precisions = list(dict.fromkeys(row.precision for row in rows))
-    forms = list(dict.fromkeys((row.method, row.layout) for row in rows))
-    for axes, lam in zip(panels, lambdas, strict=True):
-        panel = [row for row in rows if row.lambda_rel == lam]
-        for row in panel:
-            colour = colours[precisions.index(row.precision)]
-            marker = _MARKERS[forms.index((row.method, row.layout))]
-            axes.plot([row.seconds], [row.error], marker, color=colour, ms=8, mec="white", mew=0.6, zorder=3)
-        _draw_front(axes, [(row.seconds, row.error) for row in panel])
-        _log_log(axes)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.tick_params(labelsize=FONT - 1)
-        axes.set_title(typeset(f"relative \N{GREEK SMALL LETTER LAMDA} {lam:.0e}"), fontsize=FONT)
-        label_axes(axes, "wall time [s]", "")
-    panels[0].set_ylabel("relative error of the image [1]", fontsize=FONT)
-    grey: dict[str, Any] = {"ls": "", "ms": 8, "color": "#9ca3af"}
-    entries = [(Line2D([], [], ls="", ms=8, color=colours[i], marker="o"), name) for i, name in enumerate(precisions)]
-    entries.append((panels[0].lines[-1], _BEST))
-    entries += [(Line2D([], [], **grey, marker=_MARKERS[i]), ", ".join(form)) for i, form in enumerate(forms)]
-    _legend_below(figure, 4, *zip(*entries, strict=True))
-    return figure
+def _name_rows(axes: Axes, names: Sequence[str]) -> None:
+    """Names of bars, from below, and a legend above the axes, where no bar is, of two or more kinds."""
+    axes.set_yticks(range(len(names)), [typeset(name) for name in names])
+    axes.tick_params(axis="y", length=0)
+    axes.set_ylim(-0.6, len(names) - 0.4)
+    if len(axes.get_legend_handles_labels()[0]) > 1:
+        axes.legend(fontsize=FONT - 1, frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
 
 
-def quality_by_factors(rows: Sequence[tuple[str, str, float]], message: str) -> Figure:
-    """PSNR [dB] of each system by the factors that its solver used, ``rows`` (system, factors, PSNR), first on top;
-    ``message`` above."""
-    systems = list(dict.fromkeys(system for system, _, _ in rows))[::-1]
-    factors = list(dict.fromkeys(name for _, name, _ in rows))
-    figure, axes = figure_of(1.3 + 0.46 * len(systems))
-    for place, system in enumerate(systems):
-        values = [value for name, _, value in rows if name == system]
-        axes.plot([min(values), max(values)], [place, place], color=LINK, lw=2, zorder=1)
-    for index, name in enumerate(factors):
-        points = [(value, systems.index(system)) for system, kind, value in rows if kind == name]
-        style = {"color": (VERMILION, BLUE, GREEN)[index % 3], "marker": _MARKERS[index % len(_MARKERS)]}
-        axes.plot(*zip(*points, strict=True), ls="", ms=8, label=name, zorder=3, **style)
-    axes.set_yticks(range(len(systems)), systems, fontsize=FONT - 2)
-    label_axes(axes, "PSNR of the image [dB]", "", grid="x")
-    figure.suptitle(fill(message, _TITLE_LETTERS), fontsize=FONT)
-    _legend_below(figure, len(factors), *axes.get_legend_handles_labels())
-    return figure
-
-
-def shadow_profiles(
-    position_mm: npt.ArrayLike, profiles: Mapping[str, npt.ArrayLike], reach_mm: float, message: str
-) -> Figure:
-    """Shadows on one row of the sensor.
+def beside(axes: Axes, row: float, points: float, text: str, **style: Any) -> None:
+    """Text at a row, to the right of the axes.
 
     Parameters
     ----------
-    position_mm, profiles
-        (pixels,) along the row, and relative irradiance there by light.
-    reach_mm, message
-        how far from the middle of the ``position_mm`` is shown, and what is said above.
+    axes, row
+        that it stands beside.
+    points
+        from the axes.
+    text, **style
+        what is said, and matplotlib's options of it.
     """
-    figure, axes = figure_of(0.4 * WIDTH)
-    position = np.asarray(position_mm, dtype=np.float64)
-    inside = np.abs(position - position.mean()) <= reach_mm
-    for index, (name, values) in enumerate(profiles.items()):
-        axes.plot(position[inside], np.asarray(values)[inside], lw=1.8, label=name, **line_style(index))
-    axes.set_title(message, fontsize=FONT)
-    label_axes(axes, "position on the sensor [mm]", "irradiance, open sensor = 1 [1]")
-    axes.legend(fontsize=FONT - 1, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
-    return figure
+    options = {"xycoords": axes.get_yaxis_transform(), "textcoords": "offset points", "va": "center", "fontsize": FONT}
+    axes.annotate(text, (1.0, row), (points, 0), **{**options, **style})
 
 
-# ---- parts of figures ------------------------------------------------------------------------------------------------
+def _known(errors: FloatArray) -> FloatArray | None:
+    """Errors of bars; None where none is known, so that no bar of zero is drawn."""
+    return None if np.isnan(errors).all() else errors
 
 
-def _beside(axes: Axes, row: float, points: float, text: str, **style: Any) -> None:
-    """Text at a row, some points to the right of the axes."""
-    where: Any = axes.get_yaxis_transform()
-    axes.annotate(
-        text, (1.0, row), (points, 0), xycoords=where, textcoords="offset points", va="center", fontsize=FONT, **style
-    )
-
-
-def _draw_front(axes: Axes, points: Sequence[Point]) -> None:
-    """Rings around the points that nothing beats, and the staircase that joins them."""
-    seconds, error = zip(*pareto_front(points), strict=True)
-    style: dict[str, Any] = {"color": GREY, "lw": 1.0, "ls": ":", "drawstyle": "steps-post", "zorder": 2}
-    axes.plot(seconds, error, "o", ms=13, mfc="none", mec=GREY, mew=1.3, label=_BEST, **style)
-
-
-def _log_log(axes: Axes) -> None:
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    low, high = axes.dataLim.intervalx
+def log_ticks(axes: Axes, parts: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
+    """Ticks at these ``parts`` of a decade where powers of ten alone leave the x axis of ``axes`` one or none."""
+    low, high = axes.get_xlim()
     if high < _SHORT_AXIS * low:
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_locator(LogLocator(subs=parts))
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter(NullFormatter())
 
@@ -347,7 +389,16 @@ def label_axes(axes: Axes, x: str, y: str, grid: Literal["both", "x", "y"] = "bo
     axes.set_axisbelow(True)
 
 
-def _legend_below(figure: Figure, columns: int, handles: Any, labels: Any) -> None:
+def legend_below(figure: Figure, columns: int, handles: Any, labels: Any) -> None:
+    """A legend below a figure.
+
+    Parameters
+    ----------
+    figure, columns
+        that it is of, and how many it has.
+    handles, labels
+        matplotlib's.
+    """
     figure.legend(handles, labels, fontsize=FONT - 1, frameon=False, loc="outside lower center", ncols=columns)
 
 
@@ -361,12 +412,37 @@ def figure_of(
     height, width
         inches.
     layout
-        matplotlib's engine.
+        matplotlib's engine: "compressed" makes room around an image of fixed aspect, whose row label "constrained" lets
+        run off the figure.
+    """
+    figure, places = panels_of(1, 1, height, width, layout)
+    axes: Axes = places[0, 0]
+    return figure, axes
+
+
+def panels_of(
+    rows: int,
+    columns: int,
+    height: float,
+    width: float = WIDTH,
+    layout: Literal["constrained", "compressed"] = "constrained",
+    **shared: Any,
+) -> tuple[Figure, Any]:
+    """An empty figure with (rows, columns) open axes.
+
+    Parameters
+    ----------
+    rows, columns
+        of axes.
+    height, width, layout
+        as for :func:`figure_of`.
+    **shared
+        as for matplotlib's ``subplots``.
     """
     figure = Figure(figsize=(width, height), layout=layout)
     FigureCanvasAgg(figure)
-    axes: Any = figure.add_subplot()
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    axes.tick_params(labelsize=FONT - 1)
-    return figure, axes
+    places: Any = figure.subplots(rows, columns, squeeze=False, **shared)
+    for axes in places.flat:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(labelsize=FONT - 1)
+    return figure, places

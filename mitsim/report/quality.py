@@ -1,4 +1,7 @@
-"""`mitsim reconstruct`: a RUN and a CAL folder in, the image written, and compared with the truth if there is one."""
+"""`mitsim reconstruct`: a RUN and a CAL folder in, the image written, and compared with the truth if there is one.
+
+It stands alone so that an image starts without what pages and figures load.
+"""
 
 from __future__ import annotations
 

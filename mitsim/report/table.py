@@ -1,4 +1,7 @@
-"""Rows of a study in; means with standard errors, and a tidy CSV file, out."""
+"""Rows of a study in; means with standard errors, and a tidy CSV file, out.
+
+Processes that measure points load this and no figures.
+"""
 
 from __future__ import annotations
 

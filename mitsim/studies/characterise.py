@@ -22,14 +22,13 @@ from mitsim.core.environment import versions
 from mitsim.core.files import write_json
 from mitsim.core.job import Job
 from mitsim.devices.sensor import SensorModel
-from mitsim.report.html import rounded, typeset
+from mitsim.report.html import round_to_error, typeset
 from mitsim.report.plots import BLACK, BLUE, FONT, GREY, ORANGE, VERMILION, WIDTH, figure_of, label_axes
 from mitsim.sensor.emva import LEAST_DARK, QUANTISATION, SPLIT, Session, figures
 from mitsim.sensor.specimen import mean_dark_current
 from mitsim.studies.emva_options import Procedure, capacity_of, efficiency_of
-from mitsim.studies.emva_procedure import Frames, drawn
-from mitsim.studies.framework.folder import study_folder
-from mitsim.studies.framework.run import write_figures
+from mitsim.studies.emva_procedure import Frames, draw_sessions
+from mitsim.studies.framework.run import study_folder, write_figures
 
 UNITS: Mapping[str, tuple[str, str]] = {
     "system_gain": ("K", "DN/e-"),
@@ -147,25 +146,25 @@ class Characterisation:
         """For people."""
         names = ("set", "expected", "found", "std. error")
         head = f"{'figure':<26}{'symbol':<18}{'unit':<10}" + "".join(f"{name:>12}" for name in names) + f"{'off by':>8}"
-        told = [
+        lines = [
             f"{self.sensor.name}: {self.procedure.pixels} x {self.procedure.pixels} pixels, "
             f"{self.procedure.steps} steps of light"
         ]
-        told += [head]
+        lines += [head]
         for row in self.rows:
             expected = "" if row.expected is None else f"{row.expected:.5g}"
-            told.append(
+            lines.append(
                 f"{row.name:<26}{row.symbol:<18}{row.unit:<10}{row.set:>12.5g}{expected:>12}"
-                f"{rounded(row.found, row.standard_error):>12}"
-                f"{rounded(row.standard_error, row.standard_error):>12}{row.deviations:>8.1f}"
+                f"{round_to_error(row.found, row.standard_error):>12}"
+                f"{round_to_error(row.standard_error, row.standard_error):>12}{row.deviations:>8.1f}"
             )
         if any(row.expected is not None for row in self.rows):
-            told.append(
+            lines.append(
                 "expected: where the procedure finds another figure than the one set, at these steps and frames"
             )
         if self.output:
-            told.append(f"JSON and plots: {self.output}")
-        return told
+            lines.append(f"JSON and plots: {self.output}")
+        return lines
 
     def figures(self) -> Mapping[str, Figure]:
         """Plots by file name."""
@@ -197,9 +196,9 @@ def characterise(
     capacity = capacity_of(sensor)
     efficiency_of(sensor, procedure)
     if output is None:
-        return _characterised(sensor, procedure, capacity, job)
+        return _characterise(sensor, procedure, capacity, job)
     with study_folder(output, "characterise") as folder:
-        done = _characterised(sensor, procedure, capacity, job, str(folder))
+        done = _characterise(sensor, procedure, capacity, job, str(folder))
         results = folder / "characterise.json"  # last, so that a folder with it is whole
         results.unlink(missing_ok=True)
         write_figures(folder, done.figures())
@@ -207,12 +206,12 @@ def characterise(
     return done
 
 
-def _characterised(
+def _characterise(
     sensor: SensorModel, procedure: Procedure, capacity: float, job: Job, output: str | None = None
 ) -> Characterisation:
     frames = Frames.of(sensor, procedure, capacity)
     expected = frames.expected()
-    spread = figures(drawn(frames, expected))
+    spread = figures(draw_sessions(frames, expected))
     session = frames.measured(job)
     found = figures(session)
     # Without a quantum efficiency light is counted in electrons, and there is none to find.
@@ -275,6 +274,9 @@ def _row(frames: Frames, name: str, found: FloatArray, sessions: FloatArray) -> 
 
 # -------- A characterisation in, its plots out
 
+_CLOSED: dict[str, Any] = {"color": GREY, "lw": 1.5, "label": "closed form"}
+_PAIRS: dict[str, Any] = {"color": BLUE, "lw": 0, "marker": "o", "ms": 5, "label": "pairs of frames"}
+"""How what is expected and what was found are drawn."""
 MOST_OFF = 5.0
 """Standard errors from which a figure is off: one of twenty figures is so by chance in 1e5 characterisations."""
 
@@ -294,17 +296,15 @@ def _photon_transfer(done: Characterisation) -> Figure:
     figure, axes = figure_of(0.5 * WIDTH)
     session, expected = done.session, done.expected
     signal = session.ladder.mean - session.dark.mean
-    axes.plot(
-        expected.ladder.mean - expected.dark.mean, expected.ladder.variance, color=GREY, lw=1.5, label="closed form"
-    )
-    axes.plot(signal, session.ladder.variance, "o", color=BLUE, ms=5, label="pairs of frames")
+    axes.plot(expected.ladder.mean - expected.dark.mean, expected.ladder.variance, **_CLOSED)
+    axes.plot(signal, session.ladder.variance, **_PAIRS)
     gain = _figure(done, "system_gain").found
     full = float(signal[int(session.ladder.variance.argmax())])
     line = np.array([0.0, 0.7 * full])
     label = "fit to 70 % of saturation"
     axes.plot(line, session.dark.variance + gain * line, color=VERMILION, lw=2, ls="--", label=label)
     axes.axvline(full, color=ORANGE, lw=1.5, ls=":", label="largest variance: saturation")
-    axes.set_title(f"Photon transfer: the gain is {_found(done, 'system_gain')}", fontsize=FONT + 1)
+    axes.set_title(f"Photon transfer: the gain is {_figure_text(done, 'system_gain')}", fontsize=FONT + 1)
     label_axes(axes, "signal less dark signal [DN]", "temporal variance [DN$^2$]")
     axes.legend(fontsize=FONT - 1, frameon=False, loc="upper left")
     return figure
@@ -313,16 +313,13 @@ def _photon_transfer(done: Characterisation) -> Figure:
 def _linearity(done: Characterisation) -> Figure:
     """Relative deviation of the signal from a line, over the photons."""
     figure, axes = figure_of(0.42 * WIDTH)
-    for session, style, label in (
-        (done.expected, {"color": GREY, "lw": 1.5}, "closed form"),
-        (done.session, {"color": BLUE, "lw": 0, "marker": "o", "ms": 5}, "pairs of frames"),
-    ):
+    for session, style in ((done.expected, _CLOSED), (done.session, _PAIRS)):
         signal = session.ladder.mean - session.dark.mean
         full = signal[int(session.ladder.variance.argmax())]
         used = (signal >= 0.05 * full) & (signal <= 0.95 * full)
         slope, start = np.polyfit(session.photons[used], signal[used], 1, w=1 / signal[used])
         line = start + slope * session.photons[used]
-        axes.plot(session.photons[used], 100 * (signal[used] / line - 1), label=label, **style)
+        axes.plot(session.photons[used], 100 * (signal[used] / line - 1), **style)
     axes.axhline(0, color=BLACK, lw=1)
     light = "photons on a pixel [1]" if done.sensor.states_efficiency else "photoelectrons of a pixel [e$^-$]"
     ends = [_figure(done, f"linearity_{end}").found for end in ("min", "max")]
@@ -340,13 +337,10 @@ def _dark_current(done: Characterisation) -> Figure:
     """Dark signal over exposure time."""
     figure, axes = figure_of(0.42 * WIDTH)
     gain = _figure(done, "system_gain").found
-    for session, style, label in (
-        (done.expected, {"color": GREY, "lw": 1.5}, "closed form"),
-        (done.session, {"color": BLUE, "lw": 0, "marker": "o", "ms": 5}, "pairs of frames"),
-    ):
+    for session, style in ((done.expected, _CLOSED), (done.session, _PAIRS)):
         dark = (session.dark_series.mean - done.sensor.superpixel_black_level_dn) / gain
-        axes.plot(session.dark_times, dark, label=label, **style)
-    axes.set_title(f"The dark current is {_found(done, 'dark_current')}", fontsize=FONT + 1)
+        axes.plot(session.dark_times, dark, **style)
+    axes.set_title(f"The dark current is {_figure_text(done, 'dark_current')}", fontsize=FONT + 1)
     label_axes(axes, "exposure time [s]", "dark signal less black level [e$^-$]")
     axes.legend(fontsize=FONT - 1, frameon=False)
     return figure
@@ -357,12 +351,12 @@ def _figure(done: Characterisation, name: str) -> Row:
     return next(row for row in done.rows if row.name == name)
 
 
-def _found(done: Characterisation, name: str) -> str:
+def _figure_text(done: Characterisation, name: str) -> str:
     """A figure with its standard error and unit, and what the file sets."""
     row = _figure(done, name)
-    error = rounded(row.standard_error, row.standard_error)
+    error = round_to_error(row.standard_error, row.standard_error)
     unit = row.unit.replace("e-", "e\N{SUPERSCRIPT MINUS}")
-    return typeset(f"{rounded(row.found, row.standard_error)} +- {error} {unit}, set {row.set:g}")
+    return typeset(f"{round_to_error(row.found, row.standard_error)} +- {error} {unit}, set {row.set:g}")
 
 
 def _deviations(done: Characterisation) -> Figure:
@@ -376,8 +370,8 @@ def _deviations(done: Characterisation) -> Figure:
     names = [row.name.replace("_", " ").replace("dsnu", "DSNU").replace("prnu", "PRNU") for row in done.rows]
     axes.set_yticks(place, names, fontsize=FONT - 1)
     far = sum(not abs(row.deviations) <= MOST_OFF for row in done.rows)
-    said = f"{far} of {len(names)} figures are" if far else f"None of {len(names)} figures is"
-    axes.set_title(f"{said} more than {MOST_OFF:g} standard errors off", fontsize=FONT + 1)
+    verdict = f"{far} of {len(names)} figures are" if far else f"None of {len(names)} figures is"
+    axes.set_title(f"{verdict} more than {MOST_OFF:g} standard errors off", fontsize=FONT + 1)
     axes.set_xlim(-1.2 * max(MOST_OFF, float(np.abs(off).max())), 1.2 * max(MOST_OFF, float(np.abs(off).max())))
     label_axes(
         axes, f"found less set or expected [predicted standard errors]; shaded: within {MOST_OFF:g}", "", grid="x"

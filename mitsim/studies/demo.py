@@ -11,8 +11,11 @@ import re
 import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from mitsim.acquire.capture import expose, trace_request
 from mitsim.api.bench import Bench
@@ -26,9 +29,12 @@ from mitsim.core.runs import Capture, frame_name
 from mitsim.devices.session import load_recipe
 from mitsim.light.light import SampledLight, pinhole_view
 from mitsim.reconstruct.factors import Factors
-from mitsim.report.compare import Comparison, label
-from mitsim.report.report import BudgetRow, FamilyResult, ReportData, build_report, verdict
-from mitsim.studies.framework.folder import DEMO_FOLDERS, DEMO_PAGE, study_folder
+from mitsim.reconstruct.reconstruct import reconstruct
+from mitsim.report import CONVENTIONS, EQUAL_PEAK, label
+from mitsim.report.demo_page import BudgetRow, FamilyResult, Recovery, ReportData, Trust, build_report, verdict
+from mitsim.report.lit_scene import LitScene, Unexposed
+from mitsim.sensor.chain import Digital
+from mitsim.studies.framework.run import DEMO_FOLDERS, DEMO_PAGE, study_folder
 
 _BEFORE, _AFTER = ("uniform", "dots:4", "dots:5"), ("hadamard:8",)
 """Families that the main one stands between in the report: the paper's, from the fewest frames to the most."""
@@ -269,3 +275,75 @@ def _configuration(evidence: _Evidence) -> dict[str, object]:
         f"exposure ({label(evidence.main)})": f"{evidence.shots.exposure_s:.3g} s a frame",
         "accuracy asked for": f"{evidence.light.plan.accuracy:g}",
     }
+
+
+# -------- Pattern families compared on one scene
+
+_SECOND_SHOWN = 0.4
+"""Part of a family's shots after which its second example of a pattern comes, so that it is neither like the first nor
+its mirror image."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Reconstructions of any family in the same light, with the same sensor, judged against the same truth.
+
+    ``light`` is the scene's, by projector pixel, ``factors`` the camera's.
+    """
+
+    light: SampledLight
+    factors: Factors
+
+    def family(self, name: str, shots: Capture | None = None) -> FamilyResult:
+        """Both reconstructions of the family ``name`` at equal peak, the rendered one with how far to trust it, and its
+        PSNR [dB] under each exposure convention.
+
+        Parameters
+        ----------
+        name
+            of the family; MitsimError when it does not fit the projector.
+        shots
+            of it at equal peak, where they were taken already.
+        """
+        lit, seed = self._lit, self.light.seed
+        family = lit.bench.family(name, seed)
+        frames, ideal = lit.rendered(self.factors, family, seed), lit.idealised(family, seed)
+        times = {convention: frames.seconds(convention) for convention in CONVENTIONS}
+        rendered = {times[EQUAL_PEAK]: self._trusted(shots or expose(self.light, name))}
+        for time in times.values():
+            if time not in rendered:
+                rendered[time] = self._recovery(frames, time)
+        singular = np.sort(frames.prepared().left.singular ** 2)[::-1]
+        examples = family.shots[0], family.shots[int(len(family.shots) * _SECOND_SHOWN)]
+        return FamilyResult(
+            name=name,
+            label=label(name),
+            shots=len(family.shots),
+            patterns=tuple(family.light(shot) for shot in dict.fromkeys(examples)),
+            singular_values=singular / singular[0],
+            idealised=self._recovery(ideal, ideal.seconds(EQUAL_PEAK)),
+            rendered=rendered[times[EQUAL_PEAK]],
+            by_exposure={convention: rendered[time].quality.psnr_db for convention, time in times.items()},
+        )
+
+    def white(self) -> Digital:
+        """The noisy frame of uniform light at equal peak [DN]."""
+        frames = self._lit.rendered(self.factors, self.light.bench.family("uniform"), self.light.seed)
+        (shot,), (frame,), exposer = frames.family.shots, frames.expected, frames.exposer(frames.seconds(EQUAL_PEAK))
+        return exposer.digital(exposer.lit(frame, *shot.names), *shot.names)
+
+    @cached_property
+    def _lit(self) -> LitScene:
+        return LitScene(self.light)
+
+    def _trusted(self, shots: Capture) -> Recovery:
+        """As a user's own frames are reconstructed."""
+        image = reconstruct(shots, self.factors)
+        quality = self._lit.quality(image.image)
+        # What the capture and the calibration are flagged for is in the report's notes, once for all families.
+        status = replace(image.status, flags=())
+        return Recovery(image.image, quality, image.lam, str(status), Trust.of(image, self.light.truth))
+
+    def _recovery(self, frames: Unexposed, seconds: float) -> Recovery:
+        solution = frames.solve(seconds)
+        return Recovery(solution.image, self._lit.quality(solution.image), solution.lam, str(solution.status))

@@ -195,7 +195,7 @@ class Frames:
         return row + row_response * light, column + column_response * light, pixel + dark + own * light
 
 
-def drawn(frames: Frames, expected: Session) -> Session:
+def draw_sessions(frames: Frames, expected: Session) -> Session:
     """Statistics of :data:`_SESSIONS` sessions, each as far off the ``expected`` ones of ``frames`` as noise and
     specimen make them.
 

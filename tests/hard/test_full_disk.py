@@ -12,9 +12,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.files import write_json, write_text
 from mitsim.devices.sensor import SensorModel, load_sensor
-from mitsim.exchange.formats import export_run
-from mitsim.exchange.loaders import import_file
-from mitsim.exchange.pictures import draw_family
+from mitsim.exchange.formats import export_run, import_file
+from mitsim.exchange.png_files import draw_family
 from mitsim.report.table import Table
 from mitsim.studies.framework.experiment import Found
 from mitsim.studies.framework.run import Store

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.status import Solution
-from mitsim.studies.solver import Judge, dots, make_problem
+from mitsim.studies.solver_study import Judge, dots, make_problem
 from tests.hard.hard_models import EPS, Frames, frames_of, shadow
 from tests.robustness import Recorder
 

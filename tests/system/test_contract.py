@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.studies import solver
-from mitsim.studies.accuracy import study as accuracy
-from mitsim.studies.solver import make_problem, time_solver
+from mitsim.studies import accuracy_study as accuracy
+from mitsim.studies import solver_study
+from mitsim.studies.solver_study import make_problem, time_solver
 
 VERBS = (
     *("demo", "plan", "capture", "calibrate", "reconstruct", "render", "study", "characterise", "sense", "export"),
@@ -185,7 +185,7 @@ def test_study_accuracy(call: Callable[..., Any], lab: Any, tmp_path: Path, monk
 def test_study_solver(call: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of no scene, and of a small problem here."""
     problem = make_problem(np.random.default_rng(1).random((12, 8)), 2, 0)
-    monkeypatch.setattr(solver, "time_solver", lambda seed, progress: time_solver(seed, progress, problem, 1))
+    monkeypatch.setattr(solver_study, "time_solver", lambda seed, progress: time_solver(seed, progress, problem, 1))
     study = call("study", "solver", "-o", tmp_path / "study", "--json", "--quiet").payload
     assert study["scene"] is None and study["patterns"] is None
     keys = {

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 import mitsim as ms
-from mitsim.acquire import capture
+from mitsim.acquire import capture, spectral
 from mitsim.core.exr import read_frame
 from mitsim.light import light
 
@@ -206,19 +206,20 @@ def test_lambda_out_of_range(shots: ms.Capture, factors: ms.Factors, lam: Any) -
 def traced(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Purposes of all light that was traced since."""
     purposes: list[str] = []
-    original, truth = light.trace_light, light.trace_truth
+    original, truth, truths = light.trace_lines, light.trace_truth, spectral.trace_truths
 
-    def counted(bench: Any, plan: Any, lighting: Any, seed: int, sampling: Any = None, progress: Any = None) -> Any:
+    def counted(*arguments: Any) -> Any:
+        sampling = arguments[5] if len(arguments) > 5 else None
         purposes.append((sampling or light.Sampling()).purpose)
-        return original(bench, plan, lighting, seed, sampling, *([progress] if progress else []))
+        return original(*arguments)
 
-    def counted_truth(*arguments: Any) -> Any:
-        purposes.append("truth")
-        return truth(*arguments)
+    def counted_truth(of: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda *arguments: (purposes.append("truth"), of(*arguments))[1]  # type: ignore[func-returns-value]
 
     for module in (light, capture):
-        monkeypatch.setattr(module, "trace_light", counted)
-    monkeypatch.setattr(light, "trace_truth", counted_truth)
+        monkeypatch.setattr(module, "trace_lines", counted)
+    monkeypatch.setattr(light, "trace_truth", counted_truth(truth))
+    monkeypatch.setattr(spectral, "trace_truths", counted_truth(truths))
     return purposes
 
 

@@ -16,16 +16,14 @@ from pydantic import TypeAdapter, ValidationError
 from mitsim.bench.open import check_scene
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, cut
-from mitsim.core.files import read_json, write_json
+from mitsim.core.files import read_json, sweep, write_json
 from mitsim.core.job import Job
 from mitsim.core.resources import workers
-from mitsim.studies import find_experiment
-from mitsim.studies.framework.experiment import HEADS, Claim, Experiment, Found, Scope
-from mitsim.studies.framework.folder import POINTS, check_study_folder, study_folder
-from mitsim.studies.framework.run import Shard, Store, batches, write_figures
+from mitsim.studies import ALL, EXPERIMENTS, PAPER
+from mitsim.studies.framework.experiment import HEADS, Claim, Experiment, Found, Scope, find_experiment
+from mitsim.studies.framework.run import POINTS, Shard, Store, batches, check_study_folder, study_folder, write_figures
 from mitsim.studies.framework.setup import Point
 from mitsim.studies.framework.workers import in_processes, on_cluster
-from mitsim.studies.names import ALL, EXPERIMENTS, PAPER
 
 # What draws is imported where it is used: a study that cannot be is refused without it.
 if TYPE_CHECKING:
@@ -90,10 +88,10 @@ class CampaignResult:
                 f"{self.points} points measured, {self.missing} of other parts are missing: {self.output}",
                 "Join all parts with: mitsim study merge PART... -o FOLDER",
             ]
-        heads = self.section.heads if self.section else HEADS
-        said = [f"{claim.verdict}: {claim.claim} ({claim.told(heads)})" for claim in self.claims]
-        said += self.section.warnings if self.section else ()
-        return [*said, f"{self.points} points in {self.seconds:.0f} s; table, figures and page: {self.output}"]
+        heads = self.section.experiment.heads if self.section else HEADS
+        lines = [f"{claim.verdict}: {claim.claim} ({claim.figures_text(heads)})" for claim in self.claims]
+        lines += self.section.warnings if self.section else ()
+        return [*lines, f"{self.points} points in {self.seconds:.0f} s; table, figures and page: {self.output}"]
 
 
 def run_experiment(
@@ -132,7 +130,7 @@ def run_experiment(
         for done, (point, found) in enumerate(where.measure(study, todo) if todo else (), start=1):
             store.save(point, found)
             left = (time.perf_counter() - started) / done * (len(todo) - done)
-            job.progress(f"{study}: {done} of {len(todo)} points, {_spoken(left)} left", done / len(todo))
+            job.progress(f"{study}: {done} of {len(todo)} points, {_duration_text(left)} left", done / len(todo))
         return campaign.finished(folder, store, time.perf_counter() - started)
 
 
@@ -160,7 +158,7 @@ def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | Non
             raise MitsimError(
                 f"study merge: {part} is of another study, scope or version than {parts[0]}; run it again"
             )
-    study, scope = _known(heads[0]["study"], parts[0], experiment), _scope(heads[0]["scope"], parts[0])
+    study, scope = _known_study(heads[0]["study"], parts[0], experiment), _scope(heads[0]["scope"], parts[0])
     if study == ALL:
         for part in parts:
             for name in PAPER:
@@ -240,7 +238,7 @@ class _Campaign:
                 )
             (folder / POINTS).mkdir(exist_ok=True)
             store = Store(folder / POINTS)
-            store.tidy()
+            sweep(folder / POINTS)  # what killed processes left half-written
             self._write(folder, status="incomplete")
             yield folder, store
 
@@ -277,13 +275,13 @@ def _head(folder: Path) -> dict[str, Any]:
     raise MitsimError(f"study merge: {folder} holds no part of a study; give folders that `mitsim study` wrote")
 
 
-def _known(study: Any, part: Path | str, experiment: str | None) -> str:
+def _known_study(study: Any, part: Path | str, experiment: str | None) -> str:
     """The name of a ``study`` as the file of a ``part`` has it, where it ships or was named as ``experiment`` too."""
     known = (*PAPER, *EXPERIMENTS, ALL) if experiment is None else (experiment, ALL)
     if not isinstance(study, str) or study not in known:
-        asked = "none that ships" if experiment is None else f"not {experiment}"
+        instead = "none that ships" if experiment is None else f"not {experiment}"
         raise MitsimError(
-            f"study merge: {part} is of the study {cut(str(study))!r}, {asked}; a study of your own is merged by its "
+            f"study merge: {part} is of the study {cut(str(study))!r}, {instead}; a study of your own is merged by its "
             "name, --experiment MODULE"
         )
     return study
@@ -296,5 +294,5 @@ def _scope(found: Any, part: Path | str) -> Scope:
         raise MitsimError(f"study merge: {part}: its scope cannot be read ({error.errors()[0]['msg']})") from error
 
 
-def _spoken(seconds: float) -> str:
+def _duration_text(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"

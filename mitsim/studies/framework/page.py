@@ -11,10 +11,9 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from mitsim.core.environment import versions
-from mitsim.report.html import rendered, shown_figure, write_html
-from mitsim.studies.framework.experiment import HEADS, KNOBS, Claim, Experiment, PageTable, Results, Scope
-from mitsim.studies.framework.pictures import TEST_IMAGES
-from mitsim.studies.framework.setup import Setup
+from mitsim.report.html import page_figure, render_page, write_html
+from mitsim.studies.framework.experiment import KNOBS, Claim, Experiment, PageTable, Results, Scope
+from mitsim.studies.framework.setup import TEST_IMAGES, Setup
 
 _NUMBER = re.compile(r"[+-]?\d|nothing$")
 """How a cell of a column of numbers begins."""
@@ -22,24 +21,19 @@ _NUMBER = re.compile(r"[+-]?\d|nothing$")
 
 @dataclass(frozen=True)
 class Section:
-    """One study on a page; ``pictures`` are figures by file name: what holds each, and its width [pixels]; ``about``,
-    ``heads`` and ``note`` are the experiment's; ``quick``: of a few points alone; ``warnings`` are on what was
-    measured; ``prints``: over how many test images means are."""
+    """One study on a page; ``pictures`` are figures by file name: what holds each, and its width [pixels]; ``quick``:
+    of a few points alone; ``warnings`` are on what was measured; ``prints``: over how many test images means are."""
 
-    name: str
+    experiment: Experiment
     title: str
-    question: str
     claims: tuple[Claim, ...]
     pictures: Mapping[str, tuple[str, int]]
     count: str
     command: str
-    about: str = ""
-    heads: tuple[str, str, str] = HEADS
-    tables: tuple[PageTable, ...] = ()
-    quick: bool = False
-    note: str = ""
-    warnings: tuple[str, ...] = ()
-    prints: int = 1
+    tables: tuple[PageTable, ...]
+    quick: bool
+    warnings: tuple[str, ...]
+    prints: int
 
     @classmethod
     def of(
@@ -65,22 +59,18 @@ class Section:
         setup = scope.setup
         command = ["mitsim study", study, *([] if any(scope.pictures) else [setup.scene]), *_options(scope)]
         accuracies = sorted({point.setup.accuracy for point in experiment.points(scope)} if experiment.traced else ())
-        asked = " or ".join(f"{each:g}" for each in accuracies)
-        good = f"; frames before noise asked to be good to {asked} (relative rms)" if accuracies else ""
+        named = " or ".join(f"{each:g}" for each in accuracies)
+        good = f"; frames before noise asked to be good to {named} (relative rms)" if accuracies else ""
         return cls(
-            name=experiment.name,
+            experiment=experiment,
             title=experiment.title.replace(KNOBS, " and ".join(name for name, _ in scope.sweep)),
-            question=experiment.question,
             claims=tuple(claims),
-            pictures={name: shown_figure(figure) for name, figure in figures.items()},
+            pictures={name: page_figure(figure) for name, figure in figures.items()},
             count=f"{len(results.table)} measurements{of}{good}",
             command=" ".join(command),
-            about=experiment.about,
-            heads=experiment.heads,
             tables=tuple(experiment.tables(results)),
             quick=scope.quick,
-            note=experiment.note,
-            warnings=flagged(experiment.name, results),
+            warnings=flag_warnings(experiment.name, results),
             prints=len(prints),
         )
 
@@ -104,7 +94,7 @@ class Part:
         return tuple(any(cells) and all(not cell or _NUMBER.match(cell) for cell in cells) for cells in columns)
 
 
-def flagged(name: str, results: Results) -> tuple[str, ...]:
+def flag_warnings(name: str, results: Results) -> tuple[str, ...]:
     """That images of the study ``name`` are flagged in its ``results``, how many and what for; empty where none is."""
     # An image may have many rows, such as a transfer function's.
     rows = {
@@ -116,10 +106,10 @@ def flagged(name: str, results: Results) -> tuple[str, ...]:
     if not found:
         return ()
     reasons = Counter(reason for each in found for reason in each.split("; ") if reason)
-    told = "; ".join(f"{count} \N{MULTIPLICATION SIGN} {reason}" for reason, count in reasons.most_common())
+    counts = "; ".join(f"{count} \N{MULTIPLICATION SIGN} {reason}" for reason, count in reasons.most_common())
     return (
         f"{len(found)} of {len(rows)} images are flagged by the solver, their calibration or their capture, and "
-        f"count all the same (column flagged of {name}.csv){': ' if told else ''}{told}.",
+        f"count all the same (column flagged of {name}.csv){': ' if counts else ''}{counts}.",
     )
 
 
@@ -146,8 +136,8 @@ def build_findings(
     warnings
         why its findings may not be trusted, for its head.
     """
-    pictures = {file: shown_figure(figure) for file, figure in figures.items()}
-    return rendered(
+    pictures = {file: page_figure(figure) for file, figure in figures.items()}
+    return render_page(
         "findings.html",
         name=name,
         title=title,
@@ -171,7 +161,7 @@ def build_page(sections: Sequence[Section], path: Path, title: str) -> Path:
     path
         where.
     """
-    return write_html(path, rendered("study.html", title=title, sections=sections, versions=versions()))
+    return write_html(path, render_page("study.html", title=title, sections=sections, versions=versions()))
 
 
 def _options(scope: Scope) -> list[str]:

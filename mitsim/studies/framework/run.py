@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from fnmatch import fnmatch
+from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from mitsim.api.bench import Bench
 from mitsim.bench.request import Request
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
-from mitsim.core.files import check_plain, sweep, whole_file, write_json
+from mitsim.core.files import check_output, check_plain, output_folder, read_json, sweep, whole_file, write_json
 from mitsim.core.job import Job
+from mitsim.studies import ALL, EXPERIMENTS, PAPER, STUDIES
 from mitsim.studies.framework.experiment import Found, Results
-from mitsim.studies.framework.folder import study_folder
 from mitsim.studies.framework.setup import Point
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from mitsim.api.bench import Bench
     from mitsim.report.table import Table
     from mitsim.studies.framework.page import Part
 
@@ -38,44 +43,36 @@ def write_figures(folder: Path, figures: Mapping[str, Figure]) -> None:
             figure.savefig(part, dpi=DPI, format="png")
 
 
-class Findings(Protocol):
-    """What a study measured."""
+class Findings:
+    """What a study of one bench measured, as its folder and the command line show it."""
+
+    title: ClassVar[str] = ""
+    """Of its page; without one it has none."""
 
     def payload(self) -> dict[str, Any]:
         """As JSON holds it."""
+        raise NotImplementedError
 
     def lines(self) -> list[str]:
         """For people."""
+        raise NotImplementedError
 
     def figures(self) -> Mapping[str, Figure]:
         """By file name."""
-
-
-@runtime_checkable
-class Tabled(Protocol):
-    """Findings with tables."""
+        raise NotImplementedError
 
     def tables(self) -> Mapping[str, Table]:
         """By file name."""
+        return {}
 
-
-@runtime_checkable
-class Warned(Protocol):
-    """Findings that may not be trusted."""
+    def parts(self) -> Sequence[Part]:
+        """Of its page."""
+        return ()
 
     @property
     def warnings(self) -> Sequence[str]:
-        """What is wrong, and what to do; empty where nothing is."""
-
-
-@runtime_checkable
-class Paged(Protocol):
-    """Findings with a page."""
-
-    title: str
-
-    def parts(self) -> Sequence[Part]:
-        """Of the page."""
+        """Why it may not be trusted, and what to do; empty where nothing is wrong."""
+        return ()
 
 
 @dataclass(frozen=True)
@@ -99,16 +96,12 @@ class StudyResult:
     @property
     def warnings(self) -> Sequence[str]:
         """Of the findings."""
-        return self.findings.warnings if isinstance(self.findings, Warned) else ()
-
-
-Measure = Callable[[Any, Request, Job], Findings]
-Study = Callable[[Bench | None, Path | str, Request | None, Job | None], StudyResult]
+        return self.findings.warnings
 
 
 def run_study(
     name: str,
-    measure: Measure,
+    measure: Callable[[Any, Request, Job], Findings],
     bench: Bench | None,
     output: Path | str,
     request: Request | None = None,
@@ -136,7 +129,7 @@ def run_study(
         write_json(folder / f"{name}.json", {**result.payload(), **provenance})
         figures = findings.figures()
         write_figures(folder, figures)
-        if isinstance(findings, Paged):
+        if findings.title:
             from mitsim.studies.framework.page import build_findings
 
             where = f"Scene {bench.loaded.path.parent.name}, " if bench else ""
@@ -144,9 +137,38 @@ def run_study(
             page = build_findings(name, findings.title, where, findings.parts(), figures, result.warnings)
             with whole_file(folder / f"{name}.html") as part:
                 part.write_text(page, encoding="utf-8")
-        for file, table in findings.tables().items() if isinstance(findings, Tabled) else ():
+        for file, table in findings.tables().items():
             table.write(folder / file)
         return result
+
+
+def find_study(name: str, **settings: object) -> Callable[..., StudyResult]:
+    """The study ``name``, to be called with (bench, output, request, job); nothing heavy is imported before the name is
+    known to be one, and its folder to be free.
+
+    Parameters
+    ----------
+    name
+        of the study.
+    **settings
+        further arguments of its function.
+
+    Raises
+    ------
+    MitsimError
+        for another name, with those that there are.
+    """
+    if name not in STUDIES:
+        raise MitsimError(f"study {name!r}: there is no such study; use {', '.join((*STUDIES, *EXPERIMENTS))}")
+
+    def measure(bench: Bench | None, request: Request, job: Job) -> Findings:
+        """What the study finds."""
+        found: Findings = importlib.import_module(f"mitsim.studies.{name}_study").measure(
+            bench, request, job, **settings
+        )
+        return found
+
+    return partial(run_study, name, measure)
 
 
 # -------- Findings of points on disk
@@ -208,10 +230,6 @@ class Store:
         arrays = {(key, name): array for key, each in found.items() for name, array in each.arrays.items()}
         return Results(Table(rows), arrays)
 
-    def tidy(self) -> None:
-        """Remove what killed processes left half-written."""
-        sweep(self.folder)
-
     def _file(self, point: Point) -> Path:
         return self.folder / f"{point.key}.npz"
 
@@ -240,3 +258,51 @@ class Shard:
         """The ``points`` of this part: every ``count``-th batch, as a batch's light is traced once."""
         own = batches(points)[self.number - 1 :: self.count]
         return [point for batch in own for point in batch]
+
+
+# -------- The folder of a study
+
+POINTS = "points"
+"""Folder of what the points of a study came to."""
+DEMO_FOLDERS, DEMO_PAGE = ("run", "calibration"), "report.html"
+"""What `mitsim demo` writes."""
+_PARTS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        ALL: (*PAPER, "*.html"),
+        "characterise": ("*.png",),
+        "demo": (*DEMO_FOLDERS, DEMO_PAGE),
+        **{name: ("*.png", "*.csv", f"{name}.html") for name in STUDIES},
+    }
+)
+"""What a study writes beside NAME.json, with wildcards."""
+_OF_POINTS = ("*.png", "*.csv", "*.html", POINTS)
+"""The same of all others, which are of many points."""
+
+
+def check_study_folder(output: Path | str, name: str) -> None:
+    """Refuse an ``output`` that :func:`study_folder` of the study ``name`` would refuse, before what is slow to import.
+
+    MitsimError as there.
+    """
+    check_output(output, overwrite=_is_earlier(Path(output), name))
+
+
+@contextmanager
+def study_folder(output: Path | str, name: str) -> Iterator[Path]:
+    """The folder ``output`` of the study ``name``, held while the context lasts.
+
+    It is new or empty, or holds an earlier study of that name alone, of which nothing is removed. MitsimError when it
+    holds anything else, or cannot be written.
+    """
+    with output_folder(output, overwrite=_is_earlier(Path(output), name)) as folder:
+        sweep(folder)
+        yield folder
+
+
+def _is_earlier(place: Path, name: str) -> bool:
+    """Whether an earlier study of a ``name``, whose NAME.json says ``"kind": NAME``, has a ``place`` to itself."""
+    head, names = place / f"{name}.json", (f"{name}.json", ".*", *_PARTS.get(name, _OF_POINTS))
+    found = read_json(head) if head.is_file() else None
+    if not isinstance(found, dict) or found.get("kind") != name:
+        return False
+    return all(any(fnmatch(item.name, known) for known in names) for item in place.iterdir())

@@ -25,11 +25,10 @@ from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.misfit import Misfit
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.status import Status
-from mitsim.report.exposures import EQUAL_PEAK, RENDERED, LitScene, Unexposed
+from mitsim.report import EQUAL_PEAK, RENDERED
+from mitsim.report.lit_scene import LitScene, Unexposed
 from mitsim.report.table import Value
-from mitsim.studies.framework.pictures import picture
-from mitsim.studies.framework.setup import Point, Setup
-from mitsim.studies.sweepcam import Places, calibrated_places
+from mitsim.studies.framework.setup import Point, Setup, picture
 
 Kept = TypeVar("Kept")
 _PRINT = "reflectance.png"
@@ -74,7 +73,7 @@ class Image:
         frames
             what is exposed.
         seconds, lam, binning
-            as for :meth:`mitsim.report.exposures.Unexposed.solve`.
+            as for :meth:`mitsim.report.lit_scene.Unexposed.solve`.
         """
         solution = frames.solve(seconds, lam, binning)
         quality, reason = frames.lit.quality(solution.image), reason_of(solution.status)
@@ -148,20 +147,6 @@ class Studio:
         blank = setup.printed(None)
         return self.once("factors", 4, (blank, seed), lambda: self._calibrated(blank, seed))
 
-    def places(self, setup: Setup, places_mm: tuple[float, ...], seed: int) -> Places:
-        """Factors of the same camera with its mask moved.
-
-        Parameters
-        ----------
-        setup, seed
-            as for :meth:`factors`.
-        places_mm
-            how far it is moved along both axes.
-        """
-        blank = setup.printed(None)
-        key = blank, places_mm, seed
-        return self.once("places", 1, key, lambda: calibrated_places(self.bench(blank), places_mm, seed))
-
     def frames(self, setup: Setup, model: str, patterns: str | PatternFamily, seed: int = 0) -> Unexposed:
         """Frames of a family before any exposure.
 
@@ -194,13 +179,13 @@ class Studio:
         setup
             the scene.
         model
-            one of :data:`mitsim.report.exposures.MODELS`.
+            one of :data:`mitsim.report.MODELS`.
         patterns
             the family.
         seed
             of the frames' noise, and of the calibration's.
         exposure
-            one of :data:`mitsim.report.exposures.CONVENTIONS`, or ``DIM``.
+            one of :data:`mitsim.report.CONVENTIONS`, or ``DIM``.
         focus
             of rendered frames, as for :func:`mitsim.reconstruct`.
         """
@@ -210,11 +195,11 @@ class Studio:
         seconds = "auto" if exposure == EQUAL_PEAK else frames.seconds(exposure)
         shots = expose(frames.lit.light, patterns, seed=seed, exposure=seconds)
         found = reconstruct(shots, self.factors(setup, seed), focus=focus)
-        misfit, told = found.misfit, found.uncertainty
+        misfit, uncertainty = found.misfit, found.uncertainty
         trust = {
             "misfit": misfit.unexplained if misfit else None,
             "chi_square": misfit.chi_square if misfit else None,
-            "uncertainty": None if told is None else float(np.sqrt(np.square(told).mean())),
+            "uncertainty": None if uncertainty is None else float(np.sqrt(np.square(uncertainty).mean())),
         }
         count, quality = len(frames.family.shots), frames.lit.quality(found.image)
         reason = reason_of(found.status, misfit)

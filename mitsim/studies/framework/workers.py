@@ -45,7 +45,7 @@ def _opened(shared: str | None) -> Any:
     return Studio(shared)
 
 
-def measured(name: str, point: Point, shared: str | None = None) -> Found:
+def measure_point(name: str, point: Point, shared: str | None = None) -> Found:
     """What an experiment finds at a point, in this process's studio.
 
     Parameters
@@ -55,7 +55,7 @@ def measured(name: str, point: Point, shared: str | None = None) -> Found:
     shared
         folder of calibrations that processes share; None: this process keeps its own.
     """
-    from mitsim.studies import find_experiment
+    from mitsim.studies.framework.experiment import find_experiment
 
     return find_experiment(name).measure(cast("Studio", _Studio(shared)), point)
 
@@ -101,8 +101,9 @@ def in_processes(
                     tries[point] = tries.get(point, 0) + 1
                     if tries[point] == _TRIES:
                         raise MitsimError(
-                            f"study {name}: {_TRIES} processes ended at one point ({_said(point)}), the last with exit "
-                            f"code {worker.process.exitcode}; finished points are kept. Is memory short? Try --jobs 1"
+                            f"study {name}: {_TRIES} processes ended at one point ({_point_text(point)}), the last "
+                            f"with exit code {worker.process.exitcode}; finished points are kept. Is memory short? Try "
+                            "--jobs 1"
                         )
                     waiting.appendleft(tuple(worker.left))
                     crew[crew.index(worker)] = _Worker.started(name, folders)
@@ -148,7 +149,7 @@ def _batch(name: str, batch: Batch) -> tuple[list[Found], str]:
     found = []
     for point in batch:
         try:
-            found.append(measured(name, point))
+            found.append(measure_point(name, point))
         except MitsimError as error:
             return found, str(error)
     return found, ""
@@ -202,12 +203,12 @@ def _serve(name: str, folders: tuple[str, str], pipe: Connection) -> None:
         while True:
             for point in pipe.recv():
                 try:
-                    pipe.send(measured(name, point, shared))
+                    pipe.send(measure_point(name, point, shared))
                 except MitsimError as error:
                     pipe.send(str(error))
                     break
 
 
-def _said(point: Point) -> str:
+def _point_text(point: Point) -> str:
     values = {**dict(point.setup.parameters), "picture": point.setup.picture, **dict(point.values)}
     return ", ".join(f"{name} = {value}" for name, value in values.items() if value is not None)

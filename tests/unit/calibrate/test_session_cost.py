@@ -20,7 +20,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """What is asked of the price of forming frames, which says 7 s; light takes a megabyte."""
     calls: list[Any] = []
     fine = SimpleNamespace(bundle=SimpleNamespace(cells=(CELLS - 1, CELLS)))
-    monkeypatch.setattr(session, "Simulation", lambda *_: SimpleNamespace(fine=fine))
+    monkeypatch.setattr(session, "Simulation", lambda *_: SimpleNamespace(grids={"fine": fine}))
     monkeypatch.setattr(session, "forming_seconds", lambda *arguments: calls.append(arguments) or FORMED_S)
     monkeypatch.setattr(session, "light_bytes", lambda board, rows, settings: LIGHT * (rows == board.n**2))
     return calls

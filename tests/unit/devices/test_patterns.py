@@ -220,7 +220,7 @@ def test_a_registered_family_is_known_to_the_command_line(tmp_path: Path) -> Non
     }.items():
         refused = mitsim(line)
         assert refused.returncode == 2 and fragment in refused.stderr, refused
-    program = TOY.replace("run()", "from mitsim.report.compare import label; print(label('bars:3'))")
+    program = TOY.replace("run()", "from mitsim.report import label; print(label('bars:3'))")
     assert mitsim("", program).stdout == "9 broad bars\n"
 
 

@@ -16,10 +16,10 @@ from scipy.io import loadmat, savemat
 import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.exchange import tensors
-from mitsim.exchange.formats import RealCapture, export_run
+from mitsim.exchange.formats import export_run, import_file
 from mitsim.exchange.hdf5 import open_hdf5
-from mitsim.exchange.loaders import import_file
 from mitsim.exchange.real import import_frames
+from mitsim.exchange.real_capture import RealCapture
 from tests.exchanged import COLUMNS, ROWS, SCENE, Made, bytes_of, made
 from tests.unit.exchange.test_real import known
 
@@ -143,7 +143,7 @@ def test_tensors_have_an_axis_of_lines(coloured: Coloured, tmp_path: Path) -> No
     assert abs((seen * y).sum() - (x * physics.A_adjoint(y)).sum()) <= 1e-12 * seen.norm() * y.norm()
     for index, name in enumerate(LINES):
         shots, factors = ms.load_run(coloured.run / name), ms.load_calibration(coloured.calibration / name)
-        assert np.array_equal(held["y"][index].numpy(), tensors.measured(shots))
+        assert np.array_equal(held["y"][index].numpy(), tensors.measurements(shots))
         lit = np.outer(shots.patterns[0][:, 1], shots.patterns[1][:, 0]) * x[1, index].numpy()
         assert np.allclose(seen[1, index, 3].numpy(), factors.left @ lit @ factors.right.T, rtol=1e-12)
 

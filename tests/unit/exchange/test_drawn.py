@@ -12,7 +12,7 @@ from PIL import Image
 
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import parse_patterns
-from mitsim.exchange.pictures import SQUARE, Raster, cells_told, draw_family, draw_stripes, grid_in, session_of
+from mitsim.exchange.png_files import SQUARE, Raster, describe_cells, draw_family, draw_stripes, grid_in, session_of
 from mitsim.reconstruct.captured_session import calibrate_frames
 from tests.real_session import RealSession, write_image
 
@@ -102,7 +102,7 @@ def test_a_cell_is_square_on_the_scene_where_pixels_are_not(tmp_path: Path) -> N
         assert np.ptp(rows) + 1 == side * result["projector"]["cell"]
     assert (result["projector"]["cell"], result["projector"]["cell_columns"]) == (4, 6)
     assert result["projector"]["cell_shape"] == pytest.approx(1, abs=1e-5)
-    assert cells_told(result["projector"]) == "4 x 6 pixels, square on the scene"
+    assert describe_cells(result["projector"]) == "4 x 6 pixels, square on the scene"
 
 
 @pytest.mark.parametrize("aspect", [0.31, 2 / 3, 0.9, 1.0, 1.05, 1.4, 3.0])
@@ -122,7 +122,7 @@ def test_of_square_cells_the_largest_is_drawn_else_the_squarest(raster: tuple[in
     found = where["cell"], where["cell_columns"]
     assert found[0] == max(rows for rows, _ in square) if square else off[found] == min(off.values())
     assert where["cell_shape"] == pytest.approx(found[1] * aspect / found[0])
-    assert ("times as wide" in cells_told(where)) == (not square)
+    assert ("times as wide" in describe_cells(where)) == (not square)
     ends = where["first_row"] + sides[0] * found[0], where["first_column"] + sides[1] * found[1]
     assert all(
         0 <= raster[axis] - ends[axis] - where[name] <= 1 for axis, name in enumerate(("first_row", "first_column"))

@@ -14,9 +14,8 @@ from scipy.io import loadmat, savemat
 import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.exchange import tensors
-from mitsim.exchange.formats import export_run
+from mitsim.exchange.formats import export_run, import_file
 from mitsim.exchange.hdf5 import open_hdf5
-from mitsim.exchange.loaders import import_file
 from mitsim.reconstruct.mosaic import behind
 from tests.coloured import WEIGHTS, mosaic_folders
 from tests.unit.exchange.test_coloured import octave, whole
@@ -118,7 +117,7 @@ def test_tensors_are_of_all_lines(folders: tuple[Path, Path], tmp_path: Path) ->
     pytest.importorskip("deepinv")
     export_run(folders[0], "deepinv", tmp_path / "run.pt", folders[1])
     physics, held = tensors.load_physics(tmp_path / "run.pt")
-    assert np.array_equal(held["y"].numpy(), tensors.measured(ms.load_run(folders[0])))
+    assert np.array_equal(held["y"].numpy(), tensors.measurements(ms.load_run(folders[0])))
     seen = physics.A(held["x"][None])[0]
     assert (seen - held["y"]).abs().mean() < 0.01 * held["y"].mean()
     generator = torch.Generator().manual_seed(1)

@@ -15,9 +15,8 @@ import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame, write_frame
 from mitsim.exchange import packed
-from mitsim.exchange.formats import export_run
+from mitsim.exchange.formats import export_run, import_file
 from mitsim.exchange.hdf5 import open_hdf5
-from mitsim.exchange.loaders import import_file
 from tests.exchanged import COLUMNS, ROWS, SCENE, Made, bytes_of, made
 
 
@@ -155,7 +154,7 @@ def test_frames_that_differ_in_shape_are_refused_and_no_file_is_left(bench: Made
 
 def test_checksums_follow_the_bytes_that_were_written(bench: Made, tmp_path: Path) -> None:
     """Where OpenEXR writes otherwise the folder is still one that can be read."""
-    run = packed.packed_run(bench.run)
+    run = packed.pack_run(bench.run)
     other = packed.Packed(run.manifest, run.text, run.names, lambda name: (run.read(name)[0], {}), run.place)
     shots = ms.load_run(other.save(tmp_path / "run 2"))
     assert np.array_equal(shots.dn, ms.load_run(bench.run).dn)

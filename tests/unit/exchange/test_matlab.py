@@ -18,8 +18,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame
 from mitsim.exchange import matlab
 from mitsim.exchange import matlab as matlab_file
-from mitsim.exchange.formats import export_run
-from mitsim.exchange.loaders import import_file
+from mitsim.exchange.formats import export_run, import_file
 from tests.exchanged import COLUMNS, DIGITAL, ROWS, SCENE, Made, bytes_of, made
 
 CASES = ["dots", "signed", "real output", "ambient"]
@@ -254,7 +253,6 @@ def test_what_is_no_array_is_not_looked_into(tmp_path: Path, packed: bool) -> No
         matrix(b"scarce", 5, (1, 1), NUMBER),
     )
     (tmp_path / "a.mat").write_bytes(mat(*others, matrix(b"P1b", 6, (1, 1), NUMBER), packed=packed))
-    assert matlab_file.names_in(tmp_path / "a.mat") == {"P1b"}
     assert {
         name: value for name, value in matlab_file.read_variables(tmp_path / "a.mat").items() if name[0] != "_"
     } == {"P1b": [[2.5]]}
@@ -272,8 +270,8 @@ def test_arrays_are_listed_as_scipy_lists_them(tmp_path: Path, order: str) -> No
     }
     for packed in (False, True):
         savemat(tmp_path / "a.mat", arrays, do_compression=packed, long_field_names=True)
-        assert matlab_file.names_in(tmp_path / "a.mat") == {name for name, *_ in whosmat(tmp_path / "a.mat")}
         found = matlab_file.read_variables(tmp_path / "a.mat")
+        assert {name for name in found if name[:2] != "__"} == {name for name, *_ in whosmat(tmp_path / "a.mat")}
         assert all(
             np.array_equal(found[name], np.atleast_2d(value)) or name == "text" for name, value in arrays.items()
         )

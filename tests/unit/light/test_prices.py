@@ -153,10 +153,10 @@ def test_every_shot_is_looked_through_once_more_than_it_is_formed() -> None:
 
     (Planted: a side of the sensor in place of its pixels.)
     """
-    frame_check = replace(COUNTED, product=0.0, pixel=1.0)
+    looked = replace(COUNTED, product=0.0, pixel=1.0)
     for classes in (FORMING.classes, 9):
         forming = replace(FORMING, classes=classes)
-        assert optics_seconds(forming, ONE, frame_check) == pytest.approx(FORMING.shots * 50**2)
+        assert optics_seconds(forming, ONE, looked) == pytest.approx(FORMING.shots * 50**2)
 
 
 def test_lines_share_paths_and_form_and_file_each_its_own() -> None:

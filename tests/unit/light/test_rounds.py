@@ -106,7 +106,7 @@ def test_work_is_that_of_paths_at_fixed_paces() -> None:
     """Shared light counts for several, and light at anchors has a pace of its own: of two lights with the same variance
     the one of less work grows. (Planted: one pace for all, shared light counted once.)"""
     shared = NeighbourTracer.__new__(NeighbourTracer)
-    shared.turns, shared.projector = None, SimpleNamespace(n=8)  # type: ignore[assignment]
+    shared.adaptive, shared.projector = None, SimpleNamespace(n=8)  # type: ignore[assignment]
     cheap, dear = shared.lanes * SHARED_COST * FIXED.passes["indirect"], 100 * FIXED.passes["from_camera"]
     simulation = simulated(indirect=(shared, 1.0), from_camera=(of_lanes(100), 1.0))
     found = next_samples(

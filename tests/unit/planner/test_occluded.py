@@ -145,6 +145,6 @@ def test_pixels_that_are_traced_apart_are_no_occluded_ones(bench: Bench, monkeyp
 def test_a_longer_look_has_an_end(pixels: int) -> None:
     """Whatever certainty is worth: a look at one pixel grew until 20 GB were full. (Planted: no limit.)"""
     sample = Sample.of(parse_patterns("dots:3", N).lighting, (64, 64), mirrors=False)
-    counts = [replace(sample, sample_cost=4**looks).occluded(pixels) for looks in range(12)]
+    counts = [replace(sample, times=4**looks).occluded(pixels) for looks in range(12)]
     assert counts == sorted(counts) and counts[0] >= 4 and counts[-1] == counts[5]
     assert counts[-1] * pixels <= max(2**11, 4 * pixels)

@@ -183,10 +183,10 @@ class Heavy:
     def __init__(self, variance: float, spread: float = 0.0, paths: float = 50.0) -> None:
         residual = replace(ONE_CLASS.sample_costs["indirect_residual"], seconds=0.0)
         self.evidence = ONE_CLASS.with_sample_costs({"camera_residual": residual})
-        self.variance, self.spread, self.paths, self.frame_check = variance, spread, paths, list[int]()
+        self.variance, self.spread, self.paths, self.looked = variance, spread, paths, list[int]()
 
     def heavy(self, samples: int) -> dict[str, SampleCost]:
-        self.frame_check.append(samples)
+        self.looked.append(samples)
         noise = Noise(math.sqrt(self.variance / samples), samples, 0.5, self.spread, self.paths)
         return {"from_camera": SampleCost(noise, self.evidence.sample_costs["from_camera"].paths)}
 
@@ -210,8 +210,8 @@ def test_rare_heavy_paths_are_sampled_from_the_first() -> None:
     left = math.sqrt(look.variance / after.settings.samples["from_camera"] / GROUPS)
     assert after.settings.samples["from_camera"] > 20 * before.settings.samples["from_camera"] and left < target
     assert (
-        look.frame_check == sorted(look.frame_check)
-        and look.frame_check[-1] * LOOKS * look.evidence.sample_costs["from_camera"].paths <= 2**23
+        look.looked == sorted(look.looked)
+        and look.looked[-1] * LOOKS * look.evidence.sample_costs["from_camera"].paths <= 2**23
     )
     _, more = planned_with(Heavy(400 * plain, spread=4.0))
     assert more.settings.samples["from_camera"] > 1.02 * after.settings.samples["from_camera"]
@@ -228,8 +228,8 @@ def test_looks_go_on_while_few_heavy_paths_are_met() -> None:
     many, few = Heavy(3 * plain, paths=50.0), Heavy(3 * plain, paths=5.0)
     planned_with(many)
     planned_with(few)
-    assert many.frame_check == few.frame_check[: len(many.frame_check)] and len(few.frame_check) > len(many.frame_check)
-    assert few.frame_check[-1] * LOOKS * ONE_CLASS.sample_costs["from_camera"].paths == pytest.approx(2**23, rel=0.01)
+    assert many.looked == few.looked[: len(many.looked)] and len(few.looked) > len(many.looked)
+    assert few.looked[-1] * LOOKS * ONE_CLASS.sample_costs["from_camera"].paths == pytest.approx(2**23, rel=0.01)
 
 
 def test_a_run_of_heavy_paths_has_a_range_of_seconds() -> None:

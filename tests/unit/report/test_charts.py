@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mitsim.report.charts import bars, curves, image_grid, paired
+from mitsim.report.plots import bars, curves, image_grid, pair_chart
 from mitsim.report.table import Mean
 
 
@@ -64,7 +64,7 @@ def test_an_error_that_nobody_knows_is_no_bar_of_zero() -> None:
         for error in (float("nan"), 0.5)
     )
     assert several.has_yerr and not single.has_yerr
-    both = paired(
+    both = pair_chart(
         {"mask, 2 um": (Mean(2.0, float("nan"), 1), Mean(1.0, 0.2, 4))}, ("measured", "predicted"), "lost [dB]"
     )
     assert [container.has_xerr for container in both.axes[0].containers if hasattr(container, "has_xerr")] == [True]

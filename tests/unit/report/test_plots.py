@@ -8,10 +8,11 @@ from itertools import product
 
 import numpy as np
 
-from mitsim.report import plots
+from mitsim.report import demo_page, plots
 from mitsim.report.html import typeset
 from mitsim.report.table import Mean
-from mitsim.studies.solver import LAMBDAS, LAYOUTS, METHODS, PRECISIONS, SolverRow
+from mitsim.studies import diffraction_study, solver_study
+from mitsim.studies.solver_study import LAMBDAS, LAYOUTS, METHODS, PRECISIONS, SolverRow
 
 SOLVER_ROWS = [
     SolverRow(method, precision, layout, lam, seconds=0.02 * 1.2**index, error=1e-3 * 0.1**index, judge_error=0, seed=0)
@@ -22,11 +23,11 @@ SOLVER_ROWS = [
 
 def test_every_axis_has_a_unit() -> None:
     figures = (
-        plots.frame(np.ones((4, 4))),
+        demo_page.frame(np.ones((4, 4))),
         plots.singular_values({"a": np.ones(3)}),
         plots.error_bars({"a": 1e-3}, 1e-2),
         plots.quality_bars({"a": (Mean(20.0, 1.0, 8), Mean(10.0, float("nan"), 1))}),
-        plots.solver_costs(SOLVER_ROWS),
+        solver_study.solver_costs(SOLVER_ROWS),
     )
     for figure in figures:
         axes = figure.axes[0]
@@ -36,7 +37,7 @@ def test_every_axis_has_a_unit() -> None:
 
 def test_frame_shows_row_zero_at_the_top_with_its_own_range() -> None:
     values = np.arange(12.0).reshape(3, 4)
-    figure = plots.frame(values)
+    figure = demo_page.frame(values)
     drawn = figure.axes[0].images[0]
     assert np.array_equal(np.asarray(drawn.get_array()), values)
     assert drawn.get_clim() == (0.0, 11.0)
@@ -48,7 +49,7 @@ def test_frame_shows_row_zero_at_the_top_with_its_own_range() -> None:
 def test_stated_and_actual_errors_share_one_scale() -> None:
     """(Planted: each panel with a range of its own.)"""
     error = np.linspace(0.0, 0.01, 10_000).reshape(100, 100)
-    figure = plots.stated_and_actual(np.full((100, 100), 0.004), error)
+    figure = demo_page.stated_and_actual(np.full((100, 100), 0.004), error)
     stated, actual, bar = figure.axes
     assert stated.images[0].get_clim() == actual.images[0].get_clim() == (0.0, np.percentile(error, 99))
     assert np.array_equal(np.asarray(actual.images[0].get_array()), error)
@@ -82,7 +83,7 @@ def test_values_of_error_bars_stand_beside_the_axes_where_no_line_crosses_them()
 
 
 def test_labels_of_a_frame_lie_inside_the_figure() -> None:
-    figure = plots.frame(np.arange(262144.0).reshape(512, 512))
+    figure = demo_page.frame(np.arange(262144.0).reshape(512, 512))
     figure.canvas.draw()
     for text in (figure.axes[0].yaxis.label, figure.axes[0].xaxis.label, figure.axes[1].yaxis.label):
         box = text.get_window_extent()
@@ -101,7 +102,7 @@ def test_the_front_is_what_nothing_beats() -> None:
 
 
 def test_legends_cover_no_point_and_lie_inside_the_figure() -> None:
-    figure = plots.solver_costs(SOLVER_ROWS)
+    figure = solver_study.solver_costs(SOLVER_ROWS)
     figure.canvas.draw()
     box = figure.legends[0].get_window_extent()
     assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= figure.bbox.x1 and box.y1 <= figure.bbox.y1
@@ -109,7 +110,7 @@ def test_legends_cover_no_point_and_lie_inside_the_figure() -> None:
 
 
 def test_solver_costs_shows_every_row_in_the_panel_of_its_lambda() -> None:
-    figure = plots.solver_costs(SOLVER_ROWS)
+    figure = solver_study.solver_costs(SOLVER_ROWS)
     for axes, lam in zip(figure.axes, LAMBDAS, strict=True):
         assert axes.get_title().endswith(typeset(f"{lam:.0e}"))
         shown = [(line.get_xdata()[0], line.get_ydata()[0]) for line in axes.lines[:-1]]
@@ -130,7 +131,7 @@ def test_an_error_of_nothing_has_no_dot() -> None:
 
 def test_no_pyplot_is_loaded() -> None:
     program = (
-        "import sys, numpy; from mitsim.report import plots; plots.frame(numpy.ones((4, 4)));"
+        "import sys, numpy; from mitsim.report import demo_page; demo_page.frame(numpy.ones((4, 4)));"
         "sys.exit('matplotlib.pyplot' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
@@ -138,7 +139,7 @@ def test_no_pyplot_is_loaded() -> None:
 
 def test_quality_by_factors_shows_every_value_on_the_line_of_its_system() -> None:
     rows = [("ray", "assumed", 40.0), ("wave", "assumed", 20.0), ("wave", "found", 41.0)]
-    figure = plots.quality_by_factors(rows, "a message")
+    figure = diffraction_study.quality_by_factors(rows, "a message")
     axes = figure.axes[0]
     assert [text.get_text() for text in axes.get_yticklabels()] == ["wave", "ray"], "the first stands on top"
     marks = {line.get_label(): line.get_xydata().tolist() for line in axes.lines if line.get_marker() != "None"}
@@ -150,7 +151,7 @@ def test_shadow_profiles_show_the_middle_of_the_sensor() -> None:
     """Of a region of interest, its middle. (Planted: the axis, which need not be on it.)"""
     for middle in (0.0, 4.0):
         position = [middle + place for place in (-1.0, -0.5, 0.0, 0.5, 1.0)]
-        axes = plots.shadow_profiles(position, {"rays": [1, 2, 3, 4, 5]}, 0.5, "a message").axes[0]
+        axes = diffraction_study.shadow_profiles(position, {"rays": [1, 2, 3, 4, 5]}, 0.5, "a message").axes[0]
         shown = [[middle - 0.5, 2.0], [middle, 3.0], [middle + 0.5, 4.0]]
         assert axes.lines[0].get_xydata().tolist() == shown
     assert "mm" in axes.get_xlabel() and axes.get_title() == "a message"

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from mitsim.core.errors import MitsimError
 from mitsim.light.plan import PlanRow
 from mitsim.metrics import Quality
-from mitsim.report import report as R
-from mitsim.report.report import Trust
+from mitsim.report import demo_page as R
+from mitsim.report.demo_page import Trust
 from mitsim.studies.demo import _no_image
 from mitsim.studies.framework.page import Part, build_findings
 

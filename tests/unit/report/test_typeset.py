@@ -2,7 +2,7 @@
 
 import pytest
 
-from mitsim.report.html import rounded, scientific, sentence, typeset, with_error
+from mitsim.report.html import round_to_error, scientific, sentence, typeset, with_error
 
 TIMES, MICRO = "\N{MULTIPLICATION SIGN}", "\N{GREEK SMALL LETTER MU}"
 
@@ -48,7 +48,7 @@ def test_a_number_keeps_its_digits(value: float | None, printed: str) -> None:
 )
 def test_a_measured_number_ends_where_its_error_does(value: float, error: float, printed: str) -> None:
     """No digits of a number whose first one is not known."""
-    assert rounded(value, error) == printed
+    assert round_to_error(value, error) == printed
 
 
 @pytest.mark.parametrize(

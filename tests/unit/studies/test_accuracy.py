@@ -18,14 +18,12 @@ from mitsim.light.settings import GROUPS
 from mitsim.planner.choose import counted
 from mitsim.planner.planner import make_plan
 from mitsim.report import plots
-from mitsim.studies import find_study
-from mitsim.studies.accuracy import parts
-from mitsim.studies.accuracy import study as accuracy
-from mitsim.studies.accuracy.findings import AccuracyFindings, PartCost
-from mitsim.studies.accuracy.parts import Judge
-from mitsim.studies.framework.knobs import Stand, at_once, one_line, reformed, sampled, without
-from mitsim.studies.framework.run import StudyResult
-from mitsim.studies.framework.spreads import Budget, Spread
+from mitsim.studies import accuracy_parts
+from mitsim.studies import accuracy_study as accuracy
+from mitsim.studies.ablation import ablations, reform
+from mitsim.studies.accuracy_findings import AccuracyFindings, Budget, PartCost, Spread
+from mitsim.studies.accuracy_parts import Judge, Stand, at_once, one_line, with_samples
+from mitsim.studies.framework.run import StudyResult, find_study
 
 pytestmark = pytest.mark.usefixtures("kept_plans", "draft_figures")
 PATTERNS, SEED = "dots:2", 5
@@ -52,9 +50,9 @@ def result(bench: Bench, folder: Path) -> StudyResult:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(accuracy, "ACCURACIES", TRIED)
         patch.setattr(accuracy, "QUOTED", QUOTED)
-        patch.setattr(parts, "_LONGEST_S", 0.0)
+        patch.setattr(accuracy_parts, "_LONGEST_S", 0.0)
         patch.setattr(accuracy, "_JUDGE_PART", 0.02)
-        patch.setattr("mitsim.studies.framework.spreads.ROUNDS", ROUNDS)
+        patch.setattr("mitsim.studies.accuracy_findings.ROUNDS", ROUNDS)
         request = Request.of(patterns=PATTERNS, seed=SEED)
         return find_study("accuracy")(bench, folder, request, Job(Clock(OPENING)))
 
@@ -138,7 +136,7 @@ def test_a_judge_takes_a_plans_own_numbers_where_its_time_does_not_buy_finer_one
     finest = stand.finest(plan).settings
     formed = SimpleNamespace(frames=lambda *_: [SimpleNamespace(irradiance=np.ones((2, 2)), variance=0.0)])
     monkeypatch.setattr(Stand, "trace", lambda _, trial, seed: traced.append((trial.plan, seed)) or formed)
-    _, dear = parts._within(stand, stand.finest(plan), 0.0)
+    _, dear = accuracy_parts._within(stand, stand.finest(plan), 0.0)
     for seconds, taken in ((math.inf, finest), (dear, finest), (0.99 * dear, plan.settings), (0.0, plan.settings)):
         answer = Judge.trace(stand, plan, seconds)
         own, seed = traced.pop()
@@ -204,7 +202,7 @@ def test_sampled_fixes_the_number_of_samples(bench: Bench) -> None:
     plan = make_plan(bench, lighting, 1e-3, SEED)
     plan = replace(plan, settings=replace(plan.settings, anchors=1, effects=frozenset()))
     for samples in (1, 8):
-        fixed = replace(plan, settings=sampled(plan.settings, samples))
+        fixed = replace(plan, settings=with_samples(plan.settings, samples))
         light = trace_light(bench, fixed, lighting, 0, Sampling(target=at_once))
         assert light.paths == GROUPS * samples * bench.n**2
 
@@ -213,11 +211,11 @@ def test_without_names_each_effect_once(bench: Bench) -> None:
     plan = make_plan(bench, bench.family(PATTERNS).lighting, 1e-4, SEED)
     present = frozenset({"diffraction", "interreflection", "speckle"})
     settings = replace(plan.settings, anchors=2)
-    switched = dict(without(settings, present))
+    switched = dict(ablations(settings, present))
     assert present - switched.keys() == {"speckle"}, "it is not part of expected frames"
     assert "anchors" in switched and switched["anchors"] == replace(settings, anchors=1)
     finest = replace(settings, followed_anchors=2, followed_width=2, subdivision=4, coarse_cells=2, layers=(3.0, 2.0))
-    fallen = dict(without(finest, frozenset()))
+    fallen = dict(ablations(finest, frozenset()))
     assert fallen["followed-anchors"] == replace(finest, followed_anchors=1, followed_width=1)
     assert fallen["cells"] == replace(finest, subdivision=1, coarse_cells=1)
     assert fallen["layers"] == replace(finest, layers=())
@@ -253,7 +251,7 @@ def test_the_judge_of_the_reference_has_what_the_registry_says(
     bench = open_bench(scene, variant, projector=projector)
     stand = Stand(bench, bench.family("hadamard:2"), SEED, Job(), 1e-2)
     answer = Judge.trace(stand, stand.plan(1e-2), 1.0)
-    monkeypatch.setattr(parts, "_SAMPLES", (64, 1024 if lacking == "thick mask" else 256))
+    monkeypatch.setattr(accuracy_parts, "_SAMPLES", (64, 1024 if lacking == "thick mask" else 256))
     for row in answer.reference(Budget(600.0)):
         assert 0.8 < row.error / row.mc_error < 1.25, row
 
@@ -265,7 +263,7 @@ def test_reformed_light_is_that_of_a_plan_without_the_effect(bench: Bench) -> No
     light = trace_light(bench, plan, lighting, SEED)
     plain = replace(plan, settings=replace(plan.settings, effects=plan.settings.effects - {"diffraction"}))
     for ours, theirs in zip(
-        reformed(light, frozenset({"diffraction"})).frames(lighting, SEED),
+        reform(light, frozenset({"diffraction"})).frames(lighting, SEED),
         trace_light(bench, plain, lighting, SEED).frames(lighting, SEED),
         strict=True,
     ):

@@ -9,12 +9,10 @@ import pytest
 from mitsim.api.bench import open_bench
 from mitsim.core.job import Job
 from mitsim.light.pilot_result import Part
-from mitsim.studies.accuracy import findings
-from mitsim.studies.accuracy.findings import PartCost
-from mitsim.studies.accuracy.parts import Judge, Orders
-from mitsim.studies.accuracy.study import PARENT
-from mitsim.studies.framework.knobs import Stand, sampled
-from mitsim.studies.framework.spreads import Budget, Spread
+from mitsim.studies import accuracy_findings
+from mitsim.studies.accuracy_findings import Budget, PartCost, Spread
+from mitsim.studies.accuracy_parts import Judge, Orders, Stand, with_samples
+from mitsim.studies.accuracy_study import PARENT
 from tests.unit.transport.test_indirect import MATT, SPHERE
 
 pytestmark = pytest.mark.usefixtures("variant", "kept_plans", "draft_figures")
@@ -32,7 +30,7 @@ def test_each_surface_keeps_the_albedo_of_the_light(shared_scene: Callable[..., 
     stand = Stand(bench, bench.family("dots:2"), 5, Job(), 1e-2)
     plan = stand.plan(1e-2)
     judge = Judge.trace(stand, plan, 0.0)
-    full = SimpleNamespace(settings=sampled(plan.settings, 1024))
+    full = SimpleNamespace(settings=with_samples(plan.settings, 1024))
     orders = Orders(stand, judge, SimpleNamespace(full=full, seconds=0.0))
     assert not orders.costs
     orders.measure(Budget(600.0), 1.0)
@@ -54,13 +52,13 @@ def test_rows_of_one_part_stand_by_their_names_in_the_chart() -> None:
     """And a bound is drawn beside each error."""
     took = Spread.of([1.0, 1.1, 1.2])
     rows = [PartCost("fog", 0.1, 0.2, took, took, True), PartCost("2 surfaces", 0.05, 0.06, took, None, True, of="fog")]
-    errors, _ = findings.parts(rows, 1e-3).axes
+    errors, _ = accuracy_findings.parts(rows, 1e-3).axes
     assert [label.get_text() for label in errors.get_yticklabels()] == ["fog", "fog: 2 surfaces"]
     assert [0.1, 0.2] in [list(line.get_xdata()) for line in errors.lines]
 
 
 def test_a_chart_of_parts_that_were_not_timed_has_no_empty_panel() -> None:
     """(Planted: both panels always.)"""
-    (errors,) = findings.parts([PartCost("fog", 0.1, 0.1, None, None, True)], 1e-3).axes
+    (errors,) = accuracy_findings.parts([PartCost("fog", 0.1, 0.1, None, None, True)], 1e-3).axes
     assert errors.figure.get_suptitle() == "What each part of the light buys"
     assert not errors.figure.legends, "no bound and nothing left out"

@@ -21,10 +21,17 @@ from mitsim.core.job import Job
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.session import load_recipe
 from mitsim.optics.frames import Frame
-from mitsim.studies.budget import LAMBDA, REST, SCENE, SOLVER, LossRow, _of_scene, gained, session_rendering
-from mitsim.studies.calibration import CalibrationFindings, _row, judged, measure, singular_rows, spent
-from mitsim.studies.drift.perturbation import Expected, Noise
+from mitsim.studies.calibration_study import (
+    CalibrationFindings,
+    _row,
+    judge_session,
+    measure,
+    session_cost,
+    singular_rows,
+)
+from mitsim.studies.error_budget import LAMBDA, REST, SCENE, SOLVER, LossRow, _of_scene, gain_without, session_rendering
 from mitsim.studies.framework.page import build_findings
+from mitsim.studies.perturbation import Expected, Noise
 from tests.unit.calibrate.test_responses import CLIPPED, EXPOSURE_S, ToyLight, lit_session
 
 SEEDS = 40
@@ -57,7 +64,7 @@ def test_errors_of_factors_are_those_that_are_predicted(mode: str) -> None:
     for seed in range(SEEDS):
         own = replace(lit, session=replace(lit.session, seed=seed))
         (noisy, clean), _, _ = estimates(own, Job(), (NOISY, NOISE_FREE))
-        report = judged(own, noisy, clean)
+        report = judge_session(own, noisy, clean)
         columns.append(np.square(report.maps["left"]).mean(axis=0))
         for row in report.entries:
             squares[row.factor].append(row.chi_square)
@@ -120,24 +127,24 @@ def test_bias_and_angle_are_second_derivatives_by_every_entry() -> None:
 def test_light_and_time_of_a_session_are_counted() -> None:
     """8 patterns of either side, two halves, three repeats at 0.02 and 0.08 s; each pair is a uniform frame's light."""
     lit = lit_session(7, rig=CLIPPED, repeats=3, exposure_ladder=(1.0, 4.0))
-    found = spent(lit)
+    found = session_cost(lit)
     assert found["frames"] == 2 * 16 * 3 * 2 and found["exposure_seconds"] == pytest.approx(2 * 16 * 3 * 0.1)
     assert found["photoelectrons"] == pytest.approx(float(lit.uniform_rate.sum()) * 16 * 3 * 0.1)
     assert found["photons"] == pytest.approx(2 * found["photoelectrons"])
     dark = lit_session(7, "uniform", rig=CLIPPED, dark_frames=5)
-    assert spent(dark)["exposure_seconds"] == pytest.approx((18 + 5) * 0.02)
+    assert session_cost(dark)["exposure_seconds"] == pytest.approx((18 + 5) * 0.02)
     shown = 2 + 2 * float((1 + dark.session.signs).sum()) / 2 / 7
-    assert spent(dark)["photoelectrons"] == pytest.approx(float(dark.uniform_rate.sum()) * shown * 0.02)
+    assert session_cost(dark)["photoelectrons"] == pytest.approx(float(dark.uniform_rate.sum()) * shown * 0.02)
 
 
 def test_a_part_of_the_error_gains_what_is_left_without_it() -> None:
     """A quarter of an image's error is 1.25 dB; a model that has half of that error has it for half of its own, 3.01
     dB. Where twice as much is predicted as there is, it is an eighth, and it may be that all of what is too much is
     this part. (Planted: the sum over the part; uncertainty of the predicted image alone.)"""
-    assert gained(1.0, 4.0, 2.0) == pytest.approx((1.2494, 3.0103 - 1.2494), abs=1e-4)
-    assert gained(1.0, 4.0, 8.0) == pytest.approx((0.5799, 0.5799), abs=1e-4)
-    assert gained(3.0, 4.0, 5.0) == pytest.approx((3.9794, 3.9794 - 3.0103), abs=1e-4)
-    assert gained(0.0, 4.0, 0.0) == (0.0, 0.0) and gained(4.0, 4.0, 4.0)[0] == pytest.approx(90)
+    assert gain_without(1.0, 4.0, 2.0) == pytest.approx((1.2494, 3.0103 - 1.2494), abs=1e-4)
+    assert gain_without(1.0, 4.0, 8.0) == pytest.approx((0.5799, 0.5799), abs=1e-4)
+    assert gain_without(3.0, 4.0, 5.0) == pytest.approx((3.9794, 3.9794 - 3.0103), abs=1e-4)
+    assert gain_without(0.0, 4.0, 0.0) == (0.0, 0.0) and gain_without(4.0, 4.0, 4.0)[0] == pytest.approx(90)
 
 
 def test_what_lambda_takes_of_a_scene_is_a_loss_of_the_solvers() -> None:

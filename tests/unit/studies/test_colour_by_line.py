@@ -15,10 +15,10 @@ from mitsim.core.exr import read_frame
 from mitsim.core.runs import load_run
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
 from mitsim.reconstruct.factors import load_calibration
-from mitsim.report.colour.by_line import reconstruct_colours
-from mitsim.report.exposures import LitScene
+from mitsim.report.line_images import reconstruct_colours
+from mitsim.report.lit_scene import LitScene
 from mitsim.report.quality import reconstruct
-from mitsim.studies.colour.lit import LitLine, serving
+from mitsim.studies.lit_lines import LitLine, serving
 from tests.coloured import LINES, PLACE, folders
 
 pytestmark = pytest.mark.usefixtures("draft_figures")

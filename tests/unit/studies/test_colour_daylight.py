@@ -13,11 +13,11 @@ from mitsim.devices.chart import ChartPlace
 from mitsim.devices.patterns import parse_patterns
 from mitsim.devices.sensor import SensorModel
 from mitsim.report.table import Mean, Table
-from mitsim.studies.colour import light as by_lux
-from mitsim.studies.colour.light import BY_LUX, LEAST, METHODS, DaylitLine, claim_of, expected, kept_lx, most
+from mitsim.studies import daylight as by_lux
+from mitsim.studies.daylight import BY_LUX, LEAST, METHODS, DaylitLine, claim_of, expected_delta_e, kept_lx, most
+from mitsim.studies.framework.claims import UNDECIDED
 from mitsim.studies.framework.experiment import Scope
 from mitsim.studies.framework.setup import Setup
-from mitsim.studies.framework.verdicts import UNDECIDED
 
 N, PIXELS = 8, 15
 BOXES = ((0, 2, 1, 4), (3, 8, 5, 7), *[(0, 1, 0, 1)] * 22)
@@ -82,8 +82,8 @@ def test_expected_differences_are_means_over_the_errors() -> None:
     def judged(values: np.ndarray) -> np.ndarray:
         return np.asarray(np.square(values[..., 0]))
 
-    assert expected(means, 0 * variances, judged) == 4.0
-    assert expected(means, variances, judged) == pytest.approx(4.25, abs=4 * 2 * 2 * 0.5 / np.sqrt(9600))
+    assert expected_delta_e(means, 0 * variances, judged) == 4.0
+    assert expected_delta_e(means, variances, judged) == pytest.approx(4.25, abs=4 * 2 * 2 * 0.5 / np.sqrt(9600))
 
 
 def test_the_most_that_is_kept() -> None:

@@ -13,8 +13,8 @@ from mitsim.core.runs import load_mosaic
 from mitsim.core.spectral_manifests import HALF, JOINT, WAYS, check_way
 from mitsim.metrics import psnr
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e
-from mitsim.report.colour.by_line import reconstruct_colours
-from mitsim.report.colour.mosaic import JudgedMosaic
+from mitsim.report.line_images import reconstruct_colours
+from mitsim.report.mosaic_images import JudgedMosaic
 from tests.coloured import LINES, PLACE, WEIGHTS, mosaic_folders, scenes
 from tests.unit.studies.test_colour_by_line import main
 

@@ -18,8 +18,8 @@ from mitsim.metrics import psnr
 from mitsim.reconstruct.colour import chart
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.mosaic import PLANES, JointMosaic
-from mitsim.report.colour.ways import demosaiced
-from mitsim.studies.colour.lit import ARRAY, HALF, JOINT, MosaicShots, filter_weights, respectred, serving
+from mitsim.report.mosaic_images import demosaic
+from mitsim.studies.lit_lines import ARRAY, HALF, JOINT, MosaicShots, filter_weights, replace_spectra, serving
 from tests.ideal_sessions import picture, shadow
 from tests.invented import sensor
 
@@ -76,22 +76,22 @@ def test_a_demosaiced_frame_of_one_colour_is_that_colour() -> None:
     colour, frame = np.array([3.0, 5.0, 2.0]), np.zeros((12, 16))
     for name, (a, b) in zip(ARRAY, PLANES, strict=True):
         frame[a::2, b::2] = colour["RGB".index(name)]
-    assert np.allclose(demosaiced(frame, ARRAY), colour, atol=1e-9)
+    assert np.allclose(demosaic(frame, ARRAY), colour, atol=1e-9)
 
 
 def test_demosaicing_names_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "colour_demosaicing", None)
     with pytest.raises(MitsimError, match=r"pip install 'mitsim\[mosaic\]'"):
-        demosaiced(np.zeros((4, 4)), ARRAY)
+        demosaic(np.zeros((4, 4)), ARRAY)
 
 
 def test_spectra_become_numbers(tmp_path: Path) -> None:
-    scene = respectred("colour_checker", tmp_path / "copy", lambda at, values: float(np.interp(638.0, at, values)))
+    scene = replace_spectra("colour_checker", tmp_path / "copy", lambda at, values: float(np.interp(638.0, at, values)))
     text = (scene.parent / "patches.xml").read_text(encoding="utf-8")
     found = [float(number) for number in re.findall(r'name="reflectance" value="([\d.e-]+)"', text)]
     assert np.allclose(found, chart().at([638.0])[:, 0], rtol=1e-8)
     with pytest.raises(MitsimError, match="scene photograph: has no spectra"):
-        respectred("photograph", tmp_path / "other", lambda at, values: 1.0)
+        replace_spectra("photograph", tmp_path / "other", lambda at, values: 1.0)
 
 
 def test_a_lent_camera_has_the_gain_of_the_line() -> None:

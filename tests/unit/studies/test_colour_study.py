@@ -15,11 +15,10 @@ import pytest
 from mitsim.devices.chart import load_chart
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e
 from mitsim.report.table import Table
-from mitsim.studies import find_experiment
-from mitsim.studies.framework.experiment import Results, Scope
+from mitsim.studies import colour_study
+from mitsim.studies.framework.experiment import Results, Scope, find_experiment
 from mitsim.studies.framework.run import batches
 from mitsim.studies.framework.setup import Point, Setup
-from mitsim.studies.paper import colour
 from tests.unit.studies.test_colour_daylight import rows_of
 
 LINES = (638.0, 520.0, 445.0)
@@ -36,13 +35,15 @@ def images(scale: float = 1.0) -> np.ndarray:
 def results(**scales: float) -> Results:
     """Of images of the chart that are so many times too bright, by the way they were seen."""
     rows, arrays = [], {}
-    dim, bright = colour.DAYLIGHT
+    dim, bright = colour_study.DAYLIGHT
     for way, scale in scales.items():
-        named = {"own": colour.OWN, "one": colour.ONE, "dim": dim, "bright": bright}.get(way) or f"mosaic, {way}"
-        families = colour.FAMILIES if way == "own" else ("dots:7",)
+        named = {"own": colour_study.OWN, "one": colour_study.ONE, "dim": dim, "bright": bright}.get(
+            way
+        ) or f"mosaic, {way}"
+        families = colour_study.FAMILIES if way == "own" else ("dots:7",)
         for family, seed in product(families, (0, 1)):
             point = Point.of(Setup("colour_checker"), way=named, patterns=family, seed=seed)
-            found = colour._judged(point, LINES, images(scale), images())
+            found = colour_study._judge(point, LINES, images(scale), images())
             rows += [{**row, "point": point.key} for row in found.rows]
             arrays |= {(point.key, name): array for name, array in found.arrays.items()}
     return Results(Table((*rows, *rows_of(2.0, 30.0).rows)), arrays)
@@ -70,30 +71,30 @@ def test_verdicts_are_on_what_is_added_to_the_floor() -> None:
     """Images 2 % too bright are near it, 30 % are not; a scale is what a fitted matrix takes out, but for white. Beside
     daylight, rows of their own say up to where."""
     mosaics = {"half resolution": 0.9, "joint": 1.01}
-    claims = colour._claims(results(own=1.02, one=1.3, dim=1.02, bright=1.3, **mosaics))
+    claims = colour_study._claims(results(own=1.02, one=1.3, dim=1.02, bright=1.3, **mosaics))
     beside = ["confirmed only if D65 has at most 30 lx"] * 2
     assert [claim.verdict for claim in claims] == ["confirmed", *beside, "confirmed", "confirmed"]
     assert "most PSNR of 2" in claims[4].claim
-    swapped = colour._claims(
+    swapped = colour_study._claims(
         results(own=1.3, one=1.01, dim=1.3, bright=1.01, **{"half resolution": 1.01, "joint": 0.9})
     )
     assert [claim.verdict for claim in swapped] == ["not confirmed", *beside, "not confirmed", "not confirmed"]
 
 
 def test_every_figure_is_drawn() -> None:
-    drawn = colour._figures(results(own=1.02, one=1.3, dim=1.02, bright=1.3, joint=1.01))
+    drawn = colour_study._figures(results(own=1.02, one=1.3, dim=1.02, bright=1.3, joint=1.01))
     assert set(drawn) == {"delta_e.png", "ways.png", "chart.png", "images.png", "daylight.png"}
 
 
 def test_the_page_has_every_patch() -> None:
     """By patch: floor, truth and three families; images 2 % too bright are off the truth's, which is the floor's."""
-    ways, ladder, needed, patches = colour._tables(results(own=1.02, one=1.3, dim=1.02, bright=1.3, joint=1.01))
+    ways, ladder, needed, patches = colour_study._tables(results(own=1.02, one=1.3, dim=1.02, bright=1.3, joint=1.01))
     assert patches.headings == ("Patch", "Floor", "Truth", "Uniform", "49 dots", "64 Hadamard")
     assert [row[0] for row in patches.rows] == ["mean of 24", *chart().names]
     assert all(row[1] == row[2] and row[3] == row[4] for row in patches.rows)
     assert patches.rows[0][1] == "4.37" and float(patches.rows[0][4]) != 4.37
-    assert ways.rows[0][0] == colour.OWN and ways.rows[-1][1] == "-", "mosaics are not seen under uniform light"
-    assert "dB" in ways.rows[0][2] and colour.BY_LUX not in [row[0] for row in ways.rows]
+    assert ways.rows[0][0] == colour_study.OWN and ways.rows[-1][1] == "-", "mosaics are not seen under uniform light"
+    assert "dB" in ways.rows[0][2] and colour_study.BY_LUX not in [row[0] for row in ways.rows]
     assert [len(table.rows) for table in (ladder, needed)] == [3, 2]
 
 
@@ -109,6 +110,6 @@ def test_a_small_scene_is_studied_whole(small_scene: Callable[..., Path], tmp_pa
     done = subprocess.run([sys.executable, "-m", "mitsim", *command], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)
-    assert told["points"] >= 6 and {row["way"] for row in told["rows"]} >= {colour.OWN, "mosaic, joint"}
-    own = [row for row in told["rows"] if row["way"] == colour.OWN and row["patterns"] == "dots:7"]
+    assert told["points"] >= 6 and {row["way"] for row in told["rows"]} >= {colour_study.OWN, "mosaic, joint"}
+    own = [row for row in told["rows"] if row["way"] == colour_study.OWN and row["patterns"] == "dots:7"]
     assert all(row["psnr_db"] > 25 for row in own)

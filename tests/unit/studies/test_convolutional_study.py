@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 
 from mitsim.acquire.reference import rendered_psf
-from mitsim.report.exposures import EQUAL_FRAME, EQUAL_PEAK
+from mitsim.report import EQUAL_FRAME, EQUAL_PEAK
 from mitsim.report.table import Table
-from mitsim.studies import find_experiment
-from mitsim.studies.framework.experiment import Results, Scope
+from mitsim.studies.framework.experiment import Results, Scope, find_experiment
 from mitsim.studies.framework.setup import Setup
 
 EXPERIMENT = find_experiment("convolutional")

@@ -19,7 +19,7 @@ from mitsim.light import light
 from mitsim.metrics import psnr
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.report.compare import label
+from mitsim.report import label
 from mitsim.studies.demo import demo, scene_line
 
 pytestmark = pytest.mark.usefixtures("draft_figures")

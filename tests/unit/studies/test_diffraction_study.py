@@ -18,11 +18,11 @@ from mitsim.optics.separable import best_term, centred
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
 from mitsim.reconstruct.estimate_factors import estimate_factors
-from mitsim.report import exposures
-from mitsim.report.exposures import IdealCamera
+from mitsim.report import lit_scene
+from mitsim.report.lit_scene import IdealCamera
 from mitsim.sensor.chain import electrons_from_irradiance
-from mitsim.studies import diffraction, find_study
-from mitsim.studies.framework.run import StudyResult
+from mitsim.studies import diffraction_study
+from mitsim.studies.framework.run import StudyResult, find_study
 
 pytestmark = pytest.mark.usefixtures("draft_figures")
 
@@ -43,12 +43,12 @@ def result(shared_scene: Callable[..., Path], variant: str, tmp_path_factory: py
 
 
 @pytest.fixture(scope="module")
-def study(result: StudyResult) -> diffraction.DiffractionFindings:
-    assert isinstance(result.findings, diffraction.DiffractionFindings)
+def study(result: StudyResult) -> diffraction_study.DiffractionFindings:
+    assert isinstance(result.findings, diffraction_study.DiffractionFindings)
     return result.findings
 
 
-def loss(study: diffraction.DiffractionFindings, *case: str) -> float:
+def loss(study: diffraction_study.DiffractionFindings, *case: str) -> float:
     return study.loss_db(study.row(*case))
 
 
@@ -68,7 +68,7 @@ def test_without_diffraction_its_factors_are_the_papers(bench: Bench) -> None:
 
 def test_frames_are_what_the_terms_say(bench: Bench) -> None:
     """Checked at one pattern: the wave-optical operator applied to the lit image, term by term."""
-    camera = IdealCamera(bench, bench.geometry.mask, exposures.lights(bench)["broadband"])
+    camera = IdealCamera(bench, bench.geometry.mask, lit_scene.lights(bench)["broadband"])
     image, family = np.random.default_rng(6).random((N, N)), bench.family("dots:2")
     lit = image * np.outer(family.left[:, 1], family.right[:, 0])
     expected = sum(left @ lit @ right.T for left, right in camera.terms)
@@ -79,14 +79,14 @@ def test_frames_are_what_the_terms_say(bench: Bench) -> None:
 
 def test_light_of_short_waves_is_not_told_from_rays(bench: Bench) -> None:
     systems = {
-        exposures.GEOMETRIC: IdealCamera(bench, bench.geometry.mask),
+        lit_scene.GEOMETRIC: IdealCamera(bench, bench.geometry.mask),
         "short": IdealCamera(bench, bench.geometry.mask, Spectrum(np.array([550 / 256]), np.ones(1))),
         "green": IdealCamera(bench, bench.geometry.mask, Spectrum(np.array([550.0]), np.ones(1))),
     }
-    rows = {name: exposures.shadow_row(name, systems) for name in systems}
+    rows = {name: lit_scene.shadow_row(name, systems) for name in systems}
     for measure in ("scene_pixel", "factor"):
         found = {name: getattr(row, measure) for name, row in rows.items()}
-        assert found[exposures.GEOMETRIC] < 1e-7 and found["short"] < 1e-2 < 0.05 < found["green"], found
+        assert found[lit_scene.GEOMETRIC] < 1e-7 and found["short"] < 1e-2 < 0.05 < found["green"], found
     assert rows["short"].separability_centred < 1e-2
 
 
@@ -97,7 +97,7 @@ def test_calibration_finds_the_best_separable_factors(bench: Bench) -> None:
     light that is uniform along one axis) and the nearest ones are two compromises. They differ by less than what one
     separable operator leaves.
     """
-    camera = IdealCamera(bench, bench.geometry.mask, exposures.lights(bench)[exposures.LINE])
+    camera = IdealCamera(bench, bench.geometry.mask, lit_scene.lights(bench)[lit_scene.LINE])
     signs = hadamard_matrix(N).astype(float)
     ones = np.ones(N)
     stripes = [[sum(np.outer(a @ h, b @ ones) for a, b in camera.terms) for h in signs.T]]
@@ -113,7 +113,7 @@ def test_calibration_finds_the_best_separable_factors(bench: Bench) -> None:
 
 
 def test_the_geometric_mask_costs_image_quality_and_the_true_shadow_does_not(
-    study: diffraction.DiffractionFindings,
+    study: diffraction_study.DiffractionFindings,
 ) -> None:
     """3 dB for "nothing": the true shadow has another condition number, for better or worse."""
     for light in ("one line", "projector", "broadband"):
@@ -128,13 +128,13 @@ def test_the_geometric_mask_costs_image_quality_and_the_true_shadow_does_not(
     assert loss(study, *case, "calibrated factors") < 3
 
 
-def test_the_best_lambda_is_at_least_as_good_as_the_solvers_own(study: diffraction.DiffractionFindings) -> None:
+def test_the_best_lambda_is_at_least_as_good_as_the_solvers_own(study: diffraction_study.DiffractionFindings) -> None:
     assert all(row.psnr_best_db >= row.psnr_db for row in study.quality)
     right = [row for row in study.quality if row.light == "no diffraction" and row.frames == "idealised"]
     assert all(row.psnr_best_db < row.psnr_db + 1 for row in right), "with the right factors its own is near the best"
 
 
-def test_separability_of_each_light(study: diffraction.DiffractionFindings) -> None:
+def test_separability_of_each_light(study: diffraction_study.DiffractionFindings) -> None:
     rows = {(row.mask, row.light): row for row in study.shadows}
     assert rows["separable", "one line"].separability < 1e-12
     assert 1e-4 < rows["separable", "broadband"].separability < 1e-2
@@ -154,7 +154,7 @@ def test_a_camera_without_a_full_well_is_refused_before_any_light_is_traced(benc
     assert not (tmp_path / "out").exists()
 
 
-def test_files_and_report(result: StudyResult, study: diffraction.DiffractionFindings) -> None:
+def test_files_and_report(result: StudyResult, study: diffraction_study.DiffractionFindings) -> None:
     folder = Path(result.output)
     assert sorted(path.name for path in folder.iterdir()) == ["diffraction.json", "quality.png", "shadow.png"]
     kept = json.loads((folder / "diffraction.json").read_text())

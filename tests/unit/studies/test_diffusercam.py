@@ -10,10 +10,9 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import parse_patterns
 from mitsim.devices.sensor import load_sensor
 from mitsim.metrics import psnr
-from mitsim.reconstruct.convolution import ConvolutionalCamera
-from mitsim.reconstruct.convolution import Classes
-from mitsim.report.exposures import CONVENTIONS
-from mitsim.studies.diffusercam import best_image, race, take
+from mitsim.reconstruct.convolution import Classes, ConvolutionalCamera
+from mitsim.report import CONVENTIONS
+from mitsim.studies.convolutional_study import best_image, race, take
 
 N = 12
 SENSOR = load_sensor(shipped("calibration", "imx249.toml"))
@@ -71,6 +70,6 @@ def test_both_solvers_come_to_one_image(sensor: tuple[int, int] | None, k: int) 
 
 
 def test_iterations_that_do_not_arrive_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mitsim.studies.diffusercam._MOST_STEPS", 2)
+    monkeypatch.setattr("mitsim.studies.convolutional_study._MOST_STEPS", 2)
     with pytest.raises(MitsimError, match=r"^iterations did not come to the direct solution at lambda [^\n]+$"):
         race(Classes(CAMERA, 3), Classes(CAMERA, 3), TRUTH, SENSOR, 0)

@@ -18,14 +18,14 @@ from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
 from mitsim.devices.drift import UNITS, Drift
 from mitsim.devices.session import load_recipe
-from mitsim.report.exposures import RENDERED, LitScene
+from mitsim.report import RENDERED
+from mitsim.report.lit_scene import LitScene
 from mitsim.report.table import Table
-from mitsim.studies import find_experiment
-from mitsim.studies.drift.drift import SESSION, DriftStand, Outcome
-from mitsim.studies.framework.experiment import Results, Scope
+from mitsim.studies.drift_loss import SESSION, DriftStand, Outcome
+from mitsim.studies.drift_study import _move_projector
+from mitsim.studies.framework.experiment import Results, Scope, find_experiment
 from mitsim.studies.framework.setup import Setup
 from mitsim.studies.framework.studio import Studio
-from mitsim.studies.paper.drift import _moved
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
 
@@ -171,7 +171,7 @@ def test_a_moved_picture_lights_other_places(stand: DriftStand) -> None:
     assert np.linalg.norm(left) < 0.2 * np.linalg.norm(moved.truth - truth)
     assert projecting(stand.lit.bench, Drift(mask_rows_um=1.0)) is stand.lit.bench
     # By the plan of the light before: another's errors pass for the drift's. (Planted: a plan of its own.)
-    own = _moved(stand.lit, drift).light
+    own = _move_projector(stand.lit, drift).light
     assert own.plan is stand.lit.light.plan and own.bench.loaded.pixels == bench.loaded.pixels
 
 

@@ -12,8 +12,18 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import open_bench
-from mitsim.report.exposures import EQUAL_PEAK, IdealCamera, LitScene, Unexposed
-from mitsim.studies.gloss import CAUSES, INTERREFLECTION, PIXELS, REST, SATURATION, SENSOR, Split, split
+from mitsim.report import EQUAL_PEAK
+from mitsim.report.lit_scene import IdealCamera, LitScene, Unexposed
+from mitsim.studies.reflectivity_study import (
+    ERROR_SOURCES,
+    INTERREFLECTION,
+    PIXELS,
+    REST,
+    SATURATION,
+    SENSOR,
+    Split,
+    split,
+)
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
 
@@ -72,7 +82,7 @@ def test_brighter_paint_is_all_brightness(lit: Callable[..., LitScene]) -> None:
     # The truth's standard error is below 1e-4 in most pixels; prints are even.
     np.testing.assert_allclose(found.parts[PIXELS], 0.3 / BOARD, atol=2e-3)
     assert parts[SENSOR] < 3e-3 and parts[INTERREFLECTION] < 1e-9 and parts[SATURATION] < 1e-9
-    assert tuple(found.parts) == CAUSES
+    assert tuple(found.parts) == ERROR_SOURCES
     np.testing.assert_allclose(sum(found.parts.values()), found.solution.image - dull.truth, atol=1e-12)
 
 

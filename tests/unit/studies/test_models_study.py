@@ -10,10 +10,9 @@ import pytest
 
 from mitsim.devices.camera import CameraGeometry
 from mitsim.report.table import Table, Value
-from mitsim.studies import find_experiment
-from mitsim.studies.framework.experiment import Results, Scope
+from mitsim.studies import models_study
+from mitsim.studies.framework.experiment import Results, Scope, find_experiment
 from mitsim.studies.framework.setup import Setup
-from mitsim.studies.paper import models
 
 EXPERIMENT = find_experiment("models")
 
@@ -39,12 +38,12 @@ def test_points_are_models_by_frames_and_sessions_by_how_they_are_taken() -> Non
     points, few = (EXPERIMENT.points(Scope(Setup(), ("astronaut", "page"), quick=quick)) for quick in (False, True))
     assert len({point.key for point in points}) == len(points) == 2 * 2 * 2 * (3 + 2 * 5)
     assert {point.key for point in few} <= {point.key for point in points} and len(few) == 3 + 2 * 2
-    taken = {point["mode"]: models._recipe(point) for point in points if point["factors"] == "measured"}
+    taken = {point["mode"]: models_study._recipe(point) for point in points if point["factors"] == "measured"}
     assert {mode: (recipe.signed_capture, recipe.repeats) for mode, recipe in taken.items()} == {
         "uniform": ("uniform", 1), "pair": ("pair", 1), "pair x 4": ("pair", 4)
     }  # fmt: skip
     assert {point["wanted"] for point in points if point["factors"] == "wave"} == {2, 4, 8, 16, 64}
-    assert {models._recipe(point).exposure_fraction for point in points} == {0.8, 0.01}
+    assert {models_study._recipe(point).exposure_fraction for point in points} == {0.8, 0.01}
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ class ToyBench:
 def test_the_camera_as_built_has_its_mask_off_its_place() -> None:
     """(Planted: rows and columns exchanged; the offset in place of what is added to it.)"""
     camera = CameraGeometry(pixels=64, pixel_pitch=0.02, mask_distance=2.0, scene_distance=400.0, mask_offset_row=0.01)
-    built = models.as_built(cast(Any, ToyBench(ToyRig(camera)))).rig.camera
+    built = models_study.as_built(cast(Any, ToyBench(ToyRig(camera)))).rig.camera
     assert built.mask_distance == pytest.approx(2.05)
     assert (built.mask_offset_row, built.mask_offset_column) == pytest.approx((0.047, -0.021))
 

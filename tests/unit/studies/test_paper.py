@@ -8,18 +8,15 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.report.exposures import MODELS
-from mitsim.report.study_options import measures_of, values_of
+from mitsim.report import MODELS
 from mitsim.report.table import Table
-from mitsim.studies import find_experiment
+from mitsim.studies import EXPERIMENTS, PAPER
 from mitsim.studies.framework.campaign import Where, run_experiment
-from mitsim.studies.framework.experiment import IMAGE, Results, Scope
-from mitsim.studies.framework.page import Section, build_page, flagged
+from mitsim.studies.framework.claims import UNDECIDED, image_rows, judge_claim, psnr_claim
+from mitsim.studies.framework.experiment import IMAGE, Results, Scope, find_experiment, measures_of, values_of
+from mitsim.studies.framework.page import Section, build_page, flag_warnings
 from mitsim.studies.framework.run import batches
 from mitsim.studies.framework.setup import Point, Setup
-from mitsim.studies.framework.verdicts import UNDECIDED, judged
-from mitsim.studies.names import EXPERIMENTS, PAPER
-from mitsim.studies.paper.measure import pictured, stated
 
 TIMES = "\N{MULTIPLICATION SIGN}"
 WHOLE = Scope(Setup(), ("coins", "page"))
@@ -50,13 +47,13 @@ def table(**means: float) -> Table:
 def test_a_claim_holds_where_both_models_are_near_the_papers_figure() -> None:
     """Two decibels beside a band count as it. (Planted: the rendered model alone.)"""
     found = table(idealised__peak=36.8, rendered__peak=40.0, idealised__frame=32.7, rendered__frame=36.8)
-    claim = stated(found, "49 dots give 34 to 35.5 dB", (34, 35.5))
+    claim = psnr_claim(found, "49 dots give 34 to 35.5 dB", (34, 35.5))
     assert claim.verdict == "confirmed only at frame" and claim.paper == "34 to 35.5 dB"
     assert claim.idealised == "peak: 36.80 ± 0.05 dB; frame: 32.70 ± 0.05 dB"
     near = table(idealised__peak=36.8, rendered__peak=33.0)
-    assert stated(near, "", (34, 35.5)).verdict == "confirmed"
+    assert psnr_claim(near, "", (34, 35.5)).verdict == "confirmed"
     far = table(idealised__peak=31.2, rendered__peak=38.2)
-    assert stated(far, "", (34, 35.5)).verdict == "not confirmed"
+    assert psnr_claim(far, "", (34, 35.5)).verdict == "not confirmed"
 
 
 @pytest.mark.parametrize(
@@ -81,7 +78,7 @@ def test_verdicts(peak: str, frame: str, verdict: str) -> None:
     signs = {(model, name): holds[sign] for name, two in (("peak", peak), ("frame", frame))
              for model, sign in zip(MODELS, two, strict=True)}  # fmt: skip
     found = table(**{f"{model}__{name}": 0.0 for model, name in signs})
-    claim = judged(found, "", "", lambda rows: ("", signs[rows.rows[0]["model"], rows.rows[0]["exposure"]]))
+    claim = judge_claim(found, "", "", lambda rows: ("", signs[rows.rows[0]["model"], rows.rows[0]["exposure"]]))
     assert claim.verdict == verdict
 
 
@@ -93,7 +90,7 @@ def test_images_are_those_of_their_rows() -> None:
     del arrays["b1", IMAGE]
     found = Results(Table(tuple(rows)), arrays)
     lines = {name: found.table.where(patterns=name) for name in "ab"}
-    grid = pictured(found, lines, "number", (2, 1), "number {number}")
+    grid = image_rows(found, lines, "number", (2, 1), "number {number}")
     assert list(grid) == ["a"]
     assert [(image[0, 0], caption) for image, caption in grid["a"]] == [(1, "number 2"), (0, "number 1")]
 
@@ -107,10 +104,10 @@ def test_a_page_says_how_many_images_are_flagged_and_what_for() -> None:
         {"point": "c", "flagged": False, "reason": "", **same},
         {"point": "d", "square": 1.0},
     ]
-    (text,) = flagged("toy", Results(Table(tuple(rows))))
+    (text,) = flag_warnings("toy", Results(Table(tuple(rows))))
     assert text.startswith("2 of 3 images are flagged") and "toy.csv" in text
     assert text.endswith(f": 2 {TIMES} misfit, likely cause: depth; 1 {TIMES} The capture was flagged: dim.")
-    assert not flagged("toy", Results(Table(tuple(rows[-2:]))))
+    assert not flag_warnings("toy", Results(Table(tuple(rows[-2:]))))
 
 
 def test_the_page_of_a_sweep_says_what_was_swept_and_its_command_repeats_it(tmp_path: Path) -> None:

@@ -15,17 +15,15 @@ from matplotlib.figure import Figure
 from mitsim.bench.request import Request
 from mitsim.core.errors import MitsimError
 from mitsim.report import plots
-from mitsim.studies import find_study
-from mitsim.studies.framework.folder import study_folder
-from mitsim.studies.framework.run import StudyResult, run_study
-from mitsim.studies.names import STUDIES
+from mitsim.studies import STUDIES
+from mitsim.studies.framework.run import Findings, StudyResult, find_study, run_study, study_folder
 from tests.unit.studies.test_colour_by_line import main
 
 BENCH: Any = SimpleNamespace(loaded=SimpleNamespace(path=Path("scene.xml")))
 
 
 @dataclass(frozen=True)
-class Toy:
+class Toy(Findings):
     """Findings of a study that measures nothing."""
 
     value: float
@@ -67,7 +65,7 @@ def test_findings_that_may_not_be_trusted_end_with_1(
     monkeypatch.setattr("mitsim.cli.study.bench_of", lambda *_: BENCH)
     for number, (toy, status) in enumerate(((Toy, 0), (Doubtful, 1))):
         measure = partial(run_study, "calibration", lambda bench, request, job, toy=toy: toy(1.0))
-        monkeypatch.setattr("mitsim.studies.find_study", lambda *_, measure=measure: measure)
+        monkeypatch.setattr("mitsim.studies.framework.run.find_study", lambda *_, measure=measure: measure)
         assert main(["study", "calibration", "-o", str(tmp_path / f"{number}")]) == status
         assert ("mitsim: warning: a cause is missing" in capsys.readouterr().err) == bool(status)
 

@@ -7,8 +7,7 @@ import pytest
 
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.solver import prepare
-from mitsim.studies.drift.perturbation import LinearImage, Noise
-from mitsim.studies.scatter import Scatter
+from mitsim.studies.perturbation import LinearImage, Noise, Scatter
 
 N, PIXELS, LAM, SIZE, DRAWS = 6, 9, 0.3, 0.02, 600
 RNG = np.random.default_rng(4)

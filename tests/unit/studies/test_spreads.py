@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from mitsim.studies.framework.spreads import ROUNDS, Budget, Extra, Spread, Timed, times
+from mitsim.studies.accuracy_findings import ROUNDS, Budget, Extra, Spread, Timed, times
 
 
 def test_a_spread_has_a_middle_between_its_ends() -> None:

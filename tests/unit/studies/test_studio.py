@@ -11,19 +11,9 @@ import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
-from mitsim.report.exposures import (
-    DIM,
-    DIM_E,
-    EQUAL_FRAME,
-    EQUAL_PEAK,
-    EQUAL_TOTAL,
-    IDEALISED,
-    RENDERED,
-    Plane,
-    averaged,
-)
-from mitsim.studies.framework.pictures import SIDE, TEST_IMAGES, picture
-from mitsim.studies.framework.setup import Setup
+from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, RENDERED
+from mitsim.report.lit_scene import DIM, DIM_E, Plane, bin_frame
+from mitsim.studies.framework.setup import SIDE, TEST_IMAGES, Setup, picture
 from mitsim.studies.framework.studio import Image, Studio
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
@@ -157,7 +147,7 @@ def test_binned_frames_are_those_of_larger_pixels(studio: Studio, setup: Setup, 
 
 def test_frames_that_are_not_square_are_averaged_by_rows_and_columns(studio: Studio, setup: Setup) -> None:
     """And refused where squares do not fill them. (Planted: as many columns as rows; columns not looked at.)"""
-    found = averaged(np.arange(24.0).reshape(4, 6), 2)
+    found = bin_frame(np.arange(24.0).reshape(4, 6), 2)
     assert found.tolist() == [[3.5, 5.5, 7.5], [15.5, 17.5, 19.5]]
     frames = studio.frames(setup, IDEALISED, "dots:4")
     wide = replace(frames, sides=(np.ones((48, 16)), np.ones((84, 16))))

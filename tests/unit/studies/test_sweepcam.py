@@ -16,14 +16,14 @@ from mitsim.calibrate.session import Session
 from mitsim.core.job import Job
 from mitsim.devices.session import load_recipe
 from mitsim.optics.frames import Frame
-from mitsim.report.exposures import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODELS, IdealCamera, LitScene
+from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODELS
+from mitsim.report.lit_scene import IdealCamera, LitScene
 from mitsim.report.table import Table
 from mitsim.sensor.chain import electrons_from_irradiance
-from mitsim.studies import find_experiment
-from mitsim.studies.framework.experiment import Results
+from mitsim.studies.framework.experiment import Results, find_experiment
 from mitsim.studies.framework.setup import Setup
 from mitsim.studies.framework.studio import Studio
-from mitsim.studies.sweepcam import MovedMask, _consistent, calibrated_places, ideal_places, moved
+from mitsim.studies.multishot_study import MovedMask, _consistent, calibrated_places, ideal_places, move_mask
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
 
@@ -141,7 +141,7 @@ def test_factors_have_the_noise_of_a_session(lit: dict[str, LitScene]) -> None:
     factor's own sum for the other's.)"""
     bench = lit["separable"].bench
     ((left, right),) = calibrated_places(bench, [0.42], 3).values()
-    session = Session(moved(bench, 0.42, 0.42), load_recipe(), 3)
+    session = Session(move_mask(bench, 0.42, 0.42), load_recipe(), 3)
     frames = LitSession.of(session, session.trace(session.plan(1e-3, Job()), Job()), Job())
     noisy, clean = (estimate(frames, Job(), noise_free=free)[0] for free in (False, True))
     for ours, theirs, exact in ((left, noisy.left, clean.left), (right, noisy.right, clean.right)):
@@ -157,7 +157,7 @@ def test_how_a_session_shares_its_product_does_not_matter(lit: dict[str, LitScen
     mask = MovedMask(scene, IDEALISED, sound, 0)
 
     def white(row: float, column: float) -> Frame:
-        camera = IdealCamera(moved(scene.bench, row, column), "separable")
+        camera = IdealCamera(move_mask(scene.bench, row, column), "separable")
         (frame,) = camera.frames(scene.bench.family("uniform"), np.full((16, 16), scene.board_flux))
         return frame
 

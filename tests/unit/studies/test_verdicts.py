@@ -9,22 +9,21 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.report.exposures import EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED
+from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED
 from mitsim.report.table import Mean, Table, Value
-from mitsim.studies import find_experiment
-from mitsim.studies.drift.levels import EFFECTS
-from mitsim.studies.framework.experiment import Results
-from mitsim.studies.framework.verdicts import (
+from mitsim.studies import drift_study
+from mitsim.studies.framework.claims import (
     CONFIRMED,
     NOT_CONFIRMED,
     UNDECIDED,
     difference,
     every,
-    sampled,
+    sample_mean,
     verdict_at,
     within,
 )
-from mitsim.studies.paper import drift
+from mitsim.studies.framework.experiment import Results, find_experiment
+from mitsim.studies.waterfall_study import EFFECTS
 
 Row = dict[str, Value]
 Build = Callable[[float], list[Row]]
@@ -264,7 +263,7 @@ BORDERS = [
     ("ambient", 2, lamps, -math.inf, 0.0),
     ("separation", 0, lambda value: lit(corner=value, cookie_bag=9.0), 0.0, math.inf),
     ("models", 0, fitted, -0.5, math.inf),
-    ("drift", 0, drifted, -drift.AGREE_DB, drift.AGREE_DB),
+    ("drift", 0, drifted, -drift_study.AGREE_DB, drift_study.AGREE_DB),
     ("waterfall", 0, lambda value: fallen(lost=value), -math.inf, 2.0),
     ("waterfall", 1, lambda value: fallen(gained=value), 0.0, math.inf),
     ("reflectivity", 0, lambda value: glossy(card=value), 20.0, math.inf),
@@ -298,7 +297,7 @@ def test_claims_are_decided_on_both_sides_of_each_border(
 
 
 def test_every_study_of_the_paper_is_held() -> None:
-    from mitsim.studies.names import PAPER
+    from mitsim.studies import PAPER
 
     assert {study for study, *_ in BORDERS} == set(PAPER) | {"models", "drift"}
 
@@ -316,9 +315,9 @@ def test_pairs_are_of_prints_or_of_seeds_of_one_print() -> None:
     one = [{"picture": name, "seed": seed, "x": value} for name, seed, value in
            (("a", 0, 10.0), ("a", 1, 12.0), ("b", 0, 20.0), ("b", 1, 22.0))]  # fmt: skip
     other = [{**row, "x": float(row["x"]) - 1.0 - (row["picture"] == "b")} for row in one]
-    assert sampled(Table(tuple(one)), "x") == Mean(16.0, pytest.approx(5.0), 2)
+    assert sample_mean(Table(tuple(one)), "x") == Mean(16.0, pytest.approx(5.0), 2)
     assert difference(Table(tuple(one)), Table(tuple(other)), "x") == Mean(1.5, pytest.approx(0.5), 2)
-    assert sampled(Table(tuple(one[:2])), "x") == Mean(11.0, pytest.approx(1.0), 2)
+    assert sample_mean(Table(tuple(one[:2])), "x") == Mean(11.0, pytest.approx(1.0), 2)
     with pytest.raises(MitsimError, match="nothing was measured of x"):
         difference(Table(tuple(one[:2])), Table(tuple(other[2:])), "x")
 

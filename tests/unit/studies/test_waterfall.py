@@ -13,26 +13,34 @@ from mitsim.core.job import Job
 from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.light.passes import Simulation
 from mitsim.metrics import psnr
-from mitsim.report.charts import Fall, Step, waterfall
-from mitsim.report.exposures import EQUAL_PEAK, RENDERED, LitScene
+from mitsim.report import EQUAL_PEAK, RENDERED
+from mitsim.report.lit_scene import LitScene
 from mitsim.report.table import Mean, Table
-from mitsim.studies.accuracy.partial_light import BLACK_LEVEL, DEPTH, FALLOFF, Anatomy
-from mitsim.studies.drift.levels import (
-    CALIBRATED,
-    EFFECTS,
-    MODELS,
-    QUANTISATION,
-    SATURATION,
-    Levels,
-    Sessions,
-    fills_well,
-    sensor_without,
-)
+from mitsim.studies.ablation import BLACK_LEVEL, DEPTH, FALLOFF, Ablation
+from mitsim.studies.framework.claims import UNDECIDED
 from mitsim.studies.framework.experiment import Results, Scope
 from mitsim.studies.framework.setup import Setup
 from mitsim.studies.framework.studio import Studio
-from mitsim.studies.framework.verdicts import UNDECIDED
-from mitsim.studies.paper.waterfall import ALONE, EXPERIMENT, IN_ORDER, LEFT_OUT, ends, fall
+from mitsim.studies.waterfall_study import (
+    ALONE,
+    CALIBRATED,
+    EFFECTS,
+    EXPERIMENT,
+    IN_ORDER,
+    LEFT_OUT,
+    MODELS,
+    QUANTISATION,
+    SATURATION,
+    Fall,
+    Levels,
+    Sessions,
+    Step,
+    ends,
+    fall,
+    fills_well,
+    sensor_without,
+    waterfall,
+)
 
 pytestmark = pytest.mark.usefixtures("kept_plans", "draft_figures")
 
@@ -61,7 +69,7 @@ def studio() -> Iterator[Studio]:
 @pytest.fixture(scope="module")
 def levels(studio: Studio, setup: Setup) -> Levels:
     lit = studio.lit(setup)
-    return Levels(lit, Anatomy.of(lit.light), Sessions(lit.bench, 3), FAMILY, 3)
+    return Levels(lit, Ablation.of(lit.light), Sessions(lit.bench, 3), FAMILY, 3)
 
 
 def test_with_all_effects_it_is_what_a_user_gets(studio: Studio, setup: Setup, levels: Levels) -> None:
@@ -144,10 +152,10 @@ def test_quantisation_costs_a_twelfth_of_its_step(studio: Studio, setup: Setup, 
     eight = {"bits": 8, "gain_dn_per_e": 7e-3, "black_level_dn": 2.0}
     camera = replace(bench, rig=replace(bench.rig, sensor=bench.sensor.model_copy(update=eight)))
     light = replace(lit.light, simulation=Simulation(camera, lit.light.simulation.settings))
-    other, anatomy = LitScene(light), Anatomy.of(light)
+    other, scene_ablation = LitScene(light), Ablation.of(light)
     squares = []
     for seed in range(SEEDS):
-        own = Levels(other, anatomy, levels._sessions, FAMILY, seed)
+        own = Levels(other, scene_ablation, levels._sessions, FAMILY, seed)
         rounded, exact = (own.images(on)[MODELS[0]] for on in (frozenset({QUANTISATION}), frozenset[str]()))
         squares.append(float(np.square(rounded - exact).mean()))
     frames = other.idealised(bench.family(FAMILY), 0)

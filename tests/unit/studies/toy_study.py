@@ -40,7 +40,7 @@ def claims(results: Results) -> Sequence[Claim]:
 
 
 def figures(results: Results) -> Mapping[str, object]:
-    from mitsim.report.charts import curves  # not in the processes that measure: it takes a second
+    from mitsim.report.plots import curves  # not in the processes that measure: it takes a second
 
     by_number = results.table.means("square", "number")
     return {"squares.png": curves({"all": {"square": by_number}}, "number [1]", "square [1]")}

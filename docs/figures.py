@@ -1,0 +1,344 @@
+"""Figures that the pages state: the commands and formulas that give them in, docs/figures.json and the pages out.
+
+    python docs/figures.py [closed] [plan] [tour] [pictures]        all, unless some are named; `make figures`
+
+*closed*: closed forms, a second. *plan*: two plans of the photograph, seconds. *tour*: README's commands, a minute, and
+their outputs. *pictures*: docs/images/make.py and drawings.py, three minutes. Seconds and memory in README stay: they
+are an idle machine's. tests/test_docs.py compares pages with the file, closed forms with the file and, slow, commands.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shlex
+import subprocess
+import sys
+import tempfile
+import textwrap
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+README = ROOT / "README.md"
+FIGURES = ROOT / "docs" / "figures.json"
+IMAGES = ROOT / "docs" / "images"
+
+
+@dataclass(frozen=True)
+class Stated:
+    """One place of a page that states a figure."""
+
+    page: str
+    words: str
+    """Text around it, of which ``{}`` is the figure."""
+    name: str
+    """In the file of figures, as part.name."""
+    form: str
+    """Format specification; percent are stated of parts."""
+
+    @property
+    def pattern(self) -> re.Pattern[str]:
+        """What finds it, whatever number stands there and wherever lines end."""
+        before, after = (r"\s+".join(map(re.escape, part.split(" "))) for part in self.words.split("{}"))
+        return re.compile(rf"({before})([-\d.]+(?:e[+-]?\d+)?)({after})")
+
+    def text(self, figures: dict[str, dict[str, float]]) -> str:
+        """The figure as this place states it."""
+        part, name = self.name.split(".")
+        value = f"{figures[part][name]:{self.form}}"
+        return value.removesuffix("%").replace("e-0", "e-")
+
+
+PHYSICS, IMAGES_PAGE, BENCH, STUDIES = "docs/physics.md", "docs/reconstruction.md", "docs/bench.md", "docs/studies.md"
+STATED = (
+    Stated("README.md", "# {}, as above", "tour.psnr_db", ".2f"),
+    Stated(BENCH, "captures and calibrates itself it is {} dB", "tour.psnr_db", ".1f"),
+    Stated(STUDIES, "`, {} dB under 49 dots, seed 0", "tour.psnr_db", ".2f"),
+    Stated(PHYSICS, "off by a Delta E of {} in the mean", "closed.delta_e_floor", ".2f"),
+    Stated(PHYSICS, "in the mean, {} at most", "closed.delta_e_floor_most", ".1f"),
+    Stated(STUDIES, "three lines without a camera, is {} (red", "closed.delta_e_floor", ".2f"),
+    Stated(PHYSICS, "from the geometric one by {} % (450 nm)", "closed.diffraction_450_nm", ".0%"),
+    Stated(PHYSICS, "(450 nm) to {} % (640 nm)", "closed.diffraction_640_nm", ".0%"),
+    Stated(PHYSICS, "One anchor leaves {} on the photograph", "plan.anchors", ".1e"),
+    Stated(PHYSICS, "under `dots:7` and {} under uniform light", "plan.anchors_uniform", ".1e"),
+    Stated(PHYSICS, "falls with $1/c^2$: {} for $c = 1$", "plan.cells", ".1e"),
+    Stated(PHYSICS, "Neutral: the geometric shadow, {} off for", "plan.diffraction", ".1e"),
+    Stated(PHYSICS, "photograph and `dots:7`, {} for `uniform`", "plan.diffraction_uniform", ".1e"),
+    Stated(PHYSICS, "infinite contrast ({} off for `dots:7`)", "plan.black_level", ".1e"),
+    Stated(PHYSICS, "three lines has $C = {}$ lit at once", "closed.speckle_white", ".3f"),
+    Stated(PHYSICS, "lit at once and {} with a beam of", "closed.speckle_white_beam", ".4f"),
+    Stated(IMAGES_PAGE, "| cookie_bag (`dots:7x16`) | {} dB |", "pictures.each_depth_psnr_db", ".1f"),
+    Stated(IMAGES_PAGE, "| {} dB | 27.2 dB | 0.3 mm |", "pictures.one_depth_psnr_db", ".1f"),
+    Stated(IMAGES_PAGE, "0.3/128)$, {} cells of the shipped", "closed.margin_cells", ".0f"),
+    Stated(IMAGES_PAGE, "pixels in tan-angle. {} pixels from 363", "closed.parallax_cookie_bag", ".1f"),
+)
+"""Every place whose figure is another place's, or follows from a closed form."""
+
+
+def read() -> dict[str, dict[str, float]]:
+    """The file of figures."""
+    figures: dict[str, dict[str, float]] = json.loads(FIGURES.read_text(encoding="utf-8"))
+    return figures
+
+
+def stale(figures: dict[str, dict[str, float]]) -> list[str]:
+    """Places that state another figure than the file, or none."""
+    found = []
+    for place in STATED:
+        matches = place.pattern.findall((ROOT / place.page).read_text(encoding="utf-8"))
+        if [match[1] for match in matches] != [place.text(figures)]:
+            found.append(f"{place.page}: {place.words!r}: {[match[1] for match in matches]}, not {place.text(figures)}")
+    return found
+
+
+def write_pages(figures: dict[str, dict[str, float]]) -> None:
+    """Every stated figure as the file has it."""
+    for place in STATED:
+        page = ROOT / place.page
+        value = place.text(figures)
+        text, count = place.pattern.subn(
+            lambda found, value=value: found[1] + value + found[3], page.read_text("utf-8")
+        )
+        if count != 1:
+            raise SystemExit(f"{place.page}: {count} places state {place.words!r}; there should be one")
+        page.write_text(text, encoding="utf-8")
+
+
+# ---- closed forms ----------------------------------------------------------------------------------------------------
+
+
+def closed() -> dict[str, float]:
+    """Figures that follow from the shipped devices and the paper's geometry: no machine's."""
+    import numpy as np
+
+    from mitsim.core.configuration import load_model, shipped
+    from mitsim.devices.camera import CameraGeometry, Rig
+    from mitsim.devices.projector import Coherence, ProjectorModel, Spectrum
+    from mitsim.devices.sensor import load_sensor
+    from mitsim.optics.shadow import Directions
+    from mitsim.optics.speckle import contrast_of
+    from mitsim.optics.terms import shadow_terms
+    from mitsim.reconstruct.colour import ColourModel, chart, delta_e
+
+    camera, n, window = CameraGeometry(), 128, 120.0
+    projector = load_model(shipped("calibration", "mp_cl1.toml"), ProjectorModel)
+    lines = projector.wavelengths_nm
+    patches = delta_e(ColourModel.of_lines(lines).xyz(chart().at(lines)), chart().xyz)
+    pitch = window / n / camera.scene_distance
+    scene = Directions.cells((np.arange(n + 1) - n / 2) * pitch)
+
+    def sided(nm: float) -> float:
+        """How far the shadow of one side is from the geometric one."""
+        line = Spectrum(np.array([nm]), np.array([1.0]))
+        ((wave, _),), ((rays, _),) = (
+            shadow_terms(camera, scene, scene, camera.scene_distance, light) for light in (line, None)
+        )
+        return float(np.linalg.norm(wave - rays) / np.linalg.norm(rays))
+
+    def contrast(lit: Any, **coherence: float) -> float:
+        devices = Rig(
+            camera,
+            load_sensor(shipped("calibration", "imx249.toml")),
+            projector.model_copy(update={"speckle": Coherence(**coherence)}),
+            "",
+        )
+        return contrast_of(devices, (window / n, window / n), lit)
+
+    white = np.ones((n, n))
+    return {
+        "delta_e_floor": float(patches.mean()),
+        "delta_e_floor_most": float(patches.max()),
+        "diffraction_450_nm": sided(450.0),
+        "diffraction_640_nm": sided(640.0),
+        "speckle_white": contrast(white),
+        "speckle_white_beam": contrast(white, beam_radius_mm=0.5),
+        "margin_cells": math.floor(
+            (math.tan(math.radians(camera.fov / 2)) - window / 2 / camera.scene_distance) / pitch
+        ),
+        "parallax_cookie_bag": 60.0 * (1 / 363 - 1 / 451) / pitch,
+    }
+
+
+# ---- README's tour of the command line -------------------------------------------------------------------------------
+
+VERBS = ("capture", "calibrate", "reconstruct")
+"""Of photograph: from a scene to an image, with every figure at its default."""
+_BLOCK = r"^    \$ mitsim ({verb} .*)\n((?:    (?!\$ ).*\n)*)"
+_MACHINE = re.compile(r"\bin [\d.]+ s\b(?: \(transport [^)]*\))?|\bmemory [\d.]+ GiB of at most [\d.]+ predicted")
+"""What an output says of the machine, not of the scene."""
+_NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?:e[+-]?\d+)?")
+_WIDTH = 116
+"""Columns of README's outputs, without their indent."""
+
+
+def printed(verb: str) -> tuple[str, str]:
+    """The command line of a ``verb`` in README, and the output under it."""
+    found = re.search(_BLOCK.format(verb=verb), README.read_text(encoding="utf-8"), flags=re.M)
+    assert found, f"README has no command of {verb}"
+    return found[1], found[2]
+
+
+def outputs(folder: Path) -> Iterator[tuple[str, str]]:
+    """Each verb of the tour, and what its command prints in ``folder``."""
+    for verb in VERBS:
+        command = [sys.executable, "-m", "mitsim", *shlex.split(printed(verb)[0]), "--quiet"]
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, f"{shlex.join(command)}: {done.returncode}\n{done.stderr}"
+        yield verb, done.stdout
+
+
+def differences(readme: str, now: str) -> list[str]:
+    """Figures of an output ``now`` that differ from ``readme``'s by more than one of the last digit printed, or the
+    sentences, where those differ."""
+    texts = [" ".join(_MACHINE.sub("", " ".join(text.split())).split()) for text in (readme, now)]
+    sentences = [_NUMBER.sub("#", text) for text in texts]
+    if sentences[0] != sentences[1]:
+        return [f"{sentences[0]}\n{sentences[1]}"]
+    pairs = zip(*(_NUMBER.findall(text) for text in texts), strict=True)
+    return [f"{old} -> {new}" for old, new in pairs if abs(float(old) - float(new)) > 1.001 * last_digit(old)]
+
+
+def last_digit(number: str) -> float:
+    """What one of the last printed digit is worth; a whole number's is 1."""
+    mantissa, _, exponent = number.partition("e")
+    return math.pow(10, int(exponent or 0) - len(mantissa.partition(".")[2]))
+
+
+def planned(folder: Path) -> dict[str, tuple[str, str, str]]:
+    """State, reason and error of every row of README's plan, as its command gives them now."""
+    command, _ = printed("plan")
+    program = [sys.executable, "-m", "mitsim", *shlex.split(command), "--json", "--quiet"]
+    done = subprocess.run(program, cwd=folder, capture_output=True, text=True, check=True)
+    rows = json.loads(done.stdout)["effects"]
+    return {row["name"]: (row["state"], row["reason"], f"{row['error_if_off'] or 0:.1e}") for row in rows}
+
+
+def plan_lines(now: dict[str, tuple[str, str, str]]) -> dict[str, str]:
+    """README's lines of the plan that are not what the plan is ``now``, and what they should be.
+
+    A line has the first words of a reason. Its seconds are the machine's.
+    """
+    found = {}
+    for line in printed("plan")[1].splitlines():
+        cells = re.split(r"\s{2,}", line.strip())
+        name, *cells = re.split(r"\s+", cells[0], maxsplit=1) + cells[1:]
+        if name not in now:
+            continue
+        state, reason, error = cells[:3]
+        words = re.match(_NUMBER.sub("#", reason).replace("#", _NUMBER.pattern), now[name][1])
+        new = line.replace(f" {state} ", f" {now[name][0]} ").replace(f" {error} ", f" {now[name][2]} ")
+        new = new.replace(reason, words[0] if words else now[name][1])
+        found |= {} if new == line else {line: new}
+    return found
+
+
+def statuses(folder: Path) -> dict[str, str]:
+    """Sentences in README's table of exit statuses whose figures differ, and what their commands say now."""
+    found = {}
+    rows = re.findall(r'^\| \d \|.*\| `mitsim ([^`]+)`: "([^"]+)" \|$', README.read_text(encoding="utf-8"), flags=re.M)
+    for command, sentence in rows:
+        program = [sys.executable, "-m", "mitsim", *shlex.split(command)]
+        done = subprocess.run(program, cwd=folder, capture_output=True, text=True, check=False)
+        words = re.escape(_NUMBER.sub("#", sentence)).replace(re.escape("#"), _NUMBER.pattern)
+        now = re.search(words, " ".join(done.stderr.split()))
+        found |= {sentence: now[0]} if now and now[0] != sentence else {}
+    return found
+
+
+def tour_figures() -> dict[str, float]:
+    """What README prints under the tour's commands, as numbers."""
+    text = " ".join(" ".join(printed(verb)[1] for verb in VERBS).split())
+    patterns = {
+        "psnr_db": r"PSNR ([\d.]+) dB",
+        "ssim": r"SSIM ([\d.]+),",
+        "truth_db": r"truth good to ([\d.]+) dB",
+        "mc_error": r"Monte Carlo error ([\d.e+-]+),",
+        "factor_error": r"factor error ([\d.e+-]+),",
+        "uncertainty": r"standard uncertainty ([\d.e+-]+) rms",
+    }
+    return {name: float(re.findall(pattern, text)[0]) for name, pattern in patterns.items()}
+
+
+def tour(work: Path) -> dict[str, float]:
+    """The tour's commands run in ``work``; their outputs stand in README then."""
+    for line, now in (plan_lines(planned(work)) | statuses(work)).items():
+        sys.stdout.write(f"{line} -> {now}\n")
+        README.write_text(README.read_text(encoding="utf-8").replace(line, now), encoding="utf-8")
+    for verb, now in outputs(work):
+        for difference in differences(printed(verb)[1], now):
+            sys.stdout.write(f"{verb}: {difference}\n")
+        README.write_text(updated(README.read_text(encoding="utf-8"), verb, now), encoding="utf-8")
+    return tour_figures()
+
+
+def updated(page: str, verb: str, now: str) -> str:
+    """The ``page`` with the output ``now`` of a ``verb``."""
+    command, old = printed(verb)
+    kept = iter(_MACHINE.findall(" ".join(old.split())))
+    text = "\n".join(_MACHINE.sub(lambda found: next(kept, found[0]), line) for line in now.splitlines())
+    lines = [wrapped for line in text.splitlines() for wrapped in textwrap.wrap(line, _WIDTH)]
+    return page.replace(
+        f"    $ mitsim {command}\n{old}", f"    $ mitsim {command}\n" + "".join(f"    {line}\n" for line in lines)
+    )
+
+
+def plan(work: Path) -> dict[str, float]:
+    """What the photograph's frames lose with one anchor, one cell a pixel, or an effect off, by its plans at 1e-3."""
+
+    def errors(patterns: str) -> dict[str, float]:
+        program = [sys.executable, "-m", "mitsim", "plan", "photograph", "--patterns", patterns, "--json", "--quiet"]
+        done = subprocess.run(program, cwd=work, capture_output=True, text=True, check=True)
+        return {row["name"].replace("-", "_"): row["error_if_off"] for row in json.loads(done.stdout)["effects"]}
+
+    dots, uniform = errors("dots:7"), errors("uniform")
+    names = ("anchors", "cells", "diffraction", "black_level")
+    return {name: dots[name] for name in names} | {
+        f"{name}_uniform": uniform[name] for name in ("anchors", "diffraction")
+    }
+
+
+# ---- pictures --------------------------------------------------------------------------------------------------------
+
+
+def titles(picture: str) -> list[float]:
+    """Decibels in the titles of a picture of README, which its file holds as text."""
+    from PIL.PngImagePlugin import PngImageFile
+
+    return [float(psnr) for psnr in re.findall(r": ([\d.]+) dB", PngImageFile(IMAGES / picture).text["Description"])]
+
+
+def picture_figures() -> dict[str, float]:
+    """The figures in the titles of README's two pictures."""
+    names = ("uniform_psnr_db", "dots_psnr_db"), ("one_depth_psnr_db", "each_depth_psnr_db")
+    values = titles("demo.png"), titles("depth.png")
+    return {name: value for pair in zip(names, values, strict=True) for name, value in zip(*pair, strict=True)}
+
+
+def pictures(work: Path) -> dict[str, float]:
+    """README's pictures and all drawings, made anew; runs that are in ``work`` are used."""
+    for script, *arguments in (["make.py", str(work)], ["drawings.py"]):
+        subprocess.run([sys.executable, str(IMAGES / script), *arguments], check=True)
+    return picture_figures()
+
+
+WAYS = {"closed": lambda _: closed(), "plan": plan, "tour": tour, "pictures": pictures}
+
+
+def main() -> None:
+    parts = sys.argv[1:] or list(WAYS)
+    figures = read() if FIGURES.exists() else {}
+    with tempfile.TemporaryDirectory() as folder:
+        for part in parts:
+            figures[part] = WAYS[part](Path(folder))
+    # Six digits: the last ones are the machine's BLAS's.
+    kept = {part: {name: float(f"{value:.6g}") for name, value in of.items()} for part, of in figures.items()}
+    FIGURES.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
+    write_pages(figures)
+
+
+if __name__ == "__main__":
+    main()

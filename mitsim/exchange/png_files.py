@@ -1,0 +1,451 @@
+"""Patterns in; pictures at a projector's own resolution out, to show on a real one: of a family, or a calibration's."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.configuration import load_model, locate, validated
+from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.files import whole_file, whole_folder, write_json, write_text
+from mitsim.core.manifests import Patterns, RunManifest
+from mitsim.core.resources import Cost, Limits
+from mitsim.core.spectral_manifests import COLOUR
+from mitsim.devices.framelist import FrameList
+from mitsim.devices.patterns import parse_patterns, stripe_signs
+from mitsim.devices.projector import ProjectorModel
+from mitsim.devices.sensor import check_exposure, digital_of, load_sensor
+from mitsim.devices.session import UNIFORM, taken
+from mitsim.exchange.packed import Coloured, Packed, shots_of
+
+PATTERNS = "patterns.json"
+"""Which picture shows what, and where the grid lies in it."""
+SESSION = "session.json"
+"""The list of a session's frames, as `mitsim calibrate --frames` reads it."""
+SQUARE = 0.01
+"""How far a cell's width on the scene may be off its height, as a logarithm, to count as square: a hundredth, which
+nobody sees in an image."""
+_SECONDS_PER_PIXEL, _PIXEL_BYTES = 2e-8, 3
+"""Of drawing a picture: measured 6e-9 s of dots:7 in a raster of 720 x 1920, and some three times that for a slow
+disk. Bytes of cells, picture and file."""
+_WHITE = 255
+"""Of a picture for the projector; black is 0, so that its gamma plays no part."""
+
+
+@dataclass(frozen=True)
+class Raster:
+    """A projector's own pixels.
+
+    Attributes
+    ----------
+    rows, columns
+        how many there are.
+    aspect
+        width of one on the scene, over its height.
+    """
+
+    rows: int
+    columns: int
+    aspect: float = 1.0
+
+    @classmethod
+    def of(cls, projector: str) -> Raster:
+        """Of the ``projector``, a name or TOML file. MitsimError where it does not say its rows and columns."""
+        return cls.known(load_model(locate(projector, "calibration", ".toml"), ProjectorModel).model_dump())
+
+    @classmethod
+    def known(cls, model: Mapping[str, Any]) -> Raster:
+        """Of a projector's ``model``, as a run's manifest has it; MitsimError as :meth:`of`."""
+        if not model:
+            raise ArgumentError("projector", "is not known of a run of imported frames; give its name or file")
+        rows, columns = model.get("rows"), model.get("columns")
+        if not (isinstance(rows, int) and isinstance(columns, int)):
+            raise ArgumentError("projector", "does not say its rows and columns; give one that does")
+        return cls(rows, columns, float(model.get("pixel_aspect", 1.0)))
+
+
+def draw_family(folder: Path, name: str, n: int, projector: str, seed: int = 0) -> dict[str, Any]:
+    """Draw every shot of a family of patterns to a new folder, whole or not at all.
+
+    Parameters
+    ----------
+    folder
+        to make: `patterns/` and `patterns.json`.
+    name
+        of the family.
+    n
+        projector pixels a side that the patterns have.
+    projector
+        name or TOML file, of known rows and columns.
+    seed
+        of patterns of a `random` family.
+
+    Returns
+    -------
+    dict
+        `patterns`, `n`, `pictures`, `projector` (its rows and columns, and the grid's place), `output`.
+
+    Raises
+    ------
+    MitsimError
+        for a family that there is none of, or a projector of unknown or too few pixels.
+    """
+    family = parse_patterns(name, n, seed)
+    names = [frame_name(index) for index in range(len(family.shots))]
+    patterns, raster = Patterns.of(family, names), Raster.of(projector)
+    light = pictures_of(patterns, f"patterns {name}")
+    _check_cost(raster, len(names))
+    with whole_folder(folder) as place:
+        where = draw(place, light, raster, (n, n), f"projector {projector}")
+        write_json(place / PATTERNS, describe(patterns, names, where))
+    return {"patterns": name, "n": n, "pictures": len(names), "projector": where, "output": str(folder)}
+
+
+def draw_stripes(folder: Path, projector: str, listed: FrameList) -> dict[str, Any]:
+    """Draw every shot of a calibration session to a new folder, whole or not at all, in the order in which
+    `mitsim calibrate --frames` counts frames.
+
+    Parameters
+    ----------
+    folder
+        to make: `patterns/`, `patterns.json`, and the list that goes with the frames, `session.json`.
+    projector
+        name or TOML file, of known rows and columns.
+    listed
+        what the frames will be of.
+
+    Returns
+    -------
+    dict
+        as of :func:`draw_family`.
+
+    Raises
+    ------
+    MitsimError
+        for a projector of unknown or too few pixels, and where no Hadamard matrix has so many rows.
+    """
+    n, raster, signs = listed.n, Raster.of(projector), stripe_signs(listed.n)
+    light, shots = [], []
+    for number, (side, index, sign) in enumerate(taken(signs.shape[1], listed.signed_capture == "pair")):
+        stripes = signs[:, index, None] if side == "horizontal" else signs[None, :, index]
+        light.append(np.broadcast_to(np.ones((1, 1)) if sign == UNIFORM else (1 + sign * stripes) / 2, (n, n)))
+        shots.append(
+            {"file": frame_name(number), "pattern": picture_name(number), "side": side, "index": index, "sign": sign}
+        )
+    _check_cost(raster, len(light))
+    with whole_folder(folder) as place:
+        where = draw(place, light, raster, (n, n), f"projector {projector}")
+        write_json(place / PATTERNS, {"projector": where, "shots": shots})
+        write_json(place / SESSION, listed.model_dump(mode="json", exclude_defaults=True))
+    return {"patterns": "stripes", "n": n, "pictures": len(light), "projector": where, "output": str(folder)}
+
+
+def session_of(camera: str, exposure_s: float, n: int, signed_capture: str) -> FrameList:
+    """The list of a calibration session's frames, in the order of their names.
+
+    Parameters
+    ----------
+    camera
+        electronics: name of a shipped file, or a TOML file.
+    exposure_s
+        of every frame [s].
+    n
+        projector pixels a side.
+    signed_capture
+        `pair` or `uniform`: how a +-1 pattern is captured.
+
+    Raises
+    ------
+    MitsimError
+        for values that cannot be.
+    """
+    sensor = load_sensor(locate(camera, "calibration", ".toml"))
+    digital = digital_of(sensor, check_exposure(exposure_s)).model_dump(exclude_none=True)
+    stated = {"camera": {"name": sensor.name}, "n": n, "signed_capture": signed_capture, "digital": digital}
+    return validated(FrameList, stated, "stripes")
+
+
+def frame_name(index: int) -> str:
+    """Name of the frame of shot ``index`` among PNG files."""
+    return f"frame_{index:05d}.png"
+
+
+def picture_name(index: int) -> str:
+    """Path of the picture of shot ``index`` in the folder that holds it."""
+    return f"patterns/pattern_{index:05d}.png"
+
+
+def _check_cost(raster: Raster, pictures: int) -> None:
+    """MitsimError where so many ``pictures`` of a ``raster`` take more than a day, or than the memory that is free."""
+    pixels = raster.rows * raster.columns
+    cost = Cost(pictures * pixels * _SECONDS_PER_PIXEL, _PIXEL_BYTES * pixels)
+    cost.check(f"{pictures} pictures of {raster.rows} x {raster.columns} pixels", Limits())
+
+
+def draw(
+    folder: Path, light: Iterable[npt.NDArray[Any]], raster: Raster, sides: tuple[int, int], place: str
+) -> dict[str, Any]:
+    """Write a picture for each shot to `patterns/` in a folder that this process holds, and a black and a white one.
+
+    Parameters
+    ----------
+    folder
+        that holds `patterns/`.
+    light
+        (n, n') of 0 and 1 for each shot.
+    raster
+        of the projector.
+    sides
+        n and n'.
+    place
+        what the grid is of, for messages.
+
+    Returns
+    -------
+    dict
+        `rows`, `columns` of the projector, and the grid's place as of :func:`grid_in`.
+
+    Raises
+    ------
+    MitsimError
+        where a cell would have no pixel.
+    """
+    grid = grid_in(raster, sides, place)
+    (folder / "patterns").mkdir()
+    for index, shot in enumerate(light):
+        write_png(folder / picture_name(index), draw_picture(shot, grid, raster))
+    for name, level in (("black", 0), ("white", 1)):
+        write_png(folder / "patterns" / f"{name}.png", draw_picture(np.full(sides, level), grid, raster))
+    return {"rows": raster.rows, "columns": raster.columns, **grid}
+
+
+def grid_in(raster: Raster, sides: tuple[int, int], place: str) -> dict[str, Any]:
+    """Where the patterns' grid lies in a projector's raster: whole pixels a cell, in the middle.
+
+    On the scene a cell is square to :data:`SQUARE`, and of such cells as large as fits; where none is, it is the
+    squarest.
+
+    Parameters
+    ----------
+    raster
+        of the projector.
+    sides
+        rows and columns of the grid.
+    place
+        what the grid is of, for messages.
+
+    Returns
+    -------
+    dict
+        `cell`, `cell_columns`: rows and columns of a cell [pixels]; `cell_shape`: its width on the scene over its
+        height; `first_row`, `first_column` of the first cell.
+
+    Raises
+    ------
+    MitsimError
+        where a cell would have no pixel.
+    """
+    most = raster.rows // sides[0], raster.columns // sides[1]
+    if min(most) < 1:
+        raise MitsimError(
+            f"{place}: patterns of {sides[0]} x {sides[1]} pixels do not fit a projector of {raster.rows} rows x "
+            f"{raster.columns} columns; give a larger projector"
+        )
+    found: tuple[float, int, int] | None = None
+    for rows in range(most[0], 0, -1):
+        columns = min(max(round(rows / raster.aspect), 1), most[1])
+        off = abs(math.log(columns * raster.aspect / rows))
+        if found is None or (off < found[0] and found[0] > SQUARE):
+            found = off, rows, columns
+    if found is None:
+        raise AssertionError  # a row fits
+    _, rows, columns = found
+    return {
+        "cell": rows,
+        "cell_columns": columns,
+        "cell_shape": columns * raster.aspect / rows,
+        "first_row": (raster.rows - rows * sides[0]) // 2,
+        "first_column": (raster.columns - columns * sides[1]) // 2,
+    }
+
+
+def describe_cells(where: Mapping[str, Any]) -> str:
+    """How large a cell is, and its shape on the scene, of the place ``where`` of a grid as of :func:`grid_in`."""
+    rows, columns, shape = where["cell"], where["cell_columns"], where["cell_shape"]
+    size = f"{rows} pixels a side" if rows == columns else f"{rows} x {columns} pixels"
+    if abs(math.log(shape)) > SQUARE:
+        return f"{size}, {shape:.3g} times as wide as high on the scene, but square in an image"
+    return size if rows == columns else f"{size}, square on the scene"
+
+
+def draw_picture(light: npt.NDArray[Any], grid: Mapping[str, Any], raster: Raster) -> npt.NDArray[np.uint8]:
+    """A picture for the projector, (rows, columns), black around the grid.
+
+    Parameters
+    ----------
+    light
+        (n, n') of 0 and 1.
+    grid, raster
+        as of :func:`grid_in`.
+    """
+    picture = np.zeros((raster.rows, raster.columns), np.uint8)
+    cells = (_WHITE * light).astype(np.uint8).repeat(grid["cell"], axis=0).repeat(grid["cell_columns"], axis=1)
+    rows, columns = cells.shape
+    picture[grid["first_row"] :, grid["first_column"] :][:rows, :columns] = cells
+    return picture
+
+
+def pictures_of(patterns: Patterns, place: str) -> Iterator[npt.NDArray[Any]]:
+    """What the projector shows for each shot, (n, n') of 0 and 1, one at a time.
+
+    Parameters
+    ----------
+    patterns
+        and their shots.
+    place
+        of the run, for messages.
+
+    Raises
+    ------
+    MitsimError
+        for light between, which a projector's gamma changes.
+    """
+    left, right = patterns.matrices
+    if not np.isin(np.concatenate([left.ravel(), right.ravel()]), (-1, 0, 1)).all():
+        raise MitsimError(
+            f"{place}: patterns have values other than 0, 1 and -1, whose light a projector's gamma changes"
+        )
+    for shot in patterns.captures:
+        pattern = np.outer(left[:, shot.row], right[:, shot.column])
+        light = (1 + shot.sign * pattern) / 2 if shot.sign else pattern
+        if not np.isin(light, (0, 1)).all():
+            raise MitsimError(f"{place}: {shot.file} shows light other than 0 and 1, which a projector's gamma changes")
+        yield light
+
+
+def describe(patterns: Patterns, names: Sequence[str], where: Mapping[str, Any]) -> dict[str, Any]:
+    """What `patterns.json` says of a family.
+
+    Parameters
+    ----------
+    patterns
+        and their shots.
+    names
+        of the frames, one a shot.
+    where
+        the grid's place, as :func:`draw` gives it.
+    """
+    shots = [
+        {
+            "file": name,
+            "pattern": picture_name(index),
+            **shot.model_dump(include={"row", "column", "sign"}),
+        }
+        for index, (name, shot) in enumerate(zip(names, patterns.captures, strict=True))
+    ]
+    return {
+        "projector": where,
+        **patterns.model_dump(include={"family", "n", "P_L", "P_R"}),
+        "shots": shots,
+    }
+
+
+def write_png(path: Path, values: npt.NDArray[Any]) -> None:
+    """Write ``values`` (rows, columns) of 8 or 16 bits to ``path``. MitsimError where that is not possible."""
+    from PIL import Image
+
+    with whole_file(path) as part:
+        Image.fromarray(values).save(part, format="png")
+
+
+# -------- A run as PNG files
+
+_LARGEST = 2**16 - 1
+"""Of a PNG's numbers."""
+
+
+def write_pngs(
+    folder: Path, run: Packed[RunManifest] | Coloured[RunManifest], projector: str | None = None
+) -> tuple[str, ...]:
+    """Write the frames of a run, and its patterns as a projector shows them, to a new folder, whole or not at all.
+
+    Parameters
+    ----------
+    folder
+        to make: `frames/`, `patterns/`, `patterns.json`, and `ambient.npy` where an ambient frame was taken; of a
+        coloured run a folder of each line with these, and colour.json.
+    run
+        with digital numbers of up to 16 bits.
+    projector
+        name or TOML file; None: the run's own.
+
+    Returns
+    -------
+    tuple of str
+        how the frames are read again, and how large the patterns' cells are.
+
+    Raises
+    ------
+    MitsimError
+        for numbers that PNG cannot hold, patterns that are not of 0, 1 and -1, or a projector of unknown or too few
+        pixels.
+    """
+    if isinstance(run, Packed):
+        raster = _raster(run, projector)
+        with whole_folder(folder) as place:
+            where = _fill(place, run, raster)
+        return _read_again(folder, "RUN", "CAL", run.manifest), f"Patterns in cells of {describe_cells(where)}"
+    with whole_folder(folder) as place:
+        for name, shots in run.lines.items():
+            (place / name).mkdir()
+            where = _fill(place / name, shots, _raster(shots, projector))
+        write_text(place / COLOUR, run.text)
+    again = (_read_again(folder / name, f"RUN/{name}", f"CAL/{name}", run.lines[name].manifest) for name in run.lines)
+    return f"Begin with: mkdir RUN; cp {folder / COLOUR} RUN", *again, f"Patterns in cells of {describe_cells(where)}"
+
+
+def _fill(place: Path, run: Packed[RunManifest], raster: Raster) -> dict[str, Any]:
+    """Write a run's pictures to a folder that this process holds; returns the grid's place as :func:`draw` does."""
+    manifest = run.manifest
+    sides = tuple(len(matrix) for matrix in manifest.patterns.matrices)
+    pictures = pictures_of(manifest.patterns, str(run.place))
+    where = draw(place, pictures, raster, (sides[0], sides[1]), str(run.place))
+    (place / "frames").mkdir()
+    names = []
+    for index, (shot, channels, _) in enumerate(shots_of(run)):
+        dn = channels["DN"]
+        if dn.dtype != np.uint32 or int(dn.max()) > _LARGEST:
+            raise MitsimError(
+                f"{run.place / shot.file}: has {dn.dtype} numbers up to {dn.max():g}, and PNG holds whole ones up to "
+                f"{_LARGEST}; use the format hdf5"
+            )
+        names.append(frame_name(index))
+        write_png(place / "frames" / names[-1], dn.astype(np.uint16))
+    if manifest.ambient_frame is not None:
+        with whole_file(place / "ambient.npy") as part, part.open("wb") as file:
+            np.save(file, run.read(manifest.ambient_frame.file)[0]["DN"])
+    write_json(place / PATTERNS, describe(manifest.patterns, names, where))
+    return where
+
+
+def _read_again(folder: Path, run: str, calibration: str, manifest: RunManifest) -> str:
+    """How the frames in a ``folder`` become the RUN folder ``run`` again."""
+    again = f"--patterns {folder / PATTERNS} --exposure {manifest.digital.exposure_s!r}"
+    if manifest.ambient_frame is not None:
+        again += f" --ambient-frame {folder / 'ambient.npy'} --ambient-shots {manifest.ambient_frame.shots}"
+    frames = folder / "frames"
+    return f"Read again by: mitsim import {frames} {again} --camera NAME --calibration {calibration} -o {run}"
+
+
+def _raster(run: Packed[RunManifest], projector: str | None) -> Raster:
+    """That of the ``projector``, or of the one that took part in the ``run``."""
+    if projector is not None:
+        return Raster.of(projector)
+    known = run.manifest.configuration.get("projector_model")
+    return Raster.known(known if isinstance(known, dict) else {})

@@ -1,0 +1,463 @@
+"""Light of a scene and a camera in; exposures of any pattern family, and the images they come to, out.
+
+Twice: *rendered*, the light itself with calibrated factors, and *idealised*, the paper's model of the same scene with
+its own exact factors. Both have the same truth and sensor.
+
+Exposure conventions: *equal peak* exposes each family so that its brightest pixel fills the same part of the full well;
+*equal frame* gives every frame the exposure of uniform light; *equal total* shares that exposure among the family's
+frames. *A peak of 5600 electrons* is an equal peak that is dim.
+
+The idealised camera sees a planar scene lit evenly, no falloff, and with a geometric shadow one separable term: the
+yardstick beside rendered measurements. It takes the reflectance and the mean flux of the rendered bench, so exposure
+and noise are the same and only the model differs. Its shadows in several lights: how far from the geometric one, how
+far from one separable term.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from typing import Literal
+
+import numpy as np
+from scipy import sparse
+
+from mitsim.acquire.exposure import Exposer, is_taken, peak_irradiance, taken_off
+from mitsim.bench.bench import Apparatus
+from mitsim.bench.request import Exposure
+from mitsim.calibrate.lit_session import DARK, READ, ROUNDING, SHOT
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.mask import CameraMask
+from mitsim.devices.patterns import PatternFamily
+from mitsim.devices.projector import Spectrum
+from mitsim.light.light import SampledLight
+from mitsim.metrics import Quality, psnr, relative_error
+from mitsim.optics.frames import ExpectedFrames, Filed
+from mitsim.optics.image_formation import FrameOptics
+from mitsim.optics.separable import best_term, centred, relative_difference
+from mitsim.optics.shadow import Directions, SeparableTerms
+from mitsim.optics.terms import shadow_terms
+from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
+from mitsim.reconstruct.status import Solution
+from mitsim.report import EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, RENDERED
+from mitsim.sensor.chain import electrons_from_irradiance
+from mitsim.sensor.specimen import response_variance
+
+# -------- Light of a scene and a camera in
+
+NONUNIFORMITY, SPECKLE = "response nonuniformity", "speckle"
+"""Sources of noise beside those of :mod:`mitsim.calibrate.session`."""
+DIM_E = 5600
+"""Electrons of the brightest pixel with which the idealised model has the paper's decibels of uniform light and of 49
+dots, mask at 2000 um: 22.8 and 34.8 (`benchmarks/noise_reading.py --distance 2`)."""
+DIM = f"a peak of {DIM_E} electrons"
+LAMBDAS = tuple(float(relative) for relative in np.logspace(-14, 0, 57))
+"""Of the largest sigma^2: where none can be chosen by the data, the best of these, a quarter of a decade apart."""
+
+
+class LitScene:
+    """A bench in its light.
+
+    Parameters
+    ----------
+    light
+        by projector pixel.
+    """
+
+    def __init__(self, light: SampledLight) -> None:
+        self.light, self.bench = light, light.bench
+        self.uniform_s = cache(self._uniform_s)
+        """Exposure time [s] of uniform light at equal peak, by model."""
+
+    @property
+    def truth(self) -> FloatArray:
+        """(n, n) apparent reflectance."""
+        return self.light.truth
+
+    def quality(self, image: FloatArray) -> Quality:
+        """How near an ``image`` (n, n) is to the truth."""
+        return Quality.of(image, self.truth, self.light.apparent.error)
+
+    def expected(
+        self, model: str, family: PatternFamily, plane: Plane | None = None, bench: Apparatus | None = None
+    ) -> ExpectedFrames:
+        """Frames without noise.
+
+        Parameters
+        ----------
+        model
+            one of :data:`mitsim.report.MODELS`.
+        family
+            the patterns.
+        plane
+            where the idealised scene is; None: where the camera was calibrated.
+        bench
+            another mask in the same light; None: the scene's own.
+        """
+        if model == RENDERED:
+            light = self._merged if bench is None else self._merged.behind(bench)
+            return light.frames(family.lighting, self.light.seed)
+        camera = self._ideal if bench is None else IdealCamera(bench, bench.geometry.mask)
+        return camera.frames(family, self.truth * self.board_flux, plane)
+
+    def rendered(self, factors: Factors, family: PatternFamily, seed: int) -> Unexposed:
+        """Rendered frames with calibrated factors.
+
+        Parameters
+        ----------
+        factors
+            of the camera.
+        family, seed
+            the patterns, and seed of the noise.
+        """
+        sides = factors.left, factors.right
+        return Unexposed(self, RENDERED, family, sides, factors.manifest.centre, seed)
+
+    def idealised(self, family: PatternFamily, seed: int, plane: Plane | None = None) -> Unexposed:
+        """Frames of the paper's model, with its own factors.
+
+        Parameters
+        ----------
+        family, seed
+            the patterns, and seed of the noise, which is not that of rendered frames.
+        plane
+            where the scene is; None: where the factors are of.
+        """
+        camera = self._ideal
+        return Unexposed(self, IDEALISED, family, camera.calibrated(self.board_flux), camera.centre, seed + 1, plane)
+
+    def _uniform_s(self, model: str) -> float:
+        return peak_time(self.bench, self.expected(model, self.bench.family("uniform")))
+
+    @cached_property
+    def _merged(self) -> SampledLight:
+        return self.light.merged()
+
+    @cached_property
+    def _ideal(self) -> IdealCamera:
+        return IdealCamera(self.bench, self.bench.geometry.mask)
+
+    @property
+    def board_flux(self) -> float:
+        """That a projector pixel of a white board puts on the sensor without the mask [W m^-2], mean over pixels."""
+        return float(self.light.apparent.board_flux.mean())
+
+
+@dataclass(frozen=True, eq=False)
+class Unexposed:
+    """Frames of a scene under a family before any exposure, and the factors that make images of them.
+
+    Attributes
+    ----------
+    lit, model, family
+        the scene, one of :data:`mitsim.report.MODELS`, and the patterns.
+    sides, centre
+        left and right factor, and whether means are taken out of frames.
+    seed
+        of the sensor's noise.
+    plane
+        where an idealised scene is; None: where its factors are of.
+    """
+
+    lit: LitScene
+    model: str
+    family: PatternFamily
+    sides: tuple[FloatArray, FloatArray]
+    centre: bool
+    seed: int
+    plane: Plane | None = None
+
+    @cached_property
+    def expected(self) -> ExpectedFrames:
+        """The frames, without noise."""
+        return self.lit.expected(self.model, self.family, self.plane)
+
+    def seconds(self, exposure: str) -> float:
+        """Exposure time [s] of each frame by the convention ``exposure``, one of ``CONVENTIONS`` or :data:`DIM`."""
+        if exposure in (EQUAL_PEAK, DIM):
+            peak_e = Exposure().fraction * self.lit.bench.sensor.superpixel_full_well_e
+            return peak_time(self.lit.bench, self.expected) * (DIM_E / peak_e if exposure == DIM else 1.0)
+        return self.lit.uniform_s(self.model) / (len(self.family.shots) if exposure == EQUAL_TOTAL else 1)
+
+    def prepared(self, binning: int = 1) -> Prepared:
+        """The factorised model of frames whose pixels are averaged ``binning`` x ``binning``. MitsimError where such
+        squares do not fill a frame."""
+        rows, columns = (len(side) for side in self.sides)
+        if rows % binning or columns % binning:
+            raise MitsimError(
+                f"frames of {rows} x {columns} pixels: cannot be averaged {binning} x {binning}; give the scene's film "
+                f"multiples of {binning}"
+            )
+        left, right = (side.reshape(-1, binning, side.shape[1]).mean(axis=1) for side in self.sides)
+        return prepare(left, right, self.family.left, self.family.right, centre=self.centre)
+
+    def data(self, seconds: float, binning: int = 1) -> tuple[Prepared, Accumulator]:
+        """The factorised model, and one noisy exposure of all frames added up for it.
+
+        Parameters
+        ----------
+        seconds, binning
+            as for :meth:`solve`.
+        """
+        model = self.prepared(binning)
+        (sums,) = accumulate(self.exposer(seconds), self.family, self.expected, [model], binning)
+        return model, sums
+
+    def solve(self, seconds: float, lam: float | Literal["auto", "best"] = "auto", binning: int = 1) -> Solution:
+        """The image of one exposure.
+
+        Parameters
+        ----------
+        seconds
+            exposure time of each frame.
+        lam
+            lambda; best: that of :data:`LAMBDAS` which is nearest to the truth.
+        binning
+            pixels a side that are averaged.
+        """
+        model, sums = self.data(seconds, binning)
+        if lam != "best":
+            return model.solve(sums, lam)
+        scale, truth = model.problem(sums).scale, self.lit.truth
+        return max((model.solve(sums, scale * each) for each in LAMBDAS), key=lambda one: psnr(one.image, truth))
+
+    @single_threaded_blas()
+    def clear(self, lam: float) -> FloatArray:
+        """(n, n) image of the frames without noise, by a lambda ``lam``; lamps' light is taken off without any, too."""
+        model, exposer, expected = self.prepared(), self.exposer(1.0), self.expected
+        off = exposer.electrons(expected.projector_off) if is_taken("auto", self.family, expected) else 0.0
+        sums, positive = model.accumulator(), np.zeros(())
+        for shot, frame in zip(self.family.shots, expected, strict=True):
+            rate = exposer.electrons(frame) - off
+            if shot.sign == 1:
+                positive = rate
+            else:
+                sums.add(positive - rate if shot.sign else rate, shot.row, shot.column)
+        return model.solve(sums, lam).image
+
+    def exposer(self, seconds: float) -> Exposer:
+        """The camera, at an exposure time of so many ``seconds``."""
+        speckle = self.lit.light.speckle(self.family) if self.model == RENDERED else 0.0
+        return Exposer(self.lit.bench.rig, seconds, self.seed, speckle)
+
+    def noise(self, seconds: float) -> float:
+        """Standard deviation of a datum [electrons/s], rms over all frames, of exposures of so many ``seconds``."""
+        return float(np.sqrt(sum(self.noises(seconds).values())))
+
+    def noises(self, seconds: float) -> dict[str, float]:
+        """Its variance [(electrons/s)^2] by source, of exposures of so many ``seconds``.
+
+        What pixels' responses differ by is fixed, and counts as noise: factors know nothing of it.
+        """
+        exposer, sensor = self.exposer(seconds), self.lit.bench.sensor
+        light = [exposer.electrons(frame) for frame in self.expected]
+        square = float(np.mean([np.square(frame).mean() for frame in light]))
+        parts = {
+            SHOT: float(np.mean([frame.mean() for frame in light])),
+            DARK: sensor.superpixel_dark_current_e_per_s * seconds,
+            READ: sensor.superpixel_reading_noise_e**2,
+            ROUNDING: 0.0 if sensor.largest_dn is None else 1 / (12 * sensor.gain_dn_per_e**2),
+            NONUNIFORMITY: response_variance(sensor) * square,
+            SPECKLE: exposer.speckle**2 * square,
+        }
+        return {name: variance / seconds**2 for name, variance in parts.items()}
+
+
+def peak_time(bench: Apparatus, expected: ExpectedFrames) -> float:
+    """Exposure time [s] on ``bench`` at equal peak: the brightest pixel of the ``expected`` frames fills the default
+    part of the full well."""
+    return Exposure().choose(bench.rig, peak_irradiance(expected))
+
+
+def bin_frame(frame: FloatArray, binning: int) -> FloatArray:
+    """A ``frame`` (m, m') whose pixels are averaged ``binning`` x ``binning``, which divides both sides."""
+    if binning == 1:
+        return frame
+    rows, columns = (size // binning for size in frame.shape)
+    return np.asarray(frame.reshape(rows, binning, columns, binning).mean(axis=(1, 3)))
+
+
+def accumulate(
+    exposer: Exposer, family: PatternFamily, expected: ExpectedFrames, models: Sequence[Prepared], binning: int = 1
+) -> list[Accumulator]:
+    """One noisy exposure of a family's frames, ambient light taken off where there is some, added up for each model.
+
+    Parameters
+    ----------
+    exposer, family, expected, models
+        the camera and its exposure, patterns, their frames without noise, and what these are to be solved with.
+    binning
+        pixels a side that are averaged after the exposure.
+    """
+    sums = [model.accumulator() for model in models]
+    with single_threaded_blas():
+        ambient = taken_off(exposer, family, expected)
+        for measurement, row, column in exposer.measurements(family, expected):
+            frame = bin_frame(measurement - ambient, binning)
+            for each in sums:
+                each.add(frame, row, column)
+    return sums
+
+
+# -------- The paper's idealised camera
+
+BROADBAND_NM, BROADBAND_BANDS = (400.0, 700.0), 13
+"""What a camera with a usual filter sees, in bands of 23 nm, over which a shadow's fringes hardly move."""
+GEOMETRIC, LINE, PROJECTOR, BROADBAND = "no diffraction", "one line", "projector", "broadband"
+
+Pair = tuple[FloatArray, FloatArray]
+"""Left and right factor, (pixels, n) each."""
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane scene at ``depth_mm``, lit from ``baseline_mm`` beside the camera, along rows and columns (index
+    coordinates)."""
+
+    depth_mm: float
+    baseline_mm: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class IdealCamera:
+    """The idealised camera of a ``bench``, with one mask in one light (``spectrum`` None: the geometric shadow)."""
+
+    bench: Apparatus
+    mask: CameraMask
+    spectrum: Spectrum | None = None
+
+    @property
+    def centre(self) -> bool:
+        """Whether a solver takes row and column means off its frames."""
+        return self._geometry.centred
+
+    @cached_property
+    def terms(self) -> SeparableTerms:
+        """Its operator, from pixels that shine evenly."""
+        return self._terms(*self.directions)
+
+    def points(self) -> SeparableTerms:
+        """The same operator for point sources at the centres of the projector's pixels."""
+        rows, columns = (Directions(pixels.centres, 0.0) for pixels in self.directions)
+        return self._terms(rows, columns)
+
+    @cached_property
+    def factors(self) -> Pair:
+        """(pixels, n) left and right factor of the nearest separable operator, of transmissions."""
+        best = best_term(centred(self.terms) if self.centre else self.terms)
+        return best.left, best.right
+
+    def calibrated(self, board_flux: float) -> Pair:
+        """The same factors as a calibration has them [sqrt(electrons / s)], where each pixel of a white board puts
+        ``board_flux`` [W m^-2] on the sensor without the mask."""
+        model = self.bench.projector
+        rate = electrons_from_irradiance(board_flux, 1.0, self.bench.sensor, model.effective_wavelength_nm)
+        left, right = self.factors
+        return left * np.sqrt(rate), right * np.sqrt(rate)
+
+    def frames(self, family: PatternFamily, flux: FloatArray, plane: Plane | None = None) -> ExpectedFrames:
+        """Frames of a family.
+
+        Parameters
+        ----------
+        family
+            the patterns.
+        flux
+            (n, n) [W m^-2] that each projector pixel puts on the sensor without the mask.
+        plane
+            where the scene is; None: where the camera was calibrated.
+        """
+        light = sparse.csr_array(sparse.diags_array(flux.ravel()))
+        optics = self._optics if plane is None else self._optics_at(plane)
+        return ExpectedFrames([Filed(optics, (light,))], family.lighting, seed=0)
+
+    def _optics_at(self, plane: Plane) -> FrameOptics:
+        shift = 1 / plane.depth_mm - 1 / self.bench.geometry.scene_distance
+        rows, columns = (
+            Directions(pixels.centres + baseline * shift, pixels.width)
+            for pixels, baseline in zip(self.directions, plane.baseline_mm, strict=True)
+        )
+        return FrameOptics(self._geometry, rows, columns, (plane.depth_mm,), 1, self.spectrum)
+
+    @property
+    def _geometry(self) -> CameraGeometry:
+        return self.bench.geometry.model_copy(update={"mask": self.mask})
+
+    @property
+    def directions(self) -> tuple[Directions, Directions]:
+        """Of the projector's pixels, along rows and columns."""
+        rows, columns = (Directions.cells(np.linspace(*edges, self.bench.n + 1)) for edges in self.bench.windows)
+        return rows, columns
+
+    def _terms(self, rows: Directions, columns: Directions) -> SeparableTerms:
+        return shadow_terms(self._geometry, rows, columns, self.bench.geometry.scene_distance, self.spectrum)
+
+    @cached_property
+    def _optics(self) -> FrameOptics:
+        return FrameOptics(self._geometry, *self.directions, (self.bench.geometry.scene_distance,), 1, self.spectrum)
+
+
+@dataclass(frozen=True)
+class ShadowRow:
+    """One mask in one light against its geometric shadow; relative rms differences of operators, no unit.
+
+    ``terms``: separable terms of the operator. ``point_source`` and ``scene_pixel``: difference from the geometric
+    shadow, for point sources at the centres of projector pixels and averaged over these pixels. ``factor``: difference
+    of the factor that a solver uses on one side. ``separability``: what the best single separable term leaves of the
+    operator, and ``separability_centred`` once row and column means are taken off its frames.
+    """
+
+    mask: str
+    light: str
+    wavelengths: int
+    terms: int
+    point_source: float
+    scene_pixel: float
+    factor: float
+    separability: float
+    separability_centred: float
+
+
+def lights(bench: Apparatus) -> dict[str, Spectrum | None]:
+    """The study's lights on ``bench`` by name; None is light that does not diffract."""
+    edges = np.linspace(*BROADBAND_NM, BROADBAND_BANDS + 1)
+    return {
+        GEOMETRIC: None,
+        LINE: Spectrum(np.array([bench.projector.effective_wavelength_nm]), np.ones(1)),
+        PROJECTOR: bench.spectrum,
+        BROADBAND: Spectrum((edges[:-1] + edges[1:]) / 2, np.full(BROADBAND_BANDS, 1 / BROADBAND_BANDS)),
+    }
+
+
+def shadow_row(light: str, systems: Mapping[str, IdealCamera]) -> ShadowRow:
+    """The camera in one ``light`` of the ``systems`` of one mask, compared with the geometric one of them."""
+    system, geometric = systems[light], systems[GEOMETRIC]
+    factor, assumed = system.factors[0], geometric.factors[0]
+    # (left, right) and (-left, -right) are one camera.
+    sign = 1.0 if np.vdot(factor, assumed) >= 0 else -1.0
+    return ShadowRow(
+        mask=system.mask,
+        light=light,
+        wavelengths=len(system.spectrum.weights) if system.spectrum else 0,
+        terms=len(system.terms),
+        point_source=relative_difference(system.points(), geometric.points()),
+        scene_pixel=relative_difference(system.terms, geometric.terms),
+        factor=relative_error(sign * factor, assumed),
+        separability=best_term(system.terms).residual,
+        separability_centred=best_term(centred(system.terms)).residual,
+    )
+
+
+def point_profiles(bench: Apparatus) -> dict[str, FloatArray]:
+    """(pixels,) shadow of a point on the axis of ``bench`` down the rows of the sensor, through the separable mask, by
+    light."""
+    camera, axis = bench.geometry.model_copy(update={"mask": "separable"}), Directions(np.zeros(1), 0.0)
+    return {
+        name: best_term(shadow_terms(camera, axis, axis, camera.scene_distance, spectrum)).left[:, 0]
+        for name, spectrum in lights(bench).items()
+    }

@@ -1,1 +1,0 @@
-"""The accuracy study: what each part of the light costs and brings."""

@@ -1,0 +1,558 @@
+"""What the accuracy study found: rows, parts and the judge's own error in; JSON, text and figures out."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from mitsim.report.html import scientific
+from mitsim.report.plots import BLUE, FONT, GREY, LINK, VERMILION, WIDTH, label_axes, log_ticks, panels_of
+from mitsim.studies.framework.run import Findings
+
+SOLVER = "mitsim study solver"
+"""Where the part that no scene changes is measured."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One setting of one estimator.
+
+    Attributes
+    ----------
+    estimator, knob, setting
+        ``factored``: a whole run; ``reference``: all frames of the scene's own integrator.
+    spread
+        wall seconds; of the reference those of one frame, times their number.
+    error, mc_error
+        against the judge, whose noise is taken off, and the row's own Monte Carlo error.
+    accuracies
+        that lead to this run.
+    extrapolated
+        "" where all was measured; else what was not.
+    on_front
+        no other measured row is as good in less time.
+    """
+
+    estimator: str
+    knob: str
+    setting: str
+    spread: Spread
+    error: float
+    mc_error: float
+    accuracies: tuple[float, ...] = ()
+    extrapolated: str = ""
+    on_front: bool = False
+
+    def seconds_at(self, error: float) -> float:
+        """Seconds of an unbiased estimator for another ``error``: it falls with 1/sqrt(samples)."""
+        return self.spread.median * (self.error / error) ** 2
+
+    def reaching(self, error: float) -> Row:
+        """The row of the same estimator at the samples that would leave another ``error``."""
+        more = (self.error / error) ** 2
+        said = f"error falls with 1/sqrt(samples) from {self.setting}"
+        setting = f"{float(self.setting.split()[0]) * more:.0e} spp"
+        spread, noise = self.spread * more, self.mc_error / more**0.5
+        return replace(self, setting=setting, spread=spread, error=error, mc_error=noise, extrapolated=said)
+
+    def payload(self) -> dict[str, Any]:
+        """As JSON."""
+        known = {name: value for name, value in asdict(self).items() if name != "spread"}
+        return {**known, **times(self.spread), "extrapolated": bool(self.extrapolated), "by": self.extrapolated}
+
+    def line(self) -> str:
+        """For people."""
+        note = f"  extrapolated: {self.extrapolated}" if self.extrapolated else "  *" if self.on_front else ""
+        return (
+            f"{self.estimator:>9} {self.setting:<28} {self.spread!s:<36} error {self.error:.1e}  "
+            f"Monte Carlo {self.mc_error:.1e}{note}"
+        )
+
+
+@dataclass(frozen=True)
+class PartCost:
+    """One part left out where all others are in.
+
+    Attributes
+    ----------
+    name
+        an effect, ``anchors``, ``layers``, ``cells``, ``followed-anchors``, ``lines`` of the projector, or surfaces.
+    error_if_off, error_bound
+        what leaving it out changes in the frames, relative, by the pilot's looks (``lines``: by the judge's light); at
+        most, at 95 %.
+    with_it, without
+        seconds of transport and optics of all frames; None where that was not timed.
+    in_plan
+        whether the plan at the quoted accuracy has it.
+    of
+        the part that it is a share of; "" for one by itself.
+    """
+
+    name: str
+    error_if_off: float
+    error_bound: float
+    with_it: Spread | None
+    without: Spread | None
+    in_plan: bool
+    of: str = ""
+
+    @property
+    def label(self) -> str:
+        """Its name among all."""
+        return f"{self.of}: {self.name}" if self.of else self.name
+
+    @property
+    def extra(self) -> Extra | None:
+        """What it takes."""
+        return Extra.between(self.with_it, self.without) if self.with_it and self.without else None
+
+    @property
+    def cost(self) -> str:
+        """That in words."""
+        if self.extra is None:
+            return "not timed"
+        return f"{self.extra}, {'once' if self.repeats == 1 else f'{self.repeats} runs each'}"
+
+    @property
+    def repeats(self) -> int:
+        """Of the one that was measured less often."""
+        return min(self.with_it.repeats, self.without.repeats) if self.with_it and self.without else 0
+
+    def payload(self) -> dict[str, Any]:
+        """As JSON; ``seconds`` is None where noise hides it or nobody timed it."""
+        extra = self.extra
+        told = extra is not None and not extra.within_noise
+        return {
+            "name": self.name,
+            "error_if_off": self.error_if_off,
+            "error_bound": self.error_bound,
+            "seconds": extra.median if extra is not None and told else None,
+            "least_s": max(extra.least, 0.0) if extra else None,
+            "most_s": max(extra.most, 0.0) if extra else None,
+            "within_noise": None if extra is None else extra.within_noise,
+            "repeats": self.repeats,
+            "in_plan": self.in_plan,
+            "of": self.of,
+        }
+
+
+@dataclass(frozen=True)
+class JudgeFacts:
+    """How far the judge is to be trusted: Monte Carlo error, predicted discretisation, what it took."""
+
+    mc_error: float
+    systematic_error: float
+    seconds: float
+    seed: int
+
+    @property
+    def error(self) -> float:
+        """All in all."""
+        return float((self.mc_error**2 + self.systematic_error**2) ** 0.5)
+
+
+@dataclass(frozen=True)
+class AccuracyFindings(Findings):
+    """All that was measured, and what did not fit in the time.
+
+    Attributes
+    ----------
+    rows
+        whole runs, then the reference.
+    effects, parts_accuracy
+        parts, shares of one after it, and the accuracy whose samples they were timed with.
+    judge
+        what errors are held against.
+    sensor_noise
+        relative, at equal peak; None for a camera without a full well.
+    opening
+        seconds of starting and opening the scene, which every whole run counts; empty where nobody timed them.
+    speedup_at_equal_error
+        how much longer the reference would take for the error of the run at ``quoted``, over that run's transport and
+        optics; None where the reference was left out.
+    left_out
+        what did not fit, with the seconds that it was predicted to take.
+    quoted, took
+        the default accuracy, and seconds of the study.
+    """
+
+    rows: tuple[Row, ...]
+    effects: tuple[PartCost, ...]
+    parts_accuracy: float
+    judge: JudgeFacts
+    sensor_noise: float | None
+    opening: Mapping[str, float]
+    speedup_at_equal_error: float | None
+    left_out: tuple[str, ...]
+    quoted: float
+    took: float
+
+    def payload(self) -> dict[str, Any]:
+        """The JSON of the command line."""
+        return {
+            **{name: getattr(self, name) for name in ("sensor_noise", "speedup_at_equal_error", "left_out", "took")},
+            "rows": [row.payload() for row in self.rows],
+            "effects": [part.payload() for part in self.effects],
+            "parts_accuracy": self.parts_accuracy,
+            "judge": asdict(self.judge),
+            "opening": dict(self.opening),
+            "extrapolated": "rows whose `extrapolated` is true were not measured; `by` says what was",
+            "solver": SOLVER,
+        }
+
+    def lines(self) -> list[str]:
+        """For people."""
+        parts = [
+            f"{part.label:<27} error without it {part.error_if_off:.1e} (at 95 % below {part.error_bound:.1e}), "
+            f"time {part.cost}"
+            f"{'' if part.in_plan else f'; not in the plan at {self.quoted:g}'}"
+            for part in self.effects
+        ]
+        noise = [f"The sensor's noise is {self.sensor_noise:.1e} at equal peak."] if self.sensor_noise else []
+        at = f"At the error of the run at {self.quoted:g} the reference would take"
+        speedup, opening = self.speedup_at_equal_error, sum(self.opening.values())
+        equal = [f"{at} {speedup:.1e} times as long (extrapolated)."] if speedup else []
+        counted = f"opening the scene ({opening:.1f} s, once)" if opening else "planning (opening was not timed)"
+        return [
+            f"Whole runs, from {counted} to the last file; the reference, light alone:",
+            *(row.line() for row in self.rows),
+            "* nothing measured is as good in less time",
+            f"Parts of transport and optics, at the samples of {self.parts_accuracy:g}:",
+            *parts,
+            f"The judge's own error: Monte Carlo {self.judge.mc_error:.1e}, taken off above, discretisation "
+            f"predicted {self.judge.systematic_error:.1e} ({self.judge.seconds:.1f} s).",
+            *noise,
+            *equal,
+            *(f"Left out, too slow: {name}" for name in self.left_out),
+            f"What the solver's precision costs is the same for all scenes: {SOLVER}",
+        ]
+
+    def figures(self) -> dict[str, Figure]:
+        """Error against the time of whole runs, and what each part buys for how much."""
+        return {
+            "accuracy.png": front(self.rows, self.judge.error, self.sensor_noise),
+            "effects.png": parts(self.effects, self.parts_accuracy),
+        }
+
+
+# -------- Figures of the accuracy study
+
+_FAINT = "#f3f4f6"
+"""Behind the data: what no error can be told in."""
+_NARROW = 30.0
+"""Range of a logarithmic axis below which powers of ten alone leave one tick or none."""
+_FEWEST, _FEW, _MANY = 8.0, (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)
+"""Range below which more ticks are needed, and ticks in a decade above and below it."""
+_BESIDE, _BESIDE_PARTS = 0.2, 0.7
+"""Part of an axis that is left free for what stands beside its last point."""
+_ROOM = 2.0
+"""Factor between the smallest error and the lower end of the axis."""
+_ROW_IN, _AROUND_IN = 0.36, 1.3
+"""Inches of a row of the chart of parts, and of title and axes."""
+
+
+def front(rows: Sequence[Row], judge: float, noise: float | None) -> Figure:
+    """Error against time: whole runs on the left, the reference on the right, hollow where it is extrapolated.
+
+    Parameters
+    ----------
+    rows
+        whole runs, and those of the reference.
+    judge, noise
+        error of the judge, below which no error means anything, and the sensor's noise at equal peak.
+    """
+    runs = [row for row in rows if row.estimator == "factored"]
+    others = [row for row in rows if row.estimator != "factored"]
+    ratios = {"width_ratios": (3, 2)} if others else None
+    figure, (panels,) = panels_of(1, 2 if others else 1, 0.5 * WIDTH, gridspec_kw=ratios)
+    _draw(panels[0], runs, BLUE, "o")
+    titles = [f"whole runs, opening the scene to the last file\n{_counted(runs)}"]
+    if others:
+        _draw(panels[1], others, VERMILION, "s")
+        panels[1].plot([], [], "s", mfc="white", mec=VERMILION, label="extrapolated")
+        panels[1].legend(fontsize=FONT - 1, frameon=True, loc="lower left")
+        titles.append("reference, light alone\n(one frame was measured)")
+    for axes, title, shown in zip(panels, titles, (runs, others), strict=False):
+        errors = [row.error for row in shown]
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.margins(x=0.12)
+        low, high = axes.get_xlim()
+        axes.set_xlim(low, high * (high / low) ** _BESIDE)
+        axes.set_ylim(min(*errors, judge) / _ROOM, _ROOM * max(*errors, noise or 0.0))
+        axes.axhspan(axes.get_ylim()[0], judge, color=_FAINT, zorder=0)
+        if noise is not None:
+            axes.axhline(noise, color=GREY, lw=1.5, ls="--", zorder=1)
+        axes.set_title(title, fontsize=FONT)
+        low, high = axes.get_xlim()
+        log_ticks(axes, _FEW if high > _FEWEST * low else _MANY)
+        label_axes(axes, "wall time of all frames [s]", "")
+    panels[0].set_ylabel("relative error of the frames [1]", fontsize=FONT)
+    figure.suptitle("What accuracy costs in time", fontsize=FONT + 1)
+    said = {"error of what all is compared with": judge}
+    said |= {"sensor noise, exposure equal peak": noise} if noise is not None else {}
+    for text, error in said.items():
+        where: Any = panels[0].get_yaxis_transform()
+        style = {"fontsize": FONT - 2, "color": GREY, "xycoords": where, "textcoords": "offset points"}
+        panels[0].annotate(f"{text}: {scientific(error)}", (0.01, error), (2, 3), **style)
+    return figure
+
+
+def parts(costs: Sequence[PartCost], accuracy: float) -> Figure:
+    """What each part buys, and what it takes: the error that is left without it, and beside it the seconds where any
+    part was timed, row by row.
+
+    Parameters
+    ----------
+    costs
+        of parts, those first that matter most; shares of one stand after it.
+    accuracy
+        whose samples they were timed with.
+    """
+    timed = any(part.extra is not None for part in costs)
+    figure, (panels,) = panels_of(1, 1 + timed, _AROUND_IN + _ROW_IN * max(len(costs), 1), sharey=True)
+    places = range(len(costs))[::-1]
+    errors = panels[0]
+    figure.suptitle(f"What each part of the light buys{', and what it takes' if timed else ''}", fontsize=FONT + 1)
+    told = [part.error_if_off for part in costs if part.error_if_off > 0]
+    floor = min(told, default=1e-6) / 3
+    spans = [part.extra.most for part in costs if part.extra is not None and part.extra.most > 0]
+    shortest = min(spans, default=0.01) / 10
+    for place, part in zip(places, costs, strict=True):
+        face = BLUE if part.in_plan else "white"
+        dot = {"color": BLUE, "mfc": face, "ms": 6 if part.of else 8, "zorder": 3}
+        if part.error_if_off > 0:
+            errors.plot([floor, part.error_if_off], [place, place], color=LINK, lw=2, zorder=1)
+            errors.plot([part.error_if_off, part.error_bound], [place, place], "|-", color=BLUE, lw=1, zorder=2)
+            errors.plot([part.error_if_off], [place], "o", **dot)
+            _beside(errors, part.error_bound, place, scientific(part.error_if_off))
+        else:
+            _beside(errors, floor, place, "none")
+        if timed:
+            _draw_seconds(panels[1], part, place, shortest)
+    for axes, title in zip(panels, ("error that is left without it", "seconds that it takes"), strict=False):
+        axes.set_xscale("log")
+        axes.set_title(title, fontsize=FONT)
+        axes.margins(x=0.05)
+        low, high = axes.get_xlim()
+        axes.set_xlim(low, high * (high / low) ** _BESIDE_PARTS)
+    errors.set_yticks(list(places), [part.label for part in costs], fontsize=FONT)
+    errors.set_ylim(-0.7, len(costs) - 0.3)
+    label_axes(errors, "relative error of the frames [1]", "", grid="x")
+    if timed:
+        label_axes(panels[1], f"wall time of light and frames at {accuracy:g} [s]", "", grid="x")
+    if any(part.error_bound > part.error_if_off for part in costs):
+        errors.plot([], [], "|-", color=BLUE, lw=1, label="below this at 95 %")
+    if not all(part.in_plan for part in costs):
+        errors.plot([], [], "o", color=BLUE, mfc="white", ms=8, label="left out by the plan")
+    if errors.get_legend_handles_labels()[0]:
+        figure.legend(fontsize=FONT - 1, frameon=False, loc="outside lower center", ncols=2)
+    return figure
+
+
+def _draw_seconds(axes: Axes, part: PartCost, place: int, shortest: float) -> None:
+    """What a ``part`` takes, in the row at ``place``; lines begin at ``shortest``."""
+    extra = part.extra
+    if extra is None:
+        axes.plot([shortest], [place], ls="")  # an axis that holds the words
+        _beside(axes, shortest, place, "not timed")
+    elif extra.within_noise:
+        most = max(extra.most, shortest)
+        axes.plot([shortest, most], [place, place], color=LINK, lw=2, ls=":", zorder=1)
+        _beside(axes, most, place, "within noise" + (f", below {extra.most:.1g} s" if extra.most > 0 else ""))
+    else:
+        axes.plot([extra.least, extra.most], [place, place], color=VERMILION, lw=2, zorder=2)
+        axes.plot([extra.median], [place], "o", color=VERMILION, ms=6 if part.of else 8, zorder=3)
+        _beside(axes, extra.most, place, f"{extra.median:.2g} s")
+
+
+def _draw(axes: Axes, rows: Sequence[Row], colour: str, marker: str) -> None:
+    """Points with the spread of their time, joined; extrapolated ones hollow, with their settings beside them."""
+    ordered = sorted(rows, key=lambda row: -row.error)
+    alike = len({row.spread.repeats for row in rows}) == 1
+    axes.plot(
+        [row.spread.median for row in ordered],
+        [row.error for row in ordered],
+        color=colour,
+        lw=1.0,
+        ls=":" if any(row.extrapolated for row in rows) else "-",
+        zorder=2,
+    )
+    for row in ordered:
+        spread = row.spread
+        around = np.array([[spread.median - spread.least], [spread.most - spread.median]])
+        face = "white" if row.extrapolated else colour
+        style: dict[str, Any] = {"fmt": marker, "color": colour, "mfc": face, "ms": 8, "capsize": 3, "zorder": 3}
+        axes.errorbar([spread.median], [row.error], xerr=around, **style)
+        said = row.setting.removeprefix("accuracy ") + ("" if alike else f" ({_times(spread.repeats)})")
+        axes.annotate(said, (spread.median, row.error), (6, 6), textcoords="offset points", fontsize=FONT - 2)
+
+
+def _counted(rows: Sequence[Row]) -> str:
+    """What the points stand for."""
+    repeats = {row.spread.repeats for row in rows}
+    if repeats == {1}:
+        return "(each once; beside it the accuracy asked for)"
+    return "(median, least and most; beside it the accuracy asked for)"
+
+
+def _times(repeats: int) -> str:
+    return "once" if repeats == 1 else f"{repeats} runs"
+
+
+def _beside(axes: Axes, at: float, place: float, text: str) -> None:
+    axes.annotate(text, (at, place), (8, 0), textcoords="offset points", va="center", fontsize=FONT - 1)
+
+
+# -------- Repeated times in, what they tell out
+
+ROUNDS = 3
+"""Fewest repeats that have a middle between a least and a most."""
+_ALIKE = 0.1
+"""Part of a time that two single runs of the same work differ by on an idle machine, and more on a busy one."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Seconds of so many ``repeats`` of the same work: ``median``, ``least`` and ``most``."""
+
+    median: float
+    least: float
+    most: float
+    repeats: int
+
+    @classmethod
+    def of(cls, seconds: Sequence[float]) -> Spread:
+        """Of measured ``seconds``, at least one."""
+        return cls(statistics.median(seconds), min(seconds), max(seconds), len(seconds))
+
+    def __add__(self, more: float) -> Spread:
+        return Spread(self.median + more, self.least + more, self.most + more, self.repeats)
+
+    def __mul__(self, factor: float) -> Spread:
+        return Spread(self.median * factor, self.least * factor, self.most * factor, self.repeats)
+
+    def __str__(self) -> str:
+        if self.repeats == 1:
+            return f"{self.median:.3g} s (once)"
+        return f"{self.median:.3g} s ({self.least:.3g} to {self.most:.3g}, {self.repeats} runs)"
+
+
+@dataclass(frozen=True)
+class Extra:
+    """Seconds that work takes beyond work without a part of it: a difference of two spreads.
+
+    ``least`` and ``most`` are the ends that both spreads allow. Where ``least`` is not above 0 the part costs nothing
+    that these repeats could tell.
+    """
+
+    median: float
+    least: float
+    most: float
+
+    @classmethod
+    def between(cls, with_it: Spread, without: Spread) -> Extra:
+        """The difference of two spreads; single runs may be a tenth off either way.
+
+        Parameters
+        ----------
+        with_it, without
+            of the same work with and without the part.
+        """
+        wide, narrow = (_widened(each) for each in (with_it, without))
+        return cls(with_it.median - without.median, wide.least - narrow.most, wide.most - narrow.least)
+
+    @property
+    def within_noise(self) -> bool:
+        """Whether the difference may be chance."""
+        return self.least <= 0
+
+    def __str__(self) -> str:
+        if self.within_noise:
+            return f"within noise (at most {max(self.most, 0.0):.2g} s)"
+        return f"{self.median:.2g} s ({self.least:.2g} to {self.most:.2g})"
+
+
+def _widened(spread: Spread) -> Spread:
+    """A single run with the spread that it was not given."""
+    if spread.repeats > 1:
+        return spread
+    return Spread(spread.median, (1 - _ALIKE) * spread.median, (1 + _ALIKE) * spread.median, 1)
+
+
+@dataclass
+class Timed:
+    """Work that can be done ``again``, which gives its seconds, and the ``seconds`` of each time so far."""
+
+    again: Callable[[], float]
+    seconds: list[float] = field(default_factory=list)
+
+    @property
+    def spread(self) -> Spread:
+        """Of what was measured."""
+        return Spread.of(self.seconds)
+
+
+class Budget:
+    """Wall seconds that a study may take, from now on, and what did not fit in them.
+
+    ``seconds`` is all that it may take; ``slower`` what work takes here over what it is predicted to, by what was seen.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
+        self._started = time.perf_counter()
+        self.left_out: list[str] = []
+        self.slower = 1.0
+
+    @property
+    def left(self) -> float:
+        """Seconds that are left."""
+        return self.seconds - (time.perf_counter() - self._started)
+
+    def saw(self, taken: float, predicted: float) -> None:
+        """Work has ``taken`` so many seconds and was ``predicted`` to take others; a faster machine is not believed."""
+        self.slower = max(taken / predicted, 1.0)
+
+    def allows(self, name: str, seconds: float, share: float = 1.0, kept: float = 0.0) -> bool:
+        """Whether work of so many predicted seconds fits; what does not is kept under its ``name``.
+
+        Parameters
+        ----------
+        name, seconds
+            of the work.
+        share, kept
+            part of what is left that it may take, less seconds that are kept for other work.
+        """
+        left = share * self.left - kept
+        if seconds <= left:
+            return True
+        self.left_out.append(f"{name} (predicted {seconds:.0f} s, {max(left, 0.0):.0f} s were left)")
+        return False
+
+    def repeat(self, works: Iterable[Timed]) -> None:
+        """Do all ``works`` again, round by round, so that a busy moment does not fall on one alone, and the shortest
+        first, as long as there is time."""
+        ordered = sorted(works, key=lambda work: work.spread.median)
+        for _ in range(ROUNDS - 1):
+            for work in ordered:
+                if work.spread.most <= self.left:
+                    work.seconds.append(work.again())
+
+
+def times(spread: Spread) -> dict[str, float | int]:
+    """A ``spread`` as JSON rows hold it: ``seconds``, ``least_s``, ``most_s``, ``repeats``."""
+    found = asdict(spread)
+    return {
+        "seconds": found["median"],
+        "least_s": found["least"],
+        "most_s": found["most"],
+        "repeats": found["repeats"],
+    }

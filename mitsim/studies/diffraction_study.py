@@ -1,0 +1,390 @@
+"""`mitsim study diffraction`: what the mask's diffraction does to separability, and to a model that leaves it out.
+
+Three questions, for both masks and for light of one line, the projector's lines and a broad band:
+
+* How far is the wave-optical shadow from the geometric one?
+* How far is it from one separable term, all that a calibration can find and a separable solver can use?
+* What does an image lose whose solver assumes the geometric mask, and what one with factors of the true shadow?
+
+The last is asked of idealised frames (an evenly lit plane without falloff, :mod:`mitsim.report.lit_scene`), so that
+only diffraction differs from the model, and once of rendered ones: the scene's own mask, the projector's lines, a
+rendered calibration session. Every family is exposed at equal peak, with the camera's noise. Light of the scene and of
+the session's board is traced once, and formed with either shadow.
+
+The slanted edge is ISO 12233's: the edge's place is fitted row by row, all pixels are put in order of their distance
+from it, four bins a pixel, and the spectrum of the derivative is the modulation transfer function.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from textwrap import fill
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+
+from mitsim.acquire.exposure import Exposer
+from mitsim.api.bench import Bench
+from mitsim.bench.request import Exposure, Request
+from mitsim.calibrate.calibrate import estimate
+from mitsim.calibrate.lit_session import LitSession
+from mitsim.calibrate.session import Session
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.core.job import Job
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.devices.mask import CameraMask
+from mitsim.devices.patterns import PatternFamily
+from mitsim.devices.session import load_recipe
+from mitsim.light.light import SampledLight
+from mitsim.metrics import Quality, psnr
+from mitsim.optics.frames import ExpectedFrames
+from mitsim.reconstruct.solver import prepare
+from mitsim.report import plots
+from mitsim.report.lit_scene import (
+    GEOMETRIC,
+    LINE,
+    PROJECTOR,
+    IdealCamera,
+    Pair,
+    ShadowRow,
+    accumulate,
+    lights,
+    peak_time,
+    point_profiles,
+    shadow_row,
+)
+from mitsim.studies.ablation import reform
+from mitsim.studies.framework.run import Findings
+
+MASKS: tuple[CameraMask, ...] = ("separable", "flatcam")
+ASSUMED, SEPARABLE, CALIBRATED = "geometric factors", "best separable factors", "calibrated factors"
+_PROFILE_MM = 0.7
+"""Half of what is shown of a point's shadow: a dozen mask features, whose fringes can be told apart."""
+_LAMBDAS = tuple(10.0 ** (-step / 2) for step in range(17))
+"""Relative to the largest sigma^2, down to where rounding begins to show; PSNR changes little over half a decade."""
+
+
+@dataclass(frozen=True)
+class QualityRow:
+    """One reconstruction: which frames (idealised or rendered) in which light, and which factors the solver used.
+
+    ``psnr_db`` and ``ssim`` are of the image with the solver's own lambda, ``psnr_best_db`` of the best lambda that a
+    judge who knows the truth can choose: an unbiased risk estimate is misled by factors that are wrong. ``residual`` is
+    ||Y - model|| / ||Y||: the sensor's noise, and what the factors cannot explain. ``captures`` counts frames.
+    """
+
+    frames: str
+    mask: str
+    light: str
+    patterns: str
+    factors: str
+    captures: int
+    psnr_db: float
+    psnr_best_db: float
+    ssim: float | None
+    lam: float
+    residual: float
+    status: str
+
+
+@dataclass(frozen=True, eq=False)
+class DiffractionFindings(Findings):
+    """All rows, and the difference in PSNR that each choice of factors makes; figures are of ``patterns``."""
+
+    bench: Bench
+    patterns: str
+    shadows: tuple[ShadowRow, ...]
+    quality: tuple[QualityRow, ...]
+
+    def loss_db(self, row: QualityRow) -> float:
+        """PSNR [dB] lost in a ``row`` against the same frames without diffraction, solved with the factors that fit."""
+        fitting = CALIBRATED if row.frames == "rendered" else ASSUMED
+        return self.row(row.frames, row.mask, GEOMETRIC, row.patterns, fitting).psnr_db - row.psnr_db
+
+    def row(self, *case: str) -> QualityRow:
+        """The row of a ``case``: frames, mask, light, patterns, factors."""
+        return next(row for row in self.quality if (row.frames, row.mask, row.light, row.patterns, row.factors) == case)
+
+    def payload(self) -> dict[str, Any]:
+        """The JSON of the command line."""
+        return {
+            "shadows": [asdict(row) for row in self.shadows],
+            "quality": [{**asdict(row), "loss_db": self.loss_db(row)} for row in self.quality],
+        }
+
+    def lines(self) -> list[str]:
+        """For people."""
+        shadows = [
+            f"{row.mask:>10} {row.light:<14} off the geometric shadow by {row.point_source:5.1%} (point), "
+            f"{row.scene_pixel:5.1%} (scene pixel); off one separable term by {row.separability:.1e}, centred "
+            f"{row.separability_centred:.1e}"
+            for row in self.shadows
+        ]
+        quality = [
+            f"{row.frames:>10} {row.mask:<10} {row.light:<14} {row.patterns:<8} {row.factors:<22} "
+            f"{row.psnr_db:5.1f} dB, {row.psnr_best_db:5.1f} dB with the best lambda; residual {row.residual:.1e}"
+            for row in self.quality
+        ]
+        return [*shadows, *quality, f"{self.verdict}."]
+
+    @property
+    def verdict(self) -> str:
+        """What idealised frames of the separable mask in the projector's light say, in one clause."""
+        case = "idealised", MASKS[0], PROJECTOR, self.patterns
+        wrong, right = (self.loss_db(self.row(*case, factors)) for factors in (ASSUMED, SEPARABLE))
+        verb = "lose" if right > 0 else "gain"
+        return (
+            f"Under {self.patterns}, against a mask that does not diffract: geometric factors lose {wrong:.1f} dB, "
+            f"factors of the true shadow {verb} {abs(right):.1f} dB"
+        )
+
+    def figures(self) -> dict[str, Figure]:
+        """Image quality by the solver's factors, and shadows of a point."""
+        quality = [
+            (f"{row.frames}, {row.mask},\n{row.light}", row.factors, row.psnr_db)
+            for row in self.quality
+            if row.patterns == self.patterns
+        ]
+        profiles = point_profiles(self.bench)
+        # It lies on the projector's lines, to the width of a plotted line.
+        del profiles[LINE]
+        off = next(row for row in self.shadows if (row.mask, row.light) == (MASKS[0], PROJECTOR))
+        message = f"A point's shadow in the projector's light is {100 * off.point_source:.0f} % off the geometric one"
+        position = self.bench.geometry.centres(0)
+        return {
+            "quality.png": quality_by_factors(quality, self.verdict),
+            "shadow.png": shadow_profiles(position, profiles, _PROFILE_MM, message),
+        }
+
+
+def measure(bench: Bench, request: Request, job: Job) -> DiffractionFindings:
+    """Shadows, and reconstructions under the patterns asked for and under uniform light.
+
+    MitsimError for patterns that do not fit, a camera without a full well, or a scene without light.
+
+    Parameters
+    ----------
+    bench, request, job
+        the scene, patterns, seed and accuracy (diffraction is on, whatever it is worth), progress and limits.
+    """
+    Exposure().check(bench.sensor, bench.rig.camera_file)
+    request = request.changed(effects={**request.effects, "diffraction": True})
+    families = [bench.family(name, request.seed) for name in dict.fromkeys((request.patterns, "uniform"))]
+    light = bench.light(job=job, **request.model_dump())
+    trials = _Trials(families, light.truth, float(light.apparent.board_flux.mean()), request.seed)
+    shadows, quality = [], []
+    for done, mask in enumerate(MASKS):
+        job.progress("idealised frames", done / len(MASKS))
+        cameras = {name: IdealCamera(bench, mask, spectrum) for name, spectrum in lights(bench).items()}
+        shadows += [shadow_row(name, cameras) for name in cameras]
+        quality += list(trials.idealised(cameras))
+    job.progress("rendered session", 0.0)
+    quality += list(trials.rendered(light, request.accuracy, job))
+    return DiffractionFindings(bench, request.patterns, tuple(shadows), tuple(quality))
+
+
+@dataclass(frozen=True, eq=False)
+class _Trials:
+    """Reconstructions of one scene under a few families: its truth, and the board's mean flux a pixel [W m^-2]."""
+
+    families: list[PatternFamily]
+    truth: FloatArray
+    flux: float
+    seed: int
+
+    def idealised(self, cameras: Mapping[str, IdealCamera]) -> Iterator[QualityRow]:
+        """Frames of an evenly lit plane in every light, solved with geometric factors and with the true shadow's."""
+        for name, camera in cameras.items():
+            known = {ASSUMED: cameras[GEOMETRIC].calibrated(self.flux)}
+            if name != GEOMETRIC:
+                known[SEPARABLE] = camera.calibrated(self.flux)
+            for family in self.families:
+                expected = camera.frames(family, self.truth * self.flux)
+                exposer = Exposer(camera.bench.rig, peak_time(camera.bench, expected), self.seed)
+                yield from self._rows(("idealised", camera.mask, name), exposer, family, expected, known)
+
+    def rendered(self, light: SampledLight, accuracy: float, job: Job) -> Iterator[QualityRow]:
+        """Rendered frames of the scene, solved with geometric factors and with those of a rendered noisy session.
+
+        Without diffraction the same light of scene and board goes through the geometric shadow.
+        """
+        bench = light.bench
+        mask = bench.geometry.mask
+        session = Session(bench, load_recipe(), self.seed)
+        board = session.trace(session.plan(accuracy, job), job)
+        assumed = IdealCamera(bench, mask).calibrated(self.flux)
+        for name, absent in ((PROJECTOR, frozenset[str]()), (GEOMETRIC, frozenset({"diffraction"}))):
+            scene = reform(light, absent).merged()
+            fitted, _ = estimate(LitSession.of(session, reform(board, absent), job), job)
+            known = {ASSUMED: assumed, CALIBRATED: (fitted.left, fitted.right)}
+            for family in self.families:
+                expected = scene.frames(family.lighting, self.seed)
+                speckle = scene.speckle(family)
+                exposer = Exposer(bench.rig, peak_time(bench, expected), self.seed, speckle)
+                yield from self._rows(("rendered", mask, name), exposer, family, expected, known)
+
+    def _rows(
+        self,
+        case: tuple[str, CameraMask, str],
+        exposer: Exposer,
+        family: PatternFamily,
+        expected: ExpectedFrames,
+        known: Mapping[str, Pair],
+    ) -> Iterator[QualityRow]:
+        """One noisy exposure of a family, solved with each pair of factors."""
+        frames, mask, light = case
+        models = [prepare(*pair, family.left, family.right, centre=mask == "flatcam") for pair in known.values()]
+        for factors, model, sums in zip(known, models, accumulate(exposer, family, expected, models), strict=True):
+            solution = model.solve(sums, "auto")
+            quality = Quality.of(solution.image, self.truth)
+            largest = (model.left.singular.max() * model.right.singular.max()) ** 2
+            with single_threaded_blas():
+                best = max(psnr(model.solve(sums, largest * part).image, self.truth) for part in _LAMBDAS)
+            yield QualityRow(
+                frames=frames,
+                mask=mask,
+                light=light,
+                patterns=family.name,
+                factors=factors,
+                captures=len(family.shots),
+                psnr_db=quality.psnr_db,
+                psnr_best_db=max(quality.psnr_db, best),
+                ssim=quality.ssim,
+                lam=solution.lam,
+                residual=solution.residual,
+                status=str(solution.status),
+            )
+
+
+# -------- Figures
+
+_TITLE_LETTERS = 100
+"""Of a line above a figure of the page's width."""
+
+
+def quality_by_factors(rows: Sequence[tuple[str, str, float]], message: str) -> Figure:
+    """PSNR [dB] of each system by the factors that its solver used, ``rows`` (system, factors, PSNR), first on top;
+    ``message`` above."""
+    systems = list(dict.fromkeys(system for system, _, _ in rows))[::-1]
+    factors = list(dict.fromkeys(name for _, name, _ in rows))
+    figure, axes = plots.figure_of(1.3 + 0.46 * len(systems))
+    for place, system in enumerate(systems):
+        values = [value for name, _, value in rows if name == system]
+        axes.plot([min(values), max(values)], [place, place], color=plots.LINK, lw=2, zorder=1)
+    for index, name in enumerate(factors):
+        points = [(value, systems.index(system)) for system, kind, value in rows if kind == name]
+        style = {
+            "color": (plots.VERMILION, plots.BLUE, plots.GREEN)[index % 3],
+            "marker": plots.MARKERS[index % len(plots.MARKERS)],
+        }
+        axes.plot(*zip(*points, strict=True), ls="", ms=8, label=name, zorder=3, **style)
+    axes.set_yticks(range(len(systems)), systems, fontsize=plots.FONT - 2)
+    plots.label_axes(axes, "PSNR of the image [dB]", "", grid="x")
+    figure.suptitle(fill(message, _TITLE_LETTERS), fontsize=plots.FONT)
+    plots.legend_below(figure, len(factors), *axes.get_legend_handles_labels())
+    return figure
+
+
+def shadow_profiles(
+    position_mm: npt.ArrayLike, profiles: Mapping[str, npt.ArrayLike], reach_mm: float, message: str
+) -> Figure:
+    """Shadows on one row of the sensor.
+
+    Parameters
+    ----------
+    position_mm, profiles
+        (pixels,) along the row, and relative irradiance there by light.
+    reach_mm, message
+        how far from the middle of the ``position_mm`` is shown, and what is said above.
+    """
+    figure, axes = plots.figure_of(0.4 * plots.WIDTH)
+    position = np.asarray(position_mm, dtype=np.float64)
+    inside = np.abs(position - position.mean()) <= reach_mm
+    for index, (name, values) in enumerate(profiles.items()):
+        axes.plot(position[inside], np.asarray(values)[inside], lw=1.8, label=name, **plots.line_style(index))
+    axes.set_title(message, fontsize=plots.FONT)
+    plots.label_axes(axes, "position on the sensor [mm]", "irradiance, open sensor = 1 [1]")
+    axes.legend(fontsize=plots.FONT - 1, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
+    return figure
+
+
+# -------- Images of bars and of a slanted edge in, how much contrast is left by spatial frequency out
+
+_BINS = 4
+"""Bins a pixel along the edge's normal, as the standard has them."""
+_LEAST_STEP = 0.05
+"""Least step of reflectance that an edge is looked for at."""
+
+
+def contrast(image: FloatArray, axis: int) -> float:
+    """(I_max - I_min) / (I_max + I_min) of an ``image`` of bars, averaged along them, which lie along ``axis``.
+
+    The paper's definition; above 1 where the least is negative.
+    """
+    profile = image.mean(axis=axis)
+    high, low = float(profile.max()), float(profile.min())
+    return (high - low) / (high + low)
+
+
+def modulation(image: FloatArray, axis: int, frequency: float) -> float:
+    """Contrast of an image of bars at their own frequency, which noise of others does not feign.
+
+    Amplitude over mean of the fundamental of the profile across the bars; a square wave of contrast c has 4 c / pi.
+
+    Parameters
+    ----------
+    image, axis
+        as for :func:`contrast`.
+    frequency
+        cycles a pixel.
+    """
+    profile = image.mean(axis=axis)
+    phase = 2 * np.pi * frequency * np.arange(len(profile))
+    waves = np.stack([np.cos(phase), np.sin(phase), np.ones(len(profile))], axis=1)
+    cosine, sine, mean = np.linalg.lstsq(waves, profile, rcond=None)[0]
+    return float(np.hypot(cosine, sine) / mean * np.pi / 4)
+
+
+def slanted_edge(image: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Modulation transfer function of an ``image`` (rows, columns) of one edge, a few degrees off its columns.
+
+    Returns frequencies [cycles a pixel], up to half a cycle, and the transfer, 1 at zero; without that of the bins and
+    of the difference that stands for the derivative.
+
+    Raises
+    ------
+    MitsimError
+        for an image without an edge from left to right.
+    """
+    rows, columns = image.shape
+    centres: FloatArray = np.arange(columns, dtype=np.float64) + 0.5
+    between: FloatArray = centres[:-1] + 0.5
+    if abs(float(image[:, -columns // 4 :].mean() - image[:, : columns // 4].mean())) < _LEAST_STEP:
+        raise MitsimError("slanted edge: the image has no step from left to right")
+    slopes = np.diff(image, axis=1)
+    line = np.polyfit(np.arange(rows), [_centroid(slope, between) for slope in slopes], 1)
+    # Once more about the first line, so that noise far from the edge does not move it.
+    near = np.exp(-np.square((between - np.polyval(line, np.arange(rows))[:, None]) / 8))
+    places = [_centroid(np.asarray(slope), between) for slope in slopes * near]
+    line = np.polyfit(np.arange(rows), places, 1)
+    distance = (centres - np.polyval(line, np.arange(rows))[:, None]) / np.hypot(1, line[0])
+    bins = np.floor(distance * _BINS).astype(int).ravel()
+    half = _BINS * (columns // 4)
+    inside = (bins >= -half) & (bins < half)
+    count = np.bincount(bins[inside] + half, minlength=2 * half)
+    edge = np.bincount(bins[inside] + half, image.ravel()[inside], 2 * half) / np.maximum(count, 1)
+    spread = np.diff(edge) * np.hanning(2 * half - 1)
+    spectrum = np.abs(np.fft.rfft(spread))
+    frequency = np.fft.rfftfreq(len(spread)) * _BINS
+    own = np.sinc(frequency / _BINS) ** 2
+    kept = frequency <= 0.5
+    return np.asarray(frequency[kept], dtype=np.float64), np.asarray(spectrum[kept] / spectrum[0] / own[kept])
+
+
+def _centroid(weights: FloatArray, places: FloatArray) -> float:
+    squares = np.square(weights)
+    return float((squares * places).sum() / squares.sum())

@@ -1,1 +1,0 @@
-"""What moves between calibration and capture, and what it costs an image."""

@@ -1,0 +1,360 @@
+"""Quantities with standard errors in; what becomes of a claim out: confirmed, not confirmed, or not decided.
+
+A claim is that a quantity, such as the difference of two mean PSNR, lies in a range. It holds where the quantity's
+confidence interval lies in the range, fails where the interval lies outside, and is not decided where a border of the
+range lies in the interval: more prints or more seeds would decide it. Two mean PSNR are compared by the differences of
+the images of each print (and of each seed of the noise where there is one print): prints differ by decibels, what is
+compared often by tenths.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+
+from matplotlib.figure import Figure
+from scipy.special import stdtrit
+
+from mitsim.core.arrays import FloatArray
+from mitsim.report import EQUAL_PEAK, IDEALISED, MODELS, RENDERED, label
+from mitsim.report.plots import Curve, curves, image_grid
+from mitsim.report.table import Mean, Table, Value
+from mitsim.studies.framework.experiment import IMAGE, Claim, Found, Results
+from mitsim.studies.framework.setup import QUICK_IMAGES, Point
+from mitsim.studies.framework.studio import Studio
+
+CONFIRMED, NOT_CONFIRMED, UNDECIDED = "confirmed", "not confirmed", "not decided at this size"
+CONFIDENCE = 0.95
+"""Of the interval of a quantity: chosen, as the uncertainty of images is stated."""
+Holds = bool | None
+"""Whether a claim holds; None: not decided."""
+Judge = Callable[[Table], tuple[str, Holds]]
+"""From the rows of one model and exposure to what they say, and whether the claim holds for them."""
+
+
+def sample_mean(rows: Table, column: str) -> Mean:
+    """Mean of a ``column`` over prints, or over seeds of the noise where there is one print; MitsimError where the
+    ``rows`` have no number."""
+    return _mean(rows, rows, column, column, lambda one, _: one)
+
+
+def difference(one: Table, other: Table, column: str, other_column: str | None = None) -> Mean:
+    """Mean of paired differences, image by image.
+
+    Parameters
+    ----------
+    one, other
+        rows of the same prints and seeds.
+    column, other_column
+        of ``one``, and of ``other`` if it has another name.
+
+    Raises
+    ------
+    MitsimError
+        where no print, or no seed of the only one, is in both.
+    """
+    return _mean(one, other, column, other_column or column, lambda first, second: first - second)
+
+
+def _mean(one: Table, other: Table, column: str, other_column: str, combine: Callable[[float, float], float]) -> Mean:
+    prints = {row.get("picture") for row in (*one.rows, *other.rows)}
+    by = "picture" if len(prints) > 1 else "seed"
+    first, second = (_by(by, rows, name) for rows, name in ((one, column), (other, other_column)))
+    return Mean.of_numbers([combine(value, second[key]) for key, value in first.items() if key in second], column)
+
+
+def _by(by: str, rows: Table, column: str) -> dict[Value, float]:
+    """Mean of a ``column`` for each value of another."""
+    keys = dict.fromkeys(row.get(by) for row in rows.rows)
+    return {key: rows.mean(column, **{by: key}).value for key in keys if rows.numbers(column, **{by: key})}
+
+
+def within(quantity: Mean, low: float = -math.inf, high: float = math.inf) -> Holds:
+    """Whether a quantity lies in a range, by Student's interval; never decided of a single value.
+
+    Parameters
+    ----------
+    quantity
+        mean of independent values; their number less one is the degrees of freedom.
+    low, high
+        ends of the range.
+    """
+    if quantity.of < 2:
+        return None
+    reach = float(stdtrit(quantity.of - 1, (1 + CONFIDENCE) / 2)) * quantity.error
+    if low < quantity.value - reach and quantity.value + reach < high:
+        return True
+    return False if quantity.value + reach < low or quantity.value - reach > high else None
+
+
+def every(*holds: Holds) -> Holds:
+    """Whether all of these ``holds``: one that fails decides."""
+    if False in holds:
+        return False
+    return None if None in holds else True
+
+
+def verdict(holds: Holds) -> str:
+    """On a claim that ``holds``, does not, or is not decided."""
+    return UNDECIDED if holds is None else CONFIRMED if holds else NOT_CONFIRMED
+
+
+def verdict_at(places: Mapping[str, Holds]) -> str:
+    """On a claim that was judged at several ``places``, such as ways of exposing, by their names."""
+    holding = [name for name, holds in places.items() if holds]
+    if len(holding) in (0, len(places)):
+        # Not decided anywhere it may hold: that it fails elsewhere does not end the claim.
+        return verdict(True if holding else None if None in places.values() else False)
+    undecided = [name for name, holds in places.items() if holds is None]
+    rest = f", {UNDECIDED} at {' and '.join(undecided)}" if undecided else ""
+    return f"confirmed only at {' and '.join(holding)}{rest}"
+
+
+def judge_claim(table: Table, claim: str, paper: str, judge: Judge) -> Claim:
+    """What becomes of a claim at each way of exposing, in each model.
+
+    Parameters
+    ----------
+    table
+        what was measured.
+    claim, paper
+        what the paper says.
+    judge
+        from the rows of one model and exposure: what they say, and whether the claim holds for them.
+    """
+    exposures: list[Value] = table.distinct("exposure") or [None]
+    found = {
+        (model, each): judge(table.where(model=model) if each is None else table.where(model=model, exposure=each))
+        for model in MODELS
+        for each in exposures
+    }
+    figures = {
+        model: "; ".join(
+            found[model, each][0] if len(exposures) == 1 else f"{each}: {found[model, each][0]}" for each in exposures
+        )
+        for model in MODELS
+    }
+    decided = verdict_at({str(each): every(*(found[model, each][1] for model in MODELS)) for each in exposures})
+    if decided in (NOT_CONFIRMED, UNDECIDED):
+        models = {model: every(*(found[model, each][1] for each in exposures)) for model in MODELS}
+        holding = [model for model, holds in models.items() if holds]
+        rest = [f", {other} {UNDECIDED}" for other, holds in models.items() if holds is None]
+        decided = f"confirmed only {holding[0]}{''.join(rest)}" if holding else decided
+    return Claim(claim, paper, figures[IDEALISED], figures[RENDERED], decided)
+
+
+# -------- What experiments of the paper share
+
+TOLERANCE_DB = 2.0
+"""How far from the paper's figures ours may be: it states neither its images, nor how bright they are."""
+Lines = Mapping[str, Table]
+"""Rows of a table by what they are called in a figure."""
+
+
+def finding(point: Point, image: FloatArray | None = None, **measured: Value) -> Found:
+    """What a point came to, in one row.
+
+    Parameters
+    ----------
+    point
+        that was measured.
+    image
+        of it, where it is to be shown; kept for a few prints.
+    **measured
+        columns of the row.
+    """
+    kept = image is not None and point.setup.picture in (*QUICK_IMAGES, None)
+    return Found((point.row(**measured),), image_array(image) if kept and image is not None else {})
+
+
+def image_array(image: FloatArray) -> dict[str, FloatArray]:
+    """An ``image`` as findings keep it: a page shows no more than single precision."""
+    return single_precision({IMAGE: image})
+
+
+def single_precision(arrays: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """Named ``arrays`` as findings keep them, in single precision."""
+    return {name: array.astype("float32") for name, array in arrays.items()}
+
+
+def measure_image(studio: Studio, point: Point, shown: Collection[str] = ()) -> Found:
+    """The image that a user gets at a point with model, patterns, exposure and seed.
+
+    Parameters
+    ----------
+    studio, point
+        where it is made, and what varies.
+    shown
+        patterns whose images are kept.
+    """
+    values = dict(point.values)
+    patterns, exposure = str(values["patterns"]), str(values.get("exposure", EQUAL_PEAK))
+    image = studio.image(point.setup, str(values["model"]), patterns, int(point["seed"]), exposure)
+    return finding(point, image.image if patterns in shown else None, **image.row())
+
+
+def by_patterns(table: Table) -> Lines:
+    """The rows of each pattern family in a ``table``."""
+    return {label(name): table.where(patterns=name) for name in table.distinct("patterns")}
+
+
+def panels(lines: Lines, by: str, column: str = "psnr_db") -> Mapping[str, Mapping[str, Curve]]:
+    """Means of both models side by side.
+
+    Parameters
+    ----------
+    lines
+        rows by name.
+    by, column
+        columns: along the axis, and up.
+    """
+    return {
+        model: {name: rows.where(model=model).means(column, by) for name, rows in lines.items()} for model in MODELS
+    }
+
+
+def by_print(table: Table) -> Lines:
+    """The rows of a ``table`` of each shown print in both models."""
+    return {
+        f"{print_ or 'scene'}, {model}": table.where(picture=print_, model=model)
+        for print_ in (*QUICK_IMAGES, None)
+        for model in MODELS
+    }
+
+
+def image_rows(
+    results: Results, lines: Lines, across: str, columns: Sequence[Value], caption: str = "{psnr_db:.1f} dB"
+) -> dict[str, list[tuple[FloatArray, str]]]:
+    """Rows of an image grid, those of which all images were kept.
+
+    Parameters
+    ----------
+    results
+        with the images.
+    lines
+        rows of the table by the grid's.
+    across, columns
+        what varies along a row of the grid, and its values.
+    caption
+        of an image, from its row of the table.
+    """
+    grid = {}
+    for name, rows in lines.items():
+        cells = []
+        for value in columns:
+            kept = ((results.array(row), row) for row in rows.where(**{across: value}).rows)
+            cells += [(image, caption.format(**row)) for image, row in kept if image is not None][:1]
+        if len(cells) == len(columns):
+            grid[name] = cells
+    return grid
+
+
+def images(
+    file: str,
+    results: Results,
+    lines: Lines,
+    across: str,
+    columns: Sequence[Value],
+    title: str,
+    names: Sequence[str] | None = None,
+) -> dict[str, Figure]:
+    """A grid of images by its file's name; empty where not all images of any row were kept.
+
+    Parameters
+    ----------
+    file, title
+        of the figure.
+    results, lines, across, columns
+        as for :func:`image_rows`.
+    names
+        of the columns; None: their values.
+    """
+    grid = image_rows(results, lines, across, columns)
+    return {file: image_grid(grid, names or [str(value) for value in columns], title)} if grid else {}
+
+
+def by_exposure(
+    table: Table, lines: Callable[[Table], Lines], by: str, axis: str, title: str, log: bool = False
+) -> dict[str, Figure]:
+    """PSNR in both models, a figure for each way of exposing.
+
+    Parameters
+    ----------
+    table, lines
+        what was measured, and from the rows of one exposure to rows by name.
+    by, axis
+        column along the axis, and the axis' name with its unit.
+    title, log
+        of each, but for the exposure; and whether the axis is logarithmic.
+    """
+    return {
+        f"psnr_{exposure.replace(' ', '_')}.png": curves(
+            panels(lines(table.where(exposure=exposure)), by), axis, log=log, title=f"{title}, exposure {exposure}"
+        )
+        for exposure in table.distinct("exposure")
+    }
+
+
+def psnr_claim(table: Table, claim: str, band: tuple[float, float]) -> Claim:
+    """A claim of PSNR within a band.
+
+    Parameters
+    ----------
+    table
+        rows that it is said of.
+    claim, band
+        what the paper says [dB].
+    """
+
+    def judge(rows: Table) -> tuple[str, Holds]:
+        mean = sample_mean(rows, "psnr_db")
+        return f"{mean} dB", near(mean, band)
+
+    return judge_claim(table, claim, f"{band[0]:g} to {band[1]:g} dB", judge)
+
+
+def gain_claim(
+    table: Table,
+    claim: str,
+    paper: str,
+    pair: tuple[Mapping[str, Value], Mapping[str, Value]],
+    text: str = "{gain:+} dB",
+    between: tuple[float, float] = (0.0, math.inf),
+    column: str = "psnr_db",
+) -> Claim:
+    """A claim of what some images have over others.
+
+    Parameters
+    ----------
+    table
+        rows of both.
+    claim, paper
+        what is claimed, and what the paper says.
+    pair
+        values of columns that choose the rows of the ones, and of the others.
+    text
+        what is said of them: ``one`` and ``other`` are their means, ``gain`` that of the paired differences.
+    between, column
+        range of the gain that the claim holds in, and what it is a gain of.
+    """
+
+    def judge(rows: Table) -> tuple[str, Holds]:
+        one, other = (rows.where(**chosen) for chosen in pair)
+        gain = difference(one, other, column)
+        figures = text.format(gain=gain, one=sample_mean(one, column), other=sample_mean(other, column))
+        return figures, within(gain, *between)
+
+    return judge_claim(table, claim, paper, judge)
+
+
+def near(psnr_db: Mean, band: tuple[float, float]) -> Holds:
+    """Whether a mean ``psnr_db`` is within a ``band`` of the paper's [dB], or no more than TOLERANCE_DB beside it."""
+    return within(psnr_db, band[0] - TOLERANCE_DB, band[1] + TOLERANCE_DB)
+
+
+def bars(lines: Lines, column: str = "psnr_db") -> Mapping[str, tuple[Mean, Mean]]:
+    """Means of a ``column`` in both models, by the names of ``lines``."""
+    return {
+        name: (rows.where(model=IDEALISED).mean(column), rows.where(model=RENDERED).mean(column))
+        for name, rows in lines.items()
+    }

@@ -1,0 +1,350 @@
+"""A scene with measured spectra in; the same scene in the light of each line of its projector, lit and calibrated, out.
+
+Each line has a bench of its own, with the line's power, diffraction, photons and factors; light of all is traced on the
+same paths (:mod:`mitsim.acquire.spectral`). Daylight beside the projector is that of a lamp, in frames of its own.
+
+Three ways to images of the lines are compared (:mod:`mitsim.report.mosaic_images`), all with factors that were
+calibrated line by line, each with its best lambda.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mitsim.acquire.exposure import Exposer
+from mitsim.acquire.spectral import SpectralBench, plan_request
+from mitsim.api.bench import Bench, open_bench
+from mitsim.bench.request import Request, SessionRequest, Task
+from mitsim.calibrate.calibrate import calibrate_lines
+from mitsim.core import spectral_manifests
+from mitsim.core.arrays import FloatArray
+from mitsim.core.configuration import load_model, locate
+from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import integer
+from mitsim.core.spectral_manifests import RUN
+from mitsim.devices.patterns import PatternFamily
+from mitsim.devices.sensor import SensorModel
+from mitsim.light.light import trace_lines
+from mitsim.metrics import psnr
+from mitsim.reconstruct.colour import daylight
+from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.mosaic import behind
+from mitsim.report.lit_scene import LAMBDAS, LitScene
+from mitsim.report.mosaic_images import MosaicCamera, Solver, solver_of
+from mitsim.studies.framework.setup import Setup
+
+_SPECTRUM = re.compile(r'value="(\s*[\d.]+\s*:[^"]*)"')
+"""Wavelengths and values, nm:value, as Mitsuba reads them."""
+_LAMP = """
+    <shape type="rectangle" id="daylight">
+        <transform name="to_world">
+            <scale x="200" y="80" z="1"/> <rotate x="1" angle="90"/> <translate x="0" y="600" z="300"/>
+        </transform>
+        <emitter type="area"> <spectrum name="radiance" value="{radiance:g}"/> </emitter>
+        <bsdf type="diffuse"> <spectrum name="reflectance" value="0"/> </bsdf>
+    </shape>
+</scene>"""
+"""The lamp of scenes/lamp_bench."""
+DAYLIGHT_RADIANCE = 117.0
+"""Of the lamp [W m^-2 sr^-1]: it lights the sheet as the projector's white does, 2.97 W/m^2 at its middle."""
+Weigh = Callable[[FloatArray, FloatArray], float]
+"""From wavelengths [nm] and values of a spectrum to one number."""
+
+
+@dataclass(frozen=True, eq=False)
+class LitLine:
+    """A scene in one line's light, and the camera's factors there.
+
+    Attributes
+    ----------
+    name, wavelength_nm
+        of the line [nm].
+    lit
+        the scene in its light.
+    factors
+        calibrated in it.
+    """
+
+    name: str
+    wavelength_nm: float
+    lit: LitScene
+    factors: Factors
+
+    def seed(self, seed: int) -> int:
+        """One of this line's own, from the ``seed`` of all."""
+        return integer(seed, "line", self.name)
+
+
+def lit_lines(setup: Setup, seed: int) -> tuple[LitLine, ...]:
+    """The scene of a setup in the light of each line.
+
+    Parameters
+    ----------
+    setup
+        the scene, and its projector, whose lines they are.
+    seed
+        of the light, and of the calibrations' noise.
+
+    Raises
+    ------
+    MitsimError
+        as :meth:`mitsim.bench.bench.Bench.capture_lines`.
+    """
+    colours = SpectralBench.of(_open(setup, locate(setup.scene, "scenes", "scene.xml")), RUN)
+    request = Request.of(accuracy=setup.accuracy, seed=seed)
+    plan = plan_request(colours.whole, request)
+    lighting = colours.whole.family(request.patterns, seed).lighting
+    lights = trace_lines(colours.whole, colours.benches, plan, lighting, seed)
+    factors = calibrate_lines(colours.whole, SessionRequest(seed, setup.accuracy), Task())
+    return tuple(
+        LitLine(name, light.bench.projector.effective_wavelength_nm, LitScene(light), factors[name])
+        for name, light in zip(colours.names, lights, strict=True)
+    )
+
+
+def daylight_frame(setup: Setup, folder: Path) -> tuple[FloatArray, float]:
+    """What the camera sees of a scene in a lamp's daylight (D65) with the projector off.
+
+    Its spectra count as D65's photons do, 380 to 780 nm, in a camera of equal efficiency for all of them.
+
+    Parameters
+    ----------
+    setup
+        a scene with spectra.
+    folder
+        for scene files.
+
+    Returns
+    -------
+    irradiance, wavelength_nm
+        (m, m') [W m^-2], and the wavelength whose photons carry as much energy.
+    """
+
+    def weigh(at: FloatArray, values: FloatArray) -> float:
+        photons = daylight(at) * at
+        return float((values * photons).sum() / photons.sum())
+
+    scene = replace_spectra(setup.scene, folder / "daylight", weigh)
+    text = scene.read_text(encoding="utf-8")
+    end = text.rindex("</scene>")
+    scene.write_text(text[:end] + _LAMP.format(radiance=DAYLIGHT_RADIANCE), encoding="utf-8")
+    wavelengths = np.arange(380.0, 781.0, 5.0)
+    mean = float((daylight(wavelengths) * wavelengths).sum() / daylight(wavelengths).sum())
+    bench = _open(setup, scene)
+    bench = replace(bench, rig=replace(bench.rig, projector=bench.projector.at(mean)))
+    light = bench.light("uniform", accuracy=setup.accuracy)
+    return light.merged().frames(bench.family("uniform").lighting, light.seed).projector_off.irradiance, mean
+
+
+def replace_spectra(scene: str, folder: Path, weigh: Weigh) -> Path:
+    """A copy of a scene whose spectra are single numbers; its XML.
+
+    Parameters
+    ----------
+    scene
+        shipped name, or path.
+    folder
+        new, for the copy.
+    weigh
+        from a spectrum to its number.
+
+    Raises
+    ------
+    MitsimError
+        for a scene without spectra.
+    """
+    own = locate(scene, "scenes", "scene.xml")
+    shutil.copytree(own.parent, folder)
+    found = 0
+
+    def number(match: re.Match[str]) -> str:
+        pairs = np.array([[float(part) for part in pair.split(":")] for pair in re.split(r"[,\s]+", match[1].strip())])
+        return f'value="{weigh(pairs[:, 0], pairs[:, 1]):.9g}"'
+
+    for file in folder.glob("*.xml"):
+        text, count = _SPECTRUM.subn(number, file.read_text(encoding="utf-8"))
+        file.write_text(text, encoding="utf-8")
+        found += count
+    if not found:
+        raise MitsimError(
+            f"scene {scene}: has no spectra (nm:value), so it looks alike in all lines; give one such as colour_checker"
+        )
+    return folder / own.name
+
+
+def serving(line: LitLine, other: LitLine) -> Factors:
+    """The factors of an ``other`` line, said to be of a ``line``, with the gain that is nearest to its own factors."""
+    own, model = line.factors, other.factors
+    gain = 1.0
+    for mine, theirs in ((own.left, model.left), (own.right, model.right)):
+        gain *= float(np.vdot(mine, theirs) / np.vdot(theirs, theirs))
+    root = np.sqrt(gain)
+    manifest = model.manifest.model_copy(update={"camera": own.manifest.camera})
+    return replace(model, left=root * model.left, right=root * model.right, manifest=manifest, lacking=())
+
+
+def _open(setup: Setup, scene: Path) -> Bench:
+    parameters: dict[str, Any] = dict(setup.parameters)
+    variant = f"{setup.variant.rpartition('_')[0]}_spectral"
+    return open_bench(scene, variant, setup.camera, setup.projector, setup.outside, **parameters)
+
+
+# -------- Light of each line in, and filters over the sensor's pixels
+
+DEMOSAICED, HALF, JOINT = "demosaiced", "half resolution", "joint"
+WAYS = {DEMOSAICED: spectral_manifests.DEMOSAIC, HALF: spectral_manifests.HALF, JOINT: spectral_manifests.JOINT}
+"""Names in tables, and those of the ways."""
+FILTERS, ARRAY = "ov5647", "RGGB"
+"""Camera file whose measured curves the filters have, and their array."""
+_COARSE = tuple(float(relative) for relative in np.logspace(-9, -3, 7))
+"""Lambdas of the joint solve, of its largest eigenvalue; the best of them is refined by half a decade."""
+Lines = Sequence[LitLine]
+
+
+def available_ways() -> tuple[str, ...]:
+    """Those of :data:`WAYS` that are: demosaicing is an extra."""
+    return tuple(name for name, way in WAYS.items() if way in spectral_manifests.installed_ways())
+
+
+@dataclass(frozen=True, eq=False)
+class MosaicShots:
+    """One noisy exposure of a family on a sensor with filters.
+
+    Attributes
+    ----------
+    lines
+        light and factors of each line.
+    family
+        the patterns.
+    frames
+        (frame (m, m') [electrons/s], row, column) of every pattern.
+    """
+
+    lines: Lines
+    family: PatternFamily
+    frames: tuple[tuple[FloatArray, int, int], ...]
+
+    @property
+    def truth(self) -> FloatArray:
+        """(lines, n, n') reflectance at each line."""
+        return np.stack([line.lit.truth for line in self.lines])
+
+    def images(self, way: str) -> FloatArray:
+        """(lines, n, n') images of the lines by a ``way``, one of :data:`WAYS`, with the best lambda for the truth.
+
+        MitsimError for demosaicing without colour-demosaicing.
+        """
+        solver = solver_of(WAYS[way], self.camera, patterns_of(self.family))
+        with single_threaded_blas():
+            return self._best(solver, way)
+
+    def _best(self, solver: Solver, way: str) -> FloatArray:
+        for each in self.frames:
+            solver.add(*each)
+        flat, solved = self.truth.reshape(len(self.lines), -1), dict[float, FloatArray]()
+
+        def quality(lam: float) -> float:
+            if lam not in solved:
+                solved[lam] = solver.images(lam, relative=True).images
+            return psnr(solved[lam].reshape(flat.shape), flat)
+
+        best = max(_COARSE if way == JOINT else LAMBDAS, key=quality)
+        if way == JOINT:
+            best = max((best, best * 10**0.5, best / 10**0.5), key=quality)
+        return solved[best]
+
+    @cached_property
+    def camera(self) -> MosaicCamera:
+        """Factors of all lines, and filters."""
+        factors = [(line.factors.left, line.factors.right) for line in self.lines]
+        return MosaicCamera.of(factors, filter_weights(self.lines), ARRAY)
+
+
+def patterns_of(family: PatternFamily) -> tuple[FloatArray, FloatArray]:
+    """P_L (n, K) and P_R (n', K') of a ``family``."""
+    return family.left.astype(np.float64), family.right.astype(np.float64)
+
+
+def mosaic_shots(lines: Lines, patterns: str, seed: int) -> MosaicShots:
+    """All lines shown at once, at equal peak, on the scene's camera behind filters.
+
+    Parameters
+    ----------
+    lines
+        light and factors of each line.
+    patterns, seed
+        the family, and seed of the noise.
+
+    Raises
+    ------
+    MitsimError
+        for a line that the filters' curves do not hold.
+    """
+    first, family = lines[0].lit, lines[0].lit.bench.family(patterns, seed)
+    rig, weights = first.bench.rig, filter_weights(lines)
+    # Light, and what is noise of a shot, is of electrons: any time and wavelength between them.
+    one_second = [Exposer(line.lit.bench.rig, 1.0, 0) for line in lines]
+    expected = [line.lit.expected("rendered", family) for line in lines]
+    passed = behind(weights, rig.camera.frame_shape)
+    rates = [
+        np.einsum("lij,lij->ij", passed, [unit.electrons(frame) for unit, frame in zip(one_second, shot, strict=True)])
+        for shot in zip(*expected, strict=True)
+    ]
+    frames = expose_rates(Exposer(rig, peak_seconds(rig.sensor, rates), integer(seed, "mosaic")), family, rates)
+    return MosaicShots(lines, family, tuple(frames))
+
+
+def peak_seconds(sensor: SensorModel, rates: Sequence[FloatArray]) -> float:
+    """Exposure time [s] at equal peak: of expected ``rates`` [electrons/s] and dark current the brightest pixel fills
+    the default part of the ``sensor``'s full well."""
+    from mitsim.bench.request import Exposure
+
+    most = max(float(rate.max()) for rate in rates) + sensor.superpixel_dark_current_e_per_s
+    return float(Exposure().fraction * sensor.superpixel_full_well_e / most)
+
+
+def expose_rates(
+    exposer: Exposer, family: PatternFamily, rates: Sequence[FloatArray], ambient: FloatArray | float = 0.0
+) -> Iterator[tuple[FloatArray, int, int]]:
+    """Noisy measurement (m, m') [electrons/s] of each pattern, and its indices.
+
+    Parameters
+    ----------
+    exposer
+        the camera.
+    family
+        of patterns; the halves of a signed one come as their difference.
+    rates
+        (m, m') expected electrons a second of each shot.
+    ambient
+        what is taken off every shot that is not one of a pair.
+    """
+    positive: FloatArray | None = None
+    for shot, rate in zip(family.shots, rates, strict=True):
+        noisy = exposer.rate(exposer.digital(rate * exposer.exposure_s, *shot.names))
+        if shot.sign == 1:
+            positive = noisy
+            continue
+        yield noisy - ambient if positive is None else positive - noisy, shot.row, shot.column
+        positive = None
+
+
+def filter_weights(lines: Lines) -> FloatArray:
+    """(4, lines) electrons behind each filter of :data:`ARRAY` over those of the ``lines``' camera without filters."""
+    curves = load_model(locate(FILTERS, "calibration", ".toml"), SensorModel)
+    sensor = lines[0].lit.bench.sensor
+    return np.array(
+        [
+            [curves.efficiency(line.wavelength_nm, plane) / sensor.efficiency(line.wavelength_nm) for line in lines]
+            for plane in ("R", "G", "G", "B")
+        ]
+    )

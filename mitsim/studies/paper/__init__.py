@@ -1,1 +1,0 @@
-"""Experiments of Zheng & Asif, one declared in each module: what varies, what is measured, what the paper claims."""

@@ -1,0 +1,335 @@
+"""Gloss: gift card, metal blade, compact disc, then roughness from 1 to a mirror on a plate, to 0.03 on a ball.
+
+Paper, supplement: gift card and metal blade come out quite good, the disc with severe artefacts. Every scene has a twin
+of matt paint (``finish=matt``), whose reflectance is the Lambertian truth; the image's error against it is split by
+cause.
+
+At one lambda an image R(Y) is linear in the frames Y, so its error against the reflectance L of the matt twin is a sum
+of differences that leaves nothing over. With t the apparent reflectance of the glossy scene, its mean over the sensor,
+
+    pixels           = t - L                         brightness that is not the matt one
+    sensor           = R(Y_direct) - R(Y_even)       light of a projector pixel that changes over the sensor
+    interreflection  = R(Y_all) - R(Y_direct)
+    saturation       = R(what the sensor reads of Y_all in the mean) - R(Y_all)
+    rest             = R(Y_even) - t and noise       what a matt scene of the same brightness has as well
+
+Y_even is the twin's light, that of each projector pixel times t / L: as bright, from the same places, but matt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy import sparse
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.light.grids import LightEstimate
+from mitsim.light.light import SampledLight
+from mitsim.metrics import psnr
+from mitsim.optics.frames import ExpectedFrames, Frame
+from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.solver import Prepared
+from mitsim.reconstruct.status import Solution
+from mitsim.report import EQUAL_PEAK, RENDERED, label
+from mitsim.report.lit_scene import LitScene, Unexposed, peak_time
+from mitsim.report.plots import curves, image_grid
+from mitsim.report.table import Mean, Table, Value
+from mitsim.sensor.moments import frame_moments
+from mitsim.studies.framework.claims import Holds, difference, every, sample_mean, single_precision, verdict_at, within
+from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
+from mitsim.studies.framework.setup import Point, Setup
+from mitsim.studies.framework.studio import Studio
+
+# -------- Light of a glossy scene and of its matt twin in
+
+PIXELS, SENSOR, INTERREFLECTION, SATURATION, REST = ERROR_SOURCES = (
+    "pixels", "sensor", "interreflection", "saturation", "rest",
+)  # fmt: skip
+_DARK = 1e-3
+"""Reflectance below which a pixel of the twin has no light to be scaled: shadows, beyond which sampling decides."""
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """The image of one noisy exposure, and its error against the matt twin's reflectance.
+
+    Attributes
+    ----------
+    solution
+        with the image (n, n).
+    parts
+        (n, n) by :data:`ERROR_SOURCES`; image and the twin's reflectance are their sum apart.
+    """
+
+    solution: Solution
+    parts: Mapping[str, FloatArray]
+
+
+@single_threaded_blas()
+def split(frames: Unexposed, twin: LitScene, seconds: float) -> Split:
+    """The image of an exposure of so many ``seconds``, and what each cause puts into it.
+
+    Parameters
+    ----------
+    frames
+        rendered, under a family whose every pattern is one shot.
+    twin
+        the same scene without gloss, in its light.
+    seconds
+        of each frame.
+    """
+    model, sums = frames.data(seconds)
+    solution, exposer = model.solve(sums), frames.exposer(seconds)
+    lit, family = frames.lit, frames.family
+
+    def light(frame: Frame) -> FloatArray:
+        return exposer.electrons(frame) / seconds
+
+    def read(frame: Frame) -> FloatArray:
+        mean, _ = frame_moments(exposer.electrons(frame), seconds, lit.bench.sensor)
+        return exposer.rate(mean)
+
+    def image(expected: ExpectedFrames, seen: Callable[[Frame], FloatArray]) -> FloatArray:
+        return _image(model, frames, solution.lam, expected, seen)
+
+    own, matt = lit.truth, twin.truth
+    even, direct = (
+        LitScene(each).expected(RENDERED, family) for each in (as_bright(twin.light, lit.light), direct_of(lit.light))
+    )
+    images = [image(even, light), image(direct, light), image(frames.expected, light), image(frames.expected, read)]
+    parts = {
+        PIXELS: own - matt,
+        SENSOR: images[1] - images[0],
+        INTERREFLECTION: images[2] - images[1],
+        SATURATION: images[3] - images[2],
+    }
+    return Split(solution, {**parts, REST: solution.image - matt - sum(parts.values())})
+
+
+def direct_of(light: SampledLight) -> SampledLight:
+    """A ``light`` without what was followed over several surfaces."""
+
+    def without(part: LightEstimate) -> LightEstimate:
+        return part.with_light({name: sparse.csr_array(part[name].shape) for name in ("indirect", "indirect_residual")})
+
+    return replace(light, groups=tuple(without(group) for group in light.groups))
+
+
+def as_bright(matt: SampledLight, glossy: SampledLight) -> SampledLight:
+    """Direct light of a ``matt`` scene, made as bright as that of a ``glossy`` one, projector pixel by projector pixel.
+
+    By what was traced into the frames, not by the truth: what sampling left in a pixel's brightness is no gloss.
+    """
+    lit = matt.flux > _DARK * matt.apparent.board_flux
+    ratio = np.divide(glossy.flux, matt.flux, out=np.zeros_like(glossy.flux), where=lit)
+    rows = sparse.diags_array(np.append(ratio, 1.0))  # the last row is ambient light
+    matt = direct_of(matt)
+    groups = (
+        each.with_light({grid: sparse.csr_array(rows @ light) for grid, light in each.light.items()})
+        for each in matt.groups
+    )
+    return replace(matt, groups=tuple(groups))
+
+
+def _image(
+    model: Prepared, frames: Unexposed, lam: float, expected: ExpectedFrames, seen: Callable[[Frame], FloatArray]
+) -> FloatArray:
+    """Of ``expected`` frames as they are ``seen`` [electrons/s], without noise."""
+    sums = model.accumulator()
+    for shot, frame in zip(frames.family.shots, expected, strict=True):
+        sums.add(seen(frame), shot.row, shot.column)
+    return model.solve(sums, lam).image
+
+
+# -------- Gloss
+
+CARD, _, DISC = SHIPPED = ("gift_card", "metal_blade", "compact_disc")
+SHAPES = {"plate": {"shape": "rectangle", "z": "400"}, "ball": {"shape": "sphere", "z": "440"}}
+"""Of the scene `highlight`."""
+ROUGHNESSES = (1.0, 0.3, 0.1, 0.03, 0.003, 0.001)
+"""Of GGX lobes: from all directions to 0.8 mm at the sensor, which is 6 mm wide. At 0.01 lobes are neither wide enough
+for a few anchors nor sharp enough to be aimed at: light takes minutes."""
+_COUNTS = {"plate": 6, "ball": 4}
+"""Of them, as light of sharper lobes of a ball and of its backdrop takes minutes."""
+FAMILIES = ("uniform", "dots:7")
+AS_MATT = "as the matt scene"
+"""The exposure time of the twin, with which highlights saturate."""
+EXPOSURES = (EQUAL_PEAK, AS_MATT)
+_ACCURACY = 3e-3
+"""Of the light: a tenth of the artefacts that matter, in a third of the time of 1e-3."""
+_VARIED = ("finish", "roughness", "shape", "z")  # of a scene, but not of its rig
+_TRUTHS = ("matt paint", "apparent")
+_GREY = 0.5  # of no error
+_ROUNDING = 1e-12
+"""Mean square of an error that is rounding: factors of a condition of 1e7 leave 1e-28 to 1e-14 of the image's."""
+_PLAIN_DB = 20.0
+"""Artefacts of a tenth of white are plainly seen."""
+_ARTEFACTS = "artefacts_db"
+"""PSNR that the errors by gloss alone would leave."""
+_NAMES = {
+    PIXELS: "gloss over pixels", SENSOR: "gloss over sensor", INTERREFLECTION: INTERREFLECTION,
+    SATURATION: SATURATION, REST: "rest",
+}  # fmt: skip
+_DRAWN = ("dots:7", EQUAL_PEAK)
+"""Patterns and exposure of the causes that are shown as images."""
+
+
+def _points(scope: Scope) -> Sequence[Point]:
+    base = replace(scope.setup, accuracy=max(scope.setup.accuracy, _ACCURACY))
+    if scope.pictures == (None,):
+        return [Point.of(base, subject=base.scene, seed=seed) for seed in scope.repeats]
+    setups = {name: [replace(base, scene=name)] for name in scope.chosen(SHIPPED, (CARD, DISC))}
+    for name, shape in () if scope.quick else SHAPES.items():
+        setups[name] = [
+            replace(base, scene="highlight").changed(roughness=each, **shape) for each in ROUGHNESSES[: _COUNTS[name]]
+        ]
+    return [
+        Point.of(setup, subject=name, seed=seed)
+        for name, each in setups.items()
+        for setup in each
+        for seed in scope.repeats
+    ]
+
+
+def _measure(studio: Studio, point: Point) -> Found:
+    seed = int(point["seed"])
+    factors = _factors(studio, point.setup, seed)
+    twin = studio.lit(point.setup.changed(finish="matt"))
+    lit = studio.lit(point.setup)
+    rows, images = [], dict(zip(_TRUTHS, (twin.truth, lit.truth), strict=True))
+    for name in FAMILIES:
+        family = lit.bench.family(name, seed)
+        frames = lit.rendered(factors, family, seed)
+        times = frames.seconds(EQUAL_PEAK), peak_time(twin.bench, twin.expected(RENDERED, family))
+        for exposure, seconds in zip(EXPOSURES, times, strict=True):
+            found = split(frames, twin, seconds)
+            image = found.solution.image
+            measured: dict[str, Value] = {"psnr_db": psnr(image, lit.truth), "psnr_matt_db": psnr(image, twin.truth)}
+            measured |= {f"{cause}_db": _decibels(part) for cause, part in found.parts.items()}
+            added = np.sum([found.parts[cause] for cause in (SENSOR, INTERREFLECTION, SATURATION)], axis=0)
+            rows.append(
+                point.row(
+                    patterns=name, exposure=exposure, exposure_s=seconds, artefacts_db=_decibels(added), **measured
+                )
+            )
+            images[f"{label(name)}, {exposure}"] = image
+            if (name, exposure) == _DRAWN:
+                images |= found.parts
+    return Found(tuple(rows), single_precision(images))
+
+
+def _factors(studio: Studio, setup: Setup, seed: int) -> Factors:
+    """A calibration before a board, which does not see what is varied; the shipped three share a rig."""
+    parameters = tuple(each for each in setup.parameters if each[0] not in _VARIED)
+    scene = CARD if setup.scene in SHIPPED and not parameters else setup.scene
+    return studio.factors(replace(setup, scene=scene, parameters=parameters), seed)
+
+
+def _decibels(error: FloatArray) -> float | None:
+    """PSNR of an image that has this ``error`` alone; None where there is none."""
+    power = float(np.square(error).mean())
+    return -10 * float(np.log10(power)) if power > _ROUNDING else None
+
+
+def _claims(results: Results) -> Sequence[Claim]:
+    table = results.table.where(patterns="dots:7")
+    there = [name for name in SHIPPED if name in table.distinct("subject")]
+    if not {CARD, DISC} <= set(there):
+        return []
+    found = {exposure: {name: table.where(subject=name, exposure=exposure) for name in there} for exposure in EXPOSURES}
+    texts = [
+        f"{exposure}: {', '.join(f'{name} {_artefacts(rows)} dB' for name, rows in by_name.items())}".replace("_", " ")
+        for exposure, by_name in found.items()
+    ]
+
+    def claim(text: str, paper: str, holds: Callable[[Mapping[str, Table]], Holds]) -> Claim:
+        decided = verdict_at({exposure: holds(by_name) for exposure, by_name in found.items()})
+        return Claim(f"{text} (artefacts of gloss, 49 dots)", paper, "", "; ".join(texts), decided)
+
+    def well(by_name: Mapping[str, Table]) -> Holds:
+        return every(*(within(_artefacts(rows), low=_PLAIN_DB) for name, rows in by_name.items() if name != DISC))
+
+    def worst(by_name: Mapping[str, Table]) -> Holds:
+        more = (difference(by_name[DISC], rows, _ARTEFACTS) for name, rows in by_name.items() if name != DISC)
+        return every(within(_artefacts(by_name[DISC]), high=_PLAIN_DB), *(within(each, high=0) for each in more))
+
+    plain = " and ".join(name.replace("_", " ") for name in there if name != DISC)  # a quick study has no blade
+    return [
+        claim(f"{plain.capitalize()} come{'s' * (len(there) == 2)} out well", "quite good", well),
+        claim("The compact disc is the worst, with severe artefacts", "severe artefacts", worst),
+    ]
+
+
+def _artefacts(rows: Table) -> Mean:
+    return sample_mean(rows, _ARTEFACTS)
+
+
+def _figures(results: Results) -> Mapping[str, Figure]:
+    table, drawn = results.table.where(patterns=_DRAWN[0]), {}
+    peak = table.where(exposure=_DRAWN[1], seed=table.distinct("seed")[0])
+    swept = [name for name in SHAPES if name in table.distinct("subject")]
+    if swept:
+        for exposure in EXPOSURES:
+            panels = {f"{name}, {exposure}": _curves(table.where(subject=name, exposure=exposure)) for name in swept}
+            drawn[f"causes_{exposure.replace(' ', '_')}.png"] = curves(
+                panels, "roughness, alpha of GGX [1]", "PSNR against matt paint [dB]", log=True
+            )
+        name = f"{label(_DRAWN[0])}, {_DRAWN[1]}"
+        for subject in swept:
+            found = peak.where(subject=subject).rows
+            images = [_captioned(results, row, name, "psnr_db") for row in found]
+            columns = [f"alpha {row['roughness']}" for row in found]
+            drawn[f"images_{subject}.png"] = image_grid({subject: images}, columns, f"By roughness, {name}")
+    rows = [row for row in peak.rows if row["subject"] not in swept]
+    names = [str(row["subject"]).replace("_", " ") for row in rows]
+    shown = [
+        (*(_captioned(results, row, name) for name in _TRUTHS), *_images(results, row, results.table)) for row in rows
+    ]
+    titles = [*_TRUTHS, *(f"{label(name)}\n{exposure}" for exposure in EXPOSURES for name in FAMILIES)]
+    drawn["images_shipped.png"] = image_grid(dict(zip(names, shown, strict=True)), titles, "Truths and images")
+    causes = [[_captioned(results, row, cause, f"{cause}_db") for cause in ERROR_SOURCES] for row in rows]
+    title = f"Errors against matt paint by cause, {label(_DRAWN[0])}, {_DRAWN[1]}: grey is no error"
+    drawn["causes_shipped.png"] = image_grid(dict(zip(names, causes, strict=True)), list(_NAMES.values()), title)
+    return drawn
+
+
+def _curves(rows: Table) -> dict[str, dict[Value, Mean]]:
+    """PSNR of the image, and of an image with the errors of one cause alone, by roughness."""
+    columns = {"psnr_matt_db": "image", **{f"{cause}_db": f"{name} alone" for cause, name in _NAMES.items()}}
+    return {name: rows.means(column, "roughness") for column, name in columns.items()}
+
+
+def _images(results: Results, row: Mapping[str, Value], table: Table) -> list[tuple[FloatArray, str]]:
+    """Both truths of the point of a ``row``, and its images by exposure and patterns."""
+    truths = [_captioned(results, row, name) for name in _TRUTHS]
+    cases = [(exposure, name) for exposure in EXPOSURES for name in FAMILIES]
+    each = (table.where(point=row["point"], exposure=exposure, patterns=name).rows[0] for exposure, name in cases)
+    shown = (_captioned(results, row, f"{label(str(row['patterns']))}, {row['exposure']}", "psnr_db") for row in each)
+    return [*truths, *shown]
+
+
+def _captioned(results: Results, row: Mapping[str, Value], name: str, column: str = "") -> tuple[FloatArray, str]:
+    """The array ``name`` of a ``row`` with its ``column`` for a caption; errors on grey."""
+    image, level = results.array(row, name), row.get(column)
+    if image is None:
+        raise MitsimError(f"study reflectivity: no {name} was kept of {row['subject']}; measure it again")
+    return image + (_GREY if name in ERROR_SOURCES else 0.0), "" if level is None else f"{level:.1f} dB"
+
+
+EXPERIMENT = Experiment(
+    "reflectivity",
+    "Gloss",
+    "What do shiny surfaces do to the image, and by which cause?",
+    _points, _measure, _claims, _figures,
+    heads=("Paper", "", "Rendered"),
+    note="Each scene has a twin of matt paint, the truth that errors are taken against; apparent is what the glossy "
+    "scene shows, its mean over the sensor, the truth of the images' decibels. As the matt scene: exposed as long as "
+    "the twin, so that highlights saturate. Decibels of a cause are the PSNR that its errors alone would leave. "
+    "Gloss over pixels: brightness that is not the matt one; gloss over sensor: light of a projector pixel that "
+    "changes over the sensor.",
+)  # fmt: skip

@@ -1,0 +1,237 @@
+"""Effects taken out of a light: without all it is the paper's model, and each one is what a formula says it is."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mitsim as ms
+from mitsim.core.arrays import FloatArray
+from mitsim.light.grids import GRIDS
+from mitsim.light.light import SampledLight, traced_again
+from mitsim.light.passes import Simulation
+from mitsim.light.settings import SharpPixels
+from mitsim.report import IDEALISED
+from mitsim.report.lit_scene import LitScene
+from mitsim.studies import ablation
+from mitsim.studies.ablation import Ablation
+from mitsim.transport.records import DIRECT, Deposits
+
+pytestmark = pytest.mark.usefixtures("kept_plans")
+
+FAMILY = "dots:4"
+PRINT = np.random.default_rng(4).integers(20, 230, (48, 48))
+TURNED = '<rotate y="1" angle="-9"/>'
+PROJECTOR = """name = "contrast 100, blurred, with speckle"
+effective_wavelength_nm = 562.0
+contrast_ratio = 100.0
+blur_pixels = 0.6
+speckle_contrast = 0.05
+"""
+
+
+def frames(light: SampledLight) -> FloatArray:
+    lighting = light.bench.family(FAMILY).lighting
+    return np.stack([frame.irradiance for frame in light.frames(lighting, 0)])
+
+
+def apart(found: FloatArray, wanted: FloatArray) -> float:
+    return float(np.linalg.norm(found - wanted) / np.linalg.norm(wanted))
+
+
+@pytest.fixture(scope="module")
+def far(shared_scene: Callable[..., Path], variant: str) -> SampledLight:
+    """A print 20 mm before the aligned plane, whose texels are thirds of projector pixels, under a projector of low
+    contrast."""
+    path = shared_scene("far", reflectance=PRINT, sheet_z=380, fov=30)
+    device = path.parent / "device.toml"
+    device.write_text(PROJECTOR)
+    return ms.open_bench(path, variant, projector=device).light(FAMILY, accuracy=1e-2)
+
+
+@pytest.fixture(scope="module")
+def turned(shared_scene: Callable[..., Path], variant: str) -> SampledLight:
+    """A print that a turned projector lights."""
+    path = shared_scene("turned", reflectance=PRINT, projector_turn=TURNED, fov=40)
+    return ms.open_bench(path, variant).light(FAMILY, accuracy=1e-2)
+
+
+def test_nothing_taken_out_is_the_light_itself(far: SampledLight) -> None:
+    ablated = Ablation.of(far)
+    assert ablated.without(frozenset()) is far
+    assert ablated.without(frozenset({"ambient", ablation.KEYSTONE, ablation.GLOSS})) is far, "which it does not have"
+    assert ablated.effects == (
+        ablation.FALLOFF,
+        ablation.DIFFRACTION,
+        ablation.DEPTH,
+        ablation.DETAIL,
+        ablation.BLACK_LEVEL,
+        ablation.DEFOCUS,
+        ablation.SPECKLE,
+        ablation.RENDER_NOISE,
+    )
+
+
+def test_the_same_paths_are_traced_again(far: SampledLight) -> None:
+    """To the renderer's float32. (Planted: another purpose's streams.)"""
+    again = traced_again(far, ablation._Filing(far.bench, far.simulation.settings, True, frozenset()))
+    for own, other in zip(far.groups, again.groups, strict=True):
+        for grid in GRIDS:
+            assert abs(own[grid] - other[grid]).sum() <= 1e-6 * own["fine"].sum()
+    assert np.allclose(again.flux, far.flux, rtol=1e-6)
+
+
+@pytest.mark.parametrize("scene", ["far", "turned"])
+def test_without_all_it_is_the_idealised_model(scene: str, request: pytest.FixtureRequest) -> None:
+    """An even sheet at the aligned distance that shows the truth, pixel by pixel, though the traced one lies elsewhere,
+    blurred, under a keystone. (Planted: each effect left in.)"""
+    light = request.getfixturevalue(scene)
+    ablated, lit = Ablation.of(light), LitScene(light)
+    wanted = np.stack([frame.irradiance for frame in lit.expected(IDEALISED, light.bench.family(FAMILY))])
+    whole = frozenset(ablated.effects)
+    assert apart(frames(ablated.without(whole)), wanted) < 5e-5
+    for effect in whole - {ablation.SPECKLE, ablation.DETAIL}:
+        assert apart(frames(ablated.without(whole - {effect})), wanted) > 1e-4, effect
+    assert apart(frames(light), wanted) > 0.05
+
+
+def test_a_turned_projector_has_a_keystone(turned: SampledLight) -> None:
+    ablated = Ablation.of(turned)
+    assert ablation.KEYSTONE in ablated.effects and ablation.DEPTH not in ablated.effects
+    assert not ablation._off_plane(turned)
+
+
+def sharp_deposits(light: SampledLight) -> Deposits:
+    """A ray from each projector pixel, without blur."""
+    settings = light.simulation.settings
+    settings = replace(settings, effects=settings.effects - {"blur"})
+    return Simulation(light.bench, settings).direct.trace(1, 0, 1)
+
+
+def pixel_of(light: SampledLight, deposits: Deposits) -> FloatArray:
+    """Where ``deposits`` lie on the aligned plane, by projector pixels that fill the window's bounding box."""
+    n = light.bench.n
+    places = [
+        np.floor((tangents - first) / (last - first) * n)
+        for tangents, (first, last) in zip((deposits.row, deposits.column), light.bench.windows, strict=True)
+    ]
+    return np.asarray(places[0] * n + places[1])
+
+
+def test_depth_is_parallax(far: SampledLight) -> None:
+    """The projector, 60 mm aside (x = 60, column -60), 20 mm before the plane: light is seen 60 (1/380 - 1/400) aside,
+    0.35 pixels, and without depth in its pixel on the plane. (Planted: the projector on the other side.)"""
+    deposits, place = sharp_deposits(far), ablation._Place(far.bench)
+    aside = place.parallax(deposits)
+    assert np.allclose(aside[1], -60 * (1 / 380 - 1 / 400), rtol=1e-3) and np.abs(aside[0]).max() < 1e-6
+    assert (pixel_of(far, deposits) != deposits.pixel).mean() > 0.2
+    back = place.moved(deposits, frozenset({ablation.DEPTH}))
+    assert np.allclose(back.inverse_depth, 1 / 400) and np.array_equal(pixel_of(far, back), deposits.pixel)
+    assert ablation._off_plane(far)
+
+
+def test_without_keystone_light_lies_in_its_pixel(turned: SampledLight) -> None:
+    """(Planted: the homography the other way round.)"""
+    deposits = sharp_deposits(turned)
+    assert (pixel_of(turned, deposits) != deposits.pixel).mean() > 0.2
+    straight = ablation._Place(turned.bench).moved(deposits, frozenset({ablation.KEYSTONE}))
+    assert np.array_equal(pixel_of(turned, straight), deposits.pixel)
+    assert np.array_equal(straight.inverse_depth, deposits.inverse_depth)
+
+
+def test_falloff_over_pixels_is_that_of_a_matt_sheet(turned: SampledLight) -> None:
+    """A sheet that faces the camera, evenly lit from z = 0: E r^4 / z^2 is the same for all points, and pixels of a
+    shifted lens are of one size. What is taken out is the flux over the board, in units of its mean."""
+    truth = turned.apparent
+    even, lit = Ablation.of(turned)._even, truth.board_flux > 0
+    assert lit.mean() > 0.9 and np.allclose((even * truth.board_flux)[lit], truth.board_flux.mean())
+
+
+def test_falloff_is_the_fourth_power_of_the_cosine(far: SampledLight) -> None:
+    """Of a shifted lens, seen from the sensor's centre: (1 + tan^2)^-2. (Planted: the square root.)"""
+    rows, columns = (np.linspace(*window, far.bench.n + 1) for window in far.bench.windows)
+    middles = [(edges[1:] + edges[:-1]) / 2 for edges in (rows, columns)]
+    wanted = (1 + middles[0][:, None] ** 2 + middles[1][None, :] ** 2) ** -2.0
+    brightness = (1 / Ablation.of(far)._even).reshape(wanted.shape)
+    # The mean over a small sensor is that of its centre to (half-width / distance)^2 = 1e-6; pixels of 7.5 mm: 2e-4.
+    assert np.allclose(brightness, wanted / wanted.mean(), rtol=2e-3)
+
+
+def test_black_level_adds_a_part_of_uniform_light(far: SampledLight) -> None:
+    """b + (1 - b) w of every pixel: frames are (1 - b) of those without, and b of the uniform frame. (Planted: 1 for
+    1 - b.)"""
+    ablated, leak = Ablation.of(far), 1 / 100
+    without = ablated.without(frozenset({ablation.BLACK_LEVEL}))
+    (uniform,) = without.frames(far.bench.family("uniform").lighting, 0)
+    assert apart(frames(far), (1 - leak) * frames(without) + leak * uniform.irradiance) < 1e-9
+
+
+def test_detail_is_what_cells_of_a_pixel_differ_in(far: SampledLight) -> None:
+    """The same flux of each pixel, spread evenly over its cells: c x c of them have the same light. (Planted: the mean
+    over all pixels.)"""
+    ablated = Ablation.of(far)
+    off = frozenset({ablation.DETAIL, ablation.DEFOCUS, ablation.DEPTH})
+    even = ablated.without(off)
+    cells = sum(group["fine"] for group in even.groups)[:-1]
+    per_pixel = even.simulation.settings.subdivision**2
+    assert per_pixel > 1
+    for pixel in (0, 37, 255):
+        lit = np.sort(cells[[pixel]].toarray()[0])[::-1][:per_pixel]
+        assert lit.min() > 0.9 * lit.max() and lit.sum() > 0.999 * cells[[pixel]].sum()
+    uneven = sum(group["fine"] for group in ablated.without(off - {ablation.DETAIL}).groups)[:-1]
+    assert np.allclose(uneven.sum(axis=1), cells.sum(axis=1), rtol=1e-9)
+    spread = [np.ptp(np.sort(light[[37]].toarray()[0])[::-1][:per_pixel]) for light in (cells, uneven)]
+    assert spread[1] > 10 * spread[0]
+
+
+def test_what_hides_or_moves_points_leaves_them_where_they_are(far: SampledLight) -> None:
+    """Where depth stays on, all points of a pixel have the mean of their values. (Planted: that of all pixels.)"""
+    deposits = sharp_deposits(far)
+    two = Deposits.joined([deposits, replace(deposits, value=3 * deposits.value)])
+    even = ablation._even(two, far.bench.n**2)
+    assert np.allclose(even.value, 2 * np.tile(deposits.value, 2)) and np.array_equal(even.row, two.row)
+
+
+@pytest.mark.slow
+def test_gloss_is_what_the_sensor_sees_beyond_its_mean(shared_scene: Callable[..., Path], variant: str) -> None:
+    """A glossy sheet: without gloss all points of the sensor see the mean over it; all light is as much."""
+    path = shared_scene("glossy", reflectance=PRINT)
+    matt, glossy = '<bsdf type="diffuse">', '<bsdf type="roughplastic"><float name="alpha" value="0.05"/>'
+    text = path.read_text().replace(matt, glossy)
+    path.write_text(text.replace('name="reflectance" type="bitmap"', 'name="diffuse_reflectance" type="bitmap"'))
+    light = ms.open_bench(path, variant).light(FAMILY, accuracy=1e-3)
+    ablated = Ablation.of(light)
+    assert ablation.GLOSS in ablated.effects
+    plain = ablated.without(frozenset({ablation.GLOSS}))
+    assert plain.simulation.settings.anchors == 1
+    whole, mean = frames(light), frames(plain)
+    assert 1e-4 < apart(mean, whole) < 0.1
+    assert mean.sum() == pytest.approx(whole.sum(), rel=2e-3)
+
+
+def test_lobes_are_averaged_over_anchors_with_their_weights(far: SampledLight) -> None:
+    """Light of one anchor alone comes to all, times its weight in the mean over it. (Planted: its row's twice.)"""
+    sharp = SharpPixels((5,), 3, (-0.05, 0.05, -0.05, 0.05))
+    simulation = Simulation(far.bench, replace(far.simulation.settings, sharp=sharp))
+    one, zero = np.ones(1), np.zeros(1, np.int64)
+    deposits = Deposits(zero + 5, zero + 2, zero + 1, 0 * one, 0 * one, one / 400, one, np.full(1, DIRECT, np.int16))
+    labels = np.arange(far.bench.n**2)
+    bundle = simulation.grids["sharp"].bundle
+    filed, weights = bundle.file(deposits, labels, 1), simulation.mean_weights(bundle.anchors)
+    mean = ablation._even_lobes(filed, simulation)
+    weight = weights[2] * weights[1]
+    again = bundle.repeated(replace(bundle, anchors=1).file(deposits.averaged(weights), labels, 1))
+    assert abs(mean - again).max() < 1e-12 and mean.sum() == pytest.approx(9 * weight)
+    assert ablation._even_lobes(filed, far.simulation) is filed, "nothing to average where nothing is sharp"
+
+
+def test_what_is_moved_is_added_up_on_the_host(far: SampledLight) -> None:
+    """Anchors see light without depth where the sensor's centre does: sums on the device would hold it where it was
+    traced. (Planted: sums on the device.)"""
+    settings = replace(far.simulation.settings, anchors=3, samples={"anchor_residual": 1e4})
+    labels = np.arange(far.bench.n**2)
+    for off, held in ((frozenset[str](), 1), (frozenset({ablation.DEPTH}), 0)):
+        filing = ablation._Filing(far.bench, settings, True, off)
+        assert len(filing.ledgers("anchor_residual", labels, 1)) == held
