@@ -37,7 +37,7 @@ from mitsim.light.grids import LightEstimate
 from mitsim.light.passes import Simulation
 from mitsim.transport.accumulator import fetched
 from mitsim.transport.direct import DirectTracer
-from mitsim.transport.indirect import block_moments, chosen_repeats
+from mitsim.transport.indirect import adaptive_counts, block_moments
 from mitsim.transport.records import INDIRECT
 
 ROOT = Path(__file__).parents[1]
@@ -83,16 +83,16 @@ def repeats_of(simulation: Simulation, samples: int) -> tuple[int, ...]:
     assert simulation.indirect is not None
     light = simulation.indirect.trace(2**20, 0, samples)
     light, pixels = light.where(light.kind == INDIRECT), simulation.bench.n
-    return tuple(int(count) for count in chosen_repeats(block_moments(light.pixel, light.value, pixels)).ravel())
+    return tuple(int(count) for count in adaptive_counts(block_moments(light.pixel, light.value, pixels)).ravel())
 
 
 def traced(
     simulation: Simulation, name: str, labels: np.ndarray, seed: int, samples: int, device: bool
 ) -> LightEstimate:
     """Light of one group, per sample."""
-    ledgers = simulation.ledgers(name, labels, 1) if device else ()
-    light = simulation.accumulate(name, simulation.passes[name].trace(seed, 0, samples, ledgers), labels, samples)
-    for sums in fetched(ledgers) if ledgers else ():
+    accumulators = simulation.accumulators(name, labels, 1) if device else ()
+    light = simulation.accumulate(name, simulation.passes[name].trace(seed, 0, samples, accumulators), labels, samples)
+    for sums in fetched(accumulators) if accumulators else ():
         light = light + simulation.accumulate(name, sums, labels, samples)
     dr.sync_thread()
     return light

@@ -24,7 +24,7 @@ from mitsim.light.cost_model import traced_for
 from mitsim.light.passes import Simulation
 from mitsim.light.plan import ColourCandidate, ColourChoice, Plan
 from mitsim.light.settings import Settings
-from mitsim.transport.records import Deposits
+from mitsim.transport.records import PathSamples
 
 _RAYS_OF_BANDS, _SHOTS = 4, 4
 """Rays of each pixel, a tenth of a second, and shots that are compared, as the pilot's."""
@@ -184,7 +184,7 @@ class _Look(Generic[Opened]):
 
     def errors(self, names: Iterable[str]) -> dict[str, float]:
         """What each candidate leaves, by the ``names``."""
-        mono = self._electrons(self._bench, self._deposits(self._bench)[0])  # before another variant is set
+        mono = self._electrons(self._bench, self._path_samples(self._bench)[0])  # before another variant is set
         lines = self._bench.projector.lines.shining
         cut = {name: lines.bands(bands_of(name)) for name in names if name.startswith(BANDS)}
         bands = {band for each in cut.values() for band in each if band.several}
@@ -204,19 +204,19 @@ class _Look(Generic[Opened]):
         for first in range(0, len(lines), MOST_LINES):
             some = lines[first : first + MOST_LINES]
             together = Lines(tuple(line.wavelengths_nm[0] for line in some), tuple(line.shares[0] for line in some))
-            lit = self._deposits(replace(self.spectral, lines=together))
-            for line, deposits in zip(some, lit, strict=True):
-                yield line, self._electrons(line_alone(self.spectral, line), deposits)
+            lit = self._path_samples(replace(self.spectral, lines=together))
+            for line, path_samples in zip(some, lit, strict=True):
+                yield line, self._electrons(line_alone(self.spectral, line), path_samples)
 
-    def _deposits(self, bench: Apparatus) -> list[Deposits]:
+    def _path_samples(self, bench: Apparatus) -> list[PathSamples]:
         """Direct light of a ``bench`` by line, on the same paths whatever the variant."""
         found = Simulation(bench, self._settings).direct.trace(self._seed, 0, _RAYS_OF_BANDS)
         return found.by_line(1 if bench.lines is None else len(bench.lines.shares))
 
-    def _electrons(self, bench: Apparatus, deposits: Deposits) -> FloatArray:
-        """(shots, rows, columns) of the light in ``deposits``, by the photons and the efficiency of a ``bench``."""
+    def _electrons(self, bench: Apparatus, path_samples: PathSamples) -> FloatArray:
+        """(shots, rows, columns) of the light in ``path_samples``, by the photons and the efficiency of a ``bench``."""
         simulation, lighting = Simulation(bench, self._settings), self._lighting
-        filed = simulation.accumulate("direct", deposits, lighting.labels, _RAYS_OF_BANDS)
+        filed = simulation.accumulate("direct", path_samples, lighting.labels, _RAYS_OF_BANDS)
         rows = np.arange(lighting.weights.shape[1])
         frames = simulation.expected([filed], rows, lighting, self._seed, leaking=False)
         wavelength = bench.projector.effective_wavelength_nm

@@ -46,7 +46,7 @@ from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.planner.memory import frame_seconds, frames_cost
 from mitsim.planner.planner import make_plan, plan_within
 from mitsim.reconstruct.mosaic import PLANES, behind
-from mitsim.transport.records import Deposits
+from mitsim.transport.records import PathSamples
 
 _RAYS, _ALIKE = 4, 0.9
 """Rays of each pixel that tell how rough a line's light is, and paths of each cell that tell lamps' light, a tenth of a
@@ -184,11 +184,11 @@ class SpectralBench:
         bench, count = self.whole, len(self.benches)
         simulation = Simulation(bench, Settings(bench.geometry.scene_distance, effects=frozenset({"ambient"})))
         stream = integer(seed, "colour")
-        deposits, lamps = simulation.direct.trace(stream, 0, _RAYS), Deposits.none()
+        path_samples, lamps = simulation.direct.trace(stream, 0, _RAYS), PathSamples.none()
         if bench.lamplight is not None and simulation.from_camera is not None:
             lamps = simulation.from_camera.trace(stream, 0, _RAYS)
         steps = []
-        for light, ambient in zip(deposits.by_line(count), lamps.by_line(count), strict=True):
+        for light, ambient in zip(path_samples.by_line(count), lamps.by_line(count), strict=True):
             flux = np.bincount(light.pixel, light.value, bench.n**2).reshape(bench.n, bench.n)
             differences = sum(float(np.square(np.diff(flux, axis=axis)).sum()) for axis in (0, 1))
             energy = float(np.square(flux).sum())

@@ -127,9 +127,9 @@ class Apparatus:
     def glint(self) -> Glint:
         """Light of the projector that mirrors alone bring to the sensor."""
         from mitsim.bench.mirror_light import Glint
-        from mitsim.transport.specular import trace_glint
+        from mitsim.transport.specular import trace_specular_chains
 
-        return Glint(trace_glint(self.loaded.scene, self.loaded.camera, self.projector_optics))
+        return Glint(trace_specular_chains(self.loaded.scene, self.loaded.camera, self.projector_optics))
 
     @property
     def windows(self) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -16,7 +16,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError
 from mitsim.devices.session import CELLS, BoardShape
 from mitsim.scene.guard.estimators import Unfit
-from mitsim.transport.plugins.base import per_lane, turn_and_origin
+from mitsim.transport.plugins.base import host_values, turn_and_origin
 from mitsim.transport.projector import PinholeRays
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def missed_pixels(bench: Apparatus) -> int:
         ray = mi.Ray3f(mi.Point3f(rays.origin.tolist()), mi.Vector3f(directions.T.astype(np.float32)))
         met = bench.loaded.scene.ray_intersect(ray)
         facing = (dr.dot(met.n, -ray.d) > 0) & (dr.dot(met.n, mi.Point3f(eye.tolist()) - met.p) > 0)
-        missed |= ~per_lane(met.is_valid() & facing, n * n)
+        missed |= ~host_values(met.is_valid() & facing, n * n)
     return int(np.count_nonzero(missed))
 
 

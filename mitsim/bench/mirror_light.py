@@ -13,7 +13,7 @@ from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.fft_shadow import SampledTerm, geometric_samplers, wave_samplers
 from mitsim.optics.frames import ClassFrames
-from mitsim.optics.mirror_frames import Beams, glint_frames
+from mitsim.optics.mirror_frames import Beams, specular_frames
 
 _KEPT = 4
 """Frames of so many lightings and cameras: what the pilot switches between."""
@@ -67,7 +67,7 @@ class Glint:
 
     def _form(self, labels: bytes, geometry: CameraGeometry, spectrum: Spectrum | None) -> ClassFrames:
         started, terms = time.perf_counter(), self._terms(geometry, spectrum)
-        found = glint_frames(self.beams, geometry, terms, np.frombuffer(labels, np.int64))
+        found = specular_frames(self.beams, geometry, terms, np.frombuffer(labels, np.int64))
         self.seconds = time.perf_counter() - started
         return found
 

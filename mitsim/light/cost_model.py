@@ -106,8 +106,8 @@ _FILED = 0.2
 """What tracing takes more for each further line: 0.15 of a mono capture's seconds, 0.3 of one line's (three lines of
 photograph, benchmarks/colour.py)."""
 _PASSED = 0.4
-"""A place of a ledger, which is emptied and looked through, over an entry of light that is accumulated (corner in three
-lines: 4e-9 s)."""
+"""A place of an accumulator, which is emptied and looked through, over an entry of light that is accumulated (corner in
+three lines: 4e-9 s)."""
 SHARED_COST = 6
 """Paths that a path of shared indirect light takes as long as: corner 5.7, cookie_bag 3.4."""
 
@@ -441,8 +441,8 @@ def accumulation_seconds(forming: Forming, numbers: Numbers, entries_of_group: N
     entries_of_group
         of one group's light.
     """
-    ledger = forming.classes * np.square(forming.cells * numbers.coarse_cells) * numbers.coarse_layers
-    passed = numbers.indirect * _PASSED * np.where(ledger < MOST_PLACES, ledger, 0.0)
+    accumulator = forming.classes * np.square(forming.cells * numbers.coarse_cells) * numbers.coarse_layers
+    passed = numbers.indirect * _PASSED * np.where(accumulator < MOST_PLACES, accumulator, 0.0)
     return cast(Number, forming.lines * GROUPS * costs.accumulated * (entries_of_group + passed))
 
 

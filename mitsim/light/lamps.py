@@ -18,7 +18,7 @@ from mitsim.devices.lamps import SPECTRA_NM, Band, Lamplight, Response, line_uni
 from mitsim.devices.projector import Spectrum
 from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
-from mitsim.transport.from_camera import Counted, FromCameraTracer, LampTracer
+from mitsim.transport.from_camera import FromCameraTracer, LampResponse, LampTracer
 
 _STEP_NM = 24.0
 """Widest part of a band whose light diffracts as that of its middle: a shadow's fringes hardly move over it, as for
@@ -91,7 +91,7 @@ class _Look:
 
         def seen(*bands: Band) -> FloatArray:
             """(bands,) light of each."""
-            light = LampTracer(tracer, Counted(response, bands, (1.0,))).trace(stream, 0, _SAMPLES)
+            light = LampTracer(tracer, LampResponse(response, bands, (1.0,))).trace(stream, 0, _SAMPLES)
             return np.asarray(np.bincount(light.pixel - tracer.projector.n**2, light.value, MOST_LINES) / _SAMPLES)
 
         # (bands, parts)

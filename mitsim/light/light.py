@@ -512,8 +512,8 @@ def pinhole_view(bench: Apparatus, board_reflectance: float, seed: int) -> Float
 
     def view(which: Apparatus) -> FloatArray:
         simulation = Simulation(which, settings, pixels=2 * bench.n)
-        deposits = simulation.direct.trace(integer(seed, "view"), 0, _VIEW_SAMPLES)
-        light = simulation.accumulate("direct", deposits, np.zeros(bench.n**2, dtype=np.int64), 1)["fine"]
+        path_samples = simulation.direct.trace(integer(seed, "view"), 0, _VIEW_SAMPLES)
+        light = simulation.accumulate("direct", path_samples, np.zeros(bench.n**2, dtype=np.int64), 1)["fine"]
         return np.asarray(light[[0]].toarray()).reshape(simulation.grids["fine"].bundle.cells)
 
     scene, board = view(bench), view(before_board(bench, board_reflectance))

@@ -33,7 +33,7 @@ LAYOUT, LAYOUT_OF_TWO_SIDES = 1, 2
 weights for columns too, where these do not lie as rows do."""
 _PACKED: dict[str, Any] = {"shuffle": True, "compression": "gzip", "compression_opts": 1, "fletcher32": True}
 """Filters that every HDF5 library has, and a checksum for each chunk."""
-_GLINT_BYTES = 2**31
+_SPECULAR_BYTES = 2**31
 """Frames of light over mirrors that are formed at once, one a projector pixel."""
 
 
@@ -140,12 +140,12 @@ def _glint(path: Path, light: SampledLight) -> sparse.csr_array | None:
         return None
     (rows, columns), count = light.bench.geometry.frame_shape, light.bench.n**2
     shining = len(np.unique(light.bench.glint.beams.pixel))
-    if shining * rows * columns * 8 > _GLINT_BYTES:
+    if shining * rows * columns * 8 > _SPECULAR_BYTES:
         raise MitsimError(
             f"file {path}: {shining} projector pixels shine over mirrors, and their frames of {rows}x{columns} take "
-            f"more than {_GLINT_BYTES >> 30} GiB at once; leave the mirror out, or take a sensor of fewer pixels"
+            f"more than {_SPECULAR_BYTES >> 30} GiB at once; leave the mirror out, or take a sensor of fewer pixels"
         )
-    found = light.simulation.glint_frames(light.labels)
+    found = light.simulation.specular_frames(light.labels)
     if found is None:
         return None
     lit = sparse.csr_array(found.irradiance.reshape(len(found.classes), -1))

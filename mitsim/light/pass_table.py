@@ -20,14 +20,14 @@ from mitsim.light.grids import Grids
 from mitsim.light.settings import Number, Settings
 from mitsim.transport.connect import SensorPoints
 from mitsim.transport.direct import DirectTracer
-from mitsim.transport.from_camera import Counted, FromCameraTracer, LampTracer, Paths, Together
+from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer, LampResponse, LampTracer, Paths
 from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.path_reuse import NeighbourTracer
+from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.sharp_lobes import AimedTracer
 
 # -------- What traces
 
-FromCamera = FromCameraTracer | Together
+FromCamera = FromCameraTracer | CombinedTracer
 """What follows light from the camera's side."""
 PassTracer = DirectTracer | IndirectTracer | FromCamera
 """What traces a pass."""
@@ -84,7 +84,7 @@ class Tracers(Grids):
         """Follows light over several surfaces from the projector to the sensor's centre, or to all of it where it has
         anchors; none where there is none."""
         tracer, repeats = self._indirect(self._mean_points, self.settings.shared), self.settings.repeats
-        return tracer.repeating(repeats) if tracer and repeats else tracer
+        return tracer.with_adaptive_counts(repeats) if tracer and repeats else tracer
 
     @cached_property
     def from_camera(self) -> FromCamera | None:
@@ -119,7 +119,7 @@ class Tracers(Grids):
         if not any(paths):
             return None
         parts = loaded.scene, loaded.camera, physics.projector, *paths, physics.geometry, points
-        return NeighbourTracer(*parts) if shared else IndirectTracer(*parts)
+        return PathReuseTracer(*parts) if shared else IndirectTracer(*parts)
 
     def _from_camera(self, points: SensorPoints) -> FromCamera | None:
         loaded, physics, lamplight = self.bench.loaded, self.physics, self.bench.lamplight
@@ -137,10 +137,10 @@ class Tracers(Grids):
         for number, response in enumerate(lamplight.responses):
             rows = lamplight.rows(number)
             own = [unit * response.part for unit in units]
-            lamps.append(LampTracer(tracer, Counted(response, lamplight.bands[rows], own, rows.start)))
+            lamps.append(LampTracer(tracer, LampResponse(response, lamplight.bands[rows], own, rows.start)))
         if of_projector:
             lamps.insert(0, FromCameraTracer(*parts, self.aim, replace(paths, emitters=()), physics.geometry, points))
-        return lamps[0] if len(lamps) == 1 else Together(*lamps)
+        return lamps[0] if len(lamps) == 1 else CombinedTracer(*lamps)
 
 
 # -------- The table

@@ -15,12 +15,12 @@ from mitsim.core.arrays import FloatArray, Labels
 from mitsim.devices.patterns import Lighting
 from mitsim.light.grids import GRIDS, LightEstimate
 from mitsim.light.pass_table import PASSES, Pass, PassTracer, Tracers
-from mitsim.light.settings import LANES_AT_ONCE
+from mitsim.light.settings import PATHS_AT_ONCE
 from mitsim.optics.frames import ClassFrames, ExpectedFrames, Filed
-from mitsim.transport.accumulator import DeviceSums, Ledger
+from mitsim.transport.accumulator import DeviceAccumulator, DeviceSums
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.records import DIRECT, INDIRECT, Bundle, Deposits
+from mitsim.transport.records import DIRECT, INDIRECT, Bundle, PathSamples
 
 _FEWEST_AT_ONCE = 2**18
 """Paths that are held in memory at a time at least, 130 MB: so many take far longer than launching them."""
@@ -39,20 +39,20 @@ class TracedPass:
         """Samples of a group with which the prediction is kept."""
         return int(self.row.whole(self.predicted))
 
-    def trace(self, seed: int, first: int, samples: int, ledgers: Sequence[Ledger] = ()) -> Deposits:
-        """Light of some samples, but for what is added up in the ``ledgers``.
+    def trace(self, seed: int, first: int, samples: int, accumulators: Sequence[DeviceAccumulator] = ()) -> PathSamples:
+        """Light of some samples, but for what is added up in the ``accumulators``.
 
         Parameters
         ----------
         seed, first, samples
             as for :meth:`mitsim.transport.integrator.Tracer.trace`.
-        ledgers
-            of :meth:`Simulation.ledgers`.
+        accumulators
+            of :meth:`Simulation.accumulators`.
         """
-        if not ledgers:
+        if not accumulators:
             return self.tracer.trace(seed, first, samples)
         assert isinstance(self.tracer, DirectTracer | IndirectTracer), "the others have none"
-        return self.tracer.trace_into(ledgers, seed, first, samples)
+        return self.tracer.trace_into(accumulators, seed, first, samples)
 
 
 class Simulation(Tracers):
@@ -74,18 +74,18 @@ class Simulation(Tracers):
     def paths_at_once(self) -> int:
         """Paths whose light is held in memory at a time: as many as a pass is predicted to need, within limits; rounds
         that turn out to need more take no more memory."""
-        most = max(each.whole * each.tracer.lanes for each in self.passes.values())
-        lanes = max(each.tracer.lanes for each in self.passes.values())
-        return max(min(max(most, _FEWEST_AT_ONCE), LANES_AT_ONCE), lanes)
+        most = max(each.whole * each.tracer.paths_per_sample for each in self.passes.values())
+        paths_per_sample = max(each.tracer.paths_per_sample for each in self.passes.values())
+        return max(min(max(most, _FEWEST_AT_ONCE), PATHS_AT_ONCE), paths_per_sample)
 
-    def follow(self, seed: int, samples: int) -> Deposits:
+    def follow(self, seed: int, samples: int) -> PathSamples:
         """Light of :attr:`indirect` and :attr:`from_camera` in ``samples`` of each from ``seed``."""
         tracers = [tracer for tracer in (self.indirect, self.from_camera) if tracer is not None]
-        return Deposits.joined([tracer.trace(seed, 0, samples) for tracer in tracers])
+        return PathSamples.joined([tracer.trace(seed, 0, samples) for tracer in tracers])
 
     # ---- Accumulation
 
-    def ledgers(self, name: str, labels: Labels, lines: int) -> tuple[Ledger, ...]:
+    def accumulators(self, name: str, labels: Labels, lines: int) -> tuple[DeviceAccumulator, ...]:
         """What light of each line is added up in on the device; none where the pass has none, or no room.
 
         Parameters
@@ -101,15 +101,15 @@ class Simulation(Tracers):
         if not each.row.device:
             return ()
         assert isinstance(each.tracer, DirectTracer | IndirectTracer), "has sums on the device"
-        paths = each.predicted * each.tracer.lanes if each.row.device == "pays" else math.inf
+        paths = each.predicted * each.tracer.paths_per_sample if each.row.device == "pays" else math.inf
         if each.row.flux:  # which is told pixel by pixel
             pixels, labels = self._pixels_of(each.row), np.zeros_like(labels)
             labels[pixels] = np.arange(len(pixels))
-        if not Ledger.holds(bundle, labels, lines, paths):
+        if not DeviceAccumulator.holds(bundle, labels, lines, paths):
             return ()
-        return Ledger.of_lines(lines, bundle, labels, each.tracer.board)
+        return DeviceAccumulator.of_lines(lines, bundle, labels, each.tracer.board)
 
-    def accumulate(self, name: str, found: Deposits | DeviceSums, labels: Labels, samples: int) -> LightEstimate:
+    def accumulate(self, name: str, found: PathSamples | DeviceSums, labels: Labels, samples: int) -> LightEstimate:
         """Light of a pass per sample: by grid, beyond its mean over the anchors where these have a residual.
 
         Parameters
@@ -117,7 +117,7 @@ class Simulation(Tracers):
         name
             of the pass.
         found
-            paths' light on the host, or sums of :meth:`ledgers`.
+            paths' light on the host, or sums of :meth:`accumulators`.
         labels
             (n^2,) class of each projector pixel.
         samples
@@ -165,7 +165,7 @@ class Simulation(Tracers):
         """``light`` beyond its mean over the sensor."""
         return light - bundle.repeated(bundle.averaged(light, self.mean_weights(bundle.anchors)))
 
-    def flux(self, mean: Deposits, samples: int) -> FloatArray:
+    def flux(self, mean: PathSamples, samples: int) -> FloatArray:
         """(n^2,) irradiance of each projector pixel's direct light, of a ``mean`` over the sensor in so many
         ``samples``."""
         value = mean.value * (mean.kind == DIRECT) / samples
@@ -220,7 +220,7 @@ class Simulation(Tracers):
             if GRIDS[name].formed(self.settings, self.physics)
         ]
 
-    def glint_frames(self, labels: Labels) -> ClassFrames | None:
+    def specular_frames(self, labels: Labels) -> ClassFrames | None:
         """Frames of the projector's glint by class in ``labels`` (n^2,); None without such light.
 
         It is a pinhole's light, whatever the projector's lens.
@@ -289,7 +289,7 @@ def expected_of(
     light = emitted(parts[0][0].physics, lighting, leaking)
     formed = [simulation.with_optics(groups, len(rows)) for simulation, groups in parts]
     lights, ambient = ([each for part in formed for each in part[kind]] for kind in (0, 1))
-    glint = parts[-1][0].glint_frames(lighting.labels)
+    glint = parts[-1][0].specular_frames(lighting.labels)
     return ExpectedFrames(lights, Lighting(rows, light), seed, ambient, glint, probed)
 
 

@@ -16,10 +16,10 @@ from mitsim.light.cost_model import SHARED_COST
 from mitsim.light.grids import LightEstimate
 from mitsim.light.pass_table import EVEN, PASSES, even
 from mitsim.light.passes import Simulation
-from mitsim.light.settings import GROUPS, LANES_AT_ONCE
+from mitsim.light.settings import GROUPS, PATHS_AT_ONCE
 from mitsim.transport.accumulator import DeviceSums, fetched
-from mitsim.transport.path_reuse import NeighbourTracer
-from mitsim.transport.records import Deposits
+from mitsim.transport.path_reuse import PathReuseTracer
+from mitsim.transport.records import PathSamples
 
 # -------- Independent estimates
 
@@ -80,25 +80,30 @@ class Group:
             what light is accumulated by while the next is traced: that takes one processor, and a tracer waits for its
             last paths. All is there when it has been waited for.
         """
-        at_once = min(LANES_AT_ONCE, self.simulation.paths_at_once)
+        at_once = min(PATHS_AT_ONCE, self.simulation.paths_at_once)
         for name, each in self.simulation.passes.items():
             samples = wanted.get(name, 0)
             if self.done.get(name, 0) >= samples:
                 continue
-            seed, ledgers = integer(self.seed, each.row.stream), self.simulation.ledgers(name, self.labels, self._lines)
+            seed, accumulators = (
+                integer(self.seed, each.row.stream),
+                self.simulation.accumulators(name, self.labels, self._lines),
+            )
             if name in self.done:
                 accumulating.wait()
                 self._spread(name, samples / self.done[name])
             while (done := self.done.get(name, 0)) < samples:
-                count = min(max(1, at_once // each.tracer.lanes), samples - done)
-                deposits = each.trace(seed, done, count, ledgers)
-                accumulating.give(self._accumulations(name, deposits.by_line(self._lines), samples))
+                count = min(max(1, at_once // each.tracer.paths_per_sample), samples - done)
+                path_samples = each.trace(seed, done, count, accumulators)
+                accumulating.give(self._accumulations(name, path_samples.by_line(self._lines), samples))
                 self.done[name] = done + count
-                self.paths += count * each.tracer.lanes
-            if ledgers:
-                accumulating.give(self._accumulations(name, fetched(ledgers), samples))
+                self.paths += count * each.tracer.paths_per_sample
+            if accumulators:
+                accumulating.give(self._accumulations(name, fetched(accumulators), samples))
 
-    def _accumulations(self, name: str, by_line: Sequence[Deposits | DeviceSums], samples: int) -> list[Accumulation]:
+    def _accumulations(
+        self, name: str, by_line: Sequence[PathSamples | DeviceSums], samples: int
+    ) -> list[Accumulation]:
         return [partial(self._add, name, line, light, samples) for line, light in enumerate(by_line)]
 
     def _spread(self, name: str, growth: float) -> None:
@@ -106,7 +111,7 @@ class Group:
         for means in self._means:
             means[name] /= growth
 
-    def _add(self, name: str, line: int, found: Deposits | DeviceSums, samples: int) -> None:
+    def _add(self, name: str, line: int, found: PathSamples | DeviceSums, samples: int) -> None:
         means, light = self._means[line], self.simulation.accumulate(name, found, self.labels, samples)
         means[name] = means[name] + light if name in means else light
 
@@ -253,8 +258,8 @@ def _work(simulation: Simulation) -> dict[str, float]:
     """Seconds by the table's unit costs of a sample of each pass."""
     return {
         name: PASSES[name].unit_cost
-        * each.tracer.lanes
-        * (SHARED_COST if isinstance(each.tracer, NeighbourTracer) else 1)
+        * each.tracer.paths_per_sample
+        * (SHARED_COST if isinstance(each.tracer, PathReuseTracer) else 1)
         for name, each in simulation.passes.items()
     }
 
@@ -262,6 +267,7 @@ def _work(simulation: Simulation) -> dict[str, float]:
 def _mostly_followed(simulation: Simulation) -> bool:
     """Whether most paths that a plan predicts are of light over several surfaces."""
     paths = {
-        name: int(PASSES[name].whole(each.predicted)) * each.tracer.lanes for name, each in simulation.passes.items()
+        name: int(PASSES[name].whole(each.predicted)) * each.tracer.paths_per_sample
+        for name, each in simulation.passes.items()
     }
     return sum(count for name, count in paths.items() if name not in EVEN) > sum(paths.values()) / 2

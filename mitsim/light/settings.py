@@ -12,7 +12,7 @@ Number = float | FloatArray
 GROUPS = 4
 """Independent estimates of the light, whose spread is the Monte Carlo error: of light of many paths, whose noise is of
 many kinds, four tell it as well as more (docs/physics.md), and each takes its own accumulating, forming and probing."""
-LANES_AT_ONCE = 2**21
+PATHS_AT_ONCE = 2**21
 """Paths whose light is held in memory at a time."""
 MOST_PATHS = 2**32
 """Limit of one light's paths: half an hour on two cores, at which sampling stops and says so."""

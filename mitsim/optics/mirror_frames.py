@@ -85,7 +85,7 @@ class Beams:
 
 
 @dataclass(frozen=True, eq=False)
-class GlintFrames(ClassFrames):
+class SpecularFrames(ClassFrames):
     """Irradiance by mirrors, one frame for each class of projector pixels that reaches the sensor.
 
     Attributes
@@ -104,19 +104,19 @@ class GlintFrames(ClassFrames):
     error: float
 
 
-def glint_frames(
+def specular_frames(
     beams: Beams,
     geometry: CameraGeometry,
     terms: Sequence[SampledTerm],
     labels: IntArray,
     boxes_per_pixel: int = 2,
-) -> GlintFrames:
+) -> SpecularFrames:
     """Frames of the classes that mirrors bring to the sensor; memory is one frame for each of them.
 
     Parameters
     ----------
     beams
-        from ``mitsim.transport.specular.trace_glint``.
+        from ``mitsim.transport.specular.trace_specular_chains``.
     geometry
         the camera; irradiance is the mean over a pixel's active square, times the fill factor and the response.
     terms
@@ -146,7 +146,7 @@ def glint_frames(
         lit[pixels] = True
     used = np.isin(classes, labels[lit])
     area = math.prod(geometry.active_sides)
-    return GlintFrames(
+    return SpecularFrames(
         classes[used].astype(np.int64), frames[used] / area, np.flatnonzero(lit), total, beams.unresolved, beams.error
     )
 

@@ -214,13 +214,13 @@ class _Words:
         if mirror is not None and shapes and self.evidence.left_out >= min(accuracy, parts[largest]):
             said.append(self._left_out(shapes[mirror]))
         if self.facts.mirrors and self.evidence.glint >= min(accuracy, parts[largest]):
-            said.append(self._unresolved_glint(self.facts.mirrors))
+            said.append(self._unresolved_specular(self.facts.mirrors))
         return tuple(said) or (
             f"the predicted total error, up to {chosen.total.bound:.1e}, exceeds the requested {accuracy:g}; "
             f"largest: {largest}, {parts[largest]:.1e}",
         )
 
-    def _unresolved_glint(self, mirrors: tuple[Tag, ...]) -> str:
+    def _unresolved_specular(self, mirrors: tuple[Tag, ...]) -> str:
         """What is lost of light over ``mirrors`` alone."""
         kinds = Counter(str(mirror.attributes.get("type", "shape")) for mirror in mirrors)
         among = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())

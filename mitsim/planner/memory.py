@@ -17,7 +17,7 @@ from mitsim.light.settings import GROUPS, Settings
 from mitsim.optics.fft_shadow import cells_a_side, cells_per_pixel, points_per_cell
 from mitsim.optics.frames import PROBES, frames_in_memory
 
-_LANES_BYTES = 380e6
+_PATH_BYTES = 380e6
 """Paths in flight, compiled kernels, LLVM; measured about 350e6, once a little above it."""
 _FOLLOWED_BYTES = 300e6
 """What the pilot's look at light over several surfaces leaves behind: kernels, lights of four looks at several points
@@ -25,7 +25,7 @@ _FOLLOWED_BYTES = 300e6
 _ENTRY_BYTES = 45.0
 """An entry of a sparse matrix of light (12), the sum that it is added to, and what frames are formed of; measured 32 to
 45 where matrices are large."""
-_DEPOSIT_BYTES = 500.0
+_PATH_SAMPLE_BYTES = 500.0
 """A path's light while it is accumulated in one cell or two; measured."""
 _PATH_BYTES, _PART_BYTES = 200.0, 75.0
 """The same where it is shared between more: the light of a path that is accumulated, and of one that is traced
@@ -126,15 +126,15 @@ def light_bytes(bench: Apparatus, classes: int, settings: Settings, lines: int =
             0.0 if settings.raster else factors,
             raster_bytes(geometry.model_copy(update={"mask_cells": settings.raster_cells}), bench.waves),
         )
-    held = lines * GROUPS * held * _ENTRY_BYTES + min(lines, workers()) * paths * deposit_bytes(settings)
-    return factors + _LANES_BYTES + _FOLLOWED_BYTES * followed + held
+    held = lines * GROUPS * held * _ENTRY_BYTES + min(lines, workers()) * paths * path_sample_bytes(settings)
+    return factors + _PATH_BYTES + _FOLLOWED_BYTES * followed + held
 
 
-def deposit_bytes(settings: Settings) -> float:
+def path_sample_bytes(settings: Settings) -> float:
     """Memory of a path's light while it is accumulated with these ``settings``: that of sharp pixels lies in four cells
     of two layers at most."""
     parts = min(len(settings.depths), 2) * (4 if settings.sharp else 1)
-    return max(_DEPOSIT_BYTES, _PATH_BYTES + parts * _PART_BYTES)
+    return max(_PATH_SAMPLE_BYTES, _PATH_BYTES + parts * _PART_BYTES)
 
 
 # -------- Drawing a mask's shadow on a raster

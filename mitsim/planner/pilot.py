@@ -167,11 +167,13 @@ class Look:
             changes = len(self.occluded.changes)
         elif run == "followed":
             connections = sum(part.count**2 for part in self.followed.changes if part.name == "followed_anchors")
-            lanes = sum(self.switched.lanes.values())
-            paths = costs["indirect_residual"] * lanes * finer.followed * connections
+            paths_per_sample = sum(self.switched.paths_per_sample.values())
+            paths = costs["indirect_residual"] * paths_per_sample * finer.followed * connections
             changes = len(self.followed.changes)
         else:
-            followed = sum(costs[name] * lanes for name, lanes in self.switched.lanes.items())
+            followed = sum(
+                costs[name] * paths_per_sample for name, paths_per_sample in self.switched.paths_per_sample.items()
+            )
             paths = costs["direct"] * pixels * finer.direct + followed * finer.followed
             changes = _OF_EFFECTS * len(self.present)
         return LOOKS * paths + changes * float(one)
@@ -257,7 +259,7 @@ class Look:
         missing = float(unmet.irradiance.sum() - self._sharp.by_pixel[near].sum())
         return missing if missing > _LOOSELY * float(unmet.irradiance.sum()) else 0.0
 
-    def _unsure_glint(self, other: float) -> float:
+    def _unsure_specular(self, other: float) -> float:
         """Part of all light that comes over mirrors alone and is in no frame, or may be in the wrong pixels.
 
         ``other``: irradiance of all other light [W m^-2].
@@ -302,7 +304,7 @@ class Look:
             apart=switched.apart,
             unresolved=unresolved / (self._light + sharp.irradiance + unmet) if unresolved else 0.0,
             left_out=left_out / (left_out + found) if left_out else 0.0,
-            glint=self._unsure_glint(found),
+            glint=self._unsure_specular(found),
             mirror=mirror,
             reach=self._base.reach,
             sharp=apart,
@@ -377,13 +379,13 @@ def _first_light(simulation: Simulation, seed: int, sharp: SharpLight) -> tuple[
     bench, own = simulation.bench, integer(seed, "pilot", "depth")
     enough = min(_FEWEST_HITS, simulation.bench.n**2 / 4)
     first, samples = 0, 1
-    deposits = simulation.direct.trace(own)
-    while _equal(deposits.value) < enough and not bench.loaded.mirrors and not sharp.irradiance:
+    path_samples = simulation.direct.trace(own)
+    while _equal(path_samples.value) < enough and not bench.loaded.mirrors and not sharp.irradiance:
         if _MORE * (first + samples) * bench.n**2 > _MOST_RAYS:
             break
         first, samples = first + samples, (_MORE - 1) * (first + samples)
-        deposits = simulation.direct.trace(own, first, samples)
-    total = float(deposits.value.sum()) / samples
+        path_samples = simulation.direct.trace(own, first, samples)
+    total = float(path_samples.value.sum()) / samples
     if not bench.loaded.mirrors and not sharp.irradiance:
         everywhere = Simulation(bench, replace(simulation.settings, anchors=2)).direct.trace(own, first, samples)
         if total < _FAINT * float(everywhere.value.sum()) / samples:
@@ -394,11 +396,11 @@ def _first_light(simulation: Simulation, seed: int, sharp: SharpLight) -> tuple[
     if not total and not bench.loaded.mirrors:
         raise MitsimError(f"no light of the projector reaches the camera: {why_dark(bench.loaded)}")
     # Sums by numpy, here and elsewhere: those of BLAS depend on the number of its threads in the last bits.
-    mean = float((deposits.inverse_depth * deposits.value).sum()) / (samples * total) if total else 0.0
+    mean = float((path_samples.inverse_depth * path_samples.value).sum()) / (samples * total) if total else 0.0
     # A plane is met at its own depth but for rounding; the aligned plane keeps its exact cells.
     flat = abs(mean * bench.geometry.scene_distance - 1) < _ALIGNED
     depth = bench.geometry.scene_distance if flat or mean <= 0 else 1 / mean
-    return depth, total, _equal(deposits.value) / samples
+    return depth, total, _equal(path_samples.value) / samples
 
 
 def _equal(values: FloatArray) -> float:
@@ -431,13 +433,13 @@ def light_reach(simulation: Simulation, seed: int) -> float | None:
     """
     bench, depth = simulation.bench, simulation.settings.depth
     tracer = simulation.spread
-    deposits = tracer.trace(seed, 0, max(1, _CONNECTIONS // tracer.lanes))
-    if not deposits.value.size:
+    path_samples = tracer.trace(seed, 0, max(1, _CONNECTIONS // tracer.paths_per_sample))
+    if not path_samples.value.size:
         return None
-    nearest = 1 / float(deposits.inverse_depth.max())
+    nearest = 1 / float(path_samples.inverse_depth.max())
     if nearest > depth * (1 - _FLAT):
         return None
-    farthest = max(float(abs(angle).max()) for angle in (deposits.row, deposits.column))
+    farthest = max(float(abs(angle).max()) for angle in (path_samples.row, path_samples.column))
     pixel = max((last - first) / bench.n for first, last in bench.windows_at(depth))
     reach = min(farthest + pixel, simulation.physics.geometry.reach(nearest))
     return reach if reach > simulation.reach else None

@@ -20,7 +20,7 @@ from mitsim.light.pilot_result import LOOKS, Noise, Part, SampleCost
 from mitsim.light.settings import Settings
 from mitsim.planner.pilot_direct import shown_pixels, tracer_of
 from mitsim.planner.pilot_samples import EVEN_CELLS, Sample, coarsened, heavy_paths, ladder, noise, norm
-from mitsim.transport.records import Deposits
+from mitsim.transport.records import PathSamples
 
 _JUDGE = 2
 """Index of the number of anchors that judges at first: two steps tell how fast the error falls."""
@@ -121,7 +121,7 @@ class AnchorRuns:
     def _beyond(
         self,
         simulation: Simulation,
-        replicates: Sequence[Deposits],
+        replicates: Sequence[PathSamples],
         frames: FloatArray | None = None,
         samples: int | None = None,
     ) -> FloatArray:
@@ -132,7 +132,7 @@ class AnchorRuns:
         return frames - self._formed([grid.of_mean for grid in grids], mean, samples)
 
     @cached_property
-    def _few(self) -> list[Deposits]:
+    def _few(self) -> list[PathSamples]:
         """Light to a few anchors, replicate by replicate."""
         return self._traced(self._simulation(self.few))
 
@@ -151,12 +151,14 @@ class AnchorRuns:
         lamps = [simulation.ambient[name]] if name in simulation.ambient and self.bench.loaded.lamps else []
         return [simulation.grids[name], *lamps]
 
-    def _traced(self, simulation: Simulation) -> list[Deposits]:
+    def _traced(self, simulation: Simulation) -> list[PathSamples]:
         """Light to every anchor, replicate by replicate."""
         anchors = self._grids(simulation)[0].bundle.anchors
-        return tracer_of(simulation, self.pixels, anchors).trace_looks(self._seeds, self._samples)
+        return tracer_of(simulation, self.pixels, anchors).trace_replicates(self._seeds, self._samples)
 
-    def _formed(self, grids: Sequence[Grid], replicates: Sequence[Deposits], samples: int | None = None) -> FloatArray:
+    def _formed(
+        self, grids: Sequence[Grid], replicates: Sequence[PathSamples], samples: int | None = None
+    ) -> FloatArray:
         """(replicates, shots, places, places) frames of light in ``grids``; of so many ``samples``, if not of as many
         as others."""
         samples = samples or self._samples
@@ -212,7 +214,7 @@ class FollowedRuns(AnchorRuns):
             seen = every - from_camera, from_camera
         errors = (noise(each) / light if light else 0.0 for each in seen)
         return {
-            name: SampleCost(Noise(error, self._samples, 0.5), tracer.lanes) if tracer else SampleCost.none()
+            name: SampleCost(Noise(error, self._samples, 0.5), tracer.paths_per_sample) if tracer else SampleCost.none()
             for name, error, tracer in zip(self.passes, errors, tracers, strict=True)
         }
 
@@ -226,7 +228,7 @@ class FollowedRuns(AnchorRuns):
         frames = self._beyond(simulation, seen, samples=samples)
         # The heaviest paths come to one anchor of several: each connection counts.
         found = Noise.among(frames, light, samples, np.concatenate([replicate.value for replicate in seen]))
-        return SampleCost(found, one.lanes)
+        return SampleCost(found, one.paths_per_sample)
 
     @property
     def _widths(self) -> dict[Part, FloatArray]:
@@ -238,26 +240,26 @@ class FollowedRuns(AnchorRuns):
         return {Part("followed_width", width): change for width, change in {1: missing, **wide}.items()}
 
     @cached_property
-    def _few(self) -> list[Deposits]:
+    def _few(self) -> list[PathSamples]:
         return _joined(self._few_by_tracer)
 
     @cached_property
-    def _few_by_tracer(self) -> list[list[Deposits]]:
+    def _few_by_tracer(self) -> list[list[PathSamples]]:
         """The same by tracer."""
         tracers = _tracers(self._simulation(self.few))
-        return [tracer.trace_looks(self._seeds, self._samples) for tracer in tracers]
+        return [tracer.trace_replicates(self._seeds, self._samples) for tracer in tracers]
 
     def _at_anchors(self, anchors: int) -> FloatArray:
         simulation, samples = self._simulation(anchors), self._samples
         grids, tracers = self._grids(simulation), _tracers(simulation)
         if anchors == self.few:
             return self._formed(grids, self._few)
-        each = max(1, _AT_ONCE // sum(tracer.lanes for tracer in tracers))
+        each = max(1, _AT_ONCE // sum(tracer.paths_per_sample for tracer in tracers))
         found = []
         for first in range(0, samples, each):
             some = min(each, samples - first)
             traced = [
-                tracer.trace_looks(self._seeds, some)
+                tracer.trace_replicates(self._seeds, some)
                 if some == samples
                 else [tracer.trace(seed, first, some) for seed in self._seeds]
                 for tracer in tracers
@@ -270,6 +272,6 @@ def _tracers(simulation: Simulation) -> list[PassTracer]:
     return [tracer for tracer in simulation.at_anchors if tracer is not None]
 
 
-def _joined(traced: Sequence[list[Deposits]]) -> list[Deposits]:
+def _joined(traced: Sequence[list[PathSamples]]) -> list[PathSamples]:
     """Light of several tracers together, replicate by replicate."""
-    return [Deposits.joined(replicates) for replicates in zip(*traced, strict=True)]
+    return [PathSamples.joined(replicates) for replicates in zip(*traced, strict=True)]

@@ -27,7 +27,7 @@ from mitsim.optics.image_formation import raster_error
 from mitsim.planner.memory import cells_to_choose, drawing_seconds
 from mitsim.planner.pilot_samples import EVEN_CELLS, GOOD_ENOUGH, Sample, ladder, noise, norm
 from mitsim.transport.direct import DirectTracer
-from mitsim.transport.records import Deposits
+from mitsim.transport.records import PathSamples
 from mitsim.transport.sharp_lobes import SharpLight, with_neighbours
 
 LAYER_LADDER, CELL_LADDER = (1, 2, 3, 4, 6, 8, 12), (1, 2, 4, 8)
@@ -74,9 +74,9 @@ class DirectRuns:
         self._seeds = [integer(seed, "pilot", "fine", replicate) for replicate in range(LOOKS)]
         self._simulation = simulation = sample.simulation(bench, base)
         self._tracer = tracer_of(simulation, shown_pixels(base, sample), base.anchors)
-        self._deposits = self._tracer.trace_looks(self._seeds, sample.fine)
+        self._path_samples = self._tracer.trace_replicates(self._seeds, sample.fine)
         apart, samples = simulation.sharp, sample.sharp(simulation)
-        self._sharp = apart.trace_looks(self._seeds, samples) if apart else []
+        self._sharp = apart.trace_replicates(self._seeds, samples) if apart else []
 
     @property
     def judging(self) -> tuple[float, ...]:
@@ -95,7 +95,7 @@ class DirectRuns:
 
     def _range(self) -> tuple[float, float]:
         """Nearest and farthest depth that the light is seen at [mm]."""
-        inverse = np.concatenate([deposits.inverse_depth for deposits in (*self._deposits, *self._sharp)])
+        inverse = np.concatenate([path_samples.inverse_depth for path_samples in (*self._path_samples, *self._sharp)])
         if not inverse.size:
             return self.base.depth, self.base.depth
         return 1 / float(inverse.max()), 1 / max(float(inverse.min()), _FARTHEST / self.base.depth)
@@ -137,7 +137,7 @@ class DirectRuns:
     @cached_property
     def _whole(self) -> FloatArray:
         """(replicates, ...) frames of the light in the cells and layers of the base."""
-        return self._formed(self._simulation, self._deposits, self.sample.fine)
+        return self._formed(self._simulation, self._path_samples, self.sample.fine)
 
     @cached_property
     def _noise(self) -> tuple[float, float]:
@@ -146,12 +146,12 @@ class DirectRuns:
     @cached_property
     def _spread_noise(self) -> tuple[float, float]:
         tracer = tracer_of(self._simulation, shown_pixels(self.base, self.sample), 1, spread=True)
-        seen = tracer.trace_looks(self._seeds, self.sample.fine)
+        seen = tracer.trace_replicates(self._seeds, self.sample.fine)
         return self._noise_of(tracer, self._formed(self._simulation, seen, self.sample.fine))
 
     def _noise_of(self, tracer: DirectTracer, many: FloatArray) -> tuple[float, float]:
         """Error of a replicate of the ``tracer`` whose frames of all samples are ``many``, and of one with fewer."""
-        few = tracer.trace_looks(self._seeds, self._fewer)
+        few = tracer.trace_replicates(self._seeds, self._fewer)
         return noise(many), noise(self._formed(self._simulation, few, self._fewer))
 
     def forming(self, family: Lighting) -> Forming:
@@ -159,7 +159,7 @@ class DirectRuns:
         simulation = Simulation(self.bench, self.base)
         rows, weights = self.sample.rows, self.sample.lighting.weights
         fine = simulation.grids["fine"]
-        light = fine.bundle.file(self._deposits[0], self.sample.lighting.labels, self.sample.fine)
+        light = fine.bundle.file(self._path_samples[0], self.sample.lighting.labels, self.sample.fine)
         filed, timed = Filed(fine.optics, (light[: len(rows)],) * GROUPS), weights[: workers()]
         started = time.perf_counter()
         list(ExpectedFrames([filed], Lighting(rows, timed), 0))
@@ -187,7 +187,7 @@ class DirectRuns:
         """What a shadow on a raster leaves of a frame, without diffraction and with it."""
         simulation = Simulation(self.bench, self.base)
         bundle, geometry = simulation.grids["fine"].bundle, self.bench.geometry
-        light = bundle.file(self._deposits[0], self.sample.lighting.labels, self.sample.fine)
+        light = bundle.file(self._path_samples[0], self.sample.lighting.labels, self.sample.fine)
         shot = sparse.csr_array(self.sample.lighting.weights[:1]) @ light[: self.sample.lighting.weights.shape[1]]
         light = shot.toarray().reshape(bundle.anchors, bundle.cells[0], bundle.anchors, bundle.cells[1])
 
@@ -213,14 +213,14 @@ class DirectRuns:
     def _frames(self, layers: tuple[float, ...], subdivision: int) -> FloatArray:
         settings = replace(self.base, layers=layers, subdivision=subdivision)
         simulation = self.sample.simulation(self.bench, settings)
-        return self._formed(simulation, self._deposits, self.sample.fine, self._sharp)
+        return self._formed(simulation, self._path_samples, self.sample.fine, self._sharp)
 
     def _formed(
-        self, simulation: Simulation, deposits: list[Deposits], samples: int, sharp: Sequence[Deposits] = ()
+        self, simulation: Simulation, path_samples: list[PathSamples], samples: int, sharp: Sequence[PathSamples] = ()
     ) -> FloatArray:
         sample, light = self.sample, emitted(simulation.physics, self.sample.lighting)
         grids = simulation.grids
-        frames = sample.frames(grids["fine"], deposits, samples, light)
+        frames = sample.frames(grids["fine"], path_samples, samples, light)
         return frames + sample.frames(grids["sharp"], sharp, sample.sharp(simulation), light) if sharp else frames
 
 
@@ -432,7 +432,7 @@ def _connections(simulation: Simulation, chosen: SharpPixels, accuracy: float, s
         return math.inf
     tracer = Simulation(simulation.bench, replace(simulation.settings, sharp=chosen)).sharp
     assert tracer is not None
-    samples = min(max(_LARGEST_TRIAL // tracer.lanes, 2), _TRIAL)
+    samples = min(max(_LARGEST_TRIAL // tracer.paths_per_sample, 2), _TRIAL)
     seen = [tracer.trace(integer(seed, half), 0, samples) for half in range(2)]
     place = [(light.pixel * chosen.anchors + light.anchor_row) * chosen.anchors + light.anchor_column for light in seen]
     every, where = np.unique(np.concatenate(place), return_inverse=True)
@@ -440,7 +440,7 @@ def _connections(simulation: Simulation, chosen: SharpPixels, accuracy: float, s
     first, second = (np.bincount(at, light.value, len(every)) for at, light in zip(parts, seen, strict=True))
     energy = float((first * second).sum())
     noise = math.sqrt(float(np.square(first - second).sum()) / 2 / energy) if energy > 0 else math.inf
-    return float(tracer.lanes * samples * (noise / accuracy) ** (1 / SHARP_RATE))
+    return float(tracer.paths_per_sample * samples * (noise / accuracy) ** (1 / SHARP_RATE))
 
 
 def _paths(moments: FloatArray, even: float, pixels: int, anchors: int) -> FloatArray:

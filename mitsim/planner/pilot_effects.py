@@ -22,10 +22,10 @@ from mitsim.light.settings import Settings
 from mitsim.planner.pilot_direct import SHARP_RATE
 from mitsim.planner.pilot_samples import Known, Sample, coarsened, heavy_paths, noise, norm
 from mitsim.transport import records
-from mitsim.transport.indirect import block_moments, chosen_repeats, effect_of
+from mitsim.transport.indirect import adaptive_counts, block_moments, effect_of
 from mitsim.transport.integrator import KINDS
-from mitsim.transport.path_reuse import NeighbourTracer
-from mitsim.transport.records import Deposits
+from mitsim.transport.path_reuse import PathReuseTracer
+from mitsim.transport.records import PathSamples
 
 _FOLLOWED = tuple(name for name, row in PASSES.items() if not (row.even or row.anchors))
 """Passes of light that is followed to one point of the sensor."""
@@ -91,24 +91,26 @@ class EffectRuns:
             return {}
         return coarsened("indirect", partial(self._indirect, self._bounced, self._closer[1]), self.layers)
 
-    def _indirect(self, bounced: Sequence[Deposits], samples: int, cells: int, layers: tuple[float, ...]) -> FloatArray:
+    def _indirect(
+        self, bounced: Sequence[PathSamples], samples: int, cells: int, layers: tuple[float, ...]
+    ) -> FloatArray:
         """Frames of ``bounced`` light in so many samples, in coarse cells and layers."""
         coarse = replace(self.everything, coarse_cells=cells, coarse_layers=bool(layers), layers=layers)
         simulation = self.sample.simulation(self.bench, coarse)
         return self._form(simulation, followed={"indirect": bounced}, samples=samples)
 
     @cached_property
-    def _bounced(self) -> list[Deposits]:
+    def _bounced(self) -> list[PathSamples]:
         """Indirect light from the projector's side in closer replicates, replicate by replicate."""
         replicates, _ = self._closer
         return self._first_bounced if replicates is self.followed["indirect"] else _indirect_of(replicates)
 
     @cached_property
-    def _first_bounced(self) -> list[Deposits]:
+    def _first_bounced(self) -> list[PathSamples]:
         return _indirect_of(self.followed["indirect"])
 
     @cached_property
-    def _closer(self) -> tuple[list[Deposits], int]:
+    def _closer(self) -> tuple[list[PathSamples], int]:
         """Looks at the projector's side's light, and their samples: more where noise hides what coarse cells change."""
         replicates, samples, tracer = self.followed["indirect"], self.sample.followed, self.simulation.indirect
         if tracer is None or not any(light.value.size for light in self._first_bounced):
@@ -116,11 +118,11 @@ class EffectRuns:
         seen = coarsened("indirect", partial(self._indirect, self._first_bounced, samples), ())
         value, bound = Changes.between(seen, self.light**2).estimate(seen)
         wanted = math.ceil(samples * (bound**2 - value**2) / (_OPEN * self.accuracy) ** 2)
-        more = min(wanted, self.sample.closer(tracer.lanes))
+        more = min(wanted, self.sample.closer(tracer.paths_per_sample))
         if more <= samples:
             return replicates, samples
         # Seeds of their own: that the first replicates are vague says nothing of these.
-        return tracer.trace_looks([integer(seed, "closer") for seed in self.seeds], more), more
+        return tracer.trace_replicates([integer(seed, "closer") for seed in self.seeds], more), more
 
     @property
     def received(self) -> float:
@@ -135,17 +137,17 @@ class EffectRuns:
         return {name: self.simulation.physics.speckle for name in effects if not EFFECTS[name].in_frames}
 
     @property
-    def lanes(self) -> dict[str, int]:
+    def paths_per_sample(self) -> dict[str, int]:
         """Paths in a sample of each tracer."""
-        return {name: lanes for name, (_, _, lanes) in self._noise.items()}
+        return {name: paths_per_sample for name, (_, _, paths_per_sample) in self._noise.items()}
 
     def sample_cost(self, name: str) -> SampleCost:
         """Monte Carlo error of one estimate by the pass ``name``, relative to all light, and its paths."""
         if name not in self._noise:
             return SampleCost.none()
-        error, samples, lanes = self._noise[name]
+        error, samples, paths_per_sample = self._noise[name]
         relative = error / self.light if self.light else 0.0
-        return SampleCost(Noise(relative, samples, 0.5), lanes)
+        return SampleCost(Noise(relative, samples, 0.5), paths_per_sample)
 
     def with_more(self, samples: int) -> SampleCost:
         """The same of what is followed from the camera, by replicates of so many ``samples`` of their own."""
@@ -155,7 +157,7 @@ class EffectRuns:
         seen = [heavy_paths(tracer, integer(seed, "heavy"), samples) for seed in self.seeds]
         frames = self._form(self.simulation, followed=self._by_kind({"from_camera": seen}), samples=samples)
         paths = np.concatenate([replicate.value for replicate in seen])
-        return SampleCost(Noise.among(frames, self.light, samples, paths), tracer.lanes)
+        return SampleCost(Noise.among(frames, self.light, samples, paths), tracer.paths_per_sample)
 
     def indirect_cost(self) -> tuple[SampleCost, bool, tuple[int, ...]]:
         """What light over several surfaces takes, whether that is less where neighbouring pixels share it, and how
@@ -172,10 +174,10 @@ class EffectRuns:
         """Paths of each block of pixels in a sample, and what that makes of variance and paths, by other replicates."""
         pixels = self.bench.n
         moments = [block_moments(replicate.pixel, replicate.value, pixels) for replicate in self._bounced]
-        repeats = chosen_repeats(np.sum(moments, axis=0))
+        repeats = adaptive_counts(np.sum(moments, axis=0))
         # Judged by replicates that had no say, a half each: a single heavy path recommends only its own block.
         halves = np.sum(moments[::2], axis=0), np.sum(moments[1::2], axis=0)
-        judged = [effect_of(chosen_repeats(one), other) for one, other in (halves, halves[::-1])]
+        judged = [effect_of(adaptive_counts(one), other) for one, other in (halves, halves[::-1])]
         variance, paths = np.mean(judged, axis=0)
         return tuple(int(count) for count in repeats.ravel()), (float(variance), float(paths))
 
@@ -183,13 +185,13 @@ class EffectRuns:
     def _shared_or_not(self) -> tuple[SampleCost, bool]:
         """What light over several surfaces takes, and whether it is shared."""
         plain, tracer = self.sample_cost("indirect"), self._sharing.indirect
-        if not plain.noise.error or not isinstance(tracer, NeighbourTracer) or not tracer.shares():
+        if not plain.noise.error or not isinstance(tracer, PathReuseTracer) or not tracer.shares():
             return plain, False
         samples = max(1, self._closer[1] // SHARED_COST)
         seen = [tracer.trace(integer(seed, "shared"), 0, samples) for seed in self.seeds]
         error = noise(self._form(self._sharing, followed=self._by_kind({"indirect": seen}), samples=samples))
         error /= self.light
-        shared = SampleCost(Noise(error, samples, 0.5), SHARED_COST * tracer.lanes)
+        shared = SampleCost(Noise(error, samples, 0.5), SHARED_COST * tracer.paths_per_sample)
         less = shared.variance * shared.paths < plain.variance * plain.paths
         return (shared, True) if less else (plain, False)
 
@@ -202,14 +204,14 @@ class EffectRuns:
         """That of every pass that is followed to one point of the sensor, and of sharp pixels where there are any."""
         found = {name: self.sample_cost(name) for name in _FOLLOWED}
         tracer = self.simulation.sharp
-        return {**found, "sharp": self._sharp_cost(tracer.lanes)} if tracer else found
+        return {**found, "sharp": self._sharp_cost(tracer.paths_per_sample)} if tracer else found
 
-    def _sharp_cost(self, lanes: int) -> SampleCost:
+    def _sharp_cost(self, paths_per_sample: int) -> SampleCost:
         """That of pixels that are traced apart, their rate being that of stratified rays."""
         samples = self.sample.sharp(self.simulation)
         error = noise(self._form(self.simulation, sharp=self.sharp))
         relative = error / self.light if self.light else 0.0
-        return SampleCost(Noise(relative, samples, SHARP_RATE), lanes)
+        return SampleCost(Noise(relative, samples, SHARP_RATE), paths_per_sample)
 
     @cached_property
     def _noise(self) -> dict[str, tuple[float, int, int]]:
@@ -220,7 +222,7 @@ class EffectRuns:
                 first = self.followed[name], self.sample.followed
                 replicates, samples = self._closer if name == "indirect" else first
                 frames = self._form(self.simulation, followed=self._by_kind({name: replicates}), samples=samples)
-                found[name] = noise(frames), samples, each.tracer.lanes
+                found[name] = noise(frames), samples, each.tracer.paths_per_sample
         return found
 
     def _without(self, effect: Effect) -> FloatArray:
@@ -236,38 +238,38 @@ class EffectRuns:
             followed = {kind: light for kind, light in self._kinds.items() if kind != effect.kind}
         return self._form(simulation, direct, followed, sharp)
 
-    def _direct(self, simulation: Simulation) -> list[Deposits]:
-        return simulation.direct.trace_looks(self.seeds, self.sample.direct)
+    def _direct(self, simulation: Simulation) -> list[PathSamples]:
+        return simulation.direct.trace_replicates(self.seeds, self.sample.direct)
 
-    def _follow(self, simulation: Simulation, name: str) -> list[Deposits]:
+    def _follow(self, simulation: Simulation, name: str) -> list[PathSamples]:
         """Light of the pass ``name``, replicate by replicate."""
         tracer = PASSES[name].tracer(simulation)
         if tracer is None:
-            return [Deposits.none()] * LOOKS
-        return tracer.trace_looks([integer(seed, name) for seed in self.seeds], self.sample.followed)
+            return [PathSamples.none()] * LOOKS
+        return tracer.trace_replicates([integer(seed, name) for seed in self.seeds], self.sample.followed)
 
     @staticmethod
-    def _by_kind(followed: dict[str, list[Deposits]]) -> dict[str, list[Deposits]]:
+    def _by_kind(followed: dict[str, list[PathSamples]]) -> dict[str, list[PathSamples]]:
         """Light of several tracers together by its kind, replicate by replicate."""
-        replicates = [Deposits.joined(replicates) for replicates in zip(*followed.values(), strict=True)]
+        replicates = [PathSamples.joined(replicates) for replicates in zip(*followed.values(), strict=True)]
         return {
             name: [replicate.where(replicate.kind == kind) for replicate in replicates] for name, kind in KINDS.items()
         }
 
-    def _sharp(self, simulation: Simulation) -> list[Deposits]:
+    def _sharp(self, simulation: Simulation) -> list[PathSamples]:
         """Light of pixels that are traced apart, replicate by replicate."""
         tracer, samples = simulation.sharp, self.sample.sharp(simulation)
         if tracer is None:
             return []
-        found: list[Deposits] = tracer.trace_looks([integer(seed, "sharp") for seed in self.seeds], samples)
+        found: list[PathSamples] = tracer.trace_replicates([integer(seed, "sharp") for seed in self.seeds], samples)
         return found
 
     def _form(
         self,
         simulation: Simulation,
-        direct: Sequence[Deposits] = (),
-        followed: Mapping[str, Sequence[Deposits]] = MappingProxyType({}),
-        sharp: Sequence[Deposits] = (),
+        direct: Sequence[PathSamples] = (),
+        followed: Mapping[str, Sequence[PathSamples]] = MappingProxyType({}),
+        sharp: Sequence[PathSamples] = (),
         samples: int | None = None,
     ) -> FloatArray:
         """Frames of light replicate by replicate, where there is any; ``samples`` of followed light, if not as many as
@@ -286,10 +288,10 @@ class EffectRuns:
         lamps = followed.get("ambient", ())
         if physics.lamps and lamps:
             frames += sample.lamps(simulation.ambient["fine"], lamps, few, known)
-        glint = simulation.glint_frames(sample.lighting.labels)
+        glint = simulation.specular_frames(sample.lighting.labels)
         return frames if glint is None else frames + np.tensordot(light[:, glint.classes], glint.irradiance, 1)
 
 
-def _indirect_of(replicates: Sequence[Deposits]) -> list[Deposits]:
+def _indirect_of(replicates: Sequence[PathSamples]) -> list[PathSamples]:
     """Indirect light in ``replicates``, replicate by replicate."""
     return [light.where(light.kind == records.INDIRECT) for light in replicates]

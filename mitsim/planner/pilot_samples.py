@@ -21,10 +21,10 @@ from mitsim.light.pilot_result import Part
 from mitsim.light.settings import Settings
 from mitsim.optics.image_formation import Entries
 from mitsim.optics.shadow import Places
-from mitsim.transport.from_camera import FromCameraTracer, Together
-from mitsim.transport.records import AMBIENT, Deposits
+from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer
+from mitsim.transport.records import AMBIENT, PathSamples
 
-Known = dict[Hashable, tuple[Sequence[Deposits], FloatArray]]
+Known = dict[Hashable, tuple[Sequence[PathSamples], FloatArray]]
 """Frames that were formed, with the light that they show."""
 _SHOTS, _MOST_SHOTS, _SHOWN = 4, 16, 1024
 """Shots of the family that the pilot replicates at: patterns of a family differ little, and each costs its forming; but
@@ -140,7 +140,7 @@ class Sample:
 
     def sharp(self, simulation: Simulation) -> int:
         """Samples of each pixel that a ``simulation`` traces apart, in each replicate."""
-        paths = simulation.sharp.lanes if simulation.sharp else 1
+        paths = simulation.sharp.paths_per_sample if simulation.sharp else 1
         return min(max(_SHARP_PATHS // paths, 4), _MOST_SHARP)
 
     def _within(self, samples: int, pixels: int) -> int:
@@ -159,7 +159,7 @@ class Sample:
     def frames(
         self,
         grid: Grid,
-        replicates: Sequence[Deposits],
+        replicates: Sequence[PathSamples],
         samples: int,
         emitted: FloatArray | None = None,
         known: Known | None = None,
@@ -191,7 +191,9 @@ class Sample:
             frames += least[:, None, None] * self._lit(grid, replicates, np.ones((1, emitted.shape[1])), known)
         return frames / samples
 
-    def lamps(self, grid: Grid, replicates: Sequence[Deposits], samples: int, known: Known | None = None) -> FloatArray:
+    def lamps(
+        self, grid: Grid, replicates: Sequence[PathSamples], samples: int, known: Known | None = None
+    ) -> FloatArray:
         """(replicates, 1, places, places) frames of lamps' light in each replicate.
 
         Parameters
@@ -203,7 +205,9 @@ class Sample:
         pattern[:, -1] = 1
         return self._lit(grid, replicates, pattern, known) / samples
 
-    def _lit(self, grid: Grid, replicates: Sequence[Deposits], patterns: FloatArray, known: Known | None) -> FloatArray:
+    def _lit(
+        self, grid: Grid, replicates: Sequence[PathSamples], patterns: FloatArray, known: Known | None
+    ) -> FloatArray:
         """(replicates, patterns, rows, columns) frames of classes that are lit in ``patterns`` (patterns, classes),
         where lamps are the last class; else as for :meth:`frames`."""
         known = {} if known is None else known
@@ -329,7 +333,7 @@ def norm(seen: FloatArray) -> float:
     return math.sqrt(max(product(seen, seen), 0.0))
 
 
-def heavy_paths(tracer: FromCameraTracer | Together, seed: int, samples: int) -> Deposits:
+def heavy_paths(tracer: FromCameraTracer | CombinedTracer, seed: int, samples: int) -> PathSamples:
     """The projector's light, a few samples at a time: few paths bring any, but lamps shine on all of them.
 
     Parameters
@@ -337,9 +341,9 @@ def heavy_paths(tracer: FromCameraTracer | Together, seed: int, samples: int) ->
     tracer, seed, samples
         from the camera's side, the root of its random numbers, and how many are traced.
     """
-    each = max(1, _AT_ONCE // tracer.lanes)
+    each = max(1, _AT_ONCE // tracer.paths_per_sample)
     parts = [tracer.trace(seed, first, min(each, samples - first)) for first in range(0, samples, each)]
-    return Deposits.joined([part.where(part.kind != AMBIENT) for part in parts])
+    return PathSamples.joined([part.where(part.kind != AMBIENT) for part in parts])
 
 
 def noise(seen: FloatArray) -> float:

@@ -223,9 +223,9 @@ def _range(evidence: Evidence, plan: Plan) -> tuple[float, float] | None:
 
 def _seconds(simulation: Simulation, name: str, seed: int, labels: Labels, samples: int) -> float:
     """What so many ``samples`` of a pass take to be traced and accumulated."""
-    ledgers = simulation.ledgers(name, labels, 1)
+    accumulators = simulation.accumulators(name, labels, 1)
     started = time.perf_counter()
-    simulation.accumulate(name, simulation.passes[name].trace(seed, 0, samples, ledgers), labels, samples)
+    simulation.accumulate(name, simulation.passes[name].trace(seed, 0, samples, accumulators), labels, samples)
     # What is added up on the device is not waited for.
     dr.sync_thread()
     return time.perf_counter() - started
@@ -239,7 +239,7 @@ def _timed(evidence: Evidence, simulation: Simulation, labels: Labels, seed: int
         seconds, longest = _pace(simulation, name, labels, own)
         sample_cost = evidence.sample_costs.get(name, SampleCost.none())
         # A path of shared light counts for several.
-        paths = sample_cost.paths if name == "indirect" else each.tracer.lanes
+        paths = sample_cost.paths if name == "indirect" else each.tracer.paths_per_sample
         found[name] = replace(sample_cost, seconds=seconds / paths)
         if name == "direct":
             spread = replace(spread, seconds=longest / paths)
@@ -259,7 +259,7 @@ def _pace(simulation: Simulation, name: str, labels: Labels, seed: int) -> tuple
         how it is accumulated, and the root of its random numbers.
     """
     each, at_once = simulation.passes[name], simulation.paths_at_once
-    planned, lanes = each.whole, each.tracer.lanes
+    planned, paths_per_sample = each.whole, each.tracer.paths_per_sample
     every = GROUPS * planned
 
     def once(samples: int) -> float:
@@ -269,13 +269,13 @@ def _pace(simulation: Simulation, name: str, labels: Labels, seed: int) -> tuple
         return min(seconds, _seconds(simulation, name, seed, labels, samples)) if again else seconds
 
     _seconds(simulation, name, seed, labels, 1)  # compiles the kernel
-    launch, samples = once(1), max(1, _REHEARSED // lanes)
+    launch, samples = once(1), max(1, _REHEARSED // paths_per_sample)
     longest = once(samples) if samples > 1 else launch
     least = longest / samples
-    while _MORE * samples * lanes <= at_once and _MORE * samples <= _OF_ALL * every:
+    while _MORE * samples * paths_per_sample <= at_once and _MORE * samples <= _OF_ALL * every:
         samples *= _MORE
         longest = once(samples)
         least = min(least, longest / samples)
     slope = min(max((longest - launch) / (samples - 1), _LEAST_SLOPE * least), least) if samples > 1 else launch
-    launches = math.ceil(planned / max(1, at_once // lanes))
+    launches = math.ceil(planned / max(1, at_once // paths_per_sample))
     return slope + max(launch - slope, 0.0) * launches / planned, least

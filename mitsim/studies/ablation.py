@@ -46,11 +46,11 @@ from mitsim.light.settings import Settings
 from mitsim.light.truth import Truth
 from mitsim.optics.frames import ClassFrames, ExpectedFrames
 from mitsim.scene.projector import straightening
-from mitsim.transport.accumulator import DeviceSums, Ledger
+from mitsim.transport.accumulator import DeviceAccumulator, DeviceSums
 from mitsim.transport.integrator import ANY, FollowingTracer
 from mitsim.transport.plugins.base import rows_columns, turn_and_origin
 from mitsim.transport.projector import CanvasMap
-from mitsim.transport.records import DIRECT, Deposits
+from mitsim.transport.records import DIRECT, PathSamples
 
 FALLOFF, DIFFRACTION, KEYSTONE, DEPTH, OCCLUSION, DETAIL, INTERREFLECTION, MIRRORS = (
     "falloff", "diffraction", "keystone", "depth", "occlusion", "detail", "interreflection", "mirrors",
@@ -210,11 +210,13 @@ class _Filing(Simulation):
     def passes(self) -> Mapping[str, TracedPass]:
         return {name: each for name, each in super().passes.items() if each.row.even == self._only_direct}
 
-    def ledgers(self, name: str, labels: Labels, lines: int) -> tuple[Ledger, ...]:
+    def accumulators(self, name: str, labels: Labels, lines: int) -> tuple[DeviceAccumulator, ...]:
         # What is added up on the device lies where it was traced.
-        return () if self._off & {DEPTH, KEYSTONE} and PASSES[name].anchors else super().ledgers(name, labels, lines)
+        return (
+            () if self._off & {DEPTH, KEYSTONE} and PASSES[name].anchors else super().accumulators(name, labels, lines)
+        )
 
-    def accumulate(self, name: str, found: Deposits | DeviceSums, labels: Labels, samples: int) -> LightEstimate:
+    def accumulate(self, name: str, found: PathSamples | DeviceSums, labels: Labels, samples: int) -> LightEstimate:
         if isinstance(found, DeviceSums) or not (name == "direct" or PASSES[name].anchors):
             return super().accumulate(name, found, labels, samples)
         if name != "direct":
@@ -241,24 +243,26 @@ class _Place:
             str(loaded.path), loaded.projector, loaded.camera, grid, bench.geometry.scene_distance
         )
 
-    def moved(self, deposits: Deposits, off: frozenset[str]) -> Deposits:
-        """``deposits`` without depth and keystone, where these are ``off``."""
+    def moved(self, path_samples: PathSamples, off: frozenset[str]) -> PathSamples:
+        """``path_samples`` without depth and keystone, where these are ``off``."""
         if not off & {DEPTH, KEYSTONE}:
-            return deposits
-        row, column, inverse = deposits.row, deposits.column, deposits.inverse_depth
+            return path_samples
+        row, column, inverse = path_samples.row, path_samples.column, path_samples.inverse_depth
         on_plane = self._on_plane(row, inverse, self._row), self._on_plane(column, inverse, self._column)
         straight = _project(self._straight, *on_plane) if KEYSTONE in off else on_plane
         if DEPTH in off:
-            return replace(deposits, row=straight[0], column=straight[1], inverse_depth=np.full_like(row, self._plane))
+            return replace(
+                path_samples, row=straight[0], column=straight[1], inverse_depth=np.full_like(row, self._plane)
+            )
         row, column = row + straight[0] - on_plane[0], column + straight[1] - on_plane[1]
-        return replace(deposits, row=row, column=column)
+        return replace(path_samples, row=row, column=column)
 
-    def whole(self, deposits: Deposits, side: int, straight: bool) -> Deposits:
+    def whole(self, path_samples: PathSamples, side: int, straight: bool) -> PathSamples:
         """The light of each projector pixel from even points of it on the plane.
 
         Parameters
         ----------
-        deposits, side
+        path_samples, side
             the light, and how many points a side stand for a pixel.
         straight
             whether without the keystone.
@@ -270,14 +274,14 @@ class _Place:
         pixel = np.add.outer(part.astype(np.int64) * n, part.astype(np.int64)).ravel()
         if not straight:
             row, column = _project(np.asarray(np.linalg.inv(self._straight), np.float64), row, column)
-        value = np.bincount(deposits.pixel, deposits.value, n * n)[pixel] / side**2
+        value = np.bincount(path_samples.pixel, path_samples.value, n * n)[pixel] / side**2
         first = np.zeros_like(pixel)
         depth, kind = np.full_like(row, self._plane), np.full(len(pixel), DIRECT, dtype=np.int16)
-        return Deposits(pixel, first, first, row, column, depth, value, kind).where(value > 0)
+        return PathSamples(pixel, first, first, row, column, depth, value, kind).where(value > 0)
 
-    def parallax(self, deposits: Deposits) -> FloatArray:
-        """(2, m) tan-angles by which ``deposits`` are seen beside their places on the plane, rows and columns."""
-        inverse, row, column = deposits.inverse_depth, deposits.row, deposits.column
+    def parallax(self, path_samples: PathSamples) -> FloatArray:
+        """(2, m) tan-angles by which ``path_samples`` are seen beside their places on the plane, rows and columns."""
+        inverse, row, column = path_samples.inverse_depth, path_samples.row, path_samples.column
         on_plane = self._on_plane(row, inverse, self._row), self._on_plane(column, inverse, self._column)
         return np.stack([row - on_plane[0], column - on_plane[1]])
 
@@ -317,9 +321,9 @@ def _present(light: SampledLight) -> dict[str, bool]:
 def _off_plane(light: SampledLight) -> bool:
     """Whether one ray of each projector pixel tells of light that is seen beside its place on the aligned plane."""
     bench, simulation = light.bench, light.simulation
-    deposits = simulation.direct.trace(integer(light.seed, "transport", "place"), 0, 1)
+    path_samples = simulation.direct.trace(integer(light.seed, "transport", "place"), 0, 1)
     size = [(last - first) / bench.n for first, last in bench.windows]
-    aside = np.abs(_Place(bench).parallax(deposits)) / np.array(size)[:, None]
+    aside = np.abs(_Place(bench).parallax(path_samples)) / np.array(size)[:, None]
     return bool(aside.size and aside.max() > _IN_PLACE)
 
 
@@ -332,10 +336,10 @@ def _form_settings(settings: Settings, off: frozenset[str], glossy: bool) -> Set
     return replace(settings, effects=effects, anchors=anchors, occluded=occluded, followed_anchors=1)
 
 
-def _even(deposits: Deposits, pixels: int) -> Deposits:
-    """``deposits`` of so many projector ``pixels``, each of which has one value."""
-    count, total = (np.bincount(deposits.pixel, weights, pixels) for weights in (None, deposits.value))
-    return replace(deposits, value=(total / np.maximum(count, 1))[deposits.pixel])
+def _even(path_samples: PathSamples, pixels: int) -> PathSamples:
+    """``path_samples`` of so many projector ``pixels``, each of which has one value."""
+    count, total = (np.bincount(path_samples.pixel, weights, pixels) for weights in (None, path_samples.value))
+    return replace(path_samples, value=(total / np.maximum(count, 1))[path_samples.pixel])
 
 
 def _even_lobes(sharp: sparse.csr_array, simulation: Simulation) -> sparse.csr_array:
@@ -424,6 +428,6 @@ class OfOrders(Simulation):
                 found[name] = replace(each, tracer=each.tracer.of_orders(*self._orders))
         return found
 
-    def glint_frames(self, labels: Labels) -> ClassFrames | None:
+    def specular_frames(self, labels: Labels) -> ClassFrames | None:
         """None, whatever the ``labels``: glint is not followed by any of these tracers."""
         return None

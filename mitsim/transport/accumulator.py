@@ -2,7 +2,7 @@
 
 Light is added up in whole numbers of a small unit, so that the sums do not hang on the order in which threads add, and
 nothing but the sums is ever fetched. Where :class:`mitsim.transport.records.Bundle` splits light between two layers,
-the ledger does so too, or draws one of them: the same in the mean.
+the accumulator does so too, or draws one of them: the same in the mean.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _UNIT_BITS = 30
 """Power of two of units in the light that is passed as one: rounding moves a path's by 5e-10 of it at most, either way,
 and a place holds 2^34 times as much."""
 _PAYS = 4
-"""Places for each part of a path below which a ledger pays: a place takes 0.03 us, to be fetched from the machine and
-looked through, and each part of a path on the host 0.1 us or more (balls of the highlight)."""
+"""Places for each part of a path below which an accumulator pays: a place takes 0.03 us, to be fetched from the machine
+and looked through, and each part of a path on the host 0.1 us or more (balls of the highlight)."""
 _MOST_BITS = 52
 """Power of two of units that one path may bring, four million times the light that is passed as one: more is no light.
 A place would hold 4096 such paths."""
@@ -40,7 +40,7 @@ A place would hold 4096 such paths."""
 
 @dataclass(frozen=True, eq=False)
 class Lit:
-    """Sums that hold light in any of some ledgers of one kind, and how they lie in a matrix, which is found once.
+    """Sums that hold light in any of some accumulators of one kind, and how they lie in a matrix, which is found once.
 
     Attributes
     ----------
@@ -103,7 +103,7 @@ class _Held:
         return dr.gather(mi.UInt64, self.sums, entries * self.lines + line)
 
 
-class Ledger:
+class DeviceAccumulator:
     """Sums of light by row and place.
 
     Parameters
@@ -131,7 +131,7 @@ class Ledger:
         self._line, self._held = 0, _Held(self._rows * self._width + 1, 1)
 
     @classmethod
-    def of_lines(cls, lines: int, bundle: Bundle, labels: Labels, one: float) -> tuple[Ledger, ...]:
+    def of_lines(cls, lines: int, bundle: Bundle, labels: Labels, one: float) -> tuple[DeviceAccumulator, ...]:
         """One for each of so many ``lines``, which are :func:`fetched` together.
 
         Parameters
@@ -143,10 +143,10 @@ class Ledger:
         """
         first = cls(bundle, labels, one)
         first._held = _Held(first._rows * first._width + 1, lines)
-        ledgers = first, *(copy(first) for _ in range(1, lines))
-        for line, ledger in enumerate(ledgers):
-            ledger._line = line
-        return ledgers
+        accumulators = first, *(copy(first) for _ in range(1, lines))
+        for line, accumulator in enumerate(accumulators):
+            accumulator._line = line
+        return accumulators
 
     @property
     def sums(self) -> mi.UInt64:
@@ -158,21 +158,21 @@ class Ledger:
         return bundle.size + bundle.anchors**2
 
     @staticmethod
-    def holds(bundle: Bundle, labels: Labels, ledgers: int = 1, paths: float = math.inf) -> bool:
-        """Whether so many ledgers have room, and take less time than the host.
+    def holds(bundle: Bundle, labels: Labels, accumulators: int = 1, paths: float = math.inf) -> bool:
+        """Whether so many accumulators have room, and take less time than the host.
 
         Parameters
         ----------
         bundle, labels
             of each.
-        ledgers
+        accumulators
             their number.
         paths
             that they file.
         """
-        entries = (int(labels.max()) + 1) * Ledger._places(bundle)
+        entries = (int(labels.max()) + 1) * DeviceAccumulator._places(bundle)
         parts = (4 if bundle.between else 1) * min(len(bundle.depths), 2)
-        return ledgers * entries < MOST_PLACES and entries < _PAYS * parts * paths
+        return accumulators * entries < MOST_PLACES and entries < _PAYS * parts * paths
 
     def place(self, seen: Sightings, chosen: mi.Float, anchor: tuple[mi.UInt32, mi.UInt32] | None = None) -> mi.UInt32:
         """Where light is accumulated, all of it in one place.
@@ -279,19 +279,19 @@ class Ledger:
 
 @dataclass(frozen=True, eq=False)
 class DeviceSums:
-    """Sums of one ledger on the host: what a pass brought in all its samples.
+    """Sums of one accumulator on the host: what a pass brought in all its samples.
 
     Attributes
     ----------
-    ledger
+    accumulator
         that held them.
     lit
-        which of its sums hold light: of corner, a tenth of its ledger's memory.
+        which of its sums hold light: of corner, a tenth of its accumulator's memory.
     units
         these sums.
     """
 
-    ledger: Ledger
+    accumulator: DeviceAccumulator
     lit: Lit
     units: npt.NDArray[np.uint64]
 
@@ -309,35 +309,37 @@ class DeviceSums:
         MitsimError
             where light is NaN, infinite, or four million times what is bright.
         """
-        lit, units, ledger = self.lit, self.units, self.ledger
-        if len(lit.numbers) and lit.numbers[-1] == ledger._rows * ledger._width and units[-1]:
+        lit, units, accumulator = self.lit, self.units, self.accumulator
+        if len(lit.numbers) and lit.numbers[-1] == accumulator._rows * accumulator._width and units[-1]:
             raise MitsimError(
                 "the scene reflects NaN, infinite or boundless light toward the camera; check its materials"
             )
-        light = units.astype(np.float64) * (ledger._unit / samples)
+        light = units.astype(np.float64) * (accumulator._unit / samples)
         return lit.matrix(light), float(light.sum()), float(light[lit.inside :].sum())
 
     def beyond(self, samples: int = 1) -> FloatArray:
         """(rows, anchors, anchors) light from beyond all cells per sample, of so many ``samples`` [W m^-2]."""
-        lit, ledger = self.lit, self.ledger
-        rows, anchors = ledger._rows, ledger._bundle.anchors
+        lit, accumulator = self.lit, self.accumulator
+        rows, anchors = accumulator._rows, accumulator._bundle.anchors
         # Its last one counts what is no light.
         found = np.zeros(rows * anchors**2 + 1)
-        found[lit.numbers[lit.inside :] - np.uint32(rows * ledger._bundle.size)] = self.units[lit.inside :]
+        found[lit.numbers[lit.inside :] - np.uint32(rows * accumulator._bundle.size)] = self.units[lit.inside :]
         by_row = np.moveaxis(found[:-1].reshape(anchors, anchors, rows), 2, 0)
-        return np.asarray(by_row * (ledger._unit / samples))
+        return np.asarray(by_row * (accumulator._unit / samples))
 
 
-def fetched(ledgers: Sequence[Ledger]) -> list[DeviceSums]:
-    """The sums of ``ledgers`` of one kind, one for each line, on the host; they are empty then.
+def fetched(accumulators: Sequence[DeviceAccumulator]) -> list[DeviceSums]:
+    """The sums of ``accumulators`` of one kind, one for each line, on the host; they are empty then.
 
     Which sums hold light is told of all together, as it is nearly the same of each.
     """
-    first = ledgers[0]
-    lit = dr.compress(reduce(or_, (ledger._held.of_line(ledger._line) != 0 for ledger in ledgers)))
-    units = [ledger._held.of_line(ledger._line, lit) for ledger in ledgers]
+    first = accumulators[0]
+    lit = dr.compress(reduce(or_, (accumulator._held.of_line(accumulator._line) != 0 for accumulator in accumulators)))
+    units = [accumulator._held.of_line(accumulator._line, lit) for accumulator in accumulators]
     dr.eval(lit, units)
-    for ledger in ledgers:
-        ledger._held.empty()
+    for accumulator in accumulators:
+        accumulator._held.empty()
     found = Lit(np.array(lit), first._rows, first._bundle.size, first._bundle.lamps)
-    return [DeviceSums(ledger, found, np.array(each)) for ledger, each in zip(ledgers, units, strict=True)]
+    return [
+        DeviceSums(accumulator, found, np.array(each)) for accumulator, each in zip(accumulators, units, strict=True)
+    ]

@@ -98,7 +98,7 @@ class Way:
 
     ``open`` tells whether it is, ``direction`` is the unit one in which light leaves P, ``passed`` the part of it that
     comes through, ``geometric`` all factors [mm^-2] of the irradiance but for the BSDF and the arriving light's cosine
-    to the surface; ``row``, ``column`` and ``inverse_depth`` as in :class:`mitsim.transport.records.Deposits`.
+    to the surface; ``row``, ``column`` and ``inverse_depth`` as in :class:`mitsim.transport.records.PathSamples`.
     """
 
     open: mi.Bool
@@ -114,7 +114,7 @@ class Way:
 class Reception:
     """Irradiance for each unit of flux [mm^-2], where it is seen from the sensor's centre, and the turn's pdf [1/sr].
 
-    ``row``, ``column`` and ``inverse_depth`` as in :class:`mitsim.transport.records.Deposits`; ``pdf`` is that of
+    ``row``, ``column`` and ``inverse_depth`` as in :class:`mitsim.transport.records.PathSamples`; ``pdf`` is that of
     sampling the turn at P from the sensor's side, ``direction`` the unit one in which the light leaves P.
     """
 
@@ -166,7 +166,7 @@ class Receiver:
         """Irradiance [W m^-2] by the light of a projector pixel, from a white board at the rig's distance; ``rays`` are
         the projector's."""
         pixel = dr.arange(mi.UInt32, rays.projector.n**2)
-        wavelengths, spectral = sampled_wavelengths(self.camera, generator(mi.UInt32(0), pixel), rays.projector.lines)
+        wavelengths, spectral = sample_wavelengths(self.camera, generator(mi.UInt32(0), pixel), rays.projector.lines)
         flux = np.array(panchromatic(rays.flux(pixel, wavelengths) * spectral))
         return float(flux.mean(dtype=np.float64)) / (math.pi * self.geometry.scene_distance**2)
 
@@ -242,7 +242,7 @@ class Receiver:
         return Reception(irradiance, way.row, way.column, way.inverse_depth, pdf, way.direction)
 
 
-def sampled_wavelengths(camera: mi.Sensor, rng: mi.PCG32, lines: Lines | None = None) -> tuple[mi.Color0f, mi.Spectrum]:
+def sample_wavelengths(camera: mi.Sensor, rng: mi.PCG32, lines: Lines | None = None) -> tuple[mi.Color0f, mi.Spectrum]:
     """Wavelengths of a path, and their weights; but in spectral variants, none and 1.
 
     Light by the weights has a mean over the wavelengths that is the mean over 360-830 nm, where a flat spectrum of 1

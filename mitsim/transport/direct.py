@@ -19,18 +19,18 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Lines
-from mitsim.transport.accumulator import Ledger
-from mitsim.transport.connect import Receiver, Reception, SensorPoints, landing, sampled_wavelengths
-from mitsim.transport.integrator import LANES_PER_LAUNCH, InFlight, Tracer
+from mitsim.transport.accumulator import DeviceAccumulator
+from mitsim.transport.connect import Receiver, Reception, SensorPoints, landing, sample_wavelengths
+from mitsim.transport.integrator import PATHS_PER_LAUNCH, InFlight, Tracer
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
-from mitsim.transport.records import DIRECT, Deposits, Sightings, check_finite
+from mitsim.transport.records import DIRECT, PathSamples, Sightings, check_finite
 from mitsim.transport.sampler import shuffled, split_by_line, stratified, streams
 from mitsim.transport.transmission import Arrival
 
 IntArray = npt.NDArray[np.int64]
 _LOBE = 2.0**8
 """Bright light over a board's. Mitsuba takes no roughness below 1e-4, whose lobe is 2.5e7 times as bright in its middle
-as a board; ledgers pass 2^22 times what is bright, 40 times that, and round light to 1.2e-7 of a board's."""
+as a board; accumulators pass 2^22 times what is bright, 40 times that, and round light to 1.2e-7 of a board's."""
 
 
 class DirectTracer(Tracer):
@@ -72,16 +72,16 @@ class DirectTracer(Tracer):
         return _LOBE * self.receiver.of_board(self.rays)
 
     @property
-    def lanes(self) -> int:
+    def paths_per_sample(self) -> int:
         """Connections of one sample: one per projector pixel and anchor."""
         return len(self._pixels) * self.points.count
 
-    def trace_into(self, ledgers: Sequence[Ledger], seed: int, first: int, samples: int) -> Deposits:
-        """The same as :meth:`trace`, all light filed in ledgers; none is left for the host.
+    def trace_into(self, accumulators: Sequence[DeviceAccumulator], seed: int, first: int, samples: int) -> PathSamples:
+        """The same as :meth:`trace`, all light filed in accumulators; none is left for the host.
 
         Parameters
         ----------
-        ledgers
+        accumulators
             of light by pixel; of several lines, one for each.
         seed, first, samples
             as for :meth:`trace`.
@@ -89,15 +89,15 @@ class DirectTracer(Tracer):
         for tracer in self.per_wavelength:
             for flight in self._in_flight([seed], first, samples):
                 seen, _, anchor = tracer._sightings(flight)
-                lights = seen.by_line(len(ledgers))
-                for place, share in ledgers[0].shares(seen, anchor):
-                    for ledger, light in zip(ledgers, lights, strict=True):
-                        ledger.add(light * share, seen.pixel, place, ~(light == 0))  # not a number is refused
-                dr.eval([ledger.sums for ledger in ledgers])
-        return Deposits.none()
+                lights = seen.by_line(len(accumulators))
+                for place, share in accumulators[0].shares(seen, anchor):
+                    for accumulator, light in zip(accumulators, lights, strict=True):
+                        accumulator.add(light * share, seen.pixel, place, ~(light == 0))  # not a number is refused
+                dr.eval([accumulator.sums for accumulator in accumulators])
+        return PathSamples.none()
 
-    def _launch(self, flight: InFlight) -> list[Deposits]:
-        return [Deposits.fetched(*self._sightings(flight))]
+    def _launch(self, flight: InFlight) -> list[PathSamples]:
+        return [PathSamples.fetched(*self._sightings(flight))]
 
     def _sightings(self, flight: InFlight) -> tuple[Sightings, int, tuple[mi.UInt32, mi.UInt32]]:
         """Light of each sample, its kind, and its anchor."""
@@ -108,7 +108,7 @@ class DirectTracer(Tracer):
         # Streams belong to pixels: every anchor is connected to the same points.
         shared, rng = streams(flight.seed, pixel, flight.sample)
         jitter, weight = self._place(number, row, column, stratified(flight.sample, shared))
-        wavelengths, spectral = sampled_wavelengths(self.receiver.camera, rng, self.projector.lines)
+        wavelengths, spectral = sample_wavelengths(self.receiver.camera, rng, self.projector.lines)
         ray = self.rays.sample(pixel, jitter, rng, wavelengths)
         sensor = self._sensor(row, column, flight.sample, shared, rng)
         flux = self.rays.flux(pixel, wavelengths) * spectral * (weight * share)
@@ -161,11 +161,11 @@ class FluxTracer:
 
     Attributes
     ----------
-    lanes_per_launch
+    paths_per_launch
         rays of one kernel, unless those of one block are more.
     """
 
-    lanes_per_launch = LANES_PER_LAUNCH
+    paths_per_launch = PATHS_PER_LAUNCH
 
     def __init__(
         self,
@@ -211,7 +211,7 @@ class FluxTracer:
         MitsimError
             when the scene sends NaN or infinite light to the camera.
         """
-        blocks, at_once = groups * len(pixels), max(1, self.lanes_per_launch // samples)
+        blocks, at_once = groups * len(pixels), max(1, self.paths_per_launch // samples)
         lines, projectors = self._rays.projector.lines, self._rays.projector.per_wavelength
         total = np.zeros((len(lines.shares) if lines and lines.several else 1, blocks))
         numbers, starts = mi.UInt32(pixels), mi.UInt32(first)
@@ -241,7 +241,7 @@ class FluxTracer:
         pixels = dr.opaque(mi.UInt32, self._pixels)
         shared, rng = streams(seed, pixel + group * pixels, sample)
         jitter = stratified(sample, shared)
-        wavelengths, spectral = sampled_wavelengths(self._receiver.camera, rng, lines)
+        wavelengths, spectral = sample_wavelengths(self._receiver.camera, rng, lines)
         ray = self._rays.sample(pixel, jitter, rng, wavelengths)
         point = stratified(shuffled(sample, shared), shared)
         turn = stratified(shuffled(sample, shared), shared) if self._glossy else None

@@ -32,7 +32,7 @@ import numpy as np
 from mitsim.core.spectral_manifests import MOST_LINES
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.lamps import SPECTRA_NM, Band, Response
-from mitsim.transport.connect import Connection, ProjectorConnector, SensorPoints, sampled_wavelengths
+from mitsim.transport.connect import Connection, ProjectorConnector, SensorPoints, sample_wavelengths
 from mitsim.transport.integrator import (
     KINDS,
     FollowingTracer,
@@ -46,7 +46,7 @@ from mitsim.transport.integrator import (
 )
 from mitsim.transport.plugins.base import rows_columns, x_y
 from mitsim.transport.projector import ProjectorOptics
-from mitsim.transport.records import CellAxis, CellGrid, Deposits, Sightings
+from mitsim.transport.records import CellAxis, CellGrid, PathSamples, Sightings
 from mitsim.transport.sampler import shuffled, stratified, streams
 from mitsim.transport.transmission import Passage, refracted_way
 
@@ -109,7 +109,7 @@ class FromCameraTracer(FollowingTracer):
         self.connector, self.passage = ProjectorConnector(projector), Passage(scene)
 
     @property
-    def lanes(self) -> int:
+    def paths_per_sample(self) -> int:
         """Paths in one sample: one per cell and anchor."""
         return self.grid.shape[0] * self.grid.shape[1] * self.points.count
 
@@ -119,7 +119,7 @@ class FromCameraTracer(FollowingTracer):
         return self.projector.by_line
 
     def wavelengths(self, rng: mi.PCG32, sample: mi.UInt32, shared: mi.PCG32) -> tuple[mi.Color0f, mi.Spectrum]:
-        """Wavelengths of each path, and weights as :func:`mitsim.transport.connect.sampled_wavelengths` has them.
+        """Wavelengths of each path, and weights as :func:`mitsim.transport.connect.sample_wavelengths` has them.
 
         Parameters
         ----------
@@ -128,15 +128,15 @@ class FromCameraTracer(FollowingTracer):
         sample, shared
             number of each path's sample, and the numbers that all samples of its cell share.
         """
-        return sampled_wavelengths(self.camera, rng, self.projector.lines)
+        return sample_wavelengths(self.camera, rng, self.projector.lines)
 
     @property
     def rules(self) -> PathRules:
         """Which paths are followed."""
         return PathRules(self.passage, self.paths.mirrors, self.paths.interreflection, self.orders, self.by_line)
 
-    def _launch(self, flight: InFlight) -> list[Deposits]:
-        return self._paths(flight).deposits()
+    def _launch(self, flight: InFlight) -> list[PathSamples]:
+        return self._paths(flight).path_samples()
 
     def _paths(self, flight: InFlight) -> CameraPaths[Any]:
         return CameraPaths(self, CameraState, flight)
@@ -230,11 +230,11 @@ class CameraPaths(PathIntegrator[State]):
         sightings = {kind: Sightings.none(tracer.by_line) for kind in KINDS}
         self.paths = state(active=active, ray=ray, rng=rng, sightings=sightings)
 
-    def deposits(self) -> list[Deposits]:
+    def path_samples(self) -> list[PathSamples]:
         """Light on the host of every path."""
         kept = self.follow(self.paths).sightings
         dr.eval(kept)
-        return [Deposits.fetched(seen, KINDS[kind], self.anchor) for kind, seen in kept.items()]
+        return [PathSamples.fetched(seen, KINDS[kind], self.anchor) for kind, seen in kept.items()]
 
     # ---- lights that paths run into ---------------------------------------------------------------------------------
 
@@ -412,7 +412,7 @@ def _place(axis: CellAxis, index: mi.UInt32, jitter: mi.Float) -> mi.Float:
 
 
 @dataclass(frozen=True, eq=False)
-class Counted:
+class LampResponse:
     """How lamps' light is counted.
 
     Attributes
@@ -440,7 +440,7 @@ class LampTracer(FromCameraTracer):
     of_projector = False
     by_line = True
 
-    def __init__(self, like: FromCameraTracer, counted: Counted) -> None:
+    def __init__(self, like: FromCameraTracer, counted: LampResponse) -> None:
         """The paths of a tracer.
 
         Parameters
@@ -499,14 +499,14 @@ class LampTracer(FromCameraTracer):
             wavelengths = [sum(own, mi.Float(0))] * len(own)
         return type(dr.zeros(mi.Ray3f).wavelengths)(*wavelengths), mi.Spectrum(*weights)
 
-    def _launch(self, flight: InFlight) -> list[Deposits]:
+    def _launch(self, flight: InFlight) -> list[PathSamples]:
         return [self._by_band(found) for found in super()._launch(flight)]
 
-    def _by_band(self, found: Deposits) -> Deposits:
+    def _by_band(self, found: PathSamples) -> PathSamples:
         """An entry for each band of those that were ``found``, path by path."""
         assert found.lines is not None, "told apart by band"
         light = found.lines.T.ravel().astype(np.float64)
-        several = Deposits(
+        several = PathSamples(
             **{
                 name: np.repeat(getattr(found, name), MOST_LINES)
                 for name in ("anchor_row", "anchor_column", "row", "column", "inverse_depth", "kind")
@@ -522,7 +522,7 @@ class LampTracer(FromCameraTracer):
         return replace(several, lines=(units[:, None] * light).astype(np.float32))
 
 
-class Together:
+class CombinedTracer:
     """Light that several tracers follow, of the same samples of each."""
 
     def __init__(self, *tracers: FromCameraTracer) -> None:
@@ -530,11 +530,11 @@ class Together:
         self.tracers = tracers
 
     @property
-    def lanes(self) -> int:
+    def paths_per_sample(self) -> int:
         """Paths in one sample."""
-        return sum(tracer.lanes for tracer in self.tracers)
+        return sum(tracer.paths_per_sample for tracer in self.tracers)
 
-    def trace(self, seed: int, first: int = 0, samples: int = 1) -> Deposits:
+    def trace(self, seed: int, first: int = 0, samples: int = 1) -> PathSamples:
         """Light of some samples, their sum; see :meth:`mitsim.transport.integrator.Tracer.trace`.
 
         Parameters
@@ -542,9 +542,9 @@ class Together:
         seed, first, samples
             as there.
         """
-        return Deposits.joined([tracer.trace(seed, first, samples) for tracer in self.tracers])
+        return PathSamples.joined([tracer.trace(seed, first, samples) for tracer in self.tracers])
 
-    def trace_looks(self, seeds: Sequence[int], samples: int = 1) -> list[Deposits]:
+    def trace_replicates(self, seeds: Sequence[int], samples: int = 1) -> list[PathSamples]:
         """``samples`` as :meth:`trace` finds them for each of some ``seeds``."""
-        looks = [tracer.trace_looks(seeds, samples) for tracer in self.tracers]
-        return [Deposits.joined(parts) for parts in zip(*looks, strict=True)]
+        looks = [tracer.trace_replicates(seeds, samples) for tracer in self.tracers]
+        return [PathSamples.joined(parts) for parts in zip(*looks, strict=True)]

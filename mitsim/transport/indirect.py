@@ -28,8 +28,8 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, mean_of_neighbours
 from mitsim.devices.camera import CameraGeometry
-from mitsim.transport.accumulator import Ledger
-from mitsim.transport.connect import Receiver, SensorPoints, Way, sampled_wavelengths
+from mitsim.transport.accumulator import DeviceAccumulator
+from mitsim.transport.connect import Receiver, SensorPoints, Way, sample_wavelengths
 from mitsim.transport.integrator import (
     KINDS,
     FollowingTracer,
@@ -40,7 +40,7 @@ from mitsim.transport.integrator import (
     camera_part,
 )
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays
-from mitsim.transport.records import Deposits, Sightings
+from mitsim.transport.records import PathSamples, Sightings
 from mitsim.transport.sampler import stratified, streams
 
 _ROOMS = (4**2, 12**2)
@@ -79,7 +79,7 @@ class IndirectTracer(FollowingTracer):
         self.points = points or SensorPoints(self.receiver.geometry.half_width)
         self.adaptive: AdaptiveSamples | None = None
 
-    def repeating(self, repeats: Sequence[int]) -> IndirectTracer:
+    def with_adaptive_counts(self, repeats: Sequence[int]) -> IndirectTracer:
         """The same to one point of the sensor, blocks of pixels (:mod:`mitsim.transport.indirect`) as often as
         ``repeats`` (blocks^2,) say."""
         return self._with_counts(by_pixel(repeats, self.projector.n))
@@ -91,7 +91,7 @@ class IndirectTracer(FollowingTracer):
         return again
 
     @property
-    def lanes(self) -> int:
+    def paths_per_sample(self) -> int:
         """Paths of one sample: one per projector pixel and anchor, or as often as they are repeated."""
         return len(self.adaptive) if self.adaptive else self.projector.n**2 * self.points.count
 
@@ -111,12 +111,12 @@ class IndirectTracer(FollowingTracer):
         passage, by_line = self.receiver.passage, self.projector.by_line
         return PathRules(passage, self.mirrors, self.interreflection, self.orders, by_line)
 
-    def trace_into(self, ledgers: Sequence[Ledger], seed: int, first: int, samples: int) -> Deposits:
-        """The same as :meth:`trace`, indirect light filed in ledgers as far as it can be: the rest, on the host.
+    def trace_into(self, accumulators: Sequence[DeviceAccumulator], seed: int, first: int, samples: int) -> PathSamples:
+        """The same as :meth:`trace`, indirect light filed in accumulators as far as it can be: the rest, on the host.
 
         Parameters
         ----------
-        ledgers
+        accumulators
             of light by pixel, whose unit is :attr:`board`; of several lines, one for each.
         seed, first, samples
             as for :meth:`trace`.
@@ -124,12 +124,16 @@ class IndirectTracer(FollowingTracer):
         flights = (
             (tracer, flight) for tracer in self.per_wavelength for flight in self._in_flight([seed], first, samples)
         )
-        return Deposits.joined(
-            [part for tracer, flight in flights for part in tracer._paths(tracer._emission(flight)).accumulate(ledgers)]
+        return PathSamples.joined(
+            [
+                part
+                for tracer, flight in flights
+                for part in tracer._paths(tracer._emission(flight)).accumulate(accumulators)
+            ]
         )
 
-    def _launch(self, flight: InFlight) -> list[Deposits]:
-        return self._paths(self._emission(flight)).deposits()
+    def _launch(self, flight: InFlight) -> list[PathSamples]:
+        return self._paths(self._emission(flight)).path_samples()
 
     def _emission(self, flight: InFlight) -> Emission:
         """Where each path leaves the projector."""
@@ -180,7 +184,7 @@ class ProjectorPaths(PathIntegrator[PathState]):
         super().__init__(tracer.rules)
         self.receiver, self.pixel, self.anchor = tracer.receiver, emission.pixel, emission.anchor
         self.first_turn, rng = emission.first_turn, emission.rng
-        wavelengths, spectral = sampled_wavelengths(tracer.receiver.camera, rng, tracer.projector.lines)
+        wavelengths, spectral = sample_wavelengths(tracer.receiver.camera, rng, tracer.projector.lines)
         jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
         ray = tracer.rays.sample(self.pixel, jitter, rng, wavelengths)
         self.flux = tracer.rays.flux(self.pixel, wavelengths) * spectral * emission.weight
@@ -233,25 +237,25 @@ class ProjectorPaths(PathIntegrator[PathState]):
                 joined = self.connections.load(held, kind, number).joined_by(seen, drawn[kind])
                 self.connections.save(held, kind, number, joined)
 
-    def deposits(self) -> list[Deposits]:
+    def path_samples(self) -> list[PathSamples]:
         """Light on the host of every path at every anchor."""
         held = self.follow(self.paths).sightings
         return self.connections.fetched(held, tuple(held))
 
-    def accumulate(self, ledgers: Sequence[Ledger]) -> list[Deposits]:
-        """Follow all paths; indirect light goes into ``ledgers``, caustics to the host."""
+    def accumulate(self, accumulators: Sequence[DeviceAccumulator]) -> list[PathSamples]:
+        """Follow all paths; indirect light goes into ``accumulators``, caustics to the host."""
         paths = self.follow(self.paths)
         drawn = paths.rng.next_float32()
 
         def add(held: Held, number: mi.UInt32) -> None:
             seen = self.connections.load(held, "indirect", number)
-            place = ledgers[0].place(seen, drawn, self.connections.anchor(number))
-            for ledger, light in zip(ledgers, seen.by_line(len(ledgers)), strict=True):
-                ledger.add(light, seen.pixel, place, ~(light == 0))  # not a number is light to be refused
+            place = accumulators[0].place(seen, drawn, self.connections.anchor(number))
+            for accumulator, light in zip(accumulators, seen.by_line(len(accumulators)), strict=True):
+                accumulator.add(light, seen.pixel, place, ~(light == 0))  # not a number is light to be refused
 
         held = self.connections.at_each(paths.sightings, mi.Bool(True), add)
         caustics = tuple(kind for kind in held if kind == "direct")
-        return self.connections.fetched(held, caustics, [ledger.sums for ledger in ledgers])
+        return self.connections.fetched(held, caustics, [accumulator.sums for accumulator in accumulators])
 
 
 # -------- Connections of a path: to one point of the sensor, or to every anchor
@@ -292,11 +296,11 @@ class _OneConnection:
         visit(held, mi.UInt32(0))
         return held
 
-    def fetched(self, held: Held, kinds: Sequence[str], also: object = ()) -> list[Deposits]:
+    def fetched(self, held: Held, kinds: Sequence[str], also: object = ()) -> list[PathSamples]:
         """Light of some ``kinds`` on the host; what it takes is worked out with that of ``also``: apart, each would
         follow all paths again."""
         dr.eval([held[kind] for kind in kinds], also)
-        return [Deposits.fetched(held[kind], KINDS[kind], self._anchor) for kind in kinds]
+        return [PathSamples.fetched(held[kind], KINDS[kind], self._anchor) for kind in kinds]
 
 
 class _AnchorConnections(_OneConnection):
@@ -335,7 +339,7 @@ class _AnchorConnections(_OneConnection):
         found: Held = dr.while_loop((mi.UInt32(0), held), lambda number, _: active & (number < self._count), step)[1]
         return found
 
-    def fetched(self, held: Held, kinds: Sequence[str], also: object = ()) -> list[Deposits]:
+    def fetched(self, held: Held, kinds: Sequence[str], also: object = ()) -> list[PathSamples]:
         paths = dr.width(self._pixel)
         size, first = paths * self._points.count, dr.arange(mi.UInt32, paths) * self._count
         found = {kind: [dr.zeros(mi.Float, size) for _ in range(self._numbers)] for kind in kinds}
@@ -350,7 +354,7 @@ class _AnchorConnections(_OneConnection):
         dr.eval(found, self._pixel, also)
         index = dr.arange(mi.UInt32, size)
         pixel, anchor = dr.gather(mi.UInt32, self._pixel, index // self._count), self.anchor(index % self._count)
-        return [Deposits.fetched(_sightings(pixel, values), KINDS[kind], anchor) for kind, values in found.items()]
+        return [PathSamples.fetched(_sightings(pixel, values), KINDS[kind], anchor) for kind, values in found.items()]
 
 
 def _differing(seen: Sightings) -> list[mi.Float]:
@@ -402,7 +406,7 @@ def block_moments(pixel: npt.NDArray[np.int64], light: FloatArray, pixels: int) 
     return np.asarray(np.bincount(place, np.square(light), count**2).reshape(count, count), dtype=np.float64)
 
 
-def chosen_repeats(moments: FloatArray) -> npt.NDArray[np.int64]:
+def adaptive_counts(moments: FloatArray) -> npt.NDArray[np.int64]:
     """(blocks, blocks) paths of each block's pixels in a sample, of the least variance times cost.
 
     ``moments`` (blocks, blocks) are smoothed over neighbours first; blocks without light count a tenth of the mean.

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import drjit as dr
 import mitsuba as mi
 
-from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT, Deposits
+from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT, PathSamples
 from mitsim.transport.transmission import Passage
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT, "ambient": AMBIENT})
 """Kinds of light by their names in the loop."""
-LANES_PER_LAUNCH = 2**22
+PATHS_PER_LAUNCH = 2**22
 """Paths of one kernel: at some 100 bytes of state each, 0.4 GB; and a launch's fixed cost is small beside its work."""
 _TOGETHER, _ALL = 4, 2**30
 """Seeds whose paths one kernel follows at most, and samples of one seed beyond any that are asked for; the first times
@@ -54,24 +54,24 @@ _LEAST_CHANCE = 1e-6
 
 
 def launches(
-    lanes: int, first: int, samples: int, at_once: int = LANES_PER_LAUNCH
+    paths_per_sample: int, first: int, samples: int, at_once: int = PATHS_PER_LAUNCH
 ) -> Iterator[tuple[mi.UInt32, mi.UInt32]]:
     """(sample, lane) of every path, one kernel's at a time.
 
     Parameters
     ----------
-    lanes
+    paths_per_sample
         paths of one sample.
     first, samples
         samples ``first`` .. ``first + samples - 1`` are meant.
     at_once
         paths of one kernel.
     """
-    total, start = lanes * samples, lanes * first
+    total, start = paths_per_sample * samples, paths_per_sample * first
     for done in range(0, total, at_once):
         index = dr.arange(mi.UInt64, min(at_once, total - done)) + dr.opaque(mi.UInt64, start + done)
         # An opaque number keeps the compiled kernel the same for every count.
-        per_sample = dr.opaque(mi.UInt64, lanes)
+        per_sample = dr.opaque(mi.UInt64, paths_per_sample)
         yield mi.UInt32(index // per_sample), mi.UInt32(index % per_sample)
 
 
@@ -107,16 +107,16 @@ class Tracer(ABC):
 
     Attributes
     ----------
-    lanes_per_launch
+    paths_per_launch
         paths of one kernel.
     """
 
-    lanes_per_launch: ClassVar[int] = LANES_PER_LAUNCH
+    paths_per_launch: ClassVar[int] = PATHS_PER_LAUNCH
     projector: ProjectorOptics
 
     @property
     @abstractmethod
-    def lanes(self) -> int:
+    def paths_per_sample(self) -> int:
         """Paths, or connections, of one sample."""
 
     @property
@@ -128,8 +128,8 @@ class Tracer(ABC):
         """Samples ``first`` .. ``first + samples - 1`` of a seed, or of several from the first on, one kernel's at a
         time."""
         each, count = samples if len(seeds) > 1 else _ALL, self.connections_per_path
-        at_once = max(1, self.lanes_per_launch // count)
-        for sample, index in launches(self.lanes // count, first, samples * len(seeds), at_once):
+        at_once = max(1, self.paths_per_launch // count)
+        for sample, index in launches(self.paths_per_sample // count, first, samples * len(seeds), at_once):
             yield InFlight.of(seeds, each, sample, index)
 
     @property
@@ -144,10 +144,10 @@ class Tracer(ABC):
         return again
 
     @abstractmethod
-    def _launch(self, flight: InFlight) -> list[Deposits]:
+    def _launch(self, flight: InFlight) -> list[PathSamples]:
         """Light of the paths of one kernel."""
 
-    def trace(self, seed: int, first: int = 0, samples: int = 1) -> Deposits:
+    def trace(self, seed: int, first: int = 0, samples: int = 1) -> PathSamples:
         """Light of some samples, their sum.
 
         Parameters
@@ -165,12 +165,12 @@ class Tracer(ABC):
         flights = (
             (tracer, flight) for tracer in self.per_wavelength for flight in self._in_flight([seed], first, samples)
         )
-        return Deposits.joined([part for tracer, flight in flights for part in tracer._launch(flight)])
+        return PathSamples.joined([part for tracer, flight in flights for part in tracer._launch(flight)])
 
-    def trace_looks(self, seeds: Sequence[int], samples: int = 1) -> list[Deposits]:
+    def trace_replicates(self, seeds: Sequence[int], samples: int = 1) -> list[PathSamples]:
         """``samples`` as :meth:`trace` finds them for each of some ``seeds``, in as few kernels as may be."""
-        each, found = self.lanes * samples, list[Deposits]()
-        together = min(self.lanes_per_launch // each, _TOGETHER)
+        each, found = self.paths_per_sample * samples, list[PathSamples]()
+        together = min(self.paths_per_launch // each, _TOGETHER)
         if together < 2:
             return [self.trace(seed, 0, samples) for seed in seeds]
         for start in range(0, len(seeds), together):
@@ -178,7 +178,7 @@ class Tracer(ABC):
             (flight,) = self._in_flight(few, 0, samples)
             parts = [part for tracer in self.per_wavelength for part in tracer._launch(flight)]
             for start_of_one in range(0, each * len(few), each):
-                found.append(Deposits.joined([part.of_lanes(start_of_one, start_of_one + each) for part in parts]))
+                found.append(PathSamples.joined([part.of_lanes(start_of_one, start_of_one + each) for part in parts]))
         return found
 
 

@@ -24,12 +24,12 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.devices.camera import CameraGeometry
-from mitsim.transport.connect import LensHit, sampled_wavelengths
+from mitsim.transport.connect import LensHit, sample_wavelengths
 from mitsim.transport.from_camera import CameraPaths, CameraState, FromCameraTracer, Paths
 from mitsim.transport.integrator import InFlight, Turn, camera_part
-from mitsim.transport.plugins.base import channels, lanes_of, per_lane, turn_and_origin, vectors
+from mitsim.transport.plugins.base import channels, device_vectors, host_values, turn_and_origin, vectors
 from mitsim.transport.projector import PinholeRays, ProjectorOptics, ProjectorRays, wavelength_sets
-from mitsim.transport.records import DIRECT, INDIRECT, CellGrid, Deposits, Sightings
+from mitsim.transport.records import DIRECT, INDIRECT, CellGrid, PathSamples, Sightings
 from mitsim.transport.sampler import panchromatic, streams
 from mitsim.transport.transmission import Passage
 
@@ -98,10 +98,10 @@ def left_out_light(
     lens = replace(projector, aperture=_LENS * geometry.scene_distance, focus=geometry.scene_distance)
     paths = Paths(mirrors=True, interreflection=True)
     found = _MissedTracer(scene, camera, lens, grid, paths, geometry).trace(seed, 0, samples)
-    # Deposits name shapes by their number in Dr.Jit's registry.
+    # Path samples name shapes by their number in Dr.Jit's registry.
     numbers = np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr())).astype(np.int64)
 
-    def by_shape(light: Deposits, values: FloatArray) -> FloatArray:
+    def by_shape(light: PathSamples, values: FloatArray) -> FloatArray:
         return np.asarray(np.bincount(light.pixel, values, int(numbers.max()) + 1)[numbers] / samples)
 
     lost, met = (found.where(found.kind == kind) for kind in (INDIRECT, DIRECT))
@@ -209,7 +209,7 @@ def shines_in(scene: mi.Scene, camera: mi.Sensor, lamp: mi.Emitter) -> bool:
     to_world, sensor = camera.world_transform(), dr.zeros(mi.SurfaceInteraction3f, _SENSOR_POINTS**2)
     sensor.p = to_world @ mi.Point3f(x, y, 0)
     _, rng = streams(0, dr.arange(mi.UInt32, _SENSOR_POINTS**2), mi.UInt32(0))
-    sensor.wavelengths, _ = sampled_wavelengths(camera, rng)
+    sensor.wavelengths, _ = sample_wavelengths(camera, rng)
     ds, light = lamp.sample_direction(sensor, mi.Point2f(0.5), True)
     met = _in_view(camera, ds.d) & (dr.max(mi.unpolarized_spectrum(light)) > 0)
     seen, _ = Passage(scene).between(sensor, ds.p, met)
@@ -381,7 +381,9 @@ def _radiance_toward(
     """(k,) light that sharp lobes at points send to the ``eye`` [1/sr], mean over channels, and cosines of what comes
     to them; 0 where either way is blocked."""
     to = aimed - origin
-    ray = mi.Ray3f(mi.Point3f(origin.tolist()), mi.Vector3f(*lanes_of(to / np.linalg.norm(to, axis=1, keepdims=True))))
+    ray = mi.Ray3f(
+        mi.Point3f(origin.tolist()), mi.Vector3f(*device_vectors(to / np.linalg.norm(to, axis=1, keepdims=True)))
+    )
     si = scene.ray_intersect(ray)
     target = mi.Point3f(eye.tolist())
     context = mi.BSDFContext(mi.TransportMode.Importance)
@@ -391,4 +393,4 @@ def _radiance_toward(
     count = len(aimed)
     light = channels(mi.unpolarized_spectrum(dr.select(active & (density > _SHARP), value, 0)), count).mean(axis=1)
     met = np.linalg.norm(vectors(si.p, count) - aimed, axis=1) < _ON_BALL * radius + 1e-4 * np.abs(aimed).max(axis=1)
-    return light * met, per_lane(dr.abs(mi.Frame3f.cos_theta(si.wi)), count)
+    return light * met, host_values(dr.abs(mi.Frame3f.cos_theta(si.wi)), count)

@@ -33,7 +33,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsim.transport.accumulator import Ledger
+from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import Way
 from mitsim.transport.indirect import (
     MEMBERS,
@@ -44,7 +44,7 @@ from mitsim.transport.indirect import (
     blocks_of,
 )
 from mitsim.transport.integrator import InFlight, camera_part, shading_correction
-from mitsim.transport.records import INDIRECT, Deposits, Sightings, check_finite
+from mitsim.transport.records import INDIRECT, PathSamples, Sightings, check_finite
 from mitsim.transport.sampler import generator, split_by_line, stratified
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 _STEP, _TURN = 5, 16
 """Members of a block take the points of their common sequence in turn; each sample begins five members on, and sixteen
 samples one more, so that each pixel's own points are spread over the sequence."""
-_LANES_PER_LAUNCH = 2**20
+_PATHS_PER_LAUNCH = 2**20
 """Paths of one kernel: their pairs take 256 bytes a path."""
 _MOST_COMPARED = 32
 """Shapes that each second point is compared with: every comparison is an instruction of the kernel."""
@@ -64,21 +64,21 @@ _REFLECTANCE = re.compile(r"(brdf_\d\.)?reflectance\.")
 """Parameters of a diffuse material, one-sided or two-sided, and of no other."""
 
 
-class NeighbourTracer(IndirectTracer):
+class PathReuseTracer(IndirectTracer):
     """The same light as :class:`IndirectTracer`'s, to one point of the sensor or random ones."""
 
-    lanes_per_launch = _LANES_PER_LAUNCH
+    paths_per_launch = _PATHS_PER_LAUNCH
 
     @property
-    def lanes(self) -> int:
+    def paths_per_sample(self) -> int:
         """Paths of one sample: one for each pixel of whole blocks, or as often as these are repeated."""
         return MEMBERS * (len(self.adaptive) if self.adaptive else blocks_of(self.projector.n) ** 2)
 
-    def repeating(self, repeats: Sequence[int]) -> IndirectTracer:
-        """The same, as :meth:`IndirectTracer.repeating`; ``repeats`` (blocks^2,)."""
+    def with_adaptive_counts(self, repeats: Sequence[int]) -> IndirectTracer:
+        """The same, as :meth:`IndirectTracer.with_adaptive_counts`; ``repeats`` (blocks^2,)."""
         return self._with_counts(np.asarray(repeats, dtype=np.int64))
 
-    def trace_looks(self, seeds: Sequence[int], samples: int = 1) -> list[Deposits]:
+    def trace_replicates(self, seeds: Sequence[int], samples: int = 1) -> list[PathSamples]:
         """``samples`` of each of some ``seeds``, one after the other: pairs of paths have no lane of their own."""
         return [self.trace(seed, 0, samples) for seed in seeds]
 
@@ -135,15 +135,15 @@ def _is_diffuse(bsdf: mi.BSDF | None) -> bool:
 class ReusedPaths(ProjectorPaths):
     """Paths of whole blocks of pixels, each with the second points of its block."""
 
-    tracer: NeighbourTracer
+    tracer: PathReuseTracer
 
-    def __init__(self, tracer: NeighbourTracer, emission: Emission) -> None:
+    def __init__(self, tracer: PathReuseTracer, emission: Emission) -> None:
         """Of what a ``tracer`` follows, from an ``emission``."""
         super().__init__(tracer, emission)
         self.tracer = tracer
         self.member = dr.arange(mi.UInt32, dr.width(self.pixel)) % MEMBERS
 
-    def deposits(self) -> list[Deposits]:
+    def path_samples(self) -> list[PathSamples]:
         """Light on the host: of each pixel's own paths, and of all pairs of pixels and second points."""
         own, count = self._own(), dr.width(self.lit) * MEMBERS
         values = [[dr.zeros(mi.Float, count) for _ in range(self.tracer.lines)] for _ in range(2)]
@@ -157,25 +157,25 @@ class ReusedPaths(ProjectorPaths):
         dr.eval(values)
         return [*own, self._pair_samples(values[0], self.to_sensor_way), self._pair_samples(values[1], self.further)]
 
-    def accumulate(self, ledgers: Sequence[Ledger]) -> list[Deposits]:
-        """Light of each pixel's own paths on the host; that of pairs in ``ledgers``, one for each line."""
+    def accumulate(self, accumulators: Sequence[DeviceAccumulator]) -> list[PathSamples]:
+        """Light of each pixel's own paths on the host; that of pairs in ``accumulators``, one for each line."""
         own, way = self._own(), self.to_sensor_way
         seen = Sightings(way.geometric, self.pixel, way.row, way.column, way.inverse_depth)
-        places = [ledgers[0].place(each, self.paths.rng.next_float32()) for each in (seen, self.further)]
+        places = [accumulators[0].place(each, self.paths.rng.next_float32()) for each in (seen, self.further)]
         dr.eval(places)
 
         def store(place: mi.UInt32, at: mi.UInt32, light: tuple[ByLine, ByLine], active: mi.Bool) -> None:
             for each, by_line in zip(places, light, strict=True):
-                for ledger, value in zip(ledgers, by_line, strict=True):
+                for accumulator, value in zip(accumulators, by_line, strict=True):
                     lit = active & ~(value == 0)  # not a number is light to be refused
-                    ledger.add(value, self.pixel, dr.gather(mi.UInt32, each, at, lit), lit)
+                    accumulator.add(value, self.pixel, dr.gather(mi.UInt32, each, at, lit), lit)
 
         self._pair_light(*self._weights(), store)
         return own
 
     # ---- the paths themselves ---------------------------------------------------------------------------------------
 
-    def _own(self) -> list[Deposits]:
+    def _own(self) -> list[PathSamples]:
         """Follow all paths; on the host the light that is not shared."""
         self._first_vertex()
         self._second_vertex()
@@ -353,7 +353,7 @@ class ReusedPaths(ProjectorPaths):
     def _first_points(self) -> mi.SurfaceInteraction3f:
         return self.first_hit.compute_surface_interaction(self.first_ray, active=self.lit)
 
-    def _pair_samples(self, values: ByLine, seen: Way | Sightings) -> Deposits:
+    def _pair_samples(self, values: ByLine, seen: Way | Sightings) -> PathSamples:
         """Light on the host of pairs of pixels and second points."""
         by_line = np.array(values)
         light = by_line.sum(axis=0)
@@ -365,7 +365,7 @@ class ReusedPaths(ProjectorPaths):
         at = index - index % MEMBERS + other
         none = np.zeros(len(pairs), np.int64)
         row, column, inverse = (np.array(part)[at] for part in (seen.row, seen.column, seen.inverse_depth))
-        return Deposits(
+        return PathSamples(
             pixel=np.array(self.pixel)[index].astype(np.int64),
             anchor_row=none,
             anchor_column=none,

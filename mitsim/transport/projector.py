@@ -23,7 +23,7 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.projector import Lines
-from mitsim.transport.plugins.base import Numbers, channels, lanes_of, per_lane, turn_and_origin
+from mitsim.transport.plugins.base import Numbers, channels, device_vectors, host_values, turn_and_origin
 
 _WAVELENGTH_SETS = 8
 """Sets of four wavelengths: 15 nm apart, finer than any measured spectrum that a scene would hold."""
@@ -109,7 +109,7 @@ class ProjectorOptics:
         probe = dr.zeros(mi.SurfaceInteraction3f, 2)
         probe.p = self.emitter.world_transform() @ mi.Point3f([0.0, _PROBE_STEP], [0.0, _PROBE_STEP], [1.0, 1.0])
         sample, _ = self.emitter.sample_direction(probe, mi.Point2f(0.5))
-        u, v = per_lane(sample.uv.x, 2), per_lane(sample.uv.y, 2)
+        u, v = host_values(sample.uv.x, 2), host_values(sample.uv.y, 2)
         rows, columns = self.canvas
         return _PROBE_STEP / (abs(u[1] - u[0]) * columns), _PROBE_STEP / (abs(v[1] - v[0]) * rows)
 
@@ -136,7 +136,7 @@ class CanvasMap:
             local = np.stack([x, y, np.ones(x.size)], axis=1)
             uv = _direction_samples(emitter, turn, origin, local, None)[0].uv
             fits = [
-                np.linalg.lstsq(np.stack([per_lane(part, x.size), np.ones(x.size)], axis=1), tangent, rcond=None)[0]
+                np.linalg.lstsq(np.stack([host_values(part, x.size), np.ones(x.size)], axis=1), tangent, rcond=None)[0]
                 for part, tangent in ((uv.x, x), (uv.y, y))
             ]
             reach = 0.49 * min(abs(fits[0][0]), abs(fits[1][0]))
@@ -304,7 +304,7 @@ def _direction_samples(
     world = local @ turn.T
     world *= depth / (world @ forward)[:, None]
     interaction = dr.zeros(mi.SurfaceInteraction3f, len(local))
-    interaction.p = mi.Point3f(*lanes_of(origin + world))
+    interaction.p = mi.Point3f(*device_vectors(origin + world))
     if wavelengths is not None:
         interaction.wavelengths = wavelengths
     sample, emitted = emitter.sample_direction(interaction, mi.Point2f(0.5), True)

@@ -1,4 +1,5 @@
-"""From paths to light per cell: deposits in, a sparse matrix out, light[row, layer x (anchor, cell) x (anchor, cell)].
+"""From paths to light per cell: path samples in, a sparse matrix out, light[row, layer x (anchor, cell) x (anchor,
+cell)].
 
 A row is a projector pixel, or a class of pixels that a pattern family always lights together. Ambient light has the
 last row, or one of the last for each band of its wavelengths. A path's light is accumulated in the cell that holds its
@@ -32,7 +33,7 @@ _COUNTED = 4
 
 @dataclass
 class Sightings:
-    """Light of connections, a lane each, and where the camera sees it; meaning and units as in :class:`Deposits`.
+    """Light of connections, a lane each, and where the camera sees it; meaning and units as in :class:`PathSamples`.
     ``lines`` is ``value`` by line, where it is told apart."""
 
     value: mi.Float
@@ -49,7 +50,7 @@ class Sightings:
         Parameters
         ----------
         light
-            [W m^-2], by the weights of :func:`mitsim.transport.connect.sampled_wavelengths`.
+            [W m^-2], by the weights of :func:`mitsim.transport.connect.sample_wavelengths`.
         by_line
             whether it is told apart by line.
         pixel
@@ -95,7 +96,7 @@ def check_finite(light: npt.NDArray[Any]) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Deposits:
+class PathSamples:
     """Light that paths brought to the camera, one entry a connection.
 
     Attributes
@@ -130,7 +131,7 @@ class Deposits:
     lines: npt.NDArray[np.float32] | None = None
 
     @classmethod
-    def joined(cls, parts: Sequence[Deposits]) -> Deposits:
+    def joined(cls, parts: Sequence[PathSamples]) -> PathSamples:
         """All ``parts`` in one; no light where there are none."""
         parts = parts or [cls.none()]
         if len(parts) == 1:
@@ -140,7 +141,7 @@ class Deposits:
         arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
         return cls(**arrays, lines=lines)
 
-    def by_line(self, lines: int) -> list[Deposits]:
+    def by_line(self, lines: int) -> list[PathSamples]:
         """These, or the same of each of several ``lines`` with its light."""
         if lines == 1 or not len(self.value):
             return [self] * lines
@@ -148,7 +149,7 @@ class Deposits:
         return [replace(self, value=self.lines[line].astype(np.float64), lines=None) for line in range(lines)]
 
     @classmethod
-    def fetched(cls, seen: Sightings, kind: int, anchors: tuple[mi.UInt32, mi.UInt32] | None = None) -> Deposits:
+    def fetched(cls, seen: Sightings, kind: int, anchors: tuple[mi.UInt32, mi.UInt32] | None = None) -> PathSamples:
         """Lit connections of one kind from the renderer's arrays.
 
         Parameters
@@ -191,32 +192,32 @@ class Deposits:
         )
 
     @classmethod
-    def none(cls) -> Deposits:
+    def none(cls) -> PathSamples:
         """No light at all."""
         index, number = np.zeros(0, dtype=np.int64), np.zeros(0)
         return cls(index, index, index, number, number, number, number, np.zeros(0, dtype=np.int16))
 
-    def averaged(self, weights: FloatArray) -> Deposits:
+    def averaged(self, weights: FloatArray) -> PathSamples:
         """Light of one anchor: the mean over all of them, with ``weights`` (anchors,) along rows and columns."""
         first = np.zeros_like(self.pixel)
         value = self.value * weights[self.anchor_row] * weights[self.anchor_column]
         return replace(self, anchor_row=first, anchor_column=first, value=value)
 
-    def where(self, chosen: npt.NDArray[np.bool_]) -> Deposits:
+    def where(self, chosen: npt.NDArray[np.bool_]) -> PathSamples:
         """The entries that are ``chosen`` (m,)."""
         return self._taken(chosen)
 
-    def of_lanes(self, first: int, last: int) -> Deposits:
+    def of_lanes(self, first: int, last: int) -> PathSamples:
         """The entries of lanes ``first`` .. ``last`` - 1."""
         assert self.lane is not None, "known of what one launch brought"
         return self._taken(slice(*np.searchsorted(self.lane, (first, last))))
 
-    def _taken(self, which: slice | npt.NDArray[np.bool_]) -> Deposits:
+    def _taken(self, which: slice | npt.NDArray[np.bool_]) -> PathSamples:
         lines = None if self.lines is None else self.lines[:, which]
-        return Deposits(**{name: getattr(self, name)[which] for name in _ARRAYS}, lines=lines)
+        return PathSamples(**{name: getattr(self, name)[which] for name in _ARRAYS}, lines=lines)
 
 
-_ARRAYS = tuple(name for name in Deposits.__dataclass_fields__ if name not in ("lane", "lines"))
+_ARRAYS = tuple(name for name in PathSamples.__dataclass_fields__ if name not in ("lane", "lines"))
 """What is told of each entry."""
 
 
@@ -269,19 +270,19 @@ class Bundle:
         """Places for light in all."""
         return len(self.depths) * self.anchors**2 * self.cells[0] * self.cells[1]
 
-    def file(self, deposits: Deposits, labels: IntArray, samples: int = 1) -> sparse.csr_array:
+    def file(self, path_samples: PathSamples, labels: IntArray, samples: int = 1) -> sparse.csr_array:
         """(C + lamps, size) light of C classes of pixels and of lamps, per sample, but for what is :meth:`outside`.
 
         Parameters
         ----------
-        deposits
+        path_samples
             light of ``samples`` samples.
         labels
             (n^2,) class 0..C-1 of each projector pixel.
         samples
             that the light is divided by.
         """
-        flat, values, pixel = self.entries(deposits, samples)
+        flat, values, pixel = self.entries(path_samples, samples)
         count = int(labels.max()) + 1
         shape = (count + self.lamps, self.size)
         index = _index_type(*shape)
@@ -293,35 +294,35 @@ class Bundle:
         light.eliminate_zeros()
         return light
 
-    def entries(self, deposits: Deposits, samples: int = 1) -> tuple[IntArray, FloatArray, IntArray]:
+    def entries(self, path_samples: PathSamples, samples: int = 1) -> tuple[IntArray, FloatArray, IntArray]:
         """(e,) place, light and projector pixel of all that is accumulated, in no order and not summed.
 
         Parameters
         ----------
-        deposits, samples
+        path_samples, samples
             as for :meth:`file`.
         """
-        inside = self._inside(deposits)
+        inside = self._inside(path_samples)
         if not inside.all():
-            deposits = deposits.where(inside)
+            path_samples = path_samples.where(inside)
         width = self.anchors * self.cells[1]
         plane = self.anchors * self.cells[0] * width
         parts = [
             (layer * plane + (first + line) * width + second + place, share * line_share * place_share)
-            for first, second in [(deposits.anchor_row * self.cells[0], deposits.anchor_column * self.cells[1])]
-            for line, line_share in self._cells(self.grid.rows, deposits.row)
-            for place, place_share in self._cells(self.grid.columns, deposits.column)
-            for layer, share in self._layers(deposits.inverse_depth)
+            for first, second in [(path_samples.anchor_row * self.cells[0], path_samples.anchor_column * self.cells[1])]
+            for line, line_share in self._cells(self.grid.rows, path_samples.row)
+            for place, place_share in self._cells(self.grid.columns, path_samples.column)
+            for layer, share in self._layers(path_samples.inverse_depth)
         ]
-        values = np.concatenate([deposits.value * (share / samples) for _, share in parts])
-        return np.concatenate([place for place, _ in parts]), values, np.tile(deposits.pixel, len(parts))
+        values = np.concatenate([path_samples.value * (share / samples) for _, share in parts])
+        return np.concatenate([place for place, _ in parts]), values, np.tile(path_samples.pixel, len(parts))
 
-    def outside(self, deposits: Deposits) -> float:
-        """Light of ``deposits`` from beyond all cells, which is not filed [W m^-2]."""
-        return float(deposits.value[~self._inside(deposits)].sum())
+    def outside(self, path_samples: PathSamples) -> float:
+        """Light of ``path_samples`` from beyond all cells, which is not filed [W m^-2]."""
+        return float(path_samples.value[~self._inside(path_samples)].sum())
 
-    def _inside(self, deposits: Deposits) -> npt.NDArray[np.bool_]:
-        return self.grid.rows.holds(deposits.row) & self.grid.columns.holds(deposits.column)
+    def _inside(self, path_samples: PathSamples) -> npt.NDArray[np.bool_]:
+        return self.grid.rows.holds(path_samples.row) & self.grid.columns.holds(path_samples.column)
 
     def repeated(self, light: sparse.csr_array) -> sparse.csr_array:
         """``light`` that was accumulated with one anchor, (rows, size / anchors^2), as if every anchor saw it."""

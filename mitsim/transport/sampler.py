@@ -81,7 +81,7 @@ def _unit(bits: mi.UInt32) -> mi.Float:
 
 def panchromatic(radiance: mi.UnpolarizedSpectrum) -> mi.Float:
     """One number for a spectrum of ``radiance``, by a flat response: the mean over channels, or over wavelengths that
-    have the weights of :func:`mitsim.transport.connect.sampled_wavelengths`."""
+    have the weights of :func:`mitsim.transport.connect.sample_wavelengths`."""
     return dr.mean(radiance)
 
 

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, Labels, mean_of_neighbours
 from mitsim.devices.camera import CameraGeometry
-from mitsim.transport.connect import Receiver, Reception, landing, sampled_wavelengths
+from mitsim.transport.connect import Receiver, Reception, landing, sample_wavelengths
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.integrator import InFlight, launches
 from mitsim.transport.plugins.base import rows_columns
@@ -107,25 +107,27 @@ def sharp_light(
     MitsimError
         when the scene sends NaN or infinite light to the camera.
     """
-    lanes = projector.n**2
+    paths_per_sample = projector.n**2
     lobes = _Lobes(scene, camera, projector, geometry)
-    first = lobes.trace(np.arange(lanes), seed, 0, -(-samples // _FEWER), _WIDER)
+    first = lobes.trace(np.arange(paths_per_sample), seed, 0, -(-samples // _FEWER), _WIDER)
     if not len(first.widths):
-        return SharpLight.none(lanes)
+        return SharpLight.none(paths_per_sample)
     lobes.least = least = mi.Float(np.clip(_SHARP * first.sharp, _LEAST_SHARP, _SHARP).astype(np.float32))
-    found = lobes.trace(np.arange(lanes), seed, 0, samples)
+    found = lobes.trace(np.arange(paths_per_sample), seed, 0, samples)
     if len(found.widths) < _PLENTY:
         search = _Connections(scene, camera, projector, 1, geometry, spread=True).over(least, sharp=True)
-        lit = np.bincount(search.trace(seed, 0, max(1, _SEARCHING // lanes)).pixel, minlength=lanes)
+        lit = np.bincount(
+            search.trace(seed, 0, max(1, _SEARCHING // paths_per_sample)).pixel, minlength=paths_per_sample
+        )
         pixels = with_neighbours((found.by_pixel > 0) | (lit > 0), projector.n)
         if len(pixels):
-            found = lobes.trace(pixels, seed, samples, samples * lanes // len(pixels))
+            found = lobes.trace(pixels, seed, samples, samples * paths_per_sample // len(pixels))
     total, moment = float(found.by_pixel.sum()), float(found.moments.sum())
     hits = total**2 / moment if moment else 0.0
     rest = 0.0
     if total:
         others = _Connections(scene, camera, projector, 1, geometry, spread=True).over(least, sharp=False)
-        count = max(1, _CONNECTIONS // lanes)
+        count = max(1, _CONNECTIONS // paths_per_sample)
         rest = float(others.trace(seed, 0, count).value.sum()) / count
     width = _quantile(found.widths, found.weights, _SHARPEST)
     return SharpLight(total, found.error, hits, found.by_pixel, found.moments, width, rest)
@@ -249,7 +251,7 @@ class _Lobes:
         half = dr.opaque(mi.Float, wider * self.geometry.half_width)
         _, rng = streams(seed, pixel, sample)
         jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
-        wavelengths, spectral = sampled_wavelengths(self.camera, rng, self.rays.projector.lines)
+        wavelengths, spectral = sample_wavelengths(self.camera, rng, self.rays.projector.lines)
         ray = self.rays.sample(pixel, jitter, rng, wavelengths)
         flux = self.rays.flux(pixel, wavelengths) * spectral
         none = _SensorHits(mi.Float(0), mi.Float(0), mi.Float(1), mi.Float(0))
@@ -373,7 +375,7 @@ class AimedTracer(DirectTracer):
         self._near, self.far = pairs[near], pairs[~near]
 
     @property
-    def lanes(self) -> int:
+    def paths_per_sample(self) -> int:
         """Connections of one sample: all near pairs of pixel and anchor, and one of a few others."""
         return len(self._near) - (-len(self.far) // _SELDOM)
 
@@ -452,7 +454,7 @@ class AimedTracer(DirectTracer):
         pixel = dr.gather(mi.UInt32, mi.UInt32(self._pixels), number)
         shared, rng = streams(_SEED, pixel, sample)
         jitter = stratified(sample, shared)
-        wavelengths, _ = sampled_wavelengths(self.receiver.camera, rng, self.projector.lines)
+        wavelengths, _ = sample_wavelengths(self.receiver.camera, rng, self.projector.lines)
         ray = self.rays.sample(pixel, jitter, rng, wavelengths)
         none = _Axis(mi.Float(0), mi.Float(0), mi.Float(1), mi.Bool(False))
         axis, _ = self.receiver.passage.along(ray, mi.Spectrum(1), (none, rng), self._axis)

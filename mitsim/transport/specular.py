@@ -24,7 +24,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.optics.mirror_frames import Beams
 from mitsim.transport.projector import ProjectorOptics
-from mitsim.transport.specular_rays import Chains, Crossings, GlintRays, IntArray, Mask, delta_bsdfs
+from mitsim.transport.specular_rays import Chains, Crossings, IntArray, Mask, SpecularRays, delta_bsdfs
 from mitsim.transport.specular_search import first_squares, grazing
 
 _UNIT = 2**24
@@ -68,7 +68,7 @@ def has_mirrors(scene: mi.Scene) -> bool:
     return bool(delta_bsdfs(scene, int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)))
 
 
-def trace_glint(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, max_depth: int = 16) -> Beams:
+def trace_specular_chains(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, max_depth: int = 16) -> Beams:
     """All beams that leave the projector, meet perfect mirrors or lenses alone, and reach the sensor.
 
     A mirror that no ray of the coarse grid meets (one point a projector pixel, at least 128 a side) is not seen.
@@ -93,13 +93,13 @@ def trace_glint(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, 
         return _join([], np.zeros(2))
     parts, left = [], np.zeros(2)
     for each in projector.per_wavelength:
-        beams, lost = _projector_beams(GlintRays(scene, camera, each, max_depth), projector.n, camera.geometry)
+        beams, lost = _projector_beams(SpecularRays(scene, camera, each, max_depth), projector.n, camera.geometry)
         parts += beams
         left += lost
     return _join(parts, left)
 
 
-def _projector_beams(tracer: GlintRays, n: int, geometry: CameraGeometry) -> tuple[list[Beams], FloatArray]:
+def _projector_beams(tracer: SpecularRays, n: int, geometry: CameraGeometry) -> tuple[list[Beams], FloatArray]:
     """Beams of the pixels of a window of ``n`` a side, and (2,) the flux that none has and their variance."""
     step = _UNIT // min(_UNIT, 2 ** max(0, int(np.ceil(np.log2(_COARSE / n)))))
     arcs, close = grazing(tracer, geometry.half_width, _UNIT)
@@ -114,7 +114,7 @@ def _projector_beams(tracer: GlintRays, n: int, geometry: CameraGeometry) -> tup
 
 
 def _search(
-    tracer: GlintRays, row: IntArray, column: IntArray, size: int, n: int, geometry: CameraGeometry
+    tracer: SpecularRays, row: IntArray, column: IntArray, size: int, n: int, geometry: CameraGeometry
 ) -> tuple[list[Beams], FloatArray]:
     """The same of all chains in squares of the lattice (first row and column, ``size``)."""
     crossings, place = _trace_squares(tracer, row, column, np.array([0, size]))
@@ -156,7 +156,9 @@ class _Nodes:
         return self.take((slice(None), slice(i, i + 2), slice(j, j + 2)))
 
 
-def _trace_squares(tracer: GlintRays, row: IntArray, column: IntArray, steps: IntArray) -> tuple[Crossings, IntArray]:
+def _trace_squares(
+    tracer: SpecularRays, row: IntArray, column: IntArray, steps: IntArray
+) -> tuple[Crossings, IntArray]:
     """Rays through the points of squares at ``steps`` from their first corner, shared ones traced once; and which ray
     (q, k, k) each point is."""
     rows, columns = np.broadcast_arrays(row[:, None, None] + steps[:, None], column[:, None, None] + steps)
@@ -187,7 +189,7 @@ def _nodes(crossings: Crossings, chain: Chains, place: IntArray) -> _Nodes:
 
 
 def _refine(
-    tracer: GlintRays,
+    tracer: SpecularRays,
     squares: tuple[Chains, IntArray, IntArray, FloatArray],
     size: int,
     n: int,
@@ -310,7 +312,7 @@ def _points(nodes: _Nodes, flux: FloatArray, pixel: IntArray, geometry: CameraGe
     return _Points(Beams(pixel[square], light[square, i, j], sensor, tangent, whole, 0.0), square)
 
 
-def _nodes_of(tracer: GlintRays, chain: Chains, row: IntArray, column: IntArray, half: int) -> _Nodes:
+def _nodes_of(tracer: SpecularRays, chain: Chains, row: IntArray, column: IntArray, half: int) -> _Nodes:
     """Nodes (q, 3, 3) at corners, edge middles and centre of squares."""
     crossings, place = _trace_squares(tracer, row, column, half * np.arange(3))
     return _nodes(crossings, chain, place)
@@ -368,7 +370,7 @@ def _departure(values: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.norm(values - flat, axis=-1).max(axis=(1, 2)))
 
 
-def _fluxes(tracer: GlintRays, row: IntArray, column: IntArray, size: int, n: int) -> FloatArray:
+def _fluxes(tracer: SpecularRays, row: IntArray, column: IntArray, size: int, n: int) -> FloatArray:
     """(q,) flux into squares of the lattice [W m^-2 mm^2]."""
     power = tracer.rays.power.mean(axis=1)[_pixel(row, column, n)]
     return np.asarray(power * tracer.rays.area * (size / _UNIT) ** 2)

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
-from mitsim.transport.plugins.base import channels, lanes_of, per_lane, rows_columns, turn_and_origin, vectors
+from mitsim.transport.plugins.base import channels, device_vectors, host_values, rows_columns, turn_and_origin, vectors
 from mitsim.transport.projector import PinholeRays, ProjectorOptics, wavelength_sets
 from mitsim.transport.transmission import CLEAR, Passage, transmits
 
@@ -94,7 +94,7 @@ class _Rays:
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
 
 
-class GlintRays:
+class SpecularRays:
     """Follows rays of a projector over delta reflections, refractions and straight transmissions to the sensor plane.
 
     At a surface that both reflects and transmits, a ray goes both ways. A ray that meets anything that scatters ends
@@ -140,7 +140,7 @@ class GlintRays:
         crossings = []
         for _ in range(self._max_depth + 1):
             si = self._intersect(rays)
-            distance = np.where(per_lane(si.is_valid(), len(rays.index)), per_lane(si.t, len(rays.index)), np.inf)
+            distance = np.where(host_values(si.is_valid(), len(rays.index)), host_values(si.t, len(rays.index)), np.inf)
             distance = distance + np.linalg.norm(rays.start - rays.origin, axis=1)
             crossing, arrived = self._cross(rays, distance)
             crossings.append(crossing)
@@ -151,7 +151,7 @@ class GlintRays:
         return Crossings.joined(crossings)
 
     def _intersect(self, rays: _Rays) -> mi.SurfaceInteraction3f:
-        ray = mi.Ray3f(mi.Point3f(*lanes_of(rays.start)), mi.Vector3f(*lanes_of(rays.direction)))
+        ray = mi.Ray3f(mi.Point3f(*device_vectors(rays.start)), mi.Vector3f(*device_vectors(rays.direction)))
         si = self._scene.ray_intersect(ray, mi.RayFlags.All, True)
         dr.eval(si)
         return si
@@ -180,19 +180,19 @@ class GlintRays:
         count = len(active)
         hits = _plane_hits(rays, si)
         shading = hits.normal.copy()
-        shapes = per_lane(dr.reinterpret_array(mi.UInt32, si.shape), count).astype(np.uint64)
-        numbers = shapes.astype(np.int64), per_lane(si.prim_index, count).astype(np.int64)
+        shapes = host_values(dr.reinterpret_array(mi.UInt32, si.shape), count).astype(np.uint64)
+        numbers = shapes.astype(np.int64), host_values(si.prim_index, count).astype(np.int64)
         self._exact.refine(rays.origin, rays.direction, hits, *numbers)
         point, geometric, normal = hits.point, hits.geometric, hits.normal
         onward: list[_Rays] = []
-        materials = per_lane(dr.reinterpret_array(mi.UInt32, si.bsdf()), count)
+        materials = host_values(dr.reinterpret_array(mi.UInt32, si.bsdf()), count)
         for lobe, own in self._lobes:
             own_lobe = active & np.isin(materials, own)
             if not own_lobe.any():
                 continue
             here = mi.Bool(own_lobe)
             sample, weight = self._sample_lobe(lobe, si, here)
-            kind, eta = per_lane(sample.sampled_type, count), per_lane(sample.eta, count)
+            kind, eta = host_values(sample.sampled_type, count), host_values(sample.eta, count)
             single = (kind & int(mi.BSDFFlags.Delta)) != 0
             spectrum = rays.spectrum * np.nan_to_num(weight)
             chosen = np.flatnonzero(own_lobe & single & ((spectrum @ self._colour) > _FAINTEST))

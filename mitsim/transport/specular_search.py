@@ -22,7 +22,7 @@ from mitsim.transport.plugins.base import turn_and_origin
 from mitsim.transport.projector import PinholeRays
 
 if TYPE_CHECKING:
-    from mitsim.transport.specular_rays import GlintRays
+    from mitsim.transport.specular_rays import SpecularRays
 
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
@@ -101,7 +101,7 @@ def first_squares(
         )
 
 
-def grazing(tracer: GlintRays, half_width: float, unit: int) -> tuple[list[Boxes], float]:
+def grazing(tracer: SpecularRays, half_width: float, unit: int) -> tuple[list[Boxes], float]:
     """Where balls of glass send light to the sensor from close to their rim, and flux [W m^-2 mm^2] that comes from too
     close to it to be looked for.
 
@@ -161,7 +161,7 @@ class _Plane:
     aside: float
 
     @classmethod
-    def of(cls, ball: mi.Shape, tracer: GlintRays) -> _Plane:
+    def of(cls, ball: mi.Shape, tracer: SpecularRays) -> _Plane:
         """Of a ``ball`` and what a ``tracer`` knows."""
         box, origin = ball.bbox(), tracer.rays.origin
         to_ball = np.array(box.center(), dtype=np.float64).ravel() - origin

@@ -184,8 +184,8 @@ def test_light_does_not_depend_on_how_many_paths_are_held_at_once(
     monkeypatch.setattr(
         DirectTracer, "trace", lambda self, seed, first, count: counts.append(count) or trace(self, seed, first, count)
     )
-    for lanes, at_once in ((light.LANES_AT_ONCE, 16), (light.LANES_AT_ONCE, 16), (3 * bench.n**2, 3)):
-        monkeypatch.setattr(light, "LANES_AT_ONCE", lanes)
+    for paths_per_sample, at_once in ((light.PATHS_AT_ONCE, 16), (light.PATHS_AT_ONCE, 16), (3 * bench.n**2, 3)):
+        monkeypatch.setattr(light, "PATHS_AT_ONCE", paths_per_sample)
         one = trace_light(bench, plan, lighting, 3)
         found.append(np.stack([frame.irradiance for frame in one.frames(lighting, 3)]))
         assert max(counts) == at_once and sum(counts) == 16 * GROUPS

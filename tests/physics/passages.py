@@ -46,8 +46,8 @@ def all_light(bench: Bench, seed: int, samples: int = 128, lens: float = 0.0, fo
     )
     light = np.zeros(3)
     for tracer, count in tracers:
-        deposits = tracer.trace(seed, 0, count)
-        light += np.bincount(deposits.kind, deposits.value / count, minlength=3)
+        path_samples = tracer.trace(seed, 0, count)
+        light += np.bincount(path_samples.kind, path_samples.value / count, minlength=3)
     return light
 
 

@@ -23,13 +23,13 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
 from mitsim.core.spectral_manifests import RUN
 from mitsim.light.lamps import lit_by_lamps
-from mitsim.transport.accumulator import Ledger
+from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.direct import DirectTracer, FluxTracer
-from mitsim.transport.from_camera import Counted, FromCameraTracer, LampTracer, Paths
+from mitsim.transport.from_camera import FromCameraTracer, LampResponse, LampTracer, Paths
 from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.path_reuse import NeighbourTracer
-from mitsim.transport.records import Bundle, Deposits, aligned_grid
-from mitsim.transport.specular import trace_glint
+from mitsim.transport.path_reuse import PathReuseTracer
+from mitsim.transport.records import Bundle, PathSamples, aligned_grid
+from mitsim.transport.specular import trace_specular_chains
 from tests.conftest import write_small_scene
 
 N, SAMPLES = 8, 16
@@ -59,13 +59,13 @@ def index(nm: float) -> float:
     return INDEX + slope * ((nm / 1000) ** -2 - 0.58756**-2)
 
 
-def seen(light: Deposits) -> list[float]:
+def seen(light: PathSamples) -> list[float]:
     """How much light, from where and how far, and of which pixels."""
     places = (np.ones(len(light.value)), light.row, light.column, light.inverse_depth * 400, light.pixel / N**2)
     return [float(np.sum(light.value * place)) for place in places]
 
 
-def followed(bench: Bench) -> dict[str, Deposits]:
+def followed(bench: Bench) -> dict[str, PathSamples]:
     """Light of a bench by the way that it is followed."""
     loaded, optics = bench.loaded, bench.projector_optics
     aim = aligned_grid(*bench.windows, 32, 1, bench.geometry.tan_half_fov + 0.01)
@@ -73,7 +73,7 @@ def followed(bench: Bench) -> dict[str, Deposits]:
     tracers = {
         "direct": DirectTracer(*parts, 2),
         "indirect": IndirectTracer(*parts, True, True),
-        "shared": NeighbourTracer(*parts, True, True),
+        "shared": PathReuseTracer(*parts, True, True),
         "from camera": FromCameraTracer(*parts, aim, Paths(True, True, ())),
     }
     if not tracers["indirect"].receiver.passage.open:
@@ -81,7 +81,7 @@ def followed(bench: Bench) -> dict[str, Deposits]:
     else:
         del tracers["shared"]
     return {
-        name: tracer.trace_looks([3, 5], SAMPLES)[1] if name == "looks" else tracer.trace(3, 0, SAMPLES)
+        name: tracer.trace_replicates([3, 5], SAMPLES)[1] if name == "looks" else tracer.trace(3, 0, SAMPLES)
         for name, tracer in tracers.items()
     }
 
@@ -94,10 +94,10 @@ def filed(bench: Bench) -> list[list[float]]:
     bundle = Bundle(aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov), 1, (400.0,))
     found: list[list[float]] = [[] for _ in lines.shares]
     for tracer in (IndirectTracer(*parts, True, True), DirectTracer(*parts, 1)):
-        ledgers = [Ledger(bundle, labels, tracer.board) for _ in lines.shares]
-        tracer.trace_into(ledgers, 3, 0, SAMPLES)
-        for line, ledger in zip(found, ledgers, strict=True):
-            line += np.asarray(ledger.filed()[0].sum(axis=1)).ravel().tolist()
+        accumulators = [DeviceAccumulator(bundle, labels, tracer.board) for _ in lines.shares]
+        tracer.trace_into(accumulators, 3, 0, SAMPLES)
+        for line, accumulator in zip(found, accumulators, strict=True):
+            line += np.asarray(accumulator.filed()[0].sum(axis=1)).ravel().tolist()
     return found
 
 
@@ -112,7 +112,7 @@ def flux(bench: Bench) -> list[list[float]]:
 
 def glint(bench: Bench) -> list[float]:
     """Of beams that reach the sensor: power, and by place."""
-    beams = trace_glint(bench.loaded.scene, bench.loaded.camera, bench.projector_optics)
+    beams = trace_specular_chains(bench.loaded.scene, bench.loaded.camera, bench.projector_optics)
     light = beams.flux * beams.throughput.mean(axis=(1, 2))
     return [float(light.sum()), *(light @ beams.sensor.mean(axis=(1, 2))).tolist()]
 
@@ -125,7 +125,7 @@ def lamps(bench: Bench) -> list[list[float]]:
     parts = bench.loaded.scene, bench.loaded.camera, bench.projector_optics, aim
     like = FromCameraTracer(*parts, Paths(True, True, bench.loaded.lamps))
     bands = [(nm - 0.01, nm + 0.01) for nm in LINES] + [(830.0, 830.0)]
-    found = LampTracer(like, Counted(lit.lamplight.responses[0], bands, (1.0,))).trace(3, 0, SAMPLES)
+    found = LampTracer(like, LampResponse(lit.lamplight.responses[0], bands, (1.0,))).trace(3, 0, SAMPLES)
     return [seen(found.where(found.pixel == N**2 + band)) for band in range(len(LINES))]
 
 

@@ -19,12 +19,12 @@ from scipy.signal import max_len_seq
 from mitsim.devices.patterns import Lighting, parse_patterns
 from mitsim.light.light import Sampling, trace_light
 from mitsim.optics.fft_shadow import geometric_samplers
-from mitsim.optics.mirror_frames import GlintFrames, glint_frames
+from mitsim.optics.mirror_frames import SpecularFrames, specular_frames
 from mitsim.planner.planner import make_plan
 from mitsim.transport.plugins.lens import aperture_scene_parts, register
 from mitsim.transport.projector import ProjectorOptics
-from mitsim.transport.specular import trace_glint
-from mitsim.transport.specular_rays import GlintRays
+from mitsim.transport.specular import trace_specular_chains
+from mitsim.transport.specular_rays import SpecularRays
 from tests.physics.test_diffraction import by_point_source
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -83,12 +83,12 @@ class Rig:
             }
         )
 
-    def frames(self, scene, labels: np.ndarray) -> GlintFrames:
+    def frames(self, scene, labels: np.ndarray) -> SpecularFrames:
         camera = scene.sensors()[0]
         columns = 2 * N if self.shifted else N
         projector = ProjectorOptics(scene.emitters()[0], N, 0, columns - N, (N, columns))
-        beams = trace_glint(scene, camera, projector)
-        return glint_frames(beams, camera.geometry, geometric_samplers(camera.geometry), labels)
+        beams = trace_specular_chains(scene, camera, projector)
+        return specular_frames(beams, camera.geometry, geometric_samplers(camera.geometry), labels)
 
     def mirrored(self, *mirrors: tuple[Vector, np.ndarray]) -> "Rig":
         """The virtual projector behind plane mirrors (point, unit normal), met in this order."""
@@ -431,7 +431,7 @@ def test_rays_are_better_than_float32(variant: str) -> None:
     ball_shape = {"type": "sphere", "center": centre.tolist(), "radius": radius, "bsdf": {"type": "conductor"}}
     for shape, off in ((mirror((0, 0, 400), BACK, 120), 1e-6), (ball_shape, 1e-6)):
         scene = rig.scene(shape=shape)
-        tracer = GlintRays(scene, scene.sensors()[0], ProjectorOptics(scene.emitters()[0], N, 0, N, (N, 2 * N)), 1)
+        tracer = SpecularRays(scene, scene.sensors()[0], ProjectorOptics(scene.emitters()[0], N, 0, N, (N, 2 * N)), 1)
         found = tracer.follow(points)
         assert found.ray.tolist() == list(range(500))
         direction = tracer.rays.directions(points)
@@ -463,7 +463,7 @@ def mirror_part(light) -> np.ndarray:
     """What the frame holds beyond the light that camera paths found."""
     whole = next(iter(light.frames(LIT, 0))).irradiance
     without = copy.copy(light.simulation)
-    without.glint_frames = lambda labels: None
+    without.specular_frames = lambda labels: None
     traced = without.expected(light.groups, np.zeros(1, np.int64), LIT, 0)
     return whole - next(iter(traced)).irradiance
 

@@ -5,8 +5,8 @@ often: so the reference sees a projector whose lens is a disk of 50 mm that shin
 the factored estimator, which finds the same light by refracted connections, from the projector's side and, over
 mirrors, from the camera's. All light is compared, whichever tracer finds it, reflections inside of the glass too; what
 would be found twice or not at all shows. Panes are slanted so that none mirrors the lens into the sensor, which is the
-beams' light (tests/unit/transport/test_glint.py). The unmasked sensor of 0.75 mm is seen as a whole, whose mean is that
-at its centre to 1e-6.
+beams' light (tests/unit/transport/test_specular.py). The unmasked sensor of 0.75 mm is seen as a whole, whose mean is
+that at its centre to 1e-6.
 
 Significance. Means over independent seeds (8 of each side); a gate of seven standard errors stands for five of the t
 distribution, and each test states how narrow it is. Seeds are fixed.

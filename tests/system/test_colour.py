@@ -13,7 +13,7 @@ import pytest
 from mitsim.core.configuration import shipped
 from mitsim.core.exr import read_frame
 from tests.system.conftest import tree
-from tests.unit.transport.test_neighbours import WALL
+from tests.unit.transport.test_path_reuse import WALL
 
 LINES = {638: 0.5, 520: 0.3, 445: 0.2}
 """Wavelengths [nm] and their parts of the power."""

@@ -12,7 +12,7 @@ import pytest
 from mitsim.core.exr import read_frame
 from tests.system.conftest import ACCURACY
 from tests.unit.transport.test_indirect import MATT
-from tests.unit.transport.test_neighbours import WALL
+from tests.unit.transport.test_path_reuse import WALL
 
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_spectral")
 

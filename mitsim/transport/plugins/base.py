@@ -81,7 +81,7 @@ def bsdf_class() -> type:
 # -------- Between Dr.Jit and NumPy
 
 
-def per_lane(values: mi.Float, count: int) -> npt.NDArray[Any]:
+def host_values(values: mi.Float, count: int) -> npt.NDArray[Any]:
     """(count,) of a Dr.Jit array ``values`` of ``count`` numbers or one; real numbers in double precision."""
     array = np.array(values)
     array = array.astype(np.float64) if array.dtype.kind == "f" else array
@@ -90,15 +90,15 @@ def per_lane(values: mi.Float, count: int) -> npt.NDArray[Any]:
 
 def vectors(values: mi.Vector3f, count: int) -> FloatArray:
     """(``count``, 3) of a Dr.Jit vector ``values``."""
-    return np.stack([per_lane(part, count) for part in (values.x, values.y, values.z)], axis=1)
+    return np.stack([host_values(part, count) for part in (values.x, values.y, values.z)], axis=1)
 
 
 def channels(spectrum: mi.UnpolarizedSpectrum, count: int) -> FloatArray:
     """(``count``, channels) of a ``spectrum``."""
-    return np.stack([per_lane(spectrum[i], count) for i in range(len(spectrum))], axis=1)
+    return np.stack([host_values(spectrum[i], count) for i in range(len(spectrum))], axis=1)
 
 
-def lanes_of(vectors: FloatArray) -> tuple[mi.Float, mi.Float, mi.Float]:
+def device_vectors(vectors: FloatArray) -> tuple[mi.Float, mi.Float, mi.Float]:
     """Components of ``vectors`` (k, 3) on the device, in single precision.
 
     Gathered of one array: Dr.Jit takes arrays over as they lie in memory, and compiles kernels that read them anew for

@@ -18,7 +18,7 @@ from scipy import fft
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer, stream
-from mitsim.transport.plugins.base import per_lane, vectors
+from mitsim.transport.plugins.base import host_values, vectors
 
 _THICKNESS_MM = 1.0
 """Of the sheet; it moves tilted light only, by its thickness times the tangent in glass."""
@@ -209,4 +209,4 @@ def _landing(scene: mi.Scene, places: FloatArray, along: FloatArray) -> tuple[Fl
         ray = mi.Ray3f(crossing.p + along_ray * _CLEAR_MM, along_ray)
     active &= ray.d.z < 0
     landed = ray(-ray.o.z / ray.d.z)
-    return vectors(landed, places.shape[1]), per_lane(mi.Float(mi.UInt32(active)) * part, places.shape[1])
+    return vectors(landed, places.shape[1]), host_values(mi.Float(mi.UInt32(active)) * part, places.shape[1])

@@ -191,7 +191,7 @@ def test_a_look_finds_what_bands_leave_of_all_lines(
 
     asked: list[Any] = []
 
-    def deposits(self: Any, of: OfLines) -> list[Lines | None]:
+    def path_samples(self: Any, of: OfLines) -> list[Lines | None]:
         asked.append((of.variant, len(of.lines.shares) if of.lines else 0))
         return [*of.lines.single] if of.lines else [None]
 
@@ -200,7 +200,7 @@ def test_a_look_finds_what_bands_leave_of_all_lines(
         return np.array([[[1.0], [3.0]]]) if found is None else light(found)
 
     monkeypatch.setattr(bands._Look, "__init__", lambda self, whole: setattr(self, "_bench", whole))
-    monkeypatch.setattr(bands._Look, "_deposits", deposits)
+    monkeypatch.setattr(bands._Look, "_path_samples", path_samples)
     monkeypatch.setattr(bands._Look, "_electrons", electrons)
     monkeypatch.setattr(bands, "reopened", lambda of, variant: replace(of, variant=variant))
     monkeypatch.setattr(bands, "line_alone", lambda of, line: replace(of, alone=line))
@@ -260,9 +260,9 @@ def test_a_look_is_at_few_rays_of_four_shots(monkeypatch: pytest.MonkeyPatch) ->
     assert np.array_equal(look._lighting.weights[:, look._lighting.labels], weights[[0, 2, 5, 8]][:, labels])
     assert look._lighting.weights.shape[1] == len({tuple(each) for each in weights[[0, 2, 5, 8]].T})
     assert look._settings.effects == {"diffraction"} and look._settings.depth == 400
-    assert look._deposits(of) == ["light"]
+    assert look._path_samples(of) == ["light"]
     of.lines = LASERS
-    assert look._deposits(of) == ["light"] * 3
+    assert look._path_samples(of) == ["light"] * 3
     assert asked["traced"] == (integer(3, "colour"), 0, bands._RAYS_OF_BANDS) and asked["settings"] == look._settings
     found = look._electrons(of, "light")  # type: ignore[arg-type]
     assert found.shape == (2, 2, 2) and (found[1] == 250).all() and not found[0].any()

@@ -31,7 +31,7 @@ from mitsim.light.settings import Settings
 from mitsim.light.truth import Truth
 from mitsim.optics.frames import Frame
 from mitsim.reconstruct.mosaic import behind
-from mitsim.transport.records import AMBIENT, DIRECT, Deposits
+from mitsim.transport.records import AMBIENT, DIRECT, PathSamples
 
 WEIGHTS = np.array([[0.4, 0.1], [0.2, 0.3], [0.2, 0.3], [0.1, 0.5]])
 
@@ -175,15 +175,15 @@ def test_lamps_are_seen_by_each_pixel_through_its_filter(shared_scene: Callable[
     for nm, unit in units:
         own = replace(seen, rig=replace(seen.rig, projector=seen.projector.at(nm)), lamplight=lamplight)
         simulation = Simulation(own, settings)
-        lamps = Deposits(
+        lamps = PathSamples(
             n**2 + np.arange(12), none, none, place, place[::-1], place * 0 + 0.0025, counts * parts * unit,
             np.full(12, AMBIENT, np.int16),
         )  # fmt: skip
-        spot = Deposits(
+        spot = PathSamples(
             none[:1], none[:1], none[:1], place[3:4], place[5:6], place[:1] * 0 + 0.0025, np.array([unit]),
             np.full(1, DIRECT, np.int16),
         )  # fmt: skip
-        filed = simulation.accumulate("indirect", Deposits.joined([lamps, spot]), none[:1].repeat(n**2), 1)
+        filed = simulation.accumulate("indirect", PathSamples.joined([lamps, spot]), none[:1].repeat(n**2), 1)
         plan: Any = SimpleNamespace(settings=settings)
         zeros = np.zeros(n**2)
         truth = Truth(np.zeros((n, n)), np.zeros((n, n)), np.ones(n**2), 1)

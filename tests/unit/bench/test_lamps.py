@@ -81,7 +81,7 @@ def bench(shared_scene: Callable[..., Path], variant: str) -> Callable[[str], Be
 def test_a_lamp_lights_the_sensor_as_its_closed_form(bench: Callable[[str], Bench], lamp: str) -> None:
     """Eight seeds of 2^18 paths or so: gates of seven standard errors, 1 % at most, and 2e-4 of rounding and judge."""
     tracer = Simulation(bench(lamp), Settings(depth=Z, effects=frozenset({"ambient"}))).from_camera
-    samples = 2**18 // tracer.lanes + 1
+    samples = 2**18 // tracer.paths_per_sample + 1
     light = [float(tracer.trace(seed, 0, samples).value.sum()) / samples for seed in range(8)]
     error, expected = float(np.std(light, ddof=1)) / np.sqrt(8), seen(lamp)
     assert 7 * error < 0.01 * expected

@@ -31,8 +31,8 @@ from mitsim.devices.projector import Spectrum
 from mitsim.light.grids import Grid
 from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
-from mitsim.transport.from_camera import FromCameraTracer, LampTracer, Paths, Together
-from mitsim.transport.records import Deposits
+from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer, LampTracer, Paths
+from mitsim.transport.records import PathSamples
 from tests.conftest import write_small_scene
 from tests.system.conftest import CAMERA
 from tests.unit.bench.test_lamps import ALBEDO, POSITION, seen
@@ -124,7 +124,7 @@ def traced(folder: str) -> list[dict[str, Any]]:
         lines = [[light.value.sum() / SAMPLES for light in look.by_line(len(LINES))] for look in looks]
         bands = [np.bincount(look.pixel - whole.n**2, look.value) / SAMPLES for look in looks]
         parts = whole.loaded.scene, whole.loaded.camera, simulation.physics.projector, simulation.aim
-        mirrored = Together(FromCameraTracer(*parts, Paths(mirrors=True)), simulation.from_camera)
+        mirrored = CombinedTracer(FromCameraTracer(*parts, Paths(mirrors=True)), simulation.from_camera)
         both = mirrored.trace(0, 0, SAMPLES).by_line(len(LINES)) if lamp == "flat" else []
         labels = np.zeros(whole.n**2, dtype=np.int64)
         filed = [simulation.accumulate("indirect", look.by_line(3)[2], labels, SAMPLES)["fine"] for look in looks[:1]]
@@ -154,7 +154,7 @@ def through_filters(place: Path, scene: Path, lamp: str) -> dict[str, Any]:
     assert lamplight is not None
     for name, each in {"lines": colours.whole, "alone": colours.benches[1]}.items():
         tracer = Simulation(each, Settings(depth=400.0, effects=frozenset({"ambient"}))).from_camera
-        assert isinstance(tracer, Together) and len(tracer.tracers) == 3
+        assert isinstance(tracer, CombinedTracer) and len(tracer.tracers) == 3
         looks = [tracer.trace(seed, 0, SAMPLES) for seed in range(SEEDS if name == "lines" else 1)]
         lines = [look.by_line(len(LINES) if name == "lines" else 1) for look in looks]
         found[name] = [[np.bincount(one.pixel - bench.n**2, one.value, 12).tolist() for one in look] for look in lines]
@@ -275,7 +275,7 @@ def test_the_mask_diffracts_each_band_by_its_own_wavelengths(small_scene: Callab
     frames = []
     for band, spectrum in enumerate(spectra):
         none, place = np.zeros(1, np.int64), np.full(1, 0.02)
-        spot = Deposits(
+        spot = PathSamples(
             none + bench.n**2 + band, none, none, place, place, place / 8, np.ones(1), none.astype(np.int16)
         )
         light = simulation.accumulate("indirect", spot, labels, 1)

@@ -34,7 +34,7 @@ def between(low: float, high: float, of: Callable[[np.ndarray], np.ndarray] = sp
 
 @dataclass
 class Tracer:
-    """Deposits two entries of each band, a quarter and the rest of it, and says what it was asked for."""
+    """Path samples two entries of each band, a quarter and the rest of it, and says what it was asked for."""
 
     like: Any
     counted: Any

@@ -383,7 +383,9 @@ def test_paces_are_measured_of_what_was_chosen_alone(bench: Bench, monkeypatch: 
     """Direct light and its anchors, of a machine that takes 0.1 us a path; other kinds keep what they had. (Planted:
     seconds of a sample, not of a path.)"""
     monkeypatch.setattr(
-        planner, "_seconds", lambda made, name, seed, labels, samples: 1e-7 * made.passes[name].tracer.lanes * samples
+        planner,
+        "_seconds",
+        lambda made, name, seed, labels, samples: 1e-7 * made.passes[name].tracer.paths_per_sample * samples,
     )
     simulation = Simulation(bench, Settings(depth=400.0, anchors=2))
     timed = planner._timed(EVIDENCE, simulation, np.arange(bench.n**2), 0)

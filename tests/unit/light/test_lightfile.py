@@ -128,7 +128,7 @@ def test_a_scene_without_lamps_and_mirrors_has_none_in_its_file(
 
 
 def test_too_much_light_over_mirrors_is_refused(light: Light, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mitsim.light.light_file._GLINT_BYTES", 1000)
+    monkeypatch.setattr("mitsim.light.light_file._SPECULAR_BYTES", 1000)
     with pytest.raises(MitsimError, match="projector pixels shine over mirrors"):
         light.save(tmp_path / "light.h5")
     assert not (tmp_path / "light.h5").exists()

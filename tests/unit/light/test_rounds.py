@@ -10,7 +10,7 @@ import pytest
 from mitsim.light.cost_model import FIXED, SHARED_COST
 from mitsim.light.pass_table import EVEN, even
 from mitsim.light.sampling import SampledPass, cheapest_samples, first_samples, next_samples
-from mitsim.transport.path_reuse import NeighbourTracer
+from mitsim.transport.path_reuse import PathReuseTracer
 
 LIGHTS = (
     SampledPass("direct", 24, 0.165, 3.0),
@@ -75,8 +75,8 @@ def simulated(**tracers: tuple[Any, float]) -> Any:
     return SimpleNamespace(passes=passes)
 
 
-def of_lanes(lanes: int) -> Any:
-    return SimpleNamespace(lanes=lanes)
+def of_lanes(paths_per_sample: int) -> Any:
+    return SimpleNamespace(paths_per_sample=paths_per_sample)
 
 
 def test_sampling_begins_with_what_is_predicted_or_less_where_most_is_followed() -> None:
@@ -105,9 +105,9 @@ def test_the_next_round_lowers_the_variance_by_what_is_missing_and_a_twentieth()
 def test_work_is_that_of_paths_at_fixed_paces() -> None:
     """Shared light counts for several, and light at anchors has a pace of its own: of two lights with the same variance
     the one of less work grows. (Planted: one pace for all, shared light counted once.)"""
-    shared = NeighbourTracer.__new__(NeighbourTracer)
+    shared = PathReuseTracer.__new__(PathReuseTracer)
     shared.adaptive, shared.projector = None, SimpleNamespace(n=8)  # type: ignore[assignment]
-    cheap, dear = shared.lanes * SHARED_COST * FIXED.passes["indirect"], 100 * FIXED.passes["from_camera"]
+    cheap, dear = shared.paths_per_sample * SHARED_COST * FIXED.passes["indirect"], 100 * FIXED.passes["from_camera"]
     simulation = simulated(indirect=(shared, 1.0), from_camera=(of_lanes(100), 1.0))
     found = next_samples(
         simulation, dict.fromkeys(("indirect", "from_camera"), 1000), {"indirect": 1, "from_camera": 1}, 1.5

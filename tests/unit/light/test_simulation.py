@@ -14,7 +14,7 @@ from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions
-from mitsim.transport.records import AMBIENT, Deposits
+from mitsim.transport.records import AMBIENT, PathSamples
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, Z, BLACK = 16, 400.0, 0.01
@@ -89,7 +89,7 @@ def test_neutral_parts(bench: Bench) -> None:
     assert (
         not off.physics.lamps
         and off.physics.spectrum is None
-        and off.glint_frames(np.zeros(N * N, dtype=np.int64)) is None
+        and off.specular_frames(np.zeros(N * N, dtype=np.int64)) is None
     )
     assert set(off.passes) == {"direct"}
 
@@ -180,7 +180,7 @@ def test_followed_lights_mean_and_its_anchors_make_one_frame(bench: Bench) -> No
     assert (made.passes[residuals[1]].tracer.trace(1, 0, 16).kind == AMBIENT).any()
     rng = np.random.default_rng(1)
     number, place = rng.integers(0, 2, (3, 200)), rng.uniform(-0.14, 0.14, (2, 200))
-    found = Deposits(0 * number[0], *number[:2], *place, np.full(200, 1 / Z), rng.random(200), 1 + number[2])
+    found = PathSamples(0 * number[0], *number[:2], *place, np.full(200, 1 / Z), rng.random(200), 1 + number[2])
     light = made.accumulate("indirect_residual", found, labels, 16)["indirect_residual"][[0]].toarray()
     rows, columns = made.grids["indirect_residual"].bundle.cells
     weights = [0.5, 0.5]
@@ -189,7 +189,7 @@ def test_followed_lights_mean_and_its_anchors_make_one_frame(bench: Bench) -> No
     same = [
         replace(one, anchor_row=one.anchor_row + a, anchor_column=one.anchor_column + b) for a, b in np.ndindex(2, 2)
     ]
-    light = made.accumulate("indirect_residual", Deposits.joined(same), labels, 16)["indirect_residual"]
+    light = made.accumulate("indirect_residual", PathSamples.joined(same), labels, 16)["indirect_residual"]
     assert np.abs(light.data).max(initial=0) < 1e-15
     ambient = [made.from_camera.trace(seed, 0, 64) for seed in range(2)]
     assert all((one.kind == AMBIENT).any() for one in ambient)
@@ -202,7 +202,9 @@ def test_flux_counts_each_pixels_direct_light(bench: Bench) -> None:
     ambient = replace(found, pixel=np.full_like(found.pixel, N * N), kind=0 * found.kind)
     indirect = replace(found, kind=0 * found.kind + 2)
     assert (
-        not made.flux(indirect, 2).any() and not made.flux(ambient, 2).any() and not made.flux(Deposits.none(), 1).any()
+        not made.flux(indirect, 2).any()
+        and not made.flux(ambient, 2).any()
+        and not made.flux(PathSamples.none(), 1).any()
     )
 
 

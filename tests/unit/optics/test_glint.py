@@ -7,7 +7,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.fft_shadow import ProfileSampler, geometric_samplers, wave_samplers
-from mitsim.optics.mirror_frames import Beams, _bilinear, _cuts, _gradients, glint_frames
+from mitsim.optics.mirror_frames import Beams, _bilinear, _cuts, _gradients, specular_frames
 
 PITCH = 0.05
 LABELS = np.arange(9) % 3
@@ -36,7 +36,7 @@ def turned(angle: float, side: float) -> np.ndarray:
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, np.pi / 4, np.pi / 2, 2.5])
 def test_a_beam_on_the_sensor_keeps_its_flux(angle: float) -> None:
-    found = glint_frames(beams(turned(angle, 0.4)), geometry(), geometric_samplers(geometry()), LABELS)
+    found = specular_frames(beams(turned(angle, 0.4)), geometry(), geometric_samplers(geometry()), LABELS)
     assert found.flux == pytest.approx(2.0, rel=1e-12)
     assert found.irradiance.sum() * PITCH**2 == pytest.approx(2.0, rel=1e-12)
     assert (found.classes.tolist(), found.lit_pixels.tolist(), found.unresolved) == ([1], [4], 0.25)
@@ -44,7 +44,7 @@ def test_a_beam_on_the_sensor_keeps_its_flux(angle: float) -> None:
 
 def test_a_beam_aligned_with_the_pixels_covers_parts_of_them_exactly() -> None:
     low, high = (-0.13, 0.02), (0.21, 0.377)
-    frame = glint_frames(beams(square(low, high)), geometry(), geometric_samplers(geometry()), LABELS).irradiance[0]
+    frame = specular_frames(beams(square(low, high)), geometry(), geometric_samplers(geometry()), LABELS).irradiance[0]
     edges = geometry().pixel_edges
     cover = [
         np.maximum(np.minimum(edges[1:], b) - np.maximum(edges[:-1], a), 0) / PITCH
@@ -60,7 +60,7 @@ def test_a_part_of_a_sensor_and_tall_pixels_see_what_the_sensor_does() -> None:
     lit = beams(turned(0.3, 0.5))
 
     def frame(camera: CameraGeometry) -> np.ndarray:
-        return glint_frames(lit, camera, geometric_samplers(camera), LABELS).irradiance[0]
+        return specular_frames(lit, camera, geometric_samplers(camera), LABELS).irradiance[0]
 
     whole, part = geometry("separable"), geometry("separable", rows=14, columns=16, roi=(3, 2, 10, 9))
     np.testing.assert_allclose(frame(part), frame(whole)[4:14, 2:11], rtol=0, atol=1e-9)
@@ -69,17 +69,17 @@ def test_a_part_of_a_sensor_and_tall_pixels_see_what_the_sensor_does() -> None:
 
 
 def test_a_turned_beam_lights_its_inside_evenly() -> None:
-    frame = glint_frames(beams(turned(0.3, 0.5)), geometry(), geometric_samplers(geometry()), LABELS).irradiance[0]
+    frame = specular_frames(beams(turned(0.3, 0.5)), geometry(), geometric_samplers(geometry()), LABELS).irradiance[0]
     assert frame[6:10, 6:10] == pytest.approx(2.0 / 0.25, rel=2e-3)
     assert not frame[0].any() and not frame[:, 0].any()
 
 
 def test_light_beside_the_sensor_is_not_counted() -> None:
     half = beams(square((-0.1, 0.3), (0.1, 0.5)))  # the sensor ends at 0.4
-    found = glint_frames(half, geometry(), geometric_samplers(geometry()), LABELS)
+    found = specular_frames(half, geometry(), geometric_samplers(geometry()), LABELS)
     assert found.flux == pytest.approx(1.0, rel=1e-12)
     outside = beams(square((-0.1, 0.41), (0.1, 0.5)))
-    found = glint_frames(outside, geometry(), geometric_samplers(geometry()), LABELS)
+    found = specular_frames(outside, geometry(), geometric_samplers(geometry()), LABELS)
     assert (found.flux, len(found.classes), found.irradiance.shape) == (0, 0, (0, 16, 16))
 
 
@@ -88,18 +88,18 @@ def test_the_field_stop_and_a_response_weigh_directions() -> None:
     tangent = np.zeros((1, 2, 2, 2))
     tangent[..., 0] = [[0.0, 0.0], [1.0, 1.0]]  # 0 on the first row, 1 on the last
     args = geometry(), geometric_samplers(geometry()), LABELS
-    stop = glint_frames(beams(corners, tangent=tangent), *args, boxes_per_pixel=64).flux
+    stop = specular_frames(beams(corners, tangent=tangent), *args, boxes_per_pixel=64).flux
     assert stop == pytest.approx(2 * np.tan(np.radians(30)), rel=2e-3)
     # cos^2 theta is 1 / (1 + t^2), of mean pi / 4 over t from 0 to 1.
     wide = geometry(fov=120, angular_exponent=2.0)
-    answered = glint_frames(beams(corners, tangent=tangent), wide, geometric_samplers(wide), LABELS, 64)
+    answered = specular_frames(beams(corners, tangent=tangent), wide, geometric_samplers(wide), LABELS, 64)
     assert answered.flux == pytest.approx(2 * np.pi / 4, rel=1e-5)
 
 
 def test_throughput_dims_where_it_is_low() -> None:
     throughput = np.array([[[0.0, 0.0], [1.0, 1.0]]])
     lit = beams(square((-0.2, -0.2), (0.2, 0.2)), throughput=throughput)
-    found = glint_frames(lit, geometry(), geometric_samplers(geometry()), LABELS)
+    found = specular_frames(lit, geometry(), geometric_samplers(geometry()), LABELS)
     assert found.flux == pytest.approx(1.0, rel=1e-12) and lit.delivered == pytest.approx([1.0])
     rows = found.irradiance[0].sum(axis=1)
     assert rows[11] / rows[4] == pytest.approx(15, rel=1e-6)
@@ -114,7 +114,7 @@ def test_the_mask_is_magnified_as_from_the_virtual_source(depth: float) -> None:
     camera = geometry("separable")
     lit = beams(square((-0.41, -0.41), (0.41, 0.41)), depth=depth)
     assert 1 / lit.inverse_depth == pytest.approx(np.full((1, 2), depth))
-    frame = glint_frames(lit, camera, geometric_samplers(camera), LABELS).irradiance[0]
+    frame = specular_frames(lit, camera, geometric_samplers(camera), LABELS).irradiance[0]
     mask = camera.build_mask()
     fine = (np.arange(16 * 4000) + 0.5) / 4000 * PITCH - 0.4
     s = fine * (1 - camera.mask_distance / depth)
@@ -186,18 +186,18 @@ def test_wave_samplers_hold_all_that_a_box_at_the_sensor_s_and_the_field_stop_s_
 def test_flatcam_terms_add_up() -> None:
     camera = geometry("flatcam")
     lit = beams(square((-0.4, -0.4), (0.4, 0.4)), depth=1e9)
-    frame = glint_frames(lit, camera, geometric_samplers(camera), LABELS).irradiance[0]
+    frame = specular_frames(lit, camera, geometric_samplers(camera), LABELS).irradiance[0]
     fine = (np.arange(16 * 40) + 0.5) / 40 * PITCH - 0.4
     mask = camera.build_mask().transmission(fine[:, None], fine).reshape(16, 40, 16, 40).mean(axis=(1, 3))
     assert np.abs(frame - 2 / 0.64 * mask).max() < 0.05 * frame.max()
-    assert glint_frames(lit, camera, [], LABELS).irradiance.sum() == 0
+    assert specular_frames(lit, camera, [], LABELS).irradiance.sum() == 0
 
 
 def test_an_active_side_takes_the_mean_over_the_pixels_middle() -> None:
     """A quarter of the area is active, so a quarter of the light counts; the mask is seen by that quarter alone."""
     camera = geometry("separable", pixel_fill_factor=0.25)
     lit = beams(square((-0.4, -0.4), (0.4, 0.4)), depth=1e9)
-    frame = 4 * glint_frames(lit, camera, geometric_samplers(camera), LABELS).irradiance[0]
+    frame = 4 * specular_frames(lit, camera, geometric_samplers(camera), LABELS).irradiance[0]
     mask = camera.build_mask()
     sampler, middle = ProfileSampler(mask.bits, mask.feature_mm), (np.arange(16) - 7.5) * PITCH
     profile = sampler(middle, np.full(16, PITCH / 2))
@@ -207,10 +207,10 @@ def test_an_active_side_takes_the_mean_over_the_pixels_middle() -> None:
 def test_classes_are_told_apart_and_add_up() -> None:
     first, second = beams(square((-0.2, -0.2), (0.2, 0.2)), 4), beams(square((0.0, 0.0), (0.3, 0.3)), 8, 5.0)
     both = Beams(*(np.concatenate([getattr(b, name) for b in (first, second)]) for name in ORDER), 0.5)
-    found = glint_frames(both, geometry(), geometric_samplers(geometry()), LABELS)
+    found = specular_frames(both, geometry(), geometric_samplers(geometry()), LABELS)
     assert found.classes.tolist() == [1, 2] and found.lit_pixels.tolist() == [4, 8]
     assert found.irradiance.sum(axis=(1, 2)) * PITCH**2 == pytest.approx([2.0, 5.0])
-    one = glint_frames(both, geometry(), geometric_samplers(geometry()), np.zeros(9, np.int64))
+    one = specular_frames(both, geometry(), geometric_samplers(geometry()), np.zeros(9, np.int64))
     assert np.allclose(one.irradiance[0], found.irradiance.sum(axis=0))
 
 
@@ -235,4 +235,4 @@ def test_a_profile_sampler_takes_means() -> None:
 def test_bad_arguments_are_refused(change: dict[str, object], message: str) -> None:
     arguments = {"labels": LABELS, **change}
     with pytest.raises(MitsimError, match=message):
-        glint_frames(beams(turned(0, 0.4)), geometry(), geometric_samplers(geometry()), **arguments)
+        specular_frames(beams(turned(0, 0.4)), geometry(), geometric_samplers(geometry()), **arguments)

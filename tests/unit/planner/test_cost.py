@@ -10,19 +10,19 @@ import pytest
 from mitsim.api.bench import open_bench
 from mitsim.light.passes import Simulation
 from mitsim.light.sampling import Group, trace_groups
-from mitsim.light.settings import LANES_AT_ONCE, Settings, SharpPixels
-from mitsim.planner.memory import deposit_bytes
-from mitsim.transport.records import DIRECT, Bundle, CellAxis, CellGrid, Deposits
+from mitsim.light.settings import PATHS_AT_ONCE, Settings, SharpPixels
+from mitsim.planner.memory import path_sample_bytes
+from mitsim.transport.records import DIRECT, Bundle, CellAxis, CellGrid, PathSamples
 
 PATHS, PIXELS = 2**15, 16
 GRID = CellGrid(CellAxis(-0.2, 0.05, 8), CellAxis(-0.2, 0.05, 8))
 SHARP = SharpPixels((1, 2), 2, (-0.1, 0.1, -0.1, 0.1))
 
 
-def deposits() -> Deposits:
+def path_samples() -> PathSamples:
     """Light of many paths from everywhere."""
     random = np.random.default_rng(3)
-    return Deposits(
+    return PathSamples(
         pixel=random.integers(0, PIXELS, PATHS),
         anchor_row=random.integers(0, 2, PATHS),
         anchor_column=random.integers(0, 2, PATHS),
@@ -41,25 +41,25 @@ def test_a_block_takes_no_more_than_is_counted(between: bool, layers: tuple[floa
     settings = Settings(depth=400.0, layers=layers, sharp=SHARP if between else None)
     bundle = Bundle(GRID, 2, settings.depths, between)
     tracemalloc.start()
-    light = deposits()
+    light = path_samples()
     held = tracemalloc.get_traced_memory()[0]
     tracemalloc.reset_peak()
     bundle.file(light, np.arange(PIXELS), 4)
     # The light of the next paths is fetched meanwhile: it is held beside what is filed, and twice while it is fetched.
     taken = tracemalloc.get_traced_memory()[1] + held
     tracemalloc.stop()
-    assert taken <= PATHS * deposit_bytes(settings)
+    assert taken <= PATHS * path_sample_bytes(settings)
 
 
 def test_rounds_beyond_the_plan_trace_no_larger_blocks_than_are_counted(
     shared_scene: Callable[..., Path], variant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     simulation = Simulation(open_bench(shared_scene("light"), variant), Settings(depth=400.0, samples={"direct": 2.0}))
-    assert simulation.paths_at_once < LANES_AT_ONCE
+    assert simulation.paths_at_once < PATHS_AT_ONCE
     tracer, blocks = type(simulation.direct), list[int]()
     traced = tracer.trace
     monkeypatch.setattr(tracer, "trace", lambda self, *args: blocks.append(args[2]) or traced(self, *args))
-    wanted = 3 * simulation.paths_at_once // simulation.direct.lanes
+    wanted = 3 * simulation.paths_at_once // simulation.direct.paths_per_sample
     trace_groups([Group(simulation, np.zeros(simulation.bench.n**2, dtype=np.int64), 3)], {"direct": wanted})
     assert sum(blocks) == wanted
-    assert max(blocks) * simulation.direct.lanes <= simulation.paths_at_once
+    assert max(blocks) * simulation.direct.paths_per_sample <= simulation.paths_at_once

@@ -25,7 +25,7 @@ from mitsim.optics.frames import monte_carlo_error
 from mitsim.planner import pilot, pilot_anchors, pilot_direct, pilot_samples
 from mitsim.planner.pilot_anchors import AnchorRuns, FollowedRuns
 from mitsim.planner.pilot_effects import EffectRuns
-from mitsim.transport.records import Deposits
+from mitsim.transport.records import PathSamples
 
 pytestmark = pytest.mark.usefixtures("variant")
 N = 16
@@ -276,7 +276,7 @@ def test_frames_of_looks_are_those_that_a_capture_forms(bench: Bench, monkeypatc
     made = Simulation(bench, everything)
     filed = [
         made.accumulate("direct", pilot_direct, lighting.labels, sample.direct)
-        + made.accumulate("indirect", Deposits.joined(list(pilot_indirect)), lighting.labels, sample.followed)
+        + made.accumulate("indirect", PathSamples.joined(list(pilot_indirect)), lighting.labels, sample.followed)
         for pilot_direct, *pilot_indirect in zip(found.direct, *found.followed.values(), strict=True)
     ]
     assert made.physics.lamps and made.physics.black_level and sample.shape == (5, 4) and bench.geometry.pixels > 5
@@ -293,12 +293,12 @@ def test_followed_light_of_either_side_has_its_own_noise(bench: Bench) -> None:
     everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
     found = FollowedRuns(bench, everything, sample, 0.0, 5)
     indirect, camera = found.sample_costs(1.0).values()
-    alone, nothing = FollowedRuns(bench, everything, sample, 0.0, 5), [Deposits.none()] * LOOKS
+    alone, nothing = FollowedRuns(bench, everything, sample, 0.0, 5), [PathSamples.none()] * LOOKS
     vars(alone)["_few_by_tracer"] = [found._few_by_tracer[0], nothing]
     assert indirect.noise.error == pytest.approx(pilot_samples.noise(alone._beyond_mean()), rel=1e-9)
     both = pilot_samples.noise(found._beyond_mean())
     assert math.hypot(indirect.noise.error, camera.noise.error) == pytest.approx(both, rel=0.3)
-    assert (indirect.paths, camera.paths) == tuple(tracer.lanes for tracer in found._simulation().at_anchors)
+    assert (indirect.paths, camera.paths) == tuple(tracer.paths_per_sample for tracer in found._simulation().at_anchors)
 
 
 def test_indirect_light_is_looked_at_closer_where_noise_hides_what_coarse_cells_change(bench: Bench) -> None:
@@ -374,7 +374,7 @@ def test_a_mirror_shows_some_shots_only(shipped_bench: Callable[..., Bench]) -> 
     lighting = parse_patterns("dots:7", bench.n).lighting
     found = pilot.measure(bench, lighting, 1e-3, 1).effects["black-level"]
     made = Simulation(bench, Settings(depth=400.0, effects=frozenset(effects.present(bench))))
-    glint, black = made.glint_frames(lighting.labels), made.physics.black_level
+    glint, black = made.specular_frames(lighting.labels), made.physics.black_level
     assert glint is not None
     seen = np.zeros((49, 512, 512))
     seen[glint.classes] = glint.irradiance

@@ -152,29 +152,29 @@ class Machine:
 
     def seconds(self, simulation: Any, name: str, seed: int, labels: object, samples: int) -> float:
         self.launches.append(samples)
-        taken = LAUNCH_S + PATH_S * samples * simulation.passes[name].tracer.lanes
+        taken = LAUNCH_S + PATH_S * samples * simulation.passes[name].tracer.paths_per_sample
         return 10 * taken if len(self.launches) - 1 == self.disturbed else taken
 
 
-@pytest.mark.parametrize("lanes", [4000, 25_280, 300_000])
+@pytest.mark.parametrize("paths_per_sample", [4000, 25_280, 300_000])
 @pytest.mark.parametrize("planned", [3, 100, 5000])
 @pytest.mark.parametrize("disturbed", [-1, 0, 1, 2, 3, 4, 5, 6])
 def test_paces_are_those_of_launches_as_the_run_has_them(
-    monkeypatch: pytest.MonkeyPatch, lanes: int, planned: int, disturbed: int
+    monkeypatch: pytest.MonkeyPatch, paths_per_sample: int, planned: int, disturbed: int
 ) -> None:
     """Within 1.5 times of what all launches of the run take together, one slow moment or none, where that is more than
     a second. (Planted: the pace of the first launch alone, 4 times too slow; the slower of two launches.)"""
     at_once, machine = 2**21, Machine(disturbed)
     monkeypatch.setattr(planner, "_seconds", machine.seconds)
-    each = SimpleNamespace(tracer=SimpleNamespace(lanes=lanes), whole=planned)
+    each = SimpleNamespace(tracer=SimpleNamespace(paths_per_sample=paths_per_sample), whole=planned)
     simulation: Any = SimpleNamespace(passes={"direct": each}, paths_at_once=at_once)
     pace, longest = planner._pace(simulation, "direct", None, SEED)  # type: ignore[arg-type]
-    launches = math.ceil(planned / (at_once // lanes))
-    taken = GROUPS * (launches * LAUNCH_S + planned * lanes * PATH_S)
+    launches = math.ceil(planned / (at_once // paths_per_sample))
+    taken = GROUPS * (launches * LAUNCH_S + planned * paths_per_sample * PATH_S)
     if disturbed < 0 or taken > 1.0:
         assert GROUPS * planned * pace == pytest.approx(taken, rel=0.15 if disturbed < 0 and planned > 3 else 0.5)
-        assert longest == pytest.approx(PATH_S * lanes, rel=0.5) or planned * lanes < 1e6
-    assert sum(machine.launches[1:]) <= max(2 + 2**16 / lanes, 0.3 * GROUPS * planned)
+        assert longest == pytest.approx(PATH_S * paths_per_sample, rel=0.5) or planned * paths_per_sample < 1e6
+    assert sum(machine.launches[1:]) <= max(2 + 2**16 / paths_per_sample, 0.3 * GROUPS * planned)
 
 
 class Heavy:

@@ -17,7 +17,7 @@ from mitsim.report import IDEALISED
 from mitsim.report.lit_scene import LitScene
 from mitsim.studies import ablation
 from mitsim.studies.ablation import Ablation
-from mitsim.transport.records import DIRECT, Deposits
+from mitsim.transport.records import DIRECT, PathSamples
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
 
@@ -103,19 +103,19 @@ def test_a_turned_projector_has_a_keystone(turned: SampledLight) -> None:
     assert not ablation._off_plane(turned)
 
 
-def sharp_deposits(light: SampledLight) -> Deposits:
+def sharp_deposits(light: SampledLight) -> PathSamples:
     """A ray from each projector pixel, without blur."""
     settings = light.simulation.settings
     settings = replace(settings, effects=settings.effects - {"blur"})
     return Simulation(light.bench, settings).direct.trace(1, 0, 1)
 
 
-def pixel_of(light: SampledLight, deposits: Deposits) -> FloatArray:
-    """Where ``deposits`` lie on the aligned plane, by projector pixels that fill the window's bounding box."""
+def pixel_of(light: SampledLight, path_samples: PathSamples) -> FloatArray:
+    """Where ``path_samples`` lie on the aligned plane, by projector pixels that fill the window's bounding box."""
     n = light.bench.n
     places = [
         np.floor((tangents - first) / (last - first) * n)
-        for tangents, (first, last) in zip((deposits.row, deposits.column), light.bench.windows, strict=True)
+        for tangents, (first, last) in zip((path_samples.row, path_samples.column), light.bench.windows, strict=True)
     ]
     return np.asarray(places[0] * n + places[1])
 
@@ -123,22 +123,22 @@ def pixel_of(light: SampledLight, deposits: Deposits) -> FloatArray:
 def test_depth_is_parallax(far: SampledLight) -> None:
     """The projector, 60 mm aside (x = 60, column -60), 20 mm before the plane: light is seen 60 (1/380 - 1/400) aside,
     0.35 pixels, and without depth in its pixel on the plane. (Planted: the projector on the other side.)"""
-    deposits, place = sharp_deposits(far), ablation._Place(far.bench)
-    aside = place.parallax(deposits)
+    path_samples, place = sharp_deposits(far), ablation._Place(far.bench)
+    aside = place.parallax(path_samples)
     assert np.allclose(aside[1], -60 * (1 / 380 - 1 / 400), rtol=1e-3) and np.abs(aside[0]).max() < 1e-6
-    assert (pixel_of(far, deposits) != deposits.pixel).mean() > 0.2
-    back = place.moved(deposits, frozenset({ablation.DEPTH}))
-    assert np.allclose(back.inverse_depth, 1 / 400) and np.array_equal(pixel_of(far, back), deposits.pixel)
+    assert (pixel_of(far, path_samples) != path_samples.pixel).mean() > 0.2
+    back = place.moved(path_samples, frozenset({ablation.DEPTH}))
+    assert np.allclose(back.inverse_depth, 1 / 400) and np.array_equal(pixel_of(far, back), path_samples.pixel)
     assert ablation._off_plane(far)
 
 
 def test_without_keystone_light_lies_in_its_pixel(turned: SampledLight) -> None:
     """(Planted: the homography the other way round.)"""
-    deposits = sharp_deposits(turned)
-    assert (pixel_of(turned, deposits) != deposits.pixel).mean() > 0.2
-    straight = ablation._Place(turned.bench).moved(deposits, frozenset({ablation.KEYSTONE}))
-    assert np.array_equal(pixel_of(turned, straight), deposits.pixel)
-    assert np.array_equal(straight.inverse_depth, deposits.inverse_depth)
+    path_samples = sharp_deposits(turned)
+    assert (pixel_of(turned, path_samples) != path_samples.pixel).mean() > 0.2
+    straight = ablation._Place(turned.bench).moved(path_samples, frozenset({ablation.KEYSTONE}))
+    assert np.array_equal(pixel_of(turned, straight), path_samples.pixel)
+    assert np.array_equal(straight.inverse_depth, path_samples.inverse_depth)
 
 
 def test_falloff_over_pixels_is_that_of_a_matt_sheet(turned: SampledLight) -> None:
@@ -188,10 +188,10 @@ def test_detail_is_what_cells_of_a_pixel_differ_in(far: SampledLight) -> None:
 
 def test_what_hides_or_moves_points_leaves_them_where_they_are(far: SampledLight) -> None:
     """Where depth stays on, all points of a pixel have the mean of their values. (Planted: that of all pixels.)"""
-    deposits = sharp_deposits(far)
-    two = Deposits.joined([deposits, replace(deposits, value=3 * deposits.value)])
+    path_samples = sharp_deposits(far)
+    two = PathSamples.joined([path_samples, replace(path_samples, value=3 * path_samples.value)])
     even = ablation._even(two, far.bench.n**2)
-    assert np.allclose(even.value, 2 * np.tile(deposits.value, 2)) and np.array_equal(even.row, two.row)
+    assert np.allclose(even.value, 2 * np.tile(path_samples.value, 2)) and np.array_equal(even.row, two.row)
 
 
 @pytest.mark.slow
@@ -216,13 +216,15 @@ def test_lobes_are_averaged_over_anchors_with_their_weights(far: SampledLight) -
     sharp = SharpPixels((5,), 3, (-0.05, 0.05, -0.05, 0.05))
     simulation = Simulation(far.bench, replace(far.simulation.settings, sharp=sharp))
     one, zero = np.ones(1), np.zeros(1, np.int64)
-    deposits = Deposits(zero + 5, zero + 2, zero + 1, 0 * one, 0 * one, one / 400, one, np.full(1, DIRECT, np.int16))
+    path_samples = PathSamples(
+        zero + 5, zero + 2, zero + 1, 0 * one, 0 * one, one / 400, one, np.full(1, DIRECT, np.int16)
+    )
     labels = np.arange(far.bench.n**2)
     bundle = simulation.grids["sharp"].bundle
-    filed, weights = bundle.file(deposits, labels, 1), simulation.mean_weights(bundle.anchors)
+    filed, weights = bundle.file(path_samples, labels, 1), simulation.mean_weights(bundle.anchors)
     mean = ablation._even_lobes(filed, simulation)
     weight = weights[2] * weights[1]
-    again = bundle.repeated(replace(bundle, anchors=1).file(deposits.averaged(weights), labels, 1))
+    again = bundle.repeated(replace(bundle, anchors=1).file(path_samples.averaged(weights), labels, 1))
     assert abs(mean - again).max() < 1e-12 and mean.sum() == pytest.approx(9 * weight)
     assert ablation._even_lobes(filed, far.simulation) is filed, "nothing to average where nothing is sharp"
 
@@ -234,4 +236,4 @@ def test_what_is_moved_is_added_up_on_the_host(far: SampledLight) -> None:
     labels = np.arange(far.bench.n**2)
     for off, held in ((frozenset[str](), 1), (frozenset({ablation.DEPTH}), 0)):
         filing = ablation._Filing(far.bench, settings, True, off)
-        assert len(filing.ledgers("anchor_residual", labels, 1)) == held
+        assert len(filing.accumulators("anchor_residual", labels, 1)) == held

@@ -183,7 +183,7 @@ def test_tails_that_are_seldom_connected_are_whole(lit: Callable[..., tuple[Benc
     bench, pixels = lit(plate(metal(3e-4)), 64)
     parts = bench.loaded.scene, bench.loaded.camera, bench.projector_optics, 5, bench.geometry
     aimed, even = AimedTracer(*parts, pixels), DirectTracer(*parts, pixels=pixels)
-    assert aimed.lanes < 0.7 * even.lanes
+    assert aimed.paths_per_sample < 0.7 * even.paths_per_sample
     sums = np.zeros((2, SEEDS))
     for index, (tracer, samples) in enumerate(((aimed, 2048), (even, 512))):
         for seed in range(SEEDS):

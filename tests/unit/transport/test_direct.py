@@ -17,7 +17,7 @@ from mitsim.devices.camera import CameraGeometry
 from mitsim.optics.image_formation import anchor_positions
 from mitsim.transport import integrator
 from mitsim.transport.direct import DirectTracer
-from mitsim.transport.records import DIRECT, Deposits
+from mitsim.transport.records import DIRECT, PathSamples
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, Z, RADIANCE = 16, 400.0, 0.5 * 111000 / 400**2
@@ -54,7 +54,7 @@ def expected(row: float = 0.0, column: float = 0.0, exponent: float = 0.0) -> np
     return RADIANCE * cells.ravel()
 
 
-def by_pixel(found: Deposits, samples: int) -> np.ndarray:
+def by_pixel(found: PathSamples, samples: int) -> np.ndarray:
     return np.bincount(found.pixel, found.value, minlength=N * N) / samples
 
 
@@ -185,13 +185,13 @@ def test_a_sharp_lens_is_the_pinhole(white: Bench) -> None:
 
 def test_seeds_samples_and_launches(white: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     trace = tracer(white)
-    assert trace.lanes == N * N and tracer(white, 3).lanes == 9 * N * N
+    assert trace.paths_per_sample == N * N and tracer(white, 3).paths_per_sample == 9 * N * N
     whole, again, other = trace.trace(1, 0, 4), trace.trace(1, 0, 4), trace.trace(2, 0, 4)
     assert all(np.array_equal(getattr(whole, name), getattr(again, name)) for name in vars(whole))
     assert not np.isin(whole.row, other.row).any()
     # A sequence in pieces, in samples or in launches, is the same sequence.
-    pieces = Deposits.joined([trace.trace(1, 0, 1), trace.trace(1, 1, 3)])
-    monkeypatch.setattr(integrator.Tracer, "lanes_per_launch", 300)
+    pieces = PathSamples.joined([trace.trace(1, 0, 1), trace.trace(1, 1, 3)])
+    monkeypatch.setattr(integrator.Tracer, "paths_per_launch", 300)
     launches = trace.trace(1, 0, 4)
     for parts in (pieces, launches):
         assert np.array_equal(parts.pixel, whole.pixel) and np.allclose(parts.row, whole.row, atol=1e-6)
@@ -211,7 +211,7 @@ def test_light_that_is_not_a_number_is_refused(small_scene: Callable[..., Path])
 def test_chosen_pixels_are_traced_as_among_all(white: Bench) -> None:
     loaded, chosen = white.loaded, np.array([3, 17, 250])
     some = DirectTracer(loaded.scene, loaded.camera, white.projector_optics, 1, pixels=chosen)
-    assert some.lanes == 3
+    assert some.paths_per_sample == 3
     mine, whole = some.trace(5, 0, 4), tracer(white).trace(5, 0, 4)
     expected = whole.where(np.isin(whole.pixel, chosen))
     assert np.array_equal(np.sort(mine.pixel), np.sort(expected.pixel)) and len(mine.value) == 12

@@ -107,5 +107,5 @@ def test_sums_are_those_of_blocks_however_they_are_traced(
     pixels, starts = np.concatenate([LIT[::-1], LIT]), np.concatenate([first + 20, first])
     halves = tracer.sums(5, 2, pixels, starts, 20)[0]
     assert halves[:, : len(LIT)][:, ::-1] + halves[:, len(LIT) :] == pytest.approx(whole, rel=1e-12)
-    monkeypatch.setattr(FluxTracer, "lanes_per_launch", 3 * 40 + 1)
+    monkeypatch.setattr(FluxTracer, "paths_per_launch", 3 * 40 + 1)
     np.testing.assert_allclose(tracer.sums(5, 2, LIT, first, 40)[0], whole, rtol=1e-6)

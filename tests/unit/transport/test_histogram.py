@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from mitsim.transport.records import AMBIENT, DIRECT, Bundle, CellAxis, CellGrid, Deposits, Sightings
+from mitsim.transport.records import AMBIENT, DIRECT, Bundle, CellAxis, CellGrid, PathSamples, Sightings
 
 PIXELS = 9  # a projector of 3 x 3
 GRID = CellGrid(CellAxis(-0.2, 0.05, 8), CellAxis(-0.1, 0.02, 15))
 DEPTHS = (500.0, 300.0, 250.0)
 
 
-def deposits(count: int = 400, seed: int = 3, inside: bool = True) -> Deposits:
+def path_samples(count: int = 400, seed: int = 3, inside: bool = True) -> PathSamples:
     """Light from everywhere to everywhere: two anchors a side, all pixels and ambient light."""
     rng = np.random.default_rng(seed)
     pixel = rng.integers(0, PIXELS + 1, count)
@@ -18,7 +18,7 @@ def deposits(count: int = 400, seed: int = 3, inside: bool = True) -> Deposits:
     row, column = rng.uniform(*low, count), rng.uniform(*high, count)
     if not inside:
         row, column = rng.uniform(-0.4, 0.4, count), rng.uniform(-0.3, 0.5, count)
-    return Deposits(
+    return PathSamples(
         pixel=pixel,
         anchor_row=rng.integers(0, 2, count),
         anchor_column=rng.integers(0, 2, count),
@@ -30,12 +30,12 @@ def deposits(count: int = 400, seed: int = 3, inside: bool = True) -> Deposits:
     )
 
 
-def one(row: float, column: float, **changes: object) -> Deposits:
+def one(row: float, column: float, **changes: object) -> PathSamples:
     """One path of value 1."""
     values = {"pixel": 0, "anchor_row": 0, "anchor_column": 0, "row": row, "column": column}
     values |= {"inverse_depth": 1 / 400, "value": 1.0, "kind": 1, **changes}
     kinds = {"row": float, "column": float, "inverse_depth": float, "value": float, "kind": np.int16}
-    return Deposits(**{name: np.array([value], dtype=kinds.get(name, np.int64)) for name, value in values.items()})
+    return PathSamples(**{name: np.array([value], dtype=kinds.get(name, np.int64)) for name, value in values.items()})
 
 
 def bundle(depths: tuple[float, ...] = (400.0,), anchors: int = 2) -> Bundle:
@@ -54,7 +54,7 @@ WAYS = ((400.0,), DEPTHS)
 
 @pytest.mark.parametrize("depths", WAYS)
 def test_all_light_is_filed_and_under_its_own_row(depths: tuple[float, ...]) -> None:
-    made, found = bundle(depths), deposits()
+    made, found = bundle(depths), path_samples()
     light = made.file(found, LABELS, samples=4)
     assert light.shape == (4, made.size)
     lines = np.append(LABELS, 3)[found.pixel]
@@ -63,7 +63,7 @@ def test_all_light_is_filed_and_under_its_own_row(depths: tuple[float, ...]) -> 
 
 @pytest.mark.parametrize("depths", WAYS)
 def test_anchors_are_kept_apart(depths: tuple[float, ...]) -> None:
-    made, found = bundle(depths), deposits()
+    made, found = bundle(depths), path_samples()
     light = unpacked(made, made.file(found, LABELS).toarray()).sum(axis=(0, 1, 3, 5))
     for a, b in np.ndindex(2, 2):
         mine = (found.anchor_row == a) & (found.anchor_column == b)
@@ -99,7 +99,7 @@ def test_light_beyond_the_layers_goes_to_the_nearest(depth: float, layer: int) -
 
 
 def test_light_from_outside_the_grid_is_dropped() -> None:
-    made, found = bundle(), deposits(inside=False)
+    made, found = bundle(), path_samples(inside=False)
     inside = (found.row >= -0.2) & (found.row < 0.2) & (found.column >= -0.1) & (found.column < 0.2)
     assert 0.1 < inside.mean() < 0.9
     light, kept = made.file(found, LABELS), made.file(found.where(inside), LABELS)
@@ -117,14 +117,14 @@ def test_ambient_light_has_the_last_row() -> None:
 
 def test_no_light_is_an_empty_matrix() -> None:
     made = bundle(DEPTHS)
-    light = made.file(Deposits.none(), LABELS)
+    light = made.file(PathSamples.none(), LABELS)
     assert light.shape == (4, made.size) and light.nnz == 0
 
 
 def test_parts_join_in_order() -> None:
-    found = deposits()
+    found = path_samples()
     first = np.arange(400) < 150
-    joined = Deposits.joined([found.where(first), Deposits.none(), found.where(~first)])
+    joined = PathSamples.joined([found.where(first), PathSamples.none(), found.where(~first)])
     assert all(np.array_equal(getattr(joined, name), getattr(found, name)) for name in vars(found))
     assert joined.pixel.dtype == np.int64
 
@@ -138,7 +138,7 @@ def test_directions_for_the_shadow() -> None:
 
 def test_light_averaged_over_the_anchors() -> None:
     """The mean of bilinear weights: the light of each anchor times its row's and its column's weight."""
-    found, weights = deposits(), np.array([0.7, 0.3])
+    found, weights = path_samples(), np.array([0.7, 0.3])
     light = unpacked(bundle(), bundle().file(found, LABELS).toarray())
     mean = unpacked(bundle(anchors=1), bundle(anchors=1).file(found.averaged(weights), LABELS).toarray())
     assert np.allclose(mean[:, :, 0, :, 0], np.einsum("a,b,claybx->clyx", weights, weights, light), rtol=1e-12)
@@ -147,7 +147,7 @@ def test_light_averaged_over_the_anchors() -> None:
 @pytest.mark.parametrize("depths", WAYS)
 def test_filed_light_averaged_over_the_anchors(depths: tuple[float, ...]) -> None:
     """Averaged before it is filed or after, light is the same."""
-    found, weights, made = deposits(), np.array([0.7, 0.3]), bundle(depths)
+    found, weights, made = path_samples(), np.array([0.7, 0.3]), bundle(depths)
     before = bundle(depths, anchors=1).file(found.averaged(weights), LABELS).toarray()
     assert np.allclose(made.averaged(made.file(found, LABELS), weights).toarray(), before, rtol=1e-12, atol=0)
 
@@ -155,7 +155,7 @@ def test_filed_light_averaged_over_the_anchors(depths: tuple[float, ...]) -> Non
 @pytest.mark.parametrize("depths", WAYS)
 def test_light_of_one_anchor_repeated_for_all(depths: tuple[float, ...]) -> None:
     made, single = bundle(depths), bundle(depths, anchors=1)
-    light = single.file(deposits().averaged(np.array([0.5, 0.5])), LABELS)
+    light = single.file(path_samples().averaged(np.array([0.5, 0.5])), LABELS)
     shown, one = unpacked(made, made.repeated(light).toarray()), unpacked(single, light.toarray())
     for a, b in np.ndindex(2, 2):
         assert np.array_equal(shown[:, :, a, :, b], one[:, :, 0, :, 0])
@@ -166,7 +166,7 @@ def test_small_light_beside_great_light_is_counted() -> None:
     """4096 paths of 1 beside one of 2^24, where float32 has steps of 2: what is fetched and filed is exact."""
     import mitsuba as mi
 
-    from mitsim.transport.accumulator import Ledger
+    from mitsim.transport.accumulator import DeviceAccumulator
 
     light = np.ones(4097, np.float32)
     light[0] = 2.0**24
@@ -174,12 +174,12 @@ def test_small_light_beside_great_light_is_counted() -> None:
     zeros = [mi.Float(np.zeros(4097, np.float32)) for _ in range(2)]
     depth = mi.Float(np.full(4097, 1 / 400, np.float32))
     seen = Sightings(mi.Float(light), mi.UInt32(np.zeros(4097, np.uint32)), *zeros, depth)
-    fetched, alone = Deposits.fetched(seen, DIRECT), bundle(anchors=1)
+    fetched, alone = PathSamples.fetched(seen, DIRECT), bundle(anchors=1)
     assert fetched.value.dtype == np.float64 and fetched.value.sum() == 2.0**24 + 4096
     assert alone.file(fetched, LABELS).sum() == 2.0**24 + 4096
-    ledger = Ledger(alone, LABELS, one=2.0**24)
-    ledger.add(seen.value, seen.pixel, ledger.place(seen, mi.Float(0.5)), mi.Bool(True))
-    assert ledger.filed()[1] == 2.0**24 + 4096
+    accumulator = DeviceAccumulator(alone, LABELS, one=2.0**24)
+    accumulator.add(seen.value, seen.pixel, accumulator.place(seen, mi.Float(0.5)), mi.Bool(True))
+    assert accumulator.filed()[1] == 2.0**24 + 4096
 
 
 @pytest.mark.usefixtures("variant")
@@ -192,27 +192,27 @@ def test_ledgers_of_several_lines_are_fetched_together() -> None:
     import mitsuba as mi
 
     from mitsim.core.errors import MitsimError
-    from mitsim.transport.accumulator import Ledger, fetched
+    from mitsim.transport.accumulator import DeviceAccumulator, fetched
 
-    found, alone = deposits(inside=False), bundle(anchors=1)
+    found, alone = path_samples(inside=False), bundle(anchors=1)
     pixel = np.minimum(found.pixel, PIXELS - 1).astype(np.uint32)
     seen = [mi.Float(each.astype(np.float32)) for each in (found.value, found.row, found.column, found.inverse_depth)]
     light = Sightings(seen[0], mi.UInt32(pixel), *seen[1:])
-    together = Ledger.of_lines(3, alone, LABELS, one=1.0)
-    single = [Ledger(alone, LABELS, one=1.0) for _ in range(3)]
+    together = DeviceAccumulator.of_lines(3, alone, LABELS, one=1.0)
+    single = [DeviceAccumulator(alone, LABELS, one=1.0) for _ in range(3)]
     lit = [mi.Bool(found.pixel % 2 == 0), mi.Bool(found.pixel % 3 == 0), mi.Bool(False)]
-    for ledgers in (together, single):
-        place = ledgers[0].place(light, mi.Float(0.5))
-        for ledger, some in zip(ledgers, lit, strict=True):
-            ledger.add(light.value, light.pixel, place, some)
+    for accumulators in (together, single):
+        place = accumulators[0].place(light, mi.Float(0.5))
+        for accumulator, some in zip(accumulators, lit, strict=True):
+            accumulator.add(light.value, light.pixel, place, some)
     for own, counted in zip(single, fetched(together), strict=True):
         (matrix, *sums), (expected, *own_sums) = counted.light(4), own.filed(4)
         assert np.array_equal(matrix.toarray(), expected.toarray()) and sums == own_sums
     for counted in fetched(together):
         assert counted.light()[1] == 0.0 and not counted.light()[0].nnz
     assert own_sums == [0.0, 0.0] and not expected.nnz, "the last line is dark"
-    for ledger, value in zip(together, (1.0, np.nan, 1.0), strict=True):
-        ledger.add(mi.Float(value), mi.UInt32(0), mi.UInt32(0), mi.Bool(True))
+    for accumulator, value in zip(together, (1.0, np.nan, 1.0), strict=True):
+        accumulator.add(mi.Float(value), mi.UInt32(0), mi.UInt32(0), mi.Bool(True))
     broken = fetched(together)
     assert [broken[line].light()[1] for line in (0, 2)] == [1.0, 1.0]
     with pytest.raises(MitsimError, match="NaN"):

@@ -16,7 +16,7 @@ from mitsim.transport import integrator
 from mitsim.transport.connect import SensorPoints
 from mitsim.transport.from_camera import FromCameraTracer, Paths
 from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.records import DIRECT, INDIRECT, Deposits, aligned_grid
+from mitsim.transport.records import DIRECT, INDIRECT, PathSamples, aligned_grid
 from tests.unit.transport.closed_forms import mean, seen
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -172,12 +172,12 @@ def test_without_paths_there_is_no_light(hollow: Bench) -> None:
 
 def test_seeds_and_launches(hollow: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     trace = tracer(hollow)
-    assert trace.lanes == N * N
+    assert trace.paths_per_sample == N * N
     whole, again, other = trace.trace(6, 0, 64), trace.trace(6, 0, 64), trace.trace(7, 0, 64)
     assert all(np.array_equal(getattr(whole, name), getattr(again, name)) for name in vars(whole))
     assert np.isin(whole.row, other.row).mean() < 0.01
-    pieces = Deposits.joined([trace.trace(6, 0, 20), trace.trace(6, 20, 44)])
-    monkeypatch.setattr(integrator.Tracer, "lanes_per_launch", 3000)
+    pieces = PathSamples.joined([trace.trace(6, 0, 20), trace.trace(6, 20, 44)])
+    monkeypatch.setattr(integrator.Tracer, "paths_per_launch", 3000)
     order = np.argsort(whole.value)
     for parts in (pieces, trace.trace(6, 0, 64)):
         mine = np.argsort(parts.value)

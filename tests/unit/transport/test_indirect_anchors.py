@@ -16,15 +16,15 @@ import pytest
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.spectral_manifests import RUN
-from mitsim.transport.accumulator import Ledger, fetched
+from mitsim.transport.accumulator import DeviceAccumulator, fetched
 from mitsim.transport.connect import SensorPoints
 from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.records import DIRECT, INDIRECT, Bundle, Deposits, aligned_grid
+from mitsim.transport.records import DIRECT, INDIRECT, Bundle, PathSamples, aligned_grid
 from tests.conftest import write_small_scene
 from tests.unit.transport.test_indirect import CORNER, MIRROR, N
-from tests.unit.transport.test_neighbours import WALL
-from tests.unit.transport.test_neighbours_by_line import LINES, SHARES
-from tests.unit.transport.test_neighbours_by_line import SHINY as COLOURED
+from tests.unit.transport.test_path_reuse import WALL
+from tests.unit.transport.test_path_reuse_by_line import LINES, SHARES
+from tests.unit.transport.test_path_reuse_by_line import SHINY as COLOURED
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -85,8 +85,8 @@ def test_a_path_is_the_same_at_every_anchor(beside: Bench) -> None:
 
 
 def in_lines(folder: str) -> tuple[int, list[str], list[list[float]]]:
-    """The same of three lines at once, and of each line what its ledger and the host hold; its process has a spectral
-    variant for good."""
+    """The same of three lines at once, and of each line what its accumulator and the host hold; its process has a
+    spectral variant for good."""
     place = Path(folder)
     (place / "lines.toml").write_text(
         f'name = "lines"\neffective_wavelength_nm = 550\nwavelengths_nm = {list(LINES)}\n'
@@ -99,17 +99,17 @@ def in_lines(folder: str) -> tuple[int, list[str], list[list[float]]]:
     bench = SpectralBench.of(opened, RUN).whole
     tracer, labels = anchored(bench, SensorPoints(bench.geometry.half_width, 3)), np.arange(N**2) % 5
     bundle = Bundle(aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov), 3, (400.0,))
-    ledgers = Ledger.of_lines(len(LINES), bundle, labels, tracer.board)
-    tracer.trace_into(ledgers, 4, 0, 32)
+    accumulators = DeviceAccumulator.of_lines(len(LINES), bundle, labels, tracer.board)
+    tracer.trace_into(accumulators, 4, 0, 32)
     host = tracer.trace(4, 0, 32)
     light = host.where(host.kind == INDIRECT).by_line(len(LINES))
-    sums = zip(ledgers, fetched(ledgers), strict=True)
-    held = [float(ledger.filed(counted)[0].sum()) for ledger, counted in sums]
+    sums = zip(accumulators, fetched(accumulators), strict=True)
+    held = [float(accumulator.filed(counted)[0].sum()) for accumulator, counted in sums]
     return *compared(bench), [held, [float(bundle.file(each, labels).sum()) for each in light]]
 
 
 def test_a_path_in_several_lines_is_the_same_at_every_anchor(tmp_path: Path) -> None:
-    """With the light of each line, in ledgers of each. (Planted: the first line's light for that of all.)"""
+    """With the light of each line, in accumulators of each. (Planted: the first line's light for that of all.)"""
     program = (
         "import json, sys; from tests.unit.transport.test_indirect_anchors import in_lines; "
         "print(json.dumps(in_lines(sys.argv[1])))"
@@ -130,11 +130,11 @@ def test_ledgers_hold_what_anchors_are_brought(beside: Bench, launch: int, monke
     tracer, labels = anchored(beside, points), np.arange(N**2) % 5
     reach = beside.geometry.reach(beside.geometry.scene_distance)
     bundle = Bundle(aligned_grid(*beside.windows, 2 * N, 1, reach), 3, (400.0, 300.0))
-    whole, parts = (Ledger(bundle, labels, tracer.board) for _ in range(2))
+    whole, parts = (DeviceAccumulator(bundle, labels, tracer.board) for _ in range(2))
     caustics, host = tracer.trace_into([whole], 4, 0, 8), tracer.trace(4, 0, 8)
     units = np.array(whole.sums)
-    monkeypatch.setattr(IndirectTracer, "lanes_per_launch", launch)
-    again = Deposits.joined([tracer.trace_into([parts], 4, first, 4) for first in (0, 4)])
+    monkeypatch.setattr(IndirectTracer, "paths_per_launch", launch)
+    again = PathSamples.joined([tracer.trace_into([parts], 4, first, 4) for first in (0, 4)])
     assert units.any() and np.array_equal(np.array(parts.sums), units)
     for name in ("kind", "pixel", "anchor_row", "anchor_column", "value"):
         assert np.array_equal(getattr(again, name), getattr(caustics, name)), name

@@ -108,7 +108,7 @@ def test_hits_are_those_of_the_tracer_that_would_find_the_light(
         tracer = IndirectTracer(scene, camera, optics, True, False, geometry)
     else:
         tracer = FromCameraTracer(scene, camera, optics, cells(bench), Paths(mirrors=True), geometry)
-    samples = 2**21 // tracer.lanes
+    samples = 2**21 // tracer.paths_per_sample
     connected = tracer.trace(0, 0, samples).value
     light, moment = connected.sum() / samples, np.square(connected).sum() / samples
     told = left_out_of(bench, 0)

@@ -14,8 +14,8 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.transport.from_camera import FromCameraTracer, Paths
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.integrator import ANY, FollowingTracer
-from mitsim.transport.path_reuse import NeighbourTracer
-from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT, Deposits, aligned_grid
+from mitsim.transport.path_reuse import PathReuseTracer
+from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT, PathSamples, aligned_grid
 from tests.unit.transport.closed_forms import mean, seen
 from tests.unit.transport.test_indirect import CORNER, MATT, MIRROR, SPHERE
 
@@ -24,7 +24,7 @@ N, SEEDS, SIGMAS, RHO = 16, 8, 7.0, 0.5
 SKY = '<emitter type="constant"><spectrum name="radiance" value="20"/></emitter>'
 
 
-@pytest.mark.parametrize("kind", [IndirectTracer, NeighbourTracer])
+@pytest.mark.parametrize("kind", [IndirectTracer, PathReuseTracer])
 def test_each_reflection_in_a_sphere_keeps_the_albedo(
     shared_scene: Callable[..., Path], kind: type[IndirectTracer]
 ) -> None:
@@ -54,7 +54,7 @@ def tracers(bench: Bench) -> dict[str, FollowingTracer]:
     paths = Paths(mirrors=True, interreflection=True, emitters=loaded.lamps)
     return {
         "projector": IndirectTracer(*parts, True, True),
-        "neighbours": NeighbourTracer(*parts, False, True),
+        "neighbours": PathReuseTracer(*parts, False, True),
         "camera": FromCameraTracer(*parts, grid, paths),
         "lens": FromCameraTracer(loaded.scene, loaded.camera, optics, grid, paths),
     }
@@ -97,7 +97,7 @@ def test_the_sky_is_seen_or_lights_the_sheet_once(shared_scene: Callable[..., Pa
     assert not tracer.of_orders(2, ANY).trace(0, 0, 64).value.any()
 
 
-def by_path(light: Deposits, kind: int, side: str) -> np.ndarray:
+def by_path(light: PathSamples, kind: int, side: str) -> np.ndarray:
     """Light of a ``kind`` by where its paths start: pixels of the projector, or cells of the camera's view."""
     kept = light.where(light.kind == kind)
     if side in ("projector", "neighbours"):

@@ -27,14 +27,14 @@ def projector(variant: str) -> ProjectorOptics:
 
 def test_rays_areas_and_flux_are_of_one_map(projector: ProjectorOptics) -> None:
     pixel = np.arange(N * N)
-    lanes, rng = mi.UInt32(pixel), generator(mi.UInt32(1), mi.UInt32(0))
+    paths_per_sample, rng = mi.UInt32(pixel), generator(mi.UInt32(1), mi.UInt32(0))
     wavelengths = dr.zeros(mi.Ray3f).wavelengths
     rays, pinhole = ProjectorRays(projector), PinholeRays(projector, [None])
-    ray = rays.sample(lanes, mi.Point2f(0.5), rng, wavelengths)
+    ray = rays.sample(paths_per_sample, mi.Point2f(0.5), rng, wavelengths)
     centres = np.stack(np.divmod(pixel, N), axis=1) + 0.5
     direction = np.array(ray.d, dtype=np.float64).T
     assert np.abs(direction - pinhole.directions(centres)).max() < 2e-7
-    flux = np.array(rays.flux(lanes, wavelengths), dtype=np.float64).ravel()
+    flux = np.array(rays.flux(paths_per_sample, wavelengths), dtype=np.float64).ravel()
     assert flux == pytest.approx(pinhole.power[:, 0] * pinhole.area, rel=2e-5)
     assert len(np.unique(flux)) == N * N
     width, height = projector.pixel_size()

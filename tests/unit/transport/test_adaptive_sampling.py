@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import open_bench
-from mitsim.transport.indirect import AdaptiveSamples, block_moments, blocks_of, by_pixel, chosen_repeats, effect_of
-from tests.unit.transport.test_neighbours import SCENES, SIGMAS, summed, tracers
+from mitsim.transport.indirect import AdaptiveSamples, adaptive_counts, block_moments, blocks_of, by_pixel, effect_of
+from tests.unit.transport.test_path_reuse import SCENES, SIGMAS, summed, tracers
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, SEEDS = 18, 8
@@ -25,9 +25,9 @@ def test_repeated_light_is_the_same_light(shared_scene: Callable[..., Path], sha
     bench = open_bench(shared_scene(f"repeated {shared}", extra=SCENES["matt walls"], n=N))
     repeats = np.random.default_rng(2).choice([1, 2, 5], BLOCKS**2)
     plain = tracers(bench)[shared]
-    again = plain.repeating(repeats.tolist())
-    lanes = repeats.sum() * 16 if shared else by_pixel(repeats.tolist(), N).sum()
-    assert again.lanes == lanes
+    again = plain.with_adaptive_counts(repeats.tolist())
+    paths_per_sample = repeats.sum() * 16 if shared else by_pixel(repeats.tolist(), N).sum()
+    assert again.paths_per_sample == paths_per_sample
     looks = [[side.trace(seed, 0, 256) for seed in range(SEEDS)] for side in (plain, again)]
     found = np.array([[summed(look, 256, N) for look in side] for side in looks])
     means, errors = found.mean(axis=1), found.std(axis=1, ddof=1) / np.sqrt(SEEDS)
@@ -64,9 +64,9 @@ def test_repeats_leave_less_variance_for_the_cost() -> None:
     """Half of the blocks a hundred times as noisy: (1 + 10)^2 / (2 (1 + 100)) = 0.6 of variance times cost at best."""
     moments = np.ones((16, 16))
     moments[:, :8] = 100.0
-    repeats = chosen_repeats(moments)
+    repeats = adaptive_counts(moments)
     variance, paths = effect_of(repeats, moments)
     assert variance * paths < 0.72
     assert repeats[:, :6].min() > 2 * repeats[:, 10:].max()
-    assert set(chosen_repeats(np.ones((8, 8))).ravel()) == set(chosen_repeats(np.zeros((8, 8))).ravel()) == {1}
+    assert set(adaptive_counts(np.ones((8, 8))).ravel()) == set(adaptive_counts(np.zeros((8, 8))).ravel()) == {1}
     assert effect_of(repeats, np.zeros((16, 16)))[0] == 1.0

@@ -1,4 +1,5 @@
-"""Shared second points: the same light as paths of their own bring, less noise, and the ledger that it is filed in.
+"""Shared second points: the same light as paths of their own bring, less noise, and the accumulator that it is filed
+in.
 
 Gates on Monte Carlo means are seven standard errors of eight independent seeds: five sigma of the t distribution.
 """
@@ -14,11 +15,11 @@ import pytest
 
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
-from mitsim.transport.accumulator import Ledger
+from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import SensorPoints
 from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.path_reuse import NeighbourTracer
-from mitsim.transport.records import INDIRECT, Bundle, Deposits, aligned_grid
+from mitsim.transport.path_reuse import PathReuseTracer
+from mitsim.transport.records import INDIRECT, Bundle, PathSamples, aligned_grid
 from tests.unit.transport.closed_forms import seen
 from tests.unit.transport.test_indirect import MATT, MIRROR, SHINY, SPHERE
 
@@ -51,14 +52,14 @@ def opened(scene: Path) -> Bench:
     return open_bench(scene)
 
 
-def tracers(bench: Bench, spread: bool = False, mirrors: bool = False) -> tuple[IndirectTracer, NeighbourTracer]:
+def tracers(bench: Bench, spread: bool = False, mirrors: bool = False) -> tuple[IndirectTracer, PathReuseTracer]:
     """Paths of their own, and shared ones."""
     loaded, points = bench.loaded, SensorPoints(bench.geometry.half_width, spread=spread)
     parts = loaded.scene, loaded.camera, bench.projector_optics, mirrors, True
-    return IndirectTracer(*parts, points=points), NeighbourTracer(*parts, points=points)
+    return IndirectTracer(*parts, points=points), PathReuseTracer(*parts, points=points)
 
 
-def summed(light: Deposits, samples: int, pixels: int) -> np.ndarray:
+def summed(light: PathSamples, samples: int, pixels: int) -> np.ndarray:
     """Light of each column of pixels in all, and by row, column and depth that it comes from: (4, pixels)."""
     weights = np.ones_like(light.row), light.row, light.column, light.inverse_depth
     return np.array([np.bincount(light.pixel % pixels, light.value * each / samples, pixels) for each in weights])
@@ -133,7 +134,7 @@ def test_diffuse_surfaces_need_no_look_at_their_material(
     tracer = tracers(bench, spread=True)[1]
     assert tracer.all_diffuse and not tracers(opened(shared_scene("gloss", extra=SCENES["shiny wall"])))[1].all_diffuse
     short = tracer.trace(3, 0, 64)
-    monkeypatch.setattr(NeighbourTracer, "all_diffuse", False)
+    monkeypatch.setattr(PathReuseTracer, "all_diffuse", False)
     long = tracer.trace(3, 0, 64)
     whole = [np.bincount(light.pixel, light.value, N * N) for light in (short, long)]
     np.testing.assert_allclose(*whole, rtol=2e-3)
@@ -141,7 +142,7 @@ def test_diffuse_surfaces_need_no_look_at_their_material(
     assert abs(len(short.value) - len(long.value)) < 1e-3 * len(long.value)
 
 
-# ---- the ledger
+# ---- the accumulator
 
 
 @pytest.mark.parametrize("depths", [(400.0,), (450.0, 380.0, 300.0)])
@@ -152,9 +153,9 @@ def test_the_ledger_holds_what_the_host_files(shared_scene: Callable[..., Path],
     grid = aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov / 3)
     bundle, labels = Bundle(grid, 1, depths), np.arange(N * N) % 5
     tracer = tracers(bench)[1]
-    ledger = Ledger(bundle, labels, tracer.board)
-    own = tracer.trace_into([ledger], 3, 0, 512)
-    matrix, received, outside = ledger.filed()
+    accumulator = DeviceAccumulator(bundle, labels, tracer.board)
+    own = tracer.trace_into([accumulator], 3, 0, 512)
+    matrix, received, outside = accumulator.filed()
     every = tracer.trace(3, 0, 512)
     expected = bundle.file(every, labels).toarray()
     found = (matrix + bundle.file(own, labels)).toarray()
@@ -175,9 +176,9 @@ def test_the_ledger_holds_paths_of_their_own_at_every_anchor(shared_scene: Calla
     tracer = IndirectTracer(loaded.scene, loaded.camera, bench.projector_optics, mirrors, True, points=points)
     grid = aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov / 3)
     bundle, labels = Bundle(grid, 3, (400.0,)), np.arange(N * N) % 5
-    ledger = Ledger(bundle, labels, tracer.board)
-    rest = tracer.trace_into([ledger], 3, 0, 64)
-    matrix, received, outside = ledger.filed()
+    accumulator = DeviceAccumulator(bundle, labels, tracer.board)
+    rest = tracer.trace_into([accumulator], 3, 0, 64)
+    matrix, received, outside = accumulator.filed()
     every = tracer.trace(3, 0, 64)
     indirect = every.where(every.kind == INDIRECT)
     assert (len(rest.value) > 0) == mirrors and len(rest.value) + len(indirect.value) == len(every.value)
@@ -192,15 +193,15 @@ def test_light_that_is_not_a_number_is_refused(small_scene: Callable[..., Path])
     bench = open_bench(small_scene(extra=SPHERE.format(bsdf=MATT), sheet_z=3000))
     bundle = Bundle(aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov), 1, (400.0,))
     tracer = tracers(bench)[1]
-    ledger = Ledger(bundle, np.zeros(N * N, np.int64), tracer.board)
+    accumulator = DeviceAccumulator(bundle, np.zeros(N * N, np.int64), tracer.board)
     parameters = mi.traverse(bench.loaded.projector)
     parameters["scale"] = float("nan")
     parameters.update()
     with pytest.raises(MitsimError, match="NaN"):
         tracer.trace(0, 0, 256)
-    tracer.trace_into([ledger], 0, 0, 256)
+    tracer.trace_into([accumulator], 0, 0, 256)
     with pytest.raises(MitsimError, match="NaN"):
-        ledger.filed()
+        accumulator.filed()
 
 
 _PRINT = """
@@ -208,15 +209,15 @@ import hashlib, sys, drjit as dr, numpy as np
 from mitsim.api.bench import open_bench
 from mitsim.transport.records import aligned_grid
 from mitsim.transport.records import Bundle
-from mitsim.transport.accumulator import Ledger
-from tests.unit.transport.test_neighbours import tracers
+from mitsim.transport.accumulator import DeviceAccumulator
+from tests.unit.transport.test_path_reuse import tracers
 bench = open_bench(sys.argv[1])
 dr.set_thread_count(int(sys.argv[2]))
 tracer = tracers(bench)[1]
 bundle = Bundle(aligned_grid(*bench.windows, 16, 1, bench.geometry.tan_half_fov), 1, (450.0, 300.0))
-ledger = Ledger(bundle, np.arange(256) % 5, tracer.board)
-tracer.trace_into([ledger], 3, 0, 256)
-print(hashlib.sha256(ledger.filed()[0].toarray().tobytes()).hexdigest())
+accumulator = DeviceAccumulator(bundle, np.arange(256) % 5, tracer.board)
+tracer.trace_into([accumulator], 3, 0, 256)
+print(hashlib.sha256(accumulator.filed()[0].toarray().tobytes()).hexdigest())
 """
 
 

@@ -42,11 +42,11 @@ def bench(shared_scene: Callable[..., Path], variant: str) -> Bench:
 def both(simulation: Simulation, name: str, labels: np.ndarray) -> tuple[LightEstimate, LightEstimate]:
     """Light of a pass by the host and by the device."""
     each = simulation.passes[name]
-    deposits, ledgers = each.trace(3, 0, SAMPLES), simulation.ledgers(name, labels, 1)
-    rest = each.trace(3, 0, SAMPLES, ledgers)
-    assert not len(rest.value) and len(deposits.value) > 1000
-    (sums,) = fetched(ledgers)
-    host, device = (simulation.accumulate(name, found, labels, SAMPLES) for found in (deposits, sums))
+    path_samples, accumulators = each.trace(3, 0, SAMPLES), simulation.accumulators(name, labels, 1)
+    rest = each.trace(3, 0, SAMPLES, accumulators)
+    assert not len(rest.value) and len(path_samples.value) > 1000
+    (sums,) = fetched(accumulators)
+    host, device = (simulation.accumulate(name, found, labels, SAMPLES) for found in (path_samples, sums))
     return host, device
 
 
@@ -68,17 +68,17 @@ def test_the_device_adds_up_what_the_host_does(bench: Bench, name: str) -> None:
 
 
 def test_few_paths_for_many_cells_are_left_to_the_host(bench: Bench) -> None:
-    """A ledger would be mostly empty. (Planted: always a ledger.)"""
+    """An accumulator would be mostly empty. (Planted: always an accumulator.)"""
     labels = np.arange(N * N) % 49
     names = "anchor_residual", "sharp"
     few = Simulation(bench, replace(SETTINGS, samples=dict.fromkeys(names, 1.0)))
     many = Simulation(bench, replace(SETTINGS, samples=dict.fromkeys(names, 1000.0)))
-    assert all(few.ledgers(name, labels, 1) == () for name in names)
-    assert all(len(many.ledgers(name, labels, 3)) == 3 for name in names)
+    assert all(few.accumulators(name, labels, 1) == () for name in names)
+    assert all(len(many.accumulators(name, labels, 3)) == 3 for name in names)
 
 
 def test_the_middle_of_the_sharpest_lobe_is_light(bench: Bench, variant: str) -> None:
-    """Ledgers refuse what is no light; what the sharpest lobe of Mitsuba brings is, and what is dim is not rounded
+    """Accumulators refuse what is no light; what the sharpest lobe of Mitsuba brings is, and what is dim is not rounded
     away. (Planted: light compared to a board's own; `_LOBE` of 2^20.)"""
     simulation = Simulation(bench, SETTINGS)
     tracer = simulation.anchored
@@ -89,8 +89,8 @@ def test_the_middle_of_the_sharpest_lobe_is_light(bench: Bench, variant: str) ->
     brightest = math.pi * float(np.max(np.array(lobe.eval(mi.BSDFContext(), square, mi.Vector3f(0, 0, 1)))))
     assert brightest > 2e7
     board = tracer.receiver.of_board(tracer.rays)
-    (ledger,) = simulation.ledgers("anchor_residual", np.zeros(N * N, dtype=np.int64), 1)
+    (accumulator,) = simulation.accumulators("anchor_residual", np.zeros(N * N, dtype=np.int64), 1)
     for place, light in enumerate([10 * brightest * board, 1e-5 * board]):
-        ledger.add(mi.Float(light), mi.UInt32(0), mi.UInt32(place), mi.Bool(True))
-    filed, *_ = ledger.filed()
+        accumulator.add(mi.Float(light), mi.UInt32(0), mi.UInt32(place), mi.Bool(True))
+    filed, *_ = accumulator.filed()
     np.testing.assert_allclose(filed.toarray()[0, :2] / board, [10 * brightest, 1e-5], rtol=0.02)

@@ -9,10 +9,10 @@ import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.optics.fft_shadow import geometric_samplers
-from mitsim.optics.mirror_frames import glint_frames
+from mitsim.optics.mirror_frames import specular_frames
 from mitsim.transport.projector import PinholeRays, ProjectorOptics
-from mitsim.transport.specular import has_mirrors, trace_glint
-from mitsim.transport.specular_rays import GlintRays
+from mitsim.transport.specular import has_mirrors, trace_specular_chains
+from mitsim.transport.specular_rays import SpecularRays
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, SCALE = 8, 111000.0
@@ -58,9 +58,9 @@ def plane(x: float, z: float, bsdf: dict, half: float = 60.0, toward: float = -1
 
 def flux(scene: "mi.Scene", **settings: int) -> float:
     camera = scene.sensors()[0]
-    beams = trace_glint(scene, camera, projector(scene), **settings)
+    beams = trace_specular_chains(scene, camera, projector(scene), **settings)
     geometry = camera.geometry
-    return glint_frames(beams, geometry, geometric_samplers(geometry), np.zeros(N * N, np.int64)).flux
+    return specular_frames(beams, geometry, geometric_samplers(geometry), np.zeros(N * N, np.int64)).flux
 
 
 def test_a_ray_meets_the_emitter_at_the_uv_that_it_was_made_for() -> None:
@@ -116,10 +116,10 @@ def test_what_counts_as_a_mirror(variant: str) -> None:
 
 def test_no_mirror_no_beams_and_a_depth_of_at_least_one(variant: str) -> None:
     scene = scene_with(sheet=plane(0, 400, {"type": "diffuse"}))
-    beams = trace_glint(scene, scene.sensors()[0], projector(scene))
+    beams = trace_specular_chains(scene, scene.sensors()[0], projector(scene))
     assert len(beams) == 0 and beams.unresolved == 0
     with pytest.raises(MitsimError, match="max_depth of glints is 0"):
-        trace_glint(scene, scene.sensors()[0], projector(scene), max_depth=0)
+        trace_specular_chains(scene, scene.sensors()[0], projector(scene), max_depth=0)
 
 
 def fresnel(cosine: float, eta: float) -> float:
@@ -162,9 +162,9 @@ def test_light_through_a_pane_before_the_mirror(variant: str) -> None:
     passed = 1 - 2 * GLASS / (1 + GLASS)
     mirror = scene_with(sheet=plane(0, 400, CONDUCTOR))
     scene = scene_with(sheet=plane(0, 400, CONDUCTOR), pane=plane(0, 300, {**pane}, 60))
-    tracer = GlintRays(scene, scene.sensors()[0], projector(scene), 3)
+    tracer = SpecularRays(scene, scene.sensors()[0], projector(scene), 3)
     found = tracer.follow(np.array([[4.5, 7.3]]))
-    expected = GlintRays(mirror, mirror.sensors()[0], projector(mirror), 3).follow(np.array([[4.5, 7.3]]))
+    expected = SpecularRays(mirror, mirror.sensors()[0], projector(mirror), 3).follow(np.array([[4.5, 7.3]]))
     straight = np.argmin(np.abs(found.sensor - expected.sensor).sum(axis=1))
     assert len(found.ray) == 2 and len(set(found.chain.tolist())) == 2
     assert found.throughput[straight] == pytest.approx(passed**2, rel=1e-2)
@@ -186,10 +186,10 @@ def test_the_edge_of_a_card_that_is_not_there_cuts_no_beam(variant: str) -> None
     """A hole is no part of the chain of surfaces that bounds a beam: at a rim, half a sensor pixel would be lost."""
     card = plane(3, 300, {"type": "mask", "opacity": 0.0, "bsdf": {"type": "diffuse"}}, 2)
     scene = scene_with(sheet=plane(0, 400, CONDUCTOR), card=card)
-    beams = trace_glint(scene, scene.sensors()[0], projector(scene))
+    beams = trace_specular_chains(scene, scene.sensors()[0], projector(scene))
     alone = scene_with(sheet=plane(0, 400, CONDUCTOR))
     assert beams.unresolved == 0
-    assert len(beams) == len(trace_glint(alone, alone.sensors()[0], projector(alone)))
+    assert len(beams) == len(trace_specular_chains(alone, alone.sensors()[0], projector(alone)))
 
 
 def test_a_slab_of_glass_shifts_the_ray_by_snells_law(variant: str) -> None:
@@ -199,7 +199,7 @@ def test_a_slab_of_glass_shifts_the_ray_by_snells_law(variant: str) -> None:
         "bsdf": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0},
     }
     scene = scene_with(sheet=plane(0, 400, CONDUCTOR), slab=slab)
-    tracer = GlintRays(scene, scene.sensors()[0], projector(scene), 5)
+    tracer = SpecularRays(scene, scene.sensors()[0], projector(scene), 5)
     point = np.array([[4.5, 7.3]])
     found = tracer.follow(point)
     x, y, z = tracer.rays.directions(point)[0]
@@ -230,7 +230,7 @@ def test_max_depth_counts_mirrors(variant: str) -> None:
 def test_a_rim_is_followed_down_and_points_stand_for_the_rest(variant: str) -> None:
     """Half the sensor sees a mirror's edge, a straight line: a 32nd of a sensor pixel is unsure."""
     whole, half = scene_with(sheet=plane(0, 400, CONDUCTOR)), scene_with(sheet=plane(70, 400, CONDUCTOR, 60))
-    beams = trace_glint(half, half.sensors()[0], projector(half))
+    beams = trace_specular_chains(half, half.sensors()[0], projector(half))
     assert beams.unresolved == 0 and 0 < beams.error < 1e-3 * flux(whole)
     assert flux(half) == pytest.approx(flux(whole) / 2, rel=1 / 32 / 32)
 
@@ -242,8 +242,8 @@ def test_a_painted_mirror_is_divided_where_its_paint_ends(variant: str) -> None:
     whole = flux(scene_with(sheet=plane(0, 400, CONDUCTOR)))
     assert flux(scene) == pytest.approx(0.5 * whole, rel=5e-3)
     camera = scene.sensors()[0]
-    beams = trace_glint(scene, camera, projector(scene))
-    frame = glint_frames(
+    beams = trace_specular_chains(scene, camera, projector(scene))
+    frame = specular_frames(
         beams, camera.geometry, geometric_samplers(camera.geometry), np.zeros(N * N, np.int64)
     ).irradiance
     rows = np.sort(frame[0].mean(axis=1))

@@ -20,11 +20,11 @@ import pytest
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import open_bench
 from mitsim.core.spectral_manifests import RUN
-from mitsim.transport.accumulator import Ledger
-from mitsim.transport.records import Bundle, Deposits, aligned_grid
+from mitsim.transport.accumulator import DeviceAccumulator
+from mitsim.transport.records import Bundle, PathSamples, aligned_grid
 from tests.conftest import write_small_scene
 from tests.unit.transport.closed_forms import seen
-from tests.unit.transport.test_neighbours import BENT, OBJECT, WALL, tracers
+from tests.unit.transport.test_path_reuse import BENT, OBJECT, WALL, tracers
 
 N, SEEDS, SIGMAS, SAMPLES = 16, 8, 7.0, 256
 LINES, SHARES = (450.0, 530.0, 640.0), (0.5, 0.3, 0.2)
@@ -63,7 +63,7 @@ QUICK = ("coloured sphere",)
 beside it is black in a line."""
 
 
-def by_line(light: Deposits) -> list[list[float]]:
+def by_line(light: PathSamples) -> list[list[float]]:
     """Of each line, light of each fourth of the columns of pixels in all, and by the row that it comes from."""
     found = []
     for each in light.by_line(len(LINES)):
@@ -90,8 +90,8 @@ def traced(folder: str, names: Sequence[str]) -> dict[str, Any]:
         looks = [[side.trace(seed, 0, SAMPLES) for seed in range(SEEDS)] for side in (own, shared)]
         grid = aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov)
         bundle, labels = Bundle(grid, 1, (400.0,)), np.arange(N * N) % 5
-        ledgers = [Ledger(bundle, labels, shared.board) for _ in LINES]
-        rest = shared.trace_into(ledgers, 0, 0, SAMPLES)
+        accumulators = [DeviceAccumulator(bundle, labels, shared.board) for _ in LINES]
+        rest = shared.trace_into(accumulators, 0, 0, SAMPLES)
         every = looks[1][0].by_line(len(LINES))
         found[name] = {
             "own": [by_line(look) for look in looks[0]],
@@ -100,8 +100,8 @@ def traced(folder: str, names: Sequence[str]) -> dict[str, Any]:
                 [look.value.sum(), look.lines[: len(LINES)].sum()] for look in looks[1] if look.lines is not None
             ],
             "ledgers": [
-                (ledger.filed()[0] + bundle.file(light, labels)).sum(axis=1).tolist()
-                for ledger, light in zip(ledgers, rest.by_line(len(LINES)), strict=True)
+                (accumulator.filed()[0] + bundle.file(light, labels)).sum(axis=1).tolist()
+                for accumulator, light in zip(accumulators, rest.by_line(len(LINES)), strict=True)
             ],
             "host": [bundle.file(light, labels).sum(axis=1).tolist() for light in every],
             "tan": bench.geometry.tan_half_fov,
@@ -113,7 +113,7 @@ def traced(folder: str, names: Sequence[str]) -> dict[str, Any]:
 def light(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], dict[str, Any]]:
     """Light of a scene, traced with that of all others that are as quick."""
     program = (
-        "import json, sys; from tests.unit.transport.test_neighbours_by_line import traced; "
+        "import json, sys; from tests.unit.transport.test_path_reuse_by_line import traced; "
         "print(json.dumps(traced(sys.argv[1], sys.argv[2:]), default=float))"
     )
 
@@ -161,7 +161,7 @@ def test_each_line_lights_a_coloured_sphere_by_its_own_reflectance(light: Callab
 
 @every_scene
 def test_lines_add_up_and_ledgers_hold_each(light: Callable[[str], dict[str, Any]], name: str) -> None:
-    """All light is the sum of the lines', and a ledger of each line holds what the host files."""
+    """All light is the sum of the lines', and an accumulator of each line holds what the host files."""
     whole = np.array(light(name)["whole"])
     assert len(whole) == SEEDS
     np.testing.assert_allclose(whole[:, 0], whole[:, 1], rtol=1e-5)

@@ -12,7 +12,7 @@ from mitsim.bench import effects
 from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
 from mitsim.transport.integrator import Tracer
-from mitsim.transport.records import Deposits
+from mitsim.transport.records import PathSamples
 
 pytestmark = pytest.mark.usefixtures("variant")
 SEEDS = (7, 2**32 - 1, 11, 12, 13)
@@ -26,7 +26,7 @@ def bench(shared_scene: Callable[..., Path], variant: str) -> Bench:
     return open_bench(shared_scene("looks", extra=GLOSSY), variant)
 
 
-def alike(one: Deposits, other: Deposits) -> bool:
+def alike(one: PathSamples, other: PathSamples) -> bool:
     names = [field.name for field in fields(one) if field.name != "lane"]
     return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names)
 
@@ -41,8 +41,8 @@ def test_looks_together_are_looks_one_by_one(
     settings = Settings(depth=bench.geometry.scene_distance, effects=frozenset(effects.present(bench)))
     simulation = Simulation(bench, replace(settings, anchors=2, followed_anchors=2))
     tracer = simulation.at_anchors[0] if name == "at anchors" else getattr(simulation, name)
-    monkeypatch.setattr(Tracer, "lanes_per_launch", launch)
-    together = tracer.trace_looks(SEEDS, 3)
+    monkeypatch.setattr(Tracer, "paths_per_launch", launch)
+    together = tracer.trace_replicates(SEEDS, 3)
     assert len(together) == len(SEEDS) and not alike(together[0], together[1])
     for seed, found in zip(SEEDS, together, strict=True):
         assert found.value.size and alike(found, tracer.trace(seed, 0, 3))
