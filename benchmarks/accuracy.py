@@ -68,7 +68,7 @@ def answer(scene: str, noise: float) -> npt.NDArray[np.float32]:
     family = bench.family(PATTERNS, SEED)
     stand = Stand(bench, family, ANSWERS[0], Job(), FINEST / SEEN)
     finest = stand.finest(stand.plan(FINEST))
-    samples = predicted(noise, stand.evidence, finest.settings, {}).settings
+    samples = predicted(noise, stand.pilot_result, finest.settings, {}).settings
     plan = replace(finest, settings=samples, sampling_target=noise)
     halves = []
     for seed in ANSWERS:

@@ -34,7 +34,7 @@ import mitsim as ms
 from mitsim.api.bench import Bench
 from mitsim.devices.patterns import PatternFamily, parse_patterns
 from mitsim.light.grids import LightEstimate
-from mitsim.light.passes import Simulation
+from mitsim.light.simulation import Simulation
 from mitsim.transport.accumulator import fetched
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.indirect import adaptive_counts, block_moments

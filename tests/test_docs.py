@@ -452,7 +452,7 @@ def test_the_house_stands_on_its_page_as_it_is_tested() -> None:
 
 
 def test_every_pass_of_light_stands_in_the_table_of_passes(variant: str) -> None:
-    passes = pytest.importorskip("mitsim.light.pass_table").PASSES
+    passes = pytest.importorskip("mitsim.light.passes").PASSES
     table = text_of("docs/architecture.md").split("## Passes of light")[1].split("## What is passed on")[0]
     named = {name for row in re.findall(r"^\| ([a-z ,]+) \|", table, flags=re.M) for name in row.split(", ")}
     assert named - {"pass", "specular chain"} == {name.replace("_", " ") for name in passes}

@@ -21,9 +21,9 @@ from mitsim.core.spectral_manifests import BANDS, LINES, MONO, MOST_LINES, RUN, 
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Lines
 from mitsim.light.cost_model import traced_for
-from mitsim.light.passes import Simulation
 from mitsim.light.plan import ColourCandidate, ColourChoice, Plan
 from mitsim.light.settings import Settings
+from mitsim.light.simulation import Simulation
 from mitsim.transport.records import PathSamples
 
 _RAYS_OF_BANDS, _SHOTS = 4, 4

@@ -38,9 +38,9 @@ from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.devices.projector import Lines
 from mitsim.light.lamps import lit_by_lamps
 from mitsim.light.light import SampledLight, Sampling
-from mitsim.light.passes import Simulation
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Settings
+from mitsim.light.simulation import Simulation
 from mitsim.light.truth import Truth, trace_truths
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.planner.memory import frame_seconds, frames_cost

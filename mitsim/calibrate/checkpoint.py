@@ -28,8 +28,8 @@ from mitsim.devices.framelist import LISTS, DarkFile, FrameList, StripeFile
 from mitsim.devices.session import SIDES, Side
 from mitsim.light.grids import GRIDS, LightEstimate
 from mitsim.light.light import SampledLight
-from mitsim.light.passes import Simulation
 from mitsim.light.plan import Plan
+from mitsim.light.simulation import Simulation
 from mitsim.reconstruct.estimate_factors import PairSeen, PairSums, StripeSums
 from mitsim.sensor.chain import Digital as DigitalNumbers
 

@@ -28,10 +28,10 @@ from mitsim.devices.projector import Spectrum
 from mitsim.devices.session import UNIFORM, BoardShape, Half, SessionRecipe, taken
 from mitsim.light.cost_model import FIXED, Numbers, forming_seconds
 from mitsim.light.light import SampledLight, Sampling, trace_lines
-from mitsim.light.passes import Simulation
 from mitsim.light.pilot_result import Forming
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Settings
+from mitsim.light.simulation import Simulation
 from mitsim.optics.frames import Frame, at_once, mixes
 from mitsim.optics.separable import best_term, centred
 from mitsim.optics.shadow import Directions, SeparableTerms

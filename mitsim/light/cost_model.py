@@ -16,8 +16,8 @@ import numpy as np
 from mitsim.bench.effects import names
 from mitsim.core.arrays import FloatArray
 from mitsim.devices.plate import FEW
-from mitsim.light.pass_table import PASSES
-from mitsim.light.pilot_result import Evidence, Forming, SampleCost
+from mitsim.light.passes import PASSES
+from mitsim.light.pilot_result import Forming, PilotResult, SampleCost
 from mitsim.light.settings import GROUPS, Number, Settings
 from mitsim.optics.frames import PROBES, formed_frames, mixes
 from mitsim.transport.accumulator import MOST_PLACES
@@ -181,22 +181,24 @@ def in_waves(effects: frozenset[str]) -> bool:
     return bool(effects & names(lambda effect: effect.in_shadow))
 
 
-def unit_costs_of(evidence: Evidence) -> UnitCosts:
-    """Those that the ``evidence`` measured, where it measured any."""
-    forming = evidence.forming
+def unit_costs_of(pilot_result: PilotResult) -> UnitCosts:
+    """Those that the ``pilot_result`` measured, where it measured any."""
+    forming = pilot_result.forming
     products = float(_products(forming, Numbers.coarsest(), (forming.lit, forming.lit), 1.0, 1.0, 1.0))
     slower = forming.seconds / (FIXED.frame + FIXED.product * products) if forming.seconds else 1.0
     product = forming.product or slower * FIXED.product
     # The frame that the pilot forms is small: beside its products there is what every frame takes.
     frame = max(forming.seconds - product * products, 0.0) if forming.product else slower * FIXED.frame
-    measured = {name: sample_cost.seconds for name, sample_cost in evidence.sample_costs.items() if sample_cost.seconds}
+    measured = {
+        name: sample_cost.seconds for name, sample_cost in pilot_result.sample_costs.items() if sample_cost.seconds
+    }
     return UnitCosts(
         passes={**FIXED.passes, **measured},
         frame=float(frame),
         product=float(product),
         entry=float(product / FIXED.product * FIXED.entry),
         accumulated=float(product / FIXED.product * FIXED.accumulated),
-        ray=evidence.spread.seconds * FIXED.ray / FIXED.passes["direct"] or FIXED.ray,
+        ray=pilot_result.spread.seconds * FIXED.ray / FIXED.passes["direct"] or FIXED.ray,
         pixel=float(product / FIXED.product * FIXED.pixel),
     )
 
@@ -206,9 +208,9 @@ def costly_effects() -> frozenset[str]:
     return names(lambda effect: effect.followed or effect.in_shadow) | {MIXING}
 
 
-def sample_costs(evidence: Evidence, effects: frozenset[str]) -> dict[str, SampleCost]:
-    """What each pass that ``effects`` call for takes by the ``evidence``; connections to anchors: to one."""
-    found = ((name, evidence.sample_costs[name]) for name in PASSES if name in evidence.sample_costs)
+def sample_costs(pilot_result: PilotResult, effects: frozenset[str]) -> dict[str, SampleCost]:
+    """What each pass that ``effects`` call for takes by the ``pilot_result``; connections to anchors: to one."""
+    found = ((name, pilot_result.sample_costs[name]) for name in PASSES if name in pilot_result.sample_costs)
     return {name: sample_cost for name, sample_cost in found if PASSES[name].called_for(effects)}
 
 
@@ -349,12 +351,12 @@ def tells_all(classes: int, shots: int, pixels: float) -> bool:
 # -------- Tracing, accumulating and the truth
 
 
-def tracing_seconds(evidence: Evidence, settings: Settings, costs: UnitCosts) -> dict[str, float]:
+def tracing_seconds(pilot_result: PilotResult, settings: Settings, costs: UnitCosts) -> dict[str, float]:
     """Seconds of tracing the samples in ``settings``, by kind of light.
 
     Parameters
     ----------
-    evidence
+    pilot_result
         paths in a sample.
     settings
         the samples.
@@ -362,13 +364,13 @@ def tracing_seconds(evidence: Evidence, settings: Settings, costs: UnitCosts) ->
         as for :func:`forming_seconds`.
     """
     return {
-        name: traced_for(evidence.forming.lines, evidence.forming.parted)
+        name: traced_for(pilot_result.forming.lines, pilot_result.forming.parted)
         * GROUPS
         * float(PASSES[name].whole(PASSES[name].predicted(settings)))
         * sample_cost.paths
         * costs.passes[name]
         * float(PASSES[name].connections(settings))
-        for name, sample_cost in sample_costs(evidence, settings.effects).items()
+        for name, sample_cost in sample_costs(pilot_result, settings.effects).items()
     }
 
 
@@ -446,18 +448,18 @@ def accumulation_seconds(forming: Forming, numbers: Numbers, entries_of_group: N
     return cast(Number, forming.lines * GROUPS * costs.accumulated * (entries_of_group + passed))
 
 
-def truth_seconds(evidence: Evidence, settings: Settings, costs: UnitCosts) -> float:
+def truth_seconds(pilot_result: PilotResult, settings: Settings, costs: UnitCosts) -> float:
     """Seconds of tracing what a perfect image would show.
 
     Parameters
     ----------
-    evidence, settings, costs
+    pilot_result, settings, costs
         as for :func:`tracing_seconds`.
     """
-    row, direct = PASSES["direct"], evidence.sample_costs["direct"]
-    rate = (evidence.spread if settings.anchors > 1 else direct).noise.rate
+    row, direct = PASSES["direct"], pilot_result.sample_costs["direct"]
+    rate = (pilot_result.spread if settings.anchors > 1 else direct).noise.rate
     return (
-        traced_for(evidence.forming.lines, evidence.forming.parted)
+        traced_for(pilot_result.forming.lines, pilot_result.forming.parted)
         * costs.ray
         * predicted_rays(direct.paths, float(row.whole(row.predicted(settings))), rate)
     )

@@ -16,8 +16,8 @@ from mitsim.core.seeds import integer
 from mitsim.core.spectral_manifests import MOST_LINES
 from mitsim.devices.lamps import SPECTRA_NM, Band, Lamplight, Response, line_units
 from mitsim.devices.projector import Spectrum
-from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
+from mitsim.light.simulation import Simulation
 from mitsim.transport.from_camera import FromCameraTracer, LampResponse, LampTracer
 
 _STEP_NM = 24.0

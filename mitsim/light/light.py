@@ -21,10 +21,10 @@ from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.light.cost_model import CHECKED_SHOTS, MOST_CHECKED, tells_all
 from mitsim.light.grids import LightEstimate
-from mitsim.light.passes import Simulation, expected_of
 from mitsim.light.plan import Plan
 from mitsim.light.sampling import Group, first_samples, next_samples, trace_groups
 from mitsim.light.settings import GROUPS, MOST_PATHS, Estimate, Settings
+from mitsim.light.simulation import Simulation, expected_of
 from mitsim.light.truth import Truth, trace_truth
 from mitsim.optics.frames import ExpectedFrames, bound_of, shares_of_bound
 

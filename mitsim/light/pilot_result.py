@@ -19,10 +19,10 @@ of the sensor a side for light that is followed over several surfaces or from th
 occluded pixels, and projector pixels a side of a cell for what the former see beyond their mean."""
 _FEWEST_SAMPLES = 1e-3
 """Samples of light without noise: next to none, and above 0 because costs are ratios."""
-LOOKS = 4
+REPLICATES = 4
 """Independent replicates of the pilot, the fewest whose spread tells a standard error worth its name."""
 SURE = 2.35
-"""Standard errors from an estimate to its 95 % bound: Student's distribution with ``LOOKS`` - 1 degrees of freedom."""
+"""Standard errors from an estimate to its 95 % bound: Student's distribution with ``REPLICATES`` - 1 degrees of freedom."""
 RASTER_RATE = 1.5
 """Power of a raster's cells along a pixel that its error falls with: from 6 to 12 cells, in frames of dots, 1.4 (a
 picture of light) to 2.9 (a mask turned by 0.3 degrees)."""
@@ -94,7 +94,7 @@ class SampleCost:
 
 
 @dataclass(frozen=True, order=True)
-class Part:
+class Approximation:
     """What a plan may leave out (an effect; ``count`` 0), or a number that it may choose (anchors, layers, cells)."""
 
     name: str
@@ -102,7 +102,7 @@ class Part:
 
 
 @dataclass(frozen=True, eq=False)
-class Changes:
+class ErrorCovariance:
     """What each part changes in the frames, as inner products between independent replicates: the sum of any of them,
     with its signs, without the replicates' noise.
 
@@ -115,15 +115,17 @@ class Changes:
         those of a replicate with itself hold its noise, and are not used.
     """
 
-    parts: tuple[Part, ...]
+    parts: tuple[Approximation, ...]
     products: FloatArray
 
     @classmethod
-    def between(cls, seen: Mapping[Part, FloatArray], energy: float) -> Changes:
+    def between(cls, seen: Mapping[Approximation, FloatArray], energy: float) -> ErrorCovariance:
         """Of changes (replicates, ...) that were ``seen`` of frames whose squared norm is ``energy``."""
-        flat = np.array([change.reshape(LOOKS, -1) for change in seen.values()]).reshape(len(seen) * LOOKS, -1)
+        flat = np.array([change.reshape(REPLICATES, -1) for change in seen.values()]).reshape(
+            len(seen) * REPLICATES, -1
+        )
         with single_threaded_blas():  # sums of several threads depend on their number in the last bits
-            pairs = (flat @ flat.T).reshape(len(seen), LOOKS, len(seen), LOOKS)
+            pairs = (flat @ flat.T).reshape(len(seen), REPLICATES, len(seen), REPLICATES)
         products = np.ascontiguousarray(pairs.transpose(1, 3, 0, 2))
         return cls(tuple(seen), products / energy if energy > 0 else products)
 
@@ -142,7 +144,7 @@ class Changes:
         spread = np.sqrt((replicates - 1) * np.square(without - without.mean(axis=0)).mean(axis=0))
         return total / kept, spread
 
-    def estimate(self, parts: Collection[Part]) -> Estimate:
+    def estimate(self, parts: Collection[Approximation]) -> Estimate:
         """Relative change of the frames by all ``parts`` together; parts that were not measured change nothing."""
         chosen = np.array([[part in parts for part in self.parts]], dtype=np.float64)
         squared, spread = (float(values[0]) for values in self.squared(chosen))
@@ -216,7 +218,7 @@ class Drawn:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class PilotResult:
     """What a short replicate at the scene measured (:mod:`mitsim.planner.pilot`); all errors are relative.
 
     Attributes
@@ -227,7 +229,7 @@ class Evidence:
         of the frames by each effect that the bench has when it is left out, by each number of anchors, layers and
         cells that was tried, and by one coarse cell a pixel, or one layer, for light that lies in coarse cells.
     sample_costs
-        what each pass takes, by its name (:mod:`mitsim.light.pass_table`); of light at anchors: paths to one of them.
+        what each pass takes, by its name (:mod:`mitsim.light.passes`); of light at anchors: paths to one of them.
     spread
         what direct light takes that goes to random points of the sensor, and not to its centre.
     forming
@@ -255,7 +257,7 @@ class Evidence:
 
     depth: float
     layers: Mapping[int, tuple[float, ...]]
-    changes: Changes
+    changes: ErrorCovariance
     sample_costs: Mapping[str, SampleCost]
     spread: SampleCost
     forming: Forming
@@ -272,7 +274,7 @@ class Evidence:
     raster: tuple[Drawn, Drawn] = (Drawn(), Drawn())
     hits: float = math.inf
 
-    def with_sample_costs(self, found: Mapping[str, SampleCost]) -> Evidence:
+    def with_sample_costs(self, found: Mapping[str, SampleCost]) -> PilotResult:
         """The same, where some passes take what was ``found``."""
         return replace(self, sample_costs={**self.sample_costs, **found})
 
@@ -283,7 +285,7 @@ class Evidence:
             return (drawn.cells[0] if drawn.needed else 0,)
         return drawn.cells if drawn.needed else (0, *drawn.cells)
 
-    def error(self, *parts: Part) -> Estimate:
+    def error(self, *parts: Approximation) -> Estimate:
         """Relative change of the frames by all ``parts`` together."""
         apart = sum(self.apart.get(part.name, 0.0) ** 2 for part in parts)
         value, bound = self.changes.estimate(parts)
@@ -293,7 +295,7 @@ class Evidence:
     def effects(self) -> dict[str, Estimate]:
         """Error of leaving out each effect that the bench has."""
         measured = [part.name for part in self.changes.parts if part.count == 0]
-        return {name: self.error(Part(name)) for name in (*measured, *self.apart)}
+        return {name: self.error(Approximation(name)) for name in (*measured, *self.apart)}
 
     @cached_property
     def ladders(self) -> dict[str, dict[int, Estimate]]:

@@ -12,7 +12,7 @@ from mitsim.core.arguments import checked
 from mitsim.core.errors import MitsimError
 from mitsim.core.pictures import table
 from mitsim.core.spectral_manifests import MONO
-from mitsim.light.pass_table import PASSES
+from mitsim.light.passes import PASSES
 from mitsim.light.settings import Estimate, Settings
 
 if TYPE_CHECKING:

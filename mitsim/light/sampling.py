@@ -14,9 +14,9 @@ from mitsim.core.parallel import Behind
 from mitsim.core.seeds import integer
 from mitsim.light.cost_model import SHARED_COST
 from mitsim.light.grids import LightEstimate
-from mitsim.light.pass_table import EVEN, PASSES, even
-from mitsim.light.passes import Simulation
+from mitsim.light.passes import EVEN, PASSES, even
 from mitsim.light.settings import GROUPS, PATHS_AT_ONCE
+from mitsim.light.simulation import Simulation
 from mitsim.transport.accumulator import DeviceSums, fetched
 from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.records import PathSamples

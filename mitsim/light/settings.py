@@ -64,7 +64,7 @@ class Settings:
     effects
         names of those that are simulated (:mod:`mitsim.bench.effects`).
     samples
-        that each group is predicted to need, by the name of the pass (:mod:`mitsim.light.pass_table`): of a projector
+        that each group is predicted to need, by the name of the pass (:mod:`mitsim.light.passes`): of a projector
         pixel, or of a cell of what is followed from the camera. Below 1, one is traced; so it is where nothing is said.
     followed_anchors
         points a side of the sensor that light over several surfaces, or in mirrors, is followed to.

@@ -34,8 +34,8 @@ from mitsim.light.cost_model import (
     traced_for,
     truth_seconds,
 )
-from mitsim.light.pass_table import FOLLOWED, PASSES
-from mitsim.light.pilot_result import COUNTED, SURE, Evidence, Part, SampleCost
+from mitsim.light.passes import FOLLOWED, PASSES
+from mitsim.light.pilot_result import COUNTED, SURE, Approximation, PilotResult, SampleCost
 from mitsim.light.settings import GROUPS, Estimate, Number, Settings
 from mitsim.optics.frames import bound_over_error
 
@@ -99,14 +99,14 @@ class Candidate:
         return Estimate(*(math.hypot(error, self.noise) for error in self.systematic))
 
 
-def parts_of(evidence: Evidence, settings: Settings) -> frozenset[Part]:
-    """What ``settings`` leave out or make coarse, of all that the ``evidence`` knows."""
+def approximations_of(pilot_result: PilotResult, settings: Settings) -> frozenset[Approximation]:
+    """What ``settings`` leave out or make coarse, of all that the ``pilot_result`` knows."""
     counts = zip(COUNTED, counted(settings), strict=True)
-    off = (Part(name) for name in evidence.effects if name not in settings.effects)
-    return frozenset(chain((Part(*count) for count in counts), off))
+    off = (Approximation(name) for name in pilot_result.effects if name not in settings.effects)
+    return frozenset(chain((Approximation(*count) for count in counts), off))
 
 
-def cheapest(accuracy: float, evidence: Evidence, switches: Mapping[str, bool], sure: float = SURE) -> Candidate:
+def cheapest(accuracy: float, pilot_result: PilotResult, switches: Mapping[str, bool], sure: float = SURE) -> Candidate:
     """The choice of least work whose predicted total error is below ``accuracy``; failing that, of least error.
 
     What the user switched off, and light that is known to be missing, does not count for that: nothing could make up
@@ -116,39 +116,39 @@ def cheapest(accuracy: float, evidence: Evidence, switches: Mapping[str, bool], 
     ----------
     accuracy
         relative rms error of the expected frames.
-    evidence
+    pilot_result
         what the pilot measured.
     switches
         effects that the user switches on or off, by name.
     sure
         standard errors that are added to an estimate.
     """
-    table, index = Candidates(evidence, switches, sure).best(accuracy)
+    table, index = Candidates(pilot_result, switches, sure).best(accuracy)
     return table.candidate(index)
 
 
 class Candidates:
-    """All combinations that the evidence lets choose from, at any accuracy: what they leave is added up once.
+    """All combinations that the pilot result lets choose from, at any accuracy: what they leave is added up once.
 
     Parameters
     ----------
-    evidence, switches, sure
+    pilot_result, switches, sure
         as for :func:`cheapest`.
     """
 
-    def __init__(self, evidence: Evidence, switches: Mapping[str, bool], sure: float = SURE) -> None:
-        self.evidence = evidence
-        counts = [_allowed(evidence, name, switches) for name in COUNTED]
+    def __init__(self, pilot_result: PilotResult, switches: Mapping[str, bool], sure: float = SURE) -> None:
+        self.pilot_result = pilot_result
+        counts = [_allowed(pilot_result, name, switches) for name in COUNTED]
         rows = np.array(list(product(*counts, _COARSE_CELLS, (0, 1))), dtype=np.float64)
         rows = rows[(rows[:, 3] > 1) | (rows[:, 5] == 1)]  # width is that of what several anchors see
-        if evidence.occluded:
+        if pilot_result.occluded:
             # Light of one anchor is what the sensor's centre sees, of several what all of it does: all pixels, or none.
             rows = rows[(rows[:, 0] > 1) == (rows[:, 4] > 1)]
         given = _given(switches)
         self._tables = [
-            _Table(math.nan, evidence, (effects, cells), rows, given, sure)
-            for effects in _subsets(evidence, switches)
-            for cells in evidence.forms(in_waves(effects))
+            _Table(math.nan, pilot_result, (effects, cells), rows, given, sure)
+            for effects in _subsets(pilot_result, switches)
+            for cells in pilot_result.forms(in_waves(effects))
         ]
 
     def best(self, accuracy: float) -> tuple[_Table, int]:
@@ -159,49 +159,51 @@ class Candidates:
     def seconds(self, accuracy: float) -> tuple[float, bool]:
         """Seconds at fixed unit costs of that choice and of its truth, and whether it keeps the ``accuracy``."""
         table, index = self.best(accuracy)
-        truth = truth_seconds(self.evidence, table.settings(index), FIXED)
+        truth = truth_seconds(self.pilot_result, table.settings(index), FIXED)
         return float(table.work[index]) + truth, bool(table.fits[index])
 
 
 def predicted(
-    accuracy: float, evidence: Evidence, settings: Settings, switches: Mapping[str, bool], sure: float = SURE
+    accuracy: float, pilot_result: PilotResult, settings: Settings, switches: Mapping[str, bool], sure: float = SURE
 ) -> Candidate:
     """What ``settings`` leave and take with samples of their own for the rest of the budget.
 
     Parameters
     ----------
-    accuracy, evidence, switches, sure
+    accuracy, pilot_result, switches, sure
         as for :func:`cheapest`.
     settings
         effects and numbers.
     """
-    return _table_of(accuracy, evidence, settings, switches, sure).candidate(0)
+    return _table_of(accuracy, pilot_result, settings, switches, sure).candidate(0)
 
 
 def _table_of(
-    accuracy: float, evidence: Evidence, settings: Settings, switches: Mapping[str, bool], sure: float
+    accuracy: float, pilot_result: PilotResult, settings: Settings, switches: Mapping[str, bool], sure: float
 ) -> _Table:
     """Predictions of ``settings`` alone; all else as for :func:`cheapest`."""
     row = np.array([[*counted(settings), settings.coarse_cells, settings.coarse_layers]], dtype=np.float64)
-    drawn = evidence.raster[in_waves(settings.effects)]
+    drawn = pilot_result.raster[in_waves(settings.effects)]
     cells = (settings.raster_cells or drawn.cells[0]) if settings.raster or drawn.needed else 0
-    return _Table(accuracy, evidence, (settings.effects, cells), row, _given(switches), sure)
+    return _Table(accuracy, pilot_result, (settings.effects, cells), row, _given(switches), sure)
 
 
-def value_of_refining(accuracy: float, evidence: Evidence, switches: Mapping[str, bool]) -> tuple[float, Part]:
-    """Work that knowing the evidence for certain could save, and the part that is known worst.
+def value_of_refining(
+    accuracy: float, pilot_result: PilotResult, switches: Mapping[str, bool]
+) -> tuple[float, Approximation]:
+    """Work that knowing the pilot result for certain could save, and the part that is known worst.
 
     Parameters
     ----------
-    accuracy, evidence, switches
+    accuracy, pilot_result, switches
         as for :func:`cheapest`.
     """
-    careful, hopeful = (cheapest(accuracy, evidence, switches, sure) for sure in (SURE, 0.0))
-    unsure = _table_of(accuracy, evidence, hopeful.settings, switches, 0.0).unsure
-    worst = max(sorted(unsure), key=lambda part: unsure[part], default=Part("cells", 1))
+    careful, hopeful = (cheapest(accuracy, pilot_result, switches, sure) for sure in (SURE, 0.0))
+    unsure = _table_of(accuracy, pilot_result, hopeful.settings, switches, 0.0).unsure
+    worst = max(sorted(unsure), key=lambda part: unsure[part], default=Approximation("cells", 1))
     if careful.fits:
         return careful.work - hopeful.work, worst
-    lucky = cheapest(accuracy, evidence, switches, _LUCKY)
+    lucky = cheapest(accuracy, pilot_result, switches, _LUCKY)
     return lucky.work if lucky.fits else 0.0, worst
 
 
@@ -213,7 +215,7 @@ class _Table:
 
     Parameters
     ----------
-    accuracy, evidence, sure
+    accuracy, pilot_result, sure
         as for :func:`cheapest`.
     form
         effects that are on, and cells along a pixel of the raster that frames are formed of; 0: a sum of terms.
@@ -227,16 +229,16 @@ class _Table:
     def __init__(
         self,
         accuracy: float,
-        evidence: Evidence,
+        pilot_result: PilotResult,
         form: tuple[frozenset[str], int],
         rows: FloatArray,
-        given: frozenset[Part],
+        given: frozenset[Approximation],
         sure: float,
     ) -> None:
         self.effects, self.raster_cells = form
-        self.accuracy, self.evidence, self.rows = accuracy, evidence, rows
+        self.accuracy, self.pilot_result, self.rows = accuracy, pilot_result, rows
         self.given, self.sure = given, sure
-        self.numbers = Numbers.chosen([*rows.T], self.effects, len(evidence.occluded), self.raster_cells)
+        self.numbers = Numbers.chosen([*rows.T], self.effects, len(pilot_result.occluded), self.raster_cells)
 
     def at(self, accuracy: float) -> _Table:
         """The same combinations at an ``accuracy``: what does not depend on it is shared.
@@ -269,9 +271,9 @@ class _Table:
         numbers = (int(number) for number in self.rows[index])
         anchors, layers, cells, followed, occluded, width, coarse, all_layers = numbers
         return Settings(
-            depth=self.evidence.depth,
+            depth=self.pilot_result.depth,
             anchors=anchors,
-            layers=self.evidence.layers[layers] if layers > 1 else (),
+            layers=self.pilot_result.layers[layers] if layers > 1 else (),
             subdivision=cells,
             effects=self.effects,
             samples={name: float(count[index]) for name, count in self.needed.items()},
@@ -279,11 +281,11 @@ class _Table:
             followed_width=width,
             coarse_cells=coarse,
             coarse_layers=bool(all_layers),
-            shared=self.evidence.shared,
-            repeats=self.evidence.repeats,
-            reach=self.evidence.reach,
-            sharp=self.evidence.sharp,
-            occluded=self.evidence.occluded,
+            shared=self.pilot_result.shared,
+            repeats=self.pilot_result.repeats,
+            reach=self.pilot_result.reach,
+            sharp=self.pilot_result.sharp,
+            occluded=self.pilot_result.occluded,
             occluded_anchors=occluded,
             raster=self.raster_cells > 0,
             raster_cells=self.raster_cells,
@@ -291,17 +293,17 @@ class _Table:
 
     def candidate(self, index: int) -> Candidate:
         """The choice of a row."""
-        evidence = self.evidence
+        pilot_result = self.pilot_result
         lacking = {
-            "light over sharp lobes": evidence.unresolved,
-            "light over mirrors or curved glass both ways, or once and a sharp lobe (left out)": evidence.left_out,
-            "light over small mirrors alone (not resolved)": evidence.glint,
+            "light over sharp lobes": pilot_result.unresolved,
+            "light over mirrors or curved glass both ways, or once and a sharp lobe (left out)": pilot_result.left_out,
+            "light over small mirrors alone (not resolved)": pilot_result.glint,
         }
         missing = min(sum(lacking.values()), 1.0)
         # Errors of the light that is there count for its part of all.
         rest = [float(self._systematic(sure, frozenset())[index]) for sure in (0.0, SURE)]
-        if not math.isinf(self.evidence.hits):
-            one_hit = 1 / (self.evidence.hits * float(self.samples["direct"][index]))
+        if not math.isinf(self.pilot_result.hits):
+            one_hit = 1 / (self.pilot_result.hits * float(self.samples["direct"][index]))
             rest = [math.hypot(error, hits * one_hit) for error, hits in zip(rest, _OFF_BY_HITS, strict=True)]
         value, bound = (missing + (1 - missing) * error for error in rest)
         return Candidate(
@@ -322,25 +324,27 @@ class _Table:
         return self._systematic(self.sure, self.given)
 
     @property
-    def unsure(self) -> dict[Part, float]:
+    def unsure(self) -> dict[Approximation, float]:
         """By part that the only row leaves, what chance may add to the square of its error."""
-        weights = {part: float(self._weight(part)[0]) for part in self.evidence.changes.parts}
-        errors = {part: self.evidence.error(part) for part, weight in weights.items() if weight}
+        weights = {part: float(self._weight(part)[0]) for part in self.pilot_result.changes.parts}
+        errors = {part: self.pilot_result.error(part) for part, weight in weights.items() if weight}
         return {part: weights[part] ** 2 * (each.bound**2 - each.value**2) for part, each in errors.items()}
 
-    def _systematic(self, sure: float, ignored: frozenset[Part]) -> FloatArray:
+    def _systematic(self, sure: float, ignored: frozenset[Approximation]) -> FloatArray:
         """(m,) what all that is left out or made coarse adds up to, but for parts that are ``ignored``."""
-        changes, apart = self.evidence.changes, self.evidence.apart
+        changes, apart = self.pilot_result.changes, self.pilot_result.apart
         chosen = np.stack([self._weight(part) * (part not in ignored) for part in changes.parts], axis=1)
-        drawn = [size**2 for name, size in apart.items() if name not in self.effects and Part(name) not in ignored]
-        drawn += [self.evidence.sharp.left**2] if self.evidence.sharp else []
+        drawn = [
+            size**2 for name, size in apart.items() if name not in self.effects and Approximation(name) not in ignored
+        ]
+        drawn += [self.pilot_result.sharp.left**2] if self.pilot_result.sharp else []
         cells = self.raster_cells
-        of_raster = self.evidence.raster[in_waves(self.effects)].left(cells) if cells else None
+        of_raster = self.pilot_result.raster[in_waves(self.effects)].left(cells) if cells else None
         drawn += [of_raster[sure > 0] ** 2] if of_raster else []
         squared, spread = changes.squared(chosen)
         return np.asarray(np.sqrt(np.maximum(np.maximum(squared, 0) + sure * spread, 0) + sum(drawn)))
 
-    def _weight(self, part: Part) -> FloatArray:
+    def _weight(self, part: Approximation) -> FloatArray:
         """(m,) how much of a part's change each row leaves."""
         light, _, what = part.name.rpartition(" ")
         numbers, finer_cells = self.numbers, np.square(1 / self.numbers.coarse_cells)
@@ -359,7 +363,7 @@ class _Table:
     @cached_property
     def _left_by_layers(self) -> FloatArray:
         """(m,) part of one layer's error that the layers of coarse light leave."""
-        ladder = self.evidence.ladders["layers"]
+        ladder = self.pilot_result.ladders["layers"]
         parts = np.zeros(max(ladder) + 1)
         for count, error in ladder.items():
             parts[count] = min(error.bound / ladder[1].bound, 1.0) if ladder[1].bound else 0.0
@@ -378,20 +382,22 @@ class _Table:
 
         Where looks see the error of all shots, it needs no margin; what the pilot saw of a few frames does.
         """
-        forming, left = self.evidence.forming, np.square(_MARGIN * self.accuracy) - np.square(self._avoidable)
+        forming, left = self.pilot_result.forming, np.square(_MARGIN * self.accuracy) - np.square(self._avoidable)
         margin = _MARGIN if tells_all(forming.classes, forming.shots, forming.pixels) else 1.0
         target = np.where(left > 0, np.sqrt(np.maximum(left, 0)) / margin, _MARGIN * self.accuracy)
         return (
-            target if math.isinf(self.evidence.hits) else target * math.sqrt(1 - (_ONE_HIT * _OFF_BY_HITS.bound) ** 2)
+            target
+            if math.isinf(self.pilot_result.hits)
+            else target * math.sqrt(1 - (_ONE_HIT * _OFF_BY_HITS.bound) ** 2)
         )
 
     @cached_property
     def _work_of_sample(self) -> dict[str, Number]:
         """(m,) work of one sample in every group, by kind of light."""
-        lines = traced_for(self.evidence.forming.lines, self.evidence.forming.parted)
+        lines = traced_for(self.pilot_result.forming.lines, self.pilot_result.forming.parted)
         return {
             name: lines * GROUPS * FIXED.passes[name] * sample_cost.paths * PASSES[name].connections(self.numbers)
-            for name, sample_cost in sample_costs(self.evidence, self.effects).items()
+            for name, sample_cost in sample_costs(self.pilot_result, self.effects).items()
         }
 
     @cached_property
@@ -411,7 +417,7 @@ class _Table:
             share = np.sqrt(np.divide(part, every, out=np.ones(len(every)), where=part > 0))
             needed = self._by_row(name, partial(_needed, target=single * share))
             if name == "direct":
-                needed = np.maximum(needed, 1 / (self.evidence.hits * _ONE_HIT * self.target))
+                needed = np.maximum(needed, 1 / (self.pilot_result.hits * _ONE_HIT * self.target))
             # What needs no whole sample does not take two when all others grow.
             found[name] = np.where(needed < 1, needed, PASSES[name].whole(needed))
         return found
@@ -428,15 +434,15 @@ class _Table:
     def _by_row(self, name: str, of: Callable[[SampleCost], Number]) -> FloatArray:
         """(m,) something ``of`` the light ``name``: where there are several anchors, direct light goes to random points
         of the sensor."""
-        found = of(sample_costs(self.evidence, self.effects)[name]) + np.zeros(len(self.rows))
+        found = of(sample_costs(self.pilot_result, self.effects)[name]) + np.zeros(len(self.rows))
         if name == "direct":
-            found = np.where(self.rows[:, 0] > 1, of(self.evidence.spread), found)
+            found = np.where(self.rows[:, 0] > 1, of(self.pilot_result.spread), found)
         return np.asarray(found)
 
     @cached_property
     def _entries(self) -> FloatArray:
         """(m,) of one group's accumulated light."""
-        pixels, classes = self.evidence.sample_costs["direct"].paths, self.evidence.forming.classes
+        pixels, classes = self.pilot_result.sample_costs["direct"].paths, self.pilot_result.forming.classes
         found = entries(pixels, classes, self.numbers, self.samples)
         return np.asarray(found) + np.zeros(len(self.rows))
 
@@ -444,7 +450,7 @@ class _Table:
     def work(self) -> FloatArray:
         """(m,) seconds at fixed unit costs."""
         tracing = sum(self.samples[name] * price for name, price in self._work_of_sample.items())
-        forming = self.evidence.forming
+        forming = self.pilot_result.forming
         accumulating = accumulation_seconds(forming, self.numbers, self._entries, FIXED)
         shown = optics_seconds(forming, self.numbers, FIXED) + checking_seconds(forming, self.numbers, FIXED)
         return np.asarray(tracing + accumulating + shown)
@@ -476,29 +482,29 @@ def counted(settings: Settings) -> tuple[int, ...]:
     return tuple(int(getattr(numbers, name)) for name in COUNTED)
 
 
-def _counts(evidence: Evidence, name: str) -> list[int]:
-    return list(evidence.ladders[name])
+def _counts(pilot_result: PilotResult, name: str) -> list[int]:
+    return list(pilot_result.ladders[name])
 
 
-def _allowed(evidence: Evidence, name: str, switches: Mapping[str, bool]) -> list[int]:
+def _allowed(pilot_result: PilotResult, name: str, switches: Mapping[str, bool]) -> list[int]:
     """Numbers of ``name`` that the user leaves to choose from."""
-    counts = _counts(evidence, name)
+    counts = _counts(pilot_result, name)
     if name not in switches or len(counts) == 1:
         return counts
     return [count for count in counts if (count > 1) == switches[name]]
 
 
-def _given(switches: Mapping[str, bool]) -> frozenset[Part]:
+def _given(switches: Mapping[str, bool]) -> frozenset[Approximation]:
     """What is left out by the user's choice."""
     off = {name for name, on in switches.items() if not on}
     if "anchors" in off:
         off.add("occluded_anchors")
-    return frozenset(Part(name, int(name in COUNTED)) for name in off)
+    return frozenset(Approximation(name, int(name in COUNTED)) for name in off)
 
 
-def _subsets(evidence: Evidence, switches: Mapping[str, bool]) -> Iterator[frozenset[str]]:
+def _subsets(pilot_result: PilotResult, switches: Mapping[str, bool]) -> Iterator[frozenset[str]]:
     """Effects that may be on together: those that take no time always are, unless the user switches them off."""
-    takes_time, present = costly_effects(), frozenset(evidence.effects)
+    takes_time, present = costly_effects(), frozenset(pilot_result.effects)
     free = [name for name in EFFECTS if name in takes_time & present and name not in switches]
     always = {name for name in EFFECTS if switches.get(name, name in present - takes_time)}
     for several in chain.from_iterable(combinations(free, count) for count in range(len(free) + 1)):
@@ -540,7 +546,7 @@ def accuracy_for_time(candidates: Candidates, seconds: float, finest: float, kep
     seconds
         for light, frames and truth.
     finest
-        accuracy that the evidence is good for.
+        accuracy that the pilot result is good for.
     kept
         whether the choice must be predicted to keep the accuracy; else only its price counts.
     """

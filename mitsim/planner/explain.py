@@ -1,4 +1,4 @@
-"""Deciding a plan: measured evidence and an accuracy in; what is simulated, why, and what it costs, out.
+"""Deciding a plan: measured pilot result and an accuracy in; what is simulated, why, and what it costs, out.
 
 Accuracy is the relative rms error of the expected frames, ``||a - b|| / ||b||`` over all frames and pixels, all in all:
 what is left out, what is made coarse, and sampling. The cheapest settings that are predicted to keep it are chosen
@@ -27,8 +27,8 @@ from mitsim.light.cost_model import (
     truth_seconds,
     unit_costs_of,
 )
-from mitsim.light.pass_table import FOLLOWED
-from mitsim.light.pilot_result import Evidence
+from mitsim.light.passes import FOLLOWED
+from mitsim.light.pilot_result import PilotResult
 from mitsim.light.plan import Plan, PlanRow, State
 from mitsim.light.settings import Estimate, Settings
 from mitsim.planner.choose import Candidate, cheapest, predicted
@@ -51,7 +51,7 @@ _VAGUE = 2.0
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """What a plan says of a bench's devices besides the pilot's evidence.
+    """What a plan says of a bench's devices besides the pilot's pilot result.
 
     Attributes
     ----------
@@ -125,9 +125,9 @@ def _limits(bench: Apparatus, waves: bool) -> Iterator[str]:
 # -------- A plan, and what it says of its choice
 
 
-def decide(
+def explain_plan(
     accuracy: float,
-    evidence: Evidence,
+    pilot_result: PilotResult,
     facts: SceneFacts,
     switches: Mapping[str, bool] | None = None,
     chosen: Candidate | None = None,
@@ -138,7 +138,7 @@ def decide(
     ----------
     accuracy
         relative rms error of the expected frames.
-    evidence
+    pilot_result
         what the pilot measured.
     facts
         what to say of the devices.
@@ -149,9 +149,9 @@ def decide(
     """
     check_accuracy(accuracy)
     switches = switches or {}
-    chosen = chosen or cheapest(accuracy, evidence, switches)
-    words = _Words(accuracy, evidence, chosen, facts, switches)
-    stages = _stages(evidence, chosen.settings, unit_costs_of(evidence))
+    chosen = chosen or cheapest(accuracy, pilot_result, switches)
+    words = _Words(accuracy, pilot_result, chosen, facts, switches)
+    stages = _stages(pilot_result, chosen.settings, unit_costs_of(pilot_result))
     return Plan(
         accuracy=accuracy,
         effects=words.rows,
@@ -165,16 +165,16 @@ def decide(
     )
 
 
-def _stages(evidence: Evidence, settings: Settings, costs: UnitCosts) -> dict[str, float]:
+def _stages(pilot_result: PilotResult, settings: Settings, costs: UnitCosts) -> dict[str, float]:
     """Seconds of transport, truth and optics."""
-    forming, numbers = evidence.forming, Numbers.of(settings)
-    tracing = tracing_seconds(evidence, settings, costs)
-    held = entries(evidence.sample_costs["direct"].paths, forming.classes, numbers, settings)
+    forming, numbers = pilot_result.forming, Numbers.of(settings)
+    tracing = tracing_seconds(pilot_result, settings, costs)
+    held = entries(pilot_result.sample_costs["direct"].paths, forming.classes, numbers, settings)
     return {
         "transport": sum(tracing.values())
         + float(accumulation_seconds(forming, numbers, held, costs))
         + float(checking_seconds(forming, numbers, costs)),
-        "truth": truth_seconds(evidence, settings, costs),
+        "truth": truth_seconds(pilot_result, settings, costs),
         "optics": float(optics_seconds(forming, numbers, costs)),
     }
 
@@ -184,7 +184,7 @@ class _Words:
     """What a plan says of its choice."""
 
     accuracy: float
-    evidence: Evidence
+    pilot_result: PilotResult
     chosen: Candidate
     facts: SceneFacts
     switches: Mapping[str, bool]
@@ -200,7 +200,7 @@ class _Words:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Why the frames will not keep the accuracy."""
-        chosen, accuracy, missing = self.chosen, self.accuracy, self.evidence.unresolved
+        chosen, accuracy, missing = self.chosen, self.accuracy, self.pilot_result.unresolved
         if chosen.total.bound <= accuracy:
             return ()
         said, parts = [], self._left()
@@ -210,10 +210,10 @@ class _Words:
                 "most of it; give those surfaces more roughness, or make them perfect mirrors (conductor)"
             )
         largest = max(parts, key=lambda name: parts[name])
-        shapes, mirror = self.facts.shapes, self.evidence.mirror
-        if mirror is not None and shapes and self.evidence.left_out >= min(accuracy, parts[largest]):
+        shapes, mirror = self.facts.shapes, self.pilot_result.mirror
+        if mirror is not None and shapes and self.pilot_result.left_out >= min(accuracy, parts[largest]):
             said.append(self._left_out(shapes[mirror]))
-        if self.facts.mirrors and self.evidence.glint >= min(accuracy, parts[largest]):
+        if self.facts.mirrors and self.pilot_result.glint >= min(accuracy, parts[largest]):
             said.append(self._unresolved_specular(self.facts.mirrors))
         return tuple(said) or (
             f"the predicted total error, up to {chosen.total.bound:.1e}, exceeds the requested {accuracy:g}; "
@@ -225,7 +225,7 @@ class _Words:
         kinds = Counter(str(mirror.attributes.get("type", "shape")) for mirror in mirrors)
         among = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
         rule = (
-            f"{self.evidence.glint:.2g} of the light comes over the scene's mirrors and curved glass alone "
+            f"{self.pilot_result.glint:.2g} of the light comes over the scene's mirrors and curved glass alone "
             f"({among}; this is the first), in beams too fine to be placed on the sensor: it is left out, or in the "
             "wrong pixels; use fewer or larger ones, move them apart, or make them rough"
         )
@@ -234,7 +234,7 @@ class _Words:
     def _left_out(self, mirror: Tag) -> str:
         """What is lost over a ``mirror`` or curved glass."""
         rule = (
-            f"{self.evidence.left_out:.2g} of the light comes over it and, besides, a mirror, curved glass or a "
+            f"{self.pilot_result.left_out:.2g} of the light comes over it and, besides, a mirror, curved glass or a "
             "sharp lobe, where paths find it never or too seldom, so all or most of it is left out of the frames; turn "
             "it away, make it rough, or give the projector a lens (aperture_radius_mm) with the effect interreflection"
         )
@@ -242,7 +242,7 @@ class _Words:
 
     def _left(self) -> dict[str, float]:
         """By what leaves it, the bound on each part of the systematic error."""
-        evidence, settings, of_raster = self.evidence, self.chosen.settings, self._of_raster
+        pilot_result, settings, of_raster = self.pilot_result, self.chosen.settings, self._of_raster
         anchors, layers, cells = settings.anchors, len(settings.depths), settings.subdivision
         sharp = settings.sharp
         followed, occluded, width = settings.followed_anchors, settings.occluded_anchors, settings.followed_width
@@ -256,16 +256,18 @@ class _Words:
             **({f"anchors of sharp light ({sharp.anchors}x{sharp.anchors})": sharp.left} if sharp else {}),
             f"occluded anchors ({occluded}x{occluded})": self._number("occluded_anchors", occluded).bound,
             **self.chosen.lacking,
-            **{f"{name} (off)": e.bound for name, e in evidence.effects.items() if name not in settings.effects},
+            **{f"{name} (off)": e.bound for name, e in pilot_result.effects.items() if name not in settings.effects},
         }
 
     def _number(self, name: str, count: int) -> Estimate:
-        return self.evidence.ladders[name][count]
+        return self.pilot_result.ladders[name][count]
 
     def _seconds(self, **changes: Any) -> float:
         """What the settings take beyond those with ``changes``."""
-        settings, costs = self.chosen.settings, unit_costs_of(self.evidence)
-        both = (sum(_stages(self.evidence, each, costs).values()) for each in (settings, replace(settings, **changes)))
+        settings, costs = self.chosen.settings, unit_costs_of(self.pilot_result)
+        both = (
+            sum(_stages(self.pilot_result, each, costs).values()) for each in (settings, replace(settings, **changes))
+        )
         with_it, without = both
         return max(with_it - without, 0.0)
 
@@ -274,7 +276,7 @@ class _Words:
         return f"without it the error would be up to {self._total(settings):.1e}, and {self.accuracy:g} is allowed"
 
     def _total(self, settings: Settings) -> float:
-        other = predicted(self.accuracy, self.evidence, settings, {})
+        other = predicted(self.accuracy, self.pilot_result, settings, {})
         return math.hypot(other.systematic.bound, self.chosen.noise)
 
     def _anchors(self) -> PlanRow:
@@ -286,7 +288,7 @@ class _Words:
     def _layers(self) -> PlanRow:
         depths, one = self.chosen.settings.depths, self._number("layers", 1)
         if len(depths) == 1:
-            reason = f"the light is seen at {self.evidence.depth:.1f} mm; one layer leaves {_error_words(one)}"
+            reason = f"the light is seen at {self.pilot_result.depth:.1f} mm; one layer leaves {_error_words(one)}"
             return PlanRow("layers", "off", reason, one.value, 0.0)
         left = _error_words(self._number("layers", len(depths)))
         reason = f"the light is seen from {depths[-1]:.0f} to {depths[0]:.0f} mm; {len(depths)} layers leave {left}"
@@ -295,7 +297,7 @@ class _Words:
         )
 
     def _cells(self) -> PlanRow:
-        cells, errors = self.chosen.settings.subdivision, self.evidence.ladders["cells"]
+        cells, errors = self.chosen.settings.subdivision, self.pilot_result.ladders["cells"]
         reason = f"{cells}x{cells} cells of even light a projector pixel leave {_error_words(errors[cells])}"
         return PlanRow("cells", "approximate", reason, max(error.value for error in errors.values()), 0.0)
 
@@ -310,7 +312,7 @@ class _Words:
         return self._row_of_anchors("followed_anchors", f"{light}: one point", several, seconds)
 
     def _occluded_anchors(self) -> PlanRow:
-        pixels, side = len(self.evidence.occluded), self.chosen.settings.occluded_anchors
+        pixels, side = len(self.pilot_result.occluded), self.chosen.settings.occluded_anchors
         if not pixels:
             return PlanRow("occluded-anchors", "off", "few anchors serve all projector pixels", 0.0, 0.0)
         hidden = f"{pixels} projector pixels are hidden from part of the sensor"
@@ -335,18 +337,18 @@ class _Words:
     @property
     def _of_raster(self) -> Estimate | None:
         """What the raster leaves that is chosen, or one of the fewest cells where the mask may be drawn on one."""
-        return self.evidence.raster[self._waves].left(self.chosen.settings.raster_cells)
+        return self.pilot_result.raster[self._waves].left(self.chosen.settings.raster_cells)
 
     def _shadow(self) -> tuple[PlanRow, ...]:
         """How frames behind a mask of more than two terms are formed."""
-        left, settings, forming = self._of_raster, self.chosen.settings, self.evidence.forming
+        left, settings, forming = self._of_raster, self.chosen.settings, self.pilot_result.forming
         if left is None:
             return ()
-        drawn, costs = self.evidence.raster[self._waves], unit_costs_of(self.evidence)
+        drawn, costs = self.pilot_result.raster[self._waves], unit_costs_of(self.pilot_result)
 
         def seconds(cells: int) -> float:
             formed = replace(settings, raster=cells > 0, raster_cells=cells)
-            return _stages(self.evidence, formed, costs)["optics"]
+            return _stages(self.pilot_result, formed, costs)["optics"]
 
         fewest, leaves = drawn.cells[0], _error_words(left)
         cells = settings.raster_cells or fewest
@@ -369,7 +371,7 @@ class _Words:
         settings, name = self.chosen.settings, effect.name
         on = name in settings.effects
         state: State = "exact" if on else "off"
-        error = self.evidence.effects.get(name)
+        error = self.pilot_result.effects.get(name)
         if error is None:
             return PlanRow(name, state, effect.absent or "nothing in the scene calls for it", 0.0, 0.0)
         said = [self.facts.notes.get(name, ""), "switched by the user" if name in self.switches else ""]

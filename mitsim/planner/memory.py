@@ -12,8 +12,8 @@ from mitsim.devices.patterns import Lighting
 from mitsim.devices.plate import FEW, Plate
 from mitsim.devices.projector import Spectrum
 from mitsim.light.cost_model import Numbers, entries
-from mitsim.light.passes import Simulation
 from mitsim.light.settings import GROUPS, Settings
+from mitsim.light.simulation import Simulation
 from mitsim.optics.fft_shadow import cells_a_side, cells_per_pixel, points_per_cell
 from mitsim.optics.frames import PROBES, frames_in_memory
 

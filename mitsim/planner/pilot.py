@@ -18,10 +18,18 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.light.cost_model import FIXED, Numbers, forming_seconds
-from mitsim.light.pass_table import PASSES
-from mitsim.light.passes import Simulation
-from mitsim.light.pilot_result import LOOKS, Changes, Drawn, Evidence, Forming, Part, SampleCost
+from mitsim.light.passes import PASSES
+from mitsim.light.pilot_result import (
+    REPLICATES,
+    Approximation,
+    Drawn,
+    ErrorCovariance,
+    Forming,
+    PilotResult,
+    SampleCost,
+)
 from mitsim.light.settings import Settings
+from mitsim.light.simulation import Simulation
 from mitsim.planner.pilot_anchors import AnchorRuns, FollowedRuns, PenumbraRuns
 from mitsim.planner.pilot_direct import SMOOTH, DirectRuns, occluded_pixels, sharp_pixels
 from mitsim.planner.pilot_effects import EffectRuns
@@ -80,7 +88,7 @@ _ALIGNED = 1e-6
 """Relative distance from the aligned plane that is rounding: the plane keeps its exact cells."""
 
 
-class Look:
+class PilotRuns:
     """A look at a scene, as short as it can be at first; each of its runs is repeated with more samples.
 
     Parameters
@@ -163,7 +171,7 @@ class Look:
             if self.occluded is None or finer.occluded(count) == now.occluded(count):
                 return math.inf
             connections = sum(part.count**2 for part in self.occluded.changes if " " not in part.name)
-            paths = costs["penumbra"] * FINER * self.occluded.paths / LOOKS * connections
+            paths = costs["penumbra"] * FINER * self.occluded.paths / REPLICATES * connections
             changes = len(self.occluded.changes)
         elif run == "followed":
             connections = sum(part.count**2 for part in self.followed.changes if part.name == "followed_anchors")
@@ -176,7 +184,7 @@ class Look:
             )
             paths = costs["direct"] * pixels * finer.direct + followed * finer.followed
             changes = _OF_EFFECTS * len(self.present)
-        return LOOKS * paths + changes * float(one)
+        return REPLICATES * paths + changes * float(one)
 
     @property
     def seconds(self) -> float:
@@ -187,7 +195,9 @@ class Look:
     @property
     def _rough(self) -> bool:
         """Whether a few anchors may leave too much: light that is hidden from part of the sensor, or sharp gloss."""
-        few = Changes.between(self.anchored.of_few, self.switched.light**2).estimate([Part("anchors", SMOOTH)])
+        few = ErrorCovariance.between(self.anchored.of_few, self.switched.light**2).estimate(
+            [Approximation("anchors", SMOOTH)]
+        )
         return few.bound > _ROUGH * self.accuracy
 
     def heavy(self, samples: int) -> dict[str, SampleCost]:
@@ -252,7 +262,7 @@ class Look:
         if not loaded.glossy:
             return 0.0
         every = highlights(loaded.scene, loaded.camera, self._seen.physics.projector, geometry)
-        unmet = every.unmet(self.samples["cells"].fine * LOOKS)
+        unmet = every.unmet(self.samples["cells"].fine * REPLICATES)
         if not len(unmet.pixels):
             return 0.0
         near = with_neighbours(np.isin(np.arange(self.bench.n**2), unmet.pixels), self.bench.n)
@@ -270,14 +280,14 @@ class Look:
         return unsure / (other + found + unsure) if unsure else 0.0
 
     @cached_property
-    def evidence(self) -> Evidence:
+    def pilot_result(self) -> PilotResult:
         """What has been found."""
         fine, switched, anchored = self.fine, self.switched, self.anchored
         seen = {**anchored.changes, **fine.changes, **switched.changes, **self.followed.changes}
         if self.occluded:
             seen |= self.occluded.changes
         light, sharp, apart = switched.light, self._sharp, self._base.sharp
-        samples = self.samples["effects"].followed * LOOKS
+        samples = self.samples["effects"].followed * REPLICATES
         indirect, shared, repeats = switched.indirect_cost()
         sample_costs = {
             **switched.sample_costs,
@@ -289,13 +299,13 @@ class Look:
         }
         left_out, mirror = self._left_out.unseen(_FEWEST_HITS / samples, _FEWEST_MET / samples)
         found = self._light + sharp.irradiance + switched.received
-        few = not apart and sharp.hits * self.samples["cells"].fine * LOOKS < _FEWEST_HITS
+        few = not apart and sharp.hits * self.samples["cells"].fine * REPLICATES < _FEWEST_HITS
         unmet = self._unmet
         unresolved = unmet + (sharp.irradiance if few else 0.0)
-        return Evidence(
+        return PilotResult(
             depth=self._base.depth,
             layers=fine.layers,
-            changes=Changes.between(seen, light**2),
+            changes=ErrorCovariance.between(seen, light**2),
             sample_costs=sample_costs,
             spread=fine.spread(light),
             shared=shared,
@@ -314,18 +324,18 @@ class Look:
         )
 
 
-def measure(bench: Apparatus, lighting: Lighting, accuracy: float, seed: int) -> Evidence:
-    """What the shortest :class:`Look` of these arguments finds.
+def measure(bench: Apparatus, lighting: Lighting, accuracy: float, seed: int) -> PilotResult:
+    """What the shortest :class:`PilotRuns` of these arguments finds.
 
     Parameters
     ----------
     bench, lighting, accuracy, seed
         as there.
     """
-    return Look(bench, lighting, accuracy, seed).evidence
+    return PilotRuns(bench, lighting, accuracy, seed).pilot_result
 
 
-def run_of(part: Part) -> str:
+def run_of(part: Approximation) -> str:
     """The run that tells the error of a ``part``."""
     light, _, _ = part.name.rpartition(" ")
     if light:

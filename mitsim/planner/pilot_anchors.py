@@ -14,10 +14,10 @@ from mitsim.bench.bench import Apparatus
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
 from mitsim.light.grids import Grid
-from mitsim.light.pass_table import PASSES, PassTracer
-from mitsim.light.passes import Simulation
-from mitsim.light.pilot_result import LOOKS, Noise, Part, SampleCost
+from mitsim.light.passes import PASSES, PassTracer
+from mitsim.light.pilot_result import REPLICATES, Approximation, Noise, SampleCost
 from mitsim.light.settings import Settings
+from mitsim.light.simulation import Simulation
 from mitsim.planner.pilot_direct import shown_pixels, tracer_of
 from mitsim.planner.pilot_samples import EVEN_CELLS, Sample, coarsened, heavy_paths, ladder, noise, norm
 from mitsim.transport.records import PathSamples
@@ -75,7 +75,7 @@ class AnchorRuns:
     ) -> None:
         self.bench, self.base, self.sample, self.tolerance = bench, base, sample, tolerance
         self.layers, self._lit = layers, lit
-        self._seeds = [integer(seed, "pilot", self._stream, replicate) for replicate in range(LOOKS)]
+        self._seeds = [integer(seed, "pilot", self._stream, replicate) for replicate in range(REPLICATES)]
         self._frames: Callable[[int], FloatArray] = cache(self._at_anchors)
         self._beyond_mean: Callable[..., FloatArray] = cache(self._in_cells)
         self._choose(sample)
@@ -88,21 +88,21 @@ class AnchorRuns:
     @property
     def paths(self) -> int:
         """Paths of all replicates to one anchor."""
-        return LOOKS * len(self.pixels) * self._samples
+        return REPLICATES * len(self.pixels) * self._samples
 
     @cached_property
-    def changes(self) -> dict[Part, FloatArray]:
+    def changes(self) -> dict[Approximation, FloatArray]:
         """Change of the frames by every number of anchors that was tried, and by coarse cells for what they see."""
         return {**self._until(self.tolerance), **coarsened(self._pass.name, self._coarsened, self.layers)}
 
     @property
-    def of_few(self) -> dict[Part, FloatArray]:
+    def of_few(self) -> dict[Approximation, FloatArray]:
         """Change of the frames by the numbers of anchors that are always tried, as far as they tell."""
         return self._until(math.inf)
 
-    def _until(self, tolerance: float, judge: int = _JUDGE) -> dict[Part, FloatArray]:
+    def _until(self, tolerance: float, judge: int = _JUDGE) -> dict[Approximation, FloatArray]:
         found = ladder(self.ladder, self._frames, judge, tolerance)
-        return {Part(self._pass.anchors, count): change for count, change in found.items()}
+        return {Approximation(self._pass.anchors, count): change for count, change in found.items()}
 
     def sample_costs(self, light: float) -> dict[str, SampleCost]:
         """Monte Carlo error of one estimate of what a few anchors see beyond their mean, relative to all ``light``, by
@@ -193,7 +193,7 @@ class FollowedRuns(AnchorRuns):
         self._samples = sample.followed
 
     @cached_property
-    def changes(self) -> dict[Part, FloatArray]:
+    def changes(self) -> dict[Approximation, FloatArray]:
         """Change of the frames by every number of anchors that was tried; none where there is no such light."""
         if not self._lit or not _tracers(self._simulation()) or not norm(self._frames(1)):
             return {}
@@ -231,13 +231,13 @@ class FollowedRuns(AnchorRuns):
         return SampleCost(found, one.paths_per_sample)
 
     @property
-    def _widths(self) -> dict[Part, FloatArray]:
+    def _widths(self) -> dict[Approximation, FloatArray]:
         """Change of the frames by every width of cells for what a few anchors see beyond their mean."""
         one = self._beyond_mean()
         missing = (self._beyond_mean(coarse_cells=2) - one) / (1 - EVEN_CELLS)
         layered = self._beyond_mean(coarse_layers=True, layers=self.layers) if self.layers else one
         wide = {width: layered + missing - self._beyond_mean(followed_width=width) for width in WIDTHS[1:]}
-        return {Part("followed_width", width): change for width, change in {1: missing, **wide}.items()}
+        return {Approximation("followed_width", width): change for width, change in {1: missing, **wide}.items()}
 
     @cached_property
     def _few(self) -> list[PathSamples]:

@@ -18,9 +18,9 @@ from mitsim.core.resources import workers
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum
-from mitsim.light.passes import Simulation, emitted
-from mitsim.light.pilot_result import LOOKS, Drawn, Forming, Noise, Part, SampleCost
+from mitsim.light.pilot_result import REPLICATES, Approximation, Drawn, Forming, Noise, SampleCost
 from mitsim.light.settings import GROUPS, Estimate, Settings, SharpPixels
+from mitsim.light.simulation import Simulation, emitted
 from mitsim.optics.fft_shadow import cells_per_pixel
 from mitsim.optics.frames import ExpectedFrames, Filed
 from mitsim.optics.image_formation import raster_error
@@ -71,7 +71,7 @@ class DirectRuns:
 
     def __init__(self, bench: Apparatus, base: Settings, sample: Sample, accuracy: float, seed: int) -> None:
         self.bench, self.base, self.sample, self.accuracy = bench, base, sample, accuracy
-        self._seeds = [integer(seed, "pilot", "fine", replicate) for replicate in range(LOOKS)]
+        self._seeds = [integer(seed, "pilot", "fine", replicate) for replicate in range(REPLICATES)]
         self._simulation = simulation = sample.simulation(bench, base)
         self._tracer = tracer_of(simulation, shown_pixels(base, sample), base.anchors)
         self._path_samples = self._tracer.trace_replicates(self._seeds, sample.fine)
@@ -101,16 +101,16 @@ class DirectRuns:
         return 1 / float(inverse.max()), 1 / max(float(inverse.min()), _FARTHEST / self.base.depth)
 
     @cached_property
-    def changes(self) -> dict[Part, FloatArray]:
+    def changes(self) -> dict[Approximation, FloatArray]:
         """Change of the frames by every number of cells and layers that was tried."""
-        found: dict[Part, FloatArray] = {}
+        found: dict[Approximation, FloatArray] = {}
         first, tolerance = _FIRST_JUDGES["cells"], GOOD_ENOUGH * self.accuracy * norm(self._whole)
         cells = ladder(CELL_LADDER, lambda count: self._frames((), count), first, tolerance, EVEN_CELLS)
-        found |= {Part("cells", count): change for count, change in cells.items()}
+        found |= {Approximation("cells", count): change for count, change in cells.items()}
         if len(self.layers) > 1:
             first = _FIRST_JUDGES["layers"]
             layers = ladder(self.layers, lambda count: self._frames(self.layers[count], 2), first, tolerance)
-            found |= {Part("layers", count): change for count, change in layers.items()}
+            found |= {Approximation("layers", count): change for count, change in layers.items()}
         return found
 
     def sample_cost(self, light: float) -> SampleCost:
@@ -159,7 +159,7 @@ class DirectRuns:
         simulation = Simulation(self.bench, self.base)
         rows, weights = self.sample.rows, self.sample.lighting.weights
         fine = simulation.grids["fine"]
-        light = fine.bundle.file(self._path_samples[0], self.sample.lighting.labels, self.sample.fine)
+        light = fine.bundle.accumulate(self._path_samples[0], self.sample.lighting.labels, self.sample.fine)
         filed, timed = Filed(fine.optics, (light[: len(rows)],) * GROUPS), weights[: workers()]
         started = time.perf_counter()
         list(ExpectedFrames([filed], Lighting(rows, timed), 0))
@@ -187,7 +187,7 @@ class DirectRuns:
         """What a shadow on a raster leaves of a frame, without diffraction and with it."""
         simulation = Simulation(self.bench, self.base)
         bundle, geometry = simulation.grids["fine"].bundle, self.bench.geometry
-        light = bundle.file(self._path_samples[0], self.sample.lighting.labels, self.sample.fine)
+        light = bundle.accumulate(self._path_samples[0], self.sample.lighting.labels, self.sample.fine)
         shot = sparse.csr_array(self.sample.lighting.weights[:1]) @ light[: self.sample.lighting.weights.shape[1]]
         light = shot.toarray().reshape(bundle.anchors, bundle.cells[0], bundle.anchors, bundle.cells[1])
 

@@ -15,10 +15,10 @@ from mitsim.bench.effects import DIRECT, EFFECTS, FOLLOWED, Effect
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
 from mitsim.light.cost_model import SHARED_COST
-from mitsim.light.pass_table import PASSES
-from mitsim.light.passes import Simulation, emitted
-from mitsim.light.pilot_result import LOOKS, Changes, Noise, Part, SampleCost
+from mitsim.light.passes import PASSES
+from mitsim.light.pilot_result import REPLICATES, Approximation, ErrorCovariance, Noise, SampleCost
 from mitsim.light.settings import Settings
+from mitsim.light.simulation import Simulation, emitted
 from mitsim.planner.pilot_direct import SHARP_RATE
 from mitsim.planner.pilot_samples import Known, Sample, coarsened, heavy_paths, noise, norm
 from mitsim.transport import records
@@ -66,7 +66,7 @@ class EffectRuns:
     ) -> None:
         self.bench, self.everything, self.sample, self.layers = bench, everything, sample, layers
         self.accuracy = accuracy
-        self.seeds = [integer(seed, "pilot", "effects", replicate) for replicate in range(LOOKS)]
+        self.seeds = [integer(seed, "pilot", "effects", replicate) for replicate in range(REPLICATES)]
         self.simulation = sample.simulation(bench, everything)
         self.direct = self._direct(self.simulation)
         self.followed = {name: self._follow(self.simulation, name) for name in _FOLLOWED}
@@ -78,14 +78,14 @@ class EffectRuns:
         """Norm of the frames of all light."""
 
     @cached_property
-    def changes(self) -> dict[Part, FloatArray]:
+    def changes(self) -> dict[Approximation, FloatArray]:
         """Change of the frames by each effect that they have, and by coarse cells for indirect light."""
         shown = [name for name in EFFECTS if name in self.everything.effects and EFFECTS[name].in_frames]
-        found = {Part(name): self.frames - self._without(EFFECTS[name]) for name in shown}
+        found = {Approximation(name): self.frames - self._without(EFFECTS[name]) for name in shown}
         return {**found, **self._coarse}
 
     @cached_property
-    def _coarse(self) -> dict[Part, FloatArray]:
+    def _coarse(self) -> dict[Approximation, FloatArray]:
         """Change of the frames by coarse cells for indirect light; none where there is no such light."""
         if not any(light.value.size for light in self._bounced):
             return {}
@@ -116,7 +116,7 @@ class EffectRuns:
         if tracer is None or not any(light.value.size for light in self._first_bounced):
             return replicates, samples
         seen = coarsened("indirect", partial(self._indirect, self._first_bounced, samples), ())
-        value, bound = Changes.between(seen, self.light**2).estimate(seen)
+        value, bound = ErrorCovariance.between(seen, self.light**2).estimate(seen)
         wanted = math.ceil(samples * (bound**2 - value**2) / (_OPEN * self.accuracy) ** 2)
         more = min(wanted, self.sample.closer(tracer.paths_per_sample))
         if more <= samples:
@@ -128,7 +128,7 @@ class EffectRuns:
     def received(self) -> float:
         """Light that is followed, as irradiance at the sensor's centre [W m^-2]."""
         light = sum(float(replicate.value.sum()) for replicates in self.followed.values() for replicate in replicates)
-        return light / (LOOKS * self.sample.followed)
+        return light / (REPLICATES * self.sample.followed)
 
     @property
     def apart(self) -> dict[str, float]:
@@ -245,7 +245,7 @@ class EffectRuns:
         """Light of the pass ``name``, replicate by replicate."""
         tracer = PASSES[name].tracer(simulation)
         if tracer is None:
-            return [PathSamples.none()] * LOOKS
+            return [PathSamples.none()] * REPLICATES
         return tracer.trace_replicates([integer(seed, name) for seed in self.seeds], self.sample.followed)
 
     @staticmethod
@@ -281,7 +281,7 @@ class EffectRuns:
         parts.append((grids["sharp"], sharp, sample.sharp(simulation)))
         if physics.interreflection:
             parts.append((grids["indirect"], followed.get("indirect", ()), few))
-        frames = np.zeros((LOOKS, len(light), *sample.shape))
+        frames = np.zeros((REPLICATES, len(light), *sample.shape))
         for grid, replicates, count in parts:
             if any(replicate.value.size for replicate in replicates):
                 frames += sample.frames(grid, replicates, count, light, known)

@@ -16,9 +16,9 @@ from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.parallel import in_threads
 from mitsim.devices.patterns import Lighting
 from mitsim.light.grids import Grid
-from mitsim.light.passes import Simulation
-from mitsim.light.pilot_result import Part
+from mitsim.light.pilot_result import Approximation
 from mitsim.light.settings import Settings
+from mitsim.light.simulation import Simulation
 from mitsim.optics.image_formation import Entries
 from mitsim.optics.shadow import Places
 from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer
@@ -283,7 +283,7 @@ def _gain(last: float, before: float) -> float:
 
 def coarsened(
     name: str, frames: Callable[[int, tuple[float, ...]], FloatArray], layers: tuple[float, ...]
-) -> dict[Part, FloatArray]:
+) -> dict[Approximation, FloatArray]:
     """Change of the frames by one coarse cell a pixel for light called ``name``, and by one layer for it.
 
     Parameters
@@ -296,8 +296,8 @@ def coarsened(
         depths [mm] that judge the one; none for a flat scene.
     """
     one, two = frames(1, ()), frames(2, ())
-    changes = {Part(f"{name} cells", 1): (two - one) / (1 - EVEN_CELLS)}
-    return {**changes, Part(f"{name} layers", 1): frames(1, layers) - one} if layers else changes
+    changes = {Approximation(f"{name} cells", 1): (two - one) / (1 - EVEN_CELLS)}
+    return {**changes, Approximation(f"{name} layers", 1): frames(1, layers) - one} if layers else changes
 
 
 def gathered(places: Labels, values: FloatArray, size: int) -> Entries:

@@ -16,10 +16,10 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.light.cost_model import FIXED, tracing_seconds, unit_costs_of
-from mitsim.light.passes import Simulation
-from mitsim.light.pilot_result import LOOKS, Evidence, SampleCost
+from mitsim.light.pilot_result import REPLICATES, PilotResult, SampleCost
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, MOST_PATHS
+from mitsim.light.simulation import Simulation
 from mitsim.optics.diffraction import check_openings
 from mitsim.planner import pilot
 from mitsim.planner.choose import (
@@ -32,7 +32,7 @@ from mitsim.planner.choose import (
     time_warnings,
     value_of_refining,
 )
-from mitsim.planner.explain import SceneFacts, decide
+from mitsim.planner.explain import SceneFacts, explain_plan
 from mitsim.planner.memory import frame_seconds
 
 OPENING_S = 1.5
@@ -96,10 +96,10 @@ def make_plan(
     check_accuracy(accuracy)
     _refuse_unfit(bench, switches or {})
     started = time.perf_counter()
-    runs = pilot.Look(bench, lighting, accuracy, seed, lines)
+    runs = pilot.PilotRuns(bench, lighting, accuracy, seed, lines)
     while True:
-        evidence = runs.evidence
-        worth, part = value_of_refining(accuracy, evidence, switches or {})
+        pilot_result = runs.pilot_result
+        worth, part = value_of_refining(accuracy, pilot_result, switches or {})
         run = pilot.run_of(part)
         if _SELDOM * runs.work(run) > worth:
             break
@@ -130,16 +130,16 @@ def plan_within(
     started, switches = time.perf_counter(), switches or {}
     _refuse_unfit(bench, switches)
     around = OPENING_S + sum(frame_seconds(bench, len(lighting.weights)).values())
-    runs = pilot.Look(bench, lighting, FIRST_ACCURACY, seed)
+    runs = pilot.PilotRuns(bench, lighting, FIRST_ACCURACY, seed)
     around += runs.seconds
     again = _LONGER * runs.seconds
-    found = accuracy_for_time(Candidates(runs.evidence, switches), seconds - around, FIRST_ACCURACY)
+    found = accuracy_for_time(Candidates(runs.pilot_result, switches), seconds - around, FIRST_ACCURACY)
     # What a look tells of finer accuracies than its own is their price, not whether they are kept.
-    aim = accuracy_for_time(Candidates(runs.evidence, switches), seconds - around - again, 0.0, kept=False)
+    aim = accuracy_for_time(Candidates(runs.pilot_result, switches), seconds - around - again, 0.0, kept=False)
     if found.fits and aim.fits and aim.accuracy < FIRST_ACCURACY:
         around += again
-        closer = pilot.Look(bench, lighting, aim.accuracy, seed)
-        finer = accuracy_for_time(Candidates(closer.evidence, switches), seconds - around, aim.accuracy)
+        closer = pilot.PilotRuns(bench, lighting, aim.accuracy, seed)
+        finer = accuracy_for_time(Candidates(closer.pilot_result, switches), seconds - around, aim.accuracy)
         # It may say that no accuracy is kept at all, and then has the loosest.
         if finer.fits and finer.accuracy <= found.accuracy:
             runs, found = closer, finer
@@ -155,15 +155,15 @@ def _refuse_unfit(bench: Apparatus, switches: Mapping[str, bool]) -> None:
         check_openings(bench.geometry.build_mask(), float(bench.spectrum.wavelengths_nm.max()))
 
 
-def _decided(runs: pilot.Look, accuracy: float, switches: Mapping[str, bool]) -> Plan:
+def _decided(runs: pilot.PilotRuns, accuracy: float, switches: Mapping[str, bool]) -> Plan:
     """The plan at an ``accuracy`` of what ``runs`` found, with the unit costs of its choice measured."""
-    evidence, bench = runs.evidence, runs.bench
-    chosen = cheapest(accuracy, evidence, switches)
-    if evidence.sharp is not None and Simulation(bench, chosen.settings).from_camera is not None:
-        evidence, chosen = _with_heavy_paths(runs, accuracy, chosen, switches)
+    pilot_result, bench = runs.pilot_result, runs.bench
+    chosen = cheapest(accuracy, pilot_result, switches)
+    if pilot_result.sharp is not None and Simulation(bench, chosen.settings).from_camera is not None:
+        pilot_result, chosen = _with_heavy_paths(runs, accuracy, chosen, switches)
     simulation = Simulation(bench, chosen.settings)
-    timed = _timed(evidence, simulation, runs.lighting.labels, runs.seed)
-    plan = decide(accuracy, timed, SceneFacts.of(bench, switches), switches, chosen)
+    timed = _timed(pilot_result, simulation, runs.lighting.labels, runs.seed)
+    plan = explain_plan(accuracy, timed, SceneFacts.of(bench, switches), switches, chosen)
     plan = replace(plan, predicted_range=_range(timed, plan))
     if simulation.physics.mirrors:
         # The pilot formed the frames of other shots, or of fewer effects, from the same beams.
@@ -172,32 +172,32 @@ def _decided(runs: pilot.Look, accuracy: float, switches: Mapping[str, bool]) ->
 
 
 def _with_heavy_paths(
-    runs: pilot.Look, accuracy: float, chosen: Candidate, switches: Mapping[str, bool]
-) -> tuple[Evidence, Candidate]:
+    runs: pilot.PilotRuns, accuracy: float, chosen: Candidate, switches: Mapping[str, bool]
+) -> tuple[PilotResult, Candidate]:
     """What ``runs`` found, and ``chosen`` with samples for rare paths over gloss where these make most of the noise.
 
     Whether the first samples of a run meet such paths is chance, and where they do not, nothing in it tells that their
     light is missing. So sampling begins with what looks of ever more paths ask for, the last of a part of the run's.
     """
-    plain = tracing_seconds(runs.evidence, chosen.settings, FIXED)
+    plain = tracing_seconds(runs.pilot_result, chosen.settings, FIXED)
     paths = _HEAVY_PATHS
     while True:
-        known = runs.evidence.sample_costs
+        known = runs.pilot_result.sample_costs
         heavier = {
             name: replace(known[name], noise=sample_cost.noise)
-            for name, sample_cost in runs.heavy(max(1, paths // (LOOKS * known["from_camera"].paths))).items()
+            for name, sample_cost in runs.heavy(max(1, paths // (REPLICATES * known["from_camera"].paths))).items()
             if sample_cost.variance > known[name].variance
         }
-        evidence = runs.evidence.with_sample_costs(heavier)
-        planned = predicted(accuracy, evidence, chosen.settings, switches)
-        seconds = tracing_seconds(evidence, planned.settings, FIXED)
+        pilot_result = runs.pilot_result.with_sample_costs(heavier)
+        planned = predicted(accuracy, pilot_result, chosen.settings, switches)
+        seconds = tracing_seconds(pilot_result, planned.settings, FIXED)
         if sum(seconds.values()) <= _HEAVIER * sum(plain.values()):
-            return runs.evidence, chosen
+            return runs.pilot_result, chosen
         paths *= _MORE
         asked = {name: seconds[name] / FIXED.passes[name] for name in heavier}
         few = any(sample_cost.noise.heavy < _FEW for sample_cost in heavier.values())
         if paths > (_MOST_HEAVY_PATHS if few else min(_MOST_HEAVY_PATHS, _OF_ALL * sum(asked.values()))):
-            return evidence, _limited(planned, asked)
+            return pilot_result, _limited(planned, asked)
 
 
 def _limited(chosen: Candidate, paths: Mapping[str, float]) -> Candidate:
@@ -207,12 +207,12 @@ def _limited(chosen: Candidate, paths: Mapping[str, float]) -> Candidate:
     return replace(chosen, settings=replace(chosen.settings, samples=samples))
 
 
-def _range(evidence: Evidence, plan: Plan) -> tuple[float, float] | None:
+def _range(pilot_result: PilotResult, plan: Plan) -> tuple[float, float] | None:
     """Seconds between which nine of ten runs of a ``plan`` end, where few heavy paths bring most of their noise; None
     where many bring it, whose samples are known."""
-    costs, least, most = unit_costs_of(evidence), 0.0, 0.0
-    for name, seconds in tracing_seconds(evidence, plan.settings, costs).items():
-        heavy = evidence.sample_costs[name].noise.heavy
+    costs, least, most = unit_costs_of(pilot_result), 0.0, 0.0
+    for name, seconds in tracing_seconds(pilot_result, plan.settings, costs).items():
+        heavy = pilot_result.sample_costs[name].noise.heavy
         if seconds and math.isfinite(heavy):
             limit = MOST_PATHS * costs.passes[name]
             least += (_LEAST - 1) * seconds
@@ -231,19 +231,19 @@ def _seconds(simulation: Simulation, name: str, seed: int, labels: Labels, sampl
     return time.perf_counter() - started
 
 
-def _timed(evidence: Evidence, simulation: Simulation, labels: Labels, seed: int) -> Evidence:
-    """The ``evidence`` with the seconds that a path takes to be traced and accumulated in a ``simulation`` of the
+def _timed(pilot_result: PilotResult, simulation: Simulation, labels: Labels, seed: int) -> PilotResult:
+    """The ``pilot_result`` with the seconds that a path takes to be traced and accumulated in a ``simulation`` of the
     choice."""
-    own, found, spread = integer(seed, "pilot", "paces"), {}, evidence.spread
+    own, found, spread = integer(seed, "pilot", "paces"), {}, pilot_result.spread
     for name, each in simulation.passes.items():
         seconds, longest = _pace(simulation, name, labels, own)
-        sample_cost = evidence.sample_costs.get(name, SampleCost.none())
+        sample_cost = pilot_result.sample_costs.get(name, SampleCost.none())
         # A path of shared light counts for several.
         paths = sample_cost.paths if name == "indirect" else each.tracer.paths_per_sample
         found[name] = replace(sample_cost, seconds=seconds / paths)
         if name == "direct":
             spread = replace(spread, seconds=longest / paths)
-    return replace(evidence.with_sample_costs(found), spread=spread)
+    return replace(pilot_result.with_sample_costs(found), spread=spread)
 
 
 def _pace(simulation: Simulation, name: str, labels: Labels, seed: int) -> tuple[float, float]:

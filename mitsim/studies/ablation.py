@@ -40,9 +40,9 @@ from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.light.grids import LightEstimate
 from mitsim.light.light import SampledLight, traced_again
-from mitsim.light.pass_table import PASSES
-from mitsim.light.passes import Simulation, TracedPass, expected_of
+from mitsim.light.passes import PASSES
 from mitsim.light.settings import Settings
+from mitsim.light.simulation import Simulation, TracedPass, expected_of
 from mitsim.light.truth import Truth
 from mitsim.optics.frames import ClassFrames, ExpectedFrames
 from mitsim.scene.projector import straightening

@@ -22,17 +22,17 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.devices.patterns import PatternFamily
 from mitsim.light.light import SampledLight, Sampling, Target, trace_light, traced_again
-from mitsim.light.pass_table import PASSES
-from mitsim.light.passes import Simulation
-from mitsim.light.pilot_result import COUNTED, LOOKS, Changes, Evidence, Part
+from mitsim.light.passes import PASSES
+from mitsim.light.pilot_result import COUNTED, REPLICATES, Approximation, ErrorCovariance, PilotResult
 from mitsim.light.plan import Plan
 from mitsim.light.sampling import first_samples
 from mitsim.light.settings import GROUPS, Estimate, Settings
+from mitsim.light.simulation import Simulation
 from mitsim.metrics import relative_error
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.planner import pilot
 from mitsim.planner.choose import counted, predicted
-from mitsim.planner.explain import SceneFacts, decide
+from mitsim.planner.explain import SceneFacts, explain_plan
 from mitsim.studies.ablation import MOST, OfOrders, ablations, reform
 from mitsim.studies.accuracy_findings import Budget, JudgeFacts, PartCost, Row, Spread, Timed
 
@@ -114,11 +114,11 @@ class Parts:
         )
 
     def _parts(self, settings: Settings) -> Iterator[_Left]:
-        stand, evidence = self._stand, self._stand.evidence
+        stand, pilot_result = self._stand, self._stand.pilot_result
         for name, less in ablations(settings, frozenset(present(stand.bench))):
             known = _NUMBERS.get(name, name)
-            part = Part(known, 1) if known in evidence.ladders else Part(known)
-            yield self._without(name, evidence.error(part), stand.bench, replace(self.full, settings=less))
+            part = Approximation(known, 1) if known in pilot_result.ladders else Approximation(known)
+            yield self._without(name, pilot_result.error(part), stand.bench, replace(self.full, settings=less))
         if len(stand.bench.spectrum.weights) > 1:
             mono = one_line(stand.bench)
             light = self._judge.light
@@ -164,7 +164,7 @@ def _fill(now: Settings, finer: Settings) -> Settings:
 def _choose_samples(stand: Stand, settings: Settings) -> tuple[float, float, Settings]:
     """The finest accuracy whose samples take at most _LONGEST_S at fixed paces, these seconds, and the settings."""
     for accuracy in _ACCURACIES:
-        choice = predicted(accuracy, stand.evidence, settings, {})
+        choice = predicted(accuracy, stand.pilot_result, settings, {})
         if choice.work <= _LONGEST_S:
             break
     return accuracy, choice.work, choice.settings
@@ -278,7 +278,7 @@ def _within(stand: Stand, plan: Plan, seconds: float) -> tuple[Plan, float]:
     accuracy = plan.accuracy / _FINEST_OVER
     while True:
         # What its numbers leave is stated; sampling alone is given the time.
-        choice = predicted(accuracy, stand.evidence, plan.settings, {})
+        choice = predicted(accuracy, stand.pilot_result, plan.settings, {})
         if choice.work <= seconds or accuracy > plan.accuracy:
             return replace(plan, settings=choice.settings, sampling_target=choice.target), choice.work
         accuracy *= _STEP
@@ -314,7 +314,7 @@ class Orders:
         self._stand, self._judge, self._settings = stand, judge, parts.full.settings
         simulation = Simulation(stand.bench, self._settings)
         self._samples, self._whole_s = first_samples(simulation), parts.seconds
-        self._changes: Changes | None = None
+        self._changes: ErrorCovariance | None = None
         self._followed: dict[int, Timed] = {}
 
     def measure(self, budget: Budget, share: float) -> None:
@@ -331,9 +331,9 @@ class Orders:
         if not budget.allows("light by surfaces", (1 + len(_ORDERS) / _FEWER) * whole, kept=kept):
             return
         # This compiles the one kernel of all orders, too.
-        changes = {Part(name): self._looks(*orders) for name, orders in _ORDERS.items()}
+        changes = {Approximation(name): self._looks(*orders) for name, orders in _ORDERS.items()}
         energy = float(np.square(self._judge.frames[self._stand.few_shots]).sum())
-        self._changes = Changes.between(changes, energy)
+        self._changes = ErrorCovariance.between(changes, energy)
         for last in (1, *(most for _, most in _ORDERS.values())):
             most = "all" if last == MOST else "one" if last == 1 else f"up to {last}"
             if budget.allows(f"time of light followed over {most}", whole, kept=kept):
@@ -353,7 +353,7 @@ class Orders:
         return tuple(
             PartCost(
                 name,
-                *self._changes.estimate([Part(name)]),
+                *self._changes.estimate([Approximation(name)]),
                 with_it=self._spread(most),
                 without=self._spread(fewest - 1),
                 in_plan=True,
@@ -373,7 +373,7 @@ class Orders:
         """(LOOKS, shots, pixels, pixels) frames of some shots by light of some orders alone."""
         fewer = {name: max(1, samples // _FEWER) for name, samples in self._samples.items()}
         light = self._light(OfOrders(self._stand.bench, self._settings, fewest, most), fewer)
-        looks = [reduce(add, light.groups[look::LOOKS]) / (GROUPS // LOOKS) for look in range(LOOKS)]
+        looks = [reduce(add, light.groups[look::REPLICATES]) / (GROUPS // REPLICATES) for look in range(REPLICATES)]
         shots = self._stand.family.lighting.shots(self._stand.few_shots)
         formed = [replace(light, groups=(look,)).frames(shots, self._stand.seed) for look in looks]
         return np.array([[frame.irradiance for frame in frames] for frames in formed])
@@ -447,14 +447,14 @@ class Stand:
     accuracy: float
 
     @cached_property
-    def look(self) -> pilot.Look:
+    def look(self) -> pilot.PilotRuns:
         """The pilot's."""
-        return pilot.Look(self.bench, self.family.lighting, self.accuracy, self.seed)
+        return pilot.PilotRuns(self.bench, self.family.lighting, self.accuracy, self.seed)
 
     @cached_property
-    def evidence(self) -> Evidence:
+    def pilot_result(self) -> PilotResult:
         """Of the pilot."""
-        return self.look.evidence
+        return self.look.pilot_result
 
     @cached_property
     def few_shots(self) -> Labels:
@@ -462,20 +462,20 @@ class Stand:
         return np.unique(np.linspace(0, len(self.family.shots) - 1, _FEW_SHOTS).astype(np.int64))
 
     def plan(self, accuracy: float) -> Plan:
-        """What the evidence calls for at an ``accuracy``."""
-        return decide(accuracy, self.evidence, SceneFacts.of(self.bench))
+        """What the pilot result calls for at an ``accuracy``."""
+        return explain_plan(accuracy, self.pilot_result, SceneFacts.of(self.bench))
 
     def finest(self, plan: Plan) -> Plan:
         """Everything on, and one step finer than ``plan`` in each number."""
-        evidence, now = self.evidence, plan.settings
+        pilot_result, now = self.pilot_result, plan.settings
         anchors, layers, cells, followed, occluded, _ = (
-            next((finer for finer in evidence.ladders[name] if finer > count), count)
+            next((finer for finer in pilot_result.ladders[name] if finer > count), count)
             for name, count in zip(COUNTED, counted(now), strict=True)
         )
         settings = replace(
             now,
             anchors=anchors,
-            layers=evidence.layers[layers] if layers > 1 else (),
+            layers=pilot_result.layers[layers] if layers > 1 else (),
             subdivision=cells,
             effects=frozenset(present(self.bench)),
             followed_anchors=followed,
@@ -488,7 +488,9 @@ class Stand:
 
     def discretisation(self, settings: Settings) -> float:
         """Relative error that the numbers in ``settings`` are predicted to leave."""
-        return self.evidence.error(*(Part(*both) for both in zip(COUNTED, counted(settings), strict=True))).value
+        return self.pilot_result.error(
+            *(Approximation(*both) for both in zip(COUNTED, counted(settings), strict=True))
+        ).value
 
     def trace(self, trial: Trial, seed: int) -> SampledLight:
         """Light of a ``trial``, by the family's classes, from a ``seed``."""

@@ -33,7 +33,7 @@ from mitsim.bench.request import Request, Task
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.core.runs import Capture
-from mitsim.light.pass_table import PASSES
+from mitsim.light.passes import PASSES
 from mitsim.light.settings import Settings
 from mitsim.planner.memory import frame_seconds
 from mitsim.report import plots

@@ -193,7 +193,7 @@ class DeviceAccumulator:
         return self._placed(seen, layer, cells, anchor)
 
     def shares(self, seen: Sightings, anchor: tuple[mi.UInt32, mi.UInt32]) -> Iterator[tuple[mi.UInt32, mi.Float]]:
-        """Where light is accumulated, each place with its part of it, as :meth:`Bundle.file` splits it.
+        """Where light is accumulated, each place with its part of it, as :meth:`Bundle.accumulate` splits it.
 
         Parameters
         ----------
@@ -272,7 +272,7 @@ class DeviceAccumulator:
         amount = dr.select(fits, mi.UInt64(dr.round(units)), mi.UInt64(1))
         dr.scatter_reduce(dr.ReduceOp.Add, self.sums, amount, index, active, mode=dr.ReduceMode.Direct)
 
-    def filed(self, samples: int = 1) -> tuple[sparse.csr_array, float, float]:
+    def light(self, samples: int = 1) -> tuple[sparse.csr_array, float, float]:
         """As :meth:`DeviceSums.light` of so many ``samples``, of the sums that are there, which are fetched."""
         return fetched((self,))[0].light(samples)
 

@@ -270,7 +270,7 @@ class Bundle:
         """Places for light in all."""
         return len(self.depths) * self.anchors**2 * self.cells[0] * self.cells[1]
 
-    def file(self, path_samples: PathSamples, labels: IntArray, samples: int = 1) -> sparse.csr_array:
+    def accumulate(self, path_samples: PathSamples, labels: IntArray, samples: int = 1) -> sparse.csr_array:
         """(C + lamps, size) light of C classes of pixels and of lamps, per sample, but for what is :meth:`outside`.
 
         Parameters
@@ -300,7 +300,7 @@ class Bundle:
         Parameters
         ----------
         path_samples, samples
-            as for :meth:`file`.
+            as for :meth:`accumulate`.
         """
         inside = self._inside(path_samples)
         if not inside.all():

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import Lighting
-from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
+from mitsim.light.simulation import Simulation
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.indirect import IndirectTracer
 from tests.hard.hard_light import SCALE, SEVEN, SLOW, N, Z, gauss, matt, mean, seen_alone

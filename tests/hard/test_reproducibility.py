@@ -21,7 +21,7 @@ from mitsim.core import parallel
 from mitsim.core.exr import read_frame
 from mitsim.light import light
 from mitsim.light.light import trace_light
-from mitsim.light.pilot_result import LOOKS, Changes, Part
+from mitsim.light.pilot_result import REPLICATES, Approximation, ErrorCovariance
 from mitsim.light.settings import GROUPS, Settings
 from mitsim.optics import forming
 from mitsim.planner import pilot_direct, pilot_samples
@@ -121,13 +121,15 @@ def test_neither_do_large_ones(
 
 def test_sums_do_not_depend_on_threads_of_blas(measured: Recorder) -> None:
     """Norms and products of the pilot: BLAS's own of so many numbers differ between 1, 2, 3 and 8 threads."""
-    a, b = np.random.default_rng(0).random((2, LOOKS, 300, 300))
+    a, b = np.random.default_rng(0).random((2, REPLICATES, 300, 300))
     naive, norms, products = set(), set(), set()
     for count in THREADS:
         with threadpool_limits(count):
             naive.add(float(np.vdot(a[0], a[1])))
             norms.add(pilot_samples.norm(a))
-            products.add(Changes.between({Part("a"): a, Part("b"): b}, 1.0).products.tobytes())
+            products.add(
+                ErrorCovariance.between({Approximation("a"): a, Approximation("b"): b}, 1.0).products.tobytes()
+            )
     measured(len(naive), what="answers of BLAS")
     measured(max(len(norms), len(products)), at_most=1, what="ours")
 

@@ -97,7 +97,7 @@ def filed(bench: Bench) -> list[list[float]]:
         accumulators = [DeviceAccumulator(bundle, labels, tracer.board) for _ in lines.shares]
         tracer.trace_into(accumulators, 3, 0, SAMPLES)
         for line, accumulator in zip(found, accumulators, strict=True):
-            line += np.asarray(accumulator.filed()[0].sum(axis=1)).ravel().tolist()
+            line += np.asarray(accumulator.light()[0].sum(axis=1)).ravel().tolist()
     return found
 
 

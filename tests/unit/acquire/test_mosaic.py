@@ -26,8 +26,8 @@ from mitsim.devices.sensor import EfficiencyCurve, MosaicCurves
 from mitsim.devices.session import load_recipe
 from mitsim.light.grids import Grid
 from mitsim.light.light import SampledLight
-from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
+from mitsim.light.simulation import Simulation
 from mitsim.light.truth import Truth
 from mitsim.optics.frames import Frame
 from mitsim.reconstruct.mosaic import behind

@@ -11,8 +11,8 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
 from mitsim.devices.session import load_recipe
-from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
+from mitsim.light.simulation import Simulation
 
 pytestmark = pytest.mark.usefixtures("variant")
 

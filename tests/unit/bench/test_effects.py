@@ -19,8 +19,8 @@ from mitsim.bench import effects
 from mitsim.bench.effects import EFFECTS, Effect, Physics, _registry, _value
 from mitsim.core.errors import ArgumentError
 from mitsim.devices.patterns import Lighting
-from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
+from mitsim.light.simulation import Simulation
 from tests.extended import Section, Step
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -36,7 +36,7 @@ LAMP_AND_MIRROR = """<emitter type="constant"><spectrum name="radiance" value="0
     <translate x="-90" z="300"/></transform><bsdf type="conductor"/></shape>"""
 ALWAYS = ("interreflection", "diffraction")
 """Light turns at several surfaces and bends at masks wherever there are any."""
-_EFFECTS, _PASSES = "mitsim/bench/effects.py", "mitsim/light/passes.py"
+_EFFECTS, _PASSES = "mitsim/bench/effects.py", "mitsim/light/simulation.py"
 TOY = (
     Step(_EFFECTS, "below", "interreflection: bool", "    lamp: float\n"),
     Step(

@@ -16,8 +16,8 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.effects import EFFECTS
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame
-from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
+from mitsim.light.simulation import Simulation
 from mitsim.planner.explain import known_losses
 
 N, ALBEDO, Z, HALF, SCALE = 16, 0.5, 400.0, 64.0, 111000.0

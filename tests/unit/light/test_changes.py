@@ -6,15 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mitsim.light.pass_table import even
-from mitsim.light.pilot_result import LOOKS, Changes, Noise, Part
-from tests.unit.planner.invented_evidence import EVIDENCE, SIZES, changes, plan, rows
+from mitsim.light.passes import even
+from mitsim.light.pilot_result import REPLICATES, Approximation, ErrorCovariance, Noise
+from tests.unit.planner.invented_evidence import PILOT_RESULT, SIZES, changes, plan, rows
 
 
-def seen(*vectors: list[float]) -> Changes:
+def seen(*vectors: list[float]) -> ErrorCovariance:
     """Changes without noise, named a, b, ..."""
-    named = {Part(chr(97 + index)): np.array([vector] * LOOKS) for index, vector in enumerate(vectors)}
-    return Changes.between(named, 4.0)
+    named = {Approximation(chr(97 + index)): np.array([vector] * REPLICATES) for index, vector in enumerate(vectors)}
+    return ErrorCovariance.between(named, 4.0)
 
 
 def test_changes_add_up_with_their_signs() -> None:
@@ -30,7 +30,7 @@ def test_changes_add_up_with_their_signs() -> None:
 
 def test_the_noise_of_looks_is_no_change_and_bounds_hold() -> None:
     """500 scenes whose change of 1e-3 is seen with noise of 3e-3 in each look: unbiased squares, 95 % of bounds."""
-    part, scenes = Part("blur"), 500
+    part, scenes = Approximation("blur"), 500
     squares, held = [], 0
     for seed in range(scenes):
         found = changes({part: 1e-3}, 3e-3, seed)
@@ -43,7 +43,7 @@ def test_the_noise_of_looks_is_no_change_and_bounds_hold() -> None:
 
 def test_a_change_that_cannot_be_told_is_told_as_a_bound() -> None:
     """A lens whose change is below the pilot's noise is not exact."""
-    noisy = replace(EVIDENCE, changes=changes(SIZES | {Part("aperture"): 0.0}, 1e-4))
+    noisy = replace(PILOT_RESULT, changes=changes(SIZES | {Approximation("aperture"): 0.0}, 1e-4))
     reason = rows(plan(1e-2, noisy, "-aperture"))["aperture"].reason
     assert "less than" in reason
     assert noisy.effects["aperture"].bound > 1e-6

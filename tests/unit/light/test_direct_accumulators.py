@@ -12,8 +12,8 @@ import pytest
 
 from mitsim.api.bench import Bench, open_bench
 from mitsim.light.grids import LightEstimate
-from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings, SharpPixels
+from mitsim.light.simulation import Simulation
 from mitsim.transport.accumulator import fetched
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -92,5 +92,5 @@ def test_the_middle_of_the_sharpest_lobe_is_light(bench: Bench, variant: str) ->
     (accumulator,) = simulation.accumulators("anchor_residual", np.zeros(N * N, dtype=np.int64), 1)
     for place, light in enumerate([10 * brightest * board, 1e-5 * board]):
         accumulator.add(mi.Float(light), mi.UInt32(0), mi.UInt32(place), mi.Bool(True))
-    filed, *_ = accumulator.filed()
+    filed, *_ = accumulator.light()
     np.testing.assert_allclose(filed.toarray()[0, :2] / board, [10 * brightest, 1e-5], rtol=0.02)

@@ -29,8 +29,8 @@ from mitsim.devices.lamps import SPECTRA_NM, Lamplight, Response
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum
 from mitsim.light.grids import Grid
-from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings
+from mitsim.light.simulation import Simulation
 from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer, LampTracer, Paths
 from mitsim.transport.records import PathSamples
 from tests.conftest import write_small_scene

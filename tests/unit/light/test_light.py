@@ -20,16 +20,16 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import Lighting, parse_patterns
 from mitsim.light import light as module
 from mitsim.light.light import SampledLight, Sampling, trace_light
-from mitsim.light.passes import Simulation
-from mitsim.light.pilot_result import Evidence
+from mitsim.light.pilot_result import PilotResult
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, Settings
+from mitsim.light.simulation import Simulation
 from mitsim.optics.frames import ExpectedFrames, monte_carlo_error
 from mitsim.planner import choose, memory, planner
 from mitsim.planner.choose import Candidate
 from mitsim.planner.explain import SceneFacts
 from mitsim.planner.planner import make_plan
-from tests.unit.planner.invented_evidence import EVIDENCE
+from tests.unit.planner.invented_evidence import PILOT_RESULT
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
 N = 16
@@ -279,9 +279,9 @@ def test_a_plan_of_several_lines_is_priced_for_all(
     """
     seen: list[int] = []
 
-    def cheapest(accuracy: float, evidence: Evidence, switches: Mapping[str, bool]) -> Candidate:
-        seen.append(evidence.forming.lines)
-        return choose.cheapest(accuracy, evidence, switches)
+    def cheapest(accuracy: float, pilot_result: PilotResult, switches: Mapping[str, bool]) -> Candidate:
+        seen.append(pilot_result.forming.lines)
+        return choose.cheapest(accuracy, pilot_result, switches)
 
     monkeypatch.setattr(planner, "cheapest", cheapest)
     plan = planner.make_plan(bench, family, 1e-2, 0, dict.fromkeys(EFFECTS, False), lines=3)
@@ -388,8 +388,8 @@ def test_paces_are_measured_of_what_was_chosen_alone(bench: Bench, monkeypatch: 
         lambda made, name, seed, labels, samples: 1e-7 * made.passes[name].tracer.paths_per_sample * samples,
     )
     simulation = Simulation(bench, Settings(depth=400.0, anchors=2))
-    timed = planner._timed(EVIDENCE, simulation, np.arange(bench.n**2), 0)
+    timed = planner._timed(PILOT_RESULT, simulation, np.arange(bench.n**2), 0)
     for name in ("direct", "anchor_residual"):
         assert timed.sample_costs[name].seconds == pytest.approx(1e-7)
     for name in ("indirect", "indirect_residual"):
-        assert timed.sample_costs[name] == EVIDENCE.sample_costs[name]
+        assert timed.sample_costs[name] == PILOT_RESULT.sample_costs[name]

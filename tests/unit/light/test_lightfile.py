@@ -19,9 +19,9 @@ from mitsim.devices.patterns import Lighting
 from mitsim.light.grids import GRIDS, LightEstimate
 from mitsim.light.light import Sampling, trace_light
 from mitsim.light.light_file import write_light
-from mitsim.light.passes import Simulation
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Settings, SharpPixels
+from mitsim.light.simulation import Simulation
 from mitsim.planner.planner import make_plan
 from tests.exchanged import frame_of
 

@@ -16,7 +16,7 @@ import pytest
 
 import mitsim
 from mitsim.light.grids import GRIDS
-from mitsim.light.pass_table import PASSES, table_of
+from mitsim.light.passes import PASSES, table_of
 from mitsim.light.settings import Settings
 from tests.exchanged import frame_of
 
@@ -65,7 +65,7 @@ def test_a_new_pass_is_its_row_and_its_integrator(small_scene: Callable[..., Pat
     """
     patch = TOY.read_text()
     assert re.findall(r"^\+\+\+ b/(.*)$", patch, re.MULTILINE) == [
-        "mitsim/light/pass_table.py",
+        "mitsim/light/passes.py",
         "mitsim/transport/veil.py",
     ]
     row = patch[: patch.index("diff --git a/mitsim/transport")]

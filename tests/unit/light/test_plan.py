@@ -9,10 +9,10 @@ import pytest
 from mitsim.bench.effects import EFFECTS, SWITCHES
 from mitsim.bench.request import check_accuracy
 from mitsim.core.errors import MitsimError
-from mitsim.light.pilot_result import Drawn, Part
+from mitsim.light.pilot_result import Approximation, Drawn
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Estimate
-from tests.unit.planner.invented_evidence import ACCURACIES, EVIDENCE, FACTS, ONE_CLASS, SIZES, changes, plan, rows
+from tests.unit.planner.invented_evidence import ACCURACIES, FACTS, ONE_CLASS, PILOT_RESULT, SIZES, changes, plan, rows
 
 
 def test_effects_that_the_scene_does_not_have_stay_off() -> None:
@@ -22,7 +22,7 @@ def test_effects_that_the_scene_does_not_have_stay_off() -> None:
 
 def test_a_flat_scene_has_one_layer_whatever_is_asked_for() -> None:
     sizes = {part: size for part, size in SIZES.items() if "layers" not in part.name}
-    flat = replace(EVIDENCE, layers={1: (400.0,)}, changes=changes(sizes), depth=400.0)
+    flat = replace(PILOT_RESULT, layers={1: (400.0,)}, changes=changes(sizes), depth=400.0)
     for effects in ("", "+layers", "-layers"):
         assert plan(1e-4, flat, effects).settings.depths == (400.0,)
 
@@ -72,9 +72,9 @@ def test_what_costs_time_says_so() -> None:
 
 def test_rows_carry_the_measured_errors() -> None:
     found = rows(plan())
-    assert found["anchors"].error_if_off == pytest.approx(SIZES[Part("anchors", 1)])
-    assert found["layers"].error_if_off == pytest.approx(SIZES[Part("layers", 1)])
-    for name, error in EVIDENCE.effects.items():
+    assert found["anchors"].error_if_off == pytest.approx(SIZES[Approximation("anchors", 1)])
+    assert found["layers"].error_if_off == pytest.approx(SIZES[Approximation("layers", 1)])
+    for name, error in PILOT_RESULT.effects.items():
         assert found[name].error_if_off == error.value
     assert found["diffraction"].reason.startswith("Fresnel number 3.2; ")
     assert "without it the error would be up to 3.0e-01, and 0.001 is allowed" in found["diffraction"].reason
@@ -88,7 +88,7 @@ def test_a_row_is_found_by_its_name() -> None:
 
 
 def test_it_shows_itself() -> None:
-    found = plan(evidence=replace(EVIDENCE, changes=changes(SIZES | {Part("ambient"): 0.0})))
+    found = plan(pilot_result=replace(PILOT_RESULT, changes=changes(SIZES | {Approximation("ambient"): 0.0})))
     shown = found._repr_html_()
     assert all(row.name in shown for row in found.effects) and "0.0e+00" not in shown
     assert repr(found).startswith("Plan(accuracy 0.001: anchors approximate") and "ambient" not in repr(found)
@@ -152,7 +152,7 @@ def test_warnings_of_the_devices_come_first() -> None:
 def test_what_a_masks_raster_leaves_is_in_the_budget() -> None:
     """With waves alone where only these are drawn on one: in the systematic error, and told as the largest part where
     the accuracy is finer. (Planted: left out of the sum; without waves too; never chosen.)"""
-    drawn = replace(EVIDENCE, raster=(Drawn(), Drawn(Estimate(3e-3, 4e-3), needed=True)))
+    drawn = replace(PILOT_RESULT, raster=(Drawn(), Drawn(Estimate(3e-3, 4e-3), needed=True)))
     loose, without = plan(1e-2, drawn), plan(1e-2)
     assert loose.settings.raster and not without.settings.raster and not loose.warnings
     assert loose.systematic_bound >= 4e-3 and loose.systematic_error >= 3e-3
@@ -165,7 +165,7 @@ def test_what_a_masks_raster_leaves_is_in_the_budget() -> None:
 def test_a_raster_has_as_many_cells_as_the_accuracy_needs() -> None:
     """Of 6, 8 and 12 a pixel, which leave up to 4e-3, 2.6e-3 and 1.4e-3. (Planted: the error of
     the fewest for all.)"""
-    drawn = replace(EVIDENCE, raster=(Drawn(), Drawn(Estimate(3e-3, 4e-3), needed=True, cells=(6, 8, 12))))
+    drawn = replace(PILOT_RESULT, raster=(Drawn(), Drawn(Estimate(3e-3, 4e-3), needed=True, cells=(6, 8, 12))))
     found = {accuracy: plan(accuracy, drawn) for accuracy in (1e-2, 2e-3)}
     assert [each.settings.raster_cells for each in found.values()] == [6, 12]
     assert not any(each.warnings for each in found.values())
@@ -180,8 +180,8 @@ def test_many_terms_are_summed_or_formed_by_fft_whichever_takes_less() -> None:
     """At the accuracy. (Planted: always by FFT; the raster's error not counted; drawing for nothing.)"""
 
     def shown(accuracy: float, terms: float, drawing: float = 0.05) -> Plan:
-        forming = replace(EVIDENCE.forming, geometric_terms=terms, drawing=(drawing, 0.0))
-        candidate = replace(EVIDENCE, forming=forming, raster=(Drawn(Estimate(4e-4, 6e-4)), Drawn()))
+        forming = replace(PILOT_RESULT.forming, geometric_terms=terms, drawing=(drawing, 0.0))
+        candidate = replace(PILOT_RESULT, forming=forming, raster=(Drawn(Estimate(4e-4, 6e-4)), Drawn()))
         return plan(accuracy, candidate, "-diffraction")
 
     few, many = shown(1e-2, 3.0), shown(1e-2, 200.0)
@@ -196,10 +196,10 @@ def test_many_terms_are_summed_or_formed_by_fft_whichever_takes_less() -> None:
 def test_settings_do_not_depend_on_the_machines_pace() -> None:
     """Bit-equal repetition and --resume need it: the same seed must mean the same settings."""
     sample_costs = {
-        name: replace(EVIDENCE.sample_costs[name], seconds=1e-4)
+        name: replace(PILOT_RESULT.sample_costs[name], seconds=1e-4)
         for name in ("direct", "anchor_residual", "indirect", "from_camera")
     }
-    slow = replace(EVIDENCE.with_sample_costs(sample_costs), forming=replace(EVIDENCE.forming, seconds=1.0))
+    slow = replace(PILOT_RESULT.with_sample_costs(sample_costs), forming=replace(PILOT_RESULT.forming, seconds=1.0))
     for accuracy in ACCURACIES:
         one, other = plan(accuracy), plan(accuracy, slow)
         assert one.settings == other.settings and one.sampling_target == other.sampling_target

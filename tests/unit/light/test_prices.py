@@ -20,7 +20,7 @@ from mitsim.light.cost_model import (
 from mitsim.light.pilot_result import Forming, Noise, SampleCost
 from mitsim.light.settings import GROUPS, Settings
 from mitsim.optics.frames import PROBES
-from tests.unit.planner.invented_evidence import EVIDENCE, plan
+from tests.unit.planner.invented_evidence import PILOT_RESULT, plan
 
 FORMING = Forming(pixels=50, cells=10, lit=0.5, terms=3.0, shots=4, classes=4)
 ONE = Numbers.coarsest()
@@ -35,11 +35,11 @@ def products(rows: float, terms: float = 1.0) -> float:
 
 
 def test_the_frame_that_the_pilot_measured_takes_what_it_took() -> None:
-    measured = replace(EVIDENCE, forming=replace(EVIDENCE.forming, seconds=0.125))
+    measured = replace(PILOT_RESULT, forming=replace(PILOT_RESULT.forming, seconds=0.125))
     assert forming_seconds(measured.forming, ONE, 1.0, unit_costs_of(measured)) == pytest.approx(0.125, rel=1e-12)
     none = replace(
-        EVIDENCE.with_sample_costs({"direct": replace(EVIDENCE.sample_costs["direct"], seconds=0.0)}),
-        forming=replace(EVIDENCE.forming, seconds=0.0),
+        PILOT_RESULT.with_sample_costs({"direct": replace(PILOT_RESULT.sample_costs["direct"], seconds=0.0)}),
+        forming=replace(PILOT_RESULT.forming, seconds=0.0),
     )
     assert (
         unit_costs_of(none).passes["direct"] == FIXED.passes["direct"] and unit_costs_of(none).product == FIXED.product
@@ -53,7 +53,7 @@ def test_the_frame_that_the_pilot_measured_takes_what_it_took() -> None:
     assert forming_seconds(timed.forming, ONE, 1.0, unit_costs_of(timed)) == pytest.approx(0.125, rel=1e-12)
     assert unit_costs_of(timed).product == FIXED.product / 6, "large products are not slower because small frames are"
     assert unit_costs_of(timed).entry == pytest.approx(FIXED.entry / 6)
-    other = EVIDENCE.with_sample_costs({"direct": replace(EVIDENCE.sample_costs["direct"], seconds=5e-6)})
+    other = PILOT_RESULT.with_sample_costs({"direct": replace(PILOT_RESULT.sample_costs["direct"], seconds=5e-6)})
     assert unit_costs_of(other).passes["direct"] == 5e-6
 
 
@@ -119,13 +119,13 @@ def test_shadows_take_entries_of_waves_or_a_thirtieth_of_one_without() -> None:
 def test_tracing_takes_a_path_of_every_sample_in_every_group_and_connections_to_all_anchors() -> None:
     """Samples are whole; differences between 3 x 3 anchors take nine connections each, and one anchor has none."""
     settings = replace(plan().settings, samples={"direct": 2.5, "anchor_residual": 4.0})
-    costs, paths = replace(COUNTED, passes=dict.fromkeys(FIXED.passes, 1.0)), EVIDENCE.sample_costs["direct"].paths
-    several, one = (tracing_seconds(EVIDENCE, replace(settings, anchors=count), costs) for count in (3, 1))
+    costs, paths = replace(COUNTED, passes=dict.fromkeys(FIXED.passes, 1.0)), PILOT_RESULT.sample_costs["direct"].paths
+    several, one = (tracing_seconds(PILOT_RESULT, replace(settings, anchors=count), costs) for count in (3, 1))
     assert several["direct"] == one["direct"] == GROUPS * 3 * paths
-    anchored = 9 * GROUPS * 4 * EVIDENCE.sample_costs["anchor_residual"].paths
+    anchored = 9 * GROUPS * 4 * PILOT_RESULT.sample_costs["anchor_residual"].paths
     assert several["anchor_residual"] == anchored and one["anchor_residual"] == 0
     light = SampleCost(Noise(1e-3, 4, 0.5), 3)
-    occluded = replace(EVIDENCE, occluded=(3, 4, 5)).with_sample_costs({"penumbra": light})
+    occluded = replace(PILOT_RESULT, occluded=(3, 4, 5)).with_sample_costs({"penumbra": light})
     own = replace(settings, occluded=(3, 4, 5), occluded_anchors=8, samples={"penumbra": 2.0})
     assert tracing_seconds(occluded, own, costs)["penumbra"] == 64 * GROUPS * 2 * 3
     assert tracing_seconds(occluded, settings, costs)["penumbra"] == 0
@@ -161,8 +161,8 @@ def test_every_shot_is_looked_through_once_more_than_it_is_formed() -> None:
 
 def test_lines_share_paths_and_form_and_file_each_its_own() -> None:
     """Three lines: two fifths more tracing, and all else three times. (Planted: shadows of one line; filing of one.)"""
-    three = replace(EVIDENCE, forming=replace(EVIDENCE.forming, lines=3))
-    settings = plan(evidence=EVIDENCE).settings
+    three = replace(PILOT_RESULT, forming=replace(PILOT_RESULT.forming, lines=3))
+    settings = plan(pilot_result=PILOT_RESULT).settings
     numbers = Numbers.of(settings)
     for seconds in (
         lambda forming: forming_seconds(forming, numbers, 5.0, FIXED),
@@ -170,10 +170,10 @@ def test_lines_share_paths_and_form_and_file_each_its_own() -> None:
         lambda forming: checking_seconds(forming, numbers, FIXED),
         lambda forming: accumulation_seconds(forming, numbers, 1e6, FIXED),
     ):
-        assert seconds(three.forming) == pytest.approx(3 * seconds(EVIDENCE.forming))  # type: ignore[no-untyped-call]
-    one, several = (tracing_seconds(evidence, settings, FIXED) for evidence in (EVIDENCE, three))
+        assert seconds(three.forming) == pytest.approx(3 * seconds(PILOT_RESULT.forming))  # type: ignore[no-untyped-call]
+    one, several = (tracing_seconds(pilot_result, settings, FIXED) for pilot_result in (PILOT_RESULT, three))
     assert several == pytest.approx({name: 1.4 * each for name, each in one.items()})
-    assert truth_seconds(three, settings, FIXED) == pytest.approx(1.4 * truth_seconds(EVIDENCE, settings, FIXED))
+    assert truth_seconds(three, settings, FIXED) == pytest.approx(1.4 * truth_seconds(PILOT_RESULT, settings, FIXED))
 
 
 def test_a_ledger_is_emptied_and_looked_through_where_it_has_room() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from mitsim.light.cost_model import FIXED, SHARED_COST
-from mitsim.light.pass_table import EVEN, even
+from mitsim.light.passes import EVEN, even
 from mitsim.light.sampling import SampledPass, cheapest_samples, first_samples, next_samples
 from mitsim.transport.path_reuse import PathReuseTracer
 

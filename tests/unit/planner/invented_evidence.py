@@ -1,4 +1,4 @@
-"""Evidence of a scene that nobody rendered: a pilot's word on every effect in, plans and their rows out.
+"""Pilot result of a scene that nobody rendered: a pilot's word on every effect in, plans and their rows out.
 
 Sizes of changes are chosen so that each accuracy of ``ACCURACIES`` needs others of them.
 """
@@ -19,38 +19,49 @@ from mitsim.light.cost_model import (
     tracing_seconds,
     truth_seconds,
 )
-from mitsim.light.pilot_result import LOOKS, Changes, Evidence, Forming, Noise, Part, SampleCost
+from mitsim.light.pilot_result import (
+    REPLICATES,
+    Approximation,
+    ErrorCovariance,
+    Forming,
+    Noise,
+    PilotResult,
+    SampleCost,
+)
 from mitsim.light.plan import Plan, PlanRow
 from mitsim.light.settings import Settings
-from mitsim.planner.explain import SceneFacts, decide
+from mitsim.planner.explain import SceneFacts, explain_plan
 
 FACTS = SceneFacts(notes={"diffraction": "Fresnel number 3.2"}, keystone=0.0)
 SIZES = {
-    **{Part("anchors", count): size for count, size in {1: 2e-3, 2: 3e-4, 3: 4e-5, 5: 1e-5}.items()},
-    **{Part("layers", count): size for count, size in {1: 4e-3, 2: 6e-4, 3: 2e-4, 4: 5e-5}.items()},
-    **{Part("cells", count): size for count, size in {1: 6e-3, 2: 2e-3, 4: 1e-4, 8: 1e-5}.items()},
-    **{Part(name): size for name, size in {"interreflection": 2e-2, "diffraction": 0.3, "ambient": 5e-4}.items()},
-    **{Part("followed_anchors", count): size for count, size in {1: 7e-4, 2: 9e-5, 3: 1e-5}.items()},
-    Part("blur"): 1e-3,
-    Part("anchor_residual cells", 1): 2e-4,
-    Part("indirect cells", 1): 4e-4,
-    Part("indirect layers", 1): 3e-4,
+    **{Approximation("anchors", count): size for count, size in {1: 2e-3, 2: 3e-4, 3: 4e-5, 5: 1e-5}.items()},
+    **{Approximation("layers", count): size for count, size in {1: 4e-3, 2: 6e-4, 3: 2e-4, 4: 5e-5}.items()},
+    **{Approximation("cells", count): size for count, size in {1: 6e-3, 2: 2e-3, 4: 1e-4, 8: 1e-5}.items()},
+    **{
+        Approximation(name): size
+        for name, size in {"interreflection": 2e-2, "diffraction": 0.3, "ambient": 5e-4}.items()
+    },
+    **{Approximation("followed_anchors", count): size for count, size in {1: 7e-4, 2: 9e-5, 3: 1e-5}.items()},
+    Approximation("blur"): 1e-3,
+    Approximation("anchor_residual cells", 1): 2e-4,
+    Approximation("indirect cells", 1): 4e-4,
+    Approximation("indirect layers", 1): 3e-4,
 }
 APART = {"speckle": 8e-3}
 
 
-def changes(sizes: dict[Part, float], noise: float = 0.0, seed: int = 0) -> Changes:
+def changes(sizes: dict[Approximation, float], noise: float = 0.0, seed: int = 0) -> ErrorCovariance:
     """Changes at right angles to each other, each look with ``noise`` of its own: independent, of norm ``noise``."""
     rng, count = np.random.default_rng(seed), len(sizes)
     vectors = np.diag(list(sizes.values()))
     space = count + 40
     exact = np.zeros((count, space))
     exact[:, :count] = vectors
-    looks = exact[:, None] + noise * rng.normal(size=(count, LOOKS, space)) / math.sqrt(space)
-    return Changes.between(dict(zip(sizes, looks, strict=True)), 1.0)
+    looks = exact[:, None] + noise * rng.normal(size=(count, REPLICATES, space)) / math.sqrt(space)
+    return ErrorCovariance.between(dict(zip(sizes, looks, strict=True)), 1.0)
 
 
-EVIDENCE = Evidence(
+PILOT_RESULT = PilotResult(
     depth=380.0,
     layers={1: (380.0,), 2: (400.0, 300.0), 3: (400.0, 343.0, 300.0), 4: (400.0, 369.0, 327.0, 300.0)},
     changes=changes(SIZES),
@@ -66,36 +77,38 @@ EVIDENCE = Evidence(
     forming=Forming(pixels=512, cells=150, lit=0.2, terms=3.0, shots=49, classes=49, seconds=2e-3),
     apart=APART,
 )
-ONE_CLASS = replace(EVIDENCE, forming=replace(EVIDENCE.forming, shots=1, classes=1))
+ONE_CLASS = replace(PILOT_RESULT, forming=replace(PILOT_RESULT.forming, shots=1, classes=1))
 """The same under one pattern, whose light takes no memory."""
 
 
 ACCURACIES = [0.1, 1e-2, 3e-3, 1e-3, 3e-4]
 
 
-def plan(accuracy: float = 1e-3, evidence: Evidence = EVIDENCE, effects: str = "", facts: SceneFacts = FACTS) -> Plan:
-    return decide(accuracy, evidence, facts, parse_switches(effects))
+def plan(
+    accuracy: float = 1e-3, pilot_result: PilotResult = PILOT_RESULT, effects: str = "", facts: SceneFacts = FACTS
+) -> Plan:
+    return explain_plan(accuracy, pilot_result, facts, parse_switches(effects))
 
 
 def rows(found: Plan) -> dict[str, PlanRow]:
     return {effect.name: effect for effect in found.effects}
 
 
-def stages(evidence: Evidence, settings: Settings, costs: UnitCosts) -> dict[str, float]:
+def stages(pilot_result: PilotResult, settings: Settings, costs: UnitCosts) -> dict[str, float]:
     """Seconds of each stage: paths, filing of what they bring, looks at the error; rays of the truth; frames."""
-    forming, numbers = evidence.forming, Numbers.of(settings)
-    held = entries(evidence.sample_costs["direct"].paths, forming.classes, numbers, settings)
+    forming, numbers = pilot_result.forming, Numbers.of(settings)
+    held = entries(pilot_result.sample_costs["direct"].paths, forming.classes, numbers, settings)
     filing = accumulation_seconds(forming, numbers, held, costs)
     looking = checking_seconds(forming, numbers, costs)
     return {
-        "transport": sum(tracing_seconds(evidence, settings, costs).values()) + filing + looking,
-        "truth": truth_seconds(evidence, settings, costs),
+        "transport": sum(tracing_seconds(pilot_result, settings, costs).values()) + filing + looking,
+        "truth": truth_seconds(pilot_result, settings, costs),
         "optics": optics_seconds(forming, numbers, costs),
     }
 
 
-def with_occluded(sizes: dict[int, float]) -> Evidence:
+def with_occluded(sizes: dict[int, float]) -> PilotResult:
     """150 pixels that leave so much by the number of their anchors."""
-    found = changes(SIZES | {Part("occluded_anchors", count): size for count, size in sizes.items()})
+    found = changes(SIZES | {Approximation("occluded_anchors", count): size for count, size in sizes.items()})
     light = SampleCost(Noise(1e-4, 4, 0.5), 150)
     return replace(ONE_CLASS, changes=found, occluded=tuple(range(150))).with_sample_costs({"penumbra": light})

@@ -1,4 +1,4 @@
-"""The finest accuracy that a time buys, of invented evidence: more seconds never buy less, and what is bought fits."""
+"""The finest accuracy that a time buys, of invented pilot result: more seconds never buy less, and what is bought fits."""
 
 import math
 from itertools import pairwise
@@ -17,14 +17,14 @@ from mitsim.planner.choose import (
     cheapest,
     time_warnings,
 )
-from tests.unit.planner.invented_evidence import EVIDENCE
+from tests.unit.planner.invented_evidence import PILOT_RESULT
 
 TIMES = (0.01, 0.3, 0.95, 1.0, 2.0, 4.0, 10.0, 40.0, 1e5)
 
 
 @pytest.fixture(scope="module")
 def candidates() -> Candidates:
-    return Candidates(EVIDENCE, {})
+    return Candidates(PILOT_RESULT, {})
 
 
 @pytest.fixture(scope="module")
@@ -43,10 +43,12 @@ def test_candidates_choose_as_the_plan_does(candidates: Candidates) -> None:
     """What is shared between accuracies does not depend on them, nor on their order."""
     for accuracy in (3e-4, 0.1, 3e-3):
         table, index = candidates.best(accuracy)
-        candidate = cheapest(accuracy, EVIDENCE, {})
+        candidate = cheapest(accuracy, PILOT_RESULT, {})
         assert table.settings(index) == candidate.settings
         seconds, keeps = candidates.seconds(accuracy)
-        assert seconds == pytest.approx(candidate.work + truth_seconds(EVIDENCE, candidate.settings, FIXED), rel=1e-12)
+        assert seconds == pytest.approx(
+            candidate.work + truth_seconds(PILOT_RESULT, candidate.settings, FIXED), rel=1e-12
+        )
         assert keeps is candidate.fits
 
 

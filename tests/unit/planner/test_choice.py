@@ -8,15 +8,15 @@ import pytest
 
 from mitsim.bench.effects import parse_switches
 from mitsim.light.cost_model import FIXED, Numbers, entries
-from mitsim.light.pilot_result import LOOKS, Changes, Evidence, Noise, Part, SampleCost
+from mitsim.light.pilot_result import REPLICATES, Approximation, ErrorCovariance, Noise, PilotResult, SampleCost
 from mitsim.light.settings import GROUPS, Settings, SharpPixels
-from mitsim.planner.choose import cheapest, parts_of, predicted, value_of_refining
+from mitsim.planner.choose import approximations_of, cheapest, predicted, value_of_refining
 from mitsim.planner.pilot import run_of
 from tests.unit.planner.invented_evidence import (
     ACCURACIES,
     APART,
-    EVIDENCE,
     ONE_CLASS,
+    PILOT_RESULT,
     SIZES,
     changes,
     plan,
@@ -28,19 +28,19 @@ from tests.unit.planner.invented_evidence import (
 COSTLY = {"interreflection", "ambient", "diffraction", "black-level"}
 
 
-def random_evidence(seed: int) -> Evidence:
+def random_evidence(seed: int) -> PilotResult:
     """Changes of any size and angle to each other, and light of any noise."""
     rng = np.random.default_rng(seed)
     sizes = {part: size * 10 ** rng.uniform(-1, 1) for part, size in SIZES.items()}
     mixed = rng.normal(size=(len(sizes), 6))
     mixed *= (np.array(list(sizes.values())) / np.linalg.norm(mixed, axis=1))[:, None]
-    looks = mixed[:, None] + 3e-5 * rng.normal(size=(len(sizes), LOOKS, 6))
+    looks = mixed[:, None] + 3e-5 * rng.normal(size=(len(sizes), REPLICATES, 6))
     names = "direct", "spread", "anchor_residual", "indirect", "from_camera", "indirect_residual"
     noises = {name: Noise(10 ** rng.uniform(-4, -1.5), 4, 0.5) for name in names}
-    spread = replace(EVIDENCE.spread, noise=noises.pop("spread"))
-    sample_costs = {name: replace(EVIDENCE.sample_costs[name], noise=noise) for name, noise in noises.items()}
-    found = Changes.between(dict(zip(sizes, looks, strict=True)), 1.0)
-    return replace(EVIDENCE, changes=found, spread=spread).with_sample_costs(sample_costs)
+    spread = replace(PILOT_RESULT.spread, noise=noises.pop("spread"))
+    sample_costs = {name: replace(PILOT_RESULT.sample_costs[name], noise=noise) for name, noise in noises.items()}
+    found = ErrorCovariance.between(dict(zip(sizes, looks, strict=True)), 1.0)
+    return replace(PILOT_RESULT, changes=found, spread=spread).with_sample_costs(sample_costs)
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -51,40 +51,44 @@ def test_no_choice_that_fits_is_cheaper(accuracy: float, seed: int) -> None:
     Whatever is cheaper breaks the accuracy; and what was chosen keeps it. What takes no time stays on: no error is left
     in the hope that it makes up for another.
     """
-    evidence = random_evidence(seed)
-    chosen = cheapest(accuracy, evidence, {})
+    pilot_result = random_evidence(seed)
+    chosen = cheapest(accuracy, pilot_result, {})
     if not chosen.fits:
         return
     assert chosen.total.bound <= accuracy
     now = chosen.settings
     others = [replace(now, effects=now.effects - {name}) for name in COSTLY & now.effects]
-    others += [replace(now, anchors=count) for count in evidence.ladders["anchors"]]
-    others += [replace(now, layers=evidence.layers[count] if count > 1 else ()) for count in evidence.ladders["layers"]]
-    others += [replace(now, subdivision=count) for count in evidence.ladders["cells"]]
+    others += [replace(now, anchors=count) for count in pilot_result.ladders["anchors"]]
+    others += [
+        replace(now, layers=pilot_result.layers[count] if count > 1 else ()) for count in pilot_result.ladders["layers"]
+    ]
+    others += [replace(now, subdivision=count) for count in pilot_result.ladders["cells"]]
     others += [replace(now, coarse_cells=count, coarse_layers=all_) for count in (1, 2, 4, 8) for all_ in (False, True)]
     others += [replace(now, effects=frozenset({"blur", "speckle"}), anchors=1, layers=(), subdivision=1)]
     for settings in others:
-        other = predicted(accuracy, evidence, settings, {})
+        other = predicted(accuracy, pilot_result, settings, {})
         assert not other.fits or other.work >= chosen.work * (1 - 1e-12)
 
 
 @pytest.mark.parametrize("accuracy", ACCURACIES)
 def test_the_total_is_predicted_from_all_that_is_left(accuracy: float) -> None:
     """At right angles, squares add up. Where nothing is followed, it does not matter to how many points."""
-    chosen = cheapest(accuracy, EVIDENCE, {})
+    chosen = cheapest(accuracy, PILOT_RESULT, {})
     settings = chosen.settings
-    parts = parts_of(EVIDENCE, settings)
-    assert {part.name for part in parts if not part.count} == set(EVIDENCE.effects) - settings.effects
+    parts = approximations_of(PILOT_RESULT, settings)
+    assert {part.name for part in parts if not part.count} == set(PILOT_RESULT.effects) - settings.effects
     squares = sum(SIZES.get(part, APART.get(part.name, 0.0)) ** 2 for part in parts)
     if "interreflection" in settings.effects:
         layered = (
-            SIZES[Part("layers", len(settings.depths))] / SIZES[Part("layers", 1)] if settings.coarse_layers else 1
+            SIZES[Approximation("layers", len(settings.depths))] / SIZES[Approximation("layers", 1)]
+            if settings.coarse_layers
+            else 1
         )
         squares += (4e-4 / settings.coarse_cells**2) ** 2 + (3e-4 * layered) ** 2
     if settings.anchors > 1:
         squares += (2e-4 / settings.coarse_cells**2) ** 2
     if not {"interreflection", "ambient"} & settings.effects:
-        squares -= SIZES[Part("followed_anchors", settings.followed_anchors)] ** 2
+        squares -= SIZES[Approximation("followed_anchors", settings.followed_anchors)] ** 2
     expected = math.sqrt(squares)
     assert chosen.systematic.value == pytest.approx(expected, rel=1e-6)
     assert chosen.total.value == pytest.approx(math.hypot(expected, chosen.noise))
@@ -97,32 +101,35 @@ def test_opposite_errors_are_left_together() -> None:
     """
     sizes = {part: 0.0 for part in SIZES if part.name not in ("cells", "diffraction")}
     for sign, fits in ((-1.0, True), (1.0, False)):
-        vectors = {part: np.zeros((LOOKS, 2)) for part in sizes}
-        vectors[Part("cells", 1)], vectors[Part("cells", 2)] = np.full((LOOKS, 2), 5.6e-4), np.zeros((LOOKS, 2))
-        vectors[Part("diffraction")] = sign * np.full((LOOKS, 2), 5.6e-4)
-        evidence = replace(EVIDENCE, changes=Changes.between(vectors, 1.0), apart={})
-        bare = replace(cheapest(1e-3, evidence, {}).settings, effects=frozenset({"blur"}), subdivision=1)
-        assert predicted(1e-3, evidence, bare, {}).fits == fits
+        vectors = {part: np.zeros((REPLICATES, 2)) for part in sizes}
+        vectors[Approximation("cells", 1)], vectors[Approximation("cells", 2)] = (
+            np.full((REPLICATES, 2), 5.6e-4),
+            np.zeros((REPLICATES, 2)),
+        )
+        vectors[Approximation("diffraction")] = sign * np.full((REPLICATES, 2), 5.6e-4)
+        pilot_result = replace(PILOT_RESULT, changes=ErrorCovariance.between(vectors, 1.0), apart={})
+        bare = replace(cheapest(1e-3, pilot_result, {}).settings, effects=frozenset({"blur"}), subdivision=1)
+        assert predicted(1e-3, pilot_result, bare, {}).fits == fits
 
 
 @pytest.mark.parametrize("accuracy", ACCURACIES)
 def test_work_is_transport_and_optics_at_fixed_paces(accuracy: float) -> None:
     """Truth is the same for all choices, and none of it."""
-    chosen = cheapest(accuracy, EVIDENCE, {})
-    expected = stages(EVIDENCE, chosen.settings, FIXED)
+    chosen = cheapest(accuracy, PILOT_RESULT, {})
+    expected = stages(PILOT_RESULT, chosen.settings, FIXED)
     assert chosen.work == pytest.approx(expected["transport"] + expected["optics"])
 
 
 def test_light_that_is_missing_leaves_less_for_other_errors_to_be_part_of() -> None:
     """A fifth of the light, and a tenth, come over what no tracer finds: errors are those of the rest."""
-    settings = cheapest(1e-2, EVIDENCE, {}).settings
-    lacking = replace(EVIDENCE, unresolved=0.2, left_out=0.1)
-    before, after = (predicted(1e-2, evidence, settings, {}).systematic for evidence in (EVIDENCE, lacking))
+    settings = cheapest(1e-2, PILOT_RESULT, {}).settings
+    lacking = replace(PILOT_RESULT, unresolved=0.2, left_out=0.1)
+    before, after = (predicted(1e-2, pilot_result, settings, {}).systematic for pilot_result in (PILOT_RESULT, lacking))
     assert before.value > 1e-3 and after == pytest.approx([0.3 + 0.7 * error for error in before])
 
 
 def test_looser_accuracies_are_cheaper() -> None:
-    works = [cheapest(accuracy, EVIDENCE, {}).work for accuracy in ACCURACIES]
+    works = [cheapest(accuracy, PILOT_RESULT, {}).work for accuracy in ACCURACIES]
     assert works == sorted(works) and len(set(works)) == len(works)
     seconds = [plan(accuracy).predicted_seconds for accuracy in ACCURACIES]
     assert seconds == sorted(seconds) and seconds[-1] > 10 * seconds[0]
@@ -130,30 +137,30 @@ def test_looser_accuracies_are_cheaper() -> None:
 
 def test_what_the_pilot_cannot_tell_is_on() -> None:
     """Interreflection of 5e-4 fits into 1e-3 when it is known, and does not when it may be twice as much."""
-    sizes = {part: size * 0.1 for part, size in SIZES.items()} | {Part("interreflection"): 5e-4}
-    sure = replace(EVIDENCE, changes=changes(sizes), apart={})
-    noisy = changes({Part("interreflection"): 5e-4}, 3e-3).products[:, :, 0, 0]
-    place, products = sure.changes.parts.index(Part("interreflection")), sure.changes.products.copy()
+    sizes = {part: size * 0.1 for part, size in SIZES.items()} | {Approximation("interreflection"): 5e-4}
+    sure = replace(PILOT_RESULT, changes=changes(sizes), apart={})
+    noisy = changes({Approximation("interreflection"): 5e-4}, 3e-3).products[:, :, 0, 0]
+    place, products = sure.changes.parts.index(Approximation("interreflection")), sure.changes.products.copy()
     products[:, :, place, place] = noisy
-    unsure = replace(sure, changes=Changes(sure.changes.parts, products))
+    unsure = replace(sure, changes=ErrorCovariance(sure.changes.parts, products))
     assert "interreflection" not in cheapest(1e-3, sure, {}).settings.effects
     careful, hopeful = (cheapest(1e-3, unsure, {}, sigmas).settings.effects for sigmas in (2.35, 0.0))
     assert "interreflection" in careful
     worth, part = value_of_refining(1e-3, unsure, {})
-    assert worth > 0 and part == Part("interreflection") and "interreflection" not in hopeful
+    assert worth > 0 and part == Approximation("interreflection") and "interreflection" not in hopeful
     assert value_of_refining(1e-3, sure, {})[0] == 0
 
 
 def test_nothing_is_worth_knowing_where_no_luck_would_keep_the_accuracy() -> None:
     """Every number of cells is known to leave all of the light. (Planted: a second's worth.)"""
     sizes = {part: 1.0 if part.name == "cells" else size for part, size in SIZES.items()}
-    assert value_of_refining(1e-3, replace(EVIDENCE, changes=changes(sizes), apart={}), {})[0] == 0.0
+    assert value_of_refining(1e-3, replace(PILOT_RESULT, changes=changes(sizes), apart={}), {})[0] == 0.0
 
 
 @pytest.mark.parametrize("accuracy", [1e-3, 1e-4, 1e-6])
 def test_no_light_is_asked_for_that_cannot_be_held(accuracy: float) -> None:
     """Of 49 classes indirect light lies in all cells of each: 2^25 entries a group are 12 GB. (Planted: no limit.)"""
-    settings, pixels = cheapest(accuracy, EVIDENCE, {}).settings, EVIDENCE.sample_costs["direct"].paths
+    settings, pixels = cheapest(accuracy, PILOT_RESULT, {}).settings, PILOT_RESULT.sample_costs["direct"].paths
     assert entries(pixels, 49, Numbers.of(settings), settings) <= 2**25
     samples = {**settings.samples, "indirect": 1e5, "indirect_residual": 1e5}
     finest = replace(settings, followed_anchors=3, coarse_cells=8, samples=samples)
@@ -164,8 +171,8 @@ def test_occluded_pixels_count_with_their_anchors() -> None:
     """Each of 100 pixels lights four places of its own for each of 16 x 16 anchors, in two layers twice as many; with
     one anchor it is a pixel like the others."""
     pixels, few = (
-        EVIDENCE.sample_costs["direct"].paths,
-        replace(cheapest(1e-2, EVIDENCE, {}).settings, layers=(), coarse_layers=False),
+        PILOT_RESULT.sample_costs["direct"].paths,
+        replace(cheapest(1e-2, PILOT_RESULT, {}).settings, layers=(), coarse_layers=False),
     )
     own = replace(few, occluded=tuple(range(100)), occluded_anchors=16, samples={**few.samples, "penumbra": 9.0})
 
@@ -184,24 +191,24 @@ def test_occluded_pixels_count_with_their_anchors() -> None:
 def test_occluded_pixels_have_several_anchors_where_the_others_do(accuracy: float) -> None:
     """One anchor is the sensor's centre, several stand for all of the sensor: for all pixels or for none. What is left
     of either counts. (Planted: the numbers chosen apart; the occluded pixels' share not counted.)"""
-    evidence = with_occluded({1: 6e-3, 2: 3e-3, 5: 7e-4, 16: 1e-4, 32: 3e-5})
-    chosen = cheapest(accuracy, evidence, {})
+    pilot_result = with_occluded({1: 6e-3, 2: 3e-3, 5: 7e-4, 16: 1e-4, 32: 3e-5})
+    chosen = cheapest(accuracy, pilot_result, {})
     settings = chosen.settings
     assert (settings.anchors > 1) == (settings.occluded_anchors > 1) and settings.occluded == tuple(range(150))
     assert chosen.fits and chosen.total.bound <= accuracy
     left = {1: 6e-3, 2: 3e-3, 5: 7e-4, 16: 1e-4, 32: 3e-5}[settings.occluded_anchors]
     with_none = predicted(accuracy, with_occluded({1: 0.0}), replace(settings, occluded_anchors=1), {})
     assert chosen.systematic.value == pytest.approx(math.hypot(with_none.systematic.value, left), rel=1e-6)
-    off = cheapest(1e-3, evidence, {"anchors": False})
+    off = cheapest(1e-3, pilot_result, {"anchors": False})
     assert off.settings.anchors == off.settings.occluded_anchors == 1 and off.fits, "what the user wants does not count"
 
 
 def test_light_to_random_points_of_the_sensor_has_its_own_noise() -> None:
     """Ten times the noise takes so many more samples where there are several anchors, and none where there is one.
     (Planted: the centre's noise for both; spread noise with one anchor.)"""
-    noisy = replace(EVIDENCE, spread=SampleCost(Noise(2e-2, 16, 0.5), 16_384))
+    noisy = replace(PILOT_RESULT, spread=SampleCost(Noise(2e-2, 16, 0.5), 16_384))
     for switches, factor in (({"anchors": False}, 1.0), ({"anchors": True}, 10.0)):
-        quiet, loud = (cheapest(3e-3, evidence, switches) for evidence in (EVIDENCE, noisy))
+        quiet, loud = (cheapest(3e-3, pilot_result, switches) for pilot_result in (PILOT_RESULT, noisy))
         assert (loud.settings.anchors > 1) == (factor > 1)
         if factor == 1:
             assert loud == quiet
@@ -216,8 +223,8 @@ def test_what_looks_see_of_all_shots_needs_no_margin() -> None:
     (Planted: a margin for both in both; none for either.)
     """
     for classes, seen in ((64, True), (65, False)):
-        evidence = replace(EVIDENCE, forming=replace(EVIDENCE.forming, shots=100, classes=classes))
-        found = cheapest(1e-3, evidence, {})
+        pilot_result = replace(PILOT_RESULT, forming=replace(PILOT_RESULT.forming, shots=100, classes=classes))
+        found = cheapest(1e-3, pilot_result, {})
         left = found.systematic.bound
         whole = math.hypot(left / 0.95, found.target) if seen else math.hypot(left, found.target) / 0.95
         assert found.fits and whole == pytest.approx(1e-3)
@@ -230,14 +237,16 @@ def test_samples_take_the_least_work_for_the_target() -> None:
     """
     noises = {name: Noise(0.0, 1, 0.5) for name in ("direct", "anchor_residual", "indirect_residual")}
     noises["from_camera"] = Noise(3e-2, 2, 0.5)
-    evidence = replace(
-        EVIDENCE.with_sample_costs({name: replace(EVIDENCE.sample_costs[name], noise=n) for name, n in noises.items()}),
-        spread=replace(EVIDENCE.spread, noise=Noise(0.0, 1, 0.5)),
+    pilot_result = replace(
+        PILOT_RESULT.with_sample_costs(
+            {name: replace(PILOT_RESULT.sample_costs[name], noise=n) for name, n in noises.items()}
+        ),
+        spread=replace(PILOT_RESULT.spread, noise=Noise(0.0, 1, 0.5)),
     )
-    found = cheapest(1e-3, evidence, parse_switches("+interreflection"))
+    found = cheapest(1e-3, pilot_result, parse_switches("+interreflection"))
     settings = found.settings
     counts = settings.samples["indirect"], settings.samples["from_camera"]
-    variances = evidence.sample_costs["indirect"].variance, evidence.sample_costs["from_camera"].variance
+    variances = pilot_result.sample_costs["indirect"].variance, pilot_result.sample_costs["from_camera"].variance
     prices = 16_384 * FIXED.passes["indirect"], 20_000 * FIXED.passes["from_camera"]
     kinds = list(zip(variances, counts, prices, strict=True))
     assert math.sqrt(sum(v / n for v, n, _ in kinds) / GROUPS) == pytest.approx(found.target / 1.1, rel=0.01)
@@ -249,19 +258,21 @@ def test_samples_take_the_least_work_for_the_target() -> None:
 def test_wide_cells_hold_light_of_many_anchors() -> None:
     """8 x 8 anchors of 49 classes are 10^8 places, of cells of two pixels a quarter of that. (Planted: as many places
     whatever the width; the width's own error not counted.)"""
-    many = {Part("followed_anchors", count): size for count, size in {1: 7e-3, 2: 3e-3, 5: 6e-4, 8: 2e-5}.items()}
-    wide = {Part("followed_width", width): size for width, size in {1: 0.0, 2: 5e-5, 4: 4e-4}.items()}
+    many = {
+        Approximation("followed_anchors", count): size for count, size in {1: 7e-3, 2: 3e-3, 5: 6e-4, 8: 2e-5}.items()
+    }
+    wide = {Approximation("followed_width", width): size for width, size in {1: 0.0, 2: 5e-5, 4: 4e-4}.items()}
     followed = SampleCost(Noise(2e-2, 2, 0.5), 36_384)
     sizes = {part: size for part, size in SIZES.items() if part.name != "followed_anchors"} | many
     without, found = (
-        replace(EVIDENCE, changes=changes(each)).with_sample_costs({"indirect_residual": followed})
+        replace(PILOT_RESULT, changes=changes(each)).with_sample_costs({"indirect_residual": followed})
         for each in (sizes, sizes | wide)
     )
     assert not cheapest(5e-4, without, {}).fits
     chosen = cheapest(5e-4, found, {})
     settings = chosen.settings
     assert chosen.fits and (settings.followed_anchors, settings.followed_width) == (8, 2)
-    assert entries(EVIDENCE.sample_costs["direct"].paths, 49, Numbers.of(settings), settings) <= 2**25
+    assert entries(PILOT_RESULT.sample_costs["direct"].paths, 49, Numbers.of(settings), settings) <= 2**25
     narrow = predicted(5e-4, without, replace(settings, followed_width=1), {}).systematic.value
     assert chosen.systematic.value == pytest.approx(math.hypot(narrow, 5e-5), rel=1e-6)
     assert cheapest(1e-2, found, {}).settings.followed_width == 1, "one anchor sees nothing beyond its mean"
@@ -272,12 +283,12 @@ def test_wide_cells_hold_light_of_many_anchors() -> None:
 def test_doubt_about_coarse_cells_names_them() -> None:
     """Indirect light in coarse cells may be 2e-3 off or not at all: to know it saves fine cells. (Planted: doubt about
     effects and numbers alone.)"""
-    place = EVIDENCE.changes.parts.index(Part("indirect cells", 1))
-    products = EVIDENCE.changes.products.copy()
-    products[:, :, place, place] = changes({Part("indirect cells", 1): 1e-4}, 8e-3).products[:, :, 0, 0]
-    unsure = replace(ONE_CLASS, changes=Changes(EVIDENCE.changes.parts, products))
+    place = PILOT_RESULT.changes.parts.index(Approximation("indirect cells", 1))
+    products = PILOT_RESULT.changes.products.copy()
+    products[:, :, place, place] = changes({Approximation("indirect cells", 1): 1e-4}, 8e-3).products[:, :, 0, 0]
+    unsure = replace(ONE_CLASS, changes=ErrorCovariance(PILOT_RESULT.changes.parts, products))
     worth, part = value_of_refining(1e-3, unsure, {})
-    assert worth > 0 and part == Part("indirect cells", 1) and run_of(part) == "effects"
+    assert worth > 0 and part == Approximation("indirect cells", 1) and run_of(part) == "effects"
 
 
 def test_what_interpolation_leaves_of_sharp_light_counts() -> None:

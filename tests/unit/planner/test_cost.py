@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import open_bench
-from mitsim.light.passes import Simulation
 from mitsim.light.sampling import Group, trace_groups
 from mitsim.light.settings import PATHS_AT_ONCE, Settings, SharpPixels
+from mitsim.light.simulation import Simulation
 from mitsim.planner.memory import path_sample_bytes
 from mitsim.transport.records import DIRECT, Bundle, CellAxis, CellGrid, PathSamples
 
@@ -44,7 +44,7 @@ def test_a_block_takes_no_more_than_is_counted(between: bool, layers: tuple[floa
     light = path_samples()
     held = tracemalloc.get_traced_memory()[0]
     tracemalloc.reset_peak()
-    bundle.file(light, np.arange(PIXELS), 4)
+    bundle.accumulate(light, np.arange(PIXELS), 4)
     # The light of the next paths is fetched meanwhile: it is held beside what is filed, and twice while it is fetched.
     taken = tracemalloc.get_traced_memory()[1] + held
     tracemalloc.stop()

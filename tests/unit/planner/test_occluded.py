@@ -14,8 +14,8 @@ import pytest
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting, parse_patterns
-from mitsim.light.passes import Simulation
 from mitsim.light.settings import Settings, SharpPixels
+from mitsim.light.simulation import Simulation
 from mitsim.planner import pilot
 from mitsim.planner.pilot_direct import occluded_pixels
 from mitsim.planner.pilot_samples import Sample
@@ -121,14 +121,14 @@ def test_where_a_shot_shows_none_or_nothing_else_all_have_the_same_anchors(
     bench: Bench, shows: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The sample then tells of one kind alone. (Planted: apart all the same; nobody knew of several anchors.)"""
-    monkeypatch.setattr("mitsim.planner.pilot.Look._rough", True)
+    monkeypatch.setattr("mitsim.planner.pilot.PilotRuns._rough", True)
     lit = np.zeros(N**2, dtype=bool)
     lit[: 8 * N] = True  # above the card
     if shows != "none":
         lit = np.isin(np.arange(N**2), occluded_pixels(Simulation(bench, Settings(depth=Z)), 1e-3, 0))
     lighting = Lighting((~lit).astype(np.int64), np.array([[1.0, 0.0]]))
-    evidence = pilot.measure(bench, lighting, 1e-3, 0)
-    assert evidence.occluded == () and {1, 2, 3} <= set(evidence.ladders["anchors"])
+    pilot_result = pilot.measure(bench, lighting, 1e-3, 0)
+    assert pilot_result.occluded == () and {1, 2, 3} <= set(pilot_result.ladders["anchors"])
 
 
 @pytest.mark.slow
@@ -137,8 +137,8 @@ def test_pixels_that_are_traced_apart_are_no_occluded_ones(bench: Bench, monkeyp
     found = occluded_pixels(Simulation(bench, Settings(depth=Z)), 1e-3, 0)
     sharp = SharpPixels(found[::2], 2, (-0.1, 0.1, -0.1, 0.1))
     monkeypatch.setattr("mitsim.planner.pilot.sharp_pixels", lambda *_: sharp)
-    evidence = pilot.measure(bench, parse_patterns("dots:3", N).lighting, 1e-3, 0)
-    assert evidence.occluded and not set(evidence.occluded) & set(sharp.pixels)
+    pilot_result = pilot.measure(bench, parse_patterns("dots:3", N).lighting, 1e-3, 0)
+    assert pilot_result.occluded and not set(pilot_result.occluded) & set(sharp.pixels)
 
 
 @pytest.mark.parametrize("pixels", [1, 12, 300])

@@ -18,9 +18,9 @@ from mitsim.bench.effects import EFFECTS
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import parse_patterns
-from mitsim.light.passes import Simulation
-from mitsim.light.pilot_result import LOOKS, Changes, Evidence, Part
+from mitsim.light.pilot_result import REPLICATES, Approximation, ErrorCovariance, PilotResult
 from mitsim.light.settings import Settings
+from mitsim.light.simulation import Simulation
 from mitsim.optics.frames import monte_carlo_error
 from mitsim.planner import pilot, pilot_anchors, pilot_direct, pilot_samples
 from mitsim.planner.pilot_anchors import AnchorRuns, FollowedRuns
@@ -48,12 +48,12 @@ def bench(shared_scene: Callable[..., Path], variant: str) -> Bench:
     )
 
 
-def measured(bench: Bench, seed: int, accuracy: float = 1e-2) -> Evidence:
+def measured(bench: Bench, seed: int, accuracy: float = 1e-2) -> PilotResult:
     return pilot.measure(bench, parse_patterns("dots:4", N).lighting, accuracy, seed)
 
 
 @pytest.fixture(scope="module")
-def evidence(bench: Bench) -> Evidence:
+def pilot_result(bench: Bench) -> PilotResult:
     return measured(bench, seed=3)
 
 
@@ -83,12 +83,12 @@ def promised(found: float, actual: float) -> bool:
     return 1 / 1.5 < found / actual < 1.5
 
 
-def test_what_is_measured(bench: Bench, evidence: Evidence) -> None:
-    assert set(evidence.effects) == {"interreflection", "ambient", "diffraction", "black-level", "speckle"} & set(
+def test_what_is_measured(bench: Bench, pilot_result: PilotResult) -> None:
+    assert set(pilot_result.effects) == {"interreflection", "ambient", "diffraction", "black-level", "speckle"} & set(
         effects.present(bench)
     )
-    assert set(evidence.effects) <= set(EFFECTS)
-    ladders = evidence.ladders
+    assert set(pilot_result.effects) <= set(EFFECTS)
+    ladders = pilot_result.ladders
     assert {1, 2, 3} <= set(ladders["anchors"]) <= set(AnchorRuns.ladder)
     assert {1, 2, 3} <= set(ladders["layers"]) <= set(pilot_direct.LAYER_LADDER)
     assert {1, 2} <= set(ladders["cells"]) <= set(pilot_direct.CELL_LADDER)
@@ -99,16 +99,16 @@ def test_what_is_measured(bench: Bench, evidence: Evidence) -> None:
     widths = ladders["followed_width"]
     assert tuple(widths) == pilot_anchors.WIDTHS and widths[1].value < widths[2].value < widths[4].value
     assert {1, 2} <= set(ladders["followed_anchors"]) <= set(FollowedRuns.ladder)
-    assert 0 < evidence.forming.seconds < 1
+    assert 0 < pilot_result.forming.seconds < 1
     assert (
-        evidence.sample_costs["direct"].paths
-        == evidence.sample_costs["indirect"].paths
+        pilot_result.sample_costs["direct"].paths
+        == pilot_result.sample_costs["indirect"].paths
         == N * N
-        < evidence.sample_costs["from_camera"].paths
+        < pilot_result.sample_costs["from_camera"].paths
     )
-    assert evidence.sample_costs["indirect_residual"].paths == evidence.sample_costs["indirect"].paths
-    assert evidence.sample_costs["camera_residual"].paths == evidence.sample_costs["from_camera"].paths
-    assert evidence.forming.terms == len(bench.spectrum.weights)
+    assert pilot_result.sample_costs["indirect_residual"].paths == pilot_result.sample_costs["indirect"].paths
+    assert pilot_result.sample_costs["camera_residual"].paths == pilot_result.sample_costs["from_camera"].paths
+    assert pilot_result.forming.terms == len(bench.spectrum.weights)
 
 
 def test_gloss_makes_noise_at_random_points_of_the_sensor(small_scene: Callable[..., Path], variant: str) -> None:
@@ -127,11 +127,11 @@ def test_gloss_makes_noise_at_random_points_of_the_sensor(small_scene: Callable[
     assert found.spread.noise.left(16) > 10 * found.sample_costs["direct"].noise.left(16)
 
 
-def test_depth_and_layers(bench: Bench, evidence: Evidence) -> None:
+def test_depth_and_layers(bench: Bench, pilot_result: PilotResult) -> None:
     """The light is seen from the ball's top (300 mm) to the sheet (400 mm); layers are equidistant in 1/z."""
-    assert 330 < evidence.depth < 400
-    assert evidence.layers[1] == (evidence.depth,)
-    for count, depths in evidence.layers.items():
+    assert 330 < pilot_result.depth < 400
+    assert pilot_result.layers[1] == (pilot_result.depth,)
+    for count, depths in pilot_result.layers.items():
         if count > 1:
             assert len(depths) == count and depths[0] == pytest.approx(400, rel=1e-3)
             assert 299 < depths[-1] < 320
@@ -139,35 +139,35 @@ def test_depth_and_layers(bench: Bench, evidence: Evidence) -> None:
 
 
 @pytest.mark.parametrize("effect", ["interreflection", "ambient", "diffraction"])
-def test_effects_come_true(bench: Bench, evidence: Evidence, effect: str) -> None:
+def test_effects_come_true(bench: Bench, pilot_result: PilotResult, effect: str) -> None:
     names = frozenset(effects.present(bench)) - {"speckle"}
-    full = Settings(depth=evidence.depth, subdivision=2, effects=names)
+    full = Settings(depth=pilot_result.depth, subdivision=2, effects=names)
     judge = frames(bench, full)
     actual = change(frames(bench, replace(full, effects=names - {effect})), judge)
     assert actual > 1e-3, "the scene has to call for it"
-    assert promised(evidence.effects[effect].value, actual)
+    assert promised(pilot_result.effects[effect].value, actual)
 
 
-def test_anchors_come_true(bench: Bench, evidence: Evidence) -> None:
-    base = Settings(depth=evidence.depth, coarse_cells=2, subdivision=2)
+def test_anchors_come_true(bench: Bench, pilot_result: PilotResult) -> None:
+    base = Settings(depth=pilot_result.depth, coarse_cells=2, subdivision=2)
     every = frozenset(effects.present(bench)) - {"speckle"}
     light = np.linalg.norm(frames(bench, replace(base, effects=every)))
     judge = frames(bench, replace(base, anchors=5), 256)
     actual = np.linalg.norm(frames(bench, base, 256) - judge) / light
     assert actual > 2e-3
-    assert promised(evidence.ladders["anchors"][1].value, actual)
+    assert promised(pilot_result.ladders["anchors"][1].value, actual)
 
 
 @pytest.mark.slow
-def test_anchors_of_followed_light_come_true(bench: Bench, evidence: Evidence) -> None:
+def test_anchors_of_followed_light_come_true(bench: Bench, pilot_result: PilotResult) -> None:
     """Light between the ball, the wall and the sheet differs over the sensor of 24 mm. (Planted: paths from the camera
     that are filed as seen from their start.)"""
     every = frozenset(effects.present(bench)) - {"speckle"}
-    base = Settings(depth=evidence.depth, subdivision=2, effects=every)
+    base = Settings(depth=pilot_result.depth, subdivision=2, effects=every)
     light = np.linalg.norm(frames(bench, base))
     judge = frames(bench, replace(base, followed_anchors=5), 64, 96)
     actual = np.linalg.norm(frames(bench, base, 64, 96) - judge) / light
-    found = evidence.ladders["followed_anchors"]
+    found = pilot_result.ladders["followed_anchors"]
     assert actual > 1e-3, "the scene has to call for it"
     assert promised(found[1].value, actual)
     few = np.linalg.norm(frames(bench, replace(base, followed_anchors=2), 64, 96) - judge) / light
@@ -175,11 +175,13 @@ def test_anchors_of_followed_light_come_true(bench: Bench, evidence: Evidence) -
 
 
 @pytest.mark.parametrize("width", [2, pytest.param(4, marks=pytest.mark.slow)])
-def test_wide_cells_of_followed_light_come_true(bench: Bench, evidence: Evidence, width: int) -> None:
+def test_wide_cells_of_followed_light_come_true(bench: Bench, pilot_result: PilotResult, width: int) -> None:
     """What anchors see beyond their mean, in cells of several pixels and one layer, against cells of half a pixel and
     two layers. (Planted: the mean filed in the cells of indirect light; cells twice as wide.)"""
     every = frozenset(effects.present(bench)) - {"speckle"}
-    base = Settings(depth=evidence.depth, subdivision=2, effects=every, followed_anchors=2, layers=evidence.layers[2])
+    base = Settings(
+        depth=pilot_result.depth, subdivision=2, effects=every, followed_anchors=2, layers=pilot_result.layers[2]
+    )
     judge = frames(bench, replace(base, coarse_cells=2, coarse_layers=True))
     wide = replace(base, coarse_cells=2, coarse_layers=True, followed_width=width)
     filed = Simulation(bench, wide)
@@ -188,41 +190,41 @@ def test_wide_cells_of_followed_light_come_true(bench: Bench, evidence: Evidence
     )
     actual = change(frames(bench, wide), judge)
     assert actual > 1e-3, "the scene has to call for it"
-    assert promised(evidence.ladders["followed_width"][width].value, actual)
+    assert promised(pilot_result.ladders["followed_width"][width].value, actual)
 
 
 @pytest.mark.slow
 def test_light_to_many_anchors_is_traced_in_parts(
-    bench: Bench, evidence: Evidence, monkeypatch: pytest.MonkeyPatch
+    bench: Bench, pilot_result: PilotResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All of it at once takes gigabytes. Parts of two samples make the same ladder but for the order of sums.
     (Planted: every part from the first sample on.)"""
     monkeypatch.setattr(
         pilot_anchors,
         "_AT_ONCE",
-        2 * 9 * (evidence.sample_costs["indirect_residual"].paths + evidence.sample_costs["from_camera"].paths),
+        2 * 9 * (pilot_result.sample_costs["indirect_residual"].paths + pilot_result.sample_costs["from_camera"].paths),
     )
     again = measured(bench, seed=3).ladders["followed_anchors"]
-    for count, error in evidence.ladders["followed_anchors"].items():
+    for count, error in pilot_result.ladders["followed_anchors"].items():
         assert again[count] == pytest.approx(error, rel=1e-6)
 
 
 @pytest.fixture(scope="module")
-def direct_part(bench: Bench, evidence: Evidence) -> float:
+def direct_part(bench: Bench, pilot_result: PilotResult) -> float:
     """Of all light."""
-    base = Settings(depth=evidence.depth, effects=frozenset({"diffraction"}))
+    base = Settings(depth=pilot_result.depth, effects=frozenset({"diffraction"}))
     every = replace(base, effects=frozenset(effects.present(bench)) - {"speckle"})
     return float(np.linalg.norm(frames(bench, base)) / np.linalg.norm(frames(bench, every)))
 
 
-def test_cells_come_true(bench: Bench, evidence: Evidence, direct_part: float) -> None:
+def test_cells_come_true(bench: Bench, pilot_result: PilotResult, direct_part: float) -> None:
     """Against cells twice as fine as the finest that the pilot tries; of direct light, told as a part of all."""
-    base = Settings(depth=evidence.depth, effects=frozenset({"diffraction"}))
+    base = Settings(depth=pilot_result.depth, effects=frozenset({"diffraction"}))
     judge = frames(bench, replace(base, subdivision=2 * max(pilot_direct.CELL_LADDER)), 1024)
     for cells in (1, 2):
         actual = change(frames(bench, replace(base, subdivision=cells), 1024), judge)
         assert actual > 4e-4
-        assert promised(evidence.ladders["cells"][cells].value, actual * direct_part)
+        assert promised(pilot_result.ladders["cells"][cells].value, actual * direct_part)
 
 
 def test_a_print_in_the_projectors_pixels_needs_no_finer_cells(small_scene: Callable[..., Path]) -> None:
@@ -230,24 +232,24 @@ def test_a_print_in_the_projectors_pixels_needs_no_finer_cells(small_scene: Call
     assert max(found.values()).value < 6e-4, "falloff within a pixel of 7.5 mm"
 
 
-def test_layers_come_true(bench: Bench, evidence: Evidence, direct_part: float) -> None:
-    base = Settings(depth=evidence.depth, subdivision=2, effects=frozenset({"diffraction"}))
-    judge = frames(bench, replace(base, layers=evidence.layers[4]), 256)
+def test_layers_come_true(bench: Bench, pilot_result: PilotResult, direct_part: float) -> None:
+    base = Settings(depth=pilot_result.depth, subdivision=2, effects=frozenset({"diffraction"}))
+    judge = frames(bench, replace(base, layers=pilot_result.layers[4]), 256)
     actual = change(frames(bench, base, 256), judge)
     assert actual > 2e-3
-    assert promised(evidence.ladders["layers"][1].value, actual * direct_part)
+    assert promised(pilot_result.ladders["layers"][1].value, actual * direct_part)
 
 
-def test_noise_comes_true(bench: Bench, evidence: Evidence) -> None:
+def test_noise_comes_true(bench: Bench, pilot_result: PilotResult) -> None:
     """Spread of six estimates of direct light with sixteen samples; and of other light with two."""
     every = frozenset(effects.present(bench)) - {"speckle"}
     switched = {"direct": frozenset({"diffraction"}), "indirect": every, "from_camera": every}
     lighting = parse_patterns("dots:4", N).lighting.shots(SHOWN)
     labels = lighting.labels
-    everything = frames(bench, Settings(depth=evidence.depth, subdivision=2, effects=every))
+    everything = frames(bench, Settings(depth=pilot_result.depth, subdivision=2, effects=every))
     for kind in switched:
-        made = Simulation(bench, Settings(depth=evidence.depth, subdivision=2, effects=switched[kind]))
-        each, noise = made.passes[kind], evidence.sample_costs[kind].noise
+        made = Simulation(bench, Settings(depth=pilot_result.depth, subdivision=2, effects=switched[kind]))
+        each, noise = made.passes[kind], pilot_result.sample_costs[kind].noise
         samples = int(noise.samples)
         traced = [each.tracer.trace(integer(9, kind, index), 0, samples) for index in range(6)]
         groups = [made.accumulate(kind, found, labels, samples) for found in traced]
@@ -293,7 +295,7 @@ def test_followed_light_of_either_side_has_its_own_noise(bench: Bench) -> None:
     everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
     found = FollowedRuns(bench, everything, sample, 0.0, 5)
     indirect, camera = found.sample_costs(1.0).values()
-    alone, nothing = FollowedRuns(bench, everything, sample, 0.0, 5), [PathSamples.none()] * LOOKS
+    alone, nothing = FollowedRuns(bench, everything, sample, 0.0, 5), [PathSamples.none()] * REPLICATES
     vars(alone)["_few_by_tracer"] = [found._few_by_tracer[0], nothing]
     assert indirect.noise.error == pytest.approx(pilot_samples.noise(alone._beyond_mean()), rel=1e-9)
     both = pilot_samples.noise(found._beyond_mean())
@@ -308,10 +310,12 @@ def test_indirect_light_is_looked_at_closer_where_noise_hides_what_coarse_cells_
     sample = pilot_samples.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
     everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
     first, close = (EffectRuns(bench, everything, sample, 5, (450.0, 330.0), told) for told in (1.0, 1e-7))
-    seen = [Changes.between(found.changes, found.light**2) for found in (first, close)]
-    open_ = [bound**2 - value**2 for value, bound in (each.estimate([Part("indirect cells", 1)]) for each in seen)]
+    seen = [ErrorCovariance.between(found.changes, found.light**2) for found in (first, close)]
+    open_ = [
+        bound**2 - value**2 for value, bound in (each.estimate([Approximation("indirect cells", 1)]) for each in seen)
+    ]
     assert open_[1] < open_[0] / 4
-    one, two = (each.estimate([Part("indirect layers", 1)]).value for each in seen)
+    one, two = (each.estimate([Approximation("indirect layers", 1)]).value for each in seen)
     assert two == pytest.approx(one, rel=0.3)
     noises = [found.sample_cost("indirect").noise for found in (first, close)]
     assert [noise.samples for noise in noises] == [sample.followed, 16 * sample.followed]

@@ -10,12 +10,12 @@ import pytest
 from mitsim.api.bench import Bench
 from mitsim.bench.effects import EFFECTS
 from mitsim.light.cost_model import unit_costs_of
-from mitsim.light.pilot_result import Evidence, Part
+from mitsim.light.pilot_result import Approximation, PilotResult
 from mitsim.light.settings import Settings
-from mitsim.planner.explain import SceneFacts, decide
+from mitsim.planner.explain import SceneFacts, explain_plan
 from mitsim.scene.guard.estimators import Unfit
 from mitsim.scene.guard.outline import Tag
-from tests.unit.planner.invented_evidence import EVIDENCE, SIZES, changes, plan, rows, stages, with_occluded
+from tests.unit.planner.invented_evidence import PILOT_RESULT, SIZES, changes, plan, rows, stages, with_occluded
 
 
 def bench(cuts: bool = False, shift: float = 0.0, feature: float = 0.06) -> Bench:
@@ -67,10 +67,10 @@ def test_devices_are_flagged_where_their_model_ends(
 def test_light_over_mirrors_that_is_not_resolved_is_told_with_their_kinds_and_the_first() -> None:
     mirrors = tuple(Tag(Path("a.xml"), line, "shape", {"type": kind}) for line, kind in ((7, "disk"), (9, "sphere")))
     facts = SceneFacts({}, 0.0, mirrors=(*mirrors, mirrors[1]))
-    (warning,) = decide(1e-2, replace(EVIDENCE, glint=0.2), facts).warnings
+    (warning,) = explain_plan(1e-2, replace(PILOT_RESULT, glint=0.2), facts).warnings
     assert warning.startswith("a.xml:7: shape: got 'disk'")
     assert "0.2 of the light" in warning and "2 sphere, 1 disk" in warning
-    assert not decide(1e-2, replace(EVIDENCE, glint=1e-4), facts).warnings
+    assert not explain_plan(1e-2, replace(PILOT_RESULT, glint=1e-4), facts).warnings
 
 
 def test_light_that_is_lost_over_a_mirror_is_told_with_its_place() -> None:
@@ -80,7 +80,7 @@ def test_light_that_is_lost_over_a_mirror_is_told_with_its_place() -> None:
 
     def said(shapes: tuple[Tag, ...] = shapes, **lacking: float) -> tuple[str, ...]:
         facts = SceneFacts(dict.fromkeys(EFFECTS, ""), 0.0, shapes=shapes)
-        return decide(1e-2, replace(EVIDENCE, mirror=1, **lacking), facts).warnings
+        return explain_plan(1e-2, replace(PILOT_RESULT, mirror=1, **lacking), facts).warnings
 
     assert said(left_out=1e-4) == ()
     for part in (9.9e-3, 0.1):
@@ -115,22 +115,22 @@ def test_only_effects_that_are_on_by_choice_say_what_would_be_without_them() -> 
 
 def test_where_nothing_fits_sampling_still_aims_below_the_accuracy() -> None:
     """Every number of anchors leaves 5 %: the plan is flagged, and sampling is no finer than it need be."""
-    coarse = {**SIZES, **{Part("anchors", count): 0.05 for count in (1, 2, 3, 5)}}
-    found = plan(1e-2, replace(EVIDENCE, changes=changes(coarse)))
+    coarse = {**SIZES, **{Approximation("anchors", count): 0.05 for count in (1, 2, 3, 5)}}
+    found = plan(1e-2, replace(PILOT_RESULT, changes=changes(coarse)))
     assert found.warnings and found.systematic_bound > 1e-2
     assert 0.5e-2 < found.sampling_target < 1e-2
 
 
-FOLLOWS = replace(EVIDENCE, changes=changes(SIZES | {Part("ambient"): 5e-2}))
+FOLLOWS = replace(PILOT_RESULT, changes=changes(SIZES | {Approximation("ambient"): 5e-2}))
 """Light of lamps that no budget can do without, seen from two points a side of the sensor."""
 
 
-def seconds(settings: Settings, evidence: Evidence = FOLLOWS) -> float:
-    return sum(stages(evidence, settings, unit_costs_of(evidence)).values())
+def seconds(settings: Settings, pilot_result: PilotResult = FOLLOWS) -> float:
+    return sum(stages(pilot_result, settings, unit_costs_of(pilot_result)).values())
 
 
 def test_seconds_are_those_of_every_stage_once() -> None:
-    found = plan(evidence=FOLLOWS)
+    found = plan(pilot_result=FOLLOWS)
     expected = stages(FOLLOWS, found.settings, unit_costs_of(FOLLOWS))
     assert found.predicted == pytest.approx(expected) and min(expected.values()) > 0
     assert found.predicted_seconds == pytest.approx(seconds(found.settings))
@@ -138,7 +138,7 @@ def test_seconds_are_those_of_every_stage_once() -> None:
 
 def test_a_row_tells_what_one_of_it_would_save_and_leave() -> None:
     """Seconds with and without, samples as they are; the error of one anchor, layer and point, not of two."""
-    found = plan(evidence=FOLLOWS)
+    found = plan(pilot_result=FOLLOWS)
     settings, told = found.settings, rows(found)
     assert settings.anchors > 1 and settings.layers and settings.followed_anchors == 2
     for name, less in (
@@ -148,21 +148,21 @@ def test_a_row_tells_what_one_of_it_would_save_and_leave() -> None:
         ("diffraction", replace(settings, effects=settings.effects - {"diffraction"})),
     ):
         assert told[name].seconds == pytest.approx(seconds(settings) - seconds(less)) and told[name].seconds > 0, name
-    assert told["followed-anchors"].error_if_off == pytest.approx(SIZES[Part("followed_anchors", 1)])
+    assert told["followed-anchors"].error_if_off == pytest.approx(SIZES[Approximation("followed_anchors", 1)])
 
 
 def test_the_row_of_occluded_pixels_tells_their_number_and_what_they_leave() -> None:
     """None: few anchors serve all. Some: one anchor's error, and what the chosen ones leave."""
     none = rows(plan())["occluded-anchors"]
     assert (none.state, none.error_if_off, none.seconds) == ("off", 0, 0) and "serve all" in none.reason
-    evidence = with_occluded({1: 6e-3, 2: 3e-3, 5: 7e-4, 16: 1e-4, 32: 3e-5})
-    found = plan(evidence=evidence)
+    pilot_result = with_occluded({1: 6e-3, 2: 3e-3, 5: 7e-4, 16: 1e-4, 32: 3e-5})
+    found = plan(pilot_result=pilot_result)
     several, count = rows(found)["occluded-anchors"], found.settings.occluded_anchors
     assert count > 1 and several.state == "approximate" and several.seconds == 0
     assert several.error_if_off == pytest.approx(6e-3)
-    left = evidence.ladders["occluded_anchors"][count].value
+    left = pilot_result.ladders["occluded_anchors"][count].value
     hidden = "150 projector pixels are hidden from part of the sensor"
     assert several.reason == f"{hidden}: {count}x{count} anchors leave {left:.1e}, one 6.0e-03"
-    one = rows(plan(0.1, evidence, "-anchors"))["occluded-anchors"]
+    one = rows(plan(0.1, pilot_result, "-anchors"))["occluded-anchors"]
     assert (one.state, one.seconds) == ("off", 0) and one.error_if_off == pytest.approx(6e-3)
     assert one.reason == f"{hidden}: one anchor leaves 6.0e-03"

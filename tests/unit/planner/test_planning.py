@@ -14,7 +14,7 @@ import pytest
 
 from mitsim.devices.patterns import Lighting
 from mitsim.light.cost_model import FIXED
-from mitsim.light.pilot_result import LOOKS, Noise, SampleCost
+from mitsim.light.pilot_result import REPLICATES, Noise, SampleCost
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, MOST_PATHS
 from mitsim.optics.frames import bound_of
@@ -34,12 +34,12 @@ OWN = "the plan's own"
 class Invented:
     """Stands in for the choices of a look."""
 
-    evidence: Looks
+    pilot_result: Looks
     switches: Mapping[str, bool]
 
     def seconds(self, accuracy: float) -> tuple[float, bool]:
-        price = PRICE * (self.evidence.dearer if len(self.evidence.asked) > 1 else 1.0) / accuracy
-        kept = self.evidence.kept if len(self.evidence.asked) > 1 else KEPT
+        price = PRICE * (self.pilot_result.dearer if len(self.pilot_result.asked) > 1 else 1.0) / accuracy
+        kept = self.pilot_result.kept if len(self.pilot_result.asked) > 1 else KEPT
         return price * (1.0 if self.switches.get("diffraction", True) else 0.5), accuracy >= kept
 
 
@@ -62,19 +62,19 @@ def made() -> Plan:
 def looks(made: Plan, monkeypatch: pytest.MonkeyPatch) -> Looks:
     seen = Looks()
 
-    class Look:
+    class PilotRuns:
         seconds = LOOKING
 
         def __init__(self, bench: object, lighting: Lighting, accuracy: float, seed: int) -> None:
             assert lighting is LIGHTING
             seen.asked.append((accuracy, seed))
-            self.evidence = seen
+            self.pilot_result = seen
 
-    def decided(look: Look, accuracy: float, switches: Mapping[str, bool]) -> Plan:
-        seen.decided = look.evidence, accuracy, switches
+    def decided(look: PilotRuns, accuracy: float, switches: Mapping[str, bool]) -> Plan:
+        seen.decided = look.pilot_result, accuracy, switches
         return replace(made, accuracy=accuracy, warnings=(OWN,))
 
-    monkeypatch.setattr(pilot, "Look", Look)
+    monkeypatch.setattr(pilot, "PilotRuns", PilotRuns)
     monkeypatch.setattr(planner, "Candidates", Invented)
     monkeypatch.setattr(planner, "_refuse_unfit", lambda bench, switches: None)
     monkeypatch.setattr(planner, "_decided", decided)
@@ -178,22 +178,22 @@ def test_paces_are_those_of_launches_as_the_run_has_them(
 
 
 class Heavy:
-    """A look at evidence whose light from the camera turns out to have noise of such a variance in a sample."""
+    """A look at pilot result whose light from the camera turns out to have noise of such a variance in a sample."""
 
     def __init__(self, variance: float, spread: float = 0.0, paths: float = 50.0) -> None:
         residual = replace(ONE_CLASS.sample_costs["indirect_residual"], seconds=0.0)
-        self.evidence = ONE_CLASS.with_sample_costs({"camera_residual": residual})
+        self.pilot_result = ONE_CLASS.with_sample_costs({"camera_residual": residual})
         self.variance, self.spread, self.paths, self.looked = variance, spread, paths, list[int]()
 
     def heavy(self, samples: int) -> dict[str, SampleCost]:
         self.looked.append(samples)
         noise = Noise(math.sqrt(self.variance / samples), samples, 0.5, self.spread, self.paths)
-        return {"from_camera": SampleCost(noise, self.evidence.sample_costs["from_camera"].paths)}
+        return {"from_camera": SampleCost(noise, self.pilot_result.sample_costs["from_camera"].paths)}
 
 
 def planned_with(look: Any, accuracy: float = 3e-3) -> tuple[Candidate, Candidate]:
-    """The choice by the look's evidence, and that with heavy paths."""
-    chosen = cheapest(accuracy, look.evidence, {})
+    """The choice by the look's pilot result, and that with heavy paths."""
+    chosen = cheapest(accuracy, look.pilot_result, {})
     assert "interreflection" in chosen.settings.effects
     return chosen, planner._with_heavy_paths(look, accuracy, chosen, {})[1]
 
@@ -211,7 +211,7 @@ def test_rare_heavy_paths_are_sampled_from_the_first() -> None:
     assert after.settings.samples["from_camera"] > 20 * before.settings.samples["from_camera"] and left < target
     assert (
         look.looked == sorted(look.looked)
-        and look.looked[-1] * LOOKS * look.evidence.sample_costs["from_camera"].paths <= 2**23
+        and look.looked[-1] * REPLICATES * look.pilot_result.sample_costs["from_camera"].paths <= 2**23
     )
     _, more = planned_with(Heavy(400 * plain, spread=4.0))
     assert more.settings.samples["from_camera"] > 1.02 * after.settings.samples["from_camera"]
@@ -229,24 +229,27 @@ def test_looks_go_on_while_few_heavy_paths_are_met() -> None:
     planned_with(many)
     planned_with(few)
     assert many.looked == few.looked[: len(many.looked)] and len(few.looked) > len(many.looked)
-    assert few.looked[-1] * LOOKS * ONE_CLASS.sample_costs["from_camera"].paths == pytest.approx(2**23, rel=0.01)
+    assert few.looked[-1] * REPLICATES * ONE_CLASS.sample_costs["from_camera"].paths == pytest.approx(2**23, rel=0.01)
 
 
 def test_a_run_of_heavy_paths_has_a_range_of_seconds() -> None:
     """None where many paths make the noise; of some, five times their work at most and 0.7 at least, as the rest takes
     what it takes; of fewer than four, what sampling stops at. (Planted: the rest grows too; a stage that is added is
     in none of the ends.)"""
-    evidence, settings = ONE_CLASS, plan(3e-3, ONE_CLASS).settings
+    pilot_result, settings = ONE_CLASS, plan(3e-3, ONE_CLASS).settings
     settings = replace(settings, samples={**settings.samples, "from_camera": 100.0})
     planned = replace(plan(3e-3, ONE_CLASS), settings=settings)
-    assert planner._range(evidence, planned) is None and planned.range_words == ""
-    pace, total = evidence.sample_costs["from_camera"].seconds or FIXED.passes["from_camera"], planned.predicted_seconds
-    work = GROUPS * 100 * evidence.sample_costs["from_camera"].paths * pace
+    assert planner._range(pilot_result, planned) is None and planned.range_words == ""
+    pace, total = (
+        pilot_result.sample_costs["from_camera"].seconds or FIXED.passes["from_camera"],
+        planned.predicted_seconds,
+    )
+    work = GROUPS * 100 * pilot_result.sample_costs["from_camera"].paths * pace
 
     def ends(paths: float) -> tuple[float, float] | None:
-        light = evidence.sample_costs["from_camera"]
+        light = pilot_result.sample_costs["from_camera"]
         return planner._range(
-            evidence.with_sample_costs({"from_camera": replace(light, noise=replace(light.noise, heavy=paths))}),
+            pilot_result.with_sample_costs({"from_camera": replace(light, noise=replace(light.noise, heavy=paths))}),
             planned,
         )
 
@@ -274,11 +277,11 @@ def test_noise_tells_how_unlike_looks_are() -> None:
     """Four looks of which one has all the noise: a relative variance of 16/9 about; of even noise next to none. And as
     how many equal ones paths are: one that brings ten times as much as a hundred others is as 3.9 would be."""
     rng = np.random.default_rng(6)
-    even, one = rng.normal(size=(LOOKS, 4000)), np.zeros((LOOKS, 4000))
+    even, one = rng.normal(size=(REPLICATES, 4000)), np.zeros((REPLICATES, 4000))
     one[2] = even[2]
     paths = np.append(np.ones(100), 10.0)
     assert Noise.among(even, 2.0, 8, paths).spread < 0.01
     assert Noise.among(even, 2.0, 8, paths).error == pytest.approx(math.sqrt(4000) / 2, rel=0.05)
     assert Noise.among(one, 2.0, 8, paths).spread == pytest.approx(16 / 9, rel=0.01)
     assert Noise.among(one, 2.0, 8, paths).heavy == pytest.approx(200**2 / 10100)
-    assert Noise.among(np.zeros((LOOKS, 3)), 2.0, 8, np.zeros(0)) == Noise(0.0, 8, 0.5, heavy=0.0)
+    assert Noise.among(np.zeros((REPLICATES, 3)), 2.0, 8, np.zeros(0)) == Noise(0.0, 8, 0.5, heavy=0.0)

@@ -11,8 +11,8 @@ import mitsim as ms
 from mitsim.core.arrays import FloatArray
 from mitsim.light.grids import GRIDS
 from mitsim.light.light import SampledLight, traced_again
-from mitsim.light.passes import Simulation
 from mitsim.light.settings import SharpPixels
+from mitsim.light.simulation import Simulation
 from mitsim.report import IDEALISED
 from mitsim.report.lit_scene import LitScene
 from mitsim.studies import ablation
@@ -221,10 +221,10 @@ def test_lobes_are_averaged_over_anchors_with_their_weights(far: SampledLight) -
     )
     labels = np.arange(far.bench.n**2)
     bundle = simulation.grids["sharp"].bundle
-    filed, weights = bundle.file(path_samples, labels, 1), simulation.mean_weights(bundle.anchors)
+    filed, weights = bundle.accumulate(path_samples, labels, 1), simulation.mean_weights(bundle.anchors)
     mean = ablation._even_lobes(filed, simulation)
     weight = weights[2] * weights[1]
-    again = bundle.repeated(replace(bundle, anchors=1).file(path_samples.averaged(weights), labels, 1))
+    again = bundle.repeated(replace(bundle, anchors=1).accumulate(path_samples.averaged(weights), labels, 1))
     assert abs(mean - again).max() < 1e-12 and mean.sum() == pytest.approx(9 * weight)
     assert ablation._even_lobes(filed, far.simulation) is filed, "nothing to average where nothing is sharp"
 

@@ -8,7 +8,7 @@ import pytest
 
 from mitsim.api.bench import open_bench
 from mitsim.core.job import Job
-from mitsim.light.pilot_result import Part
+from mitsim.light.pilot_result import Approximation
 from mitsim.studies import accuracy_findings
 from mitsim.studies.accuracy_findings import Budget, PartCost, Spread
 from mitsim.studies.accuracy_parts import Judge, Orders, Stand, with_samples
@@ -38,7 +38,7 @@ def test_each_surface_keeps_the_albedo_of_the_light(shared_scene: Callable[..., 
     assert [each.label for each in (second, rest)] == [f"{PARENT}: 2 surfaces", f"{PARENT}: 5 or more"]
     for one, other, ratio in ((second, third, RHO), (third, fourth, RHO), (fourth, rest, RHO / (1 - RHO))):
         assert other.error_if_off / one.error_if_off == pytest.approx(ratio, rel=0.1)
-    whole = stand.evidence.error(Part(PARENT))
+    whole = stand.pilot_result.error(Approximation(PARENT))
     summed = sum(each.error_if_off for each in orders.costs)
     assert summed == pytest.approx(whole.value, abs=2 * (whole.bound - whole.value) + 0.1 * summed)
     for each in orders.costs:

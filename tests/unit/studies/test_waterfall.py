@@ -11,7 +11,7 @@ from mitsim.calibrate.calibrate import estimate
 from mitsim.core.configuration import shipped
 from mitsim.core.job import Job
 from mitsim.devices.sensor import SensorModel, load_sensor
-from mitsim.light.passes import Simulation
+from mitsim.light.simulation import Simulation
 from mitsim.metrics import psnr
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import LitScene

@@ -55,7 +55,7 @@ WAYS = ((400.0,), DEPTHS)
 @pytest.mark.parametrize("depths", WAYS)
 def test_all_light_is_filed_and_under_its_own_row(depths: tuple[float, ...]) -> None:
     made, found = bundle(depths), path_samples()
-    light = made.file(found, LABELS, samples=4)
+    light = made.accumulate(found, LABELS, samples=4)
     assert light.shape == (4, made.size)
     lines = np.append(LABELS, 3)[found.pixel]
     assert np.asarray(light.sum(axis=1)).ravel() == pytest.approx(np.bincount(lines, found.value) / 4, rel=1e-12)
@@ -64,7 +64,7 @@ def test_all_light_is_filed_and_under_its_own_row(depths: tuple[float, ...]) -> 
 @pytest.mark.parametrize("depths", WAYS)
 def test_anchors_are_kept_apart(depths: tuple[float, ...]) -> None:
     made, found = bundle(depths), path_samples()
-    light = unpacked(made, made.file(found, LABELS).toarray()).sum(axis=(0, 1, 3, 5))
+    light = unpacked(made, made.accumulate(found, LABELS).toarray()).sum(axis=(0, 1, 3, 5))
     for a, b in np.ndindex(2, 2):
         mine = (found.anchor_row == a) & (found.anchor_column == b)
         assert light[a, b] == pytest.approx(found.value[mine].sum(), rel=1e-12)
@@ -72,7 +72,9 @@ def test_anchors_are_kept_apart(depths: tuple[float, ...]) -> None:
 
 def test_an_even_cell_holds_the_light_that_falls_in_it() -> None:
     made = bundle(anchors=1)
-    light = unpacked(made, made.file(one(-0.2 + 2.99 * 0.05, -0.1 + 7.01 * 0.02), LABELS).toarray())[0, 0, 0, :, 0]
+    light = unpacked(made, made.accumulate(one(-0.2 + 2.99 * 0.05, -0.1 + 7.01 * 0.02), LABELS).toarray())[
+        0, 0, 0, :, 0
+    ]
     assert light[2, 7] == 1 and light.sum() == 1
     assert made.cells == GRID.shape
 
@@ -81,7 +83,7 @@ def test_an_even_cell_holds_the_light_that_falls_in_it() -> None:
 def test_layers_keep_the_mean_inverse_depth(depth: float) -> None:
     """Split in 1/z, in which the shadow is nearly linear: between the two layers around it and no other."""
     made = bundle(DEPTHS, anchors=1)
-    light = unpacked(made, made.file(one(0.0, 0.0, inverse_depth=1 / depth), LABELS).toarray()).sum(
+    light = unpacked(made, made.accumulate(one(0.0, 0.0, inverse_depth=1 / depth), LABELS).toarray()).sum(
         axis=(0, 2, 3, 4, 5)
     )
     assert light.sum() == pytest.approx(1) and light @ (1 / np.array(DEPTHS)) == pytest.approx(1 / depth)
@@ -92,7 +94,7 @@ def test_layers_keep_the_mean_inverse_depth(depth: float) -> None:
 @pytest.mark.parametrize(("depth", "layer"), [(700.0, 0), (np.inf, 0), (240.0, 2)])
 def test_light_beyond_the_layers_goes_to_the_nearest(depth: float, layer: int) -> None:
     made = bundle(DEPTHS, anchors=1)
-    light = unpacked(made, made.file(one(0.0, 0.0, inverse_depth=1 / depth), LABELS).toarray()).sum(
+    light = unpacked(made, made.accumulate(one(0.0, 0.0, inverse_depth=1 / depth), LABELS).toarray()).sum(
         axis=(0, 2, 3, 4, 5)
     )
     assert light == pytest.approx(np.eye(3)[layer])
@@ -102,22 +104,22 @@ def test_light_from_outside_the_grid_is_dropped() -> None:
     made, found = bundle(), path_samples(inside=False)
     inside = (found.row >= -0.2) & (found.row < 0.2) & (found.column >= -0.1) & (found.column < 0.2)
     assert 0.1 < inside.mean() < 0.9
-    light, kept = made.file(found, LABELS), made.file(found.where(inside), LABELS)
+    light, kept = made.accumulate(found, LABELS), made.accumulate(found.where(inside), LABELS)
     assert light.sum() == pytest.approx(found.value[inside].sum(), rel=1e-12)
     assert abs(light - kept).sum() == 0
 
 
 def test_ambient_light_has_the_last_row() -> None:
     made = bundle()
-    light = made.file(one(0.0, 0.0, pixel=PIXELS, kind=0), LABELS)
+    light = made.accumulate(one(0.0, 0.0, pixel=PIXELS, kind=0), LABELS)
     assert np.flatnonzero(light.toarray().any(axis=1)).tolist() == [3]
-    by_pixel = made.file(one(0.0, 0.0, pixel=PIXELS, kind=0), np.arange(PIXELS))
+    by_pixel = made.accumulate(one(0.0, 0.0, pixel=PIXELS, kind=0), np.arange(PIXELS))
     assert by_pixel.shape[0] == PIXELS + 1 and by_pixel[[PIXELS]].sum() == pytest.approx(1)
 
 
 def test_no_light_is_an_empty_matrix() -> None:
     made = bundle(DEPTHS)
-    light = made.file(PathSamples.none(), LABELS)
+    light = made.accumulate(PathSamples.none(), LABELS)
     assert light.shape == (4, made.size) and light.nnz == 0
 
 
@@ -139,8 +141,8 @@ def test_directions_for_the_shadow() -> None:
 def test_light_averaged_over_the_anchors() -> None:
     """The mean of bilinear weights: the light of each anchor times its row's and its column's weight."""
     found, weights = path_samples(), np.array([0.7, 0.3])
-    light = unpacked(bundle(), bundle().file(found, LABELS).toarray())
-    mean = unpacked(bundle(anchors=1), bundle(anchors=1).file(found.averaged(weights), LABELS).toarray())
+    light = unpacked(bundle(), bundle().accumulate(found, LABELS).toarray())
+    mean = unpacked(bundle(anchors=1), bundle(anchors=1).accumulate(found.averaged(weights), LABELS).toarray())
     assert np.allclose(mean[:, :, 0, :, 0], np.einsum("a,b,claybx->clyx", weights, weights, light), rtol=1e-12)
 
 
@@ -148,14 +150,14 @@ def test_light_averaged_over_the_anchors() -> None:
 def test_filed_light_averaged_over_the_anchors(depths: tuple[float, ...]) -> None:
     """Averaged before it is filed or after, light is the same."""
     found, weights, made = path_samples(), np.array([0.7, 0.3]), bundle(depths)
-    before = bundle(depths, anchors=1).file(found.averaged(weights), LABELS).toarray()
-    assert np.allclose(made.averaged(made.file(found, LABELS), weights).toarray(), before, rtol=1e-12, atol=0)
+    before = bundle(depths, anchors=1).accumulate(found.averaged(weights), LABELS).toarray()
+    assert np.allclose(made.averaged(made.accumulate(found, LABELS), weights).toarray(), before, rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("depths", WAYS)
 def test_light_of_one_anchor_repeated_for_all(depths: tuple[float, ...]) -> None:
     made, single = bundle(depths), bundle(depths, anchors=1)
-    light = single.file(path_samples().averaged(np.array([0.5, 0.5])), LABELS)
+    light = single.accumulate(path_samples().averaged(np.array([0.5, 0.5])), LABELS)
     shown, one = unpacked(made, made.repeated(light).toarray()), unpacked(single, light.toarray())
     for a, b in np.ndindex(2, 2):
         assert np.array_equal(shown[:, :, a, :, b], one[:, :, 0, :, 0])
@@ -176,10 +178,10 @@ def test_small_light_beside_great_light_is_counted() -> None:
     seen = Sightings(mi.Float(light), mi.UInt32(np.zeros(4097, np.uint32)), *zeros, depth)
     fetched, alone = PathSamples.fetched(seen, DIRECT), bundle(anchors=1)
     assert fetched.value.dtype == np.float64 and fetched.value.sum() == 2.0**24 + 4096
-    assert alone.file(fetched, LABELS).sum() == 2.0**24 + 4096
+    assert alone.accumulate(fetched, LABELS).sum() == 2.0**24 + 4096
     accumulator = DeviceAccumulator(alone, LABELS, one=2.0**24)
     accumulator.add(seen.value, seen.pixel, accumulator.place(seen, mi.Float(0.5)), mi.Bool(True))
-    assert accumulator.filed()[1] == 2.0**24 + 4096
+    assert accumulator.light()[1] == 2.0**24 + 4096
 
 
 @pytest.mark.usefixtures("variant")
@@ -206,7 +208,7 @@ def test_ledgers_of_several_lines_are_fetched_together() -> None:
         for accumulator, some in zip(accumulators, lit, strict=True):
             accumulator.add(light.value, light.pixel, place, some)
     for own, counted in zip(single, fetched(together), strict=True):
-        (matrix, *sums), (expected, *own_sums) = counted.light(4), own.filed(4)
+        (matrix, *sums), (expected, *own_sums) = counted.light(4), own.light(4)
         assert np.array_equal(matrix.toarray(), expected.toarray()) and sums == own_sums
     for counted in fetched(together):
         assert counted.light()[1] == 0.0 and not counted.light()[0].nnz

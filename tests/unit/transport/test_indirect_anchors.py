@@ -104,8 +104,8 @@ def in_lines(folder: str) -> tuple[int, list[str], list[list[float]]]:
     host = tracer.trace(4, 0, 32)
     light = host.where(host.kind == INDIRECT).by_line(len(LINES))
     sums = zip(accumulators, fetched(accumulators), strict=True)
-    held = [float(accumulator.filed(counted)[0].sum()) for accumulator, counted in sums]
-    return *compared(bench), [held, [float(bundle.file(each, labels).sum()) for each in light]]
+    held = [float(accumulator.light(counted)[0].sum()) for accumulator, counted in sums]
+    return *compared(bench), [held, [float(bundle.accumulate(each, labels).sum()) for each in light]]
 
 
 def test_a_path_in_several_lines_is_the_same_at_every_anchor(tmp_path: Path) -> None:
@@ -139,7 +139,7 @@ def test_ledgers_hold_what_anchors_are_brought(beside: Bench, launch: int, monke
     for name in ("kind", "pixel", "anchor_row", "anchor_column", "value"):
         assert np.array_equal(getattr(again, name), getattr(caustics, name)), name
     assert np.array_equal(caustics.value, host.value[host.kind == DIRECT]) and caustics.value.size
-    expected = bundle.file(host.where(host.kind == INDIRECT), labels)
+    expected = bundle.accumulate(host.where(host.kind == INDIRECT), labels)
     found = whole.filed()[0]
     # Which layer light is filed in is drawn: all layers together are the same.
     by_place = [np.asarray(light.toarray()).reshape(light.shape[0], 2, -1).sum(axis=1) for light in (expected, found)]

@@ -155,10 +155,10 @@ def test_the_ledger_holds_what_the_host_files(shared_scene: Callable[..., Path],
     tracer = tracers(bench)[1]
     accumulator = DeviceAccumulator(bundle, labels, tracer.board)
     own = tracer.trace_into([accumulator], 3, 0, 512)
-    matrix, received, outside = accumulator.filed()
+    matrix, received, outside = accumulator.light()
     every = tracer.trace(3, 0, 512)
-    expected = bundle.file(every, labels).toarray()
-    found = (matrix + bundle.file(own, labels)).toarray()
+    expected = bundle.accumulate(every, labels).toarray()
+    found = (matrix + bundle.accumulate(own, labels)).toarray()
     assert 0 < outside + bundle.outside(own) == pytest.approx(bundle.outside(every), rel=1e-6)
     assert received + own.value.sum() == pytest.approx(every.value.sum(), rel=1e-6)
     np.testing.assert_allclose(found.sum(axis=1), expected.sum(axis=1), rtol=1e-6)
@@ -178,13 +178,13 @@ def test_the_ledger_holds_paths_of_their_own_at_every_anchor(shared_scene: Calla
     bundle, labels = Bundle(grid, 3, (400.0,)), np.arange(N * N) % 5
     accumulator = DeviceAccumulator(bundle, labels, tracer.board)
     rest = tracer.trace_into([accumulator], 3, 0, 64)
-    matrix, received, outside = accumulator.filed()
+    matrix, received, outside = accumulator.light()
     every = tracer.trace(3, 0, 64)
     indirect = every.where(every.kind == INDIRECT)
     assert (len(rest.value) > 0) == mirrors and len(rest.value) + len(indirect.value) == len(every.value)
     assert 0 < outside == pytest.approx(bundle.outside(indirect), rel=1e-6)
     assert received == pytest.approx(indirect.value.sum(), rel=1e-6)
-    expected = bundle.file(indirect, labels).toarray()
+    expected = bundle.accumulate(indirect, labels).toarray()
     assert (np.count_nonzero(expected.reshape(6, 3, -1, 3, grid.shape[1]), axis=(0, 2, 4)) > 0).all()
     np.testing.assert_allclose(matrix.toarray(), expected, rtol=1e-4, atol=1e-7 * expected.max())
 
@@ -201,7 +201,7 @@ def test_light_that_is_not_a_number_is_refused(small_scene: Callable[..., Path])
         tracer.trace(0, 0, 256)
     tracer.trace_into([accumulator], 0, 0, 256)
     with pytest.raises(MitsimError, match="NaN"):
-        accumulator.filed()
+        accumulator.light()
 
 
 _PRINT = """
@@ -217,7 +217,7 @@ tracer = tracers(bench)[1]
 bundle = Bundle(aligned_grid(*bench.windows, 16, 1, bench.geometry.tan_half_fov), 1, (450.0, 300.0))
 accumulator = DeviceAccumulator(bundle, np.arange(256) % 5, tracer.board)
 tracer.trace_into([accumulator], 3, 0, 256)
-print(hashlib.sha256(accumulator.filed()[0].toarray().tobytes()).hexdigest())
+print(hashlib.sha256(accumulator.light()[0].toarray().tobytes()).hexdigest())
 """
 
 

@@ -100,10 +100,10 @@ def traced(folder: str, names: Sequence[str]) -> dict[str, Any]:
                 [look.value.sum(), look.lines[: len(LINES)].sum()] for look in looks[1] if look.lines is not None
             ],
             "ledgers": [
-                (accumulator.filed()[0] + bundle.file(light, labels)).sum(axis=1).tolist()
+                (accumulator.light()[0] + bundle.accumulate(light, labels)).sum(axis=1).tolist()
                 for accumulator, light in zip(accumulators, rest.by_line(len(LINES)), strict=True)
             ],
-            "host": [bundle.file(light, labels).sum(axis=1).tolist() for light in every],
+            "host": [bundle.accumulate(light, labels).sum(axis=1).tolist() for light in every],
             "tan": bench.geometry.tan_half_fov,
         }
     return found
