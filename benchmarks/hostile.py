@@ -76,7 +76,7 @@ class Outcome:
 BEFOREHAND = (
     *("capture.sense", "exchange.hdf5", "exchange.matlab", "exchange.real", "exchange.load", "exchange.pngs"),
     *("study.campaign", "study.page", "study.quality", "study.characterise", "study.paper.patterns", "core.worker"),
-    *("scene.guard.check", "capture.opening", "reconstruct.reconstruction", "rig.recipe", "capture.request"),
+    *("scene.check", "capture.opening", "reconstruct.reconstruction", "rig.recipe", "capture.request"),
     *("reconstruct.measured", "rig.framelist", "rig.profile", "rig.projector", "rig.chart"),
 )
 """Modules that commands import where they use them: here before all, so that an input takes less than a second."""

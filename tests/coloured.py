@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from mitsim.core.manifests import AmbientFile, Digital, Patterns, RunManifest
-from mitsim.core.runs import AMBIENT, Capture, LineTruth, MosaicCapture, RunMemory, frame_name
+from mitsim.core.runs import AMBIENT, Capture, LineTruth, MosaicCapture, Recorder, frame_name
 from mitsim.core.spectral_manifests import MosaicManifest
 from mitsim.devices.chart import ChartPlace
 from mitsim.devices.patterns import parse_patterns
@@ -88,7 +88,7 @@ def mosaic_folders(
         lights.append(light)
     always = np.tile(np.reshape(LAMP, (2, 2)), np.array(lights[0].shape) // 2) * max(light.max() for light in lights)
     lights = [light + lamp * always for light in lights]
-    gain, memory = peak / max(light.max() for light in lights), RunMemory()
+    gain, memory = peak / max(light.max() for light in lights), Recorder()
 
     def exposed(light: np.ndarray) -> np.ndarray:
         electrons = rng.poisson(gain * light) + ideal_sessions.READ * rng.standard_normal(light.shape)

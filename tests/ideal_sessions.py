@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mitsim.core.manifests import CalibrationManifest, Digital, FactorNoise, Patterns, RunManifest
-from mitsim.core.runs import Capture, RunMemory, frame_name
+from mitsim.core.runs import Capture, Recorder, frame_name
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.devices.patterns import parse_patterns
@@ -67,7 +67,7 @@ class Bench:
         family, whole = parse_patterns(patterns, len(scene) // self.parts, seed), np.ones((self.parts, self.parts))
         lights = [self.light(np.kron(family.light(shot), whole) * scene) for shot in family.shots]
         gain = self.peak / max(light.max() for light in lights)
-        rng, memory = np.random.default_rng([seed, 1]), RunMemory()
+        rng, memory = np.random.default_rng([seed, 1]), Recorder()
         for index, light in enumerate(lights):
             electrons = rng.poisson(self.optics(gain * light) + DARK) + READ * rng.standard_normal(light.shape)
             dn = np.clip(np.rint(GAIN * electrons + BLACK), 0, CODES - 1).astype(np.uint32)

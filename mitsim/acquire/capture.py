@@ -27,7 +27,7 @@ from mitsim.core.files import FRAMES, output_folder
 from mitsim.core.job import Job
 from mitsim.core.manifests import Patterns, RunHead, RunManifest
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.core.runs import AMBIENT, Capture, LineTruth, MosaicCapture, Recorder, RunMemory, claimed, frame_name
+from mitsim.core.runs import AMBIENT, Capture, LineTruth, MosaicCapture, Recorder, claimed, frame_name
 from mitsim.core.spectral_manifests import MOSAIC, RUN, ColourManifest, MosaicManifest, write_colours
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import load_recipe
@@ -215,7 +215,7 @@ def capture(
             places.enter_context(colour_folder(task, colours))
         heads = [RunHead.of(_configuration(each, request)) for each in readings]
         recorders = [
-            places.enter_context(claimed(place, head, task.resume)) if place else RunMemory()
+            places.enter_context(claimed(place, head, task.resume)) if place else Recorder()
             for place, head in zip(folders, heads, strict=True)
         ]
         with job.planning(request.patterns):
@@ -395,11 +395,11 @@ def _foreign(light: SampledLight, totals: Totals, request: Request) -> str:
 
 
 def _of_unknown_light(light: SampledLight, shooting: Shooting) -> Iterator[str]:
-    lamplight, accuracy = light.bench.lamplight, light.plan.accuracy
-    if lamplight is not None and lamplight.unknown * shooting.ambient_part > accuracy:
-        first, last = lamplight.range_nm
-        one = len(lamplight.responses) == 1
-        part = f"{lamplight.unknown:.1%} of the lamps' light"
+    counted_lamps, accuracy = light.bench.counted_lamps, light.plan.accuracy
+    if counted_lamps is not None and counted_lamps.unknown * shooting.ambient_part > accuracy:
+        first, last = counted_lamps.range_nm
+        one = len(counted_lamps.responses) == 1
+        part = f"{counted_lamps.unknown:.1%} of the lamps' light"
         yield (
             f"{part if one else f'up to {part} behind filters of one colour'} is in no frame: what would be counted "
             f"beyond {first:g} to {last:g} nm if the quantum efficiency went on as its curve ends; let it end at 0, as "

@@ -23,8 +23,9 @@ from mitsim.devices.camera import Rig
 from mitsim.devices.patterns import PatternFamily, Shot
 from mitsim.devices.sensor import SensorModel
 from mitsim.light.settings import GROUPS, Estimate
-from mitsim.optics.frames import ExpectedFrames, Frame, bound_of
-from mitsim.optics.speckle import speckled
+from mitsim.optics.frames import ExpectedFrames, Frame
+from mitsim.optics.replicates import bound_of
+from mitsim.optics.speckle import add_speckle
 from mitsim.planner.memory import frames_at_once
 from mitsim.sensor.chain import Digital, dn_to_electrons, electrons_from_irradiance, expose
 from mitsim.sensor.moments import mean_variance, saturated_pixels
@@ -51,7 +52,7 @@ class Exposer:
 
     def lit(self, frame: Frame, *names: str | int) -> FloatArray:
         """Expected photoelectrons of ``frame``, with the speckle of its own that ``names`` find."""
-        return speckled(self.electrons(frame), self.speckle, stream(self.seed, "speckle", *names))
+        return add_speckle(self.electrons(frame), self.speckle, stream(self.seed, "speckle", *names))
 
     def digital(self, electrons: FloatArray, *names: str | int) -> Digital:
         """Noisy digital numbers of expected ``electrons``; ``names`` find the frame's own noise."""

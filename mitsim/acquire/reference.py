@@ -88,7 +88,7 @@ class Rendered:
         return f"Rendered({rows} x {columns}: {self.facts['estimator']}, relative noise {self.mc_error:.1e})"
 
     def _repr_html_(self) -> str:
-        from mitsim.core.pictures import card, scaled, span
+        from mitsim.core.display import card, scaled, span
 
         grey = self.mean.mean(axis=2)
         facts = f"mean {grey.mean():.3g} W/m^2, relative noise {self.mc_error:.1e}"
@@ -125,7 +125,7 @@ def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) 
     """
     import mitsuba as mi
 
-    from mitsim.scene.guard.outline import one_line
+    from mitsim.scene.outline import one_line
 
     if loaded.unfit.reference is not None:
         raise loaded.unfit.reference

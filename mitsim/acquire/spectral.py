@@ -125,8 +125,8 @@ class SpectralBench:
             return
         check_untimed(request.seconds)
         projector = self.whole.projector
-        speckled = request.effects.get("speckle", True) and (projector.speckle_contrast or projector.speckle)
-        if self.whole.filters and speckled:  # each line has its own, and each filter another mixture of them
+        add_speckle = request.effects.get("speckle", True) and (projector.speckle_contrast or projector.speckle)
+        if self.whole.filters and add_speckle:  # each line has its own, and each filter another mixture of them
             raise ArgumentError(
                 "effects",
                 f"projector {projector.name} has speckle, which is not simulated behind colour filters; switch it "
@@ -147,7 +147,7 @@ class SpectralBench:
         MitsimError
             as there.
         """
-        if self.manifest is None or self.whole.lamplight is not None:
+        if self.manifest is None or self.whole.counted_lamps is not None:
             return self
         return replace(self, whole=lit_by_lamps(self.whole, effects, seed))
 
@@ -161,7 +161,7 @@ class SpectralBench:
         lit = float(np.mean(lighting.weights.mean(axis=0)[lighting.labels]))
         roughest = self.lit_by_lamps(request.effects, request.seed).roughest(request.seed, lit)
         plan = plan_request(roughest, request, len(self.benches))
-        if roughest.lamplight is not None and "ambient" not in plan.settings.effects:
+        if roughest.counted_lamps is not None and "ambient" not in plan.settings.effects:
             # Beside a weaker line lamps may count.
             request = request.changed(effects={**request.effects, "ambient": True})
             plan = plan_request(roughest, request, len(self.benches))
@@ -185,7 +185,7 @@ class SpectralBench:
         simulation = Simulation(bench, Settings(bench.geometry.scene_distance, effects=frozenset({"ambient"})))
         stream = integer(seed, "colour")
         path_samples, lamps = simulation.direct.trace(stream, 0, _RAYS), PathSamples.none()
-        if bench.lamplight is not None and simulation.from_camera is not None:
+        if bench.counted_lamps is not None and simulation.from_camera is not None:
             lamps = simulation.from_camera.trace(stream, 0, _RAYS)
         steps = []
         for light, ambient in zip(path_samples.by_line(count), lamps.by_line(count), strict=True):
@@ -322,15 +322,15 @@ class MosaicLight(SampledLight):
 
     def _lamps(self, seed: int) -> Frame | None:
         """Lamps' light behind the filters, with its error by probes of a ``seed``; None without lamps."""
-        lamplight = self.bench.lamplight
-        if lamplight is None:
+        counted_lamps = self.bench.counted_lamps
+        if counted_lamps is None:
             return None
-        each = [lamplight.units_of(light.bench.projector.lines)[0] for light in self.by_line]
+        each = [counted_lamps.units_of(light.bench.projector.lines)[0] for light in self.by_line]
         unit, line = max((unit, line) for line, unit in enumerate(each))
         light = self.by_line[line]
-        frames, counted = list[Frame](), np.zeros((len(PLANES), len(lamplight.responses)))
-        for number, response in enumerate(lamplight.responses):
-            frames += _lamps_alone(light, lamplight.rows(number), seed)
+        frames, counted = list[Frame](), np.zeros((len(PLANES), len(counted_lamps.responses)))
+        for number, response in enumerate(counted_lamps.responses):
+            frames += _lamps_alone(light, counted_lamps.rows(number), seed)
             # Filed is the mean over all pixels, of which the response's have it all.
             scale = response.part * unit * self.bench.projector.effective_wavelength_nm
             counted[list(response.planes), number] = 1 / scale
@@ -348,9 +348,9 @@ class MosaicLight(SampledLight):
 
 def _lamps_alone(light: SampledLight, bands: slice, seed: int) -> ExpectedFrames:
     """One frame of lamps of a ``light``, of some ``bands`` of theirs; a ``seed`` of its probes."""
-    lamplight = light.bench.lamplight
-    assert lamplight is not None, "asked before"
-    filed = light.simulation.of_lamps(light.groups, light.groups[0].rows - len(lamplight.bands), bands)
+    counted_lamps = light.bench.counted_lamps
+    assert counted_lamps is not None, "asked before"
+    filed = light.simulation.of_lamps(light.groups, light.groups[0].rows - len(counted_lamps.bands), bands)
     return ExpectedFrames(filed, Lighting(np.zeros(1, np.int64), np.ones((1, 1))), seed)
 
 
@@ -361,15 +361,15 @@ def excess_behind_filters(lights: Sequence[SampledLight]) -> float:
     A filter's few wavelengths are sampled worse than all. Its frames weigh by their energy, which for the same scene is
     that of what a pixel counts.
     """
-    light, lamplight = lights[0], lights[0].bench.lamplight
-    if lamplight is None or lamplight.shares is None:
+    light, counted_lamps = lights[0], lights[0].bench.counted_lamps
+    if counted_lamps is None or counted_lamps.shares is None:
         return 1.0
     whole, _ = _lamps_alone(light, slice(None), light.seed).sampling_error()
     energy = variance = 0.0
-    for number, response in enumerate(lamplight.responses):
-        rows = lamplight.rows(number)
+    for number, response in enumerate(counted_lamps.responses):
+        rows = counted_lamps.rows(number)
         error, _ = _lamps_alone(light, rows, light.seed).sampling_error()
-        own = float(lamplight.shares[rows].sum()) ** 2 / response.part
+        own = float(counted_lamps.shares[rows].sum()) ** 2 / response.part
         energy, variance = energy + own, variance + own * error**2
     return max(1.0, math.sqrt(variance / energy) / whole) if whole else 1.0
 

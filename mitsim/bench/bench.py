@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mitsim.bench.mirror_light import Glint
     from mitsim.core.manifests import Parallax
     from mitsim.devices.camera import CameraGeometry, Rig
-    from mitsim.devices.lamps import Lamplight
+    from mitsim.devices.lamps import CountedLamps
     from mitsim.devices.patterns import PatternFamily
     from mitsim.devices.projector import Lines, ProjectorModel, Spectrum
     from mitsim.devices.sensor import SensorModel
@@ -51,7 +51,7 @@ class Apparatus:
         parameters that the scene was loaded with.
     lines
         lines of the projector's light that spectral variants trace; None: wavelengths drawn from all.
-    lamplight
+    counted_lamps
         how the camera counts lamps' light of all wavelengths; None: as light of the projector's effective wavelength.
     filters
         the camera with its colour filters, which are put over frames; the sensor in ``rig`` then has none, and
@@ -63,7 +63,7 @@ class Apparatus:
     variant: str
     defines: dict[str, str]
     lines: Lines | None = None
-    lamplight: Lamplight | None = None
+    counted_lamps: CountedLamps | None = None
     filters: SensorModel | None = None
 
     @property
@@ -143,7 +143,7 @@ class Apparatus:
         if depth == self.geometry.scene_distance:
             return self.windows
         if depth not in self._windows:
-            from mitsim.scene.projector import window_at
+            from mitsim.scene.window import window_at
 
             loaded = self.loaded
             found = window_at(str(loaded.path), loaded.projector, loaded.camera, loaded.pixels, depth)
@@ -269,7 +269,7 @@ class Apparatus:
             "defines": self.defines,
             "variant": self.variant,
             **({} if self.lines is None else {"lines": asdict(self.lines)}),
-            **({} if self.lamplight is None else {"lamps_nm": list(self.lamplight.range_nm)}),
+            **({} if self.counted_lamps is None else {"lamps_nm": list(self.counted_lamps.range_nm)}),
             "projector_model": {
                 **self.projector.model_dump(mode="json", exclude={"contrast_ratio"}),
                 "black_level": self.projector.black_level,

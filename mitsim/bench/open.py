@@ -15,7 +15,7 @@ from mitsim.core.configuration import DEFAULT_CAMERA, load_model, locate
 from mitsim.core.environment import DEFAULT_VARIANT, load_variant
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import read_name
-from mitsim.scene.guard.outline import Outline, SceneFiles, lit_side
+from mitsim.scene.outline import Outline, SceneFiles, lit_side
 
 if TYPE_CHECKING:
     from mitsim.devices.mask_profile import MaskProfile

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from mitsim.bench.effects import check_switches, parse_switches
-from mitsim.core.configuration import refusal, validated
+from mitsim.core.configuration import refusal, validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import check_plain
 from mitsim.core.job import Job
@@ -246,7 +246,7 @@ class Request(BaseModel):
         """
         if isinstance(values.get("effects"), str):
             values["effects"] = parse_switches(str(values["effects"]))
-        return validated(cls, values, "request")
+        return validate(cls, values, "request")
 
     def changed(self, **values: object) -> Request:
         """The same request with other ``values``; MitsimError as :meth:`of`."""

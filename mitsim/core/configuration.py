@@ -66,10 +66,10 @@ def read_toml(path: Path | str) -> dict[str, Any]:
 
 def load_model(path: Path | str, model: type[Model]) -> Model:
     """The TOML file ``path`` as a ``model``. MitsimError naming field, value and rule when it breaks one."""
-    return validated(model, read_toml(path), f"file {path}")
+    return validate(model, read_toml(path), f"file {path}")
 
 
-def validated(model: type[Model], data: dict[str, Any], where: str, context: object = None) -> Model:
+def validate(model: type[Model], data: dict[str, Any], where: str, context: object = None) -> Model:
     """A dictionary as a checked model.
 
     Parameters
@@ -95,7 +95,7 @@ def validated(model: type[Model], data: dict[str, Any], where: str, context: obj
 
 
 def refusal(model: type[pydantic.BaseModel], error: pydantic.ValidationError, where: str) -> MitsimError:
-    """What pydantic found wrong, as :func:`validated` raises it.
+    """What pydantic found wrong, as :func:`validate` raises it.
 
     Parameters
     ----------

@@ -23,7 +23,7 @@ from pydantic import (
     model_validator,
 )
 
-from mitsim.core.configuration import LARGEST, NonNegative, Positive, validated
+from mitsim.core.configuration import LARGEST, NonNegative, Positive, validate
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.files import plain, read_json, write_json
 
@@ -192,7 +192,7 @@ class Patterns(_Part):
             for file, shot in zip(files, family.shots, strict=True)
         ]
         matrices = {"P_L": family.left.tolist(), "P_R": family.right.tolist()}
-        return validated(
+        return validate(
             cls,
             {"family": family.name, "n": len(family.left), **matrices, "captures": shots},
             f"patterns {family.name!r}",
@@ -489,7 +489,7 @@ def checked_manifest(data: Any, model: type[Manifest], place: Path) -> Manifest:
         raise MitsimError(f"{place}: holds a {cut(str(actual))}, not a {kind}; give the right folder")
     if data.get("status") != "complete":
         raise MitsimError(f"{place}: the {kind} is {cut(str(data.get('status')))}; finish it with resume=True")
-    return validated(model, data, f"{place}/{MANIFEST}", None if "format" in data else _UNVERSIONED)
+    return validate(model, data, f"{place}/{MANIFEST}", None if "format" in data else _UNVERSIONED)
 
 
 def resumable(folder: Path, kind: str) -> dict[str, Any]:
@@ -503,7 +503,7 @@ def resumable(folder: Path, kind: str) -> dict[str, Any]:
 def read_head(folder: Path) -> RunHead:
     """The head of the run in ``folder``, finished or not; MitsimError when it holds none."""
     data = resumable(folder, "capture")
-    return validated(RunHead, data, f"{folder}/{MANIFEST}", _UNVERSIONED)
+    return validate(RunHead, data, f"{folder}/{MANIFEST}", _UNVERSIONED)
 
 
 def write_manifest(folder: Path, manifest: RunHead | CalibrationManifest) -> None:

@@ -18,6 +18,7 @@ import numpy as np
 
 from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
+from mitsim.core.display import card, scaled, span
 from mitsim.core.errors import ArgumentError, MitsimError, cut
 from mitsim.core.exr import (
     Channel,
@@ -32,7 +33,6 @@ from mitsim.core.exr import (
 )
 from mitsim.core.files import output_folder, sweep
 from mitsim.core.manifests import MANIFEST, Digital, RunHead, RunManifest, read_head, read_manifest, write_manifest
-from mitsim.core.pictures import card, scaled, span
 from mitsim.core.spectral_manifests import MosaicManifest, read_mosaic, write_colours
 
 _SHOWN = 3
@@ -630,9 +630,6 @@ class Recorder:
     def _identity(self, index: int, channels: Channels) -> dict[str, Value]:
         """What tells a frame on disk from others; nothing in memory."""
         return {}
-
-
-RunMemory = Recorder  # until all call sites have its name
 
 
 class RunFolder(Recorder):

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from mitsim.core.configuration import validated
+from mitsim.core.configuration import validate
 from mitsim.core.errors import ArgumentError, MitsimError, cut
 from mitsim.core.files import read_json, write_json
 
@@ -189,13 +189,13 @@ def checked_colours(data: Any, kind: str, place: Path) -> ColourManifest:
     MitsimError
         when it is of another kind or breaks a rule.
     """
-    return validated(ColourManifest, _of_kind(data, kind, place), f"{place}/{COLOUR}")
+    return validate(ColourManifest, _of_kind(data, kind, place), f"{place}/{COLOUR}")
 
 
 def checked_mosaic(data: Any, place: Path) -> MosaicManifest:
     """What the ``data`` of a colour.json, found in ``place``, say of a run behind colour filters. MitsimError as
     :func:`checked_colours`."""
-    return validated(MosaicManifest, _of_kind(data, MOSAIC, place), f"{place}/{COLOUR}")
+    return validate(MosaicManifest, _of_kind(data, MOSAIC, place), f"{place}/{COLOUR}")
 
 
 def same_lines(run: Path, calibration: Path) -> ColourManifest:

@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.configuration import Configuration, validated
+from mitsim.core.configuration import Configuration, validate
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import FRAME_LIMITS, fits_a_frame
 from mitsim.devices.drift import MaskMotion
@@ -161,7 +161,7 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
     @classmethod
     def checked(cls, where: str, **values: object) -> CameraGeometry:
         """Build from loose ``values``; a bad one raises MitsimError with one line that begins with ``where``."""
-        return validated(cls, values, where)
+        return validate(cls, values, where)
 
     @property
     def identity(self) -> dict[str, object]:

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.configuration import Configuration, locate, validated
+from mitsim.core.configuration import Configuration, locate, validate
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import read_json
 
@@ -55,4 +55,4 @@ class ChartPlace(Configuration):
 def load_chart(name: Path | str) -> ChartPlace:
     """The chart ``name``: a shipped scene that shows one, or a JSON file. MitsimError when it cannot be read."""
     path = locate(name, "scenes", "chart.json")
-    return validated(ChartPlace, read_json(path), f"file {path}")
+    return validate(ChartPlace, read_json(path), f"file {path}")

@@ -12,7 +12,7 @@ from types import MappingProxyType
 
 from pydantic import Field, model_validator
 
-from mitsim.core.configuration import Configuration, validated
+from mitsim.core.configuration import Configuration, validate
 from mitsim.core.errors import MitsimError
 
 LARGEST_ROTATION_MRAD = 10.0
@@ -137,7 +137,7 @@ class Drift(Configuration):
         if kind not in UNITS:
             raise MitsimError(f"drift {kind!r}: there is no such kind; use {', '.join(UNITS)}")
         chosen = getattr(self, kind) if amount is None else float(amount)
-        return validated(Drift, {kind: chosen, **{name: getattr(self, name) for name in STILL}}, "drift")
+        return validate(Drift, {kind: chosen, **{name: getattr(self, name) for name in STILL}}, "drift")
 
     @property
     def kinds(self) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, FailFast, Field, model_validator
 
-from mitsim.core.configuration import Configuration, Positive, read_toml, validated
+from mitsim.core.configuration import Configuration, Positive, read_toml, validate
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import read_json
 from mitsim.core.imagelist import Raw, Wanted, image_files
@@ -175,7 +175,7 @@ def load_frames(folder: Path | str) -> SessionFrames:
             "camera, n, signed_capture and digital"
         )
     data = read_toml(lists[0]) if lists[0].suffix == ".toml" else read_json(lists[0])
-    listed = validated(FrameList, data, f"frames {lists[0]}")
+    listed = validate(FrameList, data, f"frames {lists[0]}")
     wanted = [*_keys_of_session(listed)]
     if listed.frames:
         frames, dark = listed.frames, listed.dark

@@ -121,7 +121,7 @@ class Response(ByValue):
 
 
 @dataclass(frozen=True, eq=False)
-class Lamplight(ByValue):
+class CountedLamps(ByValue):
     """A scene's lamps, as its camera counts them.
 
     Attributes

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.configuration import Configuration, read_toml, validated
+from mitsim.core.configuration import Configuration, read_toml, validate
 from mitsim.core.errors import MitsimError
 from mitsim.core.imagelist import Wanted
 from mitsim.core.images import image_size, read_image
@@ -241,7 +241,7 @@ def load_mask(path: Path | str) -> MaskProfile | None:
         return None
     if not isinstance(table, dict):
         raise MitsimError(f"file {path}: mask: got {table!r}; give a table [mask]")
-    return validated(MaskProfile, table, f"file {path}: [mask]")
+    return validate(MaskProfile, table, f"file {path}: [mask]")
 
 
 def _is_odd_prime(number: int) -> bool:

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from mitsim.core.configuration import Configuration, read_toml, validated
+from mitsim.core.configuration import Configuration, read_toml, validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import Digital
 
@@ -397,7 +397,7 @@ def load_sensor(path: Path | str) -> SensorModel:
     (:func:`mitsim.devices.mask_profile.load_mask`). MitsimError names the file, field, value and rule."""
     table = read_toml(path)
     table.pop("mask", None)
-    return validated(SensorModel, table, f"file {path}")
+    return validate(SensorModel, table, f"file {path}")
 
 
 def paper_sensor(full_well_e: float, gain: float, dynamic_range_db: float) -> SensorModel:

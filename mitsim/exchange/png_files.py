@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.configuration import load_model, locate, validated
+from mitsim.core.configuration import load_model, locate, validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import whole_file, whole_folder, write_json, write_text
 from mitsim.core.manifests import Patterns, RunManifest
@@ -168,7 +168,7 @@ def session_of(camera: str, exposure_s: float, n: int, signed_capture: str) -> F
     sensor = load_sensor(locate(camera, "calibration", ".toml"))
     digital = digital_of(sensor, check_exposure(exposure_s)).model_dump(exclude_none=True)
     stated = {"camera": {"name": sensor.name}, "n": n, "signed_capture": signed_capture, "digital": digital}
-    return validated(FrameList, stated, "stripes")
+    return validate(FrameList, stated, "stripes")
 
 
 def frame_name(index: int) -> str:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.configuration import locate, validated
+from mitsim.core.configuration import locate, validate
 from mitsim.core.environment import versions
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.exr import Channel, Channels, Metadata, checksum
@@ -66,7 +66,7 @@ def import_frames(source: Path, output: Path, known: RealCapture) -> dict[str, A
     digital = digital_of(sensor, known.exposure_s)
     if known.black_level_dn is not None:
         stated = {**digital.model_dump(), "black_level_dn": known.black_level_dn}
-        digital = validated(Digital, stated, "black_level")
+        digital = validate(Digital, stated, "black_level")
     patterns = _patterns(known, fit.scene)
     files = image_files(source, known.wanted)
     pages, count = [image_pages(path, known.wanted) for path in files], len(patterns.captures)
@@ -284,7 +284,7 @@ def _patterns(known: RealCapture, scene: tuple[int, int]) -> Patterns:
             if isinstance(shot, dict)
         ]
         named = {key: data[key] for key in ("family", "n", "P_L", "P_R") if key in data}
-        patterns = validated(Patterns, {**named, "captures": captures}, known.patterns)
+        patterns = validate(Patterns, {**named, "captures": captures}, known.patterns)
     else:
         left, right = (parse_patterns(known.patterns, side, known.seed) for side in scene)
         family = PatternFamily(known.patterns, left.left, right.right)

@@ -139,13 +139,13 @@ class Grids:
         if one_line and self.physics.spectrum:
             self.physics = replace(self.physics, spectrum=self.physics.spectrum.mean)
         self._pixels = pixels or bench.n
-        lamplight = bench.lamplight if self.physics.lamps else None
-        self.lamp_rows = len(lamplight.bands) if lamplight else 1
+        counted_lamps = bench.counted_lamps if self.physics.lamps else None
+        self.lamp_rows = len(counted_lamps.bands) if counted_lamps else 1
         # The sensor's centre sees nothing beyond the field stop, so near surfaces ask for no more directions.
         self.aim = self.cells(1, reach=None)
         self.grids = {row.name: self._grid(row) for row in GRIDS.values()}
-        self.ambient = self._of_lamps(lamplight.whole if lamplight else _bands(*_AMBIENT_NM, _AMBIENT_BANDS))
-        bands = lamplight.spectra if lamplight else ()
+        self.ambient = self._of_lamps(counted_lamps.whole if counted_lamps else _bands(*_AMBIENT_NM, _AMBIENT_BANDS))
+        bands = counted_lamps.spectra if counted_lamps else ()
         self.by_band = tuple(map(self._of_lamps, bands)) or (self.ambient,)
 
     def _of_lamps(self, light: Spectrum) -> Mapping[str, Grid]:

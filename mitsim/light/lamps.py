@@ -14,7 +14,7 @@ from mitsim.bench.effects import present
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
 from mitsim.core.spectral_manifests import MOST_LINES
-from mitsim.devices.lamps import SPECTRA_NM, Band, Lamplight, Response, line_units
+from mitsim.devices.lamps import SPECTRA_NM, Band, CountedLamps, Response, line_units
 from mitsim.devices.projector import Spectrum
 from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation
@@ -56,7 +56,7 @@ def lit_by_lamps(bench: Apparatus, effects: Mapping[str, bool], seed: int) -> Ap
     looks = [_Look.of(response, tracer, integer(seed, "lamplight")) for response in responses]
     light = np.concatenate([response.part * look.light for response, look in zip(responses, looks, strict=True)])
     lines = bench.projector.lines
-    lamplight = Lamplight(
+    counted_lamps = CountedLamps(
         responses,
         tuple(band for response in responses for band in response.bands(MOST_LINES)),
         tuple(spectrum for look in looks for spectrum in look.spectra),
@@ -64,7 +64,7 @@ def lit_by_lamps(bench: Apparatus, effects: Mapping[str, bool], seed: int) -> Ap
         max(look.unknown for look in looks),
         tuple(zip(lines.wavelengths_nm, line_units(bench.counting, lines), strict=True)),
     )
-    return replace(bench, lamplight=lamplight)
+    return replace(bench, counted_lamps=counted_lamps)
 
 
 @dataclass(frozen=True)

@@ -122,22 +122,22 @@ class Tracers(Grids):
         return PathReuseTracer(*parts) if shared else IndirectTracer(*parts)
 
     def _from_camera(self, points: SensorPoints) -> FromCamera | None:
-        loaded, physics, lamplight = self.bench.loaded, self.physics, self.bench.lamplight
+        loaded, physics, counted_lamps = self.bench.loaded, self.physics, self.bench.counted_lamps
         of_projector = self._from_camera_of_projector
         if not (physics.lamps or of_projector):
             return None
         paths = Paths(physics.mirrors, physics.interreflection, physics.lamps)
         parts = loaded.scene, loaded.camera, physics.projector
         tracer = FromCameraTracer(*parts, self.aim, paths, physics.geometry, points)
-        if lamplight is None or not physics.lamps:
+        if counted_lamps is None or not physics.lamps:
             return tracer
         # Lamps have wavelengths of their own, and filters of each colour count them on their own.
-        units = lamplight.units_of(self.bench.projector.lines)
+        units = counted_lamps.units_of(self.bench.projector.lines)
         lamps: list[FromCameraTracer] = []
-        for number, response in enumerate(lamplight.responses):
-            rows = lamplight.rows(number)
+        for number, response in enumerate(counted_lamps.responses):
+            rows = counted_lamps.rows(number)
             own = [unit * response.part for unit in units]
-            lamps.append(LampTracer(tracer, LampResponse(response, lamplight.bands[rows], own, rows.start)))
+            lamps.append(LampTracer(tracer, LampResponse(response, counted_lamps.bands[rows], own, rows.start)))
         if of_projector:
             lamps.insert(0, FromCameraTracer(*parts, self.aim, replace(paths, emitters=()), physics.geometry, points))
         return lamps[0] if len(lamps) == 1 else CombinedTracer(*lamps)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from mitsim.bench.request import Request
 from mitsim.core.arguments import checked
+from mitsim.core.display import table
 from mitsim.core.errors import MitsimError
-from mitsim.core.pictures import table
 from mitsim.core.spectral_manifests import MONO
 from mitsim.light.passes import PASSES
 from mitsim.light.settings import Estimate, Settings

@@ -16,7 +16,8 @@ from mitsim.devices.patterns import Lighting
 from mitsim.light.grids import GRIDS, LightEstimate
 from mitsim.light.passes import PASSES, Pass, PassTracer, Tracers
 from mitsim.light.settings import PATHS_AT_ONCE
-from mitsim.optics.frames import ClassFrames, ExpectedFrames, Filed
+from mitsim.optics.forming import Filed
+from mitsim.optics.frames import ClassFrames, ExpectedFrames
 from mitsim.transport.accumulator import DeviceAccumulator, DeviceSums
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.indirect import IndirectTracer

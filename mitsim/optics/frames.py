@@ -17,14 +17,9 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.parallel import in_threads
 from mitsim.devices.camera import side_of
 from mitsim.devices.patterns import Lighting
-from mitsim.optics.forming import Filed as Filed
-from mitsim.optics.forming import Mixture, form_frames, mix_frames, pair_shots, probe_frames
+from mitsim.optics.forming import Filed, Mixture, form_frames, mix_frames, pair_shots, probe_frames
 from mitsim.optics.image_formation import IntArray
-from mitsim.optics.replicates import PROBES as PROBES
-from mitsim.optics.replicates import bound_of as bound_of
-from mitsim.optics.replicates import bound_over_error as bound_over_error
-from mitsim.optics.replicates import noise_of_groups, probe_vectors
-from mitsim.optics.replicates import shares_of_bound as shares_of_bound
+from mitsim.optics.replicates import bound_of, noise_of_groups, probe_vectors
 
 _AT_ONCE, _BYTES_AT_ONCE = 32, 2**27
 """Frames formed at a time: enough to keep all processors busy; and their bytes, where fewer have as many: 4 frames of a

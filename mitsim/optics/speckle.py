@@ -40,7 +40,7 @@ Kernel = Callable[[FloatArray], FloatArray]
 """Of distances along one axis [mm]."""
 
 
-def speckled(irradiance: FloatArray, contrast: float, rng: np.random.Generator) -> FloatArray:
+def add_speckle(irradiance: FloatArray, contrast: float, rng: np.random.Generator) -> FloatArray:
     """Irradiance times a gamma field of mean 1.
 
     Parameters

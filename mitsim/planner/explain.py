@@ -36,8 +36,8 @@ from mitsim.transport.missed import polished_shapes
 
 if TYPE_CHECKING:
     from mitsim.bench.bench import Apparatus
-    from mitsim.scene.guard.outline import Tag
     from mitsim.scene.load import LoadedScene
+    from mitsim.scene.outline import Tag
 
 
 _GREY = "no surface differs by wavelength; the mask's shadow is the mean over all lines"

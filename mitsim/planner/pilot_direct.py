@@ -22,7 +22,8 @@ from mitsim.light.pilot_result import REPLICATES, Approximation, Drawn, Forming,
 from mitsim.light.settings import GROUPS, Estimate, Settings, SharpPixels
 from mitsim.light.simulation import Simulation, emitted
 from mitsim.optics.fft_shadow import cells_per_pixel
-from mitsim.optics.frames import ExpectedFrames, Filed
+from mitsim.optics.forming import Filed
+from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.image_formation import raster_error
 from mitsim.planner.memory import cells_to_choose, drawing_seconds
 from mitsim.planner.pilot_samples import EVEN_CELLS, GOOD_ENOUGH, Sample, ladder, noise, norm

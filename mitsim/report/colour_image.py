@@ -12,12 +12,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.display import card, data_uri, grey_png, lightness, png
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.files import whole_file
 from mitsim.core.manifests import CalibrationManifest, read_manifest
-from mitsim.core.pictures import card, colour_png, data_uri, grey_png, lightness
 from mitsim.core.spectral_manifests import ColourManifest
 from mitsim.devices.chart import ChartPlace
 from mitsim.metrics import Quality, psnr
@@ -180,7 +180,7 @@ class ColourImage:
             folder / IMAGE_FILE, channels, {"rgb": "linear sRGB", "xyz": "CIE 1931 under D65, perfect reflector Y = 1"}
         )
         with whole_file(folder / "image.png") as part:
-            part.write_bytes(colour_png(rgb))
+            part.write_bytes(png(rgb))
 
     def _repr_html_(self) -> str:
         pictures = {"in colour\nsRGB under D65": linear_srgb(self.xyz)}
@@ -281,7 +281,7 @@ def _verdict(image: ColourImage) -> tuple[str, str]:
 def _pictures(image: ColourImage) -> dict[str, str]:
     """Image and truth, as data URIs."""
     seen = {"image": image.xyz} | ({} if image.truth_xyz is None else {"truth": image.truth_xyz})
-    return {name: data_uri(colour_png(linear_srgb(xyz), smallest=_SMALLEST)) for name, xyz in seen.items()}
+    return {name: data_uri(png(linear_srgb(xyz), smallest=_SMALLEST)) for name, xyz in seen.items()}
 
 
 def _line(image: ColourImage, number: int, quality: Quality | None) -> dict[str, Any]:

@@ -36,7 +36,8 @@ from mitsim.devices.patterns import PatternFamily
 from mitsim.devices.projector import Spectrum
 from mitsim.light.light import SampledLight
 from mitsim.metrics import Quality, psnr, relative_error
-from mitsim.optics.frames import ExpectedFrames, Filed
+from mitsim.optics.forming import Filed
+from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.separable import best_term, centred, relative_difference
 from mitsim.optics.shadow import Directions, SeparableTerms

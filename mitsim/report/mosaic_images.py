@@ -23,10 +23,10 @@ import numpy as np
 
 from mitsim.core import spectral_manifests
 from mitsim.core.arrays import FloatArray
+from mitsim.core.display import png
 from mitsim.core.exr import write_frame
 from mitsim.core.files import output_folder, read_json, whole_file
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.core.pictures import png
 from mitsim.core.runs import MosaicCapture, load_mosaic
 from mitsim.core.spectral_manifests import JOINT, ColourManifest, check_way
 from mitsim.devices.chart import ChartPlace

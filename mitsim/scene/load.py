@@ -12,12 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.errors import MitsimError
-from mitsim.scene.guard.check import check_file, looking_beside
-from mitsim.scene.guard.estimators import Unfit
-from mitsim.scene.guard.limits import Range
-from mitsim.scene.guard.outline import Tag
-from mitsim.scene.projector import ProjectorGrid, locate_projector
+from mitsim.scene.check import check_file, looking_beside
+from mitsim.scene.estimators import Unfit
+from mitsim.scene.limits import Range
+from mitsim.scene.outline import Tag
 from mitsim.scene.tree import check_meshes, emit_by_faces, move_to_camera, with_thin_shapes_as_meshes
+from mitsim.scene.window import ProjectorGrid, locate_projector
 
 SENSOR_PLUGIN = "mitsim_lensless"
 _SMALL_LAMPS = ("DirectionalEmitter", "PointLight", "SpotLight")

@@ -17,9 +17,9 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
-from mitsim.scene.guard.check import CheckedScene
-from mitsim.scene.guard.limits import PLUGINS, references
-from mitsim.scene.guard.outline import Outline, Tag
+from mitsim.scene.check import CheckedScene
+from mitsim.scene.limits import PLUGINS, references
+from mitsim.scene.outline import Outline, Tag
 
 # ---- The camera moved to the origin, or a refusal ----
 #

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from mitsim.scene.guard.check import check_file
+from mitsim.scene.check import check_file
 from tests.hard.fuzz import RICH, Fuzz, run
 from tests.robustness import Recorder
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy import special, stats
 
 from mitsim.acquire.exposure import Exposer
-from mitsim.core.configuration import shipped, validated
+from mitsim.core.configuration import shipped, validate
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel, load_sensor
@@ -241,9 +241,9 @@ def test_codes_that_a_frame_cannot_hold_are_refused(bits: int, binning: int, fit
     fields = {**sensor().model_dump(), "bits": bits, "binning": binning, "full_well_e": 1e9}
     if not fits:
         with pytest.raises(MitsimError, match=r"^[^\n]*at most 4294967295, so bin less[^\n]*$"):
-            validated(SensorModel, fields, "camera.toml")
+            validate(SensorModel, fields, "camera.toml")
         return
-    model = validated(SensorModel, fields, "camera.toml")
+    model = validate(SensorModel, fields, "camera.toml")
     assert (exposed(model, 1e14, 8) == (2**bits - 1) * binning**2).all()
 
 
@@ -252,7 +252,7 @@ def test_codes_that_a_frame_cannot_hold_are_refused(bits: int, binning: int, fit
 def test_numbers_beyond_all_cameras_are_refused_in_one_line(field: str, value: float) -> None:
     fields = {**load_sensor(shipped("calibration", "imx249.toml")).model_dump(), field: value}
     with pytest.raises(MitsimError, match=rf"^camera\.toml: {field}: got [^\n]+$"):
-        validated(SensorModel, fields, "camera.toml")
+        validate(SensorModel, fields, "camera.toml")
 
 
 @pytest.mark.parametrize("seconds", [math.nan, math.inf, -1.0])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.scene.guard.check import check_file
+from mitsim.scene.check import check_file
 from tests.hard.hostile import GOOD, OBJ, Case, ball, beside, file, mesh, picture, png, put, skin, swap
 from tests.hard.hostile.files import CASES as OF_FILES
 from tests.hard.hostile.numbers import CASES as OF_NUMBERS

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import mitsim.transport
-from mitsim.scene.guard.limits import LIMITS
+from mitsim.scene.limits import LIMITS
 
 pytestmark = pytest.mark.usefixtures("variant")
 STEP = 0.0025

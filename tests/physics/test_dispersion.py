@@ -120,12 +120,12 @@ def glint(bench: Bench) -> list[float]:
 def lamps(bench: Bench) -> list[list[float]]:
     """What a camera counts of lamps' light in a narrow band about each line."""
     lit = lit_by_lamps(bench, {}, 1)
-    assert lit.lamplight is not None
+    assert lit.counted_lamps is not None
     aim = aligned_grid(*bench.windows, 32, 1, bench.geometry.tan_half_fov + 0.01)
     parts = bench.loaded.scene, bench.loaded.camera, bench.projector_optics, aim
     like = FromCameraTracer(*parts, Paths(True, True, bench.loaded.lamps))
     bands = [(nm - 0.01, nm + 0.01) for nm in LINES] + [(830.0, 830.0)]
-    found = LampTracer(like, LampResponse(lit.lamplight.responses[0], bands, (1.0,))).trace(3, 0, SAMPLES)
+    found = LampTracer(like, LampResponse(lit.counted_lamps.responses[0], bands, (1.0,))).trace(3, 0, SAMPLES)
     return [seen(found.where(found.pixel == N**2 + band)) for band in range(len(LINES))]
 
 

@@ -45,7 +45,7 @@ import mitsuba as mi
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from mitsim.core.configuration import read_toml, shipped, validated
+from mitsim.core.configuration import read_toml, shipped, validate
 from mitsim.core.errors import MitsimError
 from mitsim.transport.plugins.base import bsdf_class, numbers, register_once
 
@@ -102,7 +102,7 @@ class GlassModel(BaseModel):
     @classmethod
     def checked(cls, **values: object) -> GlassModel:
         """Build from loose ``values``; a bad one raises MitsimError with one line."""
-        model = validated(cls, values, PLUGIN)
+        model = validate(cls, values, PLUGIN)
         given = [name for name in ("glass", "sellmeier", "index") if getattr(model, name) is not None]
         if len(given) > 1:
             raise MitsimError(f"{PLUGIN}: {given[1]}: the index is told by {given[0]} already; give one of the two")

@@ -69,7 +69,7 @@ import mitsuba as mi
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from mitsim.core.configuration import read_toml, shipped, validated
+from mitsim.core.configuration import read_toml, shipped, validate
 from mitsim.core.errors import MitsimError
 from mitsim.transport.plugins.base import bsdf_class, numbers, register_once
 
@@ -109,7 +109,7 @@ class GratingModel(BaseModel):
     @classmethod
     def checked(cls, **values: object) -> GratingModel:
         """Build from loose ``values``; a bad one raises MitsimError with one line."""
-        model = validated(cls, values, PLUGIN)
+        model = validate(cls, values, PLUGIN)
         total = sum(model.orders.values()) + model.diffuse
         if total > 1 + _ROUNDING:
             raise MitsimError(

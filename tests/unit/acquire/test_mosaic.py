@@ -19,7 +19,7 @@ from mitsim.calibrate.lit_session import LitSession
 from mitsim.calibrate.session import Session
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
-from mitsim.devices.lamps import Lamplight, Response
+from mitsim.devices.lamps import CountedLamps, Response
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum
 from mitsim.devices.sensor import EfficiencyCurve, MosaicCurves
@@ -92,19 +92,19 @@ def test_sampling_looks_at_lamps_behind_each_filter(monkeypatch: pytest.MonkeyPa
     """Errors of 1, 2 and 3 % beside 1 % of the mean, of pixels that count 4, 2 and 1. (Planted: a mean of errors.)"""
     responses = [Response(np.ones(2), (400.0, 700.0), planes=planes) for planes in ((0,), (1, 2), (3,))]
     shares = np.repeat([4 / 9, 2 * 2 / 9, 1 / 9], 4) / 4
-    lamplight = Lamplight(tuple(responses), ((400.0, 700.0),) * 12, shares=shares)
+    counted_lamps = CountedLamps(tuple(responses), ((400.0, 700.0),) * 12, shares=shares)
     errors: dict[int | None, float] = {0: 0.01, 4: 0.02, 8: 0.03, None: 0.01}
 
     def alone(light: Any, bands: slice, seed: int) -> Any:
         return SimpleNamespace(sampling_error=lambda: (errors[bands.start], 0.0))
 
     monkeypatch.setattr(spectral, "_lamps_alone", alone)
-    light: Any = SimpleNamespace(bench=SimpleNamespace(lamplight=lamplight), seed=0)
+    light: Any = SimpleNamespace(bench=SimpleNamespace(counted_lamps=counted_lamps), seed=0)
     energy = np.array([16.0, 2 * 4.0, 1.0])
     expected = np.sqrt(np.dot(energy, [1, 4, 9]) / energy.sum())
     assert spectral.excess_behind_filters([light, light]) == pytest.approx(expected)
     errors[None] = 0.05
-    dark: Any = SimpleNamespace(bench=SimpleNamespace(lamplight=None))
+    dark: Any = SimpleNamespace(bench=SimpleNamespace(counted_lamps=None))
     assert spectral.excess_behind_filters([light]) == spectral.excess_behind_filters([dark]) == 1
 
 
@@ -166,14 +166,14 @@ def test_lamps_are_seen_by_each_pixel_through_its_filter(shared_scene: Callable[
     assert [response.planes for response in responses] == [(0,), (1, 2), (3,)]
     spectra = tuple(Spectrum(np.array([nm]), np.ones(1)) for nm in np.linspace(420.0, 690.0, 12))
     units = ((600.0, 2e-4), (500.0, 5e-4))
-    lamplight = Lamplight(responses, ((400.0, 700.0),) * 12, spectra, np.full(12, 1 / 12), units=units)
+    counted_lamps = CountedLamps(responses, ((400.0, 700.0),) * 12, spectra, np.full(12, 1 / 12), units=units)
     settings = Settings(depth=400.0, effects=frozenset({"ambient", "diffraction"}))
     rng, n = np.random.default_rng(4), seen.n
     counts, none, place = rng.random(12), np.zeros(12, np.int64), np.linspace(-0.03, 0.03, 12)
     parts = np.repeat([response.part for response in responses], 4)
     lights = []
     for nm, unit in units:
-        own = replace(seen, rig=replace(seen.rig, projector=seen.projector.at(nm)), lamplight=lamplight)
+        own = replace(seen, rig=replace(seen.rig, projector=seen.projector.at(nm)), counted_lamps=counted_lamps)
         simulation = Simulation(own, settings)
         lamps = PathSamples(
             n**2 + np.arange(12), none, none, place, place[::-1], place * 0 + 0.0025, counts * parts * unit,
@@ -189,7 +189,7 @@ def test_lamps_are_seen_by_each_pixel_through_its_filter(shared_scene: Callable[
         truth = Truth(np.zeros((n, n)), np.zeros((n, n)), np.ones(n**2), 1)
         light = SampledLight((filed,), simulation, plan, 0, none[:1].repeat(n**2), zeros, zeros, 1, 0.0, True)
         lights.append(replace(light, known_truth=truth))
-    whole = MosaicLight.of(replace(seen, lamplight=lamplight), lights, [nm for nm, _ in units])
+    whole = MosaicLight.of(replace(seen, counted_lamps=counted_lamps), lights, [nm for nm, _ in units])
     lighting = Lighting(none[:1].repeat(n**2), np.ones((1, 1)))
     expected = np.zeros(seen.geometry.frame_shape)
     for band, spectrum in enumerate(spectra):

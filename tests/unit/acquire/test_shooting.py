@@ -10,7 +10,7 @@ import pytest
 from mitsim.acquire.capture import Shooting, Totals
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
-from mitsim.core.runs import RunMemory
+from mitsim.core.runs import Recorder
 from mitsim.devices.patterns import parse_patterns
 from mitsim.light.settings import GROUPS
 from mitsim.optics import frames as forming
@@ -23,7 +23,7 @@ FAMILY = parse_patterns("dots:5", 10)
 FRAMES = [frame(1e-6 * (2 + index)) for index in range(25)]
 
 
-def shot(recorder: RunMemory) -> Shooting:
+def shot(recorder: Recorder) -> Shooting:
     shooting = Shooting(FAMILY, recorder, exposer(), None, np.zeros((PIXELS, PIXELS)))
     shooting.shoot(FRAMES, Job())
     return shooting
@@ -37,7 +37,7 @@ def test_a_large_sensor_s_frames_are_exposed_a_few_at_a_time() -> None:
 def test_shots_are_the_same_however_many_are_exposed_at_a_time(together: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Bit by bit, and with them what is told of all. (Planted: noise named by the place in the chunk; the last chunk's
     files not waited for; its sums left out.)"""
-    one, other = RunMemory(), RunMemory()
+    one, other = Recorder(), Recorder()
     first = shot(one)
     monkeypatch.setattr(memory, "FRAMES_AT_ONCE", together)
     second = shot(other)
@@ -56,7 +56,7 @@ def test_a_file_that_cannot_be_written_ends_the_shooting(monkeypatch: pytest.Mon
     monkeypatch.setattr(memory, "FRAMES_AT_ONCE", 4)
     for bad in ("frame_00000.exr", "frame_00024.exr"):
 
-        class Full(RunMemory):
+        class Full(Recorder):
             def write(self, name, channels, metadata, bad=bad) -> None:
                 if name == bad:
                     raise MitsimError(f"file {name}: cannot be written (No space left on device)")
@@ -82,7 +82,7 @@ def test_frames_take_as_much_memory_as_is_predicted(mixed: bool, monkeypatch: py
         monkeypatch.setattr(forming, "_BASIS_BYTES", 1)
     weights = np.random.default_rng(3).random((shots, classes))
 
-    class Nowhere(RunMemory):
+    class Nowhere(Recorder):
         def write(self, name, channels, metadata) -> None:
             """Kept by nobody."""
 

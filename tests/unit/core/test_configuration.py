@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel, ConfigDict, Field
 
-from mitsim.core.configuration import load_model, read_toml, shipped, validated
+from mitsim.core.configuration import load_model, read_toml, shipped, validate
 from mitsim.core.errors import MitsimError
 
 
@@ -37,7 +37,7 @@ def test_a_file_becomes_a_model(tmp_path: Path) -> None:
 )
 def test_a_broken_rule_is_one_line_with_place_value_and_rule(data: dict, message: str) -> None:
     with pytest.raises(MitsimError, match=message) as caught:
-        validated(Outer, data, "here")
+        validate(Outer, data, "here")
     assert "\n" not in str(caught.value)
 
 

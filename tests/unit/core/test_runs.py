@@ -11,7 +11,7 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame
 from mitsim.core.manifests import Digital, Patterns, RunHead, RunManifest
-from mitsim.core.runs import Capture, Recorder, RunMemory, claimed, frame_name, load_run
+from mitsim.core.runs import Capture, Recorder, claimed, frame_name, load_run
 from mitsim.devices.patterns import parse_patterns
 
 N, PIXELS = 6, 5
@@ -57,7 +57,7 @@ def content(folder: Path) -> dict[str, bytes]:
 def test_a_saved_capture_is_the_folder_that_was_streamed(tmp_path: Path) -> None:
     """To the byte: names, pixels, metadata, checksums, manifest. (Planted: metadata without the run's digest.)"""
     on_disk(tmp_path / "streamed")
-    recorded(RunMemory()).save(tmp_path / "saved")
+    recorded(Recorder()).save(tmp_path / "saved")
     load_run(tmp_path / "streamed").save(tmp_path / "copied")
     expected = content(tmp_path / "streamed")
     assert len(expected) == 4 * 2 + 2
@@ -69,7 +69,7 @@ def test_a_saved_capture_is_the_folder_that_was_streamed(tmp_path: Path) -> None
 
 
 def test_memory_and_disk_give_the_same_arrays(tmp_path: Path) -> None:
-    memory, streamed = recorded(RunMemory()), on_disk(tmp_path / "run")
+    memory, streamed = recorded(Recorder()), on_disk(tmp_path / "run")
     for shots in (streamed, load_run(tmp_path / "run")):
         assert shots.dn.dtype == memory.dn.dtype == np.uint32 and np.array_equal(shots.dn, memory.dn)
         assert shots.electrons is not None and np.array_equal(shots.electrons, memory.electrons)
@@ -84,7 +84,7 @@ def test_memory_and_disk_give_the_same_arrays(tmp_path: Path) -> None:
 
 
 def test_a_measurement_is_the_difference_of_its_halves() -> None:
-    shots = recorded(RunMemory())
+    shots = recorded(Recorder())
     rates = [(dn.astype(float) - 40) / 0.5 / 0.02 - 6 for dn in shots.dn]
     expected = {(0, 0): 0, (0, 1): 2, (1, 0): 4, (1, 1): 6}
     measured = {(i, j): frame for frame, i, j in shots.measurements()}
@@ -111,15 +111,15 @@ def test_frames_are_read_when_they_are_asked_for(tmp_path: Path, monkeypatch: py
 def test_saving_over_something_is_refused(tmp_path: Path) -> None:
     (tmp_path / "note.txt").write_text("mine")
     with pytest.raises(MitsimError, match="holds files already"):
-        recorded(RunMemory()).save(tmp_path)
+        recorded(Recorder()).save(tmp_path)
 
 
 def test_it_shows_itself(tmp_path: Path) -> None:
-    for shots in (recorded(RunMemory()), on_disk(tmp_path / "run")):
+    for shots in (recorded(Recorder()), on_disk(tmp_path / "run")):
         text = shots._repr_html_()
         assert text.count("data:image/png;base64,") == 4 and "hadamard:2" in text and "8 shots of 5 x 5" in text
         assert "too dark" in text and "pattern (" in text and " DN" in text
-    assert repr(recorded(RunMemory())) == "Capture(hadamard:2: 8 shots of 5 x 5 pixels, in memory)"
+    assert repr(recorded(Recorder())) == "Capture(hadamard:2: 8 shots of 5 x 5 pixels, in memory)"
 
 
 def test_an_unfinished_run_says_how_to_go_on(tmp_path: Path) -> None:
@@ -142,8 +142,8 @@ def test_an_unfinished_run_says_how_to_go_on(tmp_path: Path) -> None:
 
 def test_a_truth_of_before_has_no_standard_error() -> None:
     """Nor has a real camera's capture."""
-    record = RunMemory()
+    record = Recorder()
     record.write_truth(np.full((N, N), 0.5), 0.99)
-    shots = Capture(recorded(RunMemory()).manifest, memory=record.files)
+    shots = Capture(recorded(Recorder()).manifest, memory=record.files)
     assert shots.truth is not None and shots.truth_standard_error is None
     assert Capture(shots.manifest, memory={}).truth_standard_error is None

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.devices.lamps import SPECTRA_NM, Lamplight, Response, line_units
+from mitsim.devices.lamps import SPECTRA_NM, CountedLamps, Response, line_units
 from mitsim.devices.projector import Lines, Spectrum
 from tests.invented import sensor
 
@@ -109,9 +109,9 @@ def test_lamplight_has_four_rows_of_each_response() -> None:
     )
     units = ((638.0, 1.0), (520.0, 2.0), (445.0, 3.0))
     spectra = tuple(Spectrum(np.array([at, at + 10]), np.array([0.25, 0.75])) for at in (500.0, 600.0))
-    found = Lamplight(responses, (), spectra, np.array([0.4, 0.6]), units=units)
+    found = CountedLamps(responses, (), spectra, np.array([0.4, 0.6]), units=units)
     assert found.range_nm == (420, 600) and [found.rows(number) for number in range(2)] == [slice(0, 4), slice(4, 8)]
     assert found.units_of(Lines((445.0, 638.0), (0.5, 0.5))) == (3.0, 1.0)
     assert list(found.whole.wavelengths_nm) == [500, 510, 600, 610]
     assert found.whole.weights == pytest.approx([0.1, 0.3, 0.15, 0.45])
-    assert Lamplight(responses, (), spectra).whole.weights == pytest.approx([0.125, 0.375, 0.125, 0.375])
+    assert CountedLamps(responses, (), spectra).whole.weights == pytest.approx([0.125, 0.375, 0.125, 0.375])

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.core.configuration import load_model, shipped, validated
+from mitsim.core.configuration import load_model, shipped, validate
 from mitsim.core.errors import MitsimError
 from mitsim.devices.projector import Lines, ProjectorModel, Spectrum
 
@@ -53,17 +53,17 @@ def test_a_mistyped_field_is_refused_with_the_field_it_resembles(tmp_path: Path)
 )
 def test_a_value_beyond_any_device_is_refused_with_its_range(field: str, value: object, rule: str) -> None:
     with pytest.raises(MitsimError, match=rf"^here: [^\n]*{field}[^\n]*{rule}[^\n]*$"):
-        validated(ProjectorModel, {**BASE, field: value}, "here")
+        validate(ProjectorModel, {**BASE, field: value}, "here")
 
 
 def test_a_spectrum_is_of_photons_and_some_line_has_power() -> None:
     """Shares are relative to their sum; all 0 gave weights of nan."""
     lines = {**BASE, "wavelengths_nm": [450.0, 600.0]}
     with pytest.raises(MitsimError, match="radiant_shares are all 0; at least one line must have power"):
-        validated(ProjectorModel, {**lines, "radiant_shares": [0.0, 0.0]}, "here")
-    spectrum = validated(ProjectorModel, {**lines, "radiant_shares": [2.0, 3.0]}, "here").spectrum
+        validate(ProjectorModel, {**lines, "radiant_shares": [0.0, 0.0]}, "here")
+    spectrum = validate(ProjectorModel, {**lines, "radiant_shares": [2.0, 3.0]}, "here").spectrum
     assert spectrum.weights == pytest.approx([180 / 540, 360 / 540])
-    assert validated(ProjectorModel, BASE, "here").spectrum.wavelengths_nm.tolist() == [550.0]
+    assert validate(ProjectorModel, BASE, "here").spectrum.wavelengths_nm.tolist() == [550.0]
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import open_bench
 from mitsim.bench.request import Request
 from mitsim.core.spectral_manifests import MOSAIC, RUN
-from mitsim.devices.lamps import SPECTRA_NM, Lamplight, Response
+from mitsim.devices.lamps import SPECTRA_NM, CountedLamps, Response
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum
 from mitsim.light.grids import Grid
@@ -117,7 +117,7 @@ def traced(folder: str) -> list[dict[str, Any]]:
         camera = place / ("curve.toml" if curve else "number.toml")
         bench = open_bench(path, "llvm_ad_spectral", camera, place / "lines.toml", albedo=SHEETS[sheet])
         whole = SpectralBench.of(bench, RUN).lit_by_lamps({}, 0).whole
-        assert whole.lamplight is not None
+        assert whole.counted_lamps is not None
         simulation = Simulation(whole, Settings(depth=400.0, effects=frozenset({"ambient"})))
         assert isinstance(simulation.from_camera, LampTracer)
         looks = [simulation.from_camera.trace(seed, 0, SAMPLES) for seed in range(SEEDS)]
@@ -134,11 +134,11 @@ def traced(folder: str) -> list[dict[str, Any]]:
                 "bands": np.array(bands).tolist(),
                 "together": [float(light.value.sum()) / SAMPLES for light in both],
                 "filed": np.asarray(filed[0].sum(axis=1)).tolist(),
-                "shares": whole.lamplight.shares.tolist() if whole.lamplight.shares is not None else [],
-                "edges": list(whole.lamplight.bands),
-                "spectra": [list(each.wavelengths_nm) for each in whole.lamplight.spectra],
-                "weights": [list(each.weights) for each in whole.lamplight.spectra],
-                "unknown": whole.lamplight.unknown,
+                "shares": whole.counted_lamps.shares.tolist() if whole.counted_lamps.shares is not None else [],
+                "edges": list(whole.counted_lamps.bands),
+                "spectra": [list(each.wavelengths_nm) for each in whole.counted_lamps.spectra],
+                "weights": [list(each.weights) for each in whole.counted_lamps.spectra],
+                "unknown": whole.counted_lamps.unknown,
                 "filtered": through_filters(place, path, lamp) if lamp in FILTERED else {},
             }
         )
@@ -150,16 +150,21 @@ def through_filters(place: Path, scene: Path, lamp: str) -> dict[str, Any]:
     sheet = SHEETS["coloured" if lamp == "d65" else "grey"]
     bench = open_bench(scene, "llvm_ad_spectral", place / "filters.toml", place / "lines.toml", albedo=sheet)
     colours = SpectralBench.of(bench, MOSAIC).lit_by_lamps({}, 0)
-    lamplight, found = colours.whole.lamplight, {}
-    assert lamplight is not None
+    counted_lamps, found = colours.whole.counted_lamps, {}
+    assert counted_lamps is not None
     for name, each in {"lines": colours.whole, "alone": colours.benches[1]}.items():
         tracer = Simulation(each, Settings(depth=400.0, effects=frozenset({"ambient"}))).from_camera
         assert isinstance(tracer, CombinedTracer) and len(tracer.tracers) == 3
         looks = [tracer.trace(seed, 0, SAMPLES) for seed in range(SEEDS if name == "lines" else 1)]
         lines = [look.by_line(len(LINES) if name == "lines" else 1) for look in looks]
         found[name] = [[np.bincount(one.pixel - bench.n**2, one.value, 12).tolist() for one in look] for look in lines]
-    assert lamplight.shares is not None
-    return {**found, "shares": lamplight.shares.tolist(), "unknown": lamplight.unknown, "range": lamplight.range_nm}
+    assert counted_lamps.shares is not None
+    return {
+        **found,
+        "shares": counted_lamps.shares.tolist(),
+        "unknown": counted_lamps.unknown,
+        "range": counted_lamps.range_nm,
+    }
 
 
 @pytest.fixture(scope="module")
@@ -269,7 +274,7 @@ def test_the_mask_diffracts_each_band_by_its_own_wavelengths(small_scene: Callab
     lamp = '<emitter type="constant"/>'
     bench = open_bench(small_scene(extra=lamp), variant, None, "mp_cl1")
     response = Response.of(bench.sensor)
-    bench = replace(bench, lamplight=Lamplight((response,), response.bands(4), spectra, np.full(4, 0.25)))
+    bench = replace(bench, counted_lamps=CountedLamps((response,), response.bands(4), spectra, np.full(4, 0.25)))
     settings = Settings(depth=400.0, effects=frozenset({"ambient", "diffraction"}))
     simulation, labels = Simulation(bench, settings), np.zeros(bench.n**2, dtype=np.int64)
     frames = []
@@ -291,8 +296,10 @@ def test_the_mask_diffracts_each_band_by_its_own_wavelengths(small_scene: Callab
 @pytest.mark.parametrize(("part", "flagged"), [(0.5, True), (0.02, False)])
 def test_lamps_light_that_is_not_counted_flags_a_run(part: float, flagged: bool) -> None:
     """Where it is more of all light than the accuracy."""
-    lamplight = Lamplight((Response(np.ones(2), (400.0, 700.0)),), (), unknown=0.04)
-    light: Any = SimpleNamespace(bench=SimpleNamespace(lamplight=lamplight), plan=SimpleNamespace(accuracy=1e-3))
+    counted_lamps = CountedLamps((Response(np.ones(2), (400.0, 700.0)),), (), unknown=0.04)
+    light: Any = SimpleNamespace(
+        bench=SimpleNamespace(counted_lamps=counted_lamps), plan=SimpleNamespace(accuracy=1e-3)
+    )
     said = list(_of_unknown_light(light, cast("Any", SimpleNamespace(ambient_part=part))))
     assert bool(said) is flagged and all("4.0% of the lamps' light is in no frame" in sentence for sentence in said)
 
@@ -301,7 +308,7 @@ def test_lines_are_planned_with_their_lamps_lit(monkeypatch: pytest.MonkeyPatch)
     """Wherever they are planned: `mitsim plan` has not lit them before. (Planted: planned as they are.)"""
     planned: list[Any] = []
     alone, whole = (
-        SimpleNamespace(lamplight=object()),
+        SimpleNamespace(counted_lamps=object()),
         SimpleNamespace(
             family=lambda patterns, seed: SimpleNamespace(lighting=Lighting(np.zeros(4, int), np.ones((1, 1))))
         ),
@@ -313,7 +320,7 @@ def test_lines_are_planned_with_their_lamps_lit(monkeypatch: pytest.MonkeyPatch)
         whole=whole,
         check=lambda request: None,
         lit_by_lamps=lambda effects, seed: lit,
-        roughest=lambda seed, part: SimpleNamespace(lamplight=None),
+        roughest=lambda seed, part: SimpleNamespace(counted_lamps=None),
     )
 
     def plan_request(bench: Any, request: Any, lines: int) -> Any:

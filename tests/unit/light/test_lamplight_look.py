@@ -14,7 +14,7 @@ import pytest
 from mitsim.core.seeds import integer
 from mitsim.devices.lamps import SPECTRA_NM, Response, line_units
 from mitsim.devices.projector import Lines
-from mitsim.light import lamps as lamplight
+from mitsim.light import lamps as counted_lamps
 from tests.invented import sensor
 
 LINES = Lines((638.0, 445.0), (0.5, 0.5))
@@ -54,7 +54,7 @@ class OfBench:
 
     counting: Any
     n: int = N
-    lamplight: Any = None
+    counted_lamps: Any = None
     lamps: bool = True
 
     @property
@@ -85,10 +85,10 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, int]]:
         found.append((settings, pixels))
         return SimpleNamespace(from_camera=Followed())
 
-    monkeypatch.setattr(lamplight, "Simulation", simulation)
-    monkeypatch.setattr(lamplight, "FromCameraTracer", Followed)
-    monkeypatch.setattr(lamplight, "LampTracer", Tracer)
-    monkeypatch.setattr(lamplight, "present", lambda bench: ("ambient", "diffraction", "blur"))
+    monkeypatch.setattr(counted_lamps, "Simulation", simulation)
+    monkeypatch.setattr(counted_lamps, "FromCameraTracer", Followed)
+    monkeypatch.setattr(counted_lamps, "LampTracer", Tracer)
+    monkeypatch.setattr(counted_lamps, "present", lambda bench: ("ambient", "diffraction", "blur"))
     monkeypatch.setattr(Tracer, "of", staticmethod(spectrum))
     monkeypatch.setattr(Tracer, "asked", [])
     return found
@@ -103,7 +103,7 @@ def test_a_look_tells_bands_apart_and_what_is_beyond_them(made: list[tuple[Any, 
     """Shares are integrals over the bands, their spectra those over fifths of 20 nm, none of which has no light; what
     no band counts goes on as it ends. (Planted: parts one after another; light beyond either end alone.)"""
     bench: Any = OfBench(camera(400.0, 800.0))
-    found = lamplight.lit_by_lamps(bench, {"blur": False}, 3).lamplight
+    found = counted_lamps.lit_by_lamps(bench, {"blur": False}, 3).counted_lamps
     ((settings, pixels),) = made
     assert pixels == 32 and settings.depth == 410 and settings.effects == {"ambient", "diffraction"}
     assert set(Tracer.asked) == {(integer(3, "lamplight"), 0, 16)} and len(Tracer.asked) == 6
@@ -126,7 +126,7 @@ def test_parts_of_a_band_without_light_are_left_out(
 ) -> None:
     """(Planted: kept.)"""
     monkeypatch.setattr(Tracer, "of", staticmethod(lambda at: np.where(at < 430, 0.0, 1.0)))
-    first, *_ = lamplight.lit_by_lamps(OfBench(camera()), {}, 0).lamplight.spectra  # type: ignore[arg-type, union-attr]
+    first, *_ = counted_lamps.lit_by_lamps(OfBench(camera()), {}, 0).counted_lamps.spectra  # type: ignore[arg-type, union-attr]
     assert first.wavelengths_nm == pytest.approx([430, 450, 470, 490]) and first.weights == pytest.approx(
         np.array([10, 20, 20, 20]) / 70, rel=0.01
     )
@@ -135,11 +135,11 @@ def test_parts_of_a_band_without_light_are_left_out(
 def test_a_curve_that_goes_on_farther_than_spectra_has_unknown_light(made: list[tuple[Any, int]]) -> None:
     """As much a nanometre as in the last ten. (Planted: as much in all as in these.)"""
     bench: Any = OfBench(camera(360.0, 930.0))
-    found = lamplight.lit_by_lamps(bench, {}, 0).lamplight
+    found = counted_lamps.lit_by_lamps(bench, {}, 0).counted_lamps
     beyond = between(820, 830) / 10 * Response.of(bench.counting).beyond_nm
     assert found.unknown == pytest.approx(beyond / (beyond + between(*SPECTRA_NM)), rel=1e-3)
     whole: Any = OfBench(camera(360.0, 830.0))
-    assert lamplight.lit_by_lamps(whole, {}, 0).lamplight.unknown == 0
+    assert counted_lamps.lit_by_lamps(whole, {}, 0).counted_lamps.unknown == 0
 
 
 def test_pixels_behind_filters_share_the_light(made: list[tuple[Any, int]], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -150,7 +150,7 @@ def test_pixels_behind_filters_share_the_light(made: list[tuple[Any, int]], monk
         for name, first in {"G": 400.0, "R": 420.0, "B": 440.0}.items()
     }
     bench: Any = OfBench(camera(mosaic="GBRG", mosaic_curves=curves, quantum_efficiency_curve=None, binning=1))
-    found = lamplight.lit_by_lamps(bench, {}, 0).lamplight
+    found = counted_lamps.lit_by_lamps(bench, {}, 0).counted_lamps
     lights = [
         part * between(low, high)
         for first, part in ((400.0, 0.5), (440.0, 0.25), (420.0, 0.25))
@@ -161,7 +161,7 @@ def test_pixels_behind_filters_share_the_light(made: list[tuple[Any, int]], monk
     missing = between(SPECTRA_NM[0], 440.0) + between(800, SPECTRA_NM[1])
     assert found.unknown == pytest.approx(missing / (missing + between(440, 800)), rel=1e-3)
     monkeypatch.setattr(Tracer, "of", staticmethod(np.zeros_like))
-    dark = lamplight.lit_by_lamps(bench, {}, 0).lamplight
+    dark = counted_lamps.lit_by_lamps(bench, {}, 0).counted_lamps
     assert dark.shares == pytest.approx(np.full(12, 1 / 12)) and dark.unknown == 0
 
 
@@ -169,5 +169,8 @@ def test_a_bench_without_lamps_stays_as_it_is(made: list[tuple[Any, int]]) -> No
     """And one whose lamps are switched off; few pixels are looked at one by one."""
     dark: Any = OfBench(camera(), lamps=False)
     lit: Any = OfBench(camera(), n=5)
-    assert lamplight.lit_by_lamps(dark, {}, 0) is dark and lamplight.lit_by_lamps(lit, {"ambient": False}, 0) is lit
-    assert lamplight.lit_by_lamps(lit, {"ambient": True}, 0) is not lit and [pixels for _, pixels in made] == [5]
+    assert (
+        counted_lamps.lit_by_lamps(dark, {}, 0) is dark
+        and counted_lamps.lit_by_lamps(lit, {"ambient": False}, 0) is lit
+    )
+    assert counted_lamps.lit_by_lamps(lit, {"ambient": True}, 0) is not lit and [pixels for _, pixels in made] == [5]

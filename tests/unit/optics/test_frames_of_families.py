@@ -8,15 +8,7 @@ from scipy.linalg import hadamard
 from mitsim.optics import forming
 from mitsim.optics import frames as frames_module
 from mitsim.optics.forming import Filed, _product, pair_shots
-from mitsim.optics.frames import (
-    ClassFrames,
-    ExpectedFrames,
-    Frame,
-    at_once,
-    formed_frames,
-    frames_in_memory,
-    mixes,
-)
+from mitsim.optics.frames import ClassFrames, ExpectedFrames, Frame, at_once, formed_frames, frames_in_memory, mixes
 from mitsim.optics.image_formation import FrameOptics
 from tests.unit.optics.small_camera import (
     BESIDE,

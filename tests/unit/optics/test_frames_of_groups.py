@@ -5,11 +5,7 @@ import pytest
 from scipy import sparse
 
 from mitsim.optics.forming import Filed
-from mitsim.optics.frames import (
-    ClassFrames,
-    monte_carlo_bound,
-    monte_carlo_error,
-)
+from mitsim.optics.frames import ClassFrames, monte_carlo_bound, monte_carlo_error
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.replicates import bound_of, probe_vectors, shares_of_bound
 from mitsim.optics.shadow import Directions

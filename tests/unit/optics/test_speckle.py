@@ -6,19 +6,19 @@ from scipy import stats
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
-from mitsim.optics.speckle import speckled
+from mitsim.optics.speckle import add_speckle
 
 LIGHT = np.full((400, 500), 3.0)
 ALPHA = 1e-4  # of each test below; 200 000 pixels
 
 
 def test_without_contrast_light_passes_unchanged() -> None:
-    assert speckled(LIGHT, 0.0, stream(0, "speckle")) is LIGHT
+    assert add_speckle(LIGHT, 0.0, stream(0, "speckle")) is LIGHT
 
 
 @pytest.mark.parametrize("contrast", [0.02, 0.3, 1.0])
 def test_speckle_follows_the_gamma_law_of_its_contrast(contrast: float) -> None:
-    found = speckled(LIGHT, contrast, stream(1, "speckle")).ravel() / 3.0
+    found = add_speckle(LIGHT, contrast, stream(1, "speckle")).ravel() / 3.0
     limit = stats.norm.isf(ALPHA / 2)
     assert abs(found.mean() - 1) < limit * contrast / found.size**0.5
     assert stats.kstest(found, stats.gamma(contrast**-2, scale=contrast**2).cdf).pvalue > ALPHA
@@ -29,10 +29,10 @@ def test_speckle_follows_the_gamma_law_of_its_contrast(contrast: float) -> None:
 
 
 def test_dark_pixels_stay_dark() -> None:
-    assert not speckled(np.zeros((4, 4)), 0.5, stream(2, "speckle")).any()
+    assert not add_speckle(np.zeros((4, 4)), 0.5, stream(2, "speckle")).any()
 
 
 @pytest.mark.parametrize("contrast", [-0.1, 1.5, float("nan")])
 def test_impossible_contrast_is_refused(contrast: float) -> None:
     with pytest.raises(MitsimError, match=r"speckle contrast is .*0 \(none\) to 1"):
-        speckled(LIGHT, contrast, stream(0, "speckle"))
+        add_speckle(LIGHT, contrast, stream(0, "speckle"))

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mitsim.core.configuration import validated
+from mitsim.core.configuration import validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import Parallax
 from mitsim.core.runs import Capture
@@ -382,7 +382,7 @@ def test_a_focus_that_is_none_is_refused(focus: object, fragment: str) -> None:
 )
 def test_a_parallax_that_cannot_be_is_refused(field: str, value: object, fragment: str) -> None:
     with pytest.raises(MitsimError, match=fragment) as caught:
-        validated(Parallax, {**PARALLAX.model_dump(), field: value}, "cal/manifest.json")
+        validate(Parallax, {**PARALLAX.model_dump(), field: value}, "cal/manifest.json")
     assert "\n" not in str(caught.value)
 
 

@@ -15,7 +15,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame
 from mitsim.core.manifests import CalibrationManifest, Digital, Patterns, RunHead, RunManifest
 from mitsim.core.resources import Cost
-from mitsim.core.runs import Capture, RunMemory, frame_name, load_run
+from mitsim.core.runs import Capture, Recorder, frame_name, load_run
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct import request
 from mitsim.reconstruct.convolution import ConvolutionalCamera
@@ -44,7 +44,7 @@ def factors() -> Factors:
 @pytest.fixture
 def shots(factors: Factors) -> Capture:
     """Noisy frames of a scene under 2 x 2 Hadamard patterns, as pairs."""
-    family, rng, memory = parse_patterns("hadamard:2", N), np.random.default_rng(2), RunMemory()
+    family, rng, memory = parse_patterns("hadamard:2", N), np.random.default_rng(2), Recorder()
     scene = rng.random((N, N))
     for index, shot in enumerate(family.shots):
         electrons = 1e4 * factors.left @ (family.light(shot) * scene) @ factors.right.T

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from mitsim.core.exr import MAGIC
-from mitsim.scene.guard.check import check_file
-from mitsim.scene.guard.headers import check_image, is_grey
+from mitsim.scene.check import check_file
+from mitsim.scene.headers import check_image, is_grey
 from tests.conftest import write_png
 
 pytestmark = pytest.mark.usefixtures("variant")

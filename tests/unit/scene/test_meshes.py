@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.scene.guard.headers import check_ply
+from mitsim.scene.headers import check_ply
 
 VERTICES = [(-20.0, -20.0, 0.0), (20.0, -20.0, 0.0), (20.0, 20.0, 0.0), (-20.0, 20.0, 0.0)]
 FACES = [(0, 1, 2), (0, 2, 3)]

@@ -8,7 +8,7 @@ import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.scene.load import load_scene
-from mitsim.scene.projector import ProjectorGrid
+from mitsim.scene.window import ProjectorGrid
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, Z = 16, 400.0

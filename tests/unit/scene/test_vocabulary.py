@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from mitsim.scene.guard.check import check_file
+from mitsim.scene.check import check_file
 from tests.vocabulary import cases, outcome, scene
 
 ALL = ("reference", "factored", "capture")

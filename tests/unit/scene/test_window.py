@@ -8,7 +8,7 @@ from PIL import Image
 
 from mitsim.bench.open import check_scene
 from mitsim.core.errors import MitsimError
-from mitsim.scene.guard.outline import lit_side
+from mitsim.scene.outline import lit_side
 
 
 def picture(path: Path, mode: str, size: tuple[int, int] = (6, 6), value: int = 1) -> Path:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.core.configuration import shipped, validated
+from mitsim.core.configuration import shipped, validate
 from mitsim.core.errors import MitsimError
 from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.sensor.chain import expose, ripple_level, ripple_response
@@ -124,4 +124,4 @@ def test_shutters_of_the_shipped_cameras(tmp_path: Path) -> None:
 )
 def test_a_shutter_that_cannot_be_is_one_line(changes: dict[str, Any], said: str) -> None:
     with pytest.raises(MitsimError, match=rf"^camera[^\n]*{said}[^\n]*$"):
-        validated(SensorModel, {**SENSOR.model_dump(exclude_none=True), **changes}, "camera")
+        validate(SensorModel, {**SENSOR.model_dump(exclude_none=True), **changes}, "camera")

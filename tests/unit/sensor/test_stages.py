@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mitsim.core.configuration import shipped, validated
+from mitsim.core.configuration import shipped, validate
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel, load_sensor
@@ -307,7 +307,7 @@ def test_charge_that_is_binned_on_chip_is_read_once() -> None:
 def test_numbers_that_cannot_be_are_refused_in_a_line(changes: dict[str, object], message: str) -> None:
     values = {**camera().model_dump(), **changes}
     with pytest.raises(MitsimError, match=message):
-        validated(SensorModel, values, "file x.toml")
+        validate(SensorModel, values, "file x.toml")
 
 
 @pytest.mark.parametrize("name", ["offsets", "row noise", "crosstalk"])

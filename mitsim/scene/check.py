@@ -2,7 +2,7 @@
 silently accept.
 
 Making objects of a scene can run native code and read any file, and it takes NaN, negative light or a reflectance of 2
-without a word. So :mod:`mitsim.scene.guard.outline` looks at the bytes, ``mitsuba.parser`` reads them (which loads no
+without a word. So :mod:`mitsim.scene.outline` looks at the bytes, ``mitsuba.parser`` reads them (which loads no
 plugin and needs no variant), and what it read is checked here: ``limits`` knows the plugins and the
 numbers, ``headers`` the files. :func:`mitsim.scene.load.load_scene` makes objects of that same tree.
 """
@@ -20,11 +20,11 @@ import numpy as np
 import pydantic
 
 from mitsim.devices.camera import CameraGeometry
-from mitsim.scene.guard import limits
-from mitsim.scene.guard.estimators import SMALL_LAMPS, Unfit
-from mitsim.scene.guard.headers import MOST_TEXELS, check_image, check_obj, check_ply, is_grey
-from mitsim.scene.guard.limits import PLUGINS, Range, check_plugin, check_variant, references
-from mitsim.scene.guard.outline import DEEPEST, MOST_ELEMENTS, Outline, SceneFiles, Tag
+from mitsim.scene import limits
+from mitsim.scene.estimators import SMALL_LAMPS, Unfit
+from mitsim.scene.headers import MOST_TEXELS, check_image, check_obj, check_ply, is_grey
+from mitsim.scene.limits import PLUGINS, Range, check_plugin, check_variant, references
+from mitsim.scene.outline import DEEPEST, MOST_ELEMENTS, Outline, SceneFiles, Tag
 
 _IMAGES = ("bitmap", "envmap")
 _READERS = (*_IMAGES, "ply", "obj")

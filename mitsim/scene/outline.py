@@ -1,6 +1,6 @@
 """A scene's bytes in; the place of every tag out, or a refusal of what Mitsuba's parser must not be given.
 
-Mitsuba's parser reads the scene (:mod:`mitsim.scene.guard.check`). Left to this module is what that does not do
+Mitsuba's parser reads the scene (:mod:`mitsim.scene.check`). Left to this module is what that does not do
 (names of cases in tests/hard/hostile/): it calls itself for each level, until its stack overflows ("depth of
 100000"). It opens what ``<include>`` and ``<spectrum>`` name while it reads, a pipe or a file outside too ("included
 pipe", "include above"), and each include again ("million includes"); ``<path>`` lets it find native code. It reads
@@ -387,7 +387,7 @@ _MOST_TEXELS = 1 << 24
 
 def lit_side(picture: Path) -> int | None:
     """Rows and columns of the lit square in the PNG file ``picture``; None where it is no such picture: what is wrong
-    with it, :func:`mitsim.scene.projector.locate_projector` says."""
+    with it, :func:`mitsim.scene.window.locate_projector` says."""
     from PIL.PngImagePlugin import PngImageFile
 
     try:

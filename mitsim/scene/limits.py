@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from mitsim.core.errors import cut, near_name
 from mitsim.devices.camera import CameraGeometry
-from mitsim.scene.guard.headers import FARTHEST
-from mitsim.scene.guard.outline import Tag
+from mitsim.scene.headers import FARTHEST
+from mitsim.scene.outline import Tag
 
 _LARGEST = 1e20
 """Squared, still far from the end of single precision (3.4e38) in which Mitsuba calculates."""

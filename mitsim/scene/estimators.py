@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 import mitsuba as mi
 
 from mitsim.core.errors import MitsimError
-from mitsim.scene.guard.limits import PLUGINS, references
+from mitsim.scene.limits import PLUGINS, references
 
 if TYPE_CHECKING:
-    from mitsim.scene.guard.outline import Outline
+    from mitsim.scene.outline import Outline
 
 STRAIGHT = ("circular", "mask", "null", "polarizer", "retarder", "thindielectric")
 """Materials that let light straight on."""

@@ -63,9 +63,6 @@ def grey_png(values: npt.ArrayLike, largest: int | None = None, smallest: int = 
     return buffer.getvalue()
 
 
-colour_png = png  # until all call sites have its name
-
-
 def data_uri(picture: bytes) -> str:
     """A PNG ``picture`` as the address that holds it, for a page that refers to nothing outside itself."""
     return "data:image/png;base64," + base64.b64encode(picture).decode("ascii")
