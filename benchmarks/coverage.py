@@ -34,9 +34,9 @@ from skimage.transform import resize
 
 from mitsim.acquire.capture import expose
 from mitsim.api.bench import Bench, open_bench
+from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.calibrate import estimate
 from mitsim.calibrate.lit_session import LitSession
-from mitsim.calibrate.session import Session
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.devices.camera import centred_edges

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 import mitsim as ms
+from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.calibrate import estimate
 from mitsim.calibrate.lit_session import LitSession
-from mitsim.calibrate.session import Session
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.devices.sensor import digital_of

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from mitsim.api.bench import open_bench as open_bench
     from mitsim.bench.request import Request as Request
     from mitsim.calibrate.model import calibrate_model as calibrate_model
-    from mitsim.calibrate.plan import CalibrationPlan as CalibrationPlan
-    from mitsim.calibrate.plan import plan_calibration as plan_calibration
+    from mitsim.calibrate.session_plan import CalibrationPlan as CalibrationPlan
+    from mitsim.calibrate.session_plan import plan_calibration as plan_calibration
     from mitsim.core.errors import ArgumentError as ArgumentError
     from mitsim.core.errors import MitsimError as MitsimError
     from mitsim.core.job import Clock as Clock
@@ -57,7 +57,7 @@ _HOMES = {
         "api.bench": "Bench open_bench",
         "bench.request": "Request",
         "calibrate.model": "calibrate_model",
-        "calibrate.plan": "CalibrationPlan plan_calibration",
+        "calibrate.session_plan": "CalibrationPlan plan_calibration",
         "core.errors": "ArgumentError MitsimError",
         "core.job": "Clock Job",
         "core.resources": "Limits",

@@ -142,14 +142,14 @@ def test_no_file_imports_itself_over_others() -> None:
     """(Planted: a name of the bench asked of the light, for type checkers alone, in a function.)"""
     texts = sources()
     assert not circles(texts)
-    source, package = texts["mitsim.bench.bench"]
+    source, package = texts["mitsim.bench.apparatus"]
     for planted in (
         "\nfrom mitsim.light.light import SampledLight\n",
         "\ndef f():\n    from mitsim.light.light import SampledLight\n",
         "\nif TYPE_CHECKING:\n    from mitsim.light.light import SampledLight\n",
     ):
-        found = circles({**texts, "mitsim.bench.bench": (source + planted, package)})
-        assert any("mitsim.bench.bench" in circle and "mitsim.light.light" in circle for circle in found)
+        found = circles({**texts, "mitsim.bench.apparatus": (source + planted, package)})
+        assert any("mitsim.bench.apparatus" in circle and "mitsim.light.light" in circle for circle in found)
 
 
 def test_every_room_has_a_floor() -> None:
@@ -168,12 +168,12 @@ def test_every_room_has_a_floor() -> None:
         ("mitsim.core.manifests", "import mitsuba as mi"),
         ("mitsim.devices.camera", "from mitsim.optics import shadow"),
         ("mitsim.sensor.chain", "from mitsim.light.settings import Settings"),
-        ("mitsim.bench.bench", "from mitsim.light.light import SampledLight"),
+        ("mitsim.bench.apparatus", "from mitsim.light.light import SampledLight"),
         ("mitsim.planner.planner", "from mitsim.acquire.capture import capture"),
         ("mitsim.acquire.capture", "from mitsim.api.bench import Bench"),
         ("mitsim.reconstruct.factors", "from mitsim.exchange.packed import Packed"),
-        ("mitsim.devices.session", "def f():\n    from mitsim.bench import bench"),
-        ("mitsim.scene.load", "if TYPE_CHECKING:\n    from mitsim.bench.bench import Apparatus"),
+        ("mitsim.devices.session", "def f():\n    from mitsim.bench import apparatus as bench"),
+        ("mitsim.scene.load", "if TYPE_CHECKING:\n    from mitsim.bench.apparatus import Apparatus"),
         ("mitsim.report.demo_page", "from mitsim.studies.demo import demo"),
         ("mitsim.core.files", "import mitsim"),
         ("mitsim", "if TYPE_CHECKING:\n    from mitsim.cli import app"),

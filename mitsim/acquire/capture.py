@@ -15,9 +15,17 @@ from typing import Any
 
 import numpy as np
 
-from mitsim.acquire.exposure import AmbientFrame, Exposer, Shooting, Totals, camera_warnings, is_taken, shots_for
+from mitsim.acquire.exposure import (
+    AmbientFrame,
+    Exposer,
+    Shooting,
+    Totals,
+    ambient_shots,
+    camera_warnings,
+    takes_ambient_frame,
+)
 from mitsim.acquire.spectral import SpectralBench
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Request, Task
 from mitsim.core.arguments import checked
 from mitsim.core.environment import deciding_versions, versions
@@ -253,8 +261,8 @@ def _run(
         recorder.write_truth(truth.reflectance, load_recipe().board_reflectance, truth.standard_error)
     ambient = None
     with job.clock.stage("ambient frame"):
-        if is_taken(request.ambient_frame, family, expected):
-            ambient = AmbientFrame.exposed(exposer, expected, request.ambient_shots or shots_for(family))
+        if takes_ambient_frame(request.ambient_frame, family, expected):
+            ambient = AmbientFrame.exposed(exposer, expected, request.ambient_shots or ambient_shots(family))
     if ambient:
         single = {"DN": ambient.digital, "electrons": ambient.electrons}
         channels: dict[str, Channel] = {name: values.astype(np.float32) for name, values in single.items()}

@@ -173,7 +173,7 @@ _PART = 1 / 16
 decibel would be better spent on the frames."""
 
 
-def is_taken(choice: AmbientChoice, family: PatternFamily, expected: ExpectedFrames) -> bool:
+def takes_ambient_frame(choice: AmbientChoice, family: PatternFamily, expected: ExpectedFrames) -> bool:
     """Whether a capture takes an ambient frame.
 
     Parameters
@@ -188,7 +188,7 @@ def is_taken(choice: AmbientChoice, family: PatternFamily, expected: ExpectedFra
     return choice == "yes" or (choice == "auto" and expected.has_ambient and not family.signed)
 
 
-def shots_for(family: PatternFamily) -> int:
+def ambient_shots(family: PatternFamily) -> int:
     """Shots that an ambient frame is the mean of, so that its noise is at most a sixteenth of the image's variance.
 
     An ambient frame is no noisier than a frame with the projector on, but its noise is the same in all frames of a
@@ -253,9 +253,9 @@ def taken_off(exposer: Exposer, family: PatternFamily, expected: ExpectedFrames)
     exposer, family, expected
         camera and exposure, patterns, and their frames without noise.
     """
-    if not is_taken("auto", family, expected):
+    if not takes_ambient_frame("auto", family, expected):
         return 0.0
-    return exposer.rate(AmbientFrame.exposed(exposer, expected, shots_for(family)).digital)
+    return exposer.rate(AmbientFrame.exposed(exposer, expected, ambient_shots(family)).digital)
 
 
 # -------- Expected frames of a family in, noisy ones in their place out

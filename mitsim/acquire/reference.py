@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import FEWEST_PASSES, REFERENCE, check_accuracy, check_samples
 from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray

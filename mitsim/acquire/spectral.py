@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from mitsim.acquire.exposure import NoiseTarget
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.open import Opened
 from mitsim.bench.request import Request, check_untimed
 from mitsim.core.arrays import FloatArray

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.open import open_apparatus, reopened
 from mitsim.bench.request import Request, SessionRequest, Task
 from mitsim.core.arguments import checked
@@ -69,7 +69,7 @@ def open_bench(
 
 class Bench(Apparatus):
     """An apparatus that is ready to plan, capture and calibrate; its attributes are those of
-    :class:`mitsim.bench.bench.Apparatus`."""
+    :class:`mitsim.bench.apparatus.Apparatus`."""
 
     def __repr__(self) -> str:
         path, (rows, columns) = self.loaded.path, self.geometry.frame_shape

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsim.bench.bench import check_depth
+from mitsim.bench.apparatus import check_depth
 from mitsim.bench.open import Opened
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError
@@ -20,7 +20,7 @@ from mitsim.transport.plugins.base import host_values, turn_and_origin
 from mitsim.transport.projector import PinholeRays
 
 if TYPE_CHECKING:
-    from mitsim.bench.bench import Apparatus
+    from mitsim.bench.apparatus import Apparatus
 
 _INSIDE = 1e-3
 """Projector pixels from a pixel's corners to the rays that are tried: more than rounding moves a board's edge."""

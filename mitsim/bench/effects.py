@@ -20,7 +20,7 @@ from mitsim.core.errors import ArgumentError
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from mitsim.bench.bench import Apparatus
+    from mitsim.bench.apparatus import Apparatus
     from mitsim.devices.camera import CameraGeometry
     from mitsim.devices.projector import Spectrum
     from mitsim.transport.projector import ProjectorOptics

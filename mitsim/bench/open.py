@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.core.configuration import DEFAULT_CAMERA, load_model, locate
 from mitsim.core.environment import DEFAULT_VARIANT, load_variant
 from mitsim.core.errors import MitsimError

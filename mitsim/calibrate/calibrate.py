@@ -14,8 +14,9 @@ import numpy as np
 
 from mitsim.acquire.capture import colour_folder
 from mitsim.acquire.spectral import SpectralBench, without_filters
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure, SessionRequest, Task
+from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.checkpoint import (
     MOST_TIFF,
     Checkpoint,
@@ -27,7 +28,6 @@ from mitsim.calibrate.checkpoint import (
     kept_light,
 )
 from mitsim.calibrate.lit_session import LitSession, Response
-from mitsim.calibrate.session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import deciding_versions, versions
 from mitsim.core.errors import MitsimError

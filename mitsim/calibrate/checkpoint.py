@@ -19,7 +19,7 @@ import numpy.typing as npt
 from PIL import Image
 from scipy import sparse
 
-from mitsim.calibrate.session import Session
+from mitsim.calibrate.board_session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import PARTS, output_folder, plain, read_json, sweep, whole_file, write_json

@@ -12,8 +12,8 @@ import numpy as np
 
 from mitsim.acquire.exposure import Exposer, in_chunks
 from mitsim.bench.request import Exposure
+from mitsim.calibrate.board_session import Session, stripe_frames
 from mitsim.calibrate.checkpoint import KeptFrames, repeat_names
-from mitsim.calibrate.session import Session, stripe_frames
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.core.parallel import in_threads

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import SessionRequest
+from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.lit_session import LitSession
 from mitsim.calibrate.placement import GAIN_STEP, STEPS, Fitted, Shown, fit_placement
-from mitsim.calibrate.session import Session
 from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import versions
@@ -106,7 +106,7 @@ def _fit_factors(
         plan = session.plan(request.accuracy, job)
         lit = LitSession.of(session, session.trace(plan, job), job)
         with job.clock.stage("sensor"):
-            shown, used = simulated(lit, modelling)
+            shown, used = simulate_responses(lit, modelling)
         digital, reflectance = digital_of(bench.sensor, lit.exposure_s), recipe.board_reflectance
         configuration = {"seed": request.seed, "recipe": recipe.model_dump(exclude_defaults=True)}
     job.progress("fit", 0.5)
@@ -138,7 +138,7 @@ def model_of(bench: Apparatus, model: Model) -> ModelledCamera:
     return ModelledCamera(bench.geometry, bench.windows, bench.n, bench.spectrum if model == "wave" else None)
 
 
-def simulated(lit: LitSession, modelling: Modelling) -> tuple[list[Shown], int]:
+def simulate_responses(lit: LitSession, modelling: Modelling) -> tuple[list[Shown], int]:
     """Noisy responses of a session ``lit``, as many as a ``modelling`` uses, and of how many frames they are."""
     session, n = lit.session, lit.session.bench.n
     pairs, repeats, signs = session.pairs, session.recipe.repeats, session.signs

@@ -263,7 +263,7 @@ def _plan(scene: str, session: Session, planned: Planned, devices: Coloured, lim
     devices.check(scene, patterns)
     with limited.job() as job:
         bench = devices.open(scene, limited.variant, job)
-        from mitsim.calibrate.plan import plan_calibration
+        from mitsim.calibrate.session_plan import plan_calibration
 
         with nullcontext() if output is None else output_file(output):
             found = plan_calibration(bench, psnr, patterns, recipe, **request, job=job)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.effects import Physics
 from mitsim.core.arrays import FloatArray
 from mitsim.devices.camera import CameraGeometry

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.effects import present
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer

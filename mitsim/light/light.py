@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.board import before_board
 from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray, Labels

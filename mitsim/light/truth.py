@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.board import before_board
 from mitsim.bench.effects import Physics, names
 from mitsim.core.arrays import FloatArray, mean_of_neighbours

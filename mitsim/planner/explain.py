@@ -35,7 +35,7 @@ from mitsim.planner.choose import Candidate, cheapest, predicted
 from mitsim.transport.missed import polished_shapes
 
 if TYPE_CHECKING:
-    from mitsim.bench.bench import Apparatus
+    from mitsim.bench.apparatus import Apparatus
     from mitsim.scene.load import LoadedScene
     from mitsim.scene.outline import Tag
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.effects import names
 from mitsim.core.resources import Cost, workers
 from mitsim.devices.camera import CameraGeometry

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from mitsim.bench import effects
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
 from mitsim.light.grids import Grid

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.parallel import in_threads
 from mitsim.core.resources import workers

@@ -10,7 +10,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.effects import DIRECT, EFFECTS, FOLLOWED, Effect
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.parallel import in_threads
 from mitsim.devices.patterns import Lighting

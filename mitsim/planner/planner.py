@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import drjit as dr
 
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import check_accuracy
 from mitsim.core.arrays import Labels
 from mitsim.core.parallel import single_threaded_blas

@@ -23,8 +23,8 @@ from typing import Literal
 import numpy as np
 from scipy import sparse
 
-from mitsim.acquire.exposure import Exposer, is_taken, peak_irradiance, taken_off
-from mitsim.bench.bench import Apparatus
+from mitsim.acquire.exposure import Exposer, peak_irradiance, taken_off, takes_ambient_frame
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure
 from mitsim.calibrate.lit_session import DARK, READ, ROUNDING, SHOT
 from mitsim.core.arrays import FloatArray
@@ -52,7 +52,7 @@ from mitsim.sensor.specimen import response_variance
 # -------- Light of a scene and a camera in
 
 NONUNIFORMITY, SPECKLE = "response nonuniformity", "speckle"
-"""Sources of noise beside those of :mod:`mitsim.calibrate.session`."""
+"""Sources of noise beside those of :mod:`mitsim.calibrate.board_session`."""
 DIM_E = 5600
 """Electrons of the brightest pixel with which the idealised model has the paper's decibels of uniform light and of 49
 dots, mask at 2000 um: 22.8 and 34.8 (`benchmarks/noise_reading.py --distance 2`)."""
@@ -231,7 +231,7 @@ class Unexposed:
     def clear(self, lam: float) -> FloatArray:
         """(n, n) image of the frames without noise, by a lambda ``lam``; lamps' light is taken off without any, too."""
         model, exposer, expected = self.prepared(), self.exposer(1.0), self.expected
-        off = exposer.electrons(expected.projector_off) if is_taken("auto", self.family, expected) else 0.0
+        off = exposer.electrons(expected.projector_off) if takes_ambient_frame("auto", self.family, expected) else 0.0
         sums, positive = model.accumulator(), np.zeros(())
         for shot, frame in zip(self.family.shots, expected, strict=True):
             rate = exposer.electrons(frame) - off

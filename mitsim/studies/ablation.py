@@ -33,7 +33,7 @@ from types import MappingProxyType
 import numpy as np
 from scipy import sparse
 
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.effects import names
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.seeds import integer

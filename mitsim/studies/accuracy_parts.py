@@ -14,7 +14,7 @@ import numpy as np
 
 from mitsim.acquire.exposure import NoiseTarget
 from mitsim.acquire.reference import projected, render
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.effects import EFFECTS, Physics, names, present
 from mitsim.bench.request import Exposure
 from mitsim.core.arrays import FloatArray, Labels

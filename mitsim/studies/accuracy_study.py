@@ -27,7 +27,7 @@ import numpy as np
 
 from mitsim.acquire.capture import capture
 from mitsim.acquire.spectral import SpectralBench
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.effects import present
 from mitsim.bench.request import Request, Task
 from mitsim.core.arrays import FloatArray

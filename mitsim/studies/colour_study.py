@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mitsim.acquire.capture import expose
-from mitsim.acquire.exposure import shots_for
+from mitsim.acquire.exposure import ambient_shots
 from mitsim.core.arrays import FloatArray
 from mitsim.core.display import lightness
 from mitsim.devices.chart import ChartPlace, load_chart
@@ -95,7 +95,7 @@ def _under_daylight(
     images = []
     for line in lines:
         lit = DaylitLine.of(line, light, patterns, seed)
-        shots = 0 if lit.family.signed else shots_for(lit.family)
+        shots = 0 if lit.family.signed else ambient_shots(lit.family)
         images += lit.images([(part, seed)], [lit.model], shots)[0]
     return np.stack(images, axis=-1)
 

@@ -29,9 +29,9 @@ from matplotlib.figure import Figure
 from mitsim.acquire.exposure import Exposer
 from mitsim.api.bench import Bench
 from mitsim.bench.request import Exposure, Request
+from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.calibrate import estimate
 from mitsim.calibrate.lit_session import LitSession
-from mitsim.calibrate.session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job

@@ -17,10 +17,10 @@ from functools import cached_property
 
 import numpy as np
 
-from mitsim.acquire.drift import DriftedExposer, drifted, levels, projecting, warmer
-from mitsim.acquire.exposure import is_taken, shots_for
-from mitsim.bench.bench import Apparatus
-from mitsim.calibrate.session import Session
+from mitsim.acquire.drifting import DriftedExposer, drift_mask, drift_projector, levels, warmer
+from mitsim.acquire.exposure import ambient_shots, takes_ambient_frame
+from mitsim.bench.apparatus import Apparatus
+from mitsim.calibrate.board_session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.devices.drift import Drift
 from mitsim.devices.patterns import PatternFamily, stripe_signs
@@ -176,7 +176,7 @@ class DriftStand:
     def _solved(self, drift: Drift, scene: LitScene, model: Prepared) -> tuple[Solution, Solution]:
         bench = scene.bench
         moved = any(drift.mask_mm) or drift.motion is not None or drift.tilt_mrad is not None
-        expected = scene.expected(RENDERED, self.family, bench=drifted(bench, drift) if moved else None)
+        expected = scene.expected(RENDERED, self.family, bench=drift_mask(bench, drift) if moved else None)
         base = self._frames.exposer(self.exposure_s)
         ambient = expected.projector_off.irradiance if expected.has_ambient else 0.0
         exposer = DriftedExposer(bench.rig, base.exposure_s, base.seed, base.speckle, drift, self.family, ambient)
@@ -284,7 +284,7 @@ class DriftStand:
         if self._takes_ambient:
             exposer = self._frames.exposer(self.exposure_s)
             off = exposer.electrons(self._expected.projector_off)
-            variance = (exposer.sensor_noise(off) / self.exposure_s) ** 2 / shots_for(self.family)
+            variance = (exposer.sensor_noise(off) / self.exposure_s) ** 2 / ambient_shots(self.family)
             found[AMBIENT] = Noise(ambient=variance)
         if known := self.factors.manifest.noise:
             found[SESSION] = Noise(left=known.left**2, right=known.right**2)
@@ -292,7 +292,7 @@ class DriftStand:
 
     @property
     def _takes_ambient(self) -> bool:
-        return is_taken("auto", self.family, self._expected)
+        return takes_ambient_frame("auto", self.family, self._expected)
 
     def _changed(self, drift: Drift) -> Changed:
         """What a ``drift`` changes in the frames, to first order where several things drift at once."""
@@ -311,7 +311,7 @@ class DriftStand:
             exposer = self._frames.exposer(1.0)
             lamps = exposer.electrons(self._expected.projector_off)
             each = self._gains(drift, "lamp", drift.lamp_flicker)
-            common = [rms / shots_for(self.family) ** 0.5 for rms in each]
+            common = [rms / ambient_shots(self.family) ** 0.5 for rms in each]
             return replace(changed, added=lamps, added_gain=drift.lamp, added_flicker=each, added_common=common)
         frame = np.full(self.lit.bench.geometry.frame_shape, self._offset(drift))
         return replace(changed, added=frame if self._fixed_frame is None else frame + self._fixed_frame)
@@ -373,7 +373,7 @@ class DriftStand:
         bench = self.lit.bench
         best = IdealCamera(bench, bench.geometry.mask, self._spectrum).factors
         at_rest = drift.model_copy(update={"mask_rotation_mrad": 0.0, "vibration_um": 0.0})
-        found = self._shadow(projecting(drifted(bench, at_rest), drift)) + _minus([best])
+        found = self._shadow(drift_projector(drift_mask(bench, at_rest), drift)) + _minus([best])
         if drift.vibration_um:
             parts = [(self._shifted(place * drift.vibration_um / 1e3), weight) for place, weight in _HERMITE]
             found += _weigh(parts) + _minus(self._shadow(bench))
@@ -404,7 +404,7 @@ class DriftStand:
     def _shifted(self, by_mm: float) -> SeparableTerms:
         """The shadow with every profile shifted ahead: of the mask moved back."""
         back = Drift(mask_rows_um=-1e3 * by_mm, mask_columns_um=-1e3 * by_mm)
-        return self._shadow(drifted(self.lit.bench, back))
+        return self._shadow(drift_mask(self.lit.bench, back))
 
     def _shadow(self, bench: Apparatus) -> SeparableTerms:
         return IdealCamera(bench, bench.geometry.mask, self._spectrum).terms

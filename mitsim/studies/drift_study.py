@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mitsim.acquire.capture import trace_request
-from mitsim.acquire.drift import projecting
+from mitsim.acquire.drifting import drift_projector
 from mitsim.core.configuration import DEFAULT_CAMERA, locate, shipped
 from mitsim.core.errors import MitsimError
 from mitsim.devices.drift import UNITS, WORDS, Drift, amount_in_words
@@ -129,7 +129,7 @@ def _session(studio: Studio, point: Point, recipe: SessionRecipe, drift: Drift) 
 def _move_projector(lit: LitScene, drift: Drift) -> LitScene:
     """The scene in light of a projector that moved, as coarse as its light before: another plan's errors would be in
     one image alone, and would pass for the drift's."""
-    return LitScene(trace_request(projecting(lit.bench, drift), lit.light.plan))
+    return LitScene(trace_request(drift_projector(lit.bench, drift), lit.light.plan))
 
 
 def _first_amounts(table: Table) -> Mapping[str, Table]:

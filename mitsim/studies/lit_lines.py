@@ -97,7 +97,7 @@ def lit_lines(setup: Setup, seed: int) -> tuple[LitLine, ...]:
     Raises
     ------
     MitsimError
-        as :meth:`mitsim.bench.bench.Bench.capture_lines`.
+        as :meth:`mitsim.bench.apparatus.Bench.capture_lines`.
     """
     colours = SpectralBench.of(_open(setup, locate(setup.scene, "scenes", "scene.xml")), RUN)
     request = Request.of(accuracy=setup.accuracy, seed=seed)

@@ -3,7 +3,7 @@
 The camera is not built as it was to be: its mask is 50 um too far from the sensor, and 37 and -21 um off the axis. A
 model starts from the plan and is fitted to the first frames of a session; measured factors need all patterns of it, and
 more frames by taking each several times, or fewer by one uniform shot instead of a second half of each pair. Measured
-factors have the noise of their session in closed form (:mod:`mitsim.calibrate.plan`), so one session is formed.
+factors have the noise of their session in closed form (:mod:`mitsim.calibrate.session_plan`), so one session is formed.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from mitsim.api.bench import Bench
+from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.lit_session import LitSession
-from mitsim.calibrate.model import model_of, modelled_factors, simulated
+from mitsim.calibrate.model import model_of, modelled_factors, simulate_responses
 from mitsim.calibrate.placement import fit_placement
-from mitsim.calibrate.plan import PredictedSession
-from mitsim.calibrate.session import Session
+from mitsim.calibrate.session_plan import PredictedSession
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.devices.session import Modelling, SessionRecipe, load_recipe
@@ -119,7 +119,7 @@ def _session(studio: Studio, setup: Setup, recipe: SessionRecipe) -> PredictedSe
 
 def _model_factors(bench: Bench, lit: LitSession, point: Point) -> Factors:
     """Factors of a model of the ``bench`` as planned, fitted to frames of the session ``lit``."""
-    shown, frames = simulated(lit, Modelling(point["factors"], int(point["wanted"])))
+    shown, frames = simulate_responses(lit, Modelling(point["factors"], int(point["wanted"])))
     camera = model_of(bench, point["factors"])
     fitted = fit_placement(camera, shown, Modelling(point["factors"]).free)
     manifest = CalibrationManifest(camera=bench.identity(), centre=bench.geometry.centred)

@@ -28,11 +28,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mitsim.acquire.exposure import Exposer, peak_irradiance, taken_off
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure
+from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.calibrate import estimate
 from mitsim.calibrate.lit_session import LitSession
-from mitsim.calibrate.session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.core.parallel import single_threaded_blas
@@ -236,7 +236,7 @@ def calibrated_places(bench: Apparatus, places_mm: Sequence[float], seed: int, a
     bench, places_mm
         whose mask is moved, and how far along both axes.
     seed, accuracy
-        as for :meth:`mitsim.bench.bench.Bench.calibrate`; every place has noise of its own.
+        as for :meth:`mitsim.bench.apparatus.Bench.calibrate`; every place has noise of its own.
     """
     recipe, job = load_recipe(), Job()
     session = Session(bench, recipe, seed)

@@ -28,11 +28,11 @@ from matplotlib.figure import Figure
 from mitsim.acquire.capture import capture
 from mitsim.acquire.exposure import Exposer
 from mitsim.acquire.spectral import SpectralBench
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure
+from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.calibrate import estimate
 from mitsim.calibrate.lit_session import LitSession
-from mitsim.calibrate.session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import versions
 from mitsim.core.job import Job
@@ -95,7 +95,7 @@ class Sessions:
 
     @cached_property
     def noisy(self) -> Factors:
-        """Those of the real session, as :meth:`mitsim.bench.bench.Bench.calibrate` has them."""
+        """Those of the real session, as :meth:`mitsim.bench.apparatus.Bench.calibrate` has them."""
         return Factors.of(estimate(self._lit, Job())[0], self._manifest)
 
     def factors(self, off: frozenset[str], noise: bool) -> Factors:

@@ -351,7 +351,7 @@ def test_a_saturated_session_is_flagged(
     def simple_plan(*arguments: object) -> object:
         return make_plan(*arguments, switches=dict.fromkeys(EFFECTS, False))
 
-    monkeypatch.setattr("mitsim.calibrate.session.make_plan", simple_plan)
+    monkeypatch.setattr("mitsim.calibrate.board_session.make_plan", simple_plan)
     camera = tmp_path / "camera.toml"
     camera.write_text(
         'name = "short"\npixel_pitch_um = 5.86\nbinning = 2\nfull_well_e = 32360.0\nread_noise_e = 6.7\n'

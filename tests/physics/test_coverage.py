@@ -33,9 +33,9 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
 from mitsim.api.bench import Bench, open_bench
+from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.calibrate import estimate
 from mitsim.calibrate.lit_session import LitSession
-from mitsim.calibrate.session import Session
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.devices.session import load_recipe

@@ -17,8 +17,8 @@ from scipy import ndimage
 
 from mitsim.api.bench import open_bench
 from mitsim.bench.effects import EFFECTS
+from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.model import model_of
-from mitsim.calibrate.session import Session
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import mitsim as ms
-from mitsim.acquire.exposure import Exposer, shots_for
+from mitsim.acquire.exposure import Exposer, ambient_shots
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import checksum, read_frame, write_frame
@@ -163,7 +163,7 @@ def test_it_is_taken_off_each_frame(captured: Capture) -> None:
 def test_shots_follow_how_alike_patterns_are(patterns: str, shots: int) -> None:
     """16 where each pixel is lit once. K random patterns a side light half of the pixels each, so a pixel is lit in
     1 + (K - 1) / 2 of them, on average over those that light it: 16 ((K + 1) / 2)^2, within 15 %; at most 4096."""
-    found = shots_for(parse_patterns(patterns, 128))
+    found = ambient_shots(parse_patterns(patterns, 128))
     assert found == pytest.approx(shots, rel=0.15 if "random" in patterns else 0)
 
 

@@ -10,10 +10,10 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from mitsim.acquire.drift import DriftedExposer, drifted, levels, warmer
+from mitsim.acquire.drifting import DriftedExposer, drift_mask, levels, warmer
 from mitsim.acquire.exposure import AmbientFrame, Exposer, taken_off
 from mitsim.api.bench import Bench
-from mitsim.calibrate.session import Session
+from mitsim.calibrate.board_session import Session
 from mitsim.core.configuration import load_model, shipped
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
@@ -150,7 +150,7 @@ def test_a_mask_moved_by_a_pixel_casts_the_same_shadow_a_pixel_on() -> None:
     the columns instead; the other sign.)"""
     camera, cells = RIG.camera.model_copy(update={"pixels": 64}), Directions.cells(np.linspace(-0.05, 0.05, 9))
     by_um = 1e3 * camera.pixel_pitch * (1 - camera.mask_distance / 400.0)
-    moved = drifted(bench(pixels=64), Drift(mask_rows_um=by_um)).geometry
+    moved = drift_mask(bench(pixels=64), Drift(mask_rows_um=by_um)).geometry
     scene = np.random.default_rng(2).random((8, 8))
     frame, before = (
         sum(left @ scene @ right.T for left, right in shadow_terms(each, cells, cells, 400.0))
@@ -161,7 +161,7 @@ def test_a_mask_moved_by_a_pixel_casts_the_same_shadow_a_pixel_on() -> None:
 
 def test_a_mask_moves_along_the_axis_that_its_drift_names() -> None:
     """(Planted: columns the other way; rows for columns.)"""
-    moved, still = drifted(bench(), Drift(mask_rows_um=3.0, mask_columns_um=-5.0)).geometry, bench().geometry
+    moved, still = drift_mask(bench(), Drift(mask_rows_um=3.0, mask_columns_um=-5.0)).geometry, bench().geometry
     assert moved.mask_offset_row - still.mask_offset_row == pytest.approx(3e-3)
     assert moved.mask_offset_column - still.mask_offset_column == pytest.approx(-5e-3)
 
@@ -188,35 +188,35 @@ def test_a_mask_that_tilts_casts_the_shadow_of_one_that_was_made_so() -> None:
         (made(0.0, 0.0), Drift(mask_tilt_rows_mrad=6.0, mask_tilt_columns_mrad=-2.0)),
         (made(2.0, -2.0), Drift(mask_tilt_rows_mrad=4.0)),
     ):
-        moved = drifted(replace(bench(), rig=replace(RIG, camera=before)), drift).geometry
+        moved = drift_mask(replace(bench(), rig=replace(RIG, camera=before)), drift).geometry
         assert np.linalg.norm(frame(moved) - expected) < 1e-3 * np.linalg.norm(expected - even)
-    assert Drift().tilt_mrad is None and drifted(bench(), Drift()).geometry.identity == bench().geometry.identity
-    assert drifted(bench(), Drift(mask_tilt_rows_mrad=4.0)).geometry.identity != bench().geometry.identity
+    assert Drift().tilt_mrad is None and drift_mask(bench(), Drift()).geometry.identity == bench().geometry.identity
+    assert drift_mask(bench(), Drift(mask_tilt_rows_mrad=4.0)).geometry.identity != bench().geometry.identity
 
 
 def test_warmth_moves_the_mask_away() -> None:
-    moved = drifted(bench(), Drift(temperature_k=20.0, gap_um_per_k=0.5, mask_axis_um=2.0)).geometry
+    moved = drift_mask(bench(), Drift(temperature_k=20.0, gap_um_per_k=0.5, mask_axis_um=2.0)).geometry
     assert moved.mask_distance == pytest.approx(2.012)
 
 
 def test_what_cannot_be_formed_is_refused() -> None:
     """(Planted: mirrors not looked at; the raster as well.)"""
     with pytest.raises(MitsimError, match=r"^drift: [^\n]*mirrors$"):
-        drifted(bench(mirrors=True), Drift(vibration_um=1.0))
+        drift_mask(bench(mirrors=True), Drift(vibration_um=1.0))
     mask = MaskProfile.model_validate({"kind": "separable", "feature_mm": 0.06, "order": 5, "rotation_deg": 1.0})
     turned = mask.worn(RIG.camera, Path())
     for drift in (Drift(vibration_um=1.0), Drift(mask_tilt_columns_mrad=1.0)):
         with pytest.raises(MitsimError, match=rf"^drift: {drift.kinds[0]} [^\n]*\[mask\]$"):
-            drifted(bench(mask="plate", mask_plate=turned.mask_plate), drift)
+            drift_mask(bench(mask="plate", mask_plate=turned.mask_plate), drift)
     with pytest.raises(MitsimError, match=r"^drift: mask_tilt_rows_mrad [^\n]*mirrors$"):
-        drifted(bench(mirrors=True), Drift(mask_tilt_rows_mrad=1.0))
+        drift_mask(bench(mirrors=True), Drift(mask_tilt_rows_mrad=1.0))
     with pytest.raises(MitsimError, match=r"^drift: mask_tilt_rows_mrad [^\n]*mask_thickness to 0$"):
-        drifted(bench(mask_thickness=0.1), Drift(mask_tilt_rows_mrad=1.0))
+        drift_mask(bench(mask_thickness=0.1), Drift(mask_tilt_rows_mrad=1.0))
     both = Drift(mask_tilt_rows_mrad=20.0, mask_tilt_columns_mrad=20.0)
     with pytest.raises(MitsimError, match=r"^drift: mask_tilt_rows_mrad and mask_tilt_columns_mrad [^\n]*alone$"):
-        drifted(bench(pixels=512), both)
+        drift_mask(bench(pixels=512), both)
     with pytest.raises(MitsimError, match=r"^drift: mask_axis_um [^\n]*$"):
-        drifted(bench(mask_distance=0.5), Drift(mask_axis_um=-600.0))
+        drift_mask(bench(mask_distance=0.5), Drift(mask_axis_um=-600.0))
 
 
 ROLLING = replace(RIG, sensor=SENSOR.model_copy(update={"shutter": "rolling", "line_time_us": 300.0}))

@@ -14,7 +14,7 @@ import pytest
 
 from mitsim.acquire import exposure as exposing
 from mitsim.acquire.exposure import Exposer, camera_warnings
-from mitsim.calibrate.session import Session
+from mitsim.calibrate.board_session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.devices.camera import Rig
 from mitsim.devices.patterns import parse_patterns

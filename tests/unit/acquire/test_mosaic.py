@@ -14,9 +14,9 @@ import pytest
 from mitsim.acquire import spectral
 from mitsim.acquire.spectral import MosaicFrames, MosaicLight, without_filters
 from mitsim.api.bench import Bench, open_bench
+from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimates
 from mitsim.calibrate.lit_session import LitSession
-from mitsim.calibrate.session import Session
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.devices.lamps import CountedLamps, Response

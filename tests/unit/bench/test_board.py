@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.board import missed_pixels
 from mitsim.bench.effects import EFFECTS
-from mitsim.calibrate.session import Session
+from mitsim.calibrate.board_session import Session
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.session import CELLS, BoardShape, load_recipe
 from mitsim.light.light import trace_light

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 import mitsim as ms
+from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.calibrate import estimate
 from mitsim.calibrate.lit_session import LitSession
-from mitsim.calibrate.plan import least_dose
-from mitsim.calibrate.session import Session
+from mitsim.calibrate.session_plan import least_dose
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest

@@ -9,7 +9,7 @@ import pytest
 
 from mitsim.calibrate.calibrate import estimate
 from mitsim.calibrate.lit_session import LitSession
-from mitsim.calibrate.plan import PredictedSession
+from mitsim.calibrate.session_plan import PredictedSession
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.reconstruct.estimate_factors import Estimate

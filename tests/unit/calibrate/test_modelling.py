@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 import mitsim as ms
+from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.lit_session import LitSession
-from mitsim.calibrate.model import model_of, simulated
+from mitsim.calibrate.model import model_of, simulate_responses
 from mitsim.calibrate.placement import fit_placement
-from mitsim.calibrate.session import Session
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.devices.session import Modelling, load_recipe
@@ -35,7 +35,7 @@ def test_a_mask_that_is_off_is_found_in_frames_that_were_traced(bench: Any, kept
     session = Session(bench, load_recipe(), 3)
     light = session.trace(session.plan(1e-3, Job()), Job())
     built = Session(as_built(bench), load_recipe(), 3)
-    shown, frames = simulated(LitSession.of(built, light.behind(built.board), Job()), Modelling("wave", 8))
+    shown, frames = simulate_responses(LitSession.of(built, light.behind(built.board), Job()), Modelling("wave", 8))
     fitted = fit_placement(model_of(bench, "wave"), shown, Modelling("wave", fitted=FIT).free)
     assert frames == 8 and fitted.unexplained < 0.005
     truth = replace(

@@ -17,10 +17,10 @@ import numpy.typing as npt
 import pytest
 
 from mitsim.acquire.exposure import Exposer
+from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimate, estimates
 from mitsim.calibrate.checkpoint import Checkpoint
 from mitsim.calibrate.lit_session import LitSession, _Shot
-from mitsim.calibrate.session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.devices.camera import Rig
@@ -254,9 +254,9 @@ def test_a_resumed_estimate_is_the_same_to_the_bit(mode: str, kinds: tuple[str, 
 def test_stripes_that_are_formed_in_lots_are_all_there(monkeypatch: pytest.MonkeyPatch, first: int) -> None:
     """16 patterns in lots of 4 that begin at the same numbers wherever a session goes on; lots before are not formed.
     (Planted: lots from the first number on, one pattern left out between lots.)"""
-    monkeypatch.setattr("mitsim.calibrate.session.mixes", lambda *_: False)
-    monkeypatch.setattr("mitsim.calibrate.session.lines_held", lambda *_: False)
-    monkeypatch.setattr("mitsim.calibrate.session.at_once", lambda _: 4)
+    monkeypatch.setattr("mitsim.calibrate.board_session.mixes", lambda *_: False)
+    monkeypatch.setattr("mitsim.calibrate.board_session.lines_held", lambda *_: False)
+    monkeypatch.setattr("mitsim.calibrate.board_session.at_once", lambda _: 4)
     lit, formed = lit_session(13), []
     whole = {number: frame.irradiance for number, frame in lit._stripes("vertical", 0)}
     frames = ToyLight.frames

@@ -16,8 +16,8 @@ import pytest
 from mitsim.acquire.exposure import Exposer
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.effects import EFFECTS
+from mitsim.calibrate.board_session import Session, session_cost
 from mitsim.calibrate.checkpoint import Checkpoint
-from mitsim.calibrate.session import Session, session_cost
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import checksum, read_frame
 from mitsim.core.job import Job
@@ -64,7 +64,7 @@ def session(
             bench = open_bench(shared_scene(f"{mask}{n}", mask=mask, n=n), variant)
             folder = tmp_path_factory.mktemp("calibration") / "cal"
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr("mitsim.calibrate.session.make_plan", geometric_plan)
+                patch.setattr("mitsim.calibrate.board_session.make_plan", geometric_plan)
                 factors = bench.calibrate(2, recipe=recipe(mode), output=folder)
             made[key] = bench, factors, factors.estimate, folder
         return made[key]
@@ -78,7 +78,7 @@ def test_each_depth_has_factors_of_its_own(
     """At each depth those of the geometric shadow there: rows from the axis, columns from 60 mm beside it, off
     by their predicted error. In folders called by depth, which stay as they are when resumed; with the
     parallax from there. (Planted: the board always on the aligned plane, one seed for all depths.)"""
-    monkeypatch.setattr("mitsim.calibrate.session.make_plan", geometric_plan)
+    monkeypatch.setattr("mitsim.calibrate.board_session.make_plan", geometric_plan)
     bench = open_bench(shared_scene("depths16", n=16))
     depths = recipe("pair").model_copy(update={"depths": (350.0, 450.0)})
     found = bench.calibrate_depths(2, recipe=depths, output=tmp_path / "cal")
@@ -234,7 +234,7 @@ def test_a_used_folder_is_refused_before_any_work(
     session: Callable[..., Done], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench, *_, folder = session("separable", "pair", 16)
-    monkeypatch.setattr("mitsim.calibrate.session.make_plan", lambda *_: pytest.fail("work was done first"))
+    monkeypatch.setattr("mitsim.calibrate.board_session.make_plan", lambda *_: pytest.fail("work was done first"))
     with pytest.raises(MitsimError, match="holds files already"):
         bench.calibrate(output=folder)
 
@@ -314,7 +314,7 @@ def geometric_sessions(monkeypatch: pytest.MonkeyPatch) -> None:
             plans[key] = geometric_plan(board, lighting, *request)
         return plans[key]
 
-    monkeypatch.setattr("mitsim.calibrate.session.make_plan", planned)
+    monkeypatch.setattr("mitsim.calibrate.board_session.make_plan", planned)
 
 
 @pytest.fixture(autouse=True)
@@ -468,6 +468,6 @@ def test_describing_a_session_traces_nothing(
     shared_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("make_plan", "trace_lines"):
-        monkeypatch.setattr(f"mitsim.calibrate.session.{name}", lambda *_: pytest.fail("work was done"))
+        monkeypatch.setattr(f"mitsim.calibrate.board_session.{name}", lambda *_: pytest.fail("work was done"))
     session = Session(open_bench(shared_scene("separable16", n=16)), recipe("pair"))
     assert session.shots == 64 and session.signs.shape == (16, 16)

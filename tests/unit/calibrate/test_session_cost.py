@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from mitsim.calibrate import session
+from mitsim.calibrate import board_session as session
 from mitsim.light.settings import Settings
 
 CELLS, FORMED_S, LIGHT = 80, 7.0, 1e6

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsim.calibrate import session
+from mitsim.calibrate import board_session as session
 from mitsim.core.arrays import FloatArray
 from mitsim.devices.patterns import Lighting, hadamard_matrix
 from mitsim.optics.frames import Frame

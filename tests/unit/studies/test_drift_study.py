@@ -12,7 +12,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from mitsim.acquire.drift import drifted, projecting
+from mitsim.acquire.drifting import drift_mask, drift_projector
 from mitsim.cli.study_verb import recipe_for, scope_of
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
@@ -115,7 +115,7 @@ def test_a_tilt_changes_the_image_as_it_is_predicted_to(stand: DriftStand, drift
     bench, images = stand.lit.bench, []
     for each in (Drift(), drift):
         sums = stand._model.accumulator()
-        expected = stand.lit.expected(RENDERED, stand.family, bench=drifted(bench, each))
+        expected = stand.lit.expected(RENDERED, stand.family, bench=drift_mask(bench, each))
         for frame, shot in zip(expected, stand.family.shots, strict=True):
             sums.add(stand._frames.exposer(1.0).electrons(frame), shot.row, shot.column)
         images.append(stand._model.solve(sums, stand.linear.lam).image)
@@ -160,7 +160,7 @@ def test_a_moved_picture_lights_other_places(stand: DriftStand) -> None:
     """A quarter of a pixel down a smooth print, its pixels see what lies between two. (Planted: rows and columns
     swapped.)"""
     drift = Drift(projector_rows=0.25)
-    bench = projecting(stand.lit.bench, drift)
+    bench = drift_projector(stand.lit.bench, drift)
     (top, bottom), columns = bench.windows
     (before, after), same = stand.lit.bench.windows
     shift = 0.25 * (after - before) / bench.n
@@ -169,7 +169,7 @@ def test_a_moved_picture_lights_other_places(stand: DriftStand) -> None:
     truth = stand.lit.truth
     left = moved.truth[:-1] - 0.75 * truth[:-1] - 0.25 * truth[1:]
     assert np.linalg.norm(left) < 0.2 * np.linalg.norm(moved.truth - truth)
-    assert projecting(stand.lit.bench, Drift(mask_rows_um=1.0)) is stand.lit.bench
+    assert drift_projector(stand.lit.bench, Drift(mask_rows_um=1.0)) is stand.lit.bench
     # By the plan of the light before: another's errors pass for the drift's. (Planted: a plan of its own.)
     own = _move_projector(stand.lit, drift).light
     assert own.plan is stand.lit.light.plan and own.bench.loaded.pixels == bench.loaded.pixels

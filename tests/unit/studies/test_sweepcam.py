@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.calibrate import estimate
 from mitsim.calibrate.lit_session import LitSession
-from mitsim.calibrate.session import Session
 from mitsim.core.job import Job
 from mitsim.devices.session import load_recipe
 from mitsim.optics.frames import Frame

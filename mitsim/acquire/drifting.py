@@ -13,8 +13,8 @@ from functools import cached_property
 
 import numpy as np
 
-from mitsim.acquire.exposure import Exposer, shots_for
-from mitsim.bench.bench import Apparatus
+from mitsim.acquire.exposure import Exposer, ambient_shots
+from mitsim.bench.apparatus import Apparatus
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
@@ -48,7 +48,7 @@ def levels(seed: int, name: str, count: int, ramp: float = 0.0, flicker: float =
     return np.asarray(np.maximum(changed, 0.0))
 
 
-def drifted(bench: Apparatus, drift: Drift) -> Apparatus:
+def drift_mask(bench: Apparatus, drift: Drift) -> Apparatus:
     """A ``bench`` whose mask has moved as a ``drift`` says, for all that is made of light traced before.
 
     MitsimError for a mask that turns, tilts or shakes before mirrors, whose light is formed ray by ray, or whose
@@ -92,7 +92,7 @@ def drifted(bench: Apparatus, drift: Drift) -> Apparatus:
     return replace(bench, rig=replace(bench.rig, camera=moved))
 
 
-def projecting(bench: Apparatus, drift: Drift) -> Apparatus:
+def drift_projector(bench: Apparatus, drift: Drift) -> Apparatus:
     """A ``bench`` whose projector's picture has moved as a ``drift`` says, whose light is to be traced."""
     if not (drift.projector_rows or drift.projector_columns):
         return bench
@@ -185,4 +185,4 @@ class DriftedExposer(Exposer):
     def ambient_levels(self) -> FloatArray:
         """(shots,) level of the lamps in each shot of the ambient frame."""
         assert self.family is not None
-        return levels(self.seed, "ambient", shots_for(self.family), flicker=self.drift.lamp_flicker)
+        return levels(self.seed, "ambient", ambient_shots(self.family), flicker=self.drift.lamp_flicker)

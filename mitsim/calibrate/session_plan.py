@@ -25,11 +25,11 @@ import numpy as np
 from mitsim.acquire.capture import capture
 from mitsim.acquire.exposure import Exposer
 from mitsim.acquire.spectral import SpectralBench
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure, Request, check_psnr
+from mitsim.calibrate.board_session import Session, session_seconds
 from mitsim.calibrate.calibrate import NOISE_FREE, session_sums
 from mitsim.calibrate.lit_session import LitSession
-from mitsim.calibrate.session import Session, session_seconds
 from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError

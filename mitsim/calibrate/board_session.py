@@ -14,9 +14,9 @@ from functools import cached_property
 
 import numpy as np
 
-from mitsim.acquire.drift import levels
+from mitsim.acquire.drifting import levels
 from mitsim.acquire.exposure import camera_warnings
-from mitsim.bench.bench import Apparatus
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.board import before_board, missed_pixels
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
