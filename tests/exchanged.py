@@ -12,7 +12,7 @@ import numpy as np
 from mitsim.core.manifests import AmbientFile, CalibrationManifest, Digital, Patterns, RunHead, RunManifest, ShotFile
 from mitsim.core.runs import AMBIENT, claimed, frame_name
 from mitsim.reconstruct.factors import Factors, load_calibration
-from mitsim.reconstruct.status import Status, Verdict
+from mitsim.reconstruct.solution import Status, Verdict
 
 ROWS, COLUMNS = 40, 52
 SCENE = 10, 14

@@ -44,11 +44,11 @@ from mitsim.light.light import SampledLight
 from mitsim.light.plan import Plan
 from mitsim.optics.frames import Frame
 from mitsim.optics.separable import Lacking, lacking
-from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, Estimate, Seen, StripeSums, stripe_sums
+from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, Estimate, ResponseFit, StripeSums, stripe_sums
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.faults import frame_words
 from mitsim.reconstruct.mosaic import behind
-from mitsim.reconstruct.session_faults import Checked, Circumstances, check_session
+from mitsim.reconstruct.session_faults import CheckedSession, SessionConditions, check_session
 
 NOISY, NOISE_FREE = "noisy", "noise_free"
 """Kinds of responses that factors are estimated from."""
@@ -305,7 +305,7 @@ def estimate(
 @single_threaded_blas()
 def estimates(
     lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Checkpoint | None = None
-) -> tuple[list[Estimate], int, Checked]:
+) -> tuple[list[Estimate], int, CheckedSession]:
     """Factors from each kind of responses to a session, its saturated shots, and what noisy frames show of faults.
 
     Parameters
@@ -315,7 +315,7 @@ def estimates(
     """
     session, found = lit.session, session_sums(lit, job, kinds, checkpoint)
     sensor, drift = session.bench.sensor, session.recipe.drift
-    taken = Circumstances(
+    taken = SessionConditions(
         session.order,
         saturated=bool(found.saturated),
         # Who states that the lamp drifts asks what that costs, which is gone once it is divided out.
@@ -324,7 +324,7 @@ def estimates(
     )
     with job.clock.stage("estimate"):
         judged = [
-            check_session(sums, session.signs, taken) if kind == NOISY else Checked(sums)
+            check_session(sums, session.signs, taken) if kind == NOISY else CheckedSession(sums)
             for kind, sums in found.sums.items()
         ]
         factors = [
@@ -354,7 +354,7 @@ def session_sums(lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Ch
     def response(kind: str, side: str, number: int, frame: Frame) -> Response:
         return lit.noisy(side, number, frame) if kind == NOISY else Response(lit.noise_free(frame))
 
-    def seen(sums: Sequence[StripeSums], shown: tuple[int, Frame]) -> list[tuple[Seen, int]]:
+    def seen(sums: Sequence[StripeSums], shown: tuple[int, Frame]) -> list[tuple[ResponseFit, int]]:
         each = [response(kind, sums[0].side, *shown) for kind in kinds]
         return [(own.seen(one.rate, shown[0], one.light), one.saturated) for own, one in zip(sums, each, strict=True)]
 

@@ -30,7 +30,7 @@ from mitsim.light.grids import GRIDS, LightEstimate
 from mitsim.light.light import SampledLight
 from mitsim.light.plan import Plan
 from mitsim.light.simulation import Simulation
-from mitsim.reconstruct.estimate_factors import PairSeen, PairSums, StripeSums
+from mitsim.reconstruct.estimate_factors import PairLight, PairSums, StripeSums
 from mitsim.sensor.chain import Digital as DigitalNumbers
 
 KIND = "calibration"
@@ -239,7 +239,7 @@ def _kept_sums(arrays: Mapping[str, FloatArray], kind: str, side: Side, session:
     for each, finished in zip((sums.misfits, sums.energies, sums.fluxes), own["each"], strict=True):
         each[:done] = finished
     if "light" in own:
-        seen = [PairSeen(*parts) for parts in zip(own["light"].T, own["rows"], own["columns"], strict=True)]
+        seen = [PairLight(*parts) for parts in zip(own["light"].T, own["rows"], own["columns"], strict=True)]
         sums.pairs = PairSums.empty(seen[0], vectors.shape[1])
         for number, pair in enumerate(seen):
             sums.pairs.put(number, pair)

@@ -36,8 +36,8 @@ from mitsim.optics.separable import best_term
 from mitsim.reconstruct.captured_session import chosen_responses
 from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, decibels, squared_condition
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.solver import centred
-from mitsim.reconstruct.status import Status, Verdict
+from mitsim.reconstruct.solution import Status, Verdict
+from mitsim.reconstruct.solver import centre_frame
 
 _SIGNIFICANT = 3.0
 """Standard errors from which a rotation of the mask counts."""
@@ -194,7 +194,7 @@ def _changes(signs: FloatArray) -> list[int]:
 def _response(signs: FloatArray, side: Side, rate: FloatArray, noise: float, centre: bool) -> Shown:
     across = side == SIDES[0]
     even = np.ones_like(signs)
-    return Shown(signs if across else even, even if across else signs, centred(rate) if centre else rate, noise)
+    return Shown(signs if across else even, even if across else signs, centre_frame(rate) if centre else rate, noise)
 
 
 def modelled_factors(

@@ -446,7 +446,7 @@ class CalibrationManifest(_Head):
     estimate: str | None = None
     """The estimator's own words."""
     verdict: str | None = None
-    """The estimator's verdict, one of `mitsim.reconstruct.status.Verdict`."""
+    """The estimator's verdict, one of `mitsim.reconstruct.solution.Verdict`."""
 
 
 # ---- Reading and writing ----

@@ -37,9 +37,9 @@ from mitsim.devices.framelist import DarkFile, SessionFrames, StripeFile, load_f
 from mitsim.devices.patterns import stripe_signs
 from mitsim.devices.sensor import digital_of, load_sensor
 from mitsim.devices.session import SIDES, UNIFORM, Half, Merge, Side
-from mitsim.reconstruct.estimate_factors import Estimate, Seen, StripeSums, stripe_sums
+from mitsim.reconstruct.estimate_factors import Estimate, ResponseFit, StripeSums, stripe_sums
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.session_faults import Checked, Circumstances, check_session
+from mitsim.reconstruct.session_faults import CheckedSession, SessionConditions, check_session
 
 _FILLED = ("read_noise_e", "step_dn", "saturation_dn")
 """Of a list's `digital`, what a camera's file states where the list does not."""
@@ -444,14 +444,14 @@ class _Readings:
 
 
 @single_threaded_blas()
-def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Checked]:
+def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, CheckedSession]:
     """Factors, the rms noise of the responses [electrons/s] where the list states the sensor's, and which frames are
     wrong."""
     session = readings.session
     signs = stripe_signs(session.listed.n).astype(np.float64)
     sums, variances = _sums(readings, signs.shape[1], job)
     digital = session.listed.digital
-    taken = Circumstances(
+    taken = SessionConditions(
         session.order,
         session.frame_name,
         readings.clipped,
@@ -484,7 +484,7 @@ def _sums(
     step = 4 * workers()
     for side, own in zip(SIDES, sums, strict=True):
 
-        def looked(index: int, side: Side = side, own: StripeSums = own) -> tuple[Seen, float]:
+        def looked(index: int, side: Side = side, own: StripeSums = own) -> tuple[ResponseFit, float]:
             response, variance, light = readings.response(side, index)
             return own.seen(response, index, light), variance
 

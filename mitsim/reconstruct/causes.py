@@ -17,10 +17,10 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.runs import Measurement
-from mitsim.reconstruct.detail import LitFrame, block_indices, factor_slope, orthonormal, print_part
 from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL
+from mitsim.reconstruct.factorisation import IndexArray, group_pixels
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.sides import IndexArray, group_pixels
+from mitsim.reconstruct.subpixel import LitFrame, block_indices, factor_slope, orthonormal, print_part
 
 _PLACES = (0.1, 0.3), (0.4, 0.8), (0.7, 0.1), (0.9, 0.6)
 """Which groups of lit rows and columns are looked at, as parts of their number: chosen, four spread over both."""

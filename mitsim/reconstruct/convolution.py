@@ -45,7 +45,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads
 from mitsim.devices.patterns import PatternFamily
-from mitsim.reconstruct.status import Solution, Status, Verdict
+from mitsim.reconstruct.solution import Solution, Status, Verdict
 
 Operator = Callable[[FloatArray], FloatArray]
 """From an image (n, n) to another."""

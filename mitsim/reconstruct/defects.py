@@ -16,9 +16,9 @@ from scipy.ndimage import maximum_filter, uniform_filter
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.runs import Capture, Measurement
+from mitsim.reconstruct.factorisation import IndexArray
 from mitsim.reconstruct.focus import DerivedCapture
 from mitsim.reconstruct.noise import FrameNoise
-from mitsim.reconstruct.sides import IndexArray
 from mitsim.reconstruct.solver import Prepared
 
 _SPREADS = 7.0

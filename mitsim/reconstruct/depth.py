@@ -25,12 +25,12 @@ from mitsim.core.errors import ArgumentError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture, Measurement
 from mitsim.reconstruct.causes import Evidence
+from mitsim.reconstruct.factorisation import Group, factorise, group_pixels
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import LEAST_PART, FactorOfDepths, move_factors, parallax_of, parallax_period
 from mitsim.reconstruct.misfit import CHANCE
 from mitsim.reconstruct.noise import FrameNoise, factor_energy
-from mitsim.reconstruct.sides import Group, factorise, group_pixels
-from mitsim.reconstruct.solver import Accumulator, Prepared, centred, centred_columns, prepare, projected
+from mitsim.reconstruct.solver import Accumulator, Prepared, centre_columns, centre_frame, prepare, project_frames
 
 _STEP = 1.0
 """Projector pixels of parallax between depths that are tried first: the valley is some two wide on either side."""
@@ -213,7 +213,7 @@ class _Search:
             for axis, (patterns, groups) in enumerate(zip(self._all.patterns, self._groups, strict=True))
         )
         measured = np.outer(left.singular, right.singular) > 0
-        return self._all.energy - float(np.square(projected(left, right, self._all.stack)[measured]).sum())
+        return self._all.energy - float(np.square(project_frames(left, right, self._all.stack)[measured]).sum())
 
     def _valleys(self, first: float, last: float) -> Iterator[tuple[float, float]]:
         """Energy left over at the bottom of the lowest valley between two changes of 1/z and of those that may be as
@@ -285,7 +285,7 @@ class _Search:
         there = move_factors(self._factors, self._mm(shift))
         evidence = Evidence(there.factors, self._all.patterns)
         for each in there.of(self._shots).measured():
-            frame = centred(each.frame) if there.factors.manifest.centre else each.frame
+            frame = centre_frame(each.frame) if there.factors.manifest.centre else each.frame
             evidence.collect(each, frame, float(self._all.noise.variance[each.row, each.column]))
         return float(np.nan_to_num(evidence.print_part()))
 
@@ -336,7 +336,7 @@ class CommonBasis:
         least and largest change of 1/z [1/mm]; ArgumentError where too little of the sensor knows all these depths.
     groups
         scene pixels along both axes that patterns light apart
-        (:func:`mitsim.reconstruct.sides.group_pixels`): where each pattern lights one group, its frames may be on a
+        (:func:`mitsim.reconstruct.factorisation.group_pixels`): where each pattern lights one group, its frames may be on a
         basis of that alone, and so are the columns of :meth:`side`. None: all frames of an axis share one.
 
     Attributes
@@ -389,7 +389,7 @@ class CommonBasis:
         self.noise = FrameNoise(shots.manifest)
         for each in shots.measured((len(factors.left), len(factors.right))):
             frame = each.frame[self._parts[0], self._parts[1]]
-            frame = centred(frame) if self._centre else frame
+            frame = centre_frame(frame) if self._centre else frame
             self.energy += float(np.square(frame).sum())
             self.noise.add(each)
             small = self.stack[each.row, :, each.column]
@@ -435,7 +435,7 @@ class CommonBasis:
         return self._sides[axis].at(shift)[0][self._parts[axis]]
 
     def _own(self, columns: FloatArray) -> FloatArray:
-        return centred_columns(columns) if self._centre else columns
+        return centre_columns(columns) if self._centre else columns
 
 
 def shifts_searched(factors: Factors, depth_range: tuple[float, float] | None) -> tuple[float, float]:

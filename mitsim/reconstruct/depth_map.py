@@ -37,8 +37,8 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import STEP, are_dots, parallax_of, pixels_of_parallax, unambiguous_parallax
 from mitsim.reconstruct.misfit import Balance, Misfit
 from mitsim.reconstruct.noise import FrameNoise
+from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solver import prepare
-from mitsim.reconstruct.status import Solution, Status, Verdict
 
 _STEPS, _STEP_POOLED = 4, 3.0
 """Gauss-Newton steps at most, and the standard deviation [pixels] over which changes of depth are pooled: with 2 and

@@ -17,8 +17,8 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.solver import centred
-from mitsim.reconstruct.status import Status, Verdict
+from mitsim.reconstruct.solution import Status, Verdict
+from mitsim.reconstruct.solver import centre_frame
 
 SEPARABLE_RESIDUAL = 0.01
 """Unexplained residual above which the status warns: a keystone that leaves 1.5 % costs the image 16 % under uniform
@@ -86,7 +86,7 @@ class Estimate:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class ResponseFit:
     """What one response adds to :class:`StripeSums`.
 
     Attributes
@@ -104,12 +104,12 @@ class Seen:
     vector: FloatArray
     misfit: float
     energy: float
-    pair: PairSeen | None = None
+    pair: PairLight | None = None
     flux: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
-class PairSeen:
+class PairLight:
     """What :mod:`mitsim.reconstruct.session_faults` needs of a pair's two frames.
 
     Attributes
@@ -134,14 +134,14 @@ class PairSums:
     columns: FloatArray
 
     @classmethod
-    def empty(cls, first: PairSeen, count: int) -> PairSums:
+    def empty(cls, first: PairLight, count: int) -> PairSums:
         """Room for ``count`` pairs like the ``first``."""
         return cls(
             np.empty((len(first.light), count)),
             *(np.empty((count, *part.shape)) for part in (first.rows, first.columns)),
         )
 
-    def put(self, number: int, seen: PairSeen) -> None:
+    def put(self, number: int, seen: PairLight) -> None:
         """Keep what was ``seen`` of the pair of a ``number``."""
         self.light[:, number], self.rows[number], self.columns[number] = seen.light, seen.rows, seen.columns
 
@@ -189,7 +189,7 @@ class StripeSums:
         """Add the next ``response`` (rows, columns); MitsimError for another shape or values that are not finite."""
         self.put(self.seen(response, self.done))
 
-    def seen(self, response: npt.ArrayLike, number: int, light: FloatArray | None = None) -> Seen:
+    def seen(self, response: npt.ArrayLike, number: int, light: FloatArray | None = None) -> ResponseFit:
         """What a response adds; MitsimError as :meth:`add`.
 
         Changes nothing, so that responses are looked at in several threads.
@@ -208,7 +208,7 @@ class StripeSums:
         checked = _response(response, f"{self.side} response {number}", shape, self.centre)
         return self._fit_checked(checked, np.asarray(response), light)
 
-    def _pair_light(self, response: FloatArray, light: FloatArray) -> PairSeen:
+    def _pair_light(self, response: FloatArray, light: FloatArray) -> PairLight:
         across = self.side == "horizontal"
         vector = (light if across else light.T) @ (self.common / np.dot(self.common, self.common))
         # Both factors' means are zero where frames are centred; what centring takes off the other side, v does.
@@ -217,9 +217,9 @@ class StripeSums:
         rows, columns = (
             np.stack([both + difference, both - difference]) / 2 for both, difference in zip(*sums, strict=True)
         )
-        return PairSeen(vector, rows, columns)
+        return PairLight(vector, rows, columns)
 
-    def _fit_checked(self, response: FloatArray, given: FloatArray, light: FloatArray | None) -> Seen:
+    def _fit_checked(self, response: FloatArray, given: FloatArray, light: FloatArray | None) -> ResponseFit:
         """The same of a ``response`` that is checked and centred, and of it as it was ``given``."""
         across = self.side == "horizontal"
         vector = (response if across else response.T) @ (self.common / np.dot(self.common, self.common))
@@ -232,10 +232,10 @@ class StripeSums:
             misfit += sum_of_squares(np.subtract(block, explained, out=explained))
             energy += sum_of_squares(block)
         if light is None:
-            return Seen(vector, misfit, energy, flux=_flux(given))
-        return Seen(vector, misfit, energy, self._pair_light(given, light))
+            return ResponseFit(vector, misfit, energy, flux=_flux(given))
+        return ResponseFit(vector, misfit, energy, self._pair_light(given, light))
 
-    def put(self, seen: Seen) -> None:
+    def put(self, seen: ResponseFit) -> None:
         """Count in what was ``seen`` of the next response."""
         self.vectors[:, self.done] = seen.vector
         self.misfit += seen.misfit
@@ -554,7 +554,7 @@ def _response(response: npt.ArrayLike, name: str, shape: tuple[int, ...] | None,
     if not np.isfinite(values).all():
         bad = np.count_nonzero(~np.isfinite(values))
         raise MitsimError(f"{name} has {bad} values that are not finite; capture it again")
-    return centred(values) if centre else values
+    return centre_frame(values) if centre else values
 
 
 def _checked_signs(H: npt.ArrayLike, has_uniform: bool) -> FloatArray:

@@ -21,8 +21,8 @@ from mitsim.core.manifests import SIDES, CalibrationManifest, FactorNoise, read_
 from mitsim.core.runs import Capture
 from mitsim.devices.patterns import PatternFamily, parse_patterns
 from mitsim.reconstruct.estimate_factors import Estimate, squared_condition
-from mitsim.reconstruct.solver import centred_columns
-from mitsim.reconstruct.status import Status, Verdict
+from mitsim.reconstruct.solution import Status, Verdict
+from mitsim.reconstruct.solver import centre_columns
 
 if TYPE_CHECKING:
     from scipy.sparse.linalg import LinearOperator
@@ -95,7 +95,7 @@ class Factors:
         """Both factors as the solver takes them: without their columns' means where frames are centred."""
         if not self.manifest.centre:
             return self.left, self.right
-        return centred_columns(self.left), centred_columns(self.right)
+        return centre_columns(self.left), centre_columns(self.right)
 
     @property
     def ok(self) -> bool:

@@ -15,9 +15,9 @@ from scipy.ndimage import uniform_filter
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.manifests import RunManifest
 from mitsim.core.runs import Measurement
+from mitsim.reconstruct.factorisation import group_pixels
 from mitsim.reconstruct.faults import Fault, FrameFault, frame_list
 from mitsim.reconstruct.noise import FrameNoise
-from mitsim.reconstruct.sides import group_pixels
 from mitsim.reconstruct.solver import Prepared
 
 Pattern = tuple[int, int]

@@ -28,16 +28,16 @@ from mitsim.core.arrays import FloatArray, SeparableTerm
 from mitsim.core.runs import Measurement
 from mitsim.reconstruct.causes import Cause, Evidence, Reading, Signatures, likely_cause
 from mitsim.reconstruct.defects import Defects, defects_of
-from mitsim.reconstruct.detail import Model
 from mitsim.reconstruct.estimate_factors import decibels
+from mitsim.reconstruct.factorisation import Side
 from mitsim.reconstruct.faults import FrameFault
 from mitsim.reconstruct.frame_check import FrameCheck
 from mitsim.reconstruct.leave_one_out import FrameSums
 from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.readings import Readings, multiple
-from mitsim.reconstruct.sides import Side
+from mitsim.reconstruct.solution import Status, Verdict
 from mitsim.reconstruct.solver import Prepared
-from mitsim.reconstruct.status import Status, Verdict
+from mitsim.reconstruct.subpixel import Model
 
 UNEXPLAINED = 3.5e-3
 """Part of the measurements, rms, that a fitting scene may leave unexplained: prints leave up to 6e-4 (the shipped ones)
@@ -122,7 +122,7 @@ class Misfit:
         defects = f"; {self.defects}" if self.defects else ""
         detail = f" beside {self.detail:.1e} of print finer than a scene pixel" if self.detail else ""
         return (
-            f"misfit: chi-square {shown(self.chi_square)} a datum{noise}, "
+            f"misfit: chi-square {chi_square_text(self.chi_square)} a datum{noise}, "
             f"{self.unexplained:.1e} unexplained{detail}{cause}{defects}"
         )
 
@@ -163,7 +163,7 @@ class Misfit:
             more = f"; and {len(self.faults) - _SHOWN} more" if len(self.faults) > _SHOWN else ""
             named = "; ".join(map(str, self.faults[:_SHOWN]))
             return self._flag(status, f"Faulty frames: {named}{more}", Cause.FRAMES)
-        times = f", {shown(self.chi_square)} times what its noise makes" if self.stated else ""
+        times = f", {chi_square_text(self.chi_square)} times what its noise makes" if self.stated else ""
         predicted = ""
         if self.predicted:
             predicted = f"; its calibration foretells up to {self.predicted:.1%} ({decibels(self.predicted):.1f} dB)"
@@ -180,7 +180,7 @@ class Misfit:
         return replace(status, verdict=Verdict.MISFIT, sentence=sentence, remedy=remedy)
 
 
-def shown(chi_square: float) -> str:
+def chi_square_text(chi_square: float) -> str:
     """A ``chi_square`` as people read it: fitting images differ in the third decimal, others by orders of magnitude."""
     return f"{chi_square:.3f}" if chi_square < 10 else f"{chi_square:.3g}"
 

@@ -20,7 +20,6 @@ from mitsim.reconstruct.cost import BYTES_A_NUMBER, keeps_frames, predict_cost, 
 from mitsim.reconstruct.defects import Defects, LeftOut
 from mitsim.reconstruct.depth import Depth, best_depth
 from mitsim.reconstruct.depth_map import DepthMap, depth_map
-from mitsim.reconstruct.detail import Model, print_energy
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.faults import FrameFault
 from mitsim.reconstruct.focus import move_factors
@@ -30,9 +29,10 @@ from mitsim.reconstruct.misfit import Lack, Misfit, faulty_frames, find_misfit
 from mitsim.reconstruct.noise import FrameNoise, factor_energy
 from mitsim.reconstruct.request import TIKHONOV, ImageRequest
 from mitsim.reconstruct.result import Reconstruction
+from mitsim.reconstruct.solution import Solution, Verdict
 from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.reconstruct.solvers import SOLVERS, SeparableSolver
-from mitsim.reconstruct.status import Solution, Verdict
+from mitsim.reconstruct.subpixel import Model, print_energy
 from mitsim.reconstruct.uncertainty import Propagation, Uncertainty, uncertainty
 
 _LAMBDA_BESIDE = 1e-3

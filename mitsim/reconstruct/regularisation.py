@@ -25,7 +25,7 @@ from scipy.optimize import minimize_scalar
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.sides import Side
+from mitsim.reconstruct.factorisation import Side
 
 RISK_POWER = 0.5
 """Errors are weighted by sigma to this power: 0 is the image's error, 2 that of predicted frames; chosen in

@@ -20,7 +20,7 @@ from mitsim.reconstruct.depth import Depth
 from mitsim.reconstruct.depth_map import DepthMap
 from mitsim.reconstruct.misfit import Misfit
 from mitsim.reconstruct.request import IMAGE_FILE
-from mitsim.reconstruct.status import Status
+from mitsim.reconstruct.solution import Status
 from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Uncertainty
 
 UNCERTAINTY_FILE, DEPTH_FILE = "uncertainty.exr", "depth.exr"
@@ -65,7 +65,7 @@ class Reconstruction:
         seconds by stage and memory, before it was begun; None where nobody could tell.
     objective, relative_gap
         of ``tv``: what was minimised, and how far above its minimum it may be at most, relative
-        (:class:`mitsim.reconstruct.status.Solution`); None for other methods.
+        (:class:`mitsim.reconstruct.solution.Solution`); None for other methods.
     """
 
     image: FloatArray

@@ -24,7 +24,7 @@ from mitsim.reconstruct.session_side import MOST_FAULTS, SideCheck
 
 
 @dataclass
-class Checked:
+class CheckedSession:
     """Sums of a session as they can be believed.
 
     Attributes
@@ -84,7 +84,7 @@ class Checked:
 
 
 @dataclass(frozen=True)
-class Circumstances:
+class SessionConditions:
     """How a session was taken.
 
     Attributes
@@ -116,8 +116,8 @@ class Circumstances:
 
 
 def check_session(
-    sums: tuple[StripeSums, StripeSums], signs: FloatArray, taken: Circumstances, uniform_given: bool = False
-) -> Checked:
+    sums: tuple[StripeSums, StripeSums], signs: FloatArray, taken: SessionConditions, uniform_given: bool = False
+) -> CheckedSession:
     """What of a session can be believed.
 
     Parameters
@@ -142,7 +142,7 @@ def check_session(
     if all(own.pairs is not None for own in sums):
         pairs = Pairs(work, taken.order, taken.clipped, taken.step, taken.wrong)
         if taken.saturated and pairs.many:
-            return Checked(sums)
+            return CheckedSession(sums)
         lamp = pairs.check(not taken.unsteady)
         pairs.repair(lamp)
     else:
@@ -150,7 +150,7 @@ def check_session(
             own.leave_out_known(taken.wrong)
     at_first = [fault for own in work for fault in own.faults if fault.index == 0]
     if at_first and not uniform_given:
-        return Checked(sums, at_first)
+        return CheckedSession(sums, at_first)
     if not taken.unsteady and all(own.enough and not own.pairs for own in work):
         lamp = lamp_of_frames(work, taken.order, taken.step)
     for own in work:
@@ -169,7 +169,7 @@ def check_session(
             f"stripes {first.index}: {first.detail}; too many to leave out: check the order of the frames, and take "
             "the session again"
         )
-    return Checked(
+    return CheckedSession(
         (work[0].result(), work[1].result()),
         faults,
         lamp,

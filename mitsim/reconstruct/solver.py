@@ -8,7 +8,7 @@ factors prepared once and the frames added one by one:
 >>> frames.add(Y, i, j)                           # for each pattern P_L[:, i] P_R[:, j]^T
 >>> solution = prepared.solve(frames, "auto")
 
-With B_L = U_L S_L V_L^T (see :mod:`mitsim.reconstruct.sides`) and W = sum_ij U_Li^T Y_ij U_Rj the
+With B_L = U_L S_L V_L^T (see :mod:`mitsim.reconstruct.factorisation`) and W = sum_ij U_Li^T Y_ij U_Rj the
 solution is X = V_L [(s_L s_R^T o W) / (s_L^2 s_R^2^T + lambda)] V_R^T. Its rounding error is about eps /
 sqrt(lambda_rel), with lambda_rel = lambda / (max s_L^2 max s_R^2); with the paper's Q = sum (Phi_L^T Y
 Phi_R) o P in place of W it is eps / lambda_rel (docs/decisions/0001-projected-accumulation.md).
@@ -42,8 +42,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.reconstruct.regularisation import DiagonalProblem, Halves, automatic_lambda
-from mitsim.reconstruct.sides import (
+from mitsim.reconstruct.factorisation import (
     Method,
     Side,
     Slab,
@@ -54,7 +53,8 @@ from mitsim.reconstruct.sides import (
     factorise,
     group_pixels,
 )
-from mitsim.reconstruct.status import Solution, Status, Verdict
+from mitsim.reconstruct.regularisation import DiagonalProblem, Halves, automatic_lambda
+from mitsim.reconstruct.solution import Solution, Status, Verdict
 
 ROUNDING_LIMIT = 0.01
 """Rounding above this part of the image flags a solution: two digits are the least that anyone can see or use."""
@@ -112,7 +112,7 @@ class Prepared:
 
     def as_solved(self, frame: FloatArray) -> FloatArray:
         """A ``frame`` (m, m') as the solver takes it: centred where the model is."""
-        return centred(frame) if self.centre else frame
+        return centre_frame(frame) if self.centre else frame
 
     def slabs(self, pattern: tuple[int, int]) -> tuple[Slab, Slab]:
         """What the row and the column of a ``pattern`` contribute."""
@@ -347,9 +347,9 @@ def prepare(
 
 def _centre_factor(factor: FloatArray) -> FloatArray:
     """The factor without the means of its columns; a column of equal numbers leaves exact zeros, not rounding."""
-    centred = centred_columns(factor)
+    centre_frame = centre_columns(factor)
     dust = len(factor) * np.finfo(np.float64).eps * np.abs(factor).max(axis=0)
-    return np.where(np.abs(centred).max(axis=0) > dust, centred, 0.0)
+    return np.where(np.abs(centre_frame).max(axis=0) > dust, centre_frame, 0.0)
 
 
 def _matrix(name: str, array: npt.ArrayLike) -> FloatArray:
@@ -436,7 +436,7 @@ class Accumulator:
         self._check_index(row, column)
         values = self._check_frame(frame, row, column)
         if self._centre:
-            values = centred(values)
+            values = centre_frame(values)
         flat = values.ravel()
         energy = float(np.dot(flat, flat))
         if not 1 / _LARGEST_SUM**2 <= energy <= _LARGEST_SUM**2 and (energy or values.any()):
@@ -469,7 +469,7 @@ class Accumulator:
         return values.astype(np.float64, copy=False)
 
 
-def projected(left: Side, right: Side, frames: FloatArray) -> FloatArray:
+def project_frames(left: Side, right: Side, frames: FloatArray) -> FloatArray:
     """:attr:`Accumulator.sum` of all frames at once, without the halves, the energy and the checks: half the time.
 
     Parameters
@@ -488,14 +488,14 @@ def projected(left: Side, right: Side, frames: FloatArray) -> FloatArray:
     return total
 
 
-def centred_columns(matrix: FloatArray) -> FloatArray:
+def centre_columns(matrix: FloatArray) -> FloatArray:
     """C ``matrix``: the mean of each column taken out."""
     return np.asarray(matrix - matrix.mean(axis=0, keepdims=True))
 
 
-def centred(frame: FloatArray) -> FloatArray:
+def centre_frame(frame: FloatArray) -> FloatArray:
     """C Y C of a ``frame`` Y, C = I - 1 1^T / m: row and column means out, as FlatCam's constant term demands."""
-    return centred_columns(frame - frame.mean(axis=1, keepdims=True))
+    return centre_columns(frame - frame.mean(axis=1, keepdims=True))
 
 
 def _out_of_range(name: str, values: FloatArray) -> str:

@@ -1,6 +1,6 @@
 """Ways from frames to an image, by name: each prepares a camera and its patterns once, and solves any number of scenes.
 
-A further one is a class with ``init`` and ``compute`` (:class:`mitsim.reconstruct.status.Solver`); one of separable
+A further one is a class with ``init`` and ``compute`` (:class:`mitsim.reconstruct.solution.Solver`); one of separable
 cameras that an image may be asked by has a line in :data:`SOLVERS`, and its name in
 :data:`mitsim.reconstruct.request.METHODS`, which is read before numpy is imported.
 """
@@ -17,8 +17,8 @@ from mitsim.devices.patterns import PatternFamily
 from mitsim.reconstruct.convolution import ConvolutionalCamera, solve_iteratively
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.request import MARKOV, TIKHONOV, TV
+from mitsim.reconstruct.solution import Solution, Solver
 from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
-from mitsim.reconstruct.status import Solution, Solver
 from mitsim.reconstruct.tv import solve_tv
 
 Patterns = tuple[FloatArray, FloatArray]

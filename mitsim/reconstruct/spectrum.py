@@ -24,8 +24,8 @@ import numpy.typing as npt
 from scipy.fft import dct
 
 from mitsim.core.arrays import FloatArray
+from mitsim.reconstruct.factorisation import Side
 from mitsim.reconstruct.regularisation import DiagonalProblem
-from mitsim.reconstruct.sides import Side
 
 _FALL = -2.0
 """Power of frequency that spectra of scenes fall with (Field 1987)."""

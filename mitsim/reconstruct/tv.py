@@ -24,8 +24,8 @@ from scipy.fft import dctn, idctn
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.regularisation import DiagonalProblem, automatic_lambda, noise_variance
+from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solver import Accumulator, Prepared
-from mitsim.reconstruct.status import Solution, Status, Verdict
 
 _BALANCE, _STEP = 3.0, 2.0
 """Ratio of two residuals, or of two parts of the gap, beyond which a penalty changes, and by how much at most: they set

@@ -25,7 +25,7 @@ light; formulas are the same.
 
 Print that changes within a projector pixel casts another shadow than the board's. A ramp of slope g a pixel has its
 light g / 12 pixels off the centre; what that does to the image stands for print that may have hard edges or none, which
-is the least. Finer print is told by what halves of the sensor disagree on (:mod:`mitsim.reconstruct.detail`).
+is the least. Finer print is told by what halves of the sensor disagree on (:mod:`mitsim.reconstruct.subpixel`).
 
 Simulated light is off by its sampling, projector pixel by projector pixel: an error of the image that is kept as the
 image is. What lambda takes away, lambda x / (sigma^2 + lambda) of each coefficient x, is no noise, but as large as the
@@ -44,12 +44,12 @@ from scipy.ndimage import gaussian_filter
 from mitsim.core.arrays import FloatArray
 from mitsim.core.exr import Channel
 from mitsim.core.manifests import FactorNoise
-from mitsim.reconstruct.detail import PRINT, Model, disagreement
+from mitsim.reconstruct.factorisation import Side
 from mitsim.reconstruct.misfit import Lack
 from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.regularisation import DiagonalProblem, coefficient_noise
-from mitsim.reconstruct.sides import Side
 from mitsim.reconstruct.spectrum import scene_spectrum
+from mitsim.reconstruct.subpixel import PRINT, Model, disagreement
 
 _LOST = 1e-5
 """Part of the energy of G that its few products may leave out: 0.3 % of its norm, less than 1 % of a variance."""

@@ -22,7 +22,7 @@ from mitsim.core.display import data_uri, grey_png, lightness
 from mitsim.core.errors import MitsimError
 from mitsim.light.plan import PlanRow
 from mitsim.metrics import Quality
-from mitsim.reconstruct.misfit import shown
+from mitsim.reconstruct.misfit import chi_square_text
 from mitsim.reconstruct.result import Reconstruction
 from mitsim.report import plots
 from mitsim.report.html import DASH, figure_uri, reflectance, render_page, sentence, write_html
@@ -154,7 +154,7 @@ def build_report(report: ReportData, path: Path) -> Path:
 def render_html(report: ReportData) -> str:
     """The page of a ``report`` as text; `build_report` writes it."""
     filters: dict[str, Callable[..., str]] = {
-        "chi": lambda value: DASH if value is None else shown(value),
+        "chi": lambda value: DASH if value is None else chi_square_text(value),
         "db": _decibel,
         "rms": reflectance,
         "seconds": _seconds,

@@ -43,8 +43,8 @@ from mitsim.optics.separable import best_term, centred, relative_difference
 from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import shadow_terms
 from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
-from mitsim.reconstruct.status import Solution
 from mitsim.report import EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, RENDERED
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.sensor.specimen import response_variance

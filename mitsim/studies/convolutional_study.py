@@ -33,8 +33,8 @@ from mitsim.devices.patterns import PatternFamily, parse_patterns
 from mitsim.devices.sensor import SensorModel
 from mitsim.metrics import psnr, relative_error
 from mitsim.reconstruct.convolution import Classes, ConvolutionalCamera, FactorisedClasses, solve_iteratively
+from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import prepare
-from mitsim.reconstruct.status import Solution
 from mitsim.report import CONVENTIONS, EQUAL_FRAME, EQUAL_PEAK
 from mitsim.report.lit_scene import IdealCamera
 from mitsim.report.plots import curves, image_grid

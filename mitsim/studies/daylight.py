@@ -34,8 +34,8 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.chart import ChartPlace
 from mitsim.devices.patterns import PatternFamily
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e
+from mitsim.reconstruct.factorisation import Side
 from mitsim.reconstruct.request import MARKOV, TIKHONOV
-from mitsim.reconstruct.sides import Side
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.report import RENDERED, label
 from mitsim.report.plots import curves

@@ -41,8 +41,8 @@ from mitsim.devices.patterns import PatternFamily
 from mitsim.devices.session import load_recipe
 from mitsim.light.light import SampledLight
 from mitsim.optics.frames import ExpectedFrames, Frame
-from mitsim.reconstruct.solver import centred, centred_columns, prepare
-from mitsim.reconstruct.status import Solution
+from mitsim.reconstruct.solution import Solution
+from mitsim.reconstruct.solver import centre_columns, centre_frame, prepare
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODELS, RENDERED
 from mitsim.report.lit_scene import IdealCamera, LitScene, Pair, Unexposed
 from mitsim.report.table import Table
@@ -269,7 +269,7 @@ def _consistent(factors: Places, bench: Apparatus, white: Callable[[float, float
         modelled = np.outer(left.sum(axis=1), factors[first][1].sum(axis=1))
         measured = Exposer(bench.rig, 1.0, 0).electrons(white(place, first))
         if bench.geometry.centred:
-            modelled, measured = centred(modelled), centred(measured)
+            modelled, measured = centre_frame(modelled), centre_frame(measured)
         share = float(np.vdot(modelled, measured) / np.vdot(measured, measured))
         found[place] = left / share, right * share
     return found
@@ -366,7 +366,7 @@ class MovedMask:
 
     def _side(self, axis: int, place: float) -> FloatArray:
         factor = self.factors[place][axis]
-        return centred_columns(factor) if self._centre else factor
+        return centre_columns(factor) if self._centre else factor
 
     def _measured(self, row_mm: float, column_mm: float, seconds: float) -> FloatArray:
         """Noisy electrons a second at one place, of ambient light what a user takes off."""
@@ -376,4 +376,4 @@ class MovedMask:
         family = bench.family("uniform")
         ((frame, _, _),) = exposer.measurements(family, expected)
         frame = frame - taken_off(exposer, family, expected)
-        return centred(frame) if self._centre else frame
+        return centre_frame(frame) if self._centre else frame

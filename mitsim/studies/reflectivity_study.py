@@ -33,8 +33,8 @@ from mitsim.light.light import SampledLight
 from mitsim.metrics import psnr
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import Prepared
-from mitsim.reconstruct.status import Solution
 from mitsim.report import EQUAL_PEAK, RENDERED, label
 from mitsim.report.lit_scene import LitScene, Unexposed, peak_time
 from mitsim.report.plots import curves, image_grid

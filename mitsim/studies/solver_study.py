@@ -42,7 +42,7 @@ from mitsim.core.seeds import stream
 from mitsim.devices.camera import CameraGeometry, centred_edges
 from mitsim.metrics import relative_error
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.sides import Method, Structure
+from mitsim.reconstruct.factorisation import Method, Structure
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.report import plots
 from mitsim.report.html import typeset

@@ -45,7 +45,7 @@ from mitsim.metrics import psnr
 from mitsim.reconstruct.estimate_factors import Estimate, factors_of_sums, stripe_sums
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.reconstruct.status import Status, Verdict
+from mitsim.reconstruct.solution import Status, Verdict
 from mitsim.report.lit_scene import IdealCamera, LitScene
 from mitsim.report.plots import BLUE, FONT, GREEN, GREY, PALE, ROW, VERMILION, beside, image_grid, label_axes, panels_of
 from mitsim.report.table import Mean, Table

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mitsim.optics.separable import centred as centred_terms
-from mitsim.reconstruct.solver import centred, prepare
+from mitsim.optics.separable import centre_frame as centred_terms
+from mitsim.reconstruct.solver import centre_frame, prepare
 from mitsim.reconstruct.tv import solve_tv
 from tests.hard.hard_models import EPS, frames_of, shadow, summed
 
@@ -41,9 +41,9 @@ def test_adjoints(data) -> None:
     sums = summed(prepared, data_frames)
     modelled = frames_of(left, right, P_L, P_R, image)
     if centre:
-        modelled = {key: centred(frame) for key, frame in modelled.items()}
+        modelled = {key: centre_frame(frame) for key, frame in modelled.items()}
     forward = sum(float(np.vdot(modelled[key], data_frames[key])) for key in modelled)
-    taken = [centred(frame) if centre else frame for frame in data_frames.values()]
+    taken = [centre_frame(frame) if centre else frame for frame in data_frames.values()]
     assert sums.energy == pytest.approx(sum(np.square(frame).sum() for frame in taken), rel=1e-12)
     found = prepared.problem(sums)
     gradient = prepared.image(found.sigma * found.projected)
@@ -70,12 +70,12 @@ def test_centring_is_its_own_adjoint() -> None:
     """Of frames and of separable operators: <C Y C, Z> = <Y, C Z C>, C Y C twice is once, <A_c X, Y> = <A X, C Y C>."""
     rng = np.random.default_rng(0)
     one, other = rng.normal(size=(9, 7)), rng.normal(size=(9, 7))
-    assert np.vdot(centred(one), other) == pytest.approx(np.vdot(one, centred(other)), abs=1e-13)
-    np.testing.assert_allclose(centred(centred(one)), centred(one), atol=1e-15)
+    assert np.vdot(centre_frame(one), other) == pytest.approx(np.vdot(one, centre_frame(other)), abs=1e-13)
+    np.testing.assert_allclose(centre_frame(centre_frame(one)), centre_frame(one), atol=1e-15)
     terms = [(rng.normal(size=(9, 4)), rng.normal(size=(7, 5))) for _ in range(3)]
     image = rng.normal(size=(4, 5))
     whole, taken = (sum(left @ image @ right.T for left, right in found) for found in (terms, centred_terms(terms)))
-    assert np.vdot(taken, one) == pytest.approx(np.vdot(whole, centred(one)), rel=1e-12)
+    assert np.vdot(taken, one) == pytest.approx(np.vdot(whole, centre_frame(one)), rel=1e-12)
 
 
 def test_total_variation_is_at_its_minimum() -> None:

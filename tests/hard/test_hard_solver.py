@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.sides import pattern_blocks
+from mitsim.reconstruct.factorisation import pattern_blocks
 from mitsim.reconstruct.solver import ROUNDING_LIMIT, prepare
 from mitsim.reconstruct.tv import solve_tv
 from mitsim.studies.solver_study import dots

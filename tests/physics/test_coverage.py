@@ -7,7 +7,7 @@ over prints. So there are PRINTS prints of SESSIONS sessions each, 200 in all. T
 well.
 
 Expectation: print within a pixel is stated as that of prints that may have hard edges or none, `detail.PRINT` = 1.95
-times the energy of the ramps that these smooth prints are made of (`mitsim.reconstruct.detail`). With v^2 = u^2 - (1 -
+times the energy of the ramps that these smooth prints are made of (`mitsim.reconstruct.subpixel`). With v^2 = u^2 - (1 -
 1 / PRINT) print^2, normal errors lie within 1.96 u in erf(1.96 u / v / sqrt 2) of the pixels: 95.2 to 97.6 % by print
 and patterns, and 95 % where nothing is print. (Held against 93 to 97 %, one print of `dots:2` had 97.004 %: 96.8 were
 to be expected.)
@@ -39,9 +39,9 @@ from mitsim.calibrate.lit_session import LitSession
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.devices.session import load_recipe
-from mitsim.reconstruct.detail import PRINT
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
+from mitsim.reconstruct.subpixel import PRINT
 from mitsim.reconstruct.uncertainty import Uncertainty
 
 pytestmark = pytest.mark.slow

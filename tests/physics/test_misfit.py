@@ -17,7 +17,7 @@ from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import UNEXPLAINED, UNEXPLAINED_TILE
 from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.reconstruct.status import Verdict
+from mitsim.reconstruct.solution import Verdict
 
 pytestmark = pytest.mark.slow
 SEEDS = {"uniform": 4, "dots:4": 4, "dots:7": 4, "hadamard:8": 2}

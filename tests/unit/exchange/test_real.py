@@ -25,7 +25,7 @@ from mitsim.exchange.formats import export_run
 from mitsim.exchange.real import LEFT_OUT, import_frames
 from mitsim.exchange.real_capture import RealCapture
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.status import Status, Verdict
+from mitsim.reconstruct.solution import Status, Verdict
 from tests.exchanged import COLUMNS, DIGITAL, ROWS, SCENE, Made, made
 
 ELECTRONICS = f"""

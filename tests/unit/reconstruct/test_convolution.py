@@ -18,7 +18,7 @@ from mitsim.reconstruct.convolution import (
     conjugate_gradients,
     solve_iteratively,
 )
-from mitsim.reconstruct.status import Verdict
+from mitsim.reconstruct.solution import Verdict
 
 SENSORS = [None, (15, 12), (8, 15)]
 """All light; cropped on all sides, unevenly; higher than wide, narrower than all light."""

@@ -16,7 +16,7 @@ from mitsim.core.runs import Capture
 from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.result import Reconstruction
-from mitsim.reconstruct.status import Verdict
+from mitsim.reconstruct.solution import Verdict
 from tests.ideal_sessions import BLACK, DARK, GAIN, PIXELS, READ, Bench, bench, picture, shadow
 
 FAMILIES = "dots:4", "hadamard:4", "random:4", "dots:1x8"

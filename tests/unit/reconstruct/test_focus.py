@@ -22,12 +22,12 @@ from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.depth import CommonBasis, Depth, best_depth
+from mitsim.reconstruct.factorisation import group_pixels
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import FactorOfDepths, move_factors
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.result import Reconstruction
-from mitsim.reconstruct.sides import group_pixels
-from mitsim.reconstruct.solver import prepare, projected
+from mitsim.reconstruct.solver import prepare, project_frames
 from tests.ideal_sessions import PEAK, PITCH, PIXELS, Bench, picture
 from tests.unit.reconstruct.test_faults import dark, with_frames
 
@@ -410,5 +410,5 @@ def test_dots_own_basis_leaves_as_much_as_the_common_one(patterns: str, own: boo
         left = []
         for depths in (one, each):
             sides = prepare(depths.side(0, shift), depths.side(1, shift), *run.patterns)
-            left.append(depths.energy - float(np.square(projected(sides.left, sides.right, depths.stack)).sum()))
+            left.append(depths.energy - float(np.square(project_frames(sides.left, sides.right, depths.stack)).sum()))
         assert left[1] == pytest.approx(left[0], abs=1e-7 * one.energy)

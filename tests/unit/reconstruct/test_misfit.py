@@ -13,11 +13,11 @@ import pytest
 from mitsim.core.manifests import Digital
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.causes import Cause
-from mitsim.reconstruct.misfit import CHANCE, UNEXPLAINED, Misfit, shown
+from mitsim.reconstruct.misfit import CHANCE, UNEXPLAINED, Misfit, chi_square_text
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.result import Reconstruction
+from mitsim.reconstruct.solution import Status, Verdict
 from mitsim.reconstruct.solver import Prepared
-from mitsim.reconstruct.status import Status, Verdict
 from tests.ideal_sessions import PIXELS, Bench, N, bench, picture, shadow
 
 DATA = PIXELS**2
@@ -239,4 +239,4 @@ def test_both_halves_of_a_pair_count_alike() -> None:
 )
 def test_chi_square_as_people_read_it(chi_square: float, text: str) -> None:
     """The third decimal where fitting images differ, three digits beyond. (Planted: 10 with three decimals.)"""
-    assert shown(chi_square) == text
+    assert chi_square_text(chi_square) == text

@@ -23,9 +23,9 @@ from mitsim.reconstruct.cost import ImageCost, predict_cost
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import accumulate, reconstruct
 from mitsim.reconstruct.result import may_replace
+from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.reconstruct.solvers import SOLVERS, Convolutional, Tikhonov
-from mitsim.reconstruct.status import Solution, Status, Verdict
 from mitsim.report.quality import reconstruct as reconstruct_folders
 from tests import ideal_sessions
 from tests.ideal_sessions import picture

@@ -9,10 +9,10 @@ from mitsim.core.manifests import Digital, FactorNoise, Patterns
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct import misfit
 from mitsim.reconstruct.causes import Evidence
-from mitsim.reconstruct.detail import LitFrame, Model, orthonormal
 from mitsim.reconstruct.misfit import Residuals
 from mitsim.reconstruct.noise import FrameNoise, factor_energy
 from mitsim.reconstruct.solver import prepare
+from mitsim.reconstruct.subpixel import LitFrame, Model, orthonormal
 from mitsim.reconstruct.uncertainty import Propagation
 from tests.ideal_sessions import bench
 from tests.unit.reconstruct.test_factors import N, factors

@@ -14,7 +14,7 @@ from mitsim.devices.patterns import stripe_signs
 from mitsim.devices.session import SIDES, Half, taken
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.estimate_factors import StripeSums, stripe_sums
-from mitsim.reconstruct.session_faults import Checked, Circumstances, check_session
+from mitsim.reconstruct.session_faults import CheckedSession, SessionConditions, check_session
 
 N, PIXELS = 32, (90, 100)
 SIGNS = stripe_signs(N).astype(float)
@@ -46,7 +46,7 @@ def frames(
     return found
 
 
-def judged(shown: Frames, pairs: bool = True) -> Checked:
+def judged(shown: Frames, pairs: bool = True) -> CheckedSession:
     """What is said of frames; not ``pairs``: each response is of its +1 frame and that of all light."""
 
     def pair(side: str, index: int) -> tuple[np.ndarray, np.ndarray | None]:
@@ -59,10 +59,10 @@ def judged(shown: Frames, pairs: bool = True) -> Checked:
         for index in range(1, N):
             response, light = pair(own.side, index)
             own.put(own.seen(response, index, light))
-    return check_session(sums, SIGNS, Circumstances(ORDER))
+    return check_session(sums, SIGNS, SessionConditions(ORDER))
 
 
-def error(found: Checked) -> tuple[float, float]:
+def error(found: CheckedSession) -> tuple[float, float]:
     """Actual and stated relative error of both factors."""
     estimate = found.estimate(SIGNS, None)
     whole = [factor.sum(axis=1) for factor in EXACT]

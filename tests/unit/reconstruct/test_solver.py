@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy.linalg import hadamard
 
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.sides import pattern_blocks
-from mitsim.reconstruct.solver import prepare, projected
+from mitsim.reconstruct.factorisation import pattern_blocks
+from mitsim.reconstruct.solver import prepare, project_frames
 
 
 def dots(n, k):
@@ -245,4 +245,4 @@ def test_all_frames_at_once_are_the_sum_of_each(rows, columns):
     sums = prepared.accumulator()
     for i, j in np.ndindex(left.shape[1], right.shape[1]):
         sums.add(frames[i, :, j], i, j)
-    np.testing.assert_allclose(projected(prepared.left, prepared.right, frames), sums.sum, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(project_frames(prepared.left, prepared.right, frames), sums.sum, rtol=1e-12, atol=1e-12)

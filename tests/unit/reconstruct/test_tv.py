@@ -5,8 +5,8 @@ import pytest
 from skimage.restoration import denoise_tv_chambolle
 
 from mitsim.reconstruct.regularisation import DiagonalProblem
+from mitsim.reconstruct.solution import Verdict
 from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
-from mitsim.reconstruct.status import Verdict
 from mitsim.reconstruct.tv import AUTO_WEIGHT, automatic_weight, solve_tv
 
 SIZE = 12

@@ -21,8 +21,8 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter
 
 from mitsim.core.arrays import FloatArray
+from mitsim.reconstruct.factorisation import IndexArray, Side
 from mitsim.reconstruct.regularisation import Halves, half_spread
-from mitsim.reconstruct.sides import IndexArray, Side
 from mitsim.reconstruct.solver import Prepared
 
 EDGES = 2.9
