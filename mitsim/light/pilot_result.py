@@ -22,7 +22,8 @@ _FEWEST_SAMPLES = 1e-3
 REPLICATES = 4
 """Independent replicates of the pilot, the fewest whose spread tells a standard error worth its name."""
 SURE = 2.35
-"""Standard errors from an estimate to its 95 % bound: Student's distribution with ``REPLICATES`` - 1 degrees of freedom."""
+"""Standard errors from an estimate to its 95 % bound: Student's distribution with ``REPLICATES`` - 1 degrees of
+freedom."""
 RASTER_RATE = 1.5
 """Power of a raster's cells along a pixel that its error falls with: from 6 to 12 cells, in frames of dots, 1.4 (a
 picture of light) to 2.9 (a mask turned by 0.3 degrees)."""

@@ -336,8 +336,8 @@ class CommonBasis:
         least and largest change of 1/z [1/mm]; ArgumentError where too little of the sensor knows all these depths.
     groups
         scene pixels along both axes that patterns light apart
-        (:func:`mitsim.reconstruct.factorisation.group_pixels`): where each pattern lights one group, its frames may be on a
-        basis of that alone, and so are the columns of :meth:`side`. None: all frames of an axis share one.
+        (:func:`mitsim.reconstruct.factorisation.group_pixels`): where each pattern lights one group, its frames may be
+        on a basis of that alone, and so are the columns of :meth:`side`. None: all frames of an axis share one.
 
     Attributes
     ----------

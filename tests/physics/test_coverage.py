@@ -7,8 +7,8 @@ over prints. So there are PRINTS prints of SESSIONS sessions each, 200 in all. T
 well.
 
 Expectation: print within a pixel is stated as that of prints that may have hard edges or none, `detail.PRINT` = 1.95
-times the energy of the ramps that these smooth prints are made of (`mitsim.reconstruct.subpixel`). With v^2 = u^2 - (1 -
-1 / PRINT) print^2, normal errors lie within 1.96 u in erf(1.96 u / v / sqrt 2) of the pixels: 95.2 to 97.6 % by print
+times the energy of the ramps that these smooth prints are made of (`mitsim.reconstruct.subpixel`). With v^2 = u^2 - (1
+- 1 / PRINT) print^2, normal errors lie within 1.96 u in erf(1.96 u / v / sqrt 2) of the pixels: 95.2 to 97.6 % by print
 and patterns, and 95 % where nothing is print. (Held against 93 to 97 %, one print of `dots:2` had 97.004 %: 96.8 were
 to be expected.)
 

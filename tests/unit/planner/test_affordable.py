@@ -1,4 +1,5 @@
-"""The finest accuracy that a time buys, of invented pilot result: more seconds never buy less, and what is bought fits."""
+"""The finest accuracy that a time buys, of invented pilot result: more seconds never buy less, and what is bought
+fits."""
 
 import math
 from itertools import pairwise
