@@ -479,7 +479,6 @@ ALIKE: set[str] = {"bench", "drift", "lamps", "plan", "projector", "request", "s
 """Names that files of several rooms have still: a change takes some away, and adds none."""
 WITHOUT_HEADINGS: set[str] = {
     "mitsim.api.bench",
-    "mitsim.core.manifests",
     "mitsim.exchange.png_files",
     "mitsim.reconstruct.captured_session",
     "mitsim.reconstruct.depth",

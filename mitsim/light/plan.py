@@ -12,7 +12,6 @@ from mitsim.core.arguments import checked
 from mitsim.core.display import table
 from mitsim.core.errors import MitsimError
 from mitsim.core.spectral_manifests import MONO
-from mitsim.light.passes import PASSES
 from mitsim.light.settings import Estimate, Settings
 
 if TYPE_CHECKING:
@@ -171,6 +170,8 @@ class Plan:
 
     def block(self) -> dict[str, Any]:
         """The plan as JSON holds it."""
+        from mitsim.light.passes import PASSES  # with what traces them: a plan that is read needs no renderer
+
         samples = {row.samples_key: row.predicted(self.settings) for row in PASSES.values()}
         settings = {**asdict(replace(self.settings, samples={})), "effects": sorted(self.settings.effects), **samples}
         del settings["samples"]
