@@ -1,4 +1,15 @@
-"""Which colours a scene calls for: a bench and a request in; mono, bands or lines of light, with its plan, out."""
+"""Which colours a scene calls for: a bench and a request in; mono, bands or lines of light, with its plan, out.
+
+A monochrome camera that sees all lines l of a projector at once makes, of their irradiances E_l, electrons in
+proportion to
+
+    sum_l q_l lambda_l E_l,
+
+q being its quantum efficiency. A band of lines is simulated as one line at their mean wavelength, *mono* all of them by
+one panchromatic reflectance behind the mean of their shadows. What either leaves is the relative rms difference of its
+frames from that sum over its lines. Both are formed of the same few rays a projector pixel, so that the difference
+holds no noise of the light's geometry, of direct light alone.
+"""
 
 from __future__ import annotations
 

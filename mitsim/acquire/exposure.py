@@ -166,6 +166,9 @@ def camera_warnings(sensor: SensorModel, shape: tuple[int, ...]) -> Iterator[str
 
 
 # -------- The ambient frame of a capture
+# It is taken with the projector off, not with a black pattern: it then holds what the lamps bring and nothing else,
+# and a run less its ambient frame has the expectation of the same run in a dark room. The light that black pixels
+# leak stays in the frames, as there.
 
 AmbientChoice = Literal["auto", "yes", "no"]
 _PART = 1 / 16

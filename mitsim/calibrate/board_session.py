@@ -240,6 +240,7 @@ def _lines(n: int) -> Lighting:
 
 
 # -------- What a calibration session takes
+# The reason of each figure is how :class:`mitsim.calibrate.session.LitSession` works.
 
 _PACES = replace(FIXED, product=1.1e-11)
 """A multiplication of products as large as those of stripes: half of what it takes in small ones (2048 pixels a side,
@@ -311,6 +312,9 @@ def session_cost(board: Apparatus, count: int, settings: Settings, seconds: floa
 
 
 # -------- Light by projector pixel and a side's stripes in
+# Where frames of single lines can be held, those of patterns are mixed from them: by :class:`ExpectedFrames` up to
+# 256 lines, and here beyond. Otherwise they are formed in lots: which pixels each of 512 patterns lights would be 2
+# GiB.
 
 _LINES_BYTES = 7 * 2**28
 """Frames of lines that are held at most, as of classes that are mixed."""

@@ -1,5 +1,12 @@
 """What a calibration session leaves on disk: finished parts in its CAL folder until the whole is, and its frames where
-a user wants them."""
+a user wants them.
+
+Only what a camera's user has: digital numbers, what each file shows, and how the camera is read. Expected light, exact
+factors, parallax, seeds and plan are left out.
+
+A part is a ``.npz`` file with a SHA-256 of the session's configuration and the file behind it: one that is damaged or
+of another session is computed again.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,14 @@
-"""Responses to striped light and a camera's model in; where its mask and projector are, with standard errors, out."""
+"""Responses to striped light and a camera's model in; where its mask and projector are, with standard errors, out.
+
+Model frames are sums of few products u v^T, so are their changes with every number that is fitted: a response is
+replaced by its coefficients in the few directions of sensor rows and columns that these span (which is all that the fit
+can use of it, and leaves white noise white), and the sum of squares over all coefficients is made least by
+:func:`scipy.optimize.least_squares`, with variables in units of a step each, and bounded, as these directions hold for
+small steps only. They are taken anew where the fit has ended, until it stays. The covariance of what is fitted is (J^T
+J)^-1 for data in units of their noise, times chi-square a datum where that is above 1.
+
+A mask that is off by more than half a feature looks like another one: the shift is first looked for over some features.
+"""
 
 from __future__ import annotations
 

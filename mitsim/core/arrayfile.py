@@ -2,6 +2,9 @@
 
 NumPy maps an NPY file into memory, where a file that is cut short meanwhile ends the process, and allocates what the
 header of one in an NPZ claims. Here what a header claims is held against the file first, and numbers are copied.
+
+HDF5's own writer cannot close a file on a disk that is full: it says so many times on stderr, and once more when the
+program ends, or ends it. Here it writes through Python, which keeps the error until the file is closed.
 """
 
 from __future__ import annotations

@@ -221,6 +221,9 @@ def _reinstall(package: str) -> str:
 
 
 # -------- The LLVM library Dr.Jit compiles with
+# Dr.Jit 1.5 refuses LLVM 14 and older with a message about a missing file, and LLVM 15 and 16 load and then end the
+# process (`Cannot select ... fminimum`, SIGABRT, no exception). So a library is taken only if its name says 17 or
+# newer and a child process has compiled with it.
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 """Environment variable by which Dr.Jit finds the library."""

@@ -446,6 +446,7 @@ class Measurement:
 
 
 # -------- A run behind colour filters, in memory or in its folder
+# The folder is a RUN folder of the frames, with colour.json, and ``638nm/truth.exr`` for each line.
 
 
 @dataclass(frozen=True, eq=False)
@@ -553,6 +554,7 @@ def _truth(path: Path) -> LineTruth:
 
 
 # -------- Shots of a run in, as they are exposed
+# Both recorders take the same calls; :class:`mitsim.core.runs.Capture` reads what they kept.
 
 TRUTH, AMBIENT = "truth.exr", "ambient.exr"
 

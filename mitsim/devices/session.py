@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 
 # -------- The white board of a calibration session
+# A board without these is flat, faces the camera on the aligned plane, and is larger than what the camera sees.
 
 _BEYOND = 1.1
 """Half side of a board without a size, as a part of what the sensor's edge sees; chosen: more than rounding."""

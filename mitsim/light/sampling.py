@@ -1,4 +1,8 @@
-"""Sampling: independent estimates of the light, traced pass by pass in rounds, and how many samples a round takes."""
+"""Sampling: independent estimates of the light, traced pass by pass in rounds, and how many samples a round takes.
+
+A further round buys what is missing where that takes least: light that brings much noise for its work grows, other
+light stays as it is. Work is that of paths at fixed paces: the same seed must mean the same samples.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""A bench under one choice of settings: its passes traced, their light accumulated, and frames of it formed."""
+"""A bench under one choice of settings: its passes traced, their light accumulated, and frames of it formed.
+
+An effect that is off takes its neutral value here and nowhere else: a pinhole for the lens, a thin mask, a geometric
+shadow. :mod:`mitsim.planner.pilot` switches effects on and off to see what they are worth; :mod:`mitsim.light.light`
+samples the choice that the plan made.
+"""
 
 from __future__ import annotations
 

@@ -268,6 +268,15 @@ def _blocks(values: npt.NDArray[np.floating], side: int) -> FloatArray:
 
 
 # -------- Frames behind a mask drawn on a raster
+# A sensor pixel is a whole number q of raster cells. With w the part of raster cell a that pixel and light cell weigh
+# (two boxes, one after the other), pixel i sees raster cell a from light cell c with w(a - q i, c): what holds for
+# one pixel holds for all. The light is spread over the raster by those weights, X = D_row T D_column^T, and the frame
+# is a correlation, worked out for each of the q x q phases of the raster::
+#
+#     frame[i, j] = sum_ab X[a, b] V[a + q i, b + q j]
+#
+# It is exact for the raster, to rounding, whatever the cells; the sum of separable terms gives the same
+# (tests/unit/optics/test_correlation.py), and takes a product for each of them.
 
 _WHOLE = 1e-6
 """Part of a raster cell by which a pixel may miss a whole number of them: rounding, of a frame 4096 pixels wide too."""
@@ -359,6 +368,10 @@ def _part(values: FloatArray, first: int, count: int) -> FloatArray:
 
 
 # -------- A mask as functions that can be asked for means
+# A term is ``(weight, row sampler, column sampler)``. A sampler takes arrays of centres s and widths w (mm, index
+# coordinates in the mask plane) and of tan-angles t, and gives the mean over each [s - w/2, s + w/2] of a mask
+# profile for light that comes under t. :func:`geometric_samplers` makes them for a thin mask's geometric shadow,
+# where t does not matter; profiles of thick masks and wave-optical ones fit as well.
 
 Sampler = Callable[[FloatArray, FloatArray], FloatArray]
 """From places s and widths [mm], which broadcast, to means of a profile over [s - width/2, s + width/2]."""

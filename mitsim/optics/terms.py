@@ -163,6 +163,22 @@ def _hats(shift: FloatArray, nodes: FloatArray) -> list[FloatArray]:
 
 
 # ---- A tilted mask ----
+# Where a mask's distance grows by alpha along its rows and by beta along its columns, a ray of slope t that would
+# cross the even plane at s crosses the mask at s + t (alpha s_row + beta s_col) / (1 - t . (alpha, beta)). Along the
+# rows::
+#
+#     s_row + t_row (alpha s_row + beta s_col) / (1 - alpha t_row)
+#
+# but for the other axis's part of the slope, beta t_col of the shift, 30 nm of 5 um at 40 mrad. The rows' own tilt
+# moves rows alone: the profile stays one. What the other axis adds is a profile that is moved by beta s_col t_row, as
+# much as the column says; between Chebyshev's nodes sigma_k of s_col it is interpolated by Lagrange's polynomials
+# l_k::
+#
+#     a(s_row + t_row beta s_col / ..) = sum_k l_k(s_col) a(s_row + t_row beta sigma_k / ..)
+#
+# so K nodes make K terms of each, and two tilts K L. Waves come from as far as the mask is where the ray crosses it:
+# rows are formed at d + beta sigma_k, and interpolated over alpha s_row between those of three distances
+# (:mod:`mitsim.optics.diffraction`), which keeps them one profile.
 
 
 def tilted_terms(

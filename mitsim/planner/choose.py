@@ -512,6 +512,7 @@ def _subsets(pilot_result: PilotResult, switches: Mapping[str, bool]) -> Iterato
 
 
 # -------- The finest accuracy that a time buys
+# Accuracies are tried on a grid, by bisection: more seconds never buy a coarser one.
 
 FIRST_ACCURACY = 1e-3
 """Accuracy of the look that tells what accuracies cost: a looser one takes as long."""

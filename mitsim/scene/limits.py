@@ -139,6 +139,8 @@ def check_transform(tag: Tag, name: str, matrix: npt.NDArray[np.float64], rigid:
 
 
 # -------- Which plugins a scene may have
+# Those that are left out run or read what cannot be checked beforehand (binary grids, tables and caches), or give
+# something else than light on a sensor.
 
 _TEXTURES = "bitmap blackbody checkerboard d65 irregular mesh_attribute rawconstant regular srgb uniform"
 PLUGINS = {

@@ -149,6 +149,8 @@ def _mirrors_and_gloss(scene: mi.Scene, unfit: Unfit) -> tuple[bool, bool]:
 
 
 # -------- Values of a loaded scene's bitmaps and meshes
+# OpenEXR holds NaN, infinity, negative numbers and reflectances above 1, and Mitsuba takes them without a word; so do
+# meshes, whose vertices have colours too. The renderer would spread one such texel over every frame.
 
 _ANY = Range(-np.inf, np.inf)
 _ROUNDING = 1e-5
