@@ -468,18 +468,19 @@ def test_lanes_are_not_added_up_in_32_bits() -> None:
 
 # ---- sizes and names -------------------------------------------------------------------------------------------------
 
-MOST_FILES, MOST_LINES_OF_CODE = 254, 40_800
+MOST_FILES, MOST_LINES_OF_CODE = 253, 40_800
 """What the house was when its rooms were last counted, and room for an extension or two: a change that needs more says
 so here. A new file or line is one more that the next reader has to know."""
 LONG = 450
 """Lines of a file that a reader does not scroll without headings; chosen: some six screens."""
 HEADING = re.compile(r"^\s*# -{4,} ?\w", flags=re.M)
 UNNAMED = {"__init__", "__main__"}
-ALIKE: set[str] = {"bench", "drift", "lamps", "plan", "projector", "request", "session"}
+ALIKE: set[str] = {"lamps", "projector", "request"}
 """Names that files of several rooms have still: a change takes some away, and adds none."""
 WITHOUT_HEADINGS: set[str] = {
     "mitsim.api.bench",
     "mitsim.exchange.png_files",
+    "mitsim.planner.pilot",
     "mitsim.reconstruct.captured_session",
     "mitsim.reconstruct.depth",
     "mitsim.reconstruct.estimate_factors",
@@ -498,7 +499,7 @@ PARTICIPLE = re.compile(
     "|given|gone|grown|held|hidden|kept|known|laid|led|left|lent|lit|lost|made|meant|met|paid|said|seen|sent|shown"
     "|spent|split|spoken|struck|sunk|swept|taken|thought|thrown|told|understood|worn|written|[a-z]+[^e]ed"
 )
-MOST_PARTICIPLES = 226
+MOST_PARTICIPLES = 218
 """Functions that are named by a participle alone: what was done is no name of what a function does or gives. A change
 takes some away, and adds none."""
 TOKENS_WITHOUT_CODE = {

@@ -18,7 +18,7 @@ from mitsim.optics.fft_shadow import cells_a_side, cells_per_pixel, points_per_c
 from mitsim.optics.frames import frames_in_memory
 from mitsim.optics.replicates import PROBES
 
-_PATH_BYTES = 380e6
+_LAUNCH_BYTES = 380e6
 """Paths in flight, compiled kernels, LLVM; measured about 350e6, once a little above it."""
 _FOLLOWED_BYTES = 300e6
 """What the pilot's look at light over several surfaces leaves behind: kernels, lights of four looks at several points
@@ -128,7 +128,7 @@ def light_bytes(bench: Apparatus, classes: int, settings: Settings, lines: int =
             raster_bytes(geometry.model_copy(update={"mask_cells": settings.raster_cells}), bench.waves),
         )
     held = lines * GROUPS * held * _ENTRY_BYTES + min(lines, workers()) * paths * path_sample_bytes(settings)
-    return factors + _PATH_BYTES + _FOLLOWED_BYTES * followed + held
+    return factors + _LAUNCH_BYTES + _FOLLOWED_BYTES * followed + held
 
 
 def path_sample_bytes(settings: Settings) -> float:

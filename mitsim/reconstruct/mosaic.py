@@ -31,7 +31,6 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.reconstruct.convolution import Ending, conjugate_gradients
 
 if TYPE_CHECKING:
     from scipy.sparse.linalg import LinearOperator
@@ -200,6 +199,9 @@ class JointMosaic:
         """
         if not 0 < lam < np.inf:
             raise MitsimError(f"lambda is {lam}; give a finite number above 0")
+        # With SciPy's linear algebra, which a capture behind filters does without: 14 MB, and a tenth of a second.
+        from mitsim.reconstruct.convolution import Ending, conjugate_gradients
+
         found = conjugate_gradients(
             self.normal,
             gathered,

@@ -67,7 +67,7 @@ def test_samplers_of_mirrored_light_equal_fractions(
     feature = 2.0**-14 if many else 2.0**-4
     sampler, length = ProfileSampler(numerators / 2**20, feature), len(numerators) * feature
     s = place * length / 2
-    (found,) = sampler(np.array([s]), np.array([width]), np.zeros(1))
+    (found,) = sampler(np.array([s]), np.array([width]))
 
     def upto(x: Fraction) -> Fraction:
         """Integral of the profile up to x, in features from its first edge."""

@@ -103,8 +103,7 @@ def in_lines(folder: str) -> tuple[int, list[str], list[list[float]]]:
     tracer.trace_into(accumulators, 4, 0, 32)
     host = tracer.trace(4, 0, 32)
     light = host.where(host.kind == INDIRECT).by_line(len(LINES))
-    sums = zip(accumulators, fetched(accumulators), strict=True)
-    held = [float(accumulator.light(counted)[0].sum()) for accumulator, counted in sums]
+    held = [float(sums.light()[0].sum()) for sums in fetched(accumulators)]
     return *compared(bench), [held, [float(bundle.accumulate(each, labels).sum()) for each in light]]
 
 
@@ -140,7 +139,7 @@ def test_ledgers_hold_what_anchors_are_brought(beside: Bench, launch: int, monke
         assert np.array_equal(getattr(again, name), getattr(caustics, name)), name
     assert np.array_equal(caustics.value, host.value[host.kind == DIRECT]) and caustics.value.size
     expected = bundle.accumulate(host.where(host.kind == INDIRECT), labels)
-    found = whole.filed()[0]
+    found = whole.light()[0]
     # Which layer light is filed in is drawn: all layers together are the same.
     by_place = [np.asarray(light.toarray()).reshape(light.shape[0], 2, -1).sum(axis=1) for light in (expected, found)]
     near = np.isclose(*by_place, rtol=1e-5, atol=1e-7 * by_place[0].max())
