@@ -199,7 +199,7 @@ class JointMosaic:
         """
         if not 0 < lam < np.inf:
             raise MitsimError(f"lambda is {lam}; give a finite number above 0")
-        # With SciPy's linear algebra, which a capture behind filters does without: 14 MB, and a tenth of a second.
+        # With SciPy's linear algebra, which a capture behind filters does without: 14 MB of addresses.
         from mitsim.reconstruct.convolution import Ending, conjugate_gradients
 
         found = conjugate_gradients(
