@@ -59,6 +59,9 @@ _FORMED = frozenset({"diffraction", "mask-thickness", "black-level"})
 """Effects of which frames are formed again in the same light; for others light is traced again, by the same seed."""
 
 
+# ---- A session and the image made with it ----
+
+
 def measure(bench: Bench, request: Request, job: Job, recipe: SessionRecipe | None = None) -> CalibrationFindings:
     """Run a session and judge it.
 
@@ -125,6 +128,9 @@ def _image(stand: DriftStand, explained: float) -> dict[str, Any]:
         "photoelectrons": electrons,
         "photons": electrons / (stand.lit.bench.sensor.quantum_efficiency or np.nan),
     }
+
+
+# ---- Noisy factors against clean ones ----
 
 
 @single_threaded_blas()
@@ -228,6 +234,9 @@ def singular_rows(factor: str, exact: FloatArray, found: FloatArray, deviation: 
         )
 
 
+# ---- Cost of a session ----
+
+
 def session_cost(lit: LitSession) -> dict[str, float]:
     """Frames, seconds of exposure, expected photoelectrons and photons of a session ``lit``, without its read-out."""
     recipe, order = lit.session.recipe, len(lit.session.order)
@@ -241,6 +250,9 @@ def session_cost(lit: LitSession) -> dict[str, float]:
         "photoelectrons": electrons,
         "photons": electrons / (lit.session.bench.sensor.quantum_efficiency or np.nan),
     }
+
+
+# ---- What is not separable, by cause ----
 
 
 def _by_source(lit: LitSession, noisy: Estimate, clean: Estimate, job: Job) -> Iterator[ErrorSourceRow]:
@@ -268,7 +280,7 @@ def _row(cause: str, residual: float, left: float) -> ErrorSourceRow:
     return ErrorSourceRow(cause, left, float(np.copysign(np.sqrt(abs(less)), less)))
 
 
-# -------- What a calibration session came to in
+# ---- Rows of the findings, and their words ----
 
 _APART = 0.3
 """Predicted turn of its vectors [rad] up to which a singular value stands apart from others: beyond, noise mixes them,
@@ -344,6 +356,9 @@ class ErrorSourceRow:
     cause: str
     residual: float
     part: float
+
+
+# ---- Findings as text, figures and tables ----
 
 
 @dataclass(frozen=True, eq=False)
@@ -575,6 +590,9 @@ class CalibrationFindings(Findings):
             "causes.csv": Table(tuple(asdict(row) for row in self.causes)),
             "losses.csv": Table(tuple(asdict(row) for row in self.losses)),
         }
+
+
+# ---- Losses and causes in words ----
 
 
 def _judged(row: LossRow) -> str:

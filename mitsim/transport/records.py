@@ -31,6 +31,9 @@ _COUNTED = 4
 """Places for each entry of light up to which entries are counted by place; where places are more, sorting is faster."""
 
 
+# ---- Light of connections in the renderer ----
+
+
 @dataclass
 class Sightings:
     """Light of connections, a lane each, and where the camera sees it; meaning and units as in :class:`PathSamples`.
@@ -93,6 +96,9 @@ def check_finite(light: npt.NDArray[Any]) -> None:
     """Refuse ``light`` toward the camera that is NaN or infinite: MitsimError."""
     if not np.isfinite(light).all():
         raise MitsimError("the scene reflects NaN or infinite light toward the camera; check its materials")
+
+
+# ---- Path samples, fetched from the renderer ----
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,6 +225,9 @@ class PathSamples:
 
 _ARRAYS = tuple(name for name in PathSamples.__dataclass_fields__ if name not in ("lane", "lines"))
 """What is told of each entry."""
+
+
+# ---- Accumulation by layer, anchor and cell ----
 
 
 @dataclass(frozen=True)
@@ -376,7 +385,7 @@ def _index_type(*shape: int) -> type[np.int32] | type[np.int64]:
     return np.int32 if max(shape) < 2**31 else np.int64
 
 
-# -------- The grid of directions on which the factored estimator collects light
+# ---- The grid of directions on which light is accumulated ----
 
 _ROUNDING = 1e-9
 """Part of a pixel by which the field stop may reach over cells: float64 rounds 1e-13 of it, a whole row costs 1 %."""
