@@ -414,7 +414,7 @@ class CalibrationFindings(Findings):
     def warnings(self) -> list[str]:
         """That the sources do not make the image's squared error, where chance does not either."""
         return [
-            f"losses: {_judged(row)}, {100 * row.squared_error / squared_error(self.image['psnr_db']):+.1f} % of its "
+            f"losses: {_verdict(row)}, {100 * row.squared_error / squared_error(self.image['psnr_db']):+.1f} % of its "
             "squared error, which may have a share in every other row; look for what the scene or the camera has that "
             "no row names"
             for row in self.losses
@@ -461,7 +461,7 @@ class CalibrationFindings(Findings):
             for row in self.losses
             if abs(row.lost_db) >= _SAID_DB or row.of == UNEXPLAINED
         )
-        yield from (_judged(row) for row in self.losses if row.of == UNEXPLAINED)
+        yield from (_verdict(row) for row in self.losses if row.of == UNEXPLAINED)
         yield from (f"not predicted: {text}" for text in self.not_predicted)
 
     def figures(self) -> dict[str, Figure]:
@@ -556,7 +556,7 @@ class CalibrationFindings(Findings):
         ]
         small = ", ".join(row.name for row in ordered if abs(row.lost_db) < _SAID_DB)
         untold = "".join(f" Not predicted: {text}." for text in self.not_predicted)
-        others = "".join(f" {_judged(row).capitalize()}." for row in rest)
+        others = "".join(f" {_verdict(row).capitalize()}." for row in rest)
         return Part(
             "What an image loses",
             f"The image of this scene under {image['patterns']} has a PSNR of {image['psnr_db']:.2f} dB with "
@@ -595,7 +595,7 @@ class CalibrationFindings(Findings):
 # ---- Losses and causes in words ----
 
 
-def _judged(row: LossRow) -> str:
+def _verdict(row: LossRow) -> str:
     """What is to be said of what is not explained."""
     errors = abs(row.squared_error) / row.deviation if row.deviation else 0.0
     if errors <= 1:

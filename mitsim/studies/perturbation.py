@@ -357,8 +357,8 @@ class LinearImage:
     @cached_property
     def axes(self) -> tuple[Axis, Axis]:
         """Left and right."""
-        left = Axis.of(self._centred(self.left), self.family.left.astype(np.float64))
-        right = Axis.of(self._centred(self.right), self.family.right.astype(np.float64))
+        left = Axis.of(self._centre(self.left), self.family.left.astype(np.float64))
+        right = Axis.of(self._centre(self.right), self.family.right.astype(np.float64))
         return left, right
 
     @cached_property
@@ -367,7 +367,7 @@ class LinearImage:
         sigma = np.outer(self.axes[0].singular, self.axes[1].singular)
         return np.asarray(sigma / (np.square(sigma) + self.lam))
 
-    def _centred(self, matrix: FloatArray) -> FloatArray:
+    def _centre(self, matrix: FloatArray) -> FloatArray:
         return np.asarray(matrix - matrix.mean(axis=0)) if self.centre else matrix
 
 

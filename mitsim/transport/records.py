@@ -211,14 +211,14 @@ class PathSamples:
 
     def where(self, chosen: npt.NDArray[np.bool_]) -> PathSamples:
         """The entries that are ``chosen`` (m,)."""
-        return self._taken(chosen)
+        return self._select(chosen)
 
     def of_lanes(self, first: int, last: int) -> PathSamples:
         """The entries of lanes ``first`` .. ``last`` - 1."""
         assert self.lane is not None, "known of what one launch brought"
-        return self._taken(slice(*np.searchsorted(self.lane, (first, last))))
+        return self._select(slice(*np.searchsorted(self.lane, (first, last))))
 
-    def _taken(self, which: slice | npt.NDArray[np.bool_]) -> PathSamples:
+    def _select(self, which: slice | npt.NDArray[np.bool_]) -> PathSamples:
         lines = None if self.lines is None else self.lines[:, which]
         return PathSamples(**{name: getattr(self, name)[which] for name in _ARRAYS}, lines=lines)
 
