@@ -477,29 +477,12 @@ HEADING = re.compile(r"^\s*# -{4,} ?\w", flags=re.M)
 UNNAMED = {"__init__", "__main__"}
 ALIKE: set[str] = {"lamps", "projector", "request"}
 """Names that files of several rooms have still: a change takes some away, and adds none."""
-WITHOUT_HEADINGS: set[str] = {
-    "mitsim.api.bench",
-    "mitsim.exchange.png_files",
-    "mitsim.planner.pilot",
-    "mitsim.reconstruct.captured_session",
-    "mitsim.reconstruct.depth",
-    "mitsim.reconstruct.estimate_factors",
-    "mitsim.reconstruct.focus",
-    "mitsim.reconstruct.misfit",
-    "mitsim.report.mosaic_images",
-    "mitsim.studies.calibration_study",
-    "mitsim.studies.convolutional_study",
-    "mitsim.studies.perturbation",
-    "mitsim.transport.records",
-    "mitsim.transport.sharp_lobes",
-}
-"""Long files that have none still."""
 PARTICIPLE = re.compile(
     "begun|bent|bound|broken|brought|built|caught|chosen|done|drawn|driven|fallen|felt|filed|forgotten|formed|found"
     "|given|gone|grown|held|hidden|kept|known|laid|led|left|lent|lit|lost|made|meant|met|paid|said|seen|sent|shown"
     "|spent|split|spoken|struck|sunk|swept|taken|thought|thrown|told|understood|worn|written|[a-z]+[^e]ed"
 )
-MOST_PARTICIPLES = 218
+MOST_PARTICIPLES = 154
 """Functions that are named by a participle alone: what was done is no name of what a function does or gives. A change
 takes some away, and adds none."""
 TOKENS_WITHOUT_CODE = {
@@ -546,7 +529,7 @@ def test_the_house_has_no_more_files_and_lines_than_it_had() -> None:
 def test_long_files_have_headings() -> None:
     texts = {name: text for name, (text, _) in sources().items() if text.count("\n") > LONG}
     without = {name for name, text in texts.items() if len(HEADING.findall(text)) < 2}
-    assert without == WITHOUT_HEADINGS, without ^ WITHOUT_HEADINGS
+    assert not without, without
     assert HEADING.findall("# ---- Anchors\n\n    # -------- anchors of it\n") and not HEADING.findall("# --\n#----")
 
 

@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.factors import Factors
 
 
+# ---- Opening a bench ----
+
+
 @checked
 def open_bench(
     scene: Path | str,
@@ -67,6 +70,9 @@ def open_bench(
     return Bench(**vars(opened))
 
 
+# ---- The bench and its verbs ----
+
+
 class Bench(Apparatus):
     """An apparatus that is ready to plan, capture and calibrate; its attributes are those of
     :class:`mitsim.bench.apparatus.Apparatus`."""
@@ -75,6 +81,8 @@ class Bench(Apparatus):
         path, (rows, columns) = self.loaded.path, self.geometry.frame_shape
         rig = f"{self.sensor.name} with {rows} x {columns} pixels, {self.projector.name}"
         return f"Bench({path.parent.name}/{path.name}: {rig})"
+
+    # ---- The plan, and light of the scene ----
 
     @checked
     def plan(self, patterns: str = "dots:7", **request: Any) -> Plan:
@@ -117,6 +125,8 @@ class Bench(Apparatus):
             plan = self.plan(patterns, **request)
         return trace_request(self, plan, job)
 
+    # ---- Captures ----
+
     @checked
     def capture(
         self,
@@ -154,6 +164,8 @@ class Bench(Apparatus):
 
         known = None if isinstance(plan, str) else plan
         return capture(SpectralBench(self), request_of(plan, request), task, known).runs[0]
+
+    # ---- Spectral lines and colour filters ----
 
     @checked
     def capture_lines(
@@ -320,6 +332,8 @@ class Bench(Apparatus):
 
         return calibrate_mosaic(self, SessionRequest(seed, accuracy, recipe), task)
 
+    # ---- Calibration sessions ----
+
     @checked
     def calibrate(
         self,
@@ -406,6 +420,8 @@ class Bench(Apparatus):
         from mitsim.calibrate.calibrate import write_session
 
         return write_session(self, frames, SessionRequest(seed, accuracy, recipe), Task.of(output, job=job))
+
+    # ---- Renderings, and the same devices before a board ----
 
     @checked
     def render(

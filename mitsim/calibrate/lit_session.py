@@ -253,7 +253,9 @@ class LitSession:
             return {side: Ladder(digitals) for side in SIDES}
         recipe, found = self.session.recipe, dict[str, Ladder]()
         for side, other in zip(SIDES, reversed(SIDES), strict=True):
-            uniform, _ = self._mean_of_repeats(self._lit(self.white.irradiance, 0, other, 0), 0, True, other, 0)
+            uniform, _ = self._mean_of_repeats(
+                self._shot_electrons(self.white.irradiance, 0, other, 0), 0, True, other, 0
+            )
             rate = self._exposers[0].rate(uniform)
             found[side] = Ladder.of(digitals, rate, recipe.repeats, recipe.ladder_merge)
         return found
@@ -297,13 +299,13 @@ class LitSession:
         ladder = self.ladders[side]
         found = [
             self._mean_of_repeats(
-                self._lit(irradiance, exposure, side, index), exposure, ladder.used(exposure), side, index
+                self._shot_electrons(irradiance, exposure, side, index), exposure, ladder.used(exposure), side, index
             )
             for exposure in range(len(self._exposers))
         ]
         return _Shot(ladder, tuple(digital for digital, _ in found), sum(saturated for _, saturated in found))
 
-    def _lit(self, irradiance: FloatArray, exposure: int, *names: str | int) -> FloatArray:
+    def _shot_electrons(self, irradiance: FloatArray, exposure: int, *names: str | int) -> FloatArray:
         """Expected electrons of a shot. Speckle of a board at rest is the same in all repeats and exposures."""
         passed = Frame(self.session.filtered(irradiance), 0.0, 0.0, 0.0)
         return self._exposers[exposure].lit(passed, "calibration", *names)

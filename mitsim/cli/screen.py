@@ -30,7 +30,7 @@ def showing_progress(hidden: bool) -> Iterator[Progress]:
 
         yield silent
     elif not sys.stderr.isatty():
-        yield _logged()
+        yield _log()
     else:
         from rich.console import Console
         from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
@@ -42,7 +42,7 @@ def showing_progress(hidden: bool) -> Iterator[Progress]:
             yield lambda stage, fraction: bar.update(task, description=printable(stage), completed=fraction)
 
 
-def _logged() -> Progress:
+def _log() -> Progress:
     """Progress as lines of a log on stderr, the first after :data:`SECONDS_A_LINE`."""
     written = time.monotonic()
 

@@ -347,7 +347,7 @@ def draw_dust(lines: FloatArray, values: FloatArray, dust: Dust, reach_mm: float
     place = np.searchsorted(lines, (finer[1:] + finer[:-1]) / 2) - 1
     result = np.asarray(values[np.ix_(place, place)])
     for centre in centres:
-        rows, columns = (_met(finer - at, dust.radius_mm) for at in centre)
+        rows, columns = (_cells_within(finer - at, dust.radius_mm) for at in centre)
         part = _disc_part(
             finer[rows.start : rows.stop + 1] - centre[0],
             finer[columns.start : columns.stop + 1] - centre[1],
@@ -357,7 +357,7 @@ def draw_dust(lines: FloatArray, values: FloatArray, dust: Dust, reach_mm: float
     return finer, result
 
 
-def _met(lines: FloatArray, radius: float) -> slice:
+def _cells_within(lines: FloatArray, radius: float) -> slice:
     """The cells between ``lines`` that a disc of that ``radius`` about 0 meets."""
     return slice(max(int(np.searchsorted(lines, -radius, side="right")) - 1, 0), int(np.searchsorted(lines, radius)))
 

@@ -202,11 +202,11 @@ def hadamard_matrix(order: int) -> PatternFactor:
     """
     import numpy as np
 
-    matrix = _built(order)
+    matrix = _construct(order)
     return (matrix * matrix[:, :1]).astype(np.int8)
 
 
-def _built(order: int) -> npt.NDArray[np.int64]:
+def _construct(order: int) -> npt.NDArray[np.int64]:
     import numpy as np
 
     how, number = way_to(order)
@@ -221,7 +221,7 @@ def _built(order: int) -> npt.NDArray[np.int64]:
     if how == "symmetric":
         symmetric, eye = _conference(number), np.eye(number + 1, dtype=np.int64)
         return np.kron(symmetric, [[1, 1], [1, -1]]) + np.kron(eye, [[1, -1], [-1, -1]])
-    return np.kron(_built(number), _built(order // number))
+    return np.kron(_construct(number), _construct(order // number))
 
 
 def _conference(q: int) -> npt.NDArray[np.int64]:

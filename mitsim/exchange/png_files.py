@@ -38,6 +38,9 @@ _WHITE = 255
 """Of a picture for the projector; black is 0, so that its gamma plays no part."""
 
 
+# ---- A projector's raster ----
+
+
 @dataclass(frozen=True)
 class Raster:
     """A projector's own pixels.
@@ -68,6 +71,9 @@ class Raster:
         if not (isinstance(rows, int) and isinstance(columns, int)):
             raise ArgumentError("projector", "does not say its rows and columns; give one that does")
         return cls(rows, columns, float(model.get("pixel_aspect", 1.0)))
+
+
+# ---- Folders of pictures: of a family, and of a calibration session ----
 
 
 def draw_family(folder: Path, name: str, n: int, projector: str, seed: int = 0) -> dict[str, Any]:
@@ -171,6 +177,9 @@ def session_of(camera: str, exposure_s: float, n: int, signed_capture: str) -> F
     return validate(FrameList, stated, "stripes")
 
 
+# ---- Names of files ----
+
+
 def frame_name(index: int) -> str:
     """Name of the frame of shot ``index`` among PNG files."""
     return f"frame_{index:05d}.png"
@@ -179,6 +188,9 @@ def frame_name(index: int) -> str:
 def picture_name(index: int) -> str:
     """Path of the picture of shot ``index`` in the folder that holds it."""
     return f"patterns/pattern_{index:05d}.png"
+
+
+# ---- Pictures of all shots, and what they cost ----
 
 
 def _check_cost(raster: Raster, pictures: int) -> None:
@@ -223,6 +235,9 @@ def draw(
     for name, level in (("black", 0), ("white", 1)):
         write_png(folder / "patterns" / f"{name}.png", draw_picture(np.full(sides, level), grid, raster))
     return {"rows": raster.rows, "columns": raster.columns, **grid}
+
+
+# ---- The patterns' grid in the raster ----
 
 
 def grid_in(raster: Raster, sides: tuple[int, int], place: str) -> dict[str, Any]:
@@ -329,6 +344,9 @@ def pictures_of(patterns: Patterns, place: str) -> Iterator[npt.NDArray[Any]]:
         yield light
 
 
+# ---- What patterns.json says ----
+
+
 def describe(patterns: Patterns, names: Sequence[str], where: Mapping[str, Any]) -> dict[str, Any]:
     """What `patterns.json` says of a family.
 
@@ -356,6 +374,9 @@ def describe(patterns: Patterns, names: Sequence[str], where: Mapping[str, Any])
     }
 
 
+# ---- One PNG file ----
+
+
 def write_png(path: Path, values: npt.NDArray[Any]) -> None:
     """Write ``values`` (rows, columns) of 8 or 16 bits to ``path``. MitsimError where that is not possible."""
     from PIL import Image
@@ -364,7 +385,7 @@ def write_png(path: Path, values: npt.NDArray[Any]) -> None:
         Image.fromarray(values).save(part, format="png")
 
 
-# -------- A run as PNG files
+# ---- A run as PNG files ----
 
 _LARGEST = 2**16 - 1
 """Of a PNG's numbers."""

@@ -282,7 +282,7 @@ class LightEstimate:
         return LightEstimate(*(_sum(getattr(self, each.name), getattr(other, each.name)) for each in fields(self)))
 
     def __truediv__(self, count: float) -> LightEstimate:
-        return LightEstimate(*(_divided(getattr(self, each.name), count) for each in fields(self)))
+        return LightEstimate(*(_divide(getattr(self, each.name), count) for each in fields(self)))
 
     def with_light(self, light: Mapping[str, sparse.csr_array]) -> LightEstimate:
         """The same with other ``light`` in some grids."""
@@ -310,12 +310,12 @@ def _sum(one: Any, other: Any) -> Any:
     return one if one.nnz else other
 
 
-def _divided(light: Any, count: float) -> Any:
+def _divide(light: Any, count: float) -> Any:
     """Numbers or matrices over ``count``; SciPy would copy where a matrix has its light, which lines may share."""
     if light is None:
         return None
     if isinstance(light, Mapping):
-        return {name: _divided(each, count) for name, each in light.items()}
+        return {name: _divide(each, count) for name, each in light.items()}
     if not isinstance(light, sparse.csr_array):
         return light / count
     return sparse.csr_array((light.data * (1 / count), light.indices, light.indptr), shape=light.shape)

@@ -448,7 +448,7 @@ def _check(light: SampledLight, parts: Parts, lighting: Lighting, followed: bool
     # What black pixels leak moves the error as little as the frames, and would make every shot a sum of all light.
     each = [(light.simulation, groups) for groups in parts.values()]
     expected = expected_of(each, light.rows_of(seen), seen, light.seed, leaking=False)
-    more = _unchecked(light, lighting, seen)
+    more = _error_growth(light, lighting, seen)
     error, bound = (ratio * of_seen for ratio, of_seen in zip(more, expected.sampling_error(), strict=True))
     light = replace(light, sampling_error=error)
     if whole and expected.probed is not None:
@@ -458,7 +458,7 @@ def _check(light: SampledLight, parts: Parts, lighting: Lighting, followed: bool
     variances = dict(zip(parts, shares_of_bound(by_part.sum(axis=1)).tolist(), strict=True))
     if not whole:
         for name, groups in parts.items():
-            _, more_of_part = _unchecked(replace(light, groups=tuple(groups)), lighting, seen)
+            _, more_of_part = _error_growth(replace(light, groups=tuple(groups)), lighting, seen)
             variances[name] *= more_of_part**2
     return _Check(light, bound, variances)
 
@@ -474,7 +474,7 @@ def _some(lighting: Lighting, count: int) -> Lighting:
     return lighting.shots(np.unique(np.linspace(0, shots - 1, min(shots, count)).astype(int)))
 
 
-def _unchecked(light: SampledLight, lighting: Lighting, checked: Lighting) -> tuple[float, float]:
+def _error_growth(light: SampledLight, lighting: Lighting, checked: Lighting) -> tuple[float, float]:
     """How much larger the error of all shots of a ``lighting``, and its bound, are than those of the shots ``checked``.
 
     By what the groups of the ``light`` differ in the total light of each shot: a heavy path that no checked shot sees

@@ -159,7 +159,7 @@ class _Flux:
         most = max(MOST_RAYS, MOST_SAMPLES * len(unit)) // TRUTH_GROUPS
         while ((error := _rms(_over(self.standard_error, unit))) > target).any():
             part = float(np.square(_AIM * target / np.maximum(error, np.finfo(float).tiny)).min())
-            wanted = _allotted(likely, self._samples, self._first, part, most)
+            wanted = _allot(likely, self._samples, self._first, part, most)
             if (wanted == self._samples).all():
                 return
             self._sample(wanted)
@@ -180,7 +180,7 @@ class _Flux:
         self._samples = wanted
 
 
-def _allotted(likely: FloatArray, samples: IntArray, first: int, part: float, most: int) -> IntArray:
+def _allot(likely: FloatArray, samples: IntArray, first: int, part: float, most: int) -> IntArray:
     """(n^2,) samples that leave a part of the variance, doubled where a sample takes off most of it.
 
     Parameters

@@ -240,14 +240,14 @@ class FrameOptics:
         self, estimates: Sequence[Entries], together: bool = False
     ) -> Iterator[tuple[_Raster | _Terms, _Lit]]:
         """The light of each layer that holds any, of each estimate or of their mean ``together``."""
-        split = [self._split(*entries) for entries in estimates]
+        split = [self._split_layers(*entries) for entries in estimates]
         for of_depth, of_layer in zip(self._layers, zip(*split, strict=True), strict=True):
             parts = list(of_layer)
             most = max(len(place) for place, _ in parts)
             if not most:
                 continue
             if most < _FILLED * self.shape[0] * self.shape[1]:
-                rows, columns, parts = self._lit(parts)
+                rows, columns, parts = self._restrict_to_lit(parts)
             else:
                 rows, columns = (np.arange(count) for count in self.shape)
             lights = np.zeros((1 if together else len(parts), len(rows) * len(columns)))
@@ -260,7 +260,7 @@ class FrameOptics:
                 lights /= len(parts)
             yield of_depth, _Lit(rows, columns, lights.reshape(-1, len(rows), len(columns)))
 
-    def _lit(self, parts: Sequence[Entries]) -> tuple[IntArray, IntArray, list[Entries]]:
+    def _restrict_to_lit(self, parts: Sequence[Entries]) -> tuple[IntArray, IntArray, list[Entries]]:
         """Rows and columns that any of some ``parts`` lights, and the parts by places among these alone."""
         places = [np.divmod(place, self.shape[1]) for place, _ in parts]
         lit_row, lit_column = np.zeros(self.shape[0], bool), np.zeros(self.shape[1], bool)
@@ -277,7 +277,7 @@ class FrameOptics:
             ],
         )
 
-    def _split(self, flat: IntArray, light: FloatArray) -> list[Entries]:
+    def _split_layers(self, flat: IntArray, light: FloatArray) -> list[Entries]:
         """What lies in each layer: places in (rows, columns), and light."""
         if len(self._layers) == 1:
             return [(flat, light)]

@@ -138,13 +138,13 @@ class Candidates:
 
     def __init__(self, pilot_result: PilotResult, switches: Mapping[str, bool], sure: float = SURE) -> None:
         self.pilot_result = pilot_result
-        counts = [_allowed(pilot_result, name, switches) for name in COUNTED]
+        counts = [_choices(pilot_result, name, switches) for name in COUNTED]
         rows = np.array(list(product(*counts, _COARSE_CELLS, (0, 1))), dtype=np.float64)
         rows = rows[(rows[:, 3] > 1) | (rows[:, 5] == 1)]  # width is that of what several anchors see
         if pilot_result.occluded:
             # Light of one anchor is what the sensor's centre sees, of several what all of it does: all pixels, or none.
             rows = rows[(rows[:, 0] > 1) == (rows[:, 4] > 1)]
-        given = _given(switches)
+        given = _omissions(switches)
         self._tables = [
             _Table(math.nan, pilot_result, (effects, cells), rows, given, sure)
             for effects in _subsets(pilot_result, switches)
@@ -185,7 +185,7 @@ def _table_of(
     row = np.array([[*counted(settings), settings.coarse_cells, settings.coarse_layers]], dtype=np.float64)
     drawn = pilot_result.raster[in_waves(settings.effects)]
     cells = (settings.raster_cells or drawn.cells[0]) if settings.raster or drawn.needed else 0
-    return _Table(accuracy, pilot_result, (settings.effects, cells), row, _given(switches), sure)
+    return _Table(accuracy, pilot_result, (settings.effects, cells), row, _omissions(switches), sure)
 
 
 def value_of_refining(
@@ -415,7 +415,7 @@ class _Table:
         for name, part in parts.items():
             # Light without noise takes no share; a share of one keeps the division defined.
             share = np.sqrt(np.divide(part, every, out=np.ones(len(every)), where=part > 0))
-            needed = self._by_row(name, partial(_needed, target=single * share))
+            needed = self._by_row(name, partial(_samples_for, target=single * share))
             if name == "direct":
                 needed = np.maximum(needed, 1 / (self.pilot_result.hits * _ONE_HIT * self.target))
             # What needs no whole sample does not take two when all others grow.
@@ -427,7 +427,7 @@ class _Table:
         """(m,) Monte Carlo error that these samples leave."""
         total = np.zeros(len(self.rows))
         for name, count in self.samples.items():
-            left = self._by_row(name, partial(_left, samples=count))
+            left = self._by_row(name, partial(_noise_after, samples=count))
             total = total + (PASSES[name].connections(self.numbers) > 0) * np.square(left) / GROUPS
         return np.sqrt(total)
 
@@ -460,7 +460,7 @@ def _variance(kind: SampleCost) -> Number:
     return kind.variance
 
 
-def _needed(kind: SampleCost, target: Number) -> Number:
+def _samples_for(kind: SampleCost, target: Number) -> Number:
     """Samples at which sampling may stop at a ``target``: by a bound, which lies the further above the error the fewer
     paths make it."""
     noise = kind.noise
@@ -472,7 +472,7 @@ def _needed(kind: SampleCost, target: Number) -> Number:
     return needed
 
 
-def _left(kind: SampleCost, samples: Number) -> Number:
+def _noise_after(kind: SampleCost, samples: Number) -> Number:
     return kind.noise.left(samples)
 
 
@@ -486,7 +486,7 @@ def _counts(pilot_result: PilotResult, name: str) -> list[int]:
     return list(pilot_result.ladders[name])
 
 
-def _allowed(pilot_result: PilotResult, name: str, switches: Mapping[str, bool]) -> list[int]:
+def _choices(pilot_result: PilotResult, name: str, switches: Mapping[str, bool]) -> list[int]:
     """Numbers of ``name`` that the user leaves to choose from."""
     counts = _counts(pilot_result, name)
     if name not in switches or len(counts) == 1:
@@ -494,7 +494,7 @@ def _allowed(pilot_result: PilotResult, name: str, switches: Mapping[str, bool])
     return [count for count in counts if (count > 1) == switches[name]]
 
 
-def _given(switches: Mapping[str, bool]) -> frozenset[Approximation]:
+def _omissions(switches: Mapping[str, bool]) -> frozenset[Approximation]:
     """What is left out by the user's choice."""
     off = {name for name, on in switches.items() if not on}
     if "anchors" in off:

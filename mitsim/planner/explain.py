@@ -195,7 +195,7 @@ class _Words:
         effects = (self._effect(effect) for effect in EFFECTS.values())
         anchors = self._anchors(), self._followed_anchors(), self._occluded_anchors()
         counted = (anchors[0], self._layers(), self._cells(), *anchors[1:], *self._shadow())
-        return (*counted, *effects, *_fixed(self.facts))
+        return (*counted, *effects, *_fixed_rows(self.facts))
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -203,7 +203,7 @@ class _Words:
         chosen, accuracy, missing = self.chosen, self.accuracy, self.pilot_result.unresolved
         if chosen.total.bound <= accuracy:
             return ()
-        said, parts = [], self._left()
+        said, parts = [], self._bounds_by_part()
         if missing > accuracy:
             said.append(
                 f"{missing:.0%} of the direct light comes over lobes too sharp to sample, and the frames lack "
@@ -240,7 +240,7 @@ class _Words:
         )
         return str(mirror.refusal("shape", repr(mirror.attributes.get("type", "")), rule))
 
-    def _left(self) -> dict[str, float]:
+    def _bounds_by_part(self) -> dict[str, float]:
         """By what leaves it, the bound on each part of the systematic error."""
         pilot_result, settings, of_raster = self.pilot_result, self.chosen.settings, self._of_raster
         anchors, layers, cells = settings.anchors, len(settings.depths), settings.subdivision
@@ -407,7 +407,7 @@ def _spectrum(bench: Apparatus) -> PlanRow:
     return PlanRow("spectrum", "off", _GREY, 0.0, 0.0)
 
 
-def _fixed(facts: SceneFacts) -> tuple[PlanRow, ...]:
+def _fixed_rows(facts: SceneFacts) -> tuple[PlanRow, ...]:
     keystone = (
         f"the projector's window is {facts.keystone:.1f} of its pixels off a square; responses are not separable"
         if facts.keystone

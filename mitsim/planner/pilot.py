@@ -88,6 +88,9 @@ _ALIGNED = 1e-6
 """Relative distance from the aligned plane that is rounding: the plane keeps its exact cells."""
 
 
+# ---- Runs of the pilot, each repeated with more samples ----
+
+
 class PilotRuns:
     """A look at a scene, as short as it can be at first; each of its runs is repeated with more samples.
 
@@ -145,6 +148,8 @@ class PilotRuns:
             self._base = replace(self._base, occluded=occluded)
             for run in ("anchors", "occluded"):
                 self._measure(run)
+
+    # ---- More samples: their work, and where they are called for ----
 
     def refine(self, run: str) -> None:
         """Repeat a ``run`` with so many more samples that its standard errors are halved."""
@@ -213,6 +218,8 @@ class PilotRuns:
         sample = self.samples[run]
         return replace(sample, times=FINER * sample.times)
 
+    # ---- What is measured, and how frames are formed for it ----
+
     def _measure(self, run: str) -> None:
         bench, base, sample, seed = self.bench, self._base, self.samples[run], self.seed
         if run == "cells":
@@ -250,6 +257,8 @@ class PilotRuns:
     def _left_out(self) -> LeftOut:
         return _left_out(self.switched.simulation, self.seed)
 
+    # ---- Light that neither rays nor connections find ----
+
     def _rows_and_columns(self, pixels: tuple[int, ...]) -> tuple[float, float]:
         """Parts of the projector's rows and of its columns that ``pixels`` lie in."""
         rows, columns = (np.unique(each).size / self.bench.n for each in np.divmod(pixels, self.bench.n))
@@ -278,6 +287,8 @@ class PilotRuns:
             return 0.0
         found, unsure = self.bench.glint.irradiance(self.bench.geometry)
         return unsure / (other + found + unsure) if unsure else 0.0
+
+    # ---- The pilot's result ----
 
     @cached_property
     def pilot_result(self) -> PilotResult:
@@ -324,6 +335,9 @@ class PilotRuns:
         )
 
 
+# ---- The shortest pilot ----
+
+
 def measure(bench: Apparatus, lighting: Lighting, accuracy: float, seed: int) -> PilotResult:
     """What the shortest :class:`PilotRuns` of these arguments finds.
 
@@ -341,6 +355,9 @@ def run_of(part: Approximation) -> str:
     if light:
         return PASSES[light].pilot if PASSES[light].anchors else "effects"
     return _RUN_OF.get(part.name, "effects")
+
+
+# ---- Sharp lobes, and light that no tracer finds ----
 
 
 def _enough(sample: Sample, hits: float, bench: Apparatus) -> Sample:
@@ -378,6 +395,9 @@ def _left_out(simulation: Simulation, seed: int) -> LeftOut:
     own = integer(seed, "pilot", "caustics")
     parts = loaded.scene, loaded.camera, physics.projector, simulation.aim
     return left_out_light(*parts, physics.geometry, own, samples)
+
+
+# ---- Where light is first seen, and how many rays bring it ----
 
 
 def _first_light(simulation: Simulation, seed: int, sharp: SharpLight) -> tuple[float, float, float]:
@@ -419,7 +439,7 @@ def _equal(values: FloatArray) -> float:
     return float(values.sum(dtype=np.float64)) ** 2 / squares if squares else 0.0
 
 
-# -------- How far from the axis light comes
+# ---- How far from the axis light comes ----
 
 _CONNECTIONS = 2**16
 """Connections that look for near surfaces, some 10 ms; what they overlook is counted when the light is accumulated."""

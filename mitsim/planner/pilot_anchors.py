@@ -93,7 +93,7 @@ class AnchorRuns:
     @cached_property
     def changes(self) -> dict[Approximation, FloatArray]:
         """Change of the frames by every number of anchors that was tried, and by coarse cells for what they see."""
-        return {**self._until(self.tolerance), **coarsened(self._pass.name, self._coarsened, self.layers)}
+        return {**self._until(self.tolerance), **coarsened(self._pass.name, self._coarsen, self.layers)}
 
     @property
     def of_few(self) -> dict[Approximation, FloatArray]:
@@ -110,7 +110,7 @@ class AnchorRuns:
         relative = noise(self._beyond_mean()) / light if light else 0.0
         return {self._pass.name: SampleCost(Noise(relative, self._samples, 0.5), self._lanes)}
 
-    def _coarsened(self, cells: int, layers: tuple[float, ...]) -> FloatArray:
+    def _coarsen(self, cells: int, layers: tuple[float, ...]) -> FloatArray:
         coarse = {"coarse_cells": cells, "coarse_layers": bool(layers), "layers": layers}
         return self._beyond_mean(**coarse) if cells > 1 or layers else self._beyond_mean()
 
@@ -128,17 +128,17 @@ class AnchorRuns:
         """Frames of light to a few anchors beyond its mean, in a ``simulation``; of all of it, where they are known."""
         weights, grids = simulation.mean_weights(self.few), self._grids(simulation)
         mean = [replicate.averaged(weights) for replicate in replicates]
-        frames = self._formed(grids, replicates, samples) if frames is None else frames
-        return frames - self._formed([grid.of_mean for grid in grids], mean, samples)
+        frames = self._form(grids, replicates, samples) if frames is None else frames
+        return frames - self._form([grid.of_mean for grid in grids], mean, samples)
 
     @cached_property
     def _few(self) -> list[PathSamples]:
         """Light to a few anchors, replicate by replicate."""
-        return self._traced(self._simulation(self.few))
+        return self._trace(self._simulation(self.few))
 
     def _at_anchors(self, anchors: int) -> FloatArray:
         simulation = self._simulation(anchors)
-        return self._formed(self._grids(simulation), self._few if anchors == self.few else self._traced(simulation))
+        return self._form(self._grids(simulation), self._few if anchors == self.few else self._trace(simulation))
 
     def _simulation(self, anchors: int = 1, **cells: Any) -> Simulation:
         cells[self._pass.anchors] = anchors
@@ -151,14 +151,12 @@ class AnchorRuns:
         lamps = [simulation.ambient[name]] if name in simulation.ambient and self.bench.loaded.lamps else []
         return [simulation.grids[name], *lamps]
 
-    def _traced(self, simulation: Simulation) -> list[PathSamples]:
+    def _trace(self, simulation: Simulation) -> list[PathSamples]:
         """Light to every anchor, replicate by replicate."""
         anchors = self._grids(simulation)[0].bundle.anchors
         return tracer_of(simulation, self.pixels, anchors).trace_replicates(self._seeds, self._samples)
 
-    def _formed(
-        self, grids: Sequence[Grid], replicates: Sequence[PathSamples], samples: int | None = None
-    ) -> FloatArray:
+    def _form(self, grids: Sequence[Grid], replicates: Sequence[PathSamples], samples: int | None = None) -> FloatArray:
         """(replicates, shots, places, places) frames of light in ``grids``; of so many ``samples``, if not of as many
         as others."""
         samples = samples or self._samples
@@ -241,7 +239,7 @@ class FollowedRuns(AnchorRuns):
 
     @cached_property
     def _few(self) -> list[PathSamples]:
-        return _joined(self._few_by_tracer)
+        return _join(self._few_by_tracer)
 
     @cached_property
     def _few_by_tracer(self) -> list[list[PathSamples]]:
@@ -253,7 +251,7 @@ class FollowedRuns(AnchorRuns):
         simulation, samples = self._simulation(anchors), self._samples
         grids, tracers = self._grids(simulation), _tracers(simulation)
         if anchors == self.few:
-            return self._formed(grids, self._few)
+            return self._form(grids, self._few)
         each = max(1, _AT_ONCE // sum(tracer.paths_per_sample for tracer in tracers))
         found = []
         for first in range(0, samples, each):
@@ -264,7 +262,7 @@ class FollowedRuns(AnchorRuns):
                 else [tracer.trace(seed, first, some) for seed in self._seeds]
                 for tracer in tracers
             ]
-            found.append(self._formed(grids, _joined(traced)))
+            found.append(self._form(grids, _join(traced)))
         return np.asarray(sum(found))
 
 
@@ -272,6 +270,6 @@ def _tracers(simulation: Simulation) -> list[PassTracer]:
     return [tracer for tracer in simulation.at_anchors if tracer is not None]
 
 
-def _joined(traced: Sequence[list[PathSamples]]) -> list[PathSamples]:
+def _join(traced: Sequence[list[PathSamples]]) -> list[PathSamples]:
     """Light of several tracers together, replicate by replicate."""
     return [PathSamples.joined(replicates) for replicates in zip(*traced, strict=True)]

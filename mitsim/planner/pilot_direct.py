@@ -138,7 +138,7 @@ class DirectRuns:
     @cached_property
     def _whole(self) -> FloatArray:
         """(replicates, ...) frames of the light in the cells and layers of the base."""
-        return self._formed(self._simulation, self._path_samples, self.sample.fine)
+        return self._form(self._simulation, self._path_samples, self.sample.fine)
 
     @cached_property
     def _noise(self) -> tuple[float, float]:
@@ -148,12 +148,12 @@ class DirectRuns:
     def _spread_noise(self) -> tuple[float, float]:
         tracer = tracer_of(self._simulation, shown_pixels(self.base, self.sample), 1, spread=True)
         seen = tracer.trace_replicates(self._seeds, self.sample.fine)
-        return self._noise_of(tracer, self._formed(self._simulation, seen, self.sample.fine))
+        return self._noise_of(tracer, self._form(self._simulation, seen, self.sample.fine))
 
     def _noise_of(self, tracer: DirectTracer, many: FloatArray) -> tuple[float, float]:
         """Error of a replicate of the ``tracer`` whose frames of all samples are ``many``, and of one with fewer."""
         few = tracer.trace_replicates(self._seeds, self._fewer)
-        return noise(many), noise(self._formed(self._simulation, few, self._fewer))
+        return noise(many), noise(self._form(self._simulation, few, self._fewer))
 
     def forming(self, family: Lighting) -> Forming:
         """What forming frames of a ``family`` takes; timed with one cell a pixel, its optics prepared."""
@@ -171,7 +171,7 @@ class DirectRuns:
         return Forming(
             pixels=geometry.frame_side,
             cells=cells,
-            lit=self._lit(simulation, light) / cells,
+            lit=self._lit_rows(simulation, light) / cells,
             terms=float(len(self.bench.spectrum.weights) * geometry.mask_terms),
             shots=len(family.weights),
             classes=family.weights.shape[1],
@@ -204,7 +204,7 @@ class DirectRuns:
         without, waves = drawn(None), self.bench.waves
         return without, drawn(waves) if waves else without
 
-    def _lit(self, simulation: Simulation, light: sparse.csr_array) -> float:
+    def _lit_rows(self, simulation: Simulation, light: sparse.csr_array) -> float:
         """Rows of cells that hold light in a shot, their mean."""
         shots = (self.sample.lighting.weights @ (light[: len(self.sample.rows)] != 0)) != 0
         width = simulation.grids["fine"].bundle.cells[1]
@@ -214,9 +214,9 @@ class DirectRuns:
     def _frames(self, layers: tuple[float, ...], subdivision: int) -> FloatArray:
         settings = replace(self.base, layers=layers, subdivision=subdivision)
         simulation = self.sample.simulation(self.bench, settings)
-        return self._formed(simulation, self._path_samples, self.sample.fine, self._sharp)
+        return self._form(simulation, self._path_samples, self.sample.fine, self._sharp)
 
-    def _formed(
+    def _form(
         self, simulation: Simulation, path_samples: list[PathSamples], samples: int, sharp: Sequence[PathSamples] = ()
     ) -> FloatArray:
         sample, light = self.sample, emitted(simulation.physics, self.sample.lighting)

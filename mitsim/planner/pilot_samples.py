@@ -186,9 +186,9 @@ class Sample:
         least, most = emitted.min(axis=1), emitted.max(axis=1)
         span = np.where(most > least, most - least, 1.0)
         pattern = (emitted - least[:, None]) / span[:, None]
-        frames = span[:, None, None] * self._lit(grid, replicates, pattern, known)
+        frames = span[:, None, None] * self._class_frames(grid, replicates, pattern, known)
         if least.any():
-            frames += least[:, None, None] * self._lit(grid, replicates, np.ones((1, emitted.shape[1])), known)
+            frames += least[:, None, None] * self._class_frames(grid, replicates, np.ones((1, emitted.shape[1])), known)
         return frames / samples
 
     def lamps(
@@ -203,9 +203,9 @@ class Sample:
         """
         pattern = np.zeros((1, self.lighting.weights.shape[1] + 1))
         pattern[:, -1] = 1
-        return self._lit(grid, replicates, pattern, known) / samples
+        return self._class_frames(grid, replicates, pattern, known) / samples
 
-    def _lit(
+    def _class_frames(
         self, grid: Grid, replicates: Sequence[PathSamples], patterns: FloatArray, known: Known | None
     ) -> FloatArray:
         """(replicates, patterns, rows, columns) frames of classes that are lit in ``patterns`` (patterns, classes),

@@ -104,7 +104,7 @@ def make_plan(
         if _SELDOM * runs.work(run) > worth:
             break
         runs.refine(run)
-    return _decided(runs, accuracy, switches or {}).taking(plan=time.perf_counter() - started)
+    return _decide(runs, accuracy, switches or {}).taking(plan=time.perf_counter() - started)
 
 
 @single_threaded_blas()
@@ -143,7 +143,7 @@ def plan_within(
         # It may say that no accuracy is kept at all, and then has the loosest.
         if finer.fits and finer.accuracy <= found.accuracy:
             runs, found = closer, finer
-    plan = _decided(runs, found.accuracy, switches).taking(plan=time.perf_counter() - started)
+    plan = _decide(runs, found.accuracy, switches).taking(plan=time.perf_counter() - started)
     return replace(plan, asked_seconds=seconds, warnings=(*time_warnings(found, seconds, around), *plan.warnings))
 
 
@@ -155,14 +155,14 @@ def _refuse_unfit(bench: Apparatus, switches: Mapping[str, bool]) -> None:
         check_openings(bench.geometry.build_mask(), float(bench.spectrum.wavelengths_nm.max()))
 
 
-def _decided(runs: pilot.PilotRuns, accuracy: float, switches: Mapping[str, bool]) -> Plan:
+def _decide(runs: pilot.PilotRuns, accuracy: float, switches: Mapping[str, bool]) -> Plan:
     """The plan at an ``accuracy`` of what ``runs`` found, with the unit costs of its choice measured."""
     pilot_result, bench = runs.pilot_result, runs.bench
     chosen = cheapest(accuracy, pilot_result, switches)
     if pilot_result.sharp is not None and Simulation(bench, chosen.settings).from_camera is not None:
         pilot_result, chosen = _with_heavy_paths(runs, accuracy, chosen, switches)
     simulation = Simulation(bench, chosen.settings)
-    timed = _timed(pilot_result, simulation, runs.lighting.labels, runs.seed)
+    timed = _time_paths(pilot_result, simulation, runs.lighting.labels, runs.seed)
     plan = explain_plan(accuracy, timed, SceneFacts.of(bench, switches), switches, chosen)
     plan = replace(plan, predicted_range=_range(timed, plan))
     if simulation.physics.mirrors:
@@ -197,10 +197,10 @@ def _with_heavy_paths(
         asked = {name: seconds[name] / FIXED.passes[name] for name in heavier}
         few = any(sample_cost.noise.heavy < _FEW for sample_cost in heavier.values())
         if paths > (_MOST_HEAVY_PATHS if few else min(_MOST_HEAVY_PATHS, _OF_ALL * sum(asked.values()))):
-            return pilot_result, _limited(planned, asked)
+            return pilot_result, _limit_samples(planned, asked)
 
 
-def _limited(chosen: Candidate, paths: Mapping[str, float]) -> Candidate:
+def _limit_samples(chosen: Candidate, paths: Mapping[str, float]) -> Candidate:
     """The choice with no more samples of light whose ``paths`` in a run are known than sampling stops at."""
     samples = dict(chosen.settings.samples)
     samples |= {name: MOST_PATHS / count * samples[name] for name, count in paths.items() if count > MOST_PATHS}
@@ -231,7 +231,7 @@ def _seconds(simulation: Simulation, name: str, seed: int, labels: Labels, sampl
     return time.perf_counter() - started
 
 
-def _timed(pilot_result: PilotResult, simulation: Simulation, labels: Labels, seed: int) -> PilotResult:
+def _time_paths(pilot_result: PilotResult, simulation: Simulation, labels: Labels, seed: int) -> PilotResult:
     """The ``pilot_result`` with the seconds that a path takes to be traced and accumulated in a ``simulation`` of the
     choice."""
     own, found, spread = integer(seed, "pilot", "paces"), {}, pilot_result.spread

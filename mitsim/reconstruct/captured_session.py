@@ -56,6 +56,9 @@ _CLIPPED, _FEW = 2e-3, 10
 """Part of a frame's pixels, and how many, at its largest number that are no chance: of noisy ones a few are."""
 
 
+# ---- From the frames of a real session to factors ----
+
+
 @checked
 def calibrate_frames(
     folder: Path | str | SessionFrames,
@@ -189,6 +192,9 @@ def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -
     return Factors.of(estimate, manifest)
 
 
+# ---- What is not known, and what is refused ----
+
+
 def _not_known(session: SessionFrames) -> Iterator[str]:
     """What neither frames nor list tell, and what follows."""
     listed = session.listed
@@ -231,6 +237,9 @@ def _check_levels(session: SessionFrames, uniform: FloatArray) -> None:
             f"list states digital.black_level_dn {digital.black_level_dn:g} and dark_current_e_per_s "
             f"{digital.dark_current_e_per_s:g}, which leave no light; state levels in the numbers of the files"
         )
+
+
+# ---- Frames as electrons a second ----
 
 
 @dataclass(frozen=True, eq=False)
@@ -443,6 +452,9 @@ class _Readings:
         return _Reading(digital.rate(total / len(frames)), Ladder((digital,)), len(frames))
 
 
+# ---- Sums over responses, and the estimate ----
+
+
 @single_threaded_blas()
 def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, CheckedSession]:
     """Factors, the rms noise of the responses [electrons/s] where the list states the sensor's, and which frames are
@@ -498,7 +510,7 @@ def _sums(
     return sums, variances
 
 
-# -------- One frame taken at several exposure times in
+# ---- One frame at several exposure times ----
 
 Chosen = npt.NDArray[np.bool_] | bool
 """Pixels (rows, columns) that are chosen, or all or none."""

@@ -322,7 +322,7 @@ class Classes:
         if not self.factorised:
             return FactorisedClasses(self, lam, None)
         grams = self._grams.reshape(self.k**2, self._side**2, self._side**2)
-        lit = self._split(np.ones((self.camera.n,) * 2)).reshape(self.k**2, -1) > 0
+        lit = self._split_classes(np.ones((self.camera.n,) * 2)).reshape(self.k**2, -1) > 0
 
         def factor(index: int) -> FloatArray:
             gram = grams[index].copy()
@@ -342,7 +342,7 @@ class Classes:
     def normal(self, image: FloatArray) -> FloatArray:
         """(n, n) product of the normal matrix of all classes with an ``image`` (n, n)."""
         if not self.camera.cropped:
-            classes = fft.rfft2(self._split(image), self._section[0])
+            classes = fft.rfft2(self._split_classes(image), self._section[0])
             whole = fft.irfft2(classes * self._section[1], self._section[0])
             return self._join(whole[..., : self._side, : self._side])
         light = np.zeros_like(image)
@@ -360,7 +360,7 @@ class Classes:
         weight = 1 / (self._power[:, : self._grid[1] // 2 + 1] + least)
 
         def divide(image: FloatArray) -> FloatArray:
-            spectra = fft.rfft2(self._split(image), self._grid) * weight
+            spectra = fft.rfft2(self._split_classes(image), self._grid) * weight
             return self._join(fft.irfft2(spectra, self._grid)[..., : self._side, : self._side])
 
         return divide
@@ -422,7 +422,7 @@ class Classes:
             place[:] = fft.ifft2(spectrum).real[: self._side, : self._side]
         return self._join(classes.reshape(self.k, self.k, self._side, self._side))
 
-    def _split(self, image: FloatArray) -> FloatArray:
+    def _split_classes(self, image: FloatArray) -> FloatArray:
         """(k, k, side, side) classes of an image, zero beyond its edge."""
         room = self._side * self.k - self.camera.n
         padded = np.pad(image, ((0, room), (0, room)))
@@ -444,7 +444,7 @@ class Classes:
             below, right = step
             i = np.arange(below, side)[:, None]
             j = np.arange(max(right, 0), side + min(right, 0))[None, :]
-            shared = self._split(self._shared_light(below * k, right * k))
+            shared = self._split_classes(self._shared_light(below * k, right * k))
             grams[:, :, i, j, i - below, j - right] = shared[:, :, i, j]
 
         steps = product(range(side), range(1 - side, side))
@@ -492,7 +492,7 @@ class FactorisedClasses:
             # On a section's small grids the division would take longer than the steps that it saves.
             inverse = classes.inverse(self.lam) if classes.camera.cropped else None
             return conjugate_gradients(classes.normal, projected, self.lam, inverse, Ending(tolerance))
-        targets = classes._split(projected)
+        targets = classes._split_classes(projected)
         image = np.empty_like(targets)
         for index, factor in enumerate(self.factors):
             place = divmod(index, classes.k)

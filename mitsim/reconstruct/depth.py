@@ -53,6 +53,9 @@ _LAMBDA = 1e-3
 """Of the image by which the noise of factors is weighed, over the largest sigma^2: chosen, like that of pixeldepths."""
 
 
+# ---- A depth, its error and its alternatives ----
+
+
 @dataclass(frozen=True)
 class Alternative:
     """Another depth [mm] that explains the measurements as well, and what it explains less, rms part of all of them."""
@@ -95,6 +98,9 @@ class Depth:
             return found
         near, far = self.range_mm
         return f"{found} +- {self.error_mm:.1g}, by the least misfit from {near:.0f} to {far:.0f} mm"
+
+
+# ---- The search for the depth that leaves least ----
 
 
 def chance_difference(difference: float, variance: float, unknowns: int) -> float:
@@ -215,6 +221,8 @@ class _Search:
         measured = np.outer(left.singular, right.singular) > 0
         return self._all.energy - float(np.square(project_frames(left, right, self._all.stack)[measured]).sum())
 
+    # ---- Valleys of the energy over 1/z ----
+
     def _valleys(self, first: float, last: float) -> Iterator[tuple[float, float]]:
         """Energy left over at the bottom of the lowest valley between two changes of 1/z and of those that may be as
         low, and changes of 1/z."""
@@ -256,6 +264,8 @@ class _Search:
         )
         return float(least.fun), float(least.x)
 
+    # ---- Standard error, and valleys that may be as low ----
+
     def _certainty(self, shift: float, least: float) -> tuple[float, float]:
         """Standard error of the ``shift`` that leaves ``least``, from a parabola through quarters of a pixel: what is
         left over rises by its own mean over a datum; and how much more is left a pixel beside."""
@@ -278,6 +288,8 @@ class _Search:
         noise."""
         least = valleys[0][0]
         return [each for each in valleys[1:] if each[0] - least < self._indifferent(each[0] - least, least, misfit)]
+
+    # ---- Print, and what stays unexplained ----
 
     def _print_part(self, shift: float) -> float:
         """Part of the misfit at the depth of ``shift`` that is print finer than a scene pixel: its light lies on either
@@ -312,7 +324,7 @@ class _Search:
         return 1 / (self._inverse + shift)
 
 
-# -------- Shots and factors in
+# ---- A basis that factors of all depths share ----
 
 RANGE = 0.25
 """Depths that are looked for where no range is given, as a part of 1/z: 320 to 533 mm for 400. A baseline of 60 mm
@@ -436,6 +448,9 @@ class CommonBasis:
 
     def _own(self, columns: FloatArray) -> FloatArray:
         return centre_columns(columns) if self._centre else columns
+
+
+# ---- The range of depths, and vectors of the basis ----
 
 
 def shifts_searched(factors: Factors, depth_range: tuple[float, float] | None) -> tuple[float, float]:

@@ -43,6 +43,9 @@ _TURNS, _TURNED = 30, 1e-13
 each step took away 63 % or more, so that no more than the last change is left. A board's responses take four."""
 
 
+# ---- Estimated factors ----
+
+
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """Factors as :func:`estimate_factors` found them, and how far to trust them; once they are those of a camera, with
@@ -83,6 +86,9 @@ class Estimate:
     def ok(self) -> bool:
         """Whether the factors can be used as they are."""
         return self.status.ok
+
+
+# ---- Sums over the responses of a side ----
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,6 +290,9 @@ def stripe_sums(
     return left, right
 
 
+# ---- From responses, or their sums, to factors ----
+
+
 def estimate_factors(
     horizontal: Iterable[npt.ArrayLike],
     vertical: Iterable[npt.ArrayLike],
@@ -392,6 +401,9 @@ def factors_of_sums(
     )
 
 
+# ---- The error that noise makes ----
+
+
 def predicted_error(factor: FloatArray, noise: float, common_norm: float, count: int) -> float:
     """Relative Frobenius error of a factor when every datum has independent noise.
 
@@ -417,6 +429,9 @@ def predicted_error(factor: FloatArray, noise: float, common_norm: float, count:
     return float(deviation * np.sqrt(factor.size) / norm) if norm else float("inf")
 
 
+# ---- Means of a frame over rows and columns ----
+
+
 def _marginals(frame: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Means of a ``frame`` (rows, columns) over groups of rows, and over groups of columns, ``_BINS`` at most."""
     rows, columns = frame.shape
@@ -435,6 +450,9 @@ def _group_means(values: FloatArray) -> FloatArray:
         return values
     starts = np.arange(_BINS) * len(values) // _BINS
     return np.asarray(np.add.reduceat(values, starts) / np.diff(np.append(starts, len(values))))
+
+
+# ---- Whether the factors can be used ----
 
 
 def decibels(part: float) -> float:
@@ -466,6 +484,9 @@ def _status(inseparable: bool, residual: float, error: float, lost: tuple[int, i
             figures,
         )
     return Status(Verdict.CALIBRATED, "Calibrated: responses are separable", "", figures)
+
+
+# ---- Singular values: condition and rank ----
 
 
 @dataclass(frozen=True, eq=False)
@@ -508,6 +529,9 @@ def squared_condition(phi: FloatArray) -> float:
     return _Singular.of(phi).squared_condition
 
 
+# ---- The uniform response as a product of two vectors ----
+
+
 def _rank_one_split(mean: FloatArray) -> tuple[FloatArray, FloatArray]:
     """a, v of equal norm with mean = a v^T in the least-squares sense, a with positive sum."""
     right = _largest_right_vector(mean)
@@ -538,6 +562,9 @@ def _unit(vector: FloatArray) -> FloatArray:
     """``vector`` over its norm; zeros as they are."""
     norm = float(np.linalg.norm(vector))
     return vector / norm if norm else vector
+
+
+# ---- Responses and patterns as they are read ----
 
 
 def _next(responses: Iterator[npt.ArrayLike], side: str, index: int, count: int) -> npt.ArrayLike:

@@ -51,6 +51,9 @@ LEAST_PART = 0.5
 """Part of the sensor's rows that must remain: chosen, as fewer would be another camera."""
 
 
+# ---- Factors moved to another depth ----
+
+
 @dataclass(frozen=True, eq=False)
 class MovedFactors:
     """``factors`` of a depth, on the sensor's ``rows`` and ``columns`` where these are known; ``sensor`` is the whole's
@@ -132,6 +135,9 @@ def pixels_of_parallax(parallax: Parallax, axis: int, count: int) -> tuple[float
     return edges[0] / pixel, edges[1] / pixel, 1 / pixel
 
 
+# ---- One factor at any depth ----
+
+
 @dataclass(frozen=True, eq=False)
 class FactorOfDepths:
     """A calibrated ``factor`` (m, n), the left one (``axis`` 0) or the right one (1), and how it moves with depth."""
@@ -186,6 +192,8 @@ class FactorOfDepths:
         tangent = first + (column + 0.5) * pixel - self._place[:, None] / self.parallax.depth_mm
         return np.clip((stop - np.abs(tangent)) / pixel + 0.5, 0.0, 1.0)
 
+    # ---- Columns beside the window, and shadows between columns ----
+
     def beyond(self, margin: int) -> tuple[FloatArray, slice]:
         """(m, ``margin`` + n + ``margin``) columns at the calibrated depth, with those beside the window, which no
         projector pixel lights; what there is to see beyond the sensor's edge is taken from the last pixel. And the
@@ -217,6 +225,8 @@ class FactorOfDepths:
     @cached_property
     def _shadow(self) -> ColumnSpline:
         return ColumnSpline(self.factor / self._own_brightness, self._step)
+
+    # ---- Brightness of projector pixels ----
 
     @cached_property
     def _own_brightness(self) -> FloatArray:
@@ -262,6 +272,8 @@ class FactorOfDepths:
             changes.append(weight[:, None] * (powers[0] - powers[1]))
         return np.asarray(np.linalg.lstsq(np.concatenate(changes), np.concatenate(unlike), rcond=None)[0])
 
+    # ---- Parallax, and places on the sensor ----
+
     @property
     def _parallax_pixels(self) -> tuple[float, float, float]:
         return pixels_of_parallax(self.parallax, self.axis, self.factor.shape[1])
@@ -284,6 +296,9 @@ class FactorOfDepths:
         return self.parallax.pitch_mm(self.axis)
 
 
+# ---- Interpolation between columns ----
+
+
 def _whole(known: npt.NDArray[np.bool_]) -> slice:
     """Rows of which all numbers are ``known``."""
     inside = np.flatnonzero(known.all(axis=1))
@@ -301,6 +316,9 @@ def _cubic(factor: FloatArray, row: npt.NDArray[np.intp], column: FloatArray) ->
         t * (t - 1) * (t - 2) / 6,
     )
     return np.asarray(sum(weight * factor[row, start + k] for k, weight in enumerate(weights)))
+
+
+# ---- Captures of which something is changed ----
 
 
 class DerivedCapture(Capture):
@@ -345,6 +363,9 @@ class _Part(DerivedCapture):
 
     def _cut(self, values: FloatArray) -> FloatArray:
         return values[self._part.rows, self._part.columns]
+
+
+# ---- Dots whose light parallax moves onto another dot's place ----
 
 
 def parallax_period(patterns: tuple[FloatArray, FloatArray], parallax: Parallax) -> float:

@@ -65,6 +65,9 @@ _TILES = 8
 """Tiles a side of the sensor's map: 64 x 64 pixels each of 512 x 512, so that a highlight fills some of them."""
 
 
+# ---- The misfit, and what is said of it ----
+
+
 @dataclass(frozen=True, eq=False)
 class Misfit:
     """What the model leaves unexplained.
@@ -183,6 +186,9 @@ class Misfit:
 def chi_square_text(chi_square: float) -> str:
     """A ``chi_square`` as people read it: fitting images differ in the third decimal, others by orders of magnitude."""
     return f"{chi_square:.3f}" if chi_square < 10 else f"{chi_square:.3g}"
+
+
+# ---- Residuals of all measurements ----
 
 
 class Residuals:
@@ -313,6 +319,9 @@ class Residuals:
         return np.asarray(np.add.reduceat(rows, self._starts, axis=1))
 
 
+# ---- Measurements held against the model ----
+
+
 def find_misfit(
     check: FrameCheck, factor_energy: float | None, print_energy: float, evidence: Evidence, with_defects: bool = True
 ) -> Misfit | None:
@@ -387,6 +396,9 @@ def faulty_frames(check: FrameCheck, beside_noise: float, evidence: Evidence) ->
     return check.faults(Residuals.of(check, evidence).by_pattern, beside_noise, fits=False)
 
 
+# ---- Energies found and expected ----
+
+
 @dataclass(frozen=True, eq=False)
 class Balance:
     """Energies by tile of the sensor, or of all of it.
@@ -450,7 +462,7 @@ def _chance(noise: FrameNoise, pixels: float) -> float:
     return CHANCE * float(np.sqrt(2 * np.square(noise.variance).sum() / pixels)) / total
 
 
-# -------- Separable terms that factors lack, an image in
+# ---- Separable terms that factors lack ----
 
 
 @dataclass(frozen=True, eq=False)

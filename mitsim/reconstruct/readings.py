@@ -287,7 +287,7 @@ class ToneCurves:
         largest = max(float(read.max()) for each in self.measured() for read in _shots(each))
         own = float(digital.rate(np.array(digital.saturation_dn))) if digital.saturation_dn else largest
         own, dark = max(own + digital.dark_current_e_per_s, _TINY), digital.dark_current_e_per_s
-        most = self._held(_Curve(_power(1.0), own, own)).unlikely
+        most = self._compare(_Curve(_power(1.0), own, own)).unlikely
         tried = {words: _Curve(shape, own, own) for words, shape in _SHAPES.items()}
         for bits in _BITS:
             top = float(digital.rate(np.array(2.0**bits - 1))) + dark
@@ -299,13 +299,13 @@ class ToneCurves:
                 tried |= {f"{words} instead of its own": _Curve(shape, top, own) for words, shape in over.items()}
         fits: dict[str, float] = {}
         for words, curve in tried.items():
-            held = self._held(curve)
+            held = self._compare(curve)
             if held.unlikely < most:
                 fits[words] = held.away
         best = min(fits, key=lambda words: fits[words], default="")
         return best if best and self._fits_parts(tried[best]) else ""
 
-    def _held(self, curve: _Curve) -> _Held:
+    def _compare(self, curve: _Curve) -> _Held:
         """All measurements against the model, and of signed patterns the sums of their halves, which are all alike."""
         sums, total, energy, noise, logarithms, count = self.prepared.accumulator(), np.zeros(()), 0.0, 0.0, 0.0, 0
         for each in self._linear(curve):
@@ -323,7 +323,7 @@ class ToneCurves:
 
     def _fits_parts(self, curve: _Curve) -> bool:
         """Whether dark and bright readings have their noise left, each part of them."""
-        weights, prepared = self._held(curve).weights, self.prepared
+        weights, prepared = self._compare(curve).weights, self.prepared
         parts = np.zeros((2, _CURVE_PARTS))
         for each in self._linear(curve):
             residual = prepared.as_solved(each.frame) - prepared.frame(weights, each.pattern)

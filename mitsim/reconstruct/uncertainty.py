@@ -207,16 +207,16 @@ class Propagation:
         sides = zip(self.model.sides, (rows, columns), strict=True)
         left, right = (side.common * np.sqrt(variance)[:, None] for side, variance in sides)
         mean = max(float(rows.mean()), float(columns.mean()))
-        return np.asarray(self._taken(left, right) / (mean or 1.0))
+        return np.asarray(self._image_variance(left, right) / (mean or 1.0))
 
     def of_light(self, variance: float) -> FloatArray:
         """(n, n') variance of the image by an independent error of this ``variance`` in every scene pixel's light."""
         left, right = self.model.sides
         if left.dual is None and right.dual is None:  # what coefficients get is then independent too
             return self._spread(variance * np.square(self._sigma))
-        return variance * self._taken(left.response, right.response)
+        return variance * self._image_variance(left.response, right.response)
 
-    def _taken(self, left: FloatArray, right: FloatArray) -> FloatArray:
+    def _image_variance(self, left: FloatArray, right: FloatArray) -> FloatArray:
         """(n, n') variance of the image of W = left^T E right, E (s, s') independent numbers of variance 1.
 
         Parameters

@@ -41,6 +41,8 @@ from mitsim.reconstruct.result import check_same_inputs
 from mitsim.reconstruct.solver import prepare
 from mitsim.report.colour_image import PAGE, ColourImage, board_of, write_page
 
+# ---- Images of all lines, and what is said of them ----
+
 
 @dataclass(frozen=True, eq=False)
 class JudgedMosaic:
@@ -132,6 +134,9 @@ class JudgedMosaic:
         return self.colours._repr_html_()
 
 
+# ---- From a run to its images ----
+
+
 @single_threaded_blas()
 def reconstruct_mosaic(
     run: Path | str,
@@ -221,6 +226,9 @@ def fitting_factors(shots: MosaicCapture, calibration: Path) -> dict[str, Factor
     return found
 
 
+# ---- Unexplained energy, quality and warnings ----
+
+
 @dataclass(frozen=True)
 class _Energies:
     """Sums over all data of a run: of their squares, and of their noise's variances."""
@@ -288,6 +296,9 @@ def _warnings(
     return tuple(warnings)
 
 
+# ---- Files of an image ----
+
+
 def _may_replace(folder: Path, options: Mapping[str, str | float], overwrite: bool) -> bool:
     """Whether a ``folder`` holds an image that may be replaced: ``overwrite``, or of the same inputs ``asked`` for.
 
@@ -314,7 +325,7 @@ def _write(found: JudgedMosaic, folder: Path, options: Mapping[str, str | float]
     spectral_manifests.write_colours(folder, found.colours.lines, inputs=dict(options), **parts)
 
 
-# -------- Measured frames behind colour filters and each line's factors in
+# ---- A camera under a mosaic of colour filters ----
 
 Patterns = tuple[FloatArray, FloatArray]
 Lambda = float | Literal["auto"]
@@ -371,6 +382,9 @@ class MosaicCamera:
                 for row, term in zip(weights, terms, strict=True)
             ]
         )
+
+
+# ---- Ways from frames to images of the lines ----
 
 
 @dataclass(frozen=True, eq=False)
@@ -498,6 +512,9 @@ class _Joint:
         energy, images = self._planes.energy, found.images
         left = energy + float(np.vdot(images, self._model.normal(images) - 2 * self._gathered))
         return LineImages(images, lam, float(np.sqrt(max(left, 0.0) / energy)), found)
+
+
+# ---- Planes of filters, and demosaicing ----
 
 
 def planes_of(frame: FloatArray) -> list[FloatArray]:

@@ -89,7 +89,7 @@ def curves(
             points = sorted((float(number), mean.value, mean.error) for number, mean in curve.items())
             numbers, means, errors = np.array(points).reshape(-1, 3).T
             style = {"marker": "o", "ms": 5.0, "capsize": 3, "lw": 1.8, **line_style(names.index(name))}
-            axes.errorbar(numbers, means, _known(errors), label=name, **style)
+            axes.errorbar(numbers, means, _bar_errors(errors), label=name, **style)
         axes.set_title(panel, fontsize=FONT)
         label_axes(axes, x, fill(y, _UPRIGHT_LETTERS) if axes is places[0][0] else "")
         if log:
@@ -162,9 +162,9 @@ def pair_chart(values: Mapping[str, tuple[Mean, Mean]], labels: tuple[str, str],
     first, second = (
         np.array([(pair[index].value, pair[index].error) for _, pair in ordered]).reshape(-1, 2).T for index in (0, 1)
     )
-    axes.barh(rows, first[0], 0.66, xerr=_known(first[1]), color=PALE, capsize=3, label=labels[0])
+    axes.barh(rows, first[0], 0.66, xerr=_bar_errors(first[1]), color=PALE, capsize=3, label=labels[0])
     style: dict[str, Any] = {"color": VERMILION, "ms": 5.5, "capsize": 3, "lw": 0, "elinewidth": 1.5}
-    axes.errorbar(second[0], rows, xerr=_known(second[1]), fmt="D", label=labels[1], **style)
+    axes.errorbar(second[0], rows, xerr=_bar_errors(second[1]), fmt="D", label=labels[1], **style)
     _name_rows(axes, [name for name, _ in ordered])
     label_axes(axes, x, "", grid="x")
     return figure
@@ -275,7 +275,7 @@ def quality_bars(quality: Mapping[str, tuple[Mean, Mean]], title: str = "") -> F
     looks = (-0.2, PALE, "idealised model, ideal factors"), (0.2, BLUE, "rendered light, calibrated factors")
     for means, (shift, colour, label) in zip(zip(*quality.values(), strict=True), looks, strict=True):
         values, errors = (np.array([getattr(mean, part) for mean in means]) for part in ("value", "error"))
-        bars = axes.bar(place + shift, values, 0.38, color=colour, label=label, yerr=_known(errors), capsize=3)
+        bars = axes.bar(place + shift, values, 0.38, color=colour, label=label, yerr=_bar_errors(errors), capsize=3)
         axes.bar_label(bars, fmt="%.1f", fontsize=FONT - 1, padding=2)
     if title:
         figure.suptitle(title, fontsize=FONT)
@@ -350,7 +350,7 @@ def beside(axes: Axes, row: float, points: float, text: str, **style: Any) -> No
     axes.annotate(text, (1.0, row), (points, 0), **{**options, **style})
 
 
-def _known(errors: FloatArray) -> FloatArray | None:
+def _bar_errors(errors: FloatArray) -> FloatArray | None:
     """Errors of bars; None where none is known, so that no bar of zero is drawn."""
     return None if np.isnan(errors).all() else errors
 

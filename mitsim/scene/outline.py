@@ -327,7 +327,7 @@ class SceneFiles:
     def included(self, tag: Tag, name: str) -> Path:
         """The file ``name`` of the ``<include>`` at ``tag``, beside the file that names it; MitsimError as a
         resource."""
-        path = self._found(tag, tag.path.parent, name)
+        path = self._find(tag, tag.path.parent, name)
         _check_native(tag.path, path.parent)
         return path
 
@@ -341,15 +341,15 @@ class SceneFiles:
         folder
             where Mitsuba looks for it first.
         """
-        if self._found(tag, folder, name).stat().st_size > _MOST_SPECTRUM:
+        if self._find(tag, folder, name).stat().st_size > _MOST_SPECTRUM:
             raise tag.refusal("filename", repr(name), "the file is over 1 MiB; a spectrum is smaller")
 
     def resource(self, tag: Tag, name: str) -> Path:
         """The bitmap or mesh ``name`` at ``tag``: Mitsuba looks for it from the scene's folder, also where an included
         file names it. MitsimError when it lies elsewhere, or is no plain file of at most 512 MiB."""
-        return self._found(tag, self.folder, name)
+        return self._find(tag, self.folder, name)
 
-    def _found(self, tag: Tag, folder: Path, name: str) -> Path:
+    def _find(self, tag: Tag, folder: Path, name: str) -> Path:
         path = folder / name
         try:
             status = path.stat()

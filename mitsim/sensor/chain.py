@@ -113,18 +113,18 @@ def expose(
     dark = dark.reshape(-1) if isinstance(dark, np.ndarray) else dark
     arrays = light, dark, _few(light, dark, shot_rng), offset
     dtype = np.float64 if model.largest_dn is None else np.uint32
-    return by_pixel(_read_out, _shared(model), arrays, (shot_rng, read_rng), dtype).reshape(shape)
+    return by_pixel(_read_out, _numbers_of(model), arrays, (shot_rng, read_rng), dtype).reshape(shape)
 
 
 def _read_out(model: Any, light: Any, dark: Any, few: Any, offset: Any, shot: Any, read: Any) -> Any:
     """All stages from the Poisson draw on, of pixels whose normal deviates are ``shot`` and ``read``."""
-    electrons = bend(clip_at_full_well(_counted(light + dark, few, shot), model), model)
+    electrons = bend(clip_at_full_well(_electron_counts(light + dark, few, shot), model), model)
     if offset is not None:
         electrons = electrons + offset
     return quantise(amplify(add_read_noise(electrons, model, read), model), model)
 
 
-def _shared(model: SensorModel) -> dict[str, float | tuple[float, ...] | None]:
+def _numbers_of(model: SensorModel) -> dict[str, float | tuple[float, ...] | None]:
     """The numbers of ``model`` that :func:`_read_out` asks it for."""
     return {
         "superpixel_full_well_e": model.superpixel_full_well_e,
@@ -236,7 +236,7 @@ def draw_electrons(expected: FloatArray, rng: np.random.Generator) -> FloatArray
     number is a float64. ``rng`` gives what is random.
     """
     flat = np.reshape(expected, -1)
-    drawn = by_pixel(lambda _, *values: _counted(*values), {}, (flat, _few(flat, 0.0, rng)), (rng,))
+    drawn = by_pixel(lambda _, *values: _electron_counts(*values), {}, (flat, _few(flat, 0.0, rng)), (rng,))
     return np.asarray(drawn.reshape(np.shape(expected)))
 
 
@@ -252,7 +252,7 @@ def _few(light: FloatArray, dark: FloatArray | float, rng: np.random.Generator) 
     return counts
 
 
-def _counted(expected: Any, few: Any, z: Any) -> Any:
+def _electron_counts(expected: Any, few: Any, z: Any) -> Any:
     """Electrons of pixels, drawn before where they are ``few``, and elsewhere as probable as ``z``."""
     many = poisson_count(expected, z)
     return many if few is None else operations(many).select(few == few, few, many)

@@ -294,14 +294,14 @@ def _sum_counts(
 ) -> tuple[FloatArray, FloatArray]:
     """`moments` with those of the `hard` pixels summed over counts; `few`: which are dim, and which have some."""
     (dim, some), (mean, total) = few, moments
-    for part, found in ((dim, _counted), (some, _summed), (~dim & ~some, _average_counts)):
+    for part, found in ((dim, _sum_over_counts), (some, _sum_about_mean), (~dim & ~some, _average_counts)):
         part = hard & part
         if part.any():
             mean[part], total[part] = found(expected[part], model)
     return mean, total
 
 
-def _counted(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
+def _sum_over_counts(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
     """:func:`frame_moments` as a sum over electron counts; `expected` (pixels,) of few electrons."""
     most = float(expected.max())
     counts = np.arange(int(most + 12 * math.sqrt(most)) + 20, dtype=np.float64)
@@ -315,7 +315,7 @@ def _counted(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, Floa
     return levels[0] + first, np.maximum(second - first**2, 0.0)
 
 
-def _summed(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
+def _sum_about_mean(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
     """:func:`frame_moments` as a sum over the counts within 12 deviations, for some hundreds of electrons."""
     nodes = _grid(expected)
     reach = 12 * np.sqrt(nodes) + 20

@@ -122,7 +122,7 @@ class Ablation:
             return self.light
         bench, moved = self.light.bench, off & _MOVED
         # Light over mirrors lies among direct light, and only tracing tells one from the other.
-        direct = self._traced(direct=True, off=moved) if moved or MIRRORS in self.effects else self.light
+        direct = self._trace(direct=True, off=moved) if moved or MIRRORS in self.effects else self.light
         flux = self._exact if RENDER_NOISE in off else self.light.flux
         by_pixel = np.divide(flux, direct.flux, out=np.ones_like(flux), where=direct.flux > 0)
         groups = tuple(_scale(group, np.append(by_pixel * self._brightness(off), 0.0)) for group in direct.groups)
@@ -142,7 +142,7 @@ class Ablation:
             return None
         brightness = np.append(self._brightness(off), 1.0)
         if MIRRORS in self.effects:
-            light = self._traced(direct=False, off=off & {MIRRORS})
+            light = self._trace(direct=False, off=off & {MIRRORS})
             groups = tuple(_scale(group, brightness) for group in light.groups)
         else:
             lamps = np.append(np.zeros(len(brightness) - 1), 1.0)
@@ -156,7 +156,7 @@ class Ablation:
         """(n^2,) what each pixel's light is multiplied by."""
         return self._even if FALLOFF in off else np.ones_like(self._even)
 
-    def _traced(self, direct: bool, off: frozenset[str]) -> SampledLight:
+    def _trace(self, direct: bool, off: frozenset[str]) -> SampledLight:
         """Direct light, or all other, filed without some effects."""
         if (direct, off) not in self._kept:
             settings, bench = self.light.simulation.settings, self.light.bench

@@ -273,7 +273,7 @@ def front(rows: Sequence[Row], judge: float, noise: float | None) -> Figure:
     ratios = {"width_ratios": (3, 2)} if others else None
     figure, (panels,) = panels_of(1, 2 if others else 1, 0.5 * WIDTH, gridspec_kw=ratios)
     _draw(panels[0], runs, BLUE, "o")
-    titles = [f"whole runs, opening the scene to the last file\n{_counted(runs)}"]
+    titles = [f"whole runs, opening the scene to the last file\n{_count_points(runs)}"]
     if others:
         _draw(panels[1], others, VERMILION, "s")
         panels[1].plot([], [], "s", mfc="white", mec=VERMILION, label="extrapolated")
@@ -395,7 +395,7 @@ def _draw(axes: Axes, rows: Sequence[Row], colour: str, marker: str) -> None:
         axes.annotate(said, (spread.median, row.error), (6, 6), textcoords="offset points", fontsize=FONT - 2)
 
 
-def _counted(rows: Sequence[Row]) -> str:
+def _count_points(rows: Sequence[Row]) -> str:
     """What the points stand for."""
     repeats = {row.spread.repeats for row in rows}
     if repeats == {1}:
@@ -466,7 +466,7 @@ class Extra:
         with_it, without
             of the same work with and without the part.
         """
-        wide, narrow = (_widened(each) for each in (with_it, without))
+        wide, narrow = (_widen(each) for each in (with_it, without))
         return cls(with_it.median - without.median, wide.least - narrow.most, wide.most - narrow.least)
 
     @property
@@ -480,7 +480,7 @@ class Extra:
         return f"{self.median:.2g} s ({self.least:.2g} to {self.most:.2g})"
 
 
-def _widened(spread: Spread) -> Spread:
+def _widen(spread: Spread) -> Spread:
     """A single run with the spread that it was not given."""
     if spread.repeats > 1:
         return spread

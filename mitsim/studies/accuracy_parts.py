@@ -75,7 +75,7 @@ class Parts:
         full = _fill(self._plan.settings, stand.finest(self._plan).settings)
         self.accuracy, self.seconds, settings = _choose_samples(stand, full)
         self.full = replace(self._plan, settings=settings)
-        self._whole = self._timed(Trial("parts", "all", stand.bench, self.full, at_once))
+        self._whole = self._time(Trial("parts", "all", stand.bench, self.full, at_once))
         self._left = sorted(self._parts(settings), key=lambda part: -part.error.value)
 
     def measure(self, budget: Budget, share: float) -> None:
@@ -130,9 +130,9 @@ class Parts:
 
     def _without(self, name: str, error: Estimate, bench: Apparatus, plan: Plan) -> _Left:
         trial = Trial("parts", f"no {name}", bench, plan, at_once)
-        return _Left(name, error, trial, self._timed(trial))
+        return _Left(name, error, trial, self._time(trial))
 
-    def _timed(self, trial: Trial) -> Timed:
+    def _time(self, trial: Trial) -> Timed:
         """The light of a ``trial`` and its frames, with kernels compiled before the first time."""
         stand = self._stand
         ready = warm_up(stand, trial)

@@ -160,7 +160,7 @@ class Runs:
                 continue
             name = f"accuracy {_list(group)}"
             if first or budget.allows(name, budget.slower * predicted, share):
-                run = self._begun(group)
+                run = self._begin(group)
                 run.timed.seconds.append(run.timed.again())
                 self._runs.append(run)
                 budget.saw(run.timed.spread.median, predicted)
@@ -204,7 +204,7 @@ class Runs:
         for settings, group in groups.items():
             yield tuple(group), lit[settings] + around
 
-    def _begun(self, accuracies: tuple[float, ...]) -> _Run:
+    def _begin(self, accuracies: tuple[float, ...]) -> _Run:
         """A run at the tightest of its ``accuracies`` that was not made yet."""
         request = self._request.changed(accuracy=min(accuracies))
         light: list[float] = []

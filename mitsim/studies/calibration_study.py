@@ -59,6 +59,9 @@ _FORMED = frozenset({"diffraction", "mask-thickness", "black-level"})
 """Effects of which frames are formed again in the same light; for others light is traced again, by the same seed."""
 
 
+# ---- A session and the image made with it ----
+
+
 def measure(bench: Bench, request: Request, job: Job, recipe: SessionRecipe | None = None) -> CalibrationFindings:
     """Run a session and judge it.
 
@@ -125,6 +128,9 @@ def _image(stand: DriftStand, explained: float) -> dict[str, Any]:
         "photoelectrons": electrons,
         "photons": electrons / (stand.lit.bench.sensor.quantum_efficiency or np.nan),
     }
+
+
+# ---- Noisy factors against clean ones ----
 
 
 @single_threaded_blas()
@@ -228,6 +234,9 @@ def singular_rows(factor: str, exact: FloatArray, found: FloatArray, deviation: 
         )
 
 
+# ---- Cost of a session ----
+
+
 def session_cost(lit: LitSession) -> dict[str, float]:
     """Frames, seconds of exposure, expected photoelectrons and photons of a session ``lit``, without its read-out."""
     recipe, order = lit.session.recipe, len(lit.session.order)
@@ -241,6 +250,9 @@ def session_cost(lit: LitSession) -> dict[str, float]:
         "photoelectrons": electrons,
         "photons": electrons / (lit.session.bench.sensor.quantum_efficiency or np.nan),
     }
+
+
+# ---- What is not separable, by cause ----
 
 
 def _by_source(lit: LitSession, noisy: Estimate, clean: Estimate, job: Job) -> Iterator[ErrorSourceRow]:
@@ -268,7 +280,7 @@ def _row(cause: str, residual: float, left: float) -> ErrorSourceRow:
     return ErrorSourceRow(cause, left, float(np.copysign(np.sqrt(abs(less)), less)))
 
 
-# -------- What a calibration session came to in
+# ---- Rows of the findings, and their words ----
 
 _APART = 0.3
 """Predicted turn of its vectors [rad] up to which a singular value stands apart from others: beyond, noise mixes them,
@@ -346,6 +358,9 @@ class ErrorSourceRow:
     part: float
 
 
+# ---- Findings as text, figures and tables ----
+
+
 @dataclass(frozen=True, eq=False)
 class CalibrationFindings(Findings):
     """What a session came to.
@@ -399,7 +414,7 @@ class CalibrationFindings(Findings):
     def warnings(self) -> list[str]:
         """That the sources do not make the image's squared error, where chance does not either."""
         return [
-            f"losses: {_judged(row)}, {100 * row.squared_error / squared_error(self.image['psnr_db']):+.1f} % of its "
+            f"losses: {_verdict(row)}, {100 * row.squared_error / squared_error(self.image['psnr_db']):+.1f} % of its "
             "squared error, which may have a share in every other row; look for what the scene or the camera has that "
             "no row names"
             for row in self.losses
@@ -446,7 +461,7 @@ class CalibrationFindings(Findings):
             for row in self.losses
             if abs(row.lost_db) >= _SAID_DB or row.of == UNEXPLAINED
         )
-        yield from (_judged(row) for row in self.losses if row.of == UNEXPLAINED)
+        yield from (_verdict(row) for row in self.losses if row.of == UNEXPLAINED)
         yield from (f"not predicted: {text}" for text in self.not_predicted)
 
     def figures(self) -> dict[str, Figure]:
@@ -541,7 +556,7 @@ class CalibrationFindings(Findings):
         ]
         small = ", ".join(row.name for row in ordered if abs(row.lost_db) < _SAID_DB)
         untold = "".join(f" Not predicted: {text}." for text in self.not_predicted)
-        others = "".join(f" {_judged(row).capitalize()}." for row in rest)
+        others = "".join(f" {_verdict(row).capitalize()}." for row in rest)
         return Part(
             "What an image loses",
             f"The image of this scene under {image['patterns']} has a PSNR of {image['psnr_db']:.2f} dB with "
@@ -577,7 +592,10 @@ class CalibrationFindings(Findings):
         }
 
 
-def _judged(row: LossRow) -> str:
+# ---- Losses and causes in words ----
+
+
+def _verdict(row: LossRow) -> str:
     """What is to be said of what is not explained."""
     errors = abs(row.squared_error) / row.deviation if row.deviation else 0.0
     if errors <= 1:

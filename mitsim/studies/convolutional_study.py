@@ -63,6 +63,9 @@ _MAGNITUDE = 5.0
 Judge = Callable[[str], tuple[str, Holds]]
 
 
+# ---- What is measured with ----
+
+
 def _points(scope: Scope) -> Sequence[Point]:
     parameters = dict(scope.setup.parameters)
     measured = parameters.pop("psf", None)
@@ -97,6 +100,9 @@ def _truth(studio: Studio, point: Point) -> FloatArray:
     return np.asarray(picture(name).reshape(_N, block, _N, block).mean(axis=(1, 3)) / 255)
 
 
+# ---- PSNR and seconds at one point ----
+
+
 def _measure(studio: Studio, point: Point) -> Found:
     truth, k, seed = _truth(studio, point), round(point["patterns"] ** 0.5), int(point["seed"])
     psf, bench = _psf(point["file"], point.setup.variant), studio.bench(point.setup)
@@ -116,6 +122,9 @@ def _measure(studio: Studio, point: Point) -> Found:
             if point.setup.picture in (*QUICK_IMAGES, None) and exposure == EQUAL_FRAME:
                 arrays = image_array(solution.image)
     return Found(tuple(rows), arrays)
+
+
+# ---- Claims of the paper ----
 
 
 def _claims(results: Results) -> Sequence[Claim]:
@@ -192,6 +201,9 @@ def _judge(rows: Table, claim: str, paper: str, judge: Judge) -> Claim:
     return Claim(claim, paper, texts.get(MEASURED, ""), texts[TRACED], holds)
 
 
+# ---- Figures and the experiment ----
+
+
 def _figures(results: Results) -> Mapping[str, Figure]:
     quality, speed = results.table.where(part="quality"), results.table.where(part="speed")
     psfs = quality.distinct("psf")
@@ -255,7 +267,7 @@ EXPERIMENT = Experiment(
 )  # fmt: skip
 
 
-# -------- A convolutional camera, a reflectance image and a sensor in
+# ---- Noisy frames behind a diffuser ----
 
 WHITE_W_M2, WAVELENGTH_NM = 0.3, 550.0
 """Irradiance where all light of a white, uniformly lit scene falls: the paper's projector (0.14 W over 120 mm square
@@ -335,6 +347,9 @@ def take(
     return DiffuserShots(frames, time, saturated / frames.size)
 
 
+# ---- The best lambda ----
+
+
 def best_by_psnr(solve: Callable[[float], Solution], truth: FloatArray, largest: float) -> tuple[Solution, float]:
     """The solution nearest to the truth over lambda, to a quarter of a decade, and its PSNR [dB].
 
@@ -375,6 +390,9 @@ def best_image(classes: Classes, shots: DiffuserShots, truth: FloatArray) -> tup
     """
     projected = classes.projected(shots.frames)
     return best_by_psnr(lambda lam: classes.factorise(lam).solve(projected), truth, classes.largest)
+
+
+# ---- Iterations against the direct solver ----
 
 
 @dataclass

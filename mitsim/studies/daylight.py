@@ -161,10 +161,10 @@ class DaylitLine:
         bench, seconds, lamp = self.line.lit.bench, self.seconds(part), part * self.lamp
         exposer, read = Exposer(bench.rig, seconds, 0), 2 if self.family.signed else 1
         frames, off = ((exposer.sensor_noise((light + lamp) * seconds) / seconds) ** 2 for light in (self.levels[1], 0))
-        own, common = self._magnified(place)
+        own, common = self._noise_gain(place)
         return read * frames * own + (off / self.shots * common if self.shots else 0.0)
 
-    def _magnified(self, place: ChartPlace) -> tuple[FloatArray, FloatArray]:
+    def _noise_gain(self, place: ChartPlace) -> tuple[FloatArray, FloatArray]:
         """(patches,) variances of means over a unit of noise in every frame, and in what is taken off all of them."""
         both = []
         for top, bottom, first, last in place.patches:

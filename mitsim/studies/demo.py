@@ -309,7 +309,7 @@ class Comparison:
         family = lit.bench.family(name, seed)
         frames, ideal = lit.rendered(self.factors, family, seed), lit.idealised(family, seed)
         times = {convention: frames.seconds(convention) for convention in CONVENTIONS}
-        rendered = {times[EQUAL_PEAK]: self._trusted(shots or expose(self.light, name))}
+        rendered = {times[EQUAL_PEAK]: self._recover(shots or expose(self.light, name))}
         for time in times.values():
             if time not in rendered:
                 rendered[time] = self._recovery(frames, time)
@@ -336,7 +336,7 @@ class Comparison:
     def _lit(self) -> LitScene:
         return LitScene(self.light)
 
-    def _trusted(self, shots: Capture) -> Recovery:
+    def _recover(self, shots: Capture) -> Recovery:
         """As a user's own frames are reconstructed."""
         image = reconstruct(shots, self.factors)
         quality = self._lit.quality(image.image)

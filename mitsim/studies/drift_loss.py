@@ -169,11 +169,11 @@ class DriftStand:
         scene, model = lit or self.lit, self._model
         if session is not None:
             model = scene.rendered(session, self.family, self.seed).prepared()
-        solutions = self._solved(drift, scene, model)
+        solutions = self._solve(drift, scene, model)
         same, own = (psnr(solution.image, scene.truth) for solution in solutions)
         return same, own
 
-    def _solved(self, drift: Drift, scene: LitScene, model: Prepared) -> tuple[Solution, Solution]:
+    def _solve(self, drift: Drift, scene: LitScene, model: Prepared) -> tuple[Solution, Solution]:
         bench = scene.bench
         moved = any(drift.mask_mm) or drift.motion is not None or drift.tilt_mrad is not None
         expected = scene.expected(RENDERED, self.family, bench=drift_mask(bench, drift) if moved else None)
@@ -238,7 +238,7 @@ class DriftStand:
 
     def expected_image(self, drift: Drift) -> Expected:
         """What the image is expected to be after a ``drift``, as the model has it; MitsimError as :meth:`predict`."""
-        image, changed = self.linear, self._changed(drift)
+        image, changed = self.linear, self._frame_changes(drift)
         if drift.session_ramp or drift.session_flicker:
             left, right = self.session_mixes(drift)
             image = replace(image, left=self.factors.left @ left, right=self.factors.right @ right)
@@ -294,7 +294,7 @@ class DriftStand:
     def _takes_ambient(self) -> bool:
         return takes_ambient_frame("auto", self.family, self._expected)
 
-    def _changed(self, drift: Drift) -> Changed:
+    def _frame_changes(self, drift: Drift) -> Changed:
         """What a ``drift`` changes in the frames, to first order where several things drift at once."""
         count = self.family.left.shape[1], self.family.right.shape[1]
         ramp = levels(self.seed, "power", len(self.family.shots), drift.power_ramp).reshape(*count, -1)
@@ -366,7 +366,7 @@ class DriftStand:
     def scatter(self, drift: Drift, error: FloatArray) -> float:
         """Variance that the draw of a random ``drift`` brings into the mean squared error, beside an ``error`` (n, n')
         of the image without it."""
-        return self.linear.scatter(self.lit.truth, self._changed(drift), error) / error.size**2
+        return self.linear.scatter(self.lit.truth, self._frame_changes(drift), error) / error.size**2
 
     def _terms(self, drift: Drift) -> SeparableTerms:
         """What a ``drift`` of mask or projector adds to the camera's operator, in the unit of its factors."""
@@ -375,16 +375,16 @@ class DriftStand:
         at_rest = drift.model_copy(update={"mask_rotation_mrad": 0.0, "vibration_um": 0.0})
         found = self._shadow(drift_projector(drift_mask(bench, at_rest), drift)) + _minus([best])
         if drift.vibration_um:
-            parts = [(self._shifted(place * drift.vibration_um / 1e3), weight) for place, weight in _HERMITE]
+            parts = [(self._shift(place * drift.vibration_um / 1e3), weight) for place, weight in _HERMITE]
             found += _weigh(parts) + _minus(self._shadow(bench))
         if drift.mask_rotation_mrad:
-            found += self._turned(drift.mask_rotation_mrad / 1e3)
+            found += self._turn(drift.mask_rotation_mrad / 1e3)
         rate = electrons_from_irradiance(
             self.lit.board_flux, 1.0, bench.sensor, bench.projector.effective_wavelength_nm
         )
         return [(float(rate) * left, right) for left, right in found]
 
-    def _turned(self, angle: float) -> SeparableTerms:
+    def _turn(self, angle: float) -> SeparableTerms:
         """Change of the shadow to first order in the ``angle``: theta (s_col d/d s_row - s_row d/d s_col)."""
         camera = IdealCamera(self.lit.bench, self.lit.bench.geometry.mask)
         shadow = ShadowGeometry.of(camera.bench.geometry, camera.bench.geometry.scene_distance)
@@ -392,7 +392,7 @@ class DriftStand:
             shadow.along(axis).crossings(directions) - camera.bench.geometry.mask_offset[axis]
             for axis, directions in enumerate(camera.directions)
         )
-        still, ahead, behind = (self._shifted(shift) for shift in (0.0, _STEP_MM, -_STEP_MM))
+        still, ahead, behind = (self._shift(shift) for shift in (0.0, _STEP_MM, -_STEP_MM))
         found: SeparableTerms = []
         for (left, right), (left_ahead, right_ahead), (left_behind, right_behind) in zip(
             still, ahead, behind, strict=True
@@ -401,7 +401,7 @@ class DriftStand:
             found += [(angle * slopes[0], column * right), (-angle * row * left, slopes[1])]
         return found
 
-    def _shifted(self, by_mm: float) -> SeparableTerms:
+    def _shift(self, by_mm: float) -> SeparableTerms:
         """The shadow with every profile shifted ahead: of the mask moved back."""
         back = Drift(mask_rows_um=-1e3 * by_mm, mask_columns_um=-1e3 * by_mm)
         return self._shadow(drift_mask(self.lit.bench, back))

@@ -80,7 +80,7 @@ def _points(scope: Scope) -> Sequence[Point]:
 
 def _measure(studio: Studio, point: Point) -> Found:
     method, side, lit = point["patterns"], round(point["frames"] ** 0.5), studio.lit(point.setup)
-    images = _moved(studio, point, lit) if method in (SWEPT, LINE) else _still(studio, point, lit)
+    images = _moving(studio, point, lit) if method in (SWEPT, LINE) else _still(studio, point, lit)
     rows = tuple(point.row(exposure=exposure, **image.row()) for exposure, image in images.items())
     kept = point.setup.picture in (*QUICK_IMAGES, None) and side in (1, 7) and method != LINE
     return Found(rows, image_array(images[EQUAL_FRAME].image) if kept else {})
@@ -98,7 +98,7 @@ def _still(studio: Studio, point: Point, lit: LitScene) -> dict[str, Image]:
     return {exposure: Image.of(frames, frames.seconds(exposure)) for exposure in EXPOSURES}
 
 
-def _moved(studio: Studio, point: Point, lit: LitScene) -> dict[str, Image]:
+def _moving(studio: Studio, point: Point, lit: LitScene) -> dict[str, Image]:
     """Images through the moved mask, by exposure."""
     model, feature = point["model"], lit.bench.geometry.mask_feature
     columns: tuple[float, ...]
@@ -355,7 +355,7 @@ class MovedMask:
         model = prepare(left, right, uniform, uniform)
         sums = model.accumulator()
         with single_threaded_blas():
-            frames = [[self._measured(row, column, seconds) for column in columns_mm] for row in rows_mm]
+            frames = [[self._measure_at(row, column, seconds) for column in columns_mm] for row in rows_mm]
             sums.add(np.block(frames), 0, 0)
             return model.solve(sums)
 
@@ -368,7 +368,7 @@ class MovedMask:
         factor = self.factors[place][axis]
         return centre_columns(factor) if self._centre else factor
 
-    def _measured(self, row_mm: float, column_mm: float, seconds: float) -> FloatArray:
+    def _measure_at(self, row_mm: float, column_mm: float, seconds: float) -> FloatArray:
         """Noisy electrons a second at one place, of ambient light what a user takes off."""
         bench, expected = self.lit.bench, self.expected(row_mm, column_mm)
         speckle = self.lit.light.simulation.physics.speckle if self.model == RENDERED else 0.0

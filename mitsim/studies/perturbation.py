@@ -60,6 +60,9 @@ Gains = Sequence[float | FloatArray]
 """Root mean squares of gains that know nothing of each other: of a whole frame, or (m,) of its rows."""
 
 
+# ---- One side of the camera by its singular vectors ----
+
+
 @dataclass(frozen=True, eq=False)
 class Axis:
     """One side.
@@ -102,6 +105,9 @@ class Axis:
         """(r, n) variance of G where each number of the factor has variance 1."""
         mixed = np.einsum("nk,kmr->nmr", self.patterns, self.slabs, optimize=True)
         return np.asarray(np.square(mixed).sum(axis=1).T)
+
+
+# ---- Frames that are not what factors say, and the image expected of them ----
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +168,9 @@ class Changed:
     added_common: Gains = ()
 
 
+# ---- Noise of independent numbers ----
+
+
 @dataclass(frozen=True)
 class Noise:
     """Noise that is independent in every number, as variances.
@@ -195,6 +204,9 @@ class Noise:
     def __sub__(self, other: Noise) -> Noise:
         """All but an ``other`` that is part of it."""
         return Noise(*(getattr(self, each.name) - getattr(other, each.name) for each in fields(self)))
+
+
+# ---- A linear solver with its lambda fixed ----
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,6 +282,8 @@ class LinearImage:
         terms = self._by_gains(scene, changed)
         return sum(4 * float((off * term).sum()) ** 2 + 2 * self._energy(np.square(term)) ** 2 for term in terms)
 
+    # ---- What gains and pixels' response add to W ----
+
     def _by_gains(self, scene: FloatArray, changed: Changed) -> Iterator[FloatArray]:
         """(r, r') what each gain that varies adds to W, by its rms."""
         left, right = self.axes
@@ -308,6 +322,8 @@ class LinearImage:
             weights += gain[row, column] * left.slabs[row].T @ (response * frame) @ right.slabs[column]
         return weights
 
+    # ---- Variance by noise ----
+
     def variance(self, scene: FloatArray, noise: Noise) -> float:
         """Sum of the variances of all numbers of the image of a ``scene`` (n, n') by ``noise``."""
         units = self.units(scene)
@@ -341,8 +357,8 @@ class LinearImage:
     @cached_property
     def axes(self) -> tuple[Axis, Axis]:
         """Left and right."""
-        left = Axis.of(self._centred(self.left), self.family.left.astype(np.float64))
-        right = Axis.of(self._centred(self.right), self.family.right.astype(np.float64))
+        left = Axis.of(self._centre(self.left), self.family.left.astype(np.float64))
+        right = Axis.of(self._centre(self.right), self.family.right.astype(np.float64))
         return left, right
 
     @cached_property
@@ -351,8 +367,11 @@ class LinearImage:
         sigma = np.outer(self.axes[0].singular, self.axes[1].singular)
         return np.asarray(sigma / (np.square(sigma) + self.lam))
 
-    def _centred(self, matrix: FloatArray) -> FloatArray:
+    def _centre(self, matrix: FloatArray) -> FloatArray:
         return np.asarray(matrix - matrix.mean(axis=0)) if self.centre else matrix
+
+
+# ---- Terms of single frames ----
 
 
 def _by_row(rms: float | FloatArray) -> FloatArray:
@@ -374,7 +393,7 @@ def _together(seen: Terms, row: int, column: int, scene: FloatArray) -> FloatArr
     return np.asarray(sum(first[row] @ scene @ second[column].T for first, second in seen))
 
 
-# -------- A linear solver and noise in
+# ---- Scatter of the squared error about its mean ----
 
 _KINDS = tuple(each.name for each in fields(Noise))
 """In the order of all arrays by kind."""

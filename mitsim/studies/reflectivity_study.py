@@ -282,17 +282,17 @@ def _figures(results: Results) -> Mapping[str, Figure]:
         name = f"{label(_DRAWN[0])}, {_DRAWN[1]}"
         for subject in swept:
             found = peak.where(subject=subject).rows
-            images = [_captioned(results, row, name, "psnr_db") for row in found]
+            images = [_caption(results, row, name, "psnr_db") for row in found]
             columns = [f"alpha {row['roughness']}" for row in found]
             drawn[f"images_{subject}.png"] = image_grid({subject: images}, columns, f"By roughness, {name}")
     rows = [row for row in peak.rows if row["subject"] not in swept]
     names = [str(row["subject"]).replace("_", " ") for row in rows]
     shown = [
-        (*(_captioned(results, row, name) for name in _TRUTHS), *_images(results, row, results.table)) for row in rows
+        (*(_caption(results, row, name) for name in _TRUTHS), *_images(results, row, results.table)) for row in rows
     ]
     titles = [*_TRUTHS, *(f"{label(name)}\n{exposure}" for exposure in EXPOSURES for name in FAMILIES)]
     drawn["images_shipped.png"] = image_grid(dict(zip(names, shown, strict=True)), titles, "Truths and images")
-    causes = [[_captioned(results, row, cause, f"{cause}_db") for cause in ERROR_SOURCES] for row in rows]
+    causes = [[_caption(results, row, cause, f"{cause}_db") for cause in ERROR_SOURCES] for row in rows]
     title = f"Errors against matt paint by cause, {label(_DRAWN[0])}, {_DRAWN[1]}: grey is no error"
     drawn["causes_shipped.png"] = image_grid(dict(zip(names, causes, strict=True)), list(_NAMES.values()), title)
     return drawn
@@ -306,14 +306,14 @@ def _curves(rows: Table) -> dict[str, dict[Value, Mean]]:
 
 def _images(results: Results, row: Mapping[str, Value], table: Table) -> list[tuple[FloatArray, str]]:
     """Both truths of the point of a ``row``, and its images by exposure and patterns."""
-    truths = [_captioned(results, row, name) for name in _TRUTHS]
+    truths = [_caption(results, row, name) for name in _TRUTHS]
     cases = [(exposure, name) for exposure in EXPOSURES for name in FAMILIES]
     each = (table.where(point=row["point"], exposure=exposure, patterns=name).rows[0] for exposure, name in cases)
-    shown = (_captioned(results, row, f"{label(str(row['patterns']))}, {row['exposure']}", "psnr_db") for row in each)
+    shown = (_caption(results, row, f"{label(str(row['patterns']))}, {row['exposure']}", "psnr_db") for row in each)
     return [*truths, *shown]
 
 
-def _captioned(results: Results, row: Mapping[str, Value], name: str, column: str = "") -> tuple[FloatArray, str]:
+def _caption(results: Results, row: Mapping[str, Value], name: str, column: str = "") -> tuple[FloatArray, str]:
     """The array ``name`` of a ``row`` with its ``column`` for a caption; errors on grey."""
     image, level = results.array(row, name), row.get(column)
     if image is None:

@@ -72,7 +72,7 @@ def _measure(studio: Studio, point: Point) -> Found:
     known = global_truth(lit.light)
     rows, arrays = [], {"direct, true": lit.truth, "global, true": known}
     for depth in DEPTHS:
-        own = direct if depth == AS_IT_IS else [_modelled(frames, shot) for shot in frames.family.shots]
+        own = direct if depth == AS_IT_IS else [_direct_by_factors(frames, shot) for shot in frames.family.shots]
         images, reported = _images(frames, own, bounced, (left, right))
         levels = {f"{name}_db": psnr(image, known if name == GLOBAL else lit.truth) for name, image in images.items()}
         gain = levels[f"{SEPARATED}_db"] - levels[f"{ALL}_db"]
@@ -107,7 +107,7 @@ def _images(
     return {**images, GLOBAL: found.image}, float(found.told[0])
 
 
-def _modelled(frames: Unexposed, shot: Shot) -> FloatArray:
+def _direct_by_factors(frames: Unexposed, shot: Shot) -> FloatArray:
     """Direct light [electrons/s] of a ``shot`` as the factors have it."""
     left, right = frames.sides
     return np.asarray(left @ (frames.family.light(shot) * frames.lit.truth) @ right.T)

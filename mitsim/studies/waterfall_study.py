@@ -108,7 +108,7 @@ class Sessions:
         noise
             whether they have the noise of the real session.
         """
-        found, whole = self._expected(off), self._expected(frozenset())
+        found, whole = self._estimate(off), self._estimate(frozenset())
         if not noise:
             return Factors.of(found, self._manifest)
         if not off & (self._effects | {ablation.BLACK_LEVEL}):
@@ -135,7 +135,7 @@ class Sessions:
             versions=versions(),
         )
 
-    def _expected(self, off: frozenset[str]) -> Estimate:
+    def _estimate(self, off: frozenset[str]) -> Estimate:
         """Factors of expected frames."""
         own = off & self._effects
         if own not in self._kept:
@@ -278,10 +278,10 @@ def _measure(studio: Studio, point: Point) -> Found:
         )
         for model in MODELS
     ]
-    return Found(tuple(rows), _kept(way, effect, without, having))
+    return Found(tuple(rows), _end_images(way, effect, without, having))
 
 
-def _kept(
+def _end_images(
     way: str, effect: str, without: Mapping[str, FloatArray], having: Mapping[str, FloatArray]
 ) -> dict[str, FloatArray]:
     """Images of the two ends, by model, as findings keep them."""

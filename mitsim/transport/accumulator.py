@@ -187,10 +187,10 @@ class DeviceAccumulator:
             row and column of its anchor; the first without them.
         """
         layer = mi.UInt32(0)
-        for part in self._passed(seen):
+        for part in self._parts_beyond(seen):
             layer += dr.select(chosen < part, mi.UInt32(1), mi.UInt32(0))
         cells = [self._cell(axis, tau) for axis, tau in self._axes(seen)]
-        return self._placed(seen, layer, cells, anchor)
+        return self._place(seen, layer, cells, anchor)
 
     def shares(self, seen: Sightings, anchor: tuple[mi.UInt32, mi.UInt32]) -> Iterator[tuple[mi.UInt32, mi.Float]]:
         """Where light is accumulated, each place with its part of it, as :meth:`Bundle.accumulate` splits it.
@@ -200,16 +200,16 @@ class DeviceAccumulator:
         seen, anchor
             as for :meth:`place`.
         """
-        passed = [dr.clip(part, 0, 1) for part in self._passed(seen)]
+        passed = [dr.clip(part, 0, 1) for part in self._parts_beyond(seen)]
         layers = [(mi.UInt32(k), a - b) for k, (a, b) in enumerate(pairwise([mi.Float(1), *passed, mi.Float(0)]))]
         rows, columns = (self._cells(axis, tau) for axis, tau in self._axes(seen))
         for (layer, part), (row, row_part), (column, column_part) in product(layers, rows, columns):
-            yield self._placed(seen, layer, [row, column], anchor), part * row_part * column_part
+            yield self._place(seen, layer, [row, column], anchor), part * row_part * column_part
 
     def _axes(self, seen: Sightings) -> tuple[tuple[CellAxis, mi.Float], tuple[CellAxis, mi.Float]]:
         return (self._bundle.grid.rows, seen.row), (self._bundle.grid.columns, seen.column)
 
-    def _passed(self, seen: Sightings) -> Iterator[mi.Float]:
+    def _parts_beyond(self, seen: Sightings) -> Iterator[mi.Float]:
         """How far between each layer and the next nearer one light is; below 0 before it, and above 1 beyond."""
         for low, high in pairwise(1 / depth for depth in self._bundle.depths):
             yield (seen.inverse_depth - dr.opaque(mi.Float, low)) / dr.opaque(mi.Float, high - low)
@@ -231,7 +231,7 @@ class DeviceAccumulator:
         beyond = position - mi.Float(first)
         return [(first, 1 - beyond), (first + 1, beyond)]
 
-    def _placed(
+    def _place(
         self,
         seen: Sightings,
         layer: mi.UInt32,

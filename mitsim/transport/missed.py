@@ -154,10 +154,10 @@ class _MissedPaths(CameraPaths[_MissedState]):
         self._join(paths, "indirect", Sightings.of(missed, by_line, paths.mirror, none, none, none))
         met &= hit.met
         in_mirror = panchromatic(light) * paths.density / hit.pdf
-        connected = dr.select(met, dr.select(paths.in_mirror, in_mirror, self._lit(paths, hit)), 0)
+        connected = dr.select(met, dr.select(paths.in_mirror, in_mirror, self._projector_light(paths, hit)), 0)
         self._join(paths, "direct", Sightings.of(dr.select(met, light, 0), by_line, paths.lobe, connected, none, none))
 
-    def _lit(self, paths: _MissedState, hit: LensHit) -> mi.Float:
+    def _projector_light(self, paths: _MissedState, hit: LensHit) -> mi.Float:
         """What a connection of the projector's side, from the first surface to the sensor, brings [W m^-2]."""
         grid = self.tracer.grid
         flux = self._rays.flux(hit.pixel, paths.ray.wavelengths)

@@ -31,6 +31,9 @@ _COUNTED = 4
 """Places for each entry of light up to which entries are counted by place; where places are more, sorting is faster."""
 
 
+# ---- Light of connections in the renderer ----
+
+
 @dataclass
 class Sightings:
     """Light of connections, a lane each, and where the camera sees it; meaning and units as in :class:`PathSamples`.
@@ -93,6 +96,9 @@ def check_finite(light: npt.NDArray[Any]) -> None:
     """Refuse ``light`` toward the camera that is NaN or infinite: MitsimError."""
     if not np.isfinite(light).all():
         raise MitsimError("the scene reflects NaN or infinite light toward the camera; check its materials")
+
+
+# ---- Path samples, fetched from the renderer ----
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,20 +211,23 @@ class PathSamples:
 
     def where(self, chosen: npt.NDArray[np.bool_]) -> PathSamples:
         """The entries that are ``chosen`` (m,)."""
-        return self._taken(chosen)
+        return self._select(chosen)
 
     def of_lanes(self, first: int, last: int) -> PathSamples:
         """The entries of lanes ``first`` .. ``last`` - 1."""
         assert self.lane is not None, "known of what one launch brought"
-        return self._taken(slice(*np.searchsorted(self.lane, (first, last))))
+        return self._select(slice(*np.searchsorted(self.lane, (first, last))))
 
-    def _taken(self, which: slice | npt.NDArray[np.bool_]) -> PathSamples:
+    def _select(self, which: slice | npt.NDArray[np.bool_]) -> PathSamples:
         lines = None if self.lines is None else self.lines[:, which]
         return PathSamples(**{name: getattr(self, name)[which] for name in _ARRAYS}, lines=lines)
 
 
 _ARRAYS = tuple(name for name in PathSamples.__dataclass_fields__ if name not in ("lane", "lines"))
 """What is told of each entry."""
+
+
+# ---- Accumulation by layer, anchor and cell ----
 
 
 @dataclass(frozen=True)
@@ -376,7 +385,7 @@ def _index_type(*shape: int) -> type[np.int32] | type[np.int64]:
     return np.int32 if max(shape) < 2**31 else np.int64
 
 
-# -------- The grid of directions on which the factored estimator collects light
+# ---- The grid of directions on which light is accumulated ----
 
 _ROUNDING = 1e-9
 """Part of a pixel by which the field stop may reach over cells: float64 rounds 1e-13 of it, a whole row costs 1 %."""

@@ -51,6 +51,9 @@ _SHARPEST = 0.1
 """Part of the light over sharper lobes than the width that is reported: the peak of a GGX lobe is met that often."""
 
 
+# ---- How much light comes over sharp lobes ----
+
+
 @dataclass(frozen=True, eq=False)
 class SharpLight:
     """Light over sharp lobes, without the mask.
@@ -153,6 +156,9 @@ def with_neighbours(chosen: npt.NDArray[np.bool_], side: int) -> Labels:
     return np.flatnonzero(mean_of_neighbours(chosen.reshape(side, side).astype(np.float64)) > 0)
 
 
+# ---- What is found by pixel, and where it meets the sensor ----
+
+
 @dataclass(frozen=True, eq=False)
 class _LobeLight:
     """Irradiance and second moment of every projector pixel, the part of its turns that are sharp, the irradiance's
@@ -184,6 +190,9 @@ class _SensorHits:
         return _SensorHits(mean, self.moment + more.moment, density, self.turns + more.turns)
 
 
+# ---- What connections find of it ----
+
+
 class _Connections(DirectTracer):
     """Direct light over sharp lobes alone, or all other."""
 
@@ -206,6 +215,9 @@ class _Connections(DirectTracer):
         reception, received = super()._by_connection(at, sensor)
         sharp = reception.pdf > self._own_least
         return reception, dr.select(sharp == self._over_sharp, received, 0)
+
+
+# ---- Rays that sharp lobes send to the sensor ----
 
 
 class _Lobes:
@@ -293,7 +305,7 @@ class _Lobes:
         return met.joined_by(_SensorHits(mean, mean * connected, per_area, turns), rng), rng
 
 
-# -------- Direct light aimed at the anchors that sharp lobes meet
+# ---- Direct light aimed at the anchors that sharp lobes meet ----
 #
 # Connected to an anchor u of the sensor, light over a lobe of roughness alpha comes from a patch of some alpha r about
 # the point that mirrors the projector into u; even rays of a projector pixel seldom meet it. Where in the pixel it lies

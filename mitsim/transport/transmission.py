@@ -41,10 +41,10 @@ def lets_through(material: mi.BSDF) -> bool:
 def transmits(scene: mi.Scene) -> bool:
     """Whether a surface of a ``scene`` lets light through; an instance hides its materials, and may have such."""
     materials = [shape.bsdf() for shape in scene.shapes()]
-    return any(bsdf is not None and lets_through(bsdf) for bsdf in materials) or _instanced(scene)
+    return any(bsdf is not None and lets_through(bsdf) for bsdf in materials) or _has_instances(scene)
 
 
-def _instanced(scene: mi.Scene) -> bool:
+def _has_instances(scene: mi.Scene) -> bool:
     return any(shape.class_name() == "Instance" for shape in scene.shapes())
 
 
@@ -97,10 +97,10 @@ class Passage:
         self.scene, self.panes = scene, flat_panes(scene)
         materials = [shape.bsdf() for shape in scene.shapes()]
         self.open = any(bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in materials)
-        self.open |= _instanced(scene) or bool(self.panes)
+        self.open |= _has_instances(scene) or bool(self.panes)
         self.transmits = transmits(scene)
         kinds = {int(shape.shape_type()) for shape in scene.shapes()}
-        self._instanced = _instanced(scene)
+        self._instanced = _has_instances(scene)
         self._loose = self._instanced or int(mi.ShapeType.Cylinder) in kinds
 
     def between(self, si: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> tuple[mi.Bool, mi.Spectrum]:

@@ -133,9 +133,9 @@ def picture(name: str) -> npt.NDArray[np.uint8]:
 
     kind, _, frequency = name.partition(" ")
     if kind == "bars" and frequency:
-        return _printed(_bars(float(frequency)))
+        return _reflectance(_bars(float(frequency)))
     if name == "edge":
-        return _printed(_edge())
+        return _reflectance(_edge())
     if name not in TEST_IMAGES:
         raise MitsimError(f"picture {name!r}: use {', '.join((*TEST_IMAGES, 'edge', 'bars PAIRS_A_MM'))}")
     image = np.asarray(getattr(data, name)(), dtype=np.float64)
@@ -143,10 +143,10 @@ def picture(name: str) -> npt.NDArray[np.uint8]:
     side = min(grey.shape)
     top, left = ((size - side) // 2 for size in grey.shape)
     square = resize(grey[top : top + side, left : left + side], (SIDE, SIDE), anti_aliasing=True)
-    return _printed((square - square.min()) / (square.max() - square.min()))
+    return _reflectance((square - square.min()) / (square.max() - square.min()))
 
 
-def _printed(grey: FloatArray) -> npt.NDArray[np.uint8]:
+def _reflectance(grey: FloatArray) -> npt.NDArray[np.uint8]:
     """Eight-bit reflectance of ``grey``, 0 black to 1 white."""
     import numpy as np
 

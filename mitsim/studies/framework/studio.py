@@ -136,7 +136,7 @@ class Studio:
 
         MitsimError as :func:`mitsim.open_bench`, and for another print on a scene that has none.
         """
-        return self.once("bench", 3, setup, lambda: self._opened(setup))
+        return self.once("bench", 3, setup, lambda: self._open(setup))
 
     def lit(self, setup: Setup) -> LitScene:
         """The scene of a ``setup`` in its light."""
@@ -145,7 +145,7 @@ class Studio:
     def factors(self, setup: Setup, seed: int) -> Factors:
         """What a session with the camera of a ``setup`` estimates, its noise from ``seed``; whatever is printed."""
         blank = setup.printed(None)
-        return self.once("factors", 4, (blank, seed), lambda: self._calibrated(blank, seed))
+        return self.once("factors", 4, (blank, seed), lambda: self._calibrate(blank, seed))
 
     def frames(self, setup: Setup, model: str, patterns: str | PatternFamily, seed: int = 0) -> Unexposed:
         """Frames of a family before any exposure.
@@ -205,7 +205,7 @@ class Studio:
         reason = reason_of(found.status, misfit)
         return Image(found.image, quality, found.lam, count, shots.exposure_s, not found.ok, trust, reason)
 
-    def _calibrated(self, blank: Setup, seed: int) -> Factors:
+    def _calibrate(self, blank: Setup, seed: int) -> Factors:
         """By this studio, or by another that was first: factors in memory are as a file has them."""
         if self._shared is None:
             return self.bench(blank).calibrate(seed)
@@ -218,12 +218,12 @@ class Studio:
                 self.bench(blank).calibrate(seed).save(part).rename(place)
             return load_calibration(place)
 
-    def _opened(self, setup: Setup) -> Bench:
-        path = setup.scene if setup.picture is None else self._printed(setup.scene, setup.picture)
+    def _open(self, setup: Setup) -> Bench:
+        path = setup.scene if setup.picture is None else self._copy_with_print(setup.scene, setup.picture)
         parameters: dict[str, Any] = dict(setup.parameters)
         return open_bench(path, setup.variant, setup.camera, setup.projector, setup.outside, **parameters)
 
-    def _printed(self, scene: str, name: str) -> Path:
+    def _copy_with_print(self, scene: str, name: str) -> Path:
         """A copy of a ``scene`` with the picture ``name`` for its print."""
         own = locate(scene, "scenes", "scene.xml")
         if not (own.parent / _PRINT).is_file():

@@ -35,11 +35,11 @@ class _Studio:
     shared: str | None
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(_opened(self.shared), name)
+        return getattr(_open(self.shared), name)
 
 
 @cache
-def _opened(shared: str | None) -> Any:
+def _open(shared: str | None) -> Any:
     from mitsim.studies.framework.studio import Studio
 
     return Studio(shared)

@@ -150,7 +150,7 @@ def _sensor_class() -> type:
             geometry = self.geometry
             wavelengths, spectral_weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
             if self._points:
-                sample2, sample3 = self._stratified(sample2, *self._points)
+                sample2, sample3 = self._stratify(sample2, *self._points)
             height, width = geometry.half_sides
             u = (1 - 2 * self._active(self._on_sensor(sample2))) * mi.Point2f(width, height)
             t, weight = self._direction(u, sample3)
@@ -177,7 +177,7 @@ def _sensor_class() -> type:
             ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
             return mi.RayDifferential3f(ray), weight
 
-        def _stratified(self, film: mi.Point2f, seed: int, paths: int) -> tuple[mi.Point2f, mi.Point2f]:
+        def _stratify(self, film: mi.Point2f, seed: int, paths: int) -> tuple[mi.Point2f, mi.Point2f]:
             """Even points in the pixels of ``film`` points (0..1), and of the unit square; in the order of lanes."""
             rows, columns = self.geometry.frame_shape
             count = mi.Point2f(columns, rows)

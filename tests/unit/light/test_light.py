@@ -370,7 +370,7 @@ def test_a_heavy_path_in_a_shot_that_is_not_checked_is_seen() -> None:
 
     def ratios(groups: np.ndarray, shots: list[int]) -> tuple[float, float]:
         light = SimpleNamespace(labels=lighting.labels, groups=[SimpleNamespace(totals=group) for group in groups])
-        return module._unchecked(light, lighting, lighting.shots(np.array(shots)))
+        return module._error_growth(light, lighting, lighting.shots(np.array(shots)))
 
     assert ratios(totals, [0, 7, 14]) == (1.0, 1.0)
     error, bound = ratios(heavy, [0, 7, 14])
@@ -388,7 +388,7 @@ def test_paces_are_measured_of_what_was_chosen_alone(bench: Bench, monkeypatch: 
         lambda made, name, seed, labels, samples: 1e-7 * made.passes[name].tracer.paths_per_sample * samples,
     )
     simulation = Simulation(bench, Settings(depth=400.0, anchors=2))
-    timed = planner._timed(PILOT_RESULT, simulation, np.arange(bench.n**2), 0)
+    timed = planner._time_paths(PILOT_RESULT, simulation, np.arange(bench.n**2), 0)
     for name in ("direct", "anchor_residual"):
         assert timed.sample_costs[name].seconds == pytest.approx(1e-7)
     for name in ("indirect", "indirect_residual"):

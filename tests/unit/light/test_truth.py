@@ -185,12 +185,12 @@ def test_samples_go_where_a_ray_takes_off_most() -> None:
     """
     likely = np.array([1e-6, 1.0, 8.0, 64.0, 1.0])
     samples = np.array([16, 16, 16, 16, 32])
-    wanted = module._allotted(likely, samples, 16, 0.05, 10**6)
+    wanted = module._allot(likely, samples, 16, 0.05, 10**6)
     assert (np.log2(wanted / samples) % 1 == 0).all() and wanted[0] == 16
     assert wanted[1] < wanted[2] < wanted[3] and wanted[4] == max(wanted[1], 32)
     left = (likely * (wanted / 16) ** -module._RATE).sum() / (likely * (samples / 16) ** -module._RATE).sum()
     assert 0.025 < left <= 0.05
-    short = module._allotted(likely, samples, 16, 0.05, 130)
+    short = module._allot(likely, samples, 16, 0.05, 130)
     assert (short == [16, 16, 32, 32, 32]).all()
 
 

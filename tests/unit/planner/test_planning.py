@@ -19,7 +19,7 @@ from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, MOST_PATHS
 from mitsim.optics.replicates import bound_of
 from mitsim.planner import pilot, planner
-from mitsim.planner.choose import _BOUND_OVER_ERROR, FIRST_ACCURACY, Candidate, _needed, cheapest
+from mitsim.planner.choose import _BOUND_OVER_ERROR, FIRST_ACCURACY, Candidate, _samples_for, cheapest
 from tests.unit.planner.invented_evidence import ONE_CLASS, plan
 
 LIGHTING, SEED, LOOKING, FRAMES = Lighting.uniform(4), 7, 0.5, {"sensor": 0.2, "write": 0.1}
@@ -77,7 +77,7 @@ def looks(made: Plan, monkeypatch: pytest.MonkeyPatch) -> Looks:
     monkeypatch.setattr(pilot, "PilotRuns", PilotRuns)
     monkeypatch.setattr(planner, "Candidates", Invented)
     monkeypatch.setattr(planner, "_refuse_unfit", lambda bench, switches: None)
-    monkeypatch.setattr(planner, "_decided", decided)
+    monkeypatch.setattr(planner, "_decide", decided)
     monkeypatch.setattr(planner, "frame_seconds", lambda bench, shots: FRAMES)
     return seen
 
@@ -266,7 +266,7 @@ def test_bounds_of_few_heavy_paths_take_more_samples() -> None:
     rate, per_look = 2.0, 50  # heavy paths in a look of so many samples
     # Each brings an energy of 1 in its own pixels: variance of a sample, and of a look's energy over its square.
     noise, target = Noise(math.sqrt(rate) / per_look, per_look, 0.5, 1 / rate), 1e-2
-    samples = float(_needed(SampleCost(noise, 1), target * math.sqrt(GROUPS) / _BOUND_OVER_ERROR))
+    samples = float(_samples_for(SampleCost(noise, 1), target * math.sqrt(GROUPS) / _BOUND_OVER_ERROR))
     rng = np.random.default_rng(5)
     met = rng.poisson(rate * samples / per_look, (4000, GROUPS)).astype(np.float64)
     bounds = np.array([bound_of(each / (samples * GROUPS) ** 2, 1.0) for each in met])

@@ -119,7 +119,9 @@ def test_a_tilt_changes_the_image_as_it_is_predicted_to(stand: DriftStand, drift
         for frame, shot in zip(expected, stand.family.shots, strict=True):
             sums.add(stand._frames.exposer(1.0).electrons(frame), shot.row, shot.column)
         images.append(stand._model.solve(sums, stand.linear.lam).image)
-    still, tilted = (stand.linear.expected(stand.lit.truth, stand._changed(each)).image for each in (Drift(), drift))
+    still, tilted = (
+        stand.linear.expected(stand.lit.truth, stand._frame_changes(each)).image for each in (Drift(), drift)
+    )
     changed = images[1] - images[0]
     assert np.linalg.norm(tilted - still - changed) < 0.15 * np.linalg.norm(changed)
 
@@ -150,7 +152,7 @@ def test_a_mask_turned_over_a_region_shifts_that_part_of_its_shadow(stand: Drift
     part = replace(bench, rig=replace(bench.rig, camera=camera))
     lit = cast(LitScene, SimpleNamespace(bench=part, light=stand.lit.light))
     found, whole = (
-        np.asarray(sum(np.einsum("ir,jc->irjc", *pair) for pair in each._turned(1e-3)))
+        np.asarray(sum(np.einsum("ir,jc->irjc", *pair) for pair in each._turn(1e-3)))
         for each in (replace(stand, lit=lit), stand)
     )
     np.testing.assert_allclose(found, whole[3:33, :, 20:50], rtol=0, atol=1e-9 * np.abs(whole).max())

@@ -110,7 +110,7 @@ def test_the_image_of_all_places_is_dense_least_squares(lit: dict[str, LitScene]
     found = mask.solve(rows, columns, seconds)
     places = list(product(rows, columns))
     whole = np.concatenate([np.kron(mask._side(0, row), mask._side(1, column)) for row, column in places])
-    data = np.concatenate([mask._measured(*place, seconds).ravel() for place in places])
+    data = np.concatenate([mask._measure_at(*place, seconds).ravel() for place in places])
     dense = np.linalg.solve(whole.T @ whole + found.lam * np.eye(256), whole.T @ data).reshape(16, 16)
     assert np.linalg.norm(found.image - dense) < 1e-6 * np.linalg.norm(dense)
     assert " of 256 (" in str(found.status)
@@ -120,7 +120,7 @@ def test_every_place_has_noise_of_its_own(lit: dict[str, LitScene]) -> None:
     """Of 64^2 independent numbers the correlation is within 5 / 64 of 0. (Planted: one stream for all.)"""
     scene = lit["separable"]
     mask = MovedMask(scene, IDEALISED, {}, 5)
-    noise = [mask._measured(*place, 0.01) - rate(mask, *place) for place in ((0.0, 0.0), (0.0, 0.42), (0.42, 0.0))]
+    noise = [mask._measure_at(*place, 0.01) - rate(mask, *place) for place in ((0.0, 0.0), (0.0, 0.42), (0.42, 0.0))]
     for one, other in product(range(3), repeat=2):
         correlation = np.corrcoef(noise[one].ravel(), noise[other].ravel())[0, 1]
         assert one == other or abs(correlation) < 5 / 64
