@@ -99,13 +99,6 @@ class Candidate:
         return Estimate(*(math.hypot(error, self.noise) for error in self.systematic))
 
 
-def approximations_of(pilot_result: PilotResult, settings: Settings) -> frozenset[Approximation]:
-    """What ``settings`` leave out or make coarse, of all that the ``pilot_result`` knows."""
-    counts = zip(COUNTED, counted(settings), strict=True)
-    off = (Approximation(name) for name in pilot_result.effects if name not in settings.effects)
-    return frozenset(chain((Approximation(*count) for count in counts), off))
-
-
 def cheapest(accuracy: float, pilot_result: PilotResult, switches: Mapping[str, bool], sure: float = SURE) -> Candidate:
     """The choice of least work whose predicted total error is below ``accuracy``; failing that, of least error.
 

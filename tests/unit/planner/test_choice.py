@@ -8,9 +8,17 @@ import pytest
 
 from mitsim.bench.effects import parse_switches
 from mitsim.light.cost_model import FIXED, Numbers, entries
-from mitsim.light.pilot_result import REPLICATES, Approximation, ErrorCovariance, Noise, PilotResult, SampleCost
+from mitsim.light.pilot_result import (
+    COUNTED,
+    REPLICATES,
+    Approximation,
+    ErrorCovariance,
+    Noise,
+    PilotResult,
+    SampleCost,
+)
 from mitsim.light.settings import GROUPS, Settings, SharpPixels
-from mitsim.planner.choose import approximations_of, cheapest, predicted, value_of_refining
+from mitsim.planner.choose import cheapest, counted, predicted, value_of_refining
 from mitsim.planner.pilot import run_of
 from tests.unit.planner.invented_evidence import (
     ACCURACIES,
@@ -75,7 +83,9 @@ def test_the_total_is_predicted_from_all_that_is_left(accuracy: float) -> None:
     """At right angles, squares add up. Where nothing is followed, it does not matter to how many points."""
     chosen = cheapest(accuracy, PILOT_RESULT, {})
     settings = chosen.settings
-    parts = approximations_of(PILOT_RESULT, settings)
+    counts = zip(COUNTED, counted(settings), strict=True)
+    parts = {Approximation(*count) for count in counts}
+    parts |= {Approximation(name) for name in PILOT_RESULT.effects if name not in settings.effects}
     assert {part.name for part in parts if not part.count} == set(PILOT_RESULT.effects) - settings.effects
     squares = sum(SIZES.get(part, APART.get(part.name, 0.0)) ** 2 for part in parts)
     if "interreflection" in settings.effects:
