@@ -287,8 +287,8 @@ def expected_of(
     Parameters
     ----------
     parts
-        simulations of one rig, each with the light that it accumulated; black pixels leak as the first says, glint is
-        that of the last.
+        simulations of the same devices, each with the light that it accumulated; black pixels leak as the first says,
+        specular chains are those of the last.
     rows, lighting, seed, leaking, probed
         as for :meth:`Simulation.expected`.
     """

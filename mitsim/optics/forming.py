@@ -38,7 +38,7 @@ class Filed:
     Attributes
     ----------
     optics
-        fits the cells that the light is filed in.
+        fits the cells that the light is accumulated in.
     groups
         independent estimates of the light, (rows, cells) each; their mean is used.
     """

@@ -134,8 +134,8 @@ class ExpectedFrames:
     Parameters
     ----------
     lights
-        light of the same rows (projector pixels, or classes of them), filed in one kind of cells or more; their groups
-        are paired.
+        light of the same rows (projector pixels, or classes of them), accumulated in one kind of cells or more; their
+        groups are paired.
     lighting
         class of each row, and the fraction of full power that each class emits in each shot.
     seed

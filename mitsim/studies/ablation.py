@@ -71,7 +71,7 @@ REGISTERED = MappingProxyType(
 )
 """Effects of :data:`mitsim.bench.effects.EFFECTS` that a name stands for."""
 _MOVED = frozenset({KEYSTONE, DEPTH, DETAIL, DEFOCUS})
-"""Effects on where light lies, for which it is filed anew."""
+"""Effects on where light lies, for which it is accumulated anew."""
 _FURTHER = frozenset({"interreflection", "mirrors", "ambient"})
 _WHOLE = "pixels that are lit all over"
 """Beside :data:`DETAIL`, where nothing moves or hides a pixel's points."""
@@ -157,7 +157,7 @@ class Ablation:
         return self._even if FALLOFF in off else np.ones_like(self._even)
 
     def _trace(self, direct: bool, off: frozenset[str]) -> SampledLight:
-        """Direct light, or all other, filed without some effects."""
+        """Direct light, or all other, accumulated without some effects."""
         if (direct, off) not in self._kept:
             settings, bench = self.light.simulation.settings, self.light.bench
             own = off
@@ -200,7 +200,7 @@ class AblatedLight(SampledLight):
 
 
 class _Filing(Simulation):
-    """Direct light, or all other, filed where it would be seen without the effects ``off``."""
+    """Direct light, or all other, accumulated where it would be seen without the effects ``off``."""
 
     def __init__(self, bench: Apparatus, settings: Settings, direct: bool, off: frozenset[str]) -> None:
         super().__init__(bench, settings)
@@ -404,7 +404,7 @@ MOST = ANY
 
 class OfOrders(Simulation):
     """Followed light of the orders ``fewest`` to ``most`` alone (:class:`mitsim.transport.integrator.FollowingTracer`):
-    no direct light, no glint."""
+    no direct light, no specular chains."""
 
     def __init__(self, bench: Apparatus, settings: Settings, fewest: int, most: int) -> None:
         """What is followed.
@@ -429,5 +429,5 @@ class OfOrders(Simulation):
         return found
 
     def specular_frames(self, labels: Labels) -> ClassFrames | None:
-        """None, whatever the ``labels``: glint is not followed by any of these tracers."""
+        """None, whatever the ``labels``: specular chains are not followed by any of these tracers."""
         return None

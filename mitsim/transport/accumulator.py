@@ -168,7 +168,7 @@ class DeviceAccumulator:
         accumulators
             their number.
         paths
-            that they file.
+            that they add up.
         """
         entries = (int(labels.max()) + 1) * DeviceAccumulator._places(bundle)
         parts = (4 if bundle.between else 1) * min(len(bundle.depths), 2)

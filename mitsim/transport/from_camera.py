@@ -207,7 +207,7 @@ class CameraPaths(PathIntegrator[State]):
         # ---- Rays from the sensor through the cells
         grid, columns = tracer.grid, dr.opaque(mi.UInt32, tracer.grid.shape[1])
         shared, rng = streams(flight.seed, cell, flight.sample)
-        # A path that leaves a cell's very edge could be filed in the next cell by rounding.
+        # A path that leaves a cell's very edge could be accumulated in the next cell by rounding.
         jitter = _MARGIN + (1 - 2 * _MARGIN) * stratified(flight.sample, shared)
         sensor = tracer.points.at(*self.anchor, rng)
         self.origin, nearness = rows_columns(sensor.x, sensor.y), dr.opaque(mi.Float, 1 / tracer.points.distance)

@@ -112,7 +112,7 @@ class IndirectTracer(FollowingTracer):
         return PathRules(passage, self.mirrors, self.interreflection, self.orders, by_line)
 
     def trace_into(self, accumulators: Sequence[DeviceAccumulator], seed: int, first: int, samples: int) -> PathSamples:
-        """The same as :meth:`trace`, indirect light filed in accumulators as far as it can be: the rest, on the host.
+        """As :meth:`trace`, indirect light added up in accumulators as far as it can be: the rest, on the host.
 
         Parameters
         ----------

@@ -327,7 +327,7 @@ class Bundle:
         return np.concatenate([place for place, _ in parts]), values, np.tile(path_samples.pixel, len(parts))
 
     def outside(self, path_samples: PathSamples) -> float:
-        """Light of ``path_samples`` from beyond all cells, which is not filed [W m^-2]."""
+        """Light of ``path_samples`` from beyond all cells, which is not accumulated [W m^-2]."""
         return float(path_samples.value[~self._inside(path_samples)].sum())
 
     def _inside(self, path_samples: PathSamples) -> npt.NDArray[np.bool_]:
