@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.captured_session import calibrate_frames as calibrate_frames
     from mitsim.reconstruct.factors import Factors as Factors
     from mitsim.reconstruct.factors import load_calibration as load_calibration
+    from mitsim.reconstruct.reconstruct import Reconstruction as Reconstruction
     from mitsim.reconstruct.reconstruct import reconstruct as reconstruct
-    from mitsim.reconstruct.result import Reconstruction as Reconstruction
     from mitsim.report.line_images import reconstruct_colours as reconstruct_colours
 
 _HOMES = {
@@ -67,8 +67,7 @@ _HOMES = {
         "metrics": "psnr ssim",
         "reconstruct.captured_session": "calibrate_frames",
         "reconstruct.factors": "Factors load_calibration",
-        "reconstruct.reconstruct": "reconstruct",
-        "reconstruct.result": "Reconstruction",
+        "reconstruct.reconstruct": "Reconstruction reconstruct",
         "report.line_images": "reconstruct_colours",
     }.items()
     for name in names.split()

@@ -45,7 +45,7 @@ from mitsim.light.truth import Truth, trace_truths
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.planner.memory import frame_seconds, frames_cost
 from mitsim.planner.planner import make_plan, plan_within
-from mitsim.reconstruct.mosaic import PLANES, behind
+from mitsim.reconstruct.colour import PLANES, behind
 from mitsim.transport.records import PathSamples
 
 _RAYS, _ALIKE = 4, 0.9

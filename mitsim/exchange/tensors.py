@@ -18,7 +18,7 @@ from mitsim.core.files import whole_file
 from mitsim.core.manifests import SIDES, CalibrationManifest, RunManifest
 from mitsim.core.runs import TRUTH, Capture, load_run
 from mitsim.exchange.packed import FACTORS, Calibration, Coloured, Filtered, Packed, Run, line_of
-from mitsim.reconstruct.mosaic import behind
+from mitsim.reconstruct.colour import behind
 
 if TYPE_CHECKING:
     from mitsim.reconstruct.factors import Factors

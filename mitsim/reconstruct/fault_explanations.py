@@ -16,8 +16,7 @@ from scipy import fft
 from scipy.optimize import minimize_scalar
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
-from mitsim.reconstruct.faults import Fault, FrameFault
-from mitsim.reconstruct.leave_one_out import CHANCE, OFF, BoolArray, LeaveOneOut, Pattern
+from mitsim.reconstruct.frame_faults import CHANCE, OFF, BoolArray, Fault, FrameFault, LeaveOneOut, Pattern
 
 _EXPLAINS = 0.2
 """Part of what a frame is off by that a fault may leave: chosen, with room for what the others predict badly."""

@@ -18,8 +18,7 @@ from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.reconstruct.causes import STEPS, Cause, Reading
 from mitsim.reconstruct.factorisation import group_pixels
 from mitsim.reconstruct.fault_explanations import Explanations
-from mitsim.reconstruct.faults import Fault, FrameFault
-from mitsim.reconstruct.leave_one_out import CHANCE, OFF, BoolArray, FrameSums, LeaveOneOut, Pattern
+from mitsim.reconstruct.frame_faults import CHANCE, OFF, BoolArray, Fault, FrameFault, FrameSums, LeaveOneOut, Pattern
 
 _MORE = 4.0
 """Times the median frame's unexplained energy from which a frame is suspected: chosen, as one that is wrong puts part

@@ -26,15 +26,13 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray, SeparableTerm
 from mitsim.core.runs import Measurement
-from mitsim.reconstruct.causes import Cause, Evidence, Reading, Signatures, likely_cause
+from mitsim.reconstruct.causes import Cause, Evidence, Reading, Readings, Signatures, likely_cause, multiple
 from mitsim.reconstruct.defects import Defects, defects_of
 from mitsim.reconstruct.estimate_factors import decibels
 from mitsim.reconstruct.factorisation import Side
-from mitsim.reconstruct.faults import FrameFault
 from mitsim.reconstruct.frame_check import FrameCheck
-from mitsim.reconstruct.leave_one_out import FrameSums
+from mitsim.reconstruct.frame_faults import FrameFault, FrameSums
 from mitsim.reconstruct.noise import FrameNoise
-from mitsim.reconstruct.readings import Readings, multiple
 from mitsim.reconstruct.solution import Status, Verdict
 from mitsim.reconstruct.solver import Prepared
 from mitsim.reconstruct.subpixel import Model

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -10,8 +11,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.devices.session import Half
 from mitsim.reconstruct.estimate_factors import FLUX_NOISE
-from mitsim.reconstruct.faults import DARK, Lamp, robust_scatter
-from mitsim.reconstruct.session_side import SLIGHT, SideCheck
+from mitsim.reconstruct.session_side import DARK, SLIGHT, SideCheck, robust_scatter
 
 MATTERS = 0.5
 """Error by the lamp, over that by noise, from which it is corrected and said: both in quadrature are 12 % more."""
@@ -33,6 +33,51 @@ _SMOOTH = 2.0
 not of lines whose light is not smooth: of sides of good and faulty sessions it is 0.9 to 1.44 (240)."""
 _TURNS = 8
 """Times that a trend is fitted again without what is far from it: a fourth changes nothing in most sessions."""
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """How the projector's power changes over the session.
+
+    Attributes
+    ----------
+    drift
+        from the session's begin to its end, as a part of its mean.
+    flicker
+        from frame to frame, rms, as a part of it.
+    drift_cost, flicker_cost
+        relative error of both factors that each would leave, or leaves, in them.
+    remaining
+        the error that is left after correction.
+    corrected
+        whether factors are corrected for it.
+    """
+
+    drift: float = 0.0
+    flicker: float = 0.0
+    drift_cost: float = 0.0
+    flicker_cost: float = 0.0
+    remaining: float = 0.0
+    corrected: bool = False
+
+    def listed(self) -> dict[str, float] | None:
+        """The same for a manifest; None of a steady one."""
+        return asdict(self) if self.drift or self.flicker else None
+
+    def warnings(self) -> Iterator[str]:
+        """What is said of an unsteady lamp."""
+        left = "frames are divided by its power" + (f", and {self.remaining:.1e} is left" if self.remaining else "")
+        left = left if self.corrected else "its error is in what is stated"
+        if self.drift:
+            yield (
+                f"lamp: its power drifts by {self.drift:+.1%} over the session, a factor error of "
+                f"{self.drift_cost:.1e} if nothing is done; {left}: let it warm up"
+            )
+        if self.flicker:
+            yield (
+                f"lamp: its power flickers by {self.flicker:.2%} from frame to frame, a factor error of "
+                f"{self.flicker_cost:.1e} if nothing is done; {left}: use a steadier one, or expose for whole periods"
+            )
 
 
 def flickers(scatter: float, noise: float, count: int) -> bool:

@@ -23,7 +23,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.light.plan import PlanRow
 from mitsim.metrics import Quality
 from mitsim.reconstruct.misfit import chi_square_text
-from mitsim.reconstruct.result import Reconstruction
+from mitsim.reconstruct.reconstruct import Reconstruction
 from mitsim.report import plots
 from mitsim.report.html import DASH, figure_uri, reflectance, render_page, sentence, write_html
 from mitsim.report.plots import FONT, WIDTH, figure_of, panels_of

@@ -3,7 +3,7 @@ of each line and one in colour out.
 
 *Demosaiced*: every frame becomes three whole ones (colour-demosaicing), a solve for each channel, and channels are
 taken apart into lines. *Half resolution*: a solve for each plane of filters with its own rows of the factors, no pixel
-interpolated. *Joint*: all planes for all lines (:mod:`mitsim.reconstruct.mosaic`). A channel or plane that sees several
+interpolated. *Joint*: all planes for all lines (:mod:`mitsim.reconstruct.colour`). A channel or plane that sees several
 lines has the one factor that is nearest to them; only the joint solve knows that each line has its own.
 
 Lambda is found without a truth: each plane, or channel, chooses its own as any other frames do
@@ -32,12 +32,12 @@ from mitsim.core.spectral_manifests import JOINT, ColourManifest, check_way
 from mitsim.devices.chart import ChartPlace
 from mitsim.metrics import Quality
 from mitsim.optics.separable import BestTerm, best_term
+from mitsim.reconstruct.colour import PLANES, JointMosaic, JointSolution
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.misfit import UNEXPLAINED
-from mitsim.reconstruct.mosaic import PLANES, JointMosaic, JointSolution
+from mitsim.reconstruct.reconstruct import check_same_inputs
 from mitsim.reconstruct.regularisation import automatic_lambda
 from mitsim.reconstruct.request import IMAGE_FILE, check_joint
-from mitsim.reconstruct.result import check_same_inputs
 from mitsim.reconstruct.solver import prepare
 from mitsim.report.colour_image import PAGE, ColourImage, board_of, write_page
 

@@ -14,9 +14,9 @@ from mitsim.core.files import output_folder
 from mitsim.core.runs import load_run
 from mitsim.metrics import Quality, truth_error_for, truth_for
 from mitsim.reconstruct.factors import load_calibration
+from mitsim.reconstruct.reconstruct import Reconstruction, may_replace
 from mitsim.reconstruct.reconstruct import reconstruct as solve
 from mitsim.reconstruct.request import ImageRequest
-from mitsim.reconstruct.result import Reconstruction, may_replace
 
 
 @dataclass(frozen=True)

@@ -35,9 +35,8 @@ from mitsim.devices.patterns import PatternFamily
 from mitsim.devices.sensor import SensorModel
 from mitsim.light.light import trace_lines
 from mitsim.metrics import psnr
-from mitsim.reconstruct.colour import daylight
+from mitsim.reconstruct.colour import behind, daylight
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.mosaic import behind
 from mitsim.report.lit_scene import LAMBDAS, LitScene
 from mitsim.report.mosaic_images import MosaicCamera, Solver, solver_of
 from mitsim.studies.framework.setup import Setup

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mitsim.metrics import psnr
-from mitsim.reconstruct.tv import solve_tv
+from mitsim.reconstruct.solvers import solve_tv
 from mitsim.report import EQUAL_FRAME, MODELS, in_text, label
 from mitsim.report.lit_scene import LAMBDAS
 from mitsim.report.plots import quality_bars

@@ -19,8 +19,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import Shot
 from mitsim.light.light import SampledLight
 from mitsim.metrics import psnr
+from mitsim.reconstruct.background import separate
 from mitsim.reconstruct.focus import FactorOfDepths, parallax_of
-from mitsim.reconstruct.separation import separate
 from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import LitScene, Unexposed

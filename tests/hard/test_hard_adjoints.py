@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from mitsim.optics.separable import centred as centred_terms
 from mitsim.reconstruct.solver import centre_frame, prepare
-from mitsim.reconstruct.tv import solve_tv
+from mitsim.reconstruct.solvers import solve_tv
 from tests.hard.hard_models import EPS, frames_of, shadow, summed
 
 pytestmark = pytest.mark.robustness("Solver")

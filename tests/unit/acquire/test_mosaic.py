@@ -30,7 +30,7 @@ from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation
 from mitsim.light.truth import Truth
 from mitsim.optics.frames import Frame
-from mitsim.reconstruct.mosaic import behind
+from mitsim.reconstruct.colour import behind
 from mitsim.transport.records import AMBIENT, DIRECT, PathSamples
 
 WEIGHTS = np.array([[0.4, 0.1], [0.2, 0.3], [0.2, 0.3], [0.1, 0.5]])

@@ -16,7 +16,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.exchange import tensors
 from mitsim.exchange.formats import export_run, import_file
 from mitsim.exchange.hdf5 import open_hdf5
-from mitsim.reconstruct.mosaic import behind
+from mitsim.reconstruct.colour import behind
 from tests.coloured import WEIGHTS, mosaic_folders
 from tests.unit.exchange.test_coloured import octave, whole
 

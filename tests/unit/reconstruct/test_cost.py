@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mitsim.reconstruct.cost import ImageCost, keeps_frames, predict_cost, slab_numbers
+from mitsim.reconstruct.request import ImageCost, keeps_frames, predict_cost, slab_numbers
 
 
 def made(rows: tuple[int, int], lines: tuple[int, int], patterns: tuple[int, int], shots: int = 24) -> tuple:

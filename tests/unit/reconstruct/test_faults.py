@@ -14,8 +14,7 @@ import pytest
 from mitsim.core.manifests import Patterns
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.causes import Cause
-from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.reconstruct.result import Reconstruction
+from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
 from mitsim.reconstruct.solution import Verdict
 from tests.ideal_sessions import BLACK, DARK, GAIN, PIXELS, READ, Bench, bench, picture, shadow
 

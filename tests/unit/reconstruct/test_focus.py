@@ -25,8 +25,7 @@ from mitsim.reconstruct.depth import CommonBasis, Depth, best_depth
 from mitsim.reconstruct.factorisation import group_pixels
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import FactorOfDepths, move_factors
-from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.reconstruct.result import Reconstruction
+from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
 from mitsim.reconstruct.solver import prepare, project_frames
 from tests.ideal_sessions import PEAK, PITCH, PIXELS, Bench, picture
 from tests.unit.reconstruct.test_faults import dark, with_frames

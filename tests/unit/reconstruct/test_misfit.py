@@ -14,8 +14,7 @@ from mitsim.core.manifests import Digital
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.misfit import CHANCE, UNEXPLAINED, Misfit, chi_square_text
-from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.reconstruct.result import Reconstruction
+from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
 from mitsim.reconstruct.solution import Status, Verdict
 from mitsim.reconstruct.solver import Prepared
 from tests.ideal_sessions import PIXELS, Bench, N, bench, picture, shadow

@@ -5,7 +5,7 @@ import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import parse_patterns
-from mitsim.reconstruct.mosaic import PLANES, JointMosaic
+from mitsim.reconstruct.colour import PLANES, JointMosaic
 
 N, PIXELS, LINES = 6, 10, 3
 

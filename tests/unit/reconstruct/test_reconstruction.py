@@ -19,10 +19,9 @@ from mitsim.core.runs import Capture, Recorder, frame_name, load_run
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct import request
 from mitsim.reconstruct.convolution import ConvolutionalCamera
-from mitsim.reconstruct.cost import ImageCost, predict_cost
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.reconstruct import accumulate, reconstruct
-from mitsim.reconstruct.result import may_replace
+from mitsim.reconstruct.reconstruct import accumulate, may_replace, reconstruct
+from mitsim.reconstruct.request import ImageCost, predict_cost
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.reconstruct.solvers import SOLVERS, Convolutional, Tikhonov

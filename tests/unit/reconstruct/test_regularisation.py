@@ -24,7 +24,7 @@ from mitsim.reconstruct.regularisation import (
     risk_score,
 )
 from mitsim.reconstruct.solver import prepare
-from mitsim.reconstruct.tv import solve_tv
+from mitsim.reconstruct.solvers import solve_tv
 from tests.ideal_sessions import PIXELS, Bench, shadow
 
 N = 128

@@ -10,8 +10,7 @@ import re
 import numpy as np
 from PIL import Image
 
-from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.reconstruct.result import Reconstruction
+from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
 from tests.ideal_sessions import Bench, N, bench, picture
 
 

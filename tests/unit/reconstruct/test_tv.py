@@ -7,7 +7,7 @@ from skimage.restoration import denoise_tv_chambolle
 from mitsim.reconstruct.regularisation import DiagonalProblem
 from mitsim.reconstruct.solution import Verdict
 from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
-from mitsim.reconstruct.tv import AUTO_WEIGHT, automatic_weight, solve_tv
+from mitsim.reconstruct.solvers import AUTO_WEIGHT, automatic_weight, solve_tv
 
 SIZE = 12
 

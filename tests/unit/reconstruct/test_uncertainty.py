@@ -17,9 +17,8 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import accumulate, reconstruct
 from mitsim.reconstruct.regularisation import DiagonalProblem, automatic_lambda
 from mitsim.reconstruct.solver import prepare
-from mitsim.reconstruct.spectrum import scene_spectrum
 from mitsim.reconstruct.subpixel import EDGES, PRINT, Model, print_energy
-from mitsim.reconstruct.uncertainty import Propagation
+from mitsim.reconstruct.uncertainty import Propagation, scene_spectrum
 from tests.ideal_sessions import CALIBRATION_ERROR, Bench, bench, picture, shadow
 
 N, PIXELS = 6, 14

@@ -15,9 +15,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.devices.patterns import parse_patterns
 from mitsim.metrics import psnr
-from mitsim.reconstruct.colour import chart
+from mitsim.reconstruct.colour import PLANES, JointMosaic, chart
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.mosaic import PLANES, JointMosaic
 from mitsim.report.mosaic_images import demosaic
 from mitsim.studies.lit_lines import ARRAY, HALF, JOINT, MosaicShots, filter_weights, replace_spectra, serving
 from tests.ideal_sessions import picture, shadow

@@ -1,4 +1,4 @@
-"""Measurements and the factorised model in; each frame as the others tell it out.
+"""Measurements and the factorised model in; each frame as the others tell it, and faults of frames in words, out.
 
 Where patterns overlap the model does it: patterns are left out of the sums W, and normal equations of the others are
 solved. Under shifting dots no pixel is in two frames, and those left out have light as their pixels' neighbours.
@@ -7,6 +7,9 @@ solved. Under shifting dots no pixel is in two frames, and those left out have l
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +19,6 @@ from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.manifests import RunManifest
 from mitsim.core.runs import Measurement
 from mitsim.reconstruct.factorisation import group_pixels
-from mitsim.reconstruct.faults import Fault, FrameFault, frame_list
 from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.solver import Prepared
 
@@ -32,6 +34,60 @@ _ALIKE = 1e-3
 _SETTLED, _MOST_STEPS = 0.1, 100
 """Of :data:`CHANCE`, the energy below which a step of predicting changes nothing that counts; and the most steps,
 which patterns that know nothing of each other do not need: chosen."""
+
+
+# ---- Faults, and how they are said ----
+
+
+class Fault(Enum):
+    """What may be wrong with frames of a capture."""
+
+    BLACK = auto()
+    DIM = auto()
+    BRIGHT = auto()
+    REPEATED = auto()
+    SWAPPED = auto()
+    """Two frames are in each other's place."""
+    MISPLACED = auto()
+    """It holds the light of another pattern."""
+    HALF_LOST = auto()
+    SHIFTED = auto()
+    CLIPPED = auto()
+    NOISELESS = auto()
+    FLICKER = auto()
+    """The lamp's power differs from frame to frame."""
+
+
+@dataclass(frozen=True)
+class FrameFault:
+    """A ``fault`` of the shots of some ``numbers``, in ``files``, from 0 in the manifest's order; ``words`` say it."""
+
+    fault: Fault
+    numbers: tuple[int, ...]
+    files: tuple[str, ...]
+    words: str
+
+    def __str__(self) -> str:
+        return self.words
+
+    def summary(self) -> dict[str, Any]:
+        """For result.json."""
+        return {
+            "fault": self.fault.name.lower(),
+            "frames": list(self.numbers),
+            "files": list(self.files),
+            "words": self.words,
+        }
+
+
+def frame_list(numbers: tuple[int, ...], files: tuple[str, ...]) -> str:
+    """Frames by their ``numbers`` and ``files``, the first few."""
+    shown = ", ".join(f"{number} ({file})" for number, file in zip(numbers[:4], files[:4], strict=True))
+    more = f" and {len(numbers) - 4} more" if len(numbers) > 4 else ""
+    return f"frame{'s' if len(numbers) > 1 else ''} {shown}{more}"
+
+
+# ---- Energies by pattern ----
 
 
 class FrameSums:
@@ -90,6 +146,9 @@ class FrameSums:
                 common = (with_both * difference - with_signed * shared) / square
                 apart = (with_signed * whole - with_both * shared) / square
                 self.powers[pattern] = common, apart, whole, difference, square
+
+
+# ---- Each frame as the others tell it ----
 
 
 class LeaveOneOut:
