@@ -28,7 +28,8 @@ from skimage.transform import resize
 
 import mitsim
 from mitsim.metrics import psnr
-from mitsim.reconstruct.reconstruct import accumulate, reconstruct
+from mitsim.reconstruct.accumulation import accumulate
+from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.regularisation import automatic_lambda
 
 SCENES = (

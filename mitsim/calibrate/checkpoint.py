@@ -37,7 +37,7 @@ from mitsim.light.grids import GRIDS, LightEstimate
 from mitsim.light.light import SampledLight
 from mitsim.light.plan import Plan
 from mitsim.light.simulation import Simulation
-from mitsim.reconstruct.estimate_factors import PairLight, PairSums, StripeSums
+from mitsim.reconstruct.estimate_factors import PairLight, StripeSums
 from mitsim.sensor.chain import Digital as DigitalNumbers
 
 KIND = "calibration"
@@ -206,12 +206,10 @@ class SessionSums:
                 arrays[f"{name}_common"], arrays[f"{name}_vectors"] = sums.common, sums.vectors[:, :done]
                 arrays[f"{name}_sums"] = [sums.misfit, sums.energy]
                 arrays[f"{name}_each"] = [each[:done] for each in (sums.misfits, sums.energies, sums.fluxes)]
-                if sums.pairs is not None:
-                    arrays[f"{name}_light"] = sums.pairs.light[:, :done]
-                    arrays[f"{name}_rows"], arrays[f"{name}_columns"] = (
-                        sums.pairs.rows[:done],
-                        sums.pairs.columns[:done],
-                    )
+                if sums.pairs:
+                    pairs = PairLight.together(sums.pairs)
+                    arrays[f"{name}_light"] = pairs.light
+                    arrays[f"{name}_rows"], arrays[f"{name}_columns"] = pairs.rows, pairs.columns
         checkpoint.save("stripes", arrays)
 
     @classmethod
@@ -246,10 +244,7 @@ def _kept_sums(arrays: Mapping[str, FloatArray], kind: str, side: Side, session:
     for each, finished in zip((sums.misfits, sums.energies, sums.fluxes), own["each"], strict=True):
         each[:done] = finished
     if "light" in own:
-        seen = [PairLight(*parts) for parts in zip(own["light"].T, own["rows"], own["columns"], strict=True)]
-        sums.pairs = PairSums.empty(seen[0], vectors.shape[1])
-        for number, pair in enumerate(seen):
-            sums.pairs.put(number, pair)
+        sums.pairs = [PairLight(*parts) for parts in zip(own["light"].T, own["rows"], own["columns"], strict=True)]
     return sums
 
 

@@ -472,8 +472,8 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Ch
         wrong=readings.wrong(),
     )
     found = check_session(sums, signs, taken)
-    if wrong := found.wrong_uniform():
-        sums, variances = _sums(readings, signs.shape[1], job, found.other_uniform(wrong))
+    if right := found.right_uniform():
+        sums, variances = _sums(readings, signs.shape[1], job, right)
         found = check_session(sums, signs, taken, uniform_given=True)
     noise = float(np.sqrt(max(float(np.mean(variances)), 0.0))) if session.listed.digital.noise_is_stated else None
     with job.clock.stage("estimate"):

@@ -18,7 +18,7 @@ in that light, and s what the model leaves in units of it. A curve counts that i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
@@ -27,13 +27,11 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.manifests import RunManifest
 from mitsim.core.runs import Measurement
+from mitsim.reconstruct.accumulation import Accumulation, FrameNoise
 from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL
 from mitsim.reconstruct.factorisation import IndexArray, group_pixels
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.noise import FrameNoise
-from mitsim.reconstruct.solver import Prepared
 from mitsim.reconstruct.subpixel import LitFrame, block_indices, factor_slope, orthonormal, print_part
 
 # ---- Causes, and what tells them apart -------------------------------------------------------------------------------
@@ -322,134 +320,6 @@ _TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
 """What frames may be, and what brings them back."""
 
 
-@dataclass(frozen=True, eq=False)
-class Readings:
-    """Other readings of a run.
-
-    Attributes
-    ----------
-    prepared
-        the factorised model.
-    manifest, noise
-        of the run, and of its measurements.
-    measured
-        reads all measurements once more.
-    """
-
-    prepared: Prepared
-    manifest: RunManifest
-    noise: FrameNoise
-    measured: Callable[[], Iterable[Measurement]]
-
-    def fitting(self, unexplained: float, beside_noise: float, all_off: bool) -> Reading | None:
-        """The reading that fits best, where one does.
-
-        Parameters
-        ----------
-        unexplained
-            part of the measurements, rms, that is left of them as they are.
-        beside_noise
-            part of their energy that rendering, the factors' noise and print put there.
-        all_off
-            whether most frames are off: then an order counts that leaves one frame of a cycle.
-        """
-        fits: list[Reading] = []
-        for cause, words, frames, most in self._candidates(all_off):
-            left_over, expected = self._left_over(frames)
-            left = max(left_over - expected - beside_noise, 0.0)
-            numbers = self.noise.readings / self.noise.shots * self.prepared.spare
-            chance = min(_CHANCE * expected * np.sqrt(2 / numbers), 0.5 * unexplained**2) if self.noise.stated else 0.0
-            fit = left < most * unexplained**2 and (left < _AT_MOST**2 or most > _FITS)
-            if fit or left < chance:
-                fits.append(Reading(cause, words, float(np.sqrt(left))))
-        return min(fits, key=lambda reading: reading.left, default=None) or self.curved()
-
-    def curved(self) -> Reading | None:
-        """The tone curve that the numbers went through, where one is likelier than none."""
-        words = ToneCurves(self.prepared, self.manifest, self.measured).likeliest()
-        return Reading(Cause.GAMMA, words) if words else None
-
-    def _left_over(self, frames: Frames) -> tuple[float, float]:
-        """Part of the energy of ``frames`` that the model leaves, and that noise is expected to leave."""
-        sums, noise = self.prepared.accumulator(), 0.0
-        for frame, row, column, own in frames:
-            sums.add(frame, row, column)
-            noise += own
-        problem = self.prepared.problem(sums)
-        explained = float(np.square(problem.projected[problem.sigma > 0]).sum())
-        energy = max(problem.energy, np.finfo(float).tiny)
-        return 1 - explained / energy, noise * self.prepared.spare / energy
-
-    def _candidates(self, with_cut: bool) -> Iterator[tuple[Cause, str, Frames, float]]:
-        """Cause, words and frames of each reading, and the part of the unexplained energy that it may leave;
-        ``with_cut`` as ``all_off`` of :meth:`fitting` takes it."""
-        shape = self.prepared.left.sensor_size, self.prepared.right.sensor_size
-        for words, turn in _TURNS.items():
-            if turn(np.zeros(shape)).shape == shape:
-                yield Cause.ORIENTATION, f"the frames are {words}", self._each(turn), _FITS
-        shots = self.manifest.patterns.captures
-        size = self.prepared.left.pattern_count * self.prepared.right.pattern_count
-        if size > 1:
-            cut = min(max(_FITS, _CUT / size), _CUT_AT_MOST) if with_cut else _FITS
-            orders = {"in the reverse order": lambda number: len(shots) - 1 - number}
-            if any(shot.sign for shot in shots):  # of a step their light tells, as FrameCheck.out_of_step has it
-                orders["with the halves of each pair exchanged"] = lambda number: number ^ 1
-            else:
-                orders |= {STEPS[0]: lambda number: number - 1, STEPS[1]: lambda number: number + 1}
-            for words, order in orders.items():
-                yield Cause.ORDER, f"the frames are {words}", self._reorder(order), cut
-
-    def _each(self, turn: Callable[[FloatArray], FloatArray]) -> Frames:
-        for each in self.measured():
-            noise = float(self.noise.variance[each.row, each.column]) * each.frame.size
-            yield np.ascontiguousarray(turn(each.frame)), each.row, each.column, noise
-
-    def _shots(self) -> Iterator[tuple[int, FloatArray]]:
-        """Number and light of each shot."""
-        number = {(shot.row, shot.column, shot.sign): n for n, shot in enumerate(self.manifest.patterns.captures)}
-        for each in self.measured():
-            shots = (each.frame,) if each.shots == 1 else _shots(each)
-            for sign, light in zip((0,) if each.shots == 1 else (1, -1), shots, strict=True):
-                yield number[each.row, each.column, sign], light
-
-    def _reorder(self, order: Callable[[int], int]) -> Frames:
-        """Measurements of the shots, each taken for that which ``order`` gives for its number: halves of signed
-        patterns as their difference."""
-        captures = self.manifest.patterns.captures
-        waiting: dict[tuple[int, int], tuple[FloatArray, float]] = {}
-        for number, light in self._shots():
-            shot = captures[order(number) % len(captures)]
-            noise = float(np.maximum(self.manifest.digital.variance(light), 0.0).sum())
-            own = (shot.sign * light if shot.sign else light), noise
-            if shot.sign and (shot.row, shot.column) not in waiting:
-                waiting[shot.row, shot.column] = own
-                continue
-            other = waiting.pop((shot.row, shot.column)) if shot.sign else (np.zeros(()), 0.0)
-            yield own[0] + other[0], shot.row, shot.column, own[1] + other[1]
-
-
-def multiple(noise: FrameNoise, chi_square: float) -> Reading | None:
-    """That all numbers of a run are multiples of one, where its noise says that they were multiplied.
-
-    Multiplied numbers count too many electrons: their variance is that many times the shot noise of so many. A camera
-    whose file knows of the factor has the noise that it states.
-
-    Parameters
-    ----------
-    noise
-        of the run.
-    chi_square
-        of its misfit.
-    """
-    factor = noise.factor
-    if factor < 2 or not chi_square > max(_MULTIPLIED * factor, _LEAST_MULTIPLIED):
-        return None
-    words = f"all numbers are multiples of {factor}"
-    if factor & (factor - 1) == 0:
-        words += f", as of fewer bits that were moved up by {factor.bit_length() - 1}"
-    return Reading(Cause.SCALE, words)
-
-
 # ---- Tone curves that numbers went through ---------------------------------------------------------------------------
 
 
@@ -525,40 +395,122 @@ class _Held:
     weights: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class ToneCurves:
-    """Tone curves of a run.
+def _shots(measurement: Measurement) -> tuple[FloatArray, ...]:
+    """Light of each shot of a ``measurement``."""
+    if measurement.shots == 1:
+        return (measurement.light,)
+    return (measurement.light + measurement.frame) / 2, (measurement.light - measurement.frame) / 2
 
-    Attributes
-    ----------
-    prepared
-        the factorised model.
-    manifest
-        of the run, which states the sensor's noise.
-    measured
-        reads all measurements once more.
-    """
 
-    prepared: Prepared
-    manifest: RunManifest
-    measured: Callable[[], Iterable[Measurement]]
+# ---- Readings of a run ----
 
-    def likeliest(self) -> str:
-        """The curve that the numbers went through, in words; empty where they are as likely without, where dark or
-        bright ones do not fit with it, or where the sensor's noise is not stated."""
-        if not self.manifest.digital.noise_is_stated:
-            return ""
-        digital = self.manifest.digital
-        largest = max(float(read.max()) for each in self.measured() for read in _shots(each))
+
+class Readings:
+    """Other readings of a run, whose measurements are added up in ``data``."""
+
+    def __init__(self, data: Accumulation) -> None:
+        self._data, self._prepared, self._noise, self._digital = data, data.prepared, data.noise, data.digital
+        self._captures = data.shots.manifest.patterns.captures
+
+    def fitting(self, unexplained: float, beside_noise: float, all_off: bool) -> Reading | None:
+        """The reading that fits best, where one does.
+
+        Parameters
+        ----------
+        unexplained
+            part of the measurements, rms, that is left of them as they are.
+        beside_noise
+            part of their energy that rendering, the factors' noise and print put there.
+        all_off
+            whether most frames are off: then an order counts that leaves one frame of a cycle.
+        """
+        fits: list[Reading] = []
+        for cause, words, frames, most in self._candidates(all_off):
+            left_over, expected = self._left_over(frames)
+            left = max(left_over - expected - beside_noise, 0.0)
+            numbers = self._noise.readings / self._noise.shots * self._prepared.spare
+            chance = min(_CHANCE * expected * np.sqrt(2 / numbers), 0.5 * unexplained**2) if self._noise.stated else 0.0
+            fit = left < most * unexplained**2 and (left < _AT_MOST**2 or most > _FITS)
+            if fit or left < chance:
+                fits.append(Reading(cause, words, float(np.sqrt(left))))
+        return min(fits, key=lambda reading: reading.left, default=None) or self.curved()
+
+    def _left_over(self, frames: Frames) -> tuple[float, float]:
+        """Part of the energy of ``frames`` that the model leaves, and that noise is expected to leave."""
+        sums, noise = self._prepared.accumulator(), 0.0
+        for frame, row, column, own in frames:
+            sums.add(frame, row, column)
+            noise += own
+        problem = self._prepared.problem(sums)
+        explained = float(np.square(problem.projected[problem.sigma > 0]).sum())
+        energy = max(problem.energy, np.finfo(float).tiny)
+        return 1 - explained / energy, noise * self._prepared.spare / energy
+
+    def _candidates(self, with_cut: bool) -> Iterator[tuple[Cause, str, Frames, float]]:
+        """Cause, words and frames of each reading, and the part of the unexplained energy that it may leave;
+        ``with_cut`` as ``all_off`` of :meth:`fitting` takes it."""
+        shape = self._prepared.left.sensor_size, self._prepared.right.sensor_size
+        for words, turn in _TURNS.items():
+            if turn(np.zeros(shape)).shape == shape:
+                yield Cause.ORIENTATION, f"the frames are {words}", self._each(turn), _FITS
+        count = len(self._captures)
+        size = self._prepared.left.pattern_count * self._prepared.right.pattern_count
+        if size > 1:
+            cut = min(max(_FITS, _CUT / size), _CUT_AT_MOST) if with_cut else _FITS
+            orders = {"in the reverse order": lambda number: count - 1 - number}
+            if any(
+                shot.sign for shot in self._captures
+            ):  # of a step their light tells, as FrameCheck.out_of_step has it
+                orders["with the halves of each pair exchanged"] = lambda number: number ^ 1
+            else:
+                orders |= {STEPS[0]: lambda number: number - 1, STEPS[1]: lambda number: number + 1}
+            for words, order in orders.items():
+                yield Cause.ORDER, f"the frames are {words}", self._reorder(order), cut
+
+    def _each(self, turn: Callable[[FloatArray], FloatArray]) -> Frames:
+        for each in self._data.measured():
+            noise = float(self._noise.variance[each.row, each.column]) * each.frame.size
+            yield np.ascontiguousarray(turn(each.frame)), each.row, each.column, noise
+
+    def _shots(self) -> Iterator[tuple[int, FloatArray]]:
+        """Number and light of each shot."""
+        number = {(shot.row, shot.column, shot.sign): n for n, shot in enumerate(self._captures)}
+        for each in self._data.measured():
+            shots = (each.frame,) if each.shots == 1 else _shots(each)
+            for sign, light in zip((0,) if each.shots == 1 else (1, -1), shots, strict=True):
+                yield number[each.row, each.column, sign], light
+
+    def _reorder(self, order: Callable[[int], int]) -> Frames:
+        """Measurements of the shots, each taken for that which ``order`` gives for its number: halves of signed
+        patterns as their difference."""
+        waiting: dict[tuple[int, int], tuple[FloatArray, float]] = {}
+        for number, light in self._shots():
+            shot = self._captures[order(number) % len(self._captures)]
+            noise = float(np.maximum(self._digital.variance(light), 0.0).sum())
+            own = (shot.sign * light if shot.sign else light), noise
+            if shot.sign and (shot.row, shot.column) not in waiting:
+                waiting[shot.row, shot.column] = own
+                continue
+            other = waiting.pop((shot.row, shot.column)) if shot.sign else (np.zeros(()), 0.0)
+            yield own[0] + other[0], shot.row, shot.column, own[1] + other[1]
+
+    # ---- Tone curves that numbers went through
+
+    def curved(self) -> Reading | None:
+        """The tone curve that the numbers went through; None where they are as likely without, where dark or bright
+        ones do not fit with it, or where the sensor's noise is not stated."""
+        digital = self._digital
+        if not digital.noise_is_stated:
+            return None
+        largest = max(float(read.max()) for each in self._data.measured() for read in _shots(each))
         own = float(digital.rate(np.array(digital.saturation_dn))) if digital.saturation_dn else largest
         own, dark = max(own + digital.dark_current_e_per_s, _TINY), digital.dark_current_e_per_s
         most = self._compare(_Curve(_power(1.0), own, own)).unlikely
         tried = {words: _Curve(shape, own, own) for words, shape in _SHAPES.items()}
         for bits in _BITS:
             top = float(digital.rate(np.array(2.0**bits - 1))) + dark
-            if (
-                _FILLS * top < largest + dark <= top < own
-            ):  # its light may have been of as many bits, or of the camera's
+            # Its light may have been of as many bits, or of the camera's.
+            if _FILLS * top < largest + dark <= top < own:
                 over = {f"{words} over {bits} bits": shape for words, shape in _SHAPES.items()}
                 tried |= {words: _Curve(shape, top, top) for words, shape in over.items()}
                 tried |= {f"{words} instead of its own": _Curve(shape, top, own) for words, shape in over.items()}
@@ -568,19 +520,19 @@ class ToneCurves:
             if held.unlikely < most:
                 fits[words] = held.away
         best = min(fits, key=lambda words: fits[words], default="")
-        return best if best and self._fits_parts(tried[best]) else ""
+        return Reading(Cause.GAMMA, best) if best and self._fits_parts(tried[best]) else None
 
     def _compare(self, curve: _Curve) -> _Held:
         """All measurements against the model, and of signed patterns the sums of their halves, which are all alike."""
-        sums, total, energy, noise, logarithms, count = self.prepared.accumulator(), np.zeros(()), 0.0, 0.0, 0.0, 0
+        sums, total, energy, noise, logarithms, count = self._prepared.accumulator(), np.zeros(()), 0.0, 0.0, 0.0, 0
         for each in self._linear(curve):
             sums.add(each.frame, *each.pattern)
             total, energy, count = total + each.light, energy + float(np.vdot(each.light, each.light)), count + 1
             noise += each.variance * each.frame.size
             logarithms += each.shots * each.frame.size * np.log(each.variance) - 2 * each.logarithm
-        problem = self.prepared.problem(sums)
+        problem = self._prepared.problem(sums)
         explained = float(np.square(problem.projected[problem.sigma > 0]).sum())
-        spreads = [(problem.energy - explained) / (noise * self.prepared.spare)]
+        spreads = [(problem.energy - explained) / (noise * self._prepared.spare)]
         if each.shots == 2 and count > 1:
             spreads.append((energy - float(np.vdot(total, total)) / count) / (noise * (1 - 1 / count)))
         unlikely = sum(count * total.size * float(np.log(max(spread, _TINY))) for spread in spreads) + logarithms
@@ -588,14 +540,14 @@ class ToneCurves:
 
     def _fits_parts(self, curve: _Curve) -> bool:
         """Whether dark and bright readings have their noise left, each part of them."""
-        weights, prepared = self._compare(curve).weights, self.prepared
+        weights, prepared = self._compare(curve).weights, self._prepared
         parts = np.zeros((2, _CURVE_PARTS))
         for each in self._linear(curve):
             residual = prepared.as_solved(each.frame) - prepared.frame(weights, each.pattern)
             # By the light around a reading, which does not know of its noise.
             near = uniform_filter(each.light, _AROUND) - each.light / _AROUND**2
             part = np.searchsorted(np.quantile(near, np.arange(1, _CURVE_PARTS) / _CURVE_PARTS), near.ravel())
-            variance = np.maximum(self.manifest.digital.variance(each.light, each.shots), _TINY).ravel()
+            variance = np.maximum(self._digital.variance(each.light, each.shots), _TINY).ravel()
             for energy, values in zip(parts, (np.square(residual).ravel(), variance), strict=True):
                 energy += np.bincount(part, values, _CURVE_PARTS)
         expected = parts[1] * prepared.spare
@@ -603,13 +555,13 @@ class ToneCurves:
 
     def _linear(self, curve: _Curve) -> Iterator[_Linear]:
         """Measurements of light, dark current and ambient light, that the numbers are a ``curve`` of."""
-        digital = self.manifest.digital
+        digital = self._digital
         dark = digital.dark_current_e_per_s
 
         def linear(read: FloatArray) -> FloatArray:
             return curve.light(read + dark) - dark
 
-        for each in self.measured():
+        for each in self._data.measured():
             pair = _shots(each)
             halves = [linear(read) for read in pair]
             light = np.asarray(sum(halves))
@@ -621,8 +573,23 @@ class ToneCurves:
             yield _Linear((each.row, each.column), frame, light, each.shots, variance, logarithm)
 
 
-def _shots(measurement: Measurement) -> tuple[FloatArray, ...]:
-    """Light of each shot of a ``measurement``."""
-    if measurement.shots == 1:
-        return (measurement.light,)
-    return (measurement.light + measurement.frame) / 2, (measurement.light - measurement.frame) / 2
+def multiple(noise: FrameNoise, chi_square: float) -> Reading | None:
+    """That all numbers of a run are multiples of one, where its noise says that they were multiplied.
+
+    Multiplied numbers count too many electrons: their variance is that many times the shot noise of so many. A camera
+    whose file knows of the factor has the noise that it states.
+
+    Parameters
+    ----------
+    noise
+        of the run.
+    chi_square
+        of its misfit.
+    """
+    factor = noise.factor
+    if factor < 2 or not chi_square > max(_MULTIPLIED * factor, _LEAST_MULTIPLIED):
+        return None
+    words = f"all numbers are multiples of {factor}"
+    if factor & (factor - 1) == 0:
+        words += f", as of fewer bits that were moved up by {factor.bit_length() - 1}"
+    return Reading(Cause.SCALE, words)

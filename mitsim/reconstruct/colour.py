@@ -31,7 +31,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -39,9 +39,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
-
-if TYPE_CHECKING:
-    from scipy.sparse.linalg import LinearOperator
+from mitsim.reconstruct.solution import Solution
 
 # ---- Images of all lines behind a mosaic of filters ------------------------------------------------------------------
 
@@ -52,33 +50,6 @@ _TOLERANCE = 1e-7
 """Residual of the normal equations, relative to their right side, at which an image's last visible digit is still."""
 _MOST_STEPS = 1000
 """Of conjugate gradients; some hundred are taken at the best lambda."""
-
-
-@dataclass(frozen=True, eq=False)
-class JointSolution:
-    """Images of all lines.
-
-    Attributes
-    ----------
-    images
-        (lines, n, n') reflectances.
-    lam
-        lambda that was used.
-    steps
-        of conjugate gradients.
-    residual
-        of the normal equations, relative to their right side.
-    """
-
-    images: FloatArray
-    lam: float
-    steps: int
-    residual: float
-
-    @property
-    def converged(self) -> bool:
-        """Whether the steps led to the solution."""
-        return self.residual <= _TOLERANCE
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,27 +90,6 @@ class JointMosaic:
     def shape(self) -> tuple[int, int, int]:
         """(lines, n, n') of the images."""
         return len(self.lefts), self.lefts.shape[2], self.rights.shape[2]
-
-    def operator(self) -> LinearOperator:
-        """The model with its adjoint: images (lines, n, n') to frames (K, K', m, m'), both in one column."""
-        from scipy.sparse.linalg import LinearOperator
-
-        size = self.P_L.shape[1], self.P_R.shape[1], self.lefts.shape[1], self.rights.shape[1]
-
-        def forward(images: FloatArray) -> FloatArray:
-            frames = np.zeros(size)
-            for i, j in np.ndindex(size[:2]):
-                frames[i, j] = self.frame(images.reshape(self.shape), i, j)
-            return frames.ravel()
-
-        def adjoint(frames: FloatArray) -> FloatArray:
-            each = frames.reshape(size)
-            return sum(
-                (self.gathered(each[index], *index) for index in np.ndindex(size[:2])), np.zeros(self.shape)
-            ).ravel()
-
-        count = int(np.prod(size)), int(np.prod(self.shape))
-        return LinearOperator(count, matvec=forward, rmatvec=adjoint, dtype=np.dtype(np.float64))
 
     def frame(self, images: FloatArray, row: int, column: int) -> FloatArray:
         """The frame (m, m') of one pattern.
@@ -191,8 +141,8 @@ class JointMosaic:
         return float(rows.max() * columns.max() * lines.max())
 
     @single_threaded_blas()
-    def solve(self, gathered: FloatArray, lam: float, start: FloatArray | None = None) -> JointSolution:
-        """Images of least squares.
+    def solve(self, gathered: FloatArray, lam: float) -> Solution:
+        """Images (lines, n, n') of least squares.
 
         Parameters
         ----------
@@ -200,8 +150,6 @@ class JointMosaic:
             (lines, n, n') sum of :meth:`gathered` over all frames.
         lam
             lambda above 0, in the unit of (Phi_L Phi_R)^2.
-        start
-            (lines, n, n') images to begin with; None: black.
 
         Raises
         ------
@@ -211,17 +159,11 @@ class JointMosaic:
         if not 0 < lam < np.inf:
             raise MitsimError(f"lambda is {lam}; give a finite number above 0")
         # With SciPy's linear algebra, which a capture behind filters does without: 14 MB of addresses.
-        from mitsim.reconstruct.convolution import Ending, conjugate_gradients
+        from mitsim.reconstruct.convolution import conjugate_gradients
 
-        found = conjugate_gradients(
-            self.normal,
-            gathered,
-            lam,
-            lambda images: self._precondition(images, lam),
-            Ending(_TOLERANCE, _MOST_STEPS),
-            start,
+        return conjugate_gradients(
+            self.normal, gathered, lam, lambda images: self._precondition(images, lam), _TOLERANCE, _MOST_STEPS
         )
-        return JointSolution(found.image, lam, found.iterations, found.residual)
 
     def _precondition(self, images: FloatArray, lam: float) -> FloatArray:
         (rows, left), (columns, right), (lines, mixed) = self._spectra
@@ -405,10 +347,6 @@ class ColourModel:
     def xyz(self, reflectances: npt.ArrayLike) -> FloatArray:
         """(..., 3) CIE XYZ under D65 of ``reflectances`` (..., lines); nothing is clipped."""
         return np.asarray(np.asarray(reflectances, dtype=np.float64) @ self.matrix.T)
-
-    def srgb(self, reflectances: npt.ArrayLike) -> FloatArray:
-        """(..., 3) linear sRGB of ``reflectances`` (..., lines), 1 = the board; beyond 0..1 where sRGB ends."""
-        return linear_srgb(self.xyz(reflectances))
 
     def summary(self) -> dict[str, Any]:
         """For colour.json and the command line's JSON."""

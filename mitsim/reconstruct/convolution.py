@@ -49,22 +49,6 @@ from mitsim.reconstruct.solution import Solution, Status, Verdict
 
 Operator = Callable[[FloatArray], FloatArray]
 """From an image (n, n) to another."""
-Watch = Callable[[FloatArray], bool]
-"""Looks at an image (n, n) under way, and says whether it is good enough."""
-
-
-def _never_enough(image: FloatArray) -> bool:
-    return False
-
-
-@dataclass(frozen=True)
-class Ending:
-    """When iterations end: at a relative residual of ``tolerance``, after ``most`` steps, or where ``watch``, which is
-    called with the image after each step, says True."""
-
-    tolerance: float = 1e-6
-    most: int = 500
-    watch: Watch = _never_enough
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,10 +164,9 @@ def solve_iteratively(
     camera: ConvolutionalCamera,
     family: PatternFamily,
     frames: Iterable[FloatArray],
-    lam: float,
+    lam: float | str,
     tolerance: float = 1e-6,
     iterations: int = 500,
-    watch: Watch = _never_enough,
 ) -> Solution:
     """Tikhonov image of any ``family`` by conjugate gradients.
 
@@ -197,8 +180,6 @@ def solve_iteratively(
         residual of the normal equations, relative, at which it ends.
     iterations
         it takes at most; that image is not ok.
-    watch
-        called with the image after each step; where it says True, that was the last.
 
     Raises
     ------
@@ -209,18 +190,16 @@ def solve_iteratively(
     def normal(image: FloatArray) -> FloatArray:
         return camera.projected(family, camera.frames(family, image))
 
-    return conjugate_gradients(
-        normal, camera.projected(family, frames), lam, None, Ending(tolerance, iterations, watch)
-    )
+    return conjugate_gradients(normal, camera.projected(family, frames), lam, None, tolerance, iterations)
 
 
 def conjugate_gradients(
     normal: Operator,
     target: FloatArray,
-    lam: float,
+    lam: float | str,
     inverse: Operator | None = None,
-    ending: Ending = Ending(),
-    start: FloatArray | None = None,
+    tolerance: float = 1e-6,
+    most: int = 500,
 ) -> Solution:
     """Solve (``normal`` + lambda) X = ``target`` (Hestenes and Stiefel 1952).
 
@@ -234,41 +213,36 @@ def conjugate_gradients(
         lambda >= 0.
     inverse
         something near the inverse of normal + lambda, symmetric and positive, which saves steps.
-    ending
-        when it ends.
-    start
-        X to begin with; None: 0.
+    tolerance, most
+        relative residual at which it ends, and the most steps.
     """
     lam = check_lambda(lam)
-    image = np.zeros_like(target) if start is None else start
-    left = target.copy() if start is None else target - normal(start) - lam * start
+    image, left = np.zeros_like(target), target
     size = float(np.linalg.norm(target)) or 1.0
     turned = inverse(left) if inverse else left
     direction, power, spent = turned, float(np.vdot(left, turned)), 0
     residual = float(np.linalg.norm(left)) / size
-    while residual > ending.tolerance and spent < ending.most:
+    while residual > tolerance and spent < most:
         spent += 1
         moved = normal(direction) + lam * direction
         step = power / float(np.vdot(direction, moved))
         image, left = image + step * direction, left - step * moved
         residual = float(np.linalg.norm(left)) / size
-        if ending.watch(image):
-            break
         turned = inverse(left) if inverse else left
         before, power = power, float(np.vdot(left, turned))
         direction = turned + power / before * direction
     figures = f"Residual of the normal equations {residual:.0e} after {spent} iterations."
-    if residual > ending.tolerance:
+    if residual > tolerance:
         remedy = "allow more iterations, a larger tolerance or a larger lambda"
-        status = Status(Verdict.NOT_CONVERGED, f"Not converged to {ending.tolerance:g}", remedy, figures)
+        status = Status(Verdict.NOT_CONVERGED, f"Not converged to {tolerance:g}", remedy, figures)
     else:
         status = Status(Verdict.SOLVED, "Solved", "", figures)
     return Solution(image, lam, residual, status, iterations=spent)
 
 
-def check_lambda(lam: float) -> float:
+def check_lambda(lam: float | str) -> float:
     """``lam``; MitsimError where it is no finite number of at least 0."""
-    if not (np.isfinite(lam) and lam >= 0):
+    if isinstance(lam, str) or not (np.isfinite(lam) and lam >= 0):
         raise MitsimError(f"lambda is {lam}; give a finite number of at least 0")
     return float(lam)
 
@@ -491,7 +465,7 @@ class FactorisedClasses:
         if self.factors is None:
             # On a section's small grids the division would take longer than the steps that it saves.
             inverse = classes.inverse(self.lam) if classes.camera.cropped else None
-            return conjugate_gradients(classes.normal, projected, self.lam, inverse, Ending(tolerance))
+            return conjugate_gradients(classes.normal, projected, self.lam, inverse, tolerance)
         targets = classes._split_classes(projected)
         image = np.empty_like(targets)
         for index, factor in enumerate(self.factors):

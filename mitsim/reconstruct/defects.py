@@ -8,18 +8,17 @@ frames are set in rounds, each of which leaves the part h of the step before.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import maximum_filter, uniform_filter
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.runs import Capture, Measurement
+from mitsim.core.runs import Measurement
+from mitsim.reconstruct.accumulation import Accumulation, FrameNoise
 from mitsim.reconstruct.factorisation import IndexArray
 from mitsim.reconstruct.focus import DerivedCapture
-from mitsim.reconstruct.noise import FrameNoise
-from mitsim.reconstruct.solver import Prepared
 
 _SPREADS = 7.0
 """Standard deviations of noise, 1e-12 for a pixel, beyond which its residual's energy is no chance."""
@@ -71,25 +70,15 @@ class Defects:
         rows, columns = np.array(places, dtype=np.intp).T
         return Defects(rows, columns)
 
-    def left_out(
-        self, shots: Capture, measured: Callable[[], Iterable[Measurement]], prepared: Prepared, weights: FloatArray
-    ) -> LeftOut:
-        """The capture whose readings at these pixels are those that all others tell.
-
-        Parameters
-        ----------
-        shots, measured
-            with these pixels, and what gives all their measurements, any number of times.
-        prepared, weights
-            the factorised model, and W of ``shots``.
-        """
+    def left_out(self, data: Accumulation) -> LeftOut:
+        """The capture of ``data`` whose readings at these pixels are those that all others tell."""
+        prepared, weights = data.prepared, data.weights
         values = {
-            (each.row, each.column): prepared.as_solved(each.frame)[self.rows, self.columns] for each in measured()
+            (each.row, each.column): prepared.as_solved(each.frame)[self.rows, self.columns] for each in data.measured()
         }
         # Of a reading that is changed the means of its row and column take up their part.
         gain = (1 - 1 / prepared.left.sensor_size) * (1 - 1 / prepared.right.sensor_size) if prepared.centre else 1.0
         first = {pattern: value.copy() for pattern, value in values.items()}
-        weights = weights.copy()
         for _ in range(_ROUNDS):
             change = np.zeros_like(weights)
             for (row, column), value in values.items():
@@ -103,7 +92,7 @@ class Defects:
                 change[prepared.places((row, column))] += own.T @ (step[:, None] * other)
             weights += change
         moved = {pattern: (values[pattern] - first[pattern]) / gain for pattern in values}
-        return LeftOut(shots, measured, self, moved)
+        return LeftOut(data, self, moved)
 
     def beyond_chance(self, rest: LeftOut, noise: FrameNoise) -> Defects | None:
         """Those of them whose readings differ by more than noise from what all others tell; None where none does.
@@ -129,26 +118,20 @@ class LeftOut(DerivedCapture):
 
     Parameters
     ----------
-    whole, measured
-        the capture, and what gives its measurements.
+    data
+        the capture added up.
     defects, moved
         the pixels, and by pattern what is added to their readings.
     """
 
-    def __init__(
-        self,
-        whole: Capture,
-        measured: Callable[[], Iterable[Measurement]],
-        defects: Defects,
-        moved: dict[tuple[int, int], FloatArray],
-    ) -> None:
-        super().__init__(whole)
-        self._measured, self._defects, self.moved = measured, defects, moved
+    def __init__(self, data: Accumulation, defects: Defects, moved: dict[tuple[int, int], FloatArray]) -> None:
+        super().__init__(data.shots)
+        self._data, self._defects, self.moved = data, defects, moved
 
     def measured(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
         """As of the capture itself, whose ``shape`` is known, with other readings at its defective pixels."""
         places = self._defects.rows, self._defects.columns
-        for each in self._measured():
+        for each in self._data.measured():
             frame, light = each.frame.copy(), each.light.copy()
             frame[places] += self.moved[each.row, each.column]
             # Of a pair's sum nothing is told but that it is no less than the difference.

@@ -24,12 +24,12 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture, Measurement
+from mitsim.reconstruct.accumulation import FrameNoise, factor_energy
 from mitsim.reconstruct.causes import Evidence
 from mitsim.reconstruct.factorisation import Group, factorise, group_pixels
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import LEAST_PART, FactorOfDepths, move_factors, parallax_of, parallax_period
 from mitsim.reconstruct.misfit import CHANCE
-from mitsim.reconstruct.noise import FrameNoise, factor_energy
 from mitsim.reconstruct.solver import Accumulator, Prepared, centre_columns, centre_frame, prepare, project_frames
 
 _STEP = 1.0

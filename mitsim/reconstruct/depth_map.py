@@ -32,11 +32,11 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture, Measurement
+from mitsim.reconstruct.accumulation import FrameNoise
 from mitsim.reconstruct.depth import Alternative, CommonBasis, best_depth, chance_difference, shifts_searched
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import STEP, are_dots, parallax_of, pixels_of_parallax, unambiguous_parallax
 from mitsim.reconstruct.misfit import Balance, Misfit
-from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solver import prepare
 

@@ -130,26 +130,14 @@ class PairLight:
     rows: FloatArray
     columns: FloatArray
 
-
-@dataclass(frozen=True, eq=False)
-class PairSums:
-    """The same of all pairs of a side: ``light`` (m, N), ``rows`` (N, 2, bins), ``columns`` (N, 2, bins)."""
-
-    light: FloatArray
-    rows: FloatArray
-    columns: FloatArray
-
     @classmethod
-    def empty(cls, first: PairLight, count: int) -> PairSums:
-        """Room for ``count`` pairs like the ``first``."""
+    def together(cls, pairs: Sequence[PairLight]) -> PairLight:
+        """That of N ``pairs``: light (m, N), rows and columns (N, 2, bins)."""
         return cls(
-            np.empty((len(first.light), count)),
-            *(np.empty((count, *part.shape)) for part in (first.rows, first.columns)),
+            np.stack([pair.light for pair in pairs], axis=1),
+            np.stack([pair.rows for pair in pairs]),
+            np.stack([pair.columns for pair in pairs]),
         )
-
-    def put(self, number: int, seen: PairLight) -> None:
-        """Keep what was ``seen`` of the pair of a ``number``."""
-        self.light[:, number], self.rows[number], self.columns[number] = seen.light, seen.rows, seen.columns
 
 
 @dataclass
@@ -173,7 +161,7 @@ class StripeSums:
     misfits, energies, fluxes
         (N,) what each response added.
     pairs
-        of its two frames; None where a response is not the difference of two, or their sum is not known.
+        of the two frames of each; none where responses are not the differences of two, or their sums are not known.
     """
 
     side: str
@@ -186,7 +174,7 @@ class StripeSums:
     misfits: FloatArray = field(init=False)
     energies: FloatArray = field(init=False)
     fluxes: FloatArray = field(init=False)
-    pairs: PairSums | None = None
+    pairs: list[PairLight] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.misfits, self.energies, self.fluxes = np.zeros((3, self.vectors.shape[1]))
@@ -249,8 +237,7 @@ class StripeSums:
         self.misfits[self.done], self.energies[self.done] = seen.misfit, seen.energy
         self.fluxes[self.done] = seen.flux
         if seen.pair is not None:
-            self.pairs = self.pairs or PairSums.empty(seen.pair, self.vectors.shape[1])
-            self.pairs.put(self.done, seen.pair)
+            self.pairs.append(seen.pair)
         self.done += 1
 
 

@@ -472,7 +472,7 @@ class Explanations:
         """Shots that are equal to another, but for noise."""
         check = self._check
         found: dict[tuple[int, ...], list[_Named]] = {}
-        for each in check.measured():
+        for each in check.data.measured():
             pattern = each.row, each.column
             signs = (1, -1) if each.shots == 2 else (0,)
             variance = float(check.noise.variance[pattern])

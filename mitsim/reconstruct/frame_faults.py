@@ -6,7 +6,7 @@ solved. Under shifting dots no pixel is in two frames, and those left out have l
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Any
@@ -16,11 +16,9 @@ import numpy.typing as npt
 from scipy.ndimage import uniform_filter
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
-from mitsim.core.manifests import RunManifest
 from mitsim.core.runs import Measurement
+from mitsim.reconstruct.accumulation import Accumulation
 from mitsim.reconstruct.factorisation import group_pixels
-from mitsim.reconstruct.noise import FrameNoise
-from mitsim.reconstruct.solver import Prepared
 
 Pattern = tuple[int, int]
 BoolArray = npt.NDArray[np.bool_]
@@ -152,47 +150,22 @@ class FrameSums:
 
 
 class LeaveOneOut:
-    """Predicts each frame of a run from its others.
+    """Predicts each frame of a run from its others: of accumulated ``data``, whose image has the lambda ``lam``."""
 
-    Parameters
-    ----------
-    prepared, weights
-        the factorised model, and W of all measurements.
-    lam
-        lambda of its image.
-    patterns
-        P_L (n, K) and P_R (n', K').
-    manifest
-        of the run.
-    noise
-        of its measurements.
-    measured
-        reads all measurements once more.
-    """
-
-    def __init__(
-        self,
-        prepared: Prepared,
-        weights: FloatArray,
-        lam: float,
-        patterns: tuple[FloatArray, FloatArray],
-        manifest: RunManifest,
-        noise: FrameNoise,
-        measured: Callable[[], Iterable[Measurement]],
-    ) -> None:
-        self.prepared, self.weights, self.noise = prepared, weights, noise
-        self.manifest, self.measured = manifest, measured
-        self.patterns, self.shots = patterns, manifest.patterns.captures
+    def __init__(self, data: Accumulation, lam: float) -> None:
+        self.data, self.prepared, self.weights, self.noise = data, data.prepared, data.weights, data.noise
+        self.manifest, self.patterns = data.shots.manifest, data.shots.patterns
+        patterns, self.shots = self.patterns, self.manifest.patterns.captures
         self.number = {(shot.row, shot.column, shot.sign): index for index, shot in enumerate(self.shots)}
         self.signed = any(shot.sign for shot in self.shots)
         all_lit = [np.flatnonzero((side > 0).all(axis=0)) for side in patterns]
         self._whole = (int(all_lit[0][0]), int(all_lit[1][0])) if self.signed and all(map(len, all_lit)) else None
-        self.sigma = sigma = prepared.sigma
+        self.sigma = sigma = self.prepared.sigma
         self._kept = np.divide(np.square(sigma), np.square(sigma) + lam, out=np.zeros_like(sigma), where=sigma > 0)
         self._periods = tuple(len(group_pixels(side, "block")) for side in patterns)
         lit = [(side != 0).sum(axis=1) for side in patterns]
-        self.exclusive = bool(max(lit[0]) == 1 and max(lit[1]) == 1) and noise.variance.size > 1
-        self.size = prepared.left.sensor_size * prepared.right.sensor_size
+        self.exclusive = bool(max(lit[0]) == 1 and max(lit[1]) == 1) and self.noise.variance.size > 1
+        self.size = self.prepared.left.sensor_size * self.prepared.right.sensor_size
 
     def image(self, weights: FloatArray) -> FloatArray:
         """(n, n') image of the ``weights`` W at the image's lambda."""
@@ -220,7 +193,7 @@ class LeaveOneOut:
     def measurements(self, patterns: Iterable[Pattern]) -> dict[Pattern, Measurement]:
         """Those of ``patterns``."""
         wanted = set(patterns)
-        return {key: each for each in self.measured() if (key := (each.row, each.column)) in wanted}
+        return {key: each for each in self.data.measured() if (key := (each.row, each.column)) in wanted}
 
     def all_but(self, bad: Iterable[Pattern]) -> BoolArray:
         """(K, K') whether patterns are none of the ``bad``."""
@@ -286,7 +259,7 @@ class LeaveOneOut:
             good = zip(*np.nonzero(self.all_but(bad)), strict=True)
             total = sum((each.light for each in self.measurements(good).values()), start=np.zeros(()))
         others = max(self.noise.variance.size - len(set(bad)), 2)
-        for each in self.measured():
+        for each in self.data.measured():
             pattern, frame = (each.row, each.column), self.prepared.as_solved(each.frame)
             residual = frame - self.prepared.frame(weights, pattern)
             sums.residual[pattern], sums.power[pattern] = sum_of_squares(residual), each.power

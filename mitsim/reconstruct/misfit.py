@@ -4,15 +4,6 @@ Of data Y the model can explain what lies in its range, U_L W U_R^T, whatever th
 U_R^T hangs on no lambda. Its energy is held against what the sensor's stated noise, that of the calibrated factors and
 the error of simulated frames put there; what is more is *unexplained*: light that no flat, matt scene at the calibrated
 distance sends.
-
-*What factors lack.* A camera whose shadow is no single product, as of waves behind a FlatCam or MURA mask, adds sum_k
-L_k (P_ij o X) R_k^T to the frames that Phi_L (P_ij o X) Phi_R^T explains. With G_kl = L_k^T L_l and H_kl = R_l^T R_k
-its energy over all patterns is ::
-
-    sum_kl <X, (G_kl o P_L P_L^T) X (H_kl o P_R P_R^T)>
-
-of which |T|^2 lies in the model's range, T = sum_k (sum_i U_Li^T L_k diag(p_i)) X (sum_j U_Rj^T R_k diag(q_j))^T being
-what coefficients W take for image.
 """
 
 from __future__ import annotations
@@ -24,18 +15,17 @@ from typing import Any
 
 import numpy as np
 
-from mitsim.core.arrays import FloatArray, SeparableTerm
+from mitsim.core.arrays import FloatArray
 from mitsim.core.runs import Measurement
+from mitsim.reconstruct.accumulation import Accumulation, FrameNoise
 from mitsim.reconstruct.causes import Cause, Evidence, Reading, Readings, Signatures, likely_cause, multiple
 from mitsim.reconstruct.defects import Defects, defects_of
 from mitsim.reconstruct.estimate_factors import decibels
-from mitsim.reconstruct.factorisation import Side
 from mitsim.reconstruct.frame_check import FrameCheck
 from mitsim.reconstruct.frame_faults import FrameFault, FrameSums
-from mitsim.reconstruct.noise import FrameNoise
-from mitsim.reconstruct.solution import Status, Verdict
+from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solver import Prepared
-from mitsim.reconstruct.subpixel import Model
+from mitsim.reconstruct.subpixel import print_energy
 
 UNEXPLAINED = 3.5e-3
 """Part of the measurements, rms, that a fitting scene may leave unexplained: prints leave up to 6e-4 (the shipped ones)
@@ -52,6 +42,9 @@ _GROSS_CHI_SQUARE = 4.0
 """The same as a chi-square, of shot noise alone: read noise of as many electrons makes 2."""
 _SHOWN = 4
 """Faults that a sentence holds; result.json has them all."""
+_LAMBDA_BESIDE = 1e-3
+"""Lambda, over the largest sigma^2, by which frames are predicted beside an image whose own weight says nothing of it,
+as of total variation: chosen, between those of bright and of dim runs."""
 _MOSTLY = 0.5
 """Part of the unexplained energy at defective pixels from which frames are not blamed: most of it."""
 _QUIET = 0.03
@@ -216,10 +209,10 @@ class Residuals:
     """
 
     @classmethod
-    def of(cls, check: FrameCheck, evidence: Evidence) -> Residuals:
-        """Of all measurements of a ``check``, which are read once more; ``evidence`` is empty."""
-        sums = cls(check.prepared, check.weights, check.noise, evidence)
-        for measurement in check.measured():
+    def of(cls, data: Accumulation, evidence: Evidence) -> Residuals:
+        """Of all measurements of accumulated ``data``, which are read once more; ``evidence`` is empty."""
+        sums = cls(data.prepared, data.weights, data.noise, evidence)
+        for measurement in data.measured():
             sums.add(measurement)
         return sums
 
@@ -320,40 +313,37 @@ class Residuals:
 # ---- Measurements held against the model ----
 
 
-def find_misfit(
-    check: FrameCheck, factor_energy: float | None, print_energy: float, evidence: Evidence, with_defects: bool = True
-) -> Misfit | None:
-    """Hold all measurements against the model; None where there are no more data than unknowns.
+def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = True) -> Misfit | None:
+    """Hold all measurements of accumulated ``data`` against the model; None where there are no more data than unknowns.
 
     Parameters
     ----------
-    check
-        of the factorised model and of all measurements, which are read once more.
-    factor_energy
-        what noisy factors add to the frames; None: not stated.
-    print_energy
-        what print within a pixel may add: left to a fitting scene, but no part of the chi-square.
-    evidence
-        empty, of the same model.
+    data
+        whose frames are read again if they were not kept.
+    solution
+        of them, for what print and the factors' noise add to the frames.
     with_defects
         whether defective pixels are looked for, and no cause where there are some.
     """
-    prepared, noise = check.prepared, check.noise
+    prepared, noise, image = data.prepared, data.noise, solution.image
     if prepared.spare <= 0:
         return None
-    sums = Residuals.of(check, evidence)
+    lack, factor_energy, of_ramps = data.lack(image), data.factor_energy(image), print_energy(data.model, image)
+    evidence = Evidence(data.factors, data.shots.patterns, lack.energy if lack else None)
+    lam = solution.lam if data.solver.linear else _LAMBDA_BESIDE * prepared.problem(data.frames).scale
+    check, sums = FrameCheck(data, lam), Residuals.of(data, evidence)
     expected = sums.expected(factor_energy or 0.0)
     balance = Balance(sums.residual, sums.energy, expected, sums.pixels, factor_energy is not None)
-    found, excess = balance.misfit(noise, print_energy)
+    found, excess = balance.misfit(noise, of_ramps)
     if evidence.predicted is not None:
         found = replace(found, predicted=float(np.sqrt(evidence.predicted / max(float(sums.energy.sum()), _TINY))))
-    beside_noise = noise.rendering + (factor_energy or 0.0) + print_energy
+    beside_noise = noise.rendering + (factor_energy or 0.0) + of_ramps
     if reading := multiple(noise, found.chi_square) or check.out_of_step(sums.by_pattern):
         return found.read_as(reading)
     defects = sums.defects(check.whole()) if with_defects else None
     if defects and excess > 0 and sums.at(defects) > _MOSTLY * excess:
         return replace(found, defects=defects)
-    readings = Readings(prepared, check.manifest, noise, check.measured)
+    readings = Readings(data)
     chance = _chance(noise, float(sums.pixels.sum()))
     hinted = found.flagged or (found.stated and found.unexplained > UNEXPLAINED and found.chi_square > 1 + chance / 2)
     if hinted:
@@ -375,23 +365,25 @@ def find_misfit(
     signatures = evidence.signatures(excess, noise.saturated / max(noise.readings, 1))
     # Of what is left beyond the sensor's noise, as signatures are.
     of_print = float(np.nan_to_num(signatures.detail)) * (excess + beside_noise)
-    fine, _ = balance.misfit(noise, max(print_energy, of_print))
+    fine, _ = balance.misfit(noise, max(of_ramps, of_print))
     if not fine.flagged:
         return replace(fine, predicted=found.predicted, detail=float(np.sqrt(of_print / sums.energy.sum())))
     return replace(found, cause=likely_cause(signatures, found.unexplained, evidence.of_factors), signatures=signatures)
 
 
-def faulty_frames(check: FrameCheck, beside_noise: float, evidence: Evidence) -> tuple[FrameFault, ...]:
+def faulty_frames(data: Accumulation, image: FloatArray, lam: float) -> tuple[FrameFault, ...]:
     """Frames at fault of a scene of several depths, of which the model fits a part.
 
     Parameters
     ----------
-    check, evidence
-        as :func:`find_misfit` takes them.
-    beside_noise
-        as :meth:`FrameCheck.faults` takes it.
+    data
+        added up at the depth of most of the scene.
+    image, lam
+        (n, n') with a depth for each pixel, and its lambda.
     """
-    return check.faults(Residuals.of(check, evidence).by_pattern, beside_noise, fits=False)
+    beside = data.noise.rendering + (data.factor_energy(image) or 0.0) + print_energy(data.model, image)
+    sums = Residuals.of(data, Evidence(data.factors, data.shots.patterns)).by_pattern
+    return FrameCheck(data, lam).faults(sums, beside, fits=False)
 
 
 # ---- Energies found and expected ----
@@ -458,44 +450,3 @@ def _chance(noise: FrameNoise, pixels: float) -> float:
     variance v in n data varies by sqrt(2 n) v."""
     total = max(float(noise.variance.sum()), _TINY)
     return CHANCE * float(np.sqrt(2 * np.square(noise.variance).sum() / pixels)) / total
-
-
-# ---- Separable terms that factors lack ----
-
-
-@dataclass(frozen=True, eq=False)
-class Lack:
-    """What ``terms`` beside a ``model``'s factors, centred as these are, do to its ``image`` (n, n'); one or more."""
-
-    model: Model
-    terms: tuple[SeparableTerm, ...]
-    image: FloatArray
-
-    @property
-    def energy(self) -> float:
-        """Energy that they put into all frames outside of the model's range."""
-        left, right = (lit @ lit.T for lit in self.model.patterns)
-        total = 0.0
-        for a, b in self.terms:
-            for c, d in self.terms:
-                total += float(np.vdot(self.image, ((a.T @ c) * left) @ self.image @ ((d.T @ b) * right)))
-        return max(total - float(np.square(self.struck).sum()), 0.0)
-
-    @cached_property
-    def struck(self) -> FloatArray:
-        """(r, r') what they add to the coefficients W of all frames."""
-        sides, patterns = self.model.sides, self.model.patterns
-        return np.asarray(
-            sum(
-                _term_response(sides[0], a, patterns[0]) @ self.image @ _term_response(sides[1], b, patterns[1]).T
-                for a, b in self.terms
-            )
-        )
-
-
-def _term_response(side: Side, term: FloatArray, patterns: FloatArray) -> FloatArray:
-    """(r, n) sum_i U_i^T L diag(p_i), of one side of a ``term`` L (m, n) and its ``patterns`` (n, K)."""
-    seen = np.zeros((len(side.singular), term.shape[1]))
-    for slab, lit in zip(side.slabs, patterns.T, strict=True):
-        seen[slab.columns] += (slab.matrix.T @ term) * lit
-    return seen

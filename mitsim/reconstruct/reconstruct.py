@@ -5,9 +5,8 @@ An image is figures, sentences and pictures, and a folder of files.
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -22,33 +21,21 @@ from mitsim.core.exr import write_frame
 from mitsim.core.files import output_folder, plain, read_json, whole_file, write_json
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.resources import Cost, Limits
-from mitsim.core.runs import Capture, Measurement
+from mitsim.core.runs import Capture
+from mitsim.reconstruct.accumulation import Accumulation, accumulate, check_factorising
 from mitsim.reconstruct.background import Margin
-from mitsim.reconstruct.causes import Cause, Evidence
+from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.defects import Defects, LeftOut
 from mitsim.reconstruct.depth import Depth, best_depth
 from mitsim.reconstruct.depth_map import DepthMap, depth_map
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import move_factors
-from mitsim.reconstruct.frame_check import FrameCheck
-from mitsim.reconstruct.frame_faults import FrameFault
-from mitsim.reconstruct.misfit import Lack, Misfit, faulty_frames, find_misfit
-from mitsim.reconstruct.noise import FrameNoise, factor_energy
-from mitsim.reconstruct.request import (
-    BYTES_A_NUMBER,
-    IMAGE_FILE,
-    TIKHONOV,
-    ImageCost,
-    ImageRequest,
-    keeps_frames,
-    predict_cost,
-    slab_numbers,
-)
-from mitsim.reconstruct.solution import Solution, Status, Verdict
-from mitsim.reconstruct.solver import Accumulator, Prepared
-from mitsim.reconstruct.solvers import SOLVERS, SeparableSolver
-from mitsim.reconstruct.subpixel import Model, print_energy
-from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Propagation, Uncertainty, uncertainty
+from mitsim.reconstruct.misfit import Misfit, faulty_frames, find_misfit
+from mitsim.reconstruct.request import IMAGE_FILE, TIKHONOV, ImageCost, ImageRequest, predict_cost
+from mitsim.reconstruct.solution import Solution, Verdict
+from mitsim.reconstruct.solvers import SOLVERS
+from mitsim.reconstruct.subpixel import print_energy
+from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Uncertainty, uncertainty
 
 # ---- An image and how far to trust it --------------------------------------------------------------------------------
 
@@ -56,34 +43,24 @@ UNCERTAINTY_FILE, DEPTH_FILE = "uncertainty.exr", "depth.exr"
 RESULT_FILE = "result.json"
 
 
-@dataclass(frozen=True, eq=False)
-class Reconstruction:
-    """An image and how far to trust it.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Reconstruction(Solution):
+    """An image and how far to trust it: reflectance, 1 = the calibration's board. Its status counts misfit, and flags
+    of the capture and of the calibration.
 
     Attributes
     ----------
-    image
-        (n, n') reflectance, 1 = the calibration's board, neither clipped nor normalised.
-    lam
-        lambda that was used, in the unit of (Phi_L Phi_R)^2; for ``tv`` the weight of the total variation.
     rank
         of the whole model, the product of ``rank_sides``.
     condition
         the larger of ``condition_sides``; that of the whole model is their product, ``condition_whole``.
     rank_sides, condition_sides
         of scene rows and of scene columns.
-    residual
-        ||Y - model|| / ||Y|| over all frames.
-    rounding
-        what rounding may have changed, ||error|| / ||image||; None for ``tv`` and with a depth for each pixel.
     misfit
         what of the measurements fits no image; None where there are no more data than unknowns.
     uncertainties
         standard uncertainty of the image by source; None for ``tv`` and with a depth for each pixel, which are not
         linear in the frames.
-    status
-        whether it can be trusted, what is wrong and what to do; misfit and flags of the capture and of the calibration
-        count.
     seconds
         by stage.
     inputs
@@ -92,33 +69,18 @@ class Reconstruction:
         the depth whose factors were used, or a depth for each pixel; None: the calibrated one.
     predicted
         seconds by stage and memory, before it was begun; None where nobody could tell.
-    objective, relative_gap
-        of ``tv``: what was minimised, and how far above its minimum it may be at most, relative
-        (:class:`mitsim.reconstruct.solution.Solution`); None for other methods.
     """
 
-    image: FloatArray
-    lam: float
     rank: int
     condition: float
     rank_sides: tuple[int, int]
     condition_sides: tuple[float, float]
-    residual: float
-    rounding: float | None
     misfit: Misfit | None
     uncertainties: Uncertainty | None
-    status: Status
     seconds: dict[str, float]
     inputs: dict[str, Any]
     focus: Depth | DepthMap | None = None
     predicted: ImageCost | None = None
-    objective: float | None = None
-    relative_gap: float | None = None
-
-    @property
-    def ok(self) -> bool:
-        """Whether the image can be used as it is."""
-        return self.status.ok
 
     @property
     def depths(self) -> DepthMap | None:
@@ -273,9 +235,6 @@ def check_same_inputs(folder: Path, head: object, asked: Mapping[str, str | floa
 
 # ---- From shots and factors to an image ------------------------------------------------------------------------------
 
-_LAMBDA_BESIDE = 1e-3
-"""Lambda, over the largest sigma^2, by which frames are predicted beside an image whose own weight says nothing of it,
-as of total variation: chosen, between those of bright and of dim runs."""
 _DEFECT_ROUNDS = 6
 """Times that defective pixels are looked for: beside bright ones dim ones show when these are left out, of a tenth of
 their energy each time."""
@@ -337,7 +296,7 @@ def reconstruct(
         shots, factors = beside.of(wider.of(shots)), wider.factors
     # Depths that are looked for, and total variation, take as long as the data ask for.
     cost = predict_cost(shots, factors) if method == TIKHONOV and not request.looks_for_depth else None
-    _check_factorising(shots, factors, solver)
+    check_factorising(shots, factors, solver)
     if cost:
         Cost(sum(cost.seconds.values()), cost.memory_bytes).check(f"{shots.name}: its image", Limits())
     started = time.perf_counter()
@@ -355,7 +314,7 @@ def reconstruct(
     by_pixel = depth if isinstance(depth, DepthMap) and not depth.doubt else None
     solution = by_pixel.solution if by_pixel else data.solution(lam)
     solved = time.perf_counter()
-    misfit = data.misfit_at(by_pixel) if by_pixel else data.misfit(solution)
+    misfit = _misfit_at(data, by_pixel) if by_pixel else find_misfit(data, solution)
     if misfit and misfit.defects:
         data, solution, misfit = _without_defects(data, lam, misfit)
     if misfit and misfit.cause in _OF_THE_SCENE and isinstance(depth, Depth) and depth.at_end:
@@ -367,7 +326,7 @@ def reconstruct(
         known = (lack.struck, lack.energy) if lack else None
         solution = data.prepared.solve(data.frames, lam, explained=explained, lack=known)
     judged = time.perf_counter()
-    uncertainties = data.uncertainty(solution) if linear else None
+    uncertainties = uncertainty(data, solution) if linear else None
     status = misfit.judged(solution.status) if misfit else solution.status
     image = solution.image
     if beside:
@@ -379,17 +338,13 @@ def reconstruct(
     flags = (*status.flags, *(doubt for doubt in doubts if doubt), *_flags(data.shots, factors))
     left, right = data.model.sides
     return Reconstruction(
-        image=image,
-        lam=solution.lam,
+        **{**vars(solution), "image": image, "status": replace(status, flags=flags)},
         rank=data.prepared.rank,
         condition=data.prepared.condition,
         rank_sides=(left.rank, right.rank),
         condition_sides=(left.condition, right.condition),
-        residual=solution.residual,
-        rounding=solution.rounding,
         misfit=misfit,
         uncertainties=uncertainties,
-        status=replace(status, flags=flags),
         seconds={
             **({"focus": found - started} if depth else {}),
             "accumulate": added - found,
@@ -400,115 +355,16 @@ def reconstruct(
         inputs=asked,
         focus=depth,
         predicted=cost,
-        objective=solution.objective,
-        relative_gap=solution.relative_gap,
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Accumulation:
-    """A run's frames added up.
-
-    Attributes
-    ----------
-    shots, factors, method
-        of which, and for what image.
-    model
-        that the frames are of, factorised.
-    frames, noise
-        sums of all frames, and of their noise.
-    kept
-        the frames themselves while they are few; all or none.
-    """
-
-    shots: Capture
-    factors: Factors
-    method: str
-    model: Model
-    frames: Accumulator
-    noise: FrameNoise
-    kept: tuple[Measurement, ...]
-
-    @property
-    def solver(self) -> SeparableSolver:
-        """Of the method."""
-        return SOLVERS[self.method]
-
-    @property
-    def prepared(self) -> Prepared:
-        """The factorised model."""
-        return self.model.prepared
-
-    @property
-    def weights(self) -> FloatArray:
-        """(r, r') W of all frames."""
-        problem = self.prepared.problem(self.frames)
-        return np.where(problem.sigma > 0, problem.projected, 0.0)
-
-    def measured(self) -> Iterable[Measurement]:
-        """All measurements once more: those that are kept, or reads them."""
-        return self.kept or self.shots.measured()
-
-    def solution(self, lam: float | Literal["auto"]) -> Solution:
-        """Their image at ``lam``."""
-        return self.solver.compute(self.prepared, self.frames, lam)
-
-    def lack(self, image: FloatArray) -> Lack | None:
-        """What the factors are known to lack of the camera, of an ``image`` (n, n'); None where nothing is known."""
-        return Lack(self.model, self.factors.lacking, image) if self.factors.lacking else None
-
-    def misfit(self, solution: Solution, with_defects: bool = True) -> Misfit | None:
-        """What of the measurements the model leaves unexplained, or None; reads frames again that were not kept.
-
-        Parameters
-        ----------
-        solution
-            of them, for what the factors' noise adds to the frames.
-        with_defects
-            whether defective pixels are looked for, and no cause where there are some.
-        """
-        image, lack = solution.image, self.lack(solution.image)
-        lam = solution.lam if self.solver.linear else _LAMBDA_BESIDE * self.prepared.problem(self.frames).scale
-        evidence = Evidence(self.factors, self.shots.patterns, lack.energy if lack else None)
-        of_factors = self._factor_energy(image)
-        return find_misfit(self._check(lam), of_factors, print_energy(self.model, image), evidence, with_defects)
-
-    def misfit_at(self, depths: DepthMap) -> Misfit:
-        """The same of an image with a depth for each pixel, ``depths``."""
-        of_factors = self._factor_energy(depths.image)
-        misfit = depths.misfit(self.noise, of_factors, print_energy(self.model, depths.image))
-        # At the depth of most of the scene a frame that is not what it says is off by more than depth puts it.
-        most = move_factors(self.factors, float(np.median(depths.mm)))
-        faults = accumulate(most.of(self.shots), most.factors)._faulty_frames(depths)
-        return replace(misfit, flagged=True, cause=Cause.FRAMES, faults=faults) if faults else misfit
-
-    def _faulty_frames(self, depths: DepthMap) -> tuple[FrameFault, ...]:
-        """Frames at fault of a scene of several ``depths``, these sums being at that of most of it."""
-        added = self._factor_energy(depths.image) or 0.0
-        beside = self.noise.rendering + added + print_energy(self.model, depths.image)
-        return faulty_frames(self._check(depths.lam), beside, Evidence(self.factors, self.shots.patterns))
-
-    def _factor_energy(self, image: FloatArray) -> float | None:
-        stated = self.factors.manifest.noise
-        return factor_energy(self.prepared, self.shots.patterns, stated, image) if stated else None
-
-    def _check(self, lam: float) -> FrameCheck:
-        patterns, manifest = self.shots.patterns, self.shots.manifest
-        return FrameCheck(self.prepared, self.weights, lam, patterns, manifest, self.noise, self.measured)
-
-    def uncertainty(self, solution: Solution) -> Uncertainty:
-        """Standard uncertainty of a ``solution`` of these sums."""
-        manifest = self.factors.manifest
-        calibrated = manifest.digital.exposure_uncertainty if manifest.digital else 0.0
-        return uncertainty(
-            Propagation(self.model, solution.lam),
-            self.noise,
-            manifest.noise,
-            math.hypot(self.shots.manifest.digital.exposure_uncertainty, calibrated),
-            solution.image,
-            self.prepared.problem(self.frames),
-            self.lack(solution.image),
-        )
+def _misfit_at(data: Accumulation, depths: DepthMap) -> Misfit:
+    """What of the measurements fits no image with a depth for each pixel, ``depths``."""
+    misfit = depths.misfit(data.noise, data.factor_energy(depths.image), print_energy(data.model, depths.image))
+    # At the depth of most of the scene a frame that is not what it says is off by more than depth puts it.
+    most = move_factors(data.factors, float(np.median(depths.mm)))
+    faults = faulty_frames(accumulate(most.of(data.shots), most.factors), depths.image, depths.lam)
+    return replace(misfit, flagged=True, cause=Cause.FRAMES, faults=faults) if faults else misfit
 
 
 def _without_defects(
@@ -518,7 +374,7 @@ def _without_defects(
     frames fit no better so. ``misfit`` is that of ``data``, with the first defects."""
 
     def left_out(defects: Defects) -> tuple[LeftOut, Accumulation, Solution]:
-        rest = defects.left_out(data.shots, data.measured, data.prepared, data.weights)
+        rest = defects.left_out(data)
         without = accumulate(rest, data.factors, data.method)
         return rest, without, without.solution(lam)
 
@@ -528,61 +384,18 @@ def _without_defects(
             break
         found = now.defects.with_others(found)
         rest, without, solution = left_out(found)
-        now = without.misfit(solution) or now
+        now = find_misfit(without, solution) or now
     # What bright ones put into other pixels is none of these: they are taken in again.
     while found and (own := found.beyond_chance(rest, data.noise)) and len(own.rows) < len(found.rows):
         found = own
         rest, without, solution = left_out(found)
-        now = without.misfit(solution, with_defects=False) or now
+        now = find_misfit(without, solution, with_defects=False) or now
     if now.flagged:
-        now = without.misfit(solution, with_defects=False) or now
+        now = find_misfit(without, solution, with_defects=False) or now
     if now.flagged and now.unexplained > _BETTER * misfit.unexplained:
         solution = data.solution(lam)
-        return data, solution, data.misfit(solution, with_defects=False)
+        return data, solution, find_misfit(data, solution, with_defects=False)
     return without, solution, replace(now, defects=found)
-
-
-def accumulate(shots: Capture, factors: Factors, method: str = TIKHONOV) -> Accumulation:
-    """The model of shots and factors factorised, and every frame added.
-
-    Parameters
-    ----------
-    shots, factors
-        that fit each other.
-    method
-        of the image that they are for.
-
-    Raises
-    ------
-    MitsimError
-        when that takes more memory than is free, or a frame cannot be read.
-    """
-    solver = SOLVERS[method]
-    _check_factorising(shots, factors, solver)
-    prepared = solver.init(factors, shots.patterns)
-    noise = FrameNoise(shots.manifest, _ambient_noise(shots))
-    frames, kept = prepared.accumulator(), list[Measurement]()
-    few = keeps_frames(shots, factors)
-    for measurement in shots.measured((len(factors.left), len(factors.right))):
-        frames.add(measurement.frame, measurement.row, measurement.column)
-        noise.add(measurement)
-        if few:
-            kept.append(measurement)
-    model = Model(prepared, factors.sides, shots.patterns)
-    return Accumulation(shots, factors, method, model, frames, noise, tuple(kept))
-
-
-def _check_factorising(shots: Capture, factors: Factors, solver: SeparableSolver) -> None:
-    """MitsimError where factorising the model of ``shots`` and ``factors`` takes more memory than is free."""
-    cost = Cost(memory_bytes=BYTES_A_NUMBER * slab_numbers(shots, factors, whole=solver.whole))
-    cost.check(f"{shots.name}: factorising its patterns", Limits())
-
-
-def _ambient_noise(shots: Capture) -> tuple[FloatArray, FloatArray] | None:
-    """Variance, by sensor row and by sensor column, of the frame that is taken off all others; None where none is."""
-    if shots.ambient is None or any(shot.sign for shot in shots.manifest.patterns.captures):
-        return None
-    return shots.ambient.variance.mean(axis=1), shots.ambient.variance.mean(axis=0)
 
 
 def _depth(shots: Capture, factors: Factors, request: ImageRequest) -> Depth | DepthMap | None:

@@ -15,11 +15,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.session import SIDES, Half, Side
-from mitsim.reconstruct.estimate_factors import Estimate, StripeSums, factors_of_sums
+from mitsim.reconstruct.estimate_factors import Estimate, PairLight, StripeSums, factors_of_sums
 from mitsim.reconstruct.session_lamp import MATTERS, Lamp, end_to_end, flickers, lamp_of_frames, trend_of
 from mitsim.reconstruct.session_side import (
     DARK,
@@ -66,6 +67,38 @@ _BOTH = 36.0
 predict the other by."""
 
 
+@dataclass(frozen=True)
+class SessionConditions:
+    """How a session was taken.
+
+    Attributes
+    ----------
+    order
+        frames as they were taken.
+    name
+        of a frame.
+    clipped
+        whether many of a frame's pixels share its largest number.
+    saturated
+        whether frames have saturated pixels, which make many pairs add up to less; those sessions are flagged for it,
+        and not refused.
+    unsteady
+        whether it is stated that the lamp is, so that its power is neither divided out nor said.
+    step
+        between two numbers of a frame, as the responses have it.
+    wrong
+        frames that are known to be wrong, and why.
+    """
+
+    order: Sequence[Half]
+    name: Callable[[Half], str] = frame_words
+    clipped: Callable[[Half], bool] = lambda half: False
+    saturated: bool = False
+    unsteady: bool = False
+    step: float = 0.0
+    wrong: Mapping[Half, str] = field(default_factory=dict)
+
+
 class _Frame(NamedTuple):
     """One frame of a session: the ``number`` of its side, 0 or 1, its ``pattern`` and its ``sign``."""
 
@@ -98,101 +131,84 @@ _Parts = tuple[FloatArray, FloatArray, FloatArray]
 
 
 class Pairs:
-    """Pairs of both ``sides``, frames in the ``order`` in which they were taken."""
+    """Pairs of both ``sides``, whose frames were ``taken`` in some order."""
 
-    def __init__(
-        self,
-        sides: list[SideCheck],
-        order: Sequence[Half],
-        clipped: Callable[[Half], bool],
-        step: float,
-        wrong: Mapping[Half, str],
-    ) -> None:
-        """Add pairs up.
-
-        Parameters
-        ----------
-        sides
-            both.
-        order, clipped, step, wrong
-            as a session's circumstances have them.
-        """
-        self.sides, self.clipped, self.wrong = sides, clipped, wrong
-        self.pairs = [own.sums.pairs for own in sides if own.sums.pairs is not None]
-        self.count = sides[0].sums.done
-        places = {half: place for place, half in enumerate(order)}
-        self.before = dict(zip(order[1:], order, strict=False))
-        span = max(len(order) - 1, 1)
+    def __init__(self, sides: list[SideCheck], taken: SessionConditions) -> None:
+        self.sides, self.taken, self.count = sides, taken, sides[0].sums.done
+        self.pairs = [PairLight.together(own.sums.pairs) for own in sides]
+        self.before = dict(zip(taken.order[1:], taken.order, strict=False))
+        places = {half: place / max(len(taken.order) - 1, 1) for place, half in enumerate(taken.order)}
         self.times = np.array(
-            [[places[own.side, index, sign] / span for sign in (1, -1)] for own in sides for index in range(self.count)]
-        )
-        self.rows = np.concatenate([own.rows.sum(axis=1) for own in self.pairs])
-        self.columns = np.concatenate([own.columns.sum(axis=1) for own in self.pairs])
-        both = np.hstack([self.rows, self.columns])
+            [[places[own.side, index, sign] for sign in (1, -1)] for own in sides for index in range(self.count)]
+        ).mean(axis=1)
+        halves = [
+            np.concatenate([np.hstack([own.rows[:, half], own.columns[:, half]]) for own in self.pairs])
+            for half in (0, 1)
+        ]
+        both = halves[0] + halves[1]
         self.ambient_and_all = np.median(both, axis=0)
         self.common = self._uniform()
         # Of a pair, what its dark frame has of ambient light.
         light = float(self.ambient_and_all.sum())
         self.dark = (1 - float(self.common.sum()) / light) / 2 if light else 0.0
-        size = max(float(np.dot(self.common, self.common)), 1e-300)
-        away = both - self.ambient_and_all
         # Ambient light is in every sum, and no part of the lamp's power.
-        self.power = 1 + away @ self.common / size
+        away = both - self.ambient_and_all
+        self.power = 1 + away @ self.common / _square(self.common)
+        self.trend, self.scatter, self.steady = trend_of(self.times, self.power)
         self.lights = [np.median(own.light, axis=1) for own in self.pairs]
         self.uniforms = [other.sums.common for other in reversed(sides)]
         rests = [away - (self.power - 1)[:, None] * self.common]
-        halves = [
-            np.concatenate([np.hstack([own.rows[:, half], own.columns[:, half]]) for own in self.pairs])
-            for half in (0, 1)
-        ]
-        self.trend, self.scatter, self.steady = trend_of(self.times.mean(axis=1), self.power)
-        differences = [halves[0] - halves[1]]
-        for number, own in enumerate(self.pairs):
-            along, vectors = self.uniforms[number], sides[number].sums.vectors
-            rest = (own.light - self.lights[number][:, None]).T
-            rest = rest - np.outer(rest @ along / max(float(np.dot(along, along)), 1e-300), along)
-            rests.append(rest)
-            differences.append(vectors.T)
-        for number, along in enumerate((self.common, *self.uniforms)):
-            share = differences[number] @ along / max(float(np.dot(along, along)), 1e-300)
-            differences[number] = differences[number] - np.outer(share, along)
-        # Rounding of a pair's sum that no noise makes random is one for all its pixels of like light.
-        alike = step / np.sqrt(6) if min(own.variance for own in sides) < _RANDOM * step**2 else 0.0
-        rounding = max(_ROUNDING**2 * float(np.square(self.ambient_and_all).mean()), alike**2)
-        shares = [float(np.abs(along).sum() / max(np.dot(along, along), 1e-300)) for along in self.uniforms]
-        least = [rounding * share**2 for share in (1.0, *shares)]
-        self.flicker, self.floor = 0.0, 1.0
-        self.light_noise = [1.0, 1.0]
-        for _ in range(_TURNS):  # noise and flicker hang on each other
-            found = [
-                _unshaken(rest, difference, self.flicker, noise)
-                for rest, difference, noise in zip(
-                    rests, differences, [self.floor, *self.light_noise] if self.flicker else [1.0] * 3, strict=True
-                )
-            ]
-            self.floor, *self.light_noise = map(max, [float(np.median(each)) for each in found], least)
-            # Means of rows and of columns share the frame's mean and its noise: twice independent ones' variance.
-            self.noise = float(np.sqrt(2 * self.floor / size + alike**2 / np.square(self.common).mean()))
-            self.flicker = float(np.sqrt(max(self.scatter**2 - self.noise**2, 0.0)))
-            if not flickers(self.scatter, self.noise, len(self.power)):
-                self.flicker = 0.0
-                break
-        found = [
-            _unshaken(rest, difference, self.flicker, noise) / noise
-            for rest, difference, noise in zip(rests, differences, [self.floor, *self.light_noise], strict=True)
-        ]
-        self.excess = np.maximum(found[0], np.concatenate(found[1:]))
-        away_from_trend = np.abs(self.power - self.trend)
-        middle = max(float(np.median(self.excess)), 1.0)
-        scatter = robust_scatter(self.excess, middle)
-        bad = away_from_trend > max(_DEVIATIONS * max(self.scatter, self.noise), _LEAST)
-        bad |= self.excess > max(_EXCESS * middle, middle + _DEVIATIONS * scatter)
-        known = {(side, index) for side, index, _ in wrong}
-        bad |= [(own.side, index) in known for own in sides for index in range(self.count)]
+        differences = [_across(halves[0] - halves[1], self.common)]
+        for own, pairs, middle, along in zip(sides, self.pairs, self.lights, self.uniforms, strict=True):
+            rests.append(_across((pairs.light - middle[:, None]).T, along))
+            differences.append(_across(own.sums.vectors.T, along))
+        self.excess = self._find_noise(rests, differences)
+        bad = self._find_bad()
         self.good = ~bad
         # A camera that is not linear by a percent makes sums that differ by its squares: no frame is wrong there.
         self.slight = self.excess * self.floor < _LINEAR**2 * np.square(self.ambient_and_all).mean()
         self.many = bool((bad & ~self.slight).sum() > max(2.0, MOST_FAULTS * len(bad)))
+
+    def _find_noise(self, rests: list[FloatArray], differences: list[FloatArray]) -> FloatArray:
+        """(2 N,) mean squared deviations of pairs' sums, over the noise, which is found with the lamp's flicker: of
+        what is left of sums (``rests``) of both frames' means, and of either side's vectors, and of their
+        ``differences``."""
+        # Rounding of a pair's sum that no noise makes random is one for all its pixels of like light.
+        step = self.taken.step
+        alike = step / np.sqrt(6) if min(own.variance for own in self.sides) < _RANDOM * step**2 else 0.0
+        rounding = max(_ROUNDING**2 * float(np.square(self.ambient_and_all).mean()), alike**2)
+        shares = [float(np.abs(along).sum() / _square(along)) for along in self.uniforms]
+        least = [rounding * share**2 for share in (1.0, *shares)]
+        self.flicker, self.floor, self.light_noise = 0.0, 1.0, [1.0, 1.0]
+
+        def unshaken() -> list[FloatArray]:
+            levels = self.floor, *self.light_noise
+            each = zip(rests, differences, levels, strict=True)
+            return [_unshaken(rest, difference, self.flicker, noise) for rest, difference, noise in each]
+
+        for _ in range(_TURNS):  # noise and flicker hang on each other
+            self.floor, *self.light_noise = map(max, [float(np.median(each)) for each in unshaken()], least)
+            # Means of rows and of columns share the frame's mean and its noise: twice independent ones' variance.
+            self.noise = float(
+                np.sqrt(2 * self.floor / _square(self.common) + alike**2 / np.square(self.common).mean())
+            )
+            self.flicker = float(np.sqrt(max(self.scatter**2 - self.noise**2, 0.0)))
+            if not flickers(self.scatter, self.noise, len(self.power)):
+                self.flicker = 0.0
+                break
+        of_means, *of_vectors = unshaken()
+        vectors = [each / noise for each, noise in zip(of_vectors, self.light_noise, strict=True)]
+        return np.maximum(of_means / self.floor, np.concatenate(vectors))
+
+    def _find_bad(self) -> npt.NDArray[np.bool_]:
+        """(2 N,) whether pairs differ from the others in power, or in what they add up to, or are known to be wrong."""
+        middle = max(float(np.median(self.excess)), 1.0)
+        scatter = robust_scatter(self.excess, middle)
+        bad = np.abs(self.power - self.trend) > max(_DEVIATIONS * max(self.scatter, self.noise), _LEAST)
+        bad |= self.excess > max(_EXCESS * middle, middle + _DEVIATIONS * scatter)
+        known = {(side, index) for side, index, _ in self.taken.wrong}
+        bad |= [(own.side, index) in known for own in self.sides for index in range(self.count)]
+        return np.asarray(bad)
 
     def _uniform(self) -> FloatArray:
         """Means of rows and columns of the lamp's light: the response to the uniform pattern, of two that which differs
@@ -260,7 +276,7 @@ class Pairs:
             own.vectors = own.vectors * scale
             remaining += float(own.extras.sum() / np.sum(np.square(own.vectors)))
         return Lamp(
-            drift=end_to_end(self.times.mean(axis=1), trend) if drifts else 0.0,
+            drift=end_to_end(self.times, trend) if drifts else 0.0,
             flicker=flicker if shakes else 0.0,
             drift_cost=moved if drifts else 0.0,
             flicker_cost=shaken if shakes else 0.0,
@@ -338,7 +354,7 @@ class Pairs:
     def _repair(self, number: int, index: int, lamp: Lamp) -> None:
         """Name the faulty frame of a pair, and take its vector from the other one."""
         own, (usual, deviation) = self.sides[number], self._usual(number)
-        known = [sign for sign in (1, -1) if (own.side, index, sign) in self.wrong]
+        known = [sign for sign in (1, -1) if (own.side, index, sign) in self.taken.wrong]
         found = []
         for frame in (_Frame(number, index, 1), _Frame(number, index, -1)):
             right = usual if frame.sign < 0 else 1 - usual
@@ -349,7 +365,7 @@ class Pairs:
         found.sort(key=lambda one: (one[1] not in known, one[2].rest + one[0]))
         penalty, sign, fault = found[0]
         if known:
-            fault = _Fault(0.0, "wrong", f"is wrong: {self.wrong[own.side, index, sign]}")
+            fault = _Fault(0.0, "wrong", f"is wrong: {self.taken.wrong[own.side, index, sign]}")
         elif fault.kind == "wrong" and self.slight[number * self.count + index]:
             return
         own.uncounted.add(index)
@@ -379,7 +395,7 @@ class Pairs:
         flux = float(shown[0].sum() / expected[0].sum()) if expected[0].sum() else 0.0
         if frame.pattern == 0 and frame.sign < 0 and self.dark < DARK:
             flux = part = 1.0  # a dark frame of a dark room
-        if self.clipped((self.sides[frame.number].side, frame.pattern, frame.sign)) and flux > DARK:
+        if self.taken.clipped((self.sides[frame.number].side, frame.pattern, frame.sign)) and flux > DARK:
             return _Fault(1.0, "clipped", "is clipped: many of its pixels share its largest number")
         even = (np.ptp(own) < DARK * 2 * np.ptp(other) + 12 for own, other in zip(shown, expected, strict=True))
         if flux < DARK and all(even):
@@ -450,6 +466,16 @@ def _shifts(number: int, shown: _Parts, expected: _Parts) -> Iterator[_Fault]:
             yield _Fault(rest, "shifted", f"is shifted by {abs(shift)} of its {word}")
 
 
+def _square(vector: FloatArray) -> float:
+    """Squared length of a ``vector`` that is divided by."""
+    return max(float(np.dot(vector, vector)), 1e-300)
+
+
+def _across(values: FloatArray, along: FloatArray) -> FloatArray:
+    """``values`` (pairs, numbers) without their parts ``along`` a vector."""
+    return values - np.outer(values @ along / _square(along), along)
+
+
 def _unshaken(rests: FloatArray, differences: FloatArray, flicker: float, noise: float) -> FloatArray:
     """(pairs,) mean squared ``rests`` (pairs, numbers) of sums, less what flicker makes of the two frames'
     ``differences`` (pairs, numbers): d of it, whose deviation is the ``flicker``, at a variance ``noise`` a number."""
@@ -488,20 +514,17 @@ class CheckedSession:
     left_out: tuple[int, int] = (0, 0)
     extra: tuple[float, float] = (0.0, 0.0)
 
-    def wrong_uniform(self) -> set[Side]:
-        """Sides whose first response, which the uniform one is taken from, is wrong."""
-        return {fault.side for fault in self.faults if fault.index == 0}
-
-    @staticmethod
-    def other_uniform(wrong: set[Side]) -> Side:
-        """The side whose uniform response is right; MitsimError where both are ``wrong``."""
+    def right_uniform(self) -> Side | None:
+        """Where the first response of a side is wrong, which the uniform one is taken from, the other side; None where
+        none is wrong, MitsimError where both are."""
+        wrong = {fault.side for fault in self.faults if fault.index == 0}
         right = [side for side in SIDES if side not in wrong]
         if not right:
             raise MitsimError(
                 "the uniform frames of horizontal and of vertical stripes, number 0 of each, are both wrong; take them "
                 "again"
             )
-        return right[0]
+        return right[0] if wrong else None
 
     def estimate(self, signs: FloatArray, noise: float | None) -> Estimate:
         """Factors of what can be believed.
@@ -522,38 +545,6 @@ class CheckedSession:
     def listed(self, name: Callable[[Half], str]) -> list[dict[str, Any]]:
         """Faults for a manifest; ``name`` says which frame it is."""
         return [fault.listed(name) for fault in self.faults]
-
-
-@dataclass(frozen=True)
-class SessionConditions:
-    """How a session was taken.
-
-    Attributes
-    ----------
-    order
-        frames as they were taken.
-    name
-        of a frame.
-    clipped
-        whether many of a frame's pixels share its largest number.
-    saturated
-        whether frames have saturated pixels, which make many pairs add up to less; those sessions are flagged for it,
-        and not refused.
-    unsteady
-        whether it is stated that the lamp is, so that its power is neither divided out nor said.
-    step
-        between two numbers of a frame, as the responses have it.
-    wrong
-        frames that are known to be wrong, and why.
-    """
-
-    order: Sequence[Half]
-    name: Callable[[Half], str] = frame_words
-    clipped: Callable[[Half], bool] = lambda half: False
-    saturated: bool = False
-    unsteady: bool = False
-    step: float = 0.0
-    wrong: Mapping[Half, str] = field(default_factory=dict)
 
 
 def check_session(
@@ -580,8 +571,8 @@ def check_session(
     """
     work = [SideCheck(own, signs) for own in sums]
     lamp = Lamp()
-    if all(own.pairs is not None for own in sums):
-        pairs = Pairs(work, taken.order, taken.clipped, taken.step, taken.wrong)
+    if all(own.pairs for own in work):
+        pairs = Pairs(work, taken)
         if taken.saturated and pairs.many:
             return CheckedSession(sums)
         lamp = pairs.check(not taken.unsteady)

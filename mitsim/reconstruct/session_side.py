@@ -366,7 +366,7 @@ class SideCheck:
     @property
     def pairs(self) -> bool:
         """Whether a pattern has two frames."""
-        return self.sums.pairs is not None
+        return bool(self.sums.pairs)
 
     @property
     def variance(self) -> float:

@@ -4,14 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Literal, Protocol, TypeVar
 
 from mitsim.core.arrays import FloatArray
-
-CameraT = TypeVar("CameraT", contravariant=True)
-PatternsT = TypeVar("PatternsT", contravariant=True)
-PreparedT = TypeVar("PreparedT")
-FramesT = TypeVar("FramesT", contravariant=True)
 
 
 class Verdict(Enum):
@@ -118,31 +112,3 @@ class Solution:
     def ok(self) -> bool:
         """Whether the image can be used as it is."""
         return self.status.ok
-
-
-class Solver(Protocol[CameraT, PatternsT, PreparedT, FramesT]):
-    """A way from frames to an image: prepared once for a camera and its patterns, and then applied to any scenes.
-
-    Attributes
-    ----------
-    linear
-        whether images at one lambda are linear in the frames, so that noise of the frames is told for each pixel.
-    """
-
-    linear: bool
-
-    def init(self, camera: CameraT, patterns: PatternsT) -> PreparedT:
-        """What depends on the ``camera`` and the ``patterns`` alone; applying it changes nothing in it."""
-        ...
-
-    def compute(self, prepared: PreparedT, frames: FramesT, lam: float | Literal["auto"]) -> Solution:
-        """The image of one scene.
-
-        Parameters
-        ----------
-        prepared, frames
-            what :meth:`init` gives, and frames of all patterns.
-        lam
-            lambda; what ``auto`` does is the solver's own.
-        """
-        ...

@@ -1,7 +1,6 @@
 """Ways from frames to an image, by name: each prepares a camera and its patterns once, and solves any number of scenes.
 
-A further one is a class with ``init`` and ``compute`` (:class:`mitsim.reconstruct.solution.Solver`); one of separable
-cameras that an image may be asked by has a line in :data:`SOLVERS`, and its name in
+A further one is a class with ``init`` and ``compute`` (:class:`Solver`), a line in :data:`SOLVERS`, and its name in
 :data:`mitsim.reconstruct.request.METHODS`, which is read before numpy is imported.
 
 *Total variation.* Minimises P(X) = 1/2 sum_ij ||Y_ij - Phi_L (P_ij o X) Phi_R^T||^2 + weight TV(X), isotropic TV, by
@@ -36,7 +35,7 @@ from mitsim.reconstruct.convolution import ConvolutionalCamera, solve_iterativel
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.regularisation import DiagonalProblem, automatic_lambda, noise_variance
 from mitsim.reconstruct.request import MARKOV, TIKHONOV, TV
-from mitsim.reconstruct.solution import Solution, Solver, Status, Verdict
+from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
 
 # ---- Total variation -------------------------------------------------------------------------------------------------
@@ -271,14 +270,39 @@ Patterns = tuple[FloatArray, FloatArray]
 """P_L (n, K) and P_R (n', K')."""
 
 
-class Tikhonov:
-    """Least squares with lambda ||X||^2: pixels are independent, the solution is in closed form.
+class Solver(Protocol):
+    """A way from frames to an image: prepared once for a camera and its patterns, and then applied to any scenes.
 
     Attributes
     ----------
+    linear
+        whether images at one lambda are linear in the frames, so that noise of the frames is told for each pixel.
     whole
         whether every pattern's slab has all coefficients, not those of the pixels that it lights alone.
     """
+
+    linear: bool
+    whole: bool
+
+    def init(self, camera: Factors, patterns: Patterns) -> Prepared:
+        """What depends on the ``camera`` and the ``patterns`` alone; applying it changes nothing in it."""
+        ...
+
+    def compute(self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"]) -> Solution:
+        """The image of one scene.
+
+        Parameters
+        ----------
+        prepared, frames
+            what :meth:`init` gives, and all frames, added up.
+        lam
+            lambda; what ``auto`` does is the solver's own.
+        """
+        ...
+
+
+class Tikhonov:
+    """Least squares with lambda ||X||^2: pixels are independent, the solution is in closed form."""
 
     linear, whole = True, False
 
@@ -339,7 +363,6 @@ class Convolutional:
 
     tolerance: float = 1e-6
     iterations: int = 500
-    linear = False
 
     def init(self, camera: ConvolutionalCamera, patterns: PatternFamily) -> tuple[ConvolutionalCamera, PatternFamily]:
         """The ``camera`` and its ``patterns``: there is nothing to factorise."""
@@ -360,16 +383,8 @@ class Convolutional:
         lam
             lambda; MitsimError for ``auto``.
         """
-        if isinstance(lam, str):
-            raise MitsimError(f"lambda is {lam!r}; give a finite number of at least 0")
         return solve_iteratively(*prepared, frames, lam, self.tolerance, self.iterations)
 
 
-class SeparableSolver(Solver[Factors, Patterns, Prepared, Accumulator], Protocol):
-    """Of a separable camera, whose frames are added up; ``whole`` as of :class:`Tikhonov`."""
-
-    whole: bool
-
-
-SOLVERS: dict[str, SeparableSolver] = {TIKHONOV: Tikhonov(), MARKOV: Markov(), TV: TotalVariation()}
+SOLVERS: dict[str, Solver] = {TIKHONOV: Tikhonov(), MARKOV: Markov(), TV: TotalVariation()}
 """By the method that an image is asked by."""

@@ -48,6 +48,7 @@ octaves that are told, and further on as scenes do. How far off that may be, the
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -60,10 +61,10 @@ from scipy.ndimage import gaussian_filter
 from mitsim.core.arrays import FloatArray
 from mitsim.core.exr import Channel
 from mitsim.core.manifests import FactorNoise
+from mitsim.reconstruct.accumulation import Accumulation
 from mitsim.reconstruct.factorisation import Side
-from mitsim.reconstruct.misfit import Lack
-from mitsim.reconstruct.noise import FrameNoise
 from mitsim.reconstruct.regularisation import DiagonalProblem, coefficient_noise
+from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.subpixel import PRINT, Model, disagreement
 
 # ---- The scene's power spectrum --------------------------------------------------------------------------------------
@@ -538,45 +539,24 @@ class Propagation:
         return self.model.prepared.sigma
 
 
-def uncertainty(
-    propagation: Propagation,
-    noise: FrameNoise,
-    factors: FactorNoise | None,
-    exposure: float,
-    image: FloatArray,
-    problem: DiagonalProblem,
-    lack: Lack | None = None,
-) -> Uncertainty:
-    """Standard uncertainty of an image.
-
-    Parameters
-    ----------
-    propagation
-        of the image's model and lambda.
-    noise
-        of its frames.
-    factors
-        of its factors; None: not stated, and left out.
-    exposure
-        relative standard uncertainty of the exposures.
-    image
-        (n, n').
-    problem
-        its data in the diagonal basis.
-    lack
-        what the factors are known to lack of the camera; None: nothing.
-    """
-    zero, data = np.zeros_like(image), problem.data_count
+def uncertainty(data: Accumulation, solution: Solution) -> Uncertainty:
+    """Standard uncertainty of a ``solution`` of accumulated ``data`` that is linear in its frames."""
+    noise, image, manifest = data.noise, solution.image, data.factors.manifest
+    problem, lack = data.prepared.problem(data.frames), data.lack(image)
+    propagation, zero = Propagation(data.model, solution.lam), np.zeros_like(image)
     frames = propagation.of_frames(noise.rows, noise.columns)
-    left, right = propagation.of_factors(factors, image) if factors else (zero, zero)
+    left, right = propagation.of_factors(manifest.noise, image) if manifest.noise else (zero, zero)
     known, told = (frames + left, frames + right), zero
     if problem.halves:
-        told = disagreement(propagation.model, propagation.gain, problem.halves, known)
+        told = disagreement(data.model, propagation.gain, problem.halves, known)
     lost, factor = propagation.of_regularisation(problem, float(noise.variance.mean()))
+    of_sampling = propagation.of_white(noise.discretisation / problem.data_count)
+    calibrated = manifest.digital.exposure_uncertainty if manifest.digital else 0.0
+    exposure = math.hypot(data.digital.exposure_uncertainty, calibrated)
     variances = {
         "frame_noise": frames,
         "ambient_frame": propagation.of_ambient_frame(*noise.ambient) if noise.ambient else zero,
-        "rendering": propagation.of_white(noise.discretisation / data) + propagation.of_light(noise.light_error**2),
+        "rendering": of_sampling + propagation.of_light(noise.light_error**2),
         "calibration_noise": left + right,
         "print_detail": np.maximum(propagation.of_print(image), told),
         "exposure": np.square(exposure * image),

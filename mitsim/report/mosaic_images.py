@@ -32,12 +32,13 @@ from mitsim.core.spectral_manifests import JOINT, ColourManifest, check_way
 from mitsim.devices.chart import ChartPlace
 from mitsim.metrics import Quality
 from mitsim.optics.separable import BestTerm, best_term
-from mitsim.reconstruct.colour import PLANES, JointMosaic, JointSolution
+from mitsim.reconstruct.colour import PLANES, JointMosaic
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.reconstruct import check_same_inputs
 from mitsim.reconstruct.regularisation import automatic_lambda
 from mitsim.reconstruct.request import IMAGE_FILE, check_joint
+from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import prepare
 from mitsim.report.colour_image import PAGE, ColourImage, board_of, write_page
 
@@ -100,7 +101,7 @@ class JudgedMosaic:
             "ssim": float(np.mean(known)) if known else None,
             **self.colours.summary(),
             "lambda": self.solved.lam,
-            "steps": None if joint is None else joint.steps,
+            "steps": None if joint is None else joint.iterations,
             "residual": self.solved.residual,
             "unexplained": self.unexplained,
             "status": " ".join(self.warnings) or "Solved: every line's image can be used as it is.",
@@ -112,7 +113,7 @@ class JudgedMosaic:
     def sentences(self) -> list[str]:
         """What the command line says of it."""
         each = [f"{name}: {found or 'no truth to compare with'}" for name, found in self.qualities.items()]
-        steps = "" if self.solved.joint is None else f", {self.solved.joint.steps} steps"
+        steps = "" if self.solved.joint is None else f", {self.solved.joint.iterations} steps"
         summary = (
             f"{self.way}: lambda {self.solved.lam:.3g}{steps}, residual {self.solved.residual:.1e}, "
             f"{self.unexplained:.1e} unexplained"
@@ -122,7 +123,7 @@ class JudgedMosaic:
     @property
     def facts(self) -> dict[str, str]:
         """How the images were made, by name."""
-        steps = "" if self.solved.joint is None else f", {self.solved.joint.steps} steps"
+        steps = "" if self.solved.joint is None else f", {self.solved.joint.iterations} steps"
         return {
             "frames": "all lines at once, behind colour filters",
             "solved": f"{self.way}{steps}",
@@ -277,10 +278,10 @@ def _warnings(
     shots: MosaicCapture, factors: Mapping[str, Factors], solved: LineImages, unexplained: float
 ) -> tuple[str, ...]:
     warnings = []
-    if solved.joint is not None and not solved.joint.converged:
+    if solved.joint is not None and not solved.joint.ok:
         warnings.append(
-            f"Not converged: {solved.joint.steps} steps leave {solved.joint.residual:.1e} of the normal equations; "
-            "raise lambda."
+            f"Not converged: {solved.joint.iterations} steps leave {solved.joint.residual:.1e} of the normal "
+            "equations; raise lambda."
         )
     if unexplained > UNEXPLAINED:
         warnings.append(
@@ -406,7 +407,7 @@ class LineImages:
     images: FloatArray
     lam: float
     residual: float
-    joint: JointSolution | None = None
+    joint: Solution | None = None
 
 
 class Solver(Protocol):
@@ -509,7 +510,7 @@ class _Joint:
         elif relative:
             lam *= self._model.scale
         found = self._model.solve(self._gathered, lam)
-        energy, images = self._planes.energy, found.images
+        energy, images = self._planes.energy, found.image
         left = energy + float(np.vdot(images, self._model.normal(images) - 2 * self._gathered))
         return LineImages(images, lam, float(np.sqrt(max(left, 0.0) / energy)), found)
 

@@ -13,11 +13,12 @@ import pytest
 
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.runs import Capture
+from mitsim.reconstruct.accumulation import accumulate
 from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.depth import CommonBasis, Depth
 from mitsim.reconstruct.depth_map import PixelDepths, depth_map
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.reconstruct import accumulate, reconstruct
+from mitsim.reconstruct.reconstruct import reconstruct
 from tests.ideal_sessions import PEAK, Bench, picture
 from tests.ideal_sessions import shadow as plain_shadow
 from tests.unit.reconstruct.test_faults import dark, with_frames

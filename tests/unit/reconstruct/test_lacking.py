@@ -11,10 +11,10 @@ import pytest
 
 from mitsim.core.exr import read_frame
 from mitsim.devices.patterns import parse_patterns
+from mitsim.reconstruct.accumulation import Lack, accumulate
 from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.factors import Factors, load_calibration
-from mitsim.reconstruct.misfit import Lack
-from mitsim.reconstruct.reconstruct import accumulate, reconstruct
+from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.subpixel import Model
 from tests.ideal_sessions import Bench, picture, shadow

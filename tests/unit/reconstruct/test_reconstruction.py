@@ -18,9 +18,10 @@ from mitsim.core.resources import Cost
 from mitsim.core.runs import Capture, Recorder, frame_name, load_run
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct import request
+from mitsim.reconstruct.accumulation import accumulate
 from mitsim.reconstruct.convolution import ConvolutionalCamera
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.reconstruct import accumulate, may_replace, reconstruct
+from mitsim.reconstruct.reconstruct import may_replace, reconstruct
 from mitsim.reconstruct.request import ImageCost, predict_cost
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solver import Accumulator, Prepared

@@ -12,7 +12,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.reconstruct import accumulate
+from mitsim.reconstruct.accumulation import accumulate
 from mitsim.reconstruct.regularisation import (
     RISK_POWER,
     DiagonalProblem,

@@ -8,9 +8,9 @@ import pytest
 from mitsim.core.manifests import Digital, FactorNoise, Patterns
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct import misfit
+from mitsim.reconstruct.accumulation import FrameNoise, factor_energy
 from mitsim.reconstruct.causes import Evidence
 from mitsim.reconstruct.misfit import Residuals
-from mitsim.reconstruct.noise import FrameNoise, factor_energy
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.subpixel import LitFrame, Model, orthonormal
 from mitsim.reconstruct.uncertainty import Propagation

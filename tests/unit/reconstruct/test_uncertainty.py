@@ -13,8 +13,9 @@ from scipy.fft import idctn
 from mitsim.core.exr import read_frame
 from mitsim.core.manifests import Digital, FactorNoise
 from mitsim.devices.patterns import parse_patterns
+from mitsim.reconstruct.accumulation import accumulate
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.reconstruct import accumulate, reconstruct
+from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.regularisation import DiagonalProblem, automatic_lambda
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.subpixel import EDGES, PRINT, Model, print_energy
