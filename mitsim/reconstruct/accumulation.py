@@ -288,7 +288,10 @@ def accumulate(shots: Capture, factors: Factors, method: str = TIKHONOV) -> Accu
     solver = SOLVERS[method]
     check_factorising(shots, factors, solver)
     prepared = solver.init(factors, shots.patterns)
-    noise = FrameNoise(shots.manifest, _ambient_noise(shots))
+    # The difference of a pair has no ambient frame.
+    taken_off = None if any(shot.sign for shot in shots.manifest.patterns.captures) else shots.ambient
+    ambient = taken_off and (taken_off.variance.mean(axis=1), taken_off.variance.mean(axis=0))
+    noise = FrameNoise(shots.manifest, ambient)
     frames, kept = prepared.accumulator(), list[Measurement]()
     few = keeps_frames(shots, factors)
     for measurement in shots.measured((len(factors.left), len(factors.right))):
@@ -304,10 +307,3 @@ def check_factorising(shots: Capture, factors: Factors, solver: Solver) -> None:
     """MitsimError where factorising the model of ``shots`` and ``factors`` takes more memory than is free."""
     cost = Cost(memory_bytes=BYTES_A_NUMBER * slab_numbers(shots, factors, whole=solver.whole))
     cost.check(f"{shots.name}: factorising its patterns", Limits())
-
-
-def _ambient_noise(shots: Capture) -> tuple[FloatArray, FloatArray] | None:
-    """Variance, by sensor row and by sensor column, of the frame that is taken off all others; None where none is."""
-    if shots.ambient is None or any(shot.sign for shot in shots.manifest.patterns.captures):
-        return None
-    return shots.ambient.variance.mean(axis=1), shots.ambient.variance.mean(axis=0)

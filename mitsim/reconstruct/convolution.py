@@ -49,6 +49,8 @@ from mitsim.reconstruct.solution import Solution, Status, Verdict
 
 Operator = Callable[[FloatArray], FloatArray]
 """From an image (n, n) to another."""
+Watch = Callable[[FloatArray], bool]
+"""Looks at an image (n, n) under way, and says whether it is good enough."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,6 +169,7 @@ def solve_iteratively(
     lam: float | str,
     tolerance: float = 1e-6,
     iterations: int = 500,
+    watch: Watch | None = None,
 ) -> Solution:
     """Tikhonov image of any ``family`` by conjugate gradients.
 
@@ -180,6 +183,8 @@ def solve_iteratively(
         residual of the normal equations, relative, at which it ends.
     iterations
         it takes at most; that image is not ok.
+    watch
+        called with the image after each step; where it says True, that was the last.
 
     Raises
     ------
@@ -190,7 +195,7 @@ def solve_iteratively(
     def normal(image: FloatArray) -> FloatArray:
         return camera.projected(family, camera.frames(family, image))
 
-    return conjugate_gradients(normal, camera.projected(family, frames), lam, None, tolerance, iterations)
+    return conjugate_gradients(normal, camera.projected(family, frames), lam, None, tolerance, iterations, watch)
 
 
 def conjugate_gradients(
@@ -200,6 +205,7 @@ def conjugate_gradients(
     inverse: Operator | None = None,
     tolerance: float = 1e-6,
     most: int = 500,
+    watch: Watch | None = None,
 ) -> Solution:
     """Solve (``normal`` + lambda) X = ``target`` (Hestenes and Stiefel 1952).
 
@@ -213,8 +219,8 @@ def conjugate_gradients(
         lambda >= 0.
     inverse
         something near the inverse of normal + lambda, symmetric and positive, which saves steps.
-    tolerance, most
-        relative residual at which it ends, and the most steps.
+    tolerance, most, watch
+        relative residual at which it ends, the most steps, and what ends it before: :data:`Watch`.
     """
     lam = check_lambda(lam)
     image, left = np.zeros_like(target), target
@@ -228,6 +234,8 @@ def conjugate_gradients(
         step = power / float(np.vdot(direction, moved))
         image, left = image + step * direction, left - step * moved
         residual = float(np.linalg.norm(left)) / size
+        if watch and watch(image):
+            break
         turned = inverse(left) if inverse else left
         before, power = power, float(np.vdot(left, turned))
         direction = turned + power / before * direction

@@ -30,7 +30,7 @@ from mitsim.reconstruct.factorisation import Group, factorise, group_pixels
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import LEAST_PART, FactorOfDepths, move_factors, parallax_of, parallax_period
 from mitsim.reconstruct.misfit import CHANCE
-from mitsim.reconstruct.solver import Accumulator, Prepared, centre_columns, centre_frame, prepare, project_frames
+from mitsim.reconstruct.solver import centre_columns, centre_frame, prepare, project_frames
 
 _STEP = 1.0
 """Projector pixels of parallax between depths that are tried first: the valley is some two wide on either side."""
@@ -307,18 +307,14 @@ class _Search:
         noise, stated = self._all.noise, self._factor_noise
         if not (noise.stated and stated):
             return 0.0
-        prepared, sums = self._sum_frames(shift)
-        image = prepared.solve(sums, _LAMBDA * prepared.problem(sums).scale).image
-        expected = float(noise.variance.mean()) * (self._all.data - self._unknowns) + self._all.part * noise.rendering
-        of_factors = self._all.smoothing(shift) * factor_energy(prepared, self._all.patterns, stated, image)
-        return float(max(least - expected - of_factors, 0.0))
-
-    def _sum_frames(self, shift: float) -> tuple[Prepared, Accumulator]:
         prepared = prepare(self._all.side(0, shift), self._all.side(1, shift), *self._all.patterns)
         sums = prepared.accumulator()
         for each in self._all.frames:
             sums.add(each.frame, each.row, each.column)
-        return prepared, sums
+        image = prepared.solve(sums, _LAMBDA * prepared.problem(sums).scale).image
+        expected = float(noise.variance.mean()) * (self._all.data - self._unknowns) + self._all.part * noise.rendering
+        of_factors = self._all.smoothing(shift) * factor_energy(prepared, self._all.patterns, stated, image)
+        return float(max(least - expected - of_factors, 0.0))
 
     def _mm(self, shift: float) -> float:
         return 1 / (self._inverse + shift)

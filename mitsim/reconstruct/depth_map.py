@@ -82,6 +82,8 @@ class DepthMap:
         nearest and farthest depth that were looked for.
     smoothing
         variance of the factors' noise at these depths, over that of the calibrated ones.
+    alternatives
+        none: depths by pixel that may be others are not told at all.
     """
 
     image: FloatArray
@@ -95,6 +97,7 @@ class DepthMap:
     doubt: str = ""
     range_mm: tuple[float, float] | None = None
     smoothing: float = 1.0
+    alternatives: tuple[Alternative, ...] = ()
 
     def __str__(self) -> str:
         if self.doubt:
@@ -109,11 +112,6 @@ class DepthMap:
         residual = float(np.sqrt(self.left_over / self.energy))
         status = Status(Verdict.SOLVED, "Solved: a depth and a reflectance for each projector pixel")
         return Solution(self.image, self.lam, residual, status)
-
-    @property
-    def alternatives(self) -> tuple[Alternative, ...]:
-        """None: depths by pixel that may be others are not told at all."""
-        return ()
 
     @property
     def told(self) -> np.ndarray:

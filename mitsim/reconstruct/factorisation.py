@@ -322,7 +322,6 @@ def _frozen(array: FloatArray) -> FloatArray:
 
 def check_choices(method: str, structure: str) -> None:
     """MitsimError unless ``method`` and ``structure`` are known."""
-    if method not in get_args(Method):
-        raise MitsimError(f"solver method is {method!r}; use one of {', '.join(get_args(Method))}")
-    if structure not in get_args(Structure):
-        raise MitsimError(f"solver structure is {structure!r}; use one of {', '.join(get_args(Structure))}")
+    for name, chosen, known in (("method", method, get_args(Method)), ("structure", structure, get_args(Structure))):
+        if chosen not in known:
+            raise MitsimError(f"solver {name} is {chosen!r}; use one of {', '.join(known)}")

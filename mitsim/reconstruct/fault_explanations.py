@@ -45,6 +45,10 @@ _ROUNDING = 1e-20
 """Of a frame's energy, by which the halves of two pairs differ that were the same numbers."""
 
 
+Window = tuple[Any, ...]
+"""Rows and columns of the sensor."""
+
+
 @dataclass(frozen=True, eq=False)
 class _Suspect:
     """What was read at a pattern that is suspected: a shot, or of a signed pattern whose halves' sum is right both.
@@ -181,7 +185,8 @@ class Explanations:
             each, variance = self._measured[pattern], float(check.noise.variance[pattern]) * (1 + 1 / good)
             half, other = (each.light + sign * each.frame) / 2, (each.light - sign * each.frame) / 2
             number = check.number[(*pattern, sign)]
-            if self._is_lit(pattern, sign):
+            left, right = (side[:, index] for side, index in zip(check.patterns, pattern, strict=True))
+            if (1 + sign * np.outer(left, right)).any():  # it lights any pixel
                 found.append(_Suspect((number,), pattern, half, half, mean - other, variance, off[pattern]))
         return found
 
@@ -218,11 +223,6 @@ class Explanations:
             ranked.append((-sum(exchanged(*pair) for pair in combinations(wrong, 2)), variation, wrong))
         return dict(min(ranked)[2])
 
-    def _is_lit(self, pattern: Pattern, sign: int) -> bool:
-        """Whether the half of that ``sign`` of a signed pattern lights any pixel."""
-        left, right = (side[:, index] for side, index in zip(self._check.patterns, pattern, strict=True))
-        return bool((1 + sign * np.outer(left, right)).any())
-
     # ---- fits
 
     def _energy_outside(self, part: FloatArray, left: FloatArray, right: FloatArray, variance: float) -> float:
@@ -245,25 +245,13 @@ class Explanations:
             bases.append(np.linalg.qr(part)[0])
         return bases[0], bases[1]
 
-    def _outside_of_part(self, one: _Suspect, kept: BoolArray, axis: int) -> float:
-        """Energy beyond noise that is off in the ``kept`` rows (``axis`` 0) or columns of the sensor."""
-        window = (kept, slice(None)) if axis == 0 else (slice(None), kept)
+    def _part_left(self, one: _Suspect, window: Window, still: Window, variance: float) -> float:
+        """Energy beyond noise of a ``variance`` of a ``window`` of the sensor's rows and columns, held against what is
+        known of it, or of another, ``still`` one."""
         part = one.raw[window]
-        # The noise of a frame is that of its mean light, which what is lost makes too little.
-        variance = max(one.variance, float(self._check.noise.of(float(part.mean()), 1)))
         if one.predicted is not None:
-            return sum_of_squares(self._model.as_solved(part - one.predicted[window])) - part.size * variance
-        return self._energy_outside(part, *self._ranges(one.pattern, *window), variance)
-
-    def _inside(self, one: _Suspect, window: list[slice], still: list[slice]) -> float:
-        """Energy beyond noise of a ``window`` of the sensor, held against the ``still`` middle of it."""
-        part = one.raw[window[0], window[1]]
-        if one.predicted is not None:
-            return (
-                sum_of_squares(self._model.as_solved(part - one.predicted[still[0], still[1]]))
-                - part.size * one.variance
-            )
-        return self._energy_outside(part, *self._ranges(one.pattern, *still), one.variance)
+            return sum_of_squares(self._model.as_solved(part - one.predicted[still])) - part.size * variance
+        return self._energy_outside(part, *self._ranges(one.pattern, *still), variance)
 
     def faults(self, others_off: float) -> list[FrameFault]:
         """One for each that is found; ``others_off`` is the energy beyond noise by which patterns are off that are not
@@ -364,7 +352,10 @@ class Explanations:
             kept = np.ones(len(lines), dtype=np.bool_)
             kept[first:last] = False
             if one.predicted is None or self._check.signed:
-                left = self._outside_of_part(one, kept, axis)
+                window = (kept, slice(None)) if axis == 0 else (slice(None), kept)
+                # The noise of a frame is that of its mean light, which what is lost makes too little.
+                variance = max(one.variance, float(self._check.noise.of(float(one.raw[window].mean()), 1)))
+                left = self._part_left(one, window, window, variance)
             else:
                 left = self._energy_filled(one, one.raw, kept[:, None] if axis == 0 else kept[None, :])
             yield _Named(left, Fault.HALF_LOST, one.numbers, f"has no light in sensor {name} {first} to {last - 1}")
@@ -439,9 +430,9 @@ class Explanations:
             if (rows, columns) != (0, 0):
                 yield _shift_fault(one, left, rows, columns)
             return
-        ends = [slice(reach + step, size - reach + step) for step, size in zip(shift, one.raw.shape, strict=True)]
-        still = [slice(reach, size - reach) for size in one.raw.shape]
-        moved, unmoved = (self._inside(one, window, still) for window in (ends, still))
+        ends = tuple(slice(reach + step, size - reach + step) for step, size in zip(shift, one.raw.shape, strict=True))
+        still = tuple(slice(reach, size - reach) for size in one.raw.shape)
+        moved, unmoved = (self._part_left(one, window, still, one.variance) for window in (ends, still))
         if unmoved > 0:
             yield _shift_fault(one, moved / unmoved * one.off, *shift)
 

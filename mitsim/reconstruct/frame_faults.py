@@ -172,10 +172,6 @@ class LeaveOneOut:
         filtered = np.divide(self._kept * weights, self.sigma, out=np.zeros_like(weights), where=self.sigma > 0)
         return self.prepared.image(filtered)
 
-    def _ideal_weights(self, image: FloatArray) -> FloatArray:
-        """W of an ``image`` without noise."""
-        return np.asarray(self.sigma * (self.prepared.left.duals.T @ image @ self.prepared.right.duals))
-
     def lit(self, good: BoolArray) -> BoolArray:
         """(n, n') pixels that a ``good`` pattern lights."""
         left, right = ((side != 0).astype(np.float64) for side in self.patterns)
@@ -219,7 +215,8 @@ class LeaveOneOut:
             image = uniform_filter(image, self._periods, mode="nearest")
         lit = self.lit(self.all_but(bad))
         image = np.where(lit, image, self.neighbours(image, lit))
-        weights = self._ideal_weights(image)
+        left_duals, right_duals = self.prepared.left.duals, self.prepared.right.duals
+        weights = np.asarray(self.sigma * (left_duals.T @ image @ right_duals))
         grams = {pattern: [slab.matrix.T @ slab.matrix for slab in self.prepared.slabs(pattern)] for pattern in bad}
 
         def of_bad(values: FloatArray) -> FloatArray:

@@ -5,7 +5,6 @@ An image is figures, sentences and pictures, and a folder of files.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from mitsim.core.display import card, png, scaled, span
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.files import output_folder, plain, read_json, whole_file, write_json
+from mitsim.core.job import Clock
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import Capture
@@ -299,40 +299,42 @@ def reconstruct(
     check_factorising(shots, factors, solver)
     if cost:
         Cost(sum(cost.seconds.values()), cost.memory_bytes).check(f"{shots.name}: its image", Limits())
-    started = time.perf_counter()
-    depth = _depth(shots, factors, request)
+    clock, depth = Clock(), None
+    if focus is not None:
+        with clock.stage("focus"):
+            depth = _depth(shots, factors, request)
     doubts = [depth.doubt] if depth else []
-    found = time.perf_counter()
     if isinstance(depth, Depth):
         of_depth = move_factors(factors, depth.mm)
         shots, factors = of_depth.of(shots), of_depth.factors
         if of_depth.hidden:
             hidden = f"{of_depth.hidden:.1%} of the scene's pixels, which come out dark"
             doubts.append(f"At {depth.mm:.4g} mm the field stop takes most of the light of {hidden}.")
-    data = accumulate(shots, factors, method)
-    added = time.perf_counter()
+    with clock.stage("accumulate"):
+        data = accumulate(shots, factors, method)
     by_pixel = depth if isinstance(depth, DepthMap) and not depth.doubt else None
-    solution = by_pixel.solution if by_pixel else data.solution(lam)
-    solved = time.perf_counter()
-    misfit = _misfit_at(data, by_pixel) if by_pixel else find_misfit(data, solution)
-    if misfit and misfit.defects:
-        data, solution, misfit = _without_defects(data, lam, misfit)
-    if misfit and misfit.cause in _OF_THE_SCENE and isinstance(depth, Depth) and depth.at_end:
-        misfit = replace(misfit, cause=Cause.DEPTH)
-    explained = factors.status.verdict is not Verdict.NOT_SEPARABLE and (misfit is None or not misfit.flagged)
     linear = solver.linear and not by_pixel
-    if linear and lam == "auto" and (factors.lacking or not explained):
-        lack = data.lack(solution.image)
-        known = (lack.struck, lack.energy) if lack else None
-        solution = data.prepared.solve(data.frames, lam, explained=explained, lack=known)
-    judged = time.perf_counter()
-    uncertainties = uncertainty(data, solution) if linear else None
+    with clock.stage("solve"):
+        solution = by_pixel.solution if by_pixel else data.solution(lam)
+    with clock.stage("misfit"):
+        misfit = _misfit_at(data, by_pixel) if by_pixel else find_misfit(data, solution)
+        if misfit and misfit.defects:
+            data, solution, misfit = _without_defects(data, lam, misfit)
+        if misfit and misfit.cause in _OF_THE_SCENE and isinstance(depth, Depth) and depth.at_end:
+            misfit = replace(misfit, cause=Cause.DEPTH)
+        explained = factors.status.verdict is not Verdict.NOT_SEPARABLE and (misfit is None or not misfit.flagged)
+        if linear and lam == "auto" and (factors.lacking or not explained):
+            lack = data.lack(solution.image)
+            known = (lack.struck, lack.energy) if lack else None
+            solution = data.prepared.solve(data.frames, lam, explained=explained, lack=known)
+    with clock.stage("uncertainty"):
+        uncertainties = uncertainty(data, solution) if linear else None
     status = misfit.judged(solution.status) if misfit else solution.status
     image = solution.image
     if beside:
         image = beside.inside(image)
-        uncertainties = uncertainties and Uncertainty(
-            {name: beside.inside(values) for name, values in uncertainties.sources.items()}, uncertainties.bias_factor
+        uncertainties = uncertainties and replace(
+            uncertainties, sources={name: beside.inside(values) for name, values in uncertainties.sources.items()}
         )
     doubts.append(uncertainties.loss(image) if uncertainties else "")
     flags = (*status.flags, *(doubt for doubt in doubts if doubt), *_flags(data.shots, factors))
@@ -345,13 +347,7 @@ def reconstruct(
         condition_sides=(left.condition, right.condition),
         misfit=misfit,
         uncertainties=uncertainties,
-        seconds={
-            **({"focus": found - started} if depth else {}),
-            "accumulate": added - found,
-            "solve": solved - added,
-            "misfit": judged - solved,
-            "uncertainty": time.perf_counter() - judged,
-        },
+        seconds={stage: spent for stage, spent in clock.seconds().items() if stage != "total"},
         inputs=asked,
         focus=depth,
         predicted=cost,

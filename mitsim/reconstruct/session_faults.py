@@ -275,14 +275,9 @@ class Pairs:
             self._divide(number, own, self.side_of(number, used), flicker if shakes else 0.0)
             own.vectors = own.vectors * scale
             remaining += float(own.extras.sum() / np.sum(np.square(own.vectors)))
-        return Lamp(
-            drift=end_to_end(self.times, trend) if drifts else 0.0,
-            flicker=flicker if shakes else 0.0,
-            drift_cost=moved if drifts else 0.0,
-            flicker_cost=shaken if shakes else 0.0,
-            remaining=float(np.sqrt(remaining)),
-            corrected=True,
-        )
+        drift, moved = (end_to_end(self.times, trend), moved) if drifts else (0.0, 0.0)
+        flicker, shaken = (flicker, shaken) if shakes else (0.0, 0.0)
+        return Lamp(drift, flicker, moved, shaken, float(np.sqrt(remaining)), corrected=True)
 
     def _divide(self, number: int, own: SideCheck, powers: FloatArray, flicker: float) -> None:
         """Divide a side's vectors by the power of their frames; what flicker leaves in them counts as their error.

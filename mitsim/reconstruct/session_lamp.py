@@ -67,7 +67,6 @@ class Lamp:
     def warnings(self) -> Iterator[str]:
         """What is said of an unsteady lamp."""
         left = "frames are divided by its power" + (f", and {self.remaining:.1e} is left" if self.remaining else "")
-        left = left if self.corrected else "its error is in what is stated"
         if self.drift:
             yield (
                 f"lamp: its power drifts by {self.drift:+.1%} over the session, a factor error of "
@@ -254,11 +253,6 @@ def lamp_of_frames(sides: Sequence[SideCheck], order: Sequence[Half], step: floa
         each.divide(shares, power / np.sqrt(common), (5 if drifts else 1) * flicker**2)
         each.judge(shares)
     left = sum(float(each.own.extras.sum() / np.square(each.own.vectors).sum()) for each in found)
-    return Lamp(
-        drift=end_to_end(np.concatenate([each.places for each in found]), trends) if drifts else 0.0,
-        flicker=flicker,
-        drift_cost=moved if drifts else 0.0,
-        flicker_cost=shaken if shakes else 0.0,
-        remaining=float(np.sqrt(left)),
-        corrected=True,
-    )
+    times = np.concatenate([each.places for each in found])
+    drift, moved = (end_to_end(times, trends), moved) if drifts else (0.0, 0.0)
+    return Lamp(drift, flicker, moved, shaken if shakes else 0.0, float(np.sqrt(left)), corrected=True)

@@ -151,14 +151,14 @@ class Prepared:
 
     def accumulator(self) -> Accumulator:
         """An empty sum to add frames to."""
-        return Accumulator(self.left, self.right, self.centre)
+        return Accumulator(self)
 
     def problem(self, frames: Accumulator) -> DiagonalProblem:
         """Data of all ``frames`` and singular values in the basis where the problem is diagonal.
 
         MitsimError when frames are missing: the closed form holds for all patterns or none.
         """
-        if not frames.belongs_to(self.left, self.right):
+        if frames.prepared.left is not self.left or frames.prepared.right is not self.right:
             raise MitsimError("frames were added to an accumulator of other factors; use this one's accumulator()")
         missing = frames.missing
         if missing:
@@ -375,20 +375,12 @@ _LARGEST_SUM = 1e100
 class Accumulator:
     """Sum over frames of what the solver needs: W by quarters of the sensor, the frames' energy, and which frames came.
 
-    Made by :meth:`mitsim.reconstruct.solver.Prepared.accumulator`; belongs to the factors that made it.
-
-    Parameters
-    ----------
-    left, right
-        the factorised model.
-    centre
-        whether row and column means are taken out of each frame.
+    Made by :meth:`Prepared.accumulator`; belongs to the factors of the ``prepared`` model that made it.
     """
 
-    def __init__(self, left: Side, right: Side, centre: bool) -> None:
-        self._left = left
-        self._right = right
-        self._centre = centre
+    def __init__(self, prepared: Prepared) -> None:
+        left, right = prepared.left, prepared.right
+        self.prepared = prepared
         self._quarters = np.zeros((2, 2, left.accumulated_size, right.accumulated_size))
         self._energy = 0.0
         self._seen = np.zeros((left.pattern_count, right.pattern_count), dtype=np.bool_)
@@ -413,10 +405,6 @@ class Accumulator:
         """Pattern indices (i, j) whose frame has not been added."""
         return [(int(i), int(j)) for i, j in np.argwhere(~self._seen)]
 
-    def belongs_to(self, left: Side, right: Side) -> bool:
-        """Whether ``left`` and ``right`` are the factors the frames were projected on."""
-        return self._left is left and self._right is right
-
     def add(self, frame: npt.ArrayLike, row: int, column: int) -> None:
         """Add one frame; sums are float64.
 
@@ -434,18 +422,16 @@ class Accumulator:
             index out of range, or a pattern added twice (average repeated shots first).
         """
         self._check_index(row, column)
-        values = self._check_frame(frame, row, column)
-        if self._centre:
-            values = centre_frame(values)
+        values = self.prepared.as_solved(self._check_frame(frame, row, column))
         flat = values.ravel()
         energy = float(np.dot(flat, flat))
         if not 1 / _LARGEST_SUM**2 <= energy <= _LARGEST_SUM**2 and (energy or values.any()):
             raise MitsimError(_out_of_range(f"frame of pattern ({row}, {column})", values))
-        left, right = self._left.slabs[row], self._right.slabs[column]
+        left, right = self.prepared.slabs((row, column))
         where: Any = (left.columns, right.columns)
         if isinstance(left.columns, np.ndarray) and isinstance(right.columns, np.ndarray):
             where = np.ix_(left.columns, right.columns)
-        halves = self._left.halves, self._right.halves
+        halves = self.prepared.left.halves, self.prepared.right.halves
         self._quarters[(slice(None), slice(None), *where)] += _project(values, left.matrix, right.matrix, halves)
         self._energy += energy
         self._seen[row, column] = True
@@ -460,7 +446,7 @@ class Accumulator:
 
     def _check_frame(self, frame: npt.ArrayLike, row: int, column: int) -> FloatArray:
         values = np.asarray(frame)
-        expected = (self._left.sensor_size, self._right.sensor_size)
+        expected = (self.prepared.left.sensor_size, self.prepared.right.sensor_size)
         if values.shape != expected or values.dtype.kind not in "buif":
             raise MitsimError(
                 f"frame of pattern ({row}, {column}) is {values.dtype} of shape {values.shape}; "

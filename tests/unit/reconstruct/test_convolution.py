@@ -159,6 +159,19 @@ def test_iterations_that_do_not_suffice_are_told() -> None:
     assert "allow more iterations" in str(short.status)
 
 
+def test_a_watch_ends_the_iterations() -> None:
+    camera = ConvolutionalCamera(spread(), 9)
+    frames, _ = noisy(camera, "uniform")
+    seen: list[float] = []
+
+    def watch(image: np.ndarray) -> bool:
+        seen.append(float(np.linalg.norm(image)))
+        return len(seen) == 4
+
+    found = solve_iteratively(camera, parse_patterns("uniform", 9), frames, 1e-6, 1e-10, 100, watch)
+    assert found.iterations == 4 and seen[-1] == np.linalg.norm(found.image)
+
+
 def test_nothing_seen_is_a_dark_image() -> None:
     dark = conjugate_gradients(lambda image: image, np.zeros((3, 3)), 0.0)
     assert dark.ok and dark.iterations == 0 and not dark.image.any()
