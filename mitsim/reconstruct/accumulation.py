@@ -289,8 +289,9 @@ def accumulate(shots: Capture, factors: Factors, method: str = TIKHONOV) -> Accu
     check_factorising(shots, factors, solver)
     prepared = solver.init(factors, shots.patterns)
     # The difference of a pair has no ambient frame.
-    taken_off = None if any(shot.sign for shot in shots.manifest.patterns.captures) else shots.ambient
-    ambient = taken_off and (taken_off.variance.mean(axis=1), taken_off.variance.mean(axis=0))
+    signed = any(shot.sign for shot in shots.manifest.patterns.captures)
+    variance = None if signed or shots.ambient is None else shots.ambient.variance
+    ambient = None if variance is None else (variance.mean(axis=1), variance.mean(axis=0))
     noise = FrameNoise(shots.manifest, ambient)
     frames, kept = prepared.accumulator(), list[Measurement]()
     few = keeps_frames(shots, factors)

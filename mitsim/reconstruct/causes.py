@@ -458,9 +458,7 @@ class Readings:
         if size > 1:
             cut = min(max(_FITS, _CUT / size), _CUT_AT_MOST) if with_cut else _FITS
             orders = {"in the reverse order": lambda number: count - 1 - number}
-            if any(
-                shot.sign for shot in self._captures
-            ):  # of a step their light tells, as FrameCheck.out_of_step has it
+            if any(shot.sign for shot in self._captures):  # a step is FrameCheck.out_of_step's, by their light
                 orders["with the halves of each pair exchanged"] = lambda number: number ^ 1
             else:
                 orders |= {STEPS[0]: lambda number: number - 1, STEPS[1]: lambda number: number + 1}

@@ -200,9 +200,8 @@ class Explanations:
         check, patterns = self._check, list(off)[:_MOST_PAIRS]
 
         def exchanged(one: tuple[Pattern, int], other: tuple[Pattern, int]) -> bool:
-            noise = (
-                mean.size * float(check.noise.variance[one[0]] + check.noise.variance[other[0]]) / 2
-            )  # of a half each
+            # Of a half each.
+            noise = mean.size * float(check.noise.variance[one[0]] + check.noise.variance[other[0]]) / 2
             apart = (halves[one] + halves[other[0], -other[1]] - mean, halves[other] + halves[one[0], -one[1]] - mean)
             most = max(_EXPLAINS * min(off[one[0]], off[other[0]]), _LEFT * noise * float(np.sqrt(2 / mean.size)))
             return max(sum_of_squares(each) for each in apart) - noise < most

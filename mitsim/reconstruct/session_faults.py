@@ -220,9 +220,9 @@ class Pairs:
             found.append((float(np.std(light - self.ambient_and_all)), light))
         return min(found, key=lambda one: one[0])[1]
 
-    def side_of(self, number: int, values: FloatArray) -> FloatArray:
+    def side_of(self, number: int, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Those of the ``values`` (2 N,) that belong to the side of a ``number``, 0 or 1."""
-        return np.asarray(values[number * self.count : (number + 1) * self.count])
+        return values[number * self.count : (number + 1) * self.count]
 
     def check(self, steady: bool = True) -> Lamp:
         """How steady the lamp is, where it should be ``steady``; MitsimError where too many pairs are wrong."""
