@@ -305,6 +305,14 @@ def accumulate(shots: Capture, factors: Factors, method: str = TIKHONOV) -> Accu
 
 
 def check_factorising(shots: Capture, factors: Factors, solver: Solver) -> None:
-    """MitsimError where factorising the model of ``shots`` and ``factors`` takes more memory than is free."""
+    """MitsimError where factorising the model takes more memory than is free.
+
+    Parameters
+    ----------
+    shots, factors
+        the patterns, and the camera.
+    solver
+        that the model is for.
+    """
     cost = Cost(memory_bytes=BYTES_A_NUMBER * slab_numbers(shots, factors, whole=solver.whole))
     cost.check(f"{shots.name}: factorising its patterns", Limits())
