@@ -329,8 +329,7 @@ def prepare(
         if not (factor.any() and pattern.any()):
             what = " once centred" if centre else ""
             raise MitsimError(f"{name} factor{what} or its patterns are all zero; there is nothing to solve for")
-    groups = [group_pixels(patterns[0], structure)]
-    groups.append(groups[0] if np.array_equal(patterns[0], patterns[1]) else group_pixels(patterns[1], structure))
+    groups = [group_pixels(own, structure) for own in patterns]
 
     def side(index: int) -> Side:
         return factorise(factors[index], patterns[index], groups[index], method, structure, centre)
@@ -428,9 +427,7 @@ class Accumulator:
         if not 1 / _LARGEST_SUM**2 <= energy <= _LARGEST_SUM**2 and (energy or values.any()):
             raise MitsimError(_out_of_range(f"frame of pattern ({row}, {column})", values))
         left, right = self.prepared.slabs((row, column))
-        where: Any = (left.columns, right.columns)
-        if isinstance(left.columns, np.ndarray) and isinstance(right.columns, np.ndarray):
-            where = np.ix_(left.columns, right.columns)
+        where = self.prepared.places((row, column))
         halves = self.prepared.left.halves, self.prepared.right.halves
         self._quarters[(slice(None), slice(None), *where)] += _project(values, left.matrix, right.matrix, halves)
         self._energy += energy
