@@ -397,8 +397,6 @@ class Explanations:
 
     def _exchange(self, one: _Suspect) -> Iterable[_Named]:
         """Both halves of signed patterns: the two exchanged, or those of another pattern."""
-        if one.predicted is None:
-            return
         yield _Named(self._beyond({one.pattern: -one.frame}, one.variance), Fault.SWAPPED, one.numbers, "are exchanged")
         for other in self._bad:
             if other != one.pattern:

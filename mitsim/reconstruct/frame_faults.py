@@ -78,13 +78,6 @@ class FrameFault:
         }
 
 
-def frame_list(numbers: tuple[int, ...], files: tuple[str, ...]) -> str:
-    """Frames by their ``numbers`` and ``files``, the first few."""
-    shown = ", ".join(f"{number} ({file})" for number, file in zip(numbers[:4], files[:4], strict=True))
-    more = f" and {len(numbers) - 4} more" if len(numbers) > 4 else ""
-    return f"frame{'s' if len(numbers) > 1 else ''} {shown}{more}"
-
-
 # ---- Energies by pattern ----
 
 
@@ -266,7 +259,7 @@ class LeaveOneOut:
         return sums
 
     def fault(self, fault: Fault, numbers: Iterable[int], words: str) -> FrameFault:
-        """That.
+        """That, of the first few frames by number and file.
 
         Parameters
         ----------
@@ -275,4 +268,6 @@ class LeaveOneOut:
         """
         numbers = tuple(sorted(numbers))
         files = tuple(self.shots[number].file for number in numbers)
-        return FrameFault(fault, numbers, files, f"{frame_list(numbers, files)} {words}")
+        shown = ", ".join(f"{number} ({file})" for number, file in zip(numbers[:4], files[:4], strict=True))
+        more = f" and {len(numbers) - 4} more" if len(numbers) > 4 else ""
+        return FrameFault(fault, numbers, files, f"frame{'s' if len(numbers) > 1 else ''} {shown}{more} {words}")
