@@ -85,7 +85,7 @@ class Reconstruction(Solution):
     @property
     def depths(self) -> DepthMap | None:
         """A depth for each pixel, where these were looked for and are told."""
-        return self.focus if isinstance(self.focus, DepthMap) and not self.focus.doubt else None
+        return _by_pixel(self.focus)
 
     @property
     def condition_whole(self) -> float:
@@ -299,36 +299,13 @@ def reconstruct(
     check_factorising(shots, factors, solver)
     if cost:
         Cost(sum(cost.seconds.values()), cost.memory_bytes).check(f"{shots.name}: its image", Limits())
-    clock, depth = Clock(), None
-    if focus is not None:
-        with clock.stage("focus"):
-            depth = _depth(shots, factors, request)
-    doubts = [depth.doubt] if depth else []
-    if isinstance(depth, Depth):
-        of_depth = move_factors(factors, depth.mm)
-        shots, factors = of_depth.of(shots), of_depth.factors
-        if of_depth.hidden:
-            hidden = f"{of_depth.hidden:.1%} of the scene's pixels, which come out dark"
-            doubts.append(f"At {depth.mm:.4g} mm the field stop takes most of the light of {hidden}.")
+    clock = Clock()
+    depth, shots, factors, doubts = _focus(shots, factors, request, clock)
     with clock.stage("accumulate"):
         data = accumulate(shots, factors, method)
-    by_pixel = depth if isinstance(depth, DepthMap) and not depth.doubt else None
-    linear = solver.linear and not by_pixel
-    with clock.stage("solve"):
-        solution = by_pixel.solution if by_pixel else data.solution(lam)
-    with clock.stage("misfit"):
-        misfit = _misfit_at(data, by_pixel) if by_pixel else find_misfit(data, solution)
-        if misfit and misfit.defects:
-            data, solution, misfit = _without_defects(data, lam, misfit)
-        if misfit and misfit.cause in _OF_THE_SCENE and isinstance(depth, Depth) and depth.at_end:
-            misfit = replace(misfit, cause=Cause.DEPTH)
-        explained = factors.status.verdict is not Verdict.NOT_SEPARABLE and (misfit is None or not misfit.flagged)
-        if linear and lam == "auto" and (factors.lacking or not explained):
-            lack = data.lack(solution.image)
-            known = (lack.struck, lack.energy) if lack else None
-            solution = data.prepared.solve(data.frames, lam, explained=explained, lack=known)
+    data, solution, misfit = _fit(data, depth, lam, clock)
     with clock.stage("uncertainty"):
-        uncertainties = uncertainty(data, solution) if linear else None
+        uncertainties = uncertainty(data, solution) if solver.linear and not _by_pixel(depth) else None
     status = misfit.judged(solution.status) if misfit else solution.status
     image = solution.image
     if beside:
@@ -352,6 +329,58 @@ def reconstruct(
         focus=depth,
         predicted=cost,
     )
+
+
+def _focus(
+    shots: Capture, factors: Factors, request: ImageRequest, clock: Clock
+) -> tuple[Depth | DepthMap | None, Capture, Factors, list[str]]:
+    """The depth that is asked for, or found; the part of ``shots`` and the ``factors`` that are known there, and
+    doubts."""
+    if request.focus is None:
+        return None, shots, factors, []
+    depth: Depth | DepthMap
+    with clock.stage("focus"):
+        if request.focus == "map":
+            depth = depth_map(shots, factors, request.lam, request.depth_range)
+        elif request.focus == "auto":
+            depth = best_depth(shots, factors, request.depth_range)
+        else:
+            depth = Depth(float(request.focus))
+    doubts = [depth.doubt]
+    if isinstance(depth, Depth):
+        of_depth = move_factors(factors, depth.mm)
+        shots, factors = of_depth.of(shots), of_depth.factors
+        if of_depth.hidden:
+            hidden = f"{of_depth.hidden:.1%} of the scene's pixels, which come out dark"
+            doubts.append(f"At {depth.mm:.4g} mm the field stop takes most of the light of {hidden}.")
+    return depth, shots, factors, doubts
+
+
+def _by_pixel(depth: Depth | DepthMap | None) -> DepthMap | None:
+    """A depth for each pixel, where these were looked for and are told."""
+    return depth if isinstance(depth, DepthMap) and not depth.doubt else None
+
+
+def _fit(
+    data: Accumulation, depth: Depth | DepthMap | None, lam: float | Literal["auto"], clock: Clock
+) -> tuple[Accumulation, Solution, Misfit | None]:
+    """The image at ``lam`` and its misfit, and the sums that they are of: without defective pixels."""
+    by_pixel = _by_pixel(depth)
+    with clock.stage("solve"):
+        solution = by_pixel.solution if by_pixel else data.solution(lam)
+    with clock.stage("misfit"):
+        misfit = _misfit_at(data, by_pixel) if by_pixel else find_misfit(data, solution)
+        if misfit and misfit.defects:
+            data, solution, misfit = _without_defects(data, lam, misfit)
+        if misfit and misfit.cause in _OF_THE_SCENE and isinstance(depth, Depth) and depth.at_end:
+            misfit = replace(misfit, cause=Cause.DEPTH)
+        separable = data.factors.status.verdict is not Verdict.NOT_SEPARABLE
+        explained = separable and (misfit is None or not misfit.flagged)
+        if data.solver.linear and not by_pixel and lam == "auto" and (data.factors.lacking or not explained):
+            lack = data.lack(solution.image)
+            known = (lack.struck, lack.energy) if lack else None
+            solution = data.prepared.solve(data.frames, lam, explained=explained, lack=known)
+    return data, solution, misfit
 
 
 def _misfit_at(data: Accumulation, depths: DepthMap) -> Misfit:
@@ -392,14 +421,6 @@ def _without_defects(
         solution = data.solution(lam)
         return data, solution, find_misfit(data, solution, with_defects=False)
     return without, solution, replace(now, defects=found)
-
-
-def _depth(shots: Capture, factors: Factors, request: ImageRequest) -> Depth | DepthMap | None:
-    if request.focus == "map":
-        return depth_map(shots, factors, request.lam, request.depth_range)
-    if request.focus == "auto":
-        return best_depth(shots, factors, request.depth_range)
-    return None if request.focus is None else Depth(float(request.focus))
 
 
 def _flags(shots: Capture, factors: Factors) -> tuple[str, ...]:
