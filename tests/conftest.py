@@ -155,6 +155,16 @@ def variant() -> str:
     return "llvm_ad_mono"
 
 
+@pytest.fixture
+def set_threads(variant: str) -> Iterator[Callable[[int], None]]:
+    """Sets the threads of Dr.Jit's pool; as many as before at the end."""
+    import drjit as dr
+
+    before = dr.thread_count()
+    yield dr.set_thread_count
+    dr.set_thread_count(before)
+
+
 @pytest.fixture(scope="module")
 def shipped_bench(variant: str) -> Callable[..., object]:
     """Benches of the shipped scenes, each opened once a module: ``shipped_bench("photograph", mask="flatcam")``.

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -101,6 +101,24 @@ def _set_variant(name: str) -> ModuleType:
         drjit.set_thread_count(_FEWEST_THREADS)
     module: ModuleType = mitsuba
     return module
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Have Dr.Jit work in this thread alone while the context lasts: what it adds up in 32 bits, in the lanes' order.
+
+    Mitsuba must not read OpenEXR files meanwhile, see ``_FEWEST_THREADS``.
+    """
+    import drjit
+
+    threads = drjit.thread_count()
+    drjit.sync_thread()
+    drjit.set_thread_count(1)
+    try:
+        yield
+        drjit.sync_thread()
+    finally:
+        drjit.set_thread_count(threads)
 
 
 @cache

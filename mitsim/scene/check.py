@@ -58,7 +58,8 @@ class CheckedScene:
     the name of the parameter, of the bitmap's file or of the attribute; ``unfit`` which estimators must refuse it;
     ``shapes`` and ``small_lamps`` are the tags, in the scene's order, of its shapes and of its lamps that no path runs
     into; ``coloured`` those of what may differ by wavelength, ``parting`` of glass that sends each its own way;
-    ``samples`` is the ``sample_count`` of the camera's sampler, None where it has none.
+    ``samples`` is the ``sample_count`` of the camera's sampler, None where it has none; ``without_normals`` are names
+    of the meshes' files that give their vertices no normals.
     """
 
     outline: Outline
@@ -72,6 +73,7 @@ class CheckedScene:
     coloured: tuple[Tag, ...]
     parting: tuple[Tag, ...]
     samples: int | None
+    without_normals: frozenset[str]
 
 
 def check_file(
@@ -110,7 +112,8 @@ def check_file(
     shapes = [plugin for plugin in PLUGINS["shape"].split() if plugin != "shapegroup"]
     facts = tuple(files.used), tree.limits, Unfit.of(outline, tree.nodes)
     listed = tuple(tree.listed(shapes)), tuple(tree.listed(SMALL_LAMPS)), tuple(tree.coloured), tuple(tree.parting)
-    return CheckedScene(outline, config, state, *facts, *listed, tree.samples)
+    without_normals = frozenset(name for name, given in tree.normals.items() if given == {False})
+    return CheckedScene(outline, config, state, *facts, *listed, tree.samples, without_normals)
 
 
 @contextmanager
@@ -141,6 +144,7 @@ class _Tree:
     coloured: list[Tag] = field(default_factory=list)
     parting: list[Tag] = field(default_factory=list)
     samples: int | None = None
+    normals: dict[str, set[bool]] = field(default_factory=dict)
 
     def check(self) -> None:
         """MitsimError for the first object that a scene cannot have."""
@@ -231,7 +235,8 @@ class _Tree:
                 if not is_grey(path):
                     self.coloured.append(tag)
             else:
-                (check_ply if plugin == "ply" else check_obj)(path)
+                given = (check_ply if plugin == "ply" else check_obj)(path)
+                self.normals.setdefault(Path(name).name, set()).add(given)
         except (ValueError, OSError) as error:
             raise tag.refusal("filename", repr(name), f"the file {error}") from None
         if self.texels > MOST_TEXELS:

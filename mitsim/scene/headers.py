@@ -71,11 +71,11 @@ def is_grey(path: Path) -> bool:
         return image.mode in _GREY
 
 
-def check_ply(path: Path) -> None:
+def check_ply(path: Path) -> bool:
     """Refuse ``path`` unless it is a PLY mesh of triangles whose corners exist and lie within ``FARTHEST``.
 
     Mitsuba would read beyond its arrays. Elements and properties beside those of triangles may be there, in any order.
-    Raises ValueError or OSError.
+    Returns whether its vertices have normals. Raises ValueError or OSError.
     """
     with open(path, "rb") as file:
         start = file.read(_HEADER)
@@ -91,21 +91,26 @@ def check_ply(path: Path) -> None:
     if indices.min() < 0 or indices.max() >= count:
         named = f"{indices.min()} to {indices.max()}"
         raise ValueError(f"has faces with vertices {named}, but {count} vertices; mend the mesh")
+    return {"nx", "ny", "nz"} <= dict(parts["vertex"].properties).keys()
 
 
-def check_obj(path: Path) -> None:
-    """Refuse ``path`` unless it is a Wavefront mesh of vertices within ``FARTHEST``; Mitsuba checks the faces."""
+def check_obj(path: Path) -> bool:
+    """Refuse ``path`` unless it is a Wavefront mesh of vertices within ``FARTHEST``; Mitsuba checks the faces.
+
+    Returns whether any vertices have normals.
+    """
     if path.stat().st_size > _MOST_TEXT:
         raise ValueError(f"is a text of over {_MOST_TEXT >> 20} MiB; export it as binary PLY")
     with open(path, "rb") as file:
-        words = [line.split()[1:4] for line in file if line.split()[:1] == [b"v"]]
+        lines = [line.split()[:4] for line in file if line.split()[:1] in ([b"v"], [b"vn"])]
     try:
-        points = np.array(words, dtype=np.float64)
+        points = np.array([words for key, *words in lines if key == b"v"], dtype=np.float64)
     except ValueError:
         raise ValueError("holds vertices that are not three numbers; export the mesh again") from None
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError("is no Wavefront mesh: it has no vertices of three numbers")
     _check_points(points)
+    return len(lines) > len(points)
 
 
 def _check_points(points: npt.NDArray[np.float64]) -> None:

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
+from mitsim.core.environment import one_thread
 from mitsim.core.errors import MitsimError
 from mitsim.scene.check import check_file, looking_beside
 from mitsim.scene.estimators import Unfit
@@ -96,6 +97,7 @@ def load_scene(
             scene = mi.parser.instantiate(checked.config, checked.state)
     check_texels(path, scene, checked.limits)
     check_meshes(moved, scene)
+    _add_up_normals(scene, checked.without_normals)
     cameras = [sensor for sensor in scene.sensors() if hasattr(sensor, "geometry")]
     if len(cameras) != 1:
         raise MitsimError(f'{path}: {len(cameras)} sensors of type "{SENSOR_PLUGIN}"; a scene needs exactly one')
@@ -155,6 +157,25 @@ def _mirrors_and_gloss(scene: mi.Scene, unfit: Unfit) -> tuple[bool, bool]:
 _ANY = Range(-np.inf, np.inf)
 _ROUNDING = 1e-5
 """A reflectance of 1 after conversion of colours by single precision."""
+
+
+def _add_up_normals(scene: mi.Scene, without_normals: frozenset[str]) -> None:
+    """Give meshes of files ``without_normals`` those of one thread, the same at every loading.
+
+    A vertex has the sum over its faces, in 32 bits. Mitsuba adds it up in the order in which threads come to the faces.
+    Of shapes that are merged, some with normals of their own, all stay as they are.
+    """
+    parameters, meshes = mi.traverse(scene), []
+    for key in parameters.keys():  # noqa: SIM118 - SceneParameters is no dict
+        if key.rpartition(".")[2] == "vertex_normals":
+            mesh = parameters.properties[key][2]
+            files = re.search(r'name = "([^"]*)"', str(mesh))
+            if files and mesh.has_vertex_normals() and without_normals.issuperset(files[1].split(" + ")):
+                meshes.append(mesh)
+    if meshes:
+        with one_thread():
+            for mesh in meshes:
+                mesh.recompute_vertex_normals()
 
 
 def check_texels(path: Path, scene: mi.Scene, limits: Mapping[str, Range]) -> None:

@@ -232,7 +232,7 @@ def with_thin_shapes_as_meshes(outline: Outline, state: mi.parser.ParserState) -
         try:
             folder = stack.enter_context(tempfile.TemporaryDirectory()) if thin else ""
             for index in thin:
-                _replace(state.nodes, index, Path(folder) / f"{index}.ply")
+                _replace(state.nodes, index, Path(folder) / f"thin shape {index}.ply")
         except OSError as error:
             rule = "free some space there, or set TMPDIR to another folder"
             raise MitsimError(
