@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from mitsim.devices.projector import Lines, ProjectorModel, Spectrum
     from mitsim.devices.sensor import SensorModel
     from mitsim.scene.load import LoadedScene
+    from mitsim.transport.connect import OpticalSetup
     from mitsim.transport.projector import ProjectorOptics
 
 
@@ -109,6 +110,13 @@ class Apparatus:
             self.lines,
             bool(self.loaded.parting),
         )
+
+    @property
+    def setup(self) -> OpticalSetup:
+        """What light is traced in."""
+        from mitsim.transport.connect import OpticalSetup
+
+        return OpticalSetup(self.loaded.scene, self.loaded.camera, self.projector_optics, self.geometry)
 
     @property
     def spectrum(self) -> Spectrum:

@@ -250,9 +250,7 @@ def tracer_of(simulation: Simulation, pixels: Labels, anchors: int, spread: bool
     anchors, spread
         to so many anchors a side, or spread over the sensor.
     """
-    loaded, physics = simulation.bench.loaded, simulation.physics
-    parts = loaded.scene, loaded.camera, physics.projector, anchors, physics.geometry
-    return DirectTracer(*parts, spread=spread, pixels=pixels)
+    return DirectTracer(simulation.setup, anchors, spread, pixels)
 
 
 # -------- Projector pixels whose light is hidden from part of the sensor
@@ -328,8 +326,7 @@ def _roughness(simulation: Simulation, pixels: Labels, samples: int, seed: int) 
     seed
         of the rays.
     """
-    loaded, physics = simulation.bench.loaded, simulation.physics
-    tracer = DirectTracer(loaded.scene, loaded.camera, physics.projector, _ANCHORS, physics.geometry, pixels=pixels)
+    tracer = DirectTracer(simulation.setup, _ANCHORS, pixels=pixels)
     seen = tracer.trace(seed, 0, samples)
     place = (np.searchsorted(pixels, seen.pixel) * _ANCHORS + seen.anchor_row) * _ANCHORS + seen.anchor_column
     light = np.bincount(place, seen.value / samples, len(pixels) * _ANCHORS**2).reshape(-1, _ANCHORS, _ANCHORS)
@@ -457,9 +454,7 @@ def _paths(moments: FloatArray, even: float, pixels: int, anchors: int) -> Float
 
 def _window(simulation: Simulation, pixels: Labels, seed: int) -> tuple[float, float, float, float]:
     """First and last tan-angle, along rows and along columns, of the surfaces that ``pixels`` light."""
-    loaded, physics = simulation.bench.loaded, simulation.physics
-    parts = loaded.scene, loaded.camera, physics.projector, 2, physics.geometry
-    seen = DirectTracer(*parts, pixels=pixels).trace(seed, 0, _LOOKS)
+    seen = DirectTracer(simulation.setup, 2, pixels=pixels).trace(seed, 0, _LOOKS)
     if not seen.value.size:
         return (0.0, 0.0, 0.0, 0.0)
     return float(seen.row.min()), float(seen.row.max()), float(seen.column.min()), float(seen.column.max())

@@ -1,7 +1,6 @@
 """Connections: from a lit surface point to the irradiance that it casts on the sensor, and to the projector's lens.
 
-The bare sensor is a receiver.
-A surface point P that receives the flux phi irradiates the sensor point with::
+The bare sensor is a receiver. A surface point P that receives the flux phi irradiates the sensor point with::
 
     E = f(P) cos_s / cos_g  phi  cos_P cos_a / r^2  r(t)        [W m^-2]
 
@@ -16,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -147,27 +147,41 @@ class Reception:
         return Sightings.of(light, by_line, pixel, self.row, self.column, self.inverse_depth)
 
 
-class Receiver:
-    """Prepared once for a scene and a camera.
+@dataclass(frozen=True, eq=False)
+class OpticalSetup:
+    """What light is traced in: a scene with its camera and its projector, and how its surfaces reach the sensor.
 
-    Parameters
+    Attributes
     ----------
     scene, camera
         as loaded.
+    projector
+        where light comes from.
     geometry
-        stands in for the camera's own.
+        of the camera; may stand in for the loaded one's own.
     """
 
-    def __init__(self, scene: mi.Scene, camera: mi.Sensor, geometry: CameraGeometry | None = None) -> None:
-        self.scene, self.camera, self.passage = scene, camera, Passage(scene)
-        self.geometry: CameraGeometry = geometry or camera.geometry
+    scene: mi.Scene
+    camera: mi.Sensor
+    projector: ProjectorOptics
+    geometry: CameraGeometry
 
-    def of_board(self, rays: ProjectorRays) -> float:
-        """Irradiance [W m^-2] by the light of a projector pixel, from a white board at the rig's distance; ``rays`` are
-        the projector's."""
-        pixel = dr.arange(mi.UInt32, rays.projector.n**2)
-        wavelengths, spectral = sample_wavelengths(self.camera, generator(mi.UInt32(0), pixel), rays.projector.lines)
-        flux = np.array(panchromatic(rays.flux(pixel, wavelengths) * spectral))
+    @cached_property
+    def passage(self) -> Passage:
+        """What light passes in the scene."""
+        return Passage(self.scene)
+
+    @cached_property
+    def rays(self) -> ProjectorRays:
+        """Rays of the projector."""
+        return ProjectorRays(self.projector)
+
+    @cached_property
+    def board(self) -> float:
+        """Irradiance [W m^-2] by the light of a projector pixel, from a white board at the rig's distance."""
+        pixel = dr.arange(mi.UInt32, self.projector.n**2)
+        wavelengths, spectral = sample_wavelengths(self.camera, generator(mi.UInt32(0), pixel), self.projector.lines)
+        flux = np.array(panchromatic(self.rays.flux(pixel, wavelengths) * spectral))
         return float(flux.mean(dtype=np.float64)) / (math.pi * self.geometry.scene_distance**2)
 
     def receive(
@@ -283,12 +297,12 @@ class Landing:
     arrives: mi.Bool
 
 
-def landing(receiver: Receiver, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> Landing:
+def landing(setup: OpticalSetup, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> Landing:
     """Where light crosses the plane of the sensor from the front; whether something opaque hides it is not asked.
 
     Parameters
     ----------
-    receiver
+    setup
         the sensor, and the scene with its panes.
     si
         points of surfaces.
@@ -297,7 +311,7 @@ def landing(receiver: Receiver, si: mi.SurfaceInteraction3f, direction: mi.Vecto
     active
         lanes that count.
     """
-    inverse, passage = receiver.camera.world_transform().inverse(), receiver.passage
+    inverse, passage = setup.camera.world_transform().inverse(), setup.passage
     ray, length = mi.Ray3f(si.p, direction, si.time, si.wavelengths), mi.Float(0)
 
     def further(active: mi.Bool, ray: mi.Ray3f, length: mi.Float) -> tuple[object, ...]:

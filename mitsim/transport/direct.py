@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -17,12 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
-from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Lines
 from mitsim.transport.accumulator import DeviceAccumulator
-from mitsim.transport.connect import Receiver, Reception, SensorPoints, landing, sample_wavelengths
+from mitsim.transport.connect import OpticalSetup, Reception, SensorPoints, landing, sample_wavelengths
 from mitsim.transport.integrator import PATHS_PER_LAUNCH, InFlight, Tracer
-from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.records import DIRECT, PathSamples, Sightings, check_finite
 from mitsim.transport.sampler import shuffled, split_by_line, stratified, streams
 from mitsim.transport.transmission import Arrival
@@ -36,40 +33,27 @@ as a board; accumulators pass 2^22 times what is bright, 40 times that, and roun
 class DirectTracer(Tracer):
     """Direct light of a projector at a number of anchors."""
 
-    def __init__(
-        self,
-        scene: mi.Scene,
-        camera: mi.Sensor,
-        projector: ProjectorOptics,
-        anchors: int,
-        geometry: CameraGeometry | None = None,
-        spread: bool = False,
-        pixels: IntArray | None = None,
-    ) -> None:
+    def __init__(self, setup: OpticalSetup, anchors: int, spread: bool = False, pixels: IntArray | None = None) -> None:
         """What is followed.
 
         Parameters
         ----------
-        scene, camera, projector
-            as loaded.
+        setup
+            scene, camera and projector.
         anchors
             sensor points a side that light is connected to.
-        geometry
-            stands in for the camera's own.
         spread
             connect to random points of the sensor instead, all filed as one anchor: the mean over the sensor.
         pixels
             (m,) of the projector that are traced; None: all.
         """
-        self._pixels = np.arange(projector.n**2) if pixels is None else pixels
-        self.scene, self.projector = scene, projector
-        self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
-        self.points = SensorPoints(self.receiver.geometry.half_width, anchors, spread)
+        super().__init__(setup, SensorPoints(setup.geometry.half_width, anchors, spread))
+        self._pixels = np.arange(setup.projector.n**2) if pixels is None else pixels
 
-    @cached_property
+    @property
     def board(self) -> float:
         """Irradiance [W m^-2] that light compares to: bright light, of sharp lobes too."""
-        return _LOBE * self.receiver.of_board(self.rays)
+        return _LOBE * self.setup.board
 
     @property
     def paths_per_sample(self) -> int:
@@ -108,10 +92,10 @@ class DirectTracer(Tracer):
         # Streams belong to pixels: every anchor is connected to the same points.
         shared, rng = streams(flight.seed, pixel, flight.sample)
         jitter, weight = self._place(number, row, column, stratified(flight.sample, shared))
-        wavelengths, spectral = sample_wavelengths(self.receiver.camera, rng, self.projector.lines)
-        ray = self.rays.sample(pixel, jitter, rng, wavelengths)
+        wavelengths, spectral = sample_wavelengths(self.setup.camera, rng, self.projector.lines)
+        ray = self.setup.rays.sample(pixel, jitter, rng, wavelengths)
         sensor = self._sensor(row, column, flight.sample, shared, rng)
-        flux = self.rays.flux(pixel, wavelengths) * spectral * (weight * share)
+        flux = self.setup.rays.flux(pixel, wavelengths) * spectral * (weight * share)
 
         def add_light(at: Arrival, state: tuple[Sightings, mi.PCG32]) -> tuple[Sightings, mi.PCG32]:
             seen, rng = state
@@ -119,12 +103,12 @@ class DirectTracer(Tracer):
             return seen.joined_by(reception.sightings(received, pixel, by_line), rng.next_float32()), rng
 
         by_line = self.projector.by_line
-        seen, _ = self.receiver.passage.along(ray, flux, (Sightings.none(by_line), rng), add_light)
+        seen, _ = self.setup.passage.along(ray, flux, (Sightings.none(by_line), rng), add_light)
         return seen, DIRECT, (row, column)
 
     def _by_connection(self, at: Arrival, sensor: mi.Point3f) -> tuple[Reception, mi.UnpolarizedSpectrum]:
         """What light that comes to surfaces brings to ``sensor`` points."""
-        reception = self.receiver.receive(at.si, -at.direction, sensor, at.active)
+        reception = self.setup.receive(at.si, -at.direction, sensor, at.active)
         return reception, reception.irradiance * at.light
 
     def _pair(self, flight: InFlight) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
@@ -167,28 +151,10 @@ class FluxTracer:
 
     paths_per_launch = PATHS_PER_LAUNCH
 
-    def __init__(
-        self,
-        scene: mi.Scene,
-        camera: mi.Sensor,
-        projector: ProjectorOptics,
-        geometry: CameraGeometry,
-        glossy: bool = False,
-    ) -> None:
-        """What is followed.
-
-        Parameters
-        ----------
-        scene, camera, projector
-            as loaded.
-        geometry
-            stands in for the camera's own.
-        glossy
-            whether the scene has glossy surfaces, whose turns are sampled too.
-        """
-        self._rays, self._receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
-        self._sensor = SensorPoints(geometry.half_width, spread=True)
-        self._pixels, self._glossy = projector.n**2, glossy
+    def __init__(self, setup: OpticalSetup, glossy: bool = False) -> None:
+        """Light that is followed in a ``setup``; ``glossy``: it has glossy surfaces, whose turns are sampled too."""
+        self._setup, self._glossy = setup, glossy
+        self._sensor = SensorPoints(setup.geometry.half_width, spread=True)
 
     def sums(self, seed: int, groups: int, pixels: IntArray, first: IntArray, samples: int) -> FloatArray:
         """(lines, groups, m) light of m blocks of samples, each summed [W m^-2]; one line where light is not told
@@ -212,7 +178,7 @@ class FluxTracer:
             when the scene sends NaN or infinite light to the camera.
         """
         blocks, at_once = groups * len(pixels), max(1, self.paths_per_launch // samples)
-        lines, projectors = self._rays.projector.lines, self._rays.projector.per_wavelength
+        lines, projectors = self._setup.projector.lines, self._setup.projector.per_wavelength
         total = np.zeros((len(lines.shares) if lines and lines.several else 1, blocks))
         numbers, starts = mi.UInt32(pixels), mi.UInt32(first)
         # Opaque numbers keep the compiled kernel the same for all of them.
@@ -238,14 +204,14 @@ class FluxTracer:
         self, seed: int, group: mi.UInt32, pixel: mi.UInt32, sample: mi.UInt32, lines: Lines | None
     ) -> mi.UnpolarizedSpectrum:
         """Mean irradiance that one ray of each ``pixel`` brings to the sensor."""
-        pixels = dr.opaque(mi.UInt32, self._pixels)
+        pixels = dr.opaque(mi.UInt32, self._setup.projector.n**2)
         shared, rng = streams(seed, pixel + group * pixels, sample)
         jitter = stratified(sample, shared)
-        wavelengths, spectral = sample_wavelengths(self._receiver.camera, rng, lines)
-        ray = self._rays.sample(pixel, jitter, rng, wavelengths)
+        wavelengths, spectral = sample_wavelengths(self._setup.camera, rng, lines)
+        ray = self._setup.rays.sample(pixel, jitter, rng, wavelengths)
         point = stratified(shuffled(sample, shared), shared)
         turn = stratified(shuffled(sample, shared), shared) if self._glossy else None
-        sensor, flux = self._sensor.inside(point), self._rays.flux(pixel, wavelengths) * spectral
+        sensor, flux = self._sensor.inside(point), self._setup.rays.flux(pixel, wavelengths) * spectral
 
         def add_light(
             at: Arrival, state: tuple[mi.UnpolarizedSpectrum, mi.PCG32]
@@ -255,21 +221,21 @@ class FluxTracer:
                 total = total + self._by_turn(at, rng.next_float32(), turn)
             return total + self._by_connection(at, sensor), rng
 
-        total, _ = self._receiver.passage.along(ray, flux, (mi.UnpolarizedSpectrum(0), rng), add_light)
+        total, _ = self._setup.passage.along(ray, flux, (mi.UnpolarizedSpectrum(0), rng), add_light)
         return total
 
     def _by_turn(self, at: Arrival, number: mi.Float, point: mi.Point2f) -> mi.UnpolarizedSpectrum:
         """What light that comes to surfaces brings over turns, drawn by a ``number`` and a ``point``."""
         turn = at.turn(number, point)
         lobe = at.active & (turn.pdf > 0) & ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
-        place = landing(self._receiver, at.si, at.si.to_world(turn.wo), lobe)
+        place = landing(self._setup, at.si, at.si.to_world(turn.wo), lobe)
         half = dr.opaque(mi.Float, self._sensor.half_width)
         lobe = place.arrives & (dr.abs(place.x) <= half) & (dr.abs(place.y) <= half)
         return self._by_connection(replace(at, active=lobe), mi.Point3f(place.x, place.y, 0))
 
     def _by_connection(self, at: Arrival, point: mi.Point3f) -> mi.UnpolarizedSpectrum:
         """What it brings to a ``point`` of the sensor; over glossy surfaces, over 1 + A q."""
-        reception = self._receiver.receive(at.si, -at.direction, point, at.active)
+        reception = self._setup.receive(at.si, -at.direction, point, at.active)
         value = reception.irradiance * at.light
         if not self._glossy:
             return value

@@ -30,9 +30,8 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.spectral_manifests import MOST_LINES
-from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.lamps import SPECTRA_NM, Band, Response
-from mitsim.transport.connect import Connection, ProjectorConnector, SensorPoints, sample_wavelengths
+from mitsim.transport.connect import Connection, OpticalSetup, ProjectorConnector, SensorPoints, sample_wavelengths
 from mitsim.transport.integrator import (
     KINDS,
     FollowingTracer,
@@ -45,10 +44,9 @@ from mitsim.transport.integrator import (
     is_delta,
 )
 from mitsim.transport.plugins.base import rows_columns, x_y
-from mitsim.transport.projector import ProjectorOptics
 from mitsim.transport.records import CellAxis, CellGrid, PathSamples, Sightings
 from mitsim.transport.sampler import shuffled, stratified, streams
-from mitsim.transport.transmission import Passage, refracted_way
+from mitsim.transport.transmission import refracted_way
 
 _MARGIN = 1e-4
 """Part of a cell that paths keep clear of its edges: 2e-7 of tan-angle, above float32's rounding of 3e-8."""
@@ -78,35 +76,22 @@ class FromCameraTracer(FollowingTracer):
 
     of_projector: ClassVar[bool] = True
 
-    def __init__(
-        self,
-        scene: mi.Scene,
-        camera: mi.Sensor,
-        projector: ProjectorOptics,
-        grid: CellGrid,
-        paths: Paths,
-        geometry: CameraGeometry | None = None,
-        points: SensorPoints | None = None,
-    ) -> None:
+    def __init__(self, setup: OpticalSetup, grid: CellGrid, paths: Paths, points: SensorPoints | None = None) -> None:
         """What is followed.
 
         Parameters
         ----------
-        scene, camera, projector
-            as loaded.
+        setup
+            scene, camera and projector.
         grid
             cells that paths start in, one each.
         paths
             which of them are followed.
-        geometry
-            stands in for the camera's own.
         points
             where from; the sensor's centre if not given.
         """
-        self.geometry: CameraGeometry = geometry or camera.geometry
-        self.points = points or SensorPoints(self.geometry.half_width)
-        self.scene, self.camera, self.projector, self.grid, self.paths = scene, camera, projector, grid, paths
-        self.connector, self.passage = ProjectorConnector(projector), Passage(scene)
+        super().__init__(setup, points)
+        self.grid, self.paths, self.connector = grid, paths, ProjectorConnector(setup.projector)
 
     @property
     def paths_per_sample(self) -> int:
@@ -128,12 +113,13 @@ class FromCameraTracer(FollowingTracer):
         sample, shared
             number of each path's sample, and the numbers that all samples of its cell share.
         """
-        return sample_wavelengths(self.camera, rng, self.projector.lines)
+        return sample_wavelengths(self.setup.camera, rng, self.projector.lines)
 
     @property
     def rules(self) -> PathRules:
         """Which paths are followed."""
-        return PathRules(self.passage, self.paths.mirrors, self.paths.interreflection, self.orders, self.by_line)
+        passage, paths = self.setup.passage, self.paths
+        return PathRules(passage, paths.mirrors, paths.interreflection, self.orders, self.by_line)
 
     def _launch(self, flight: InFlight) -> list[PathSamples]:
         return self._paths(flight).path_samples()
@@ -199,7 +185,7 @@ class CameraPaths(PathIntegrator[State]):
         super().__init__(tracer.rules)
         cell, row, column = tracer.points.of(flight.index, tracer.grid.shape[0] * tracer.grid.shape[1])
         self.anchor = row, column
-        self.tracer, self.geometry, self.connector = tracer, tracer.geometry, tracer.connector
+        self.tracer, self.geometry, self.connector = tracer, tracer.setup.geometry, tracer.connector
         self.emitters, self.lens = tracer.paths.emitters, tracer.projector.aperture > 0
         # What a path runs into has been turned once less than what it is connected to.
         self.reach = 0 if self.emitters or self.lens else 1
@@ -216,7 +202,7 @@ class CameraPaths(PathIntegrator[State]):
         squared = 1 + dr.square(self.row) + dr.square(self.column)
         self.slope = dr.rsqrt(squared)
         wavelengths, spectral = tracer.wavelengths(rng, flight.sample, shared)
-        to_world = tracer.camera.world_transform()
+        to_world = tracer.setup.camera.world_transform()
         direction = mi.Vector3f(*x_y(self.row, self.column), 1) * self.slope
         ray = mi.Ray3f(to_world @ sensor, to_world @ direction, 0.0, wavelengths)
         stop = dr.opaque(mi.Float, self.geometry.tan_half_fov)
@@ -450,7 +436,7 @@ class LampTracer(FromCameraTracer):
         counted
             bands, and what they count.
         """
-        super().__init__(like.scene, like.camera, like.projector, like.grid, like.paths, like.geometry, like.points)
+        super().__init__(like.setup, like.grid, like.paths, like.points)
         self.counted = counted
         self._alone: mi.UInt32 | None = None
 

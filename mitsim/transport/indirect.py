@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import drjit as dr
@@ -27,9 +26,8 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, mean_of_neighbours
-from mitsim.devices.camera import CameraGeometry
 from mitsim.transport.accumulator import DeviceAccumulator
-from mitsim.transport.connect import Receiver, SensorPoints, Way, sample_wavelengths
+from mitsim.transport.connect import OpticalSetup, SensorPoints, Way, sample_wavelengths
 from mitsim.transport.integrator import (
     KINDS,
     FollowingTracer,
@@ -39,7 +37,6 @@ from mitsim.transport.integrator import (
     PathState,
     camera_part,
 )
-from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.records import PathSamples, Sightings
 from mitsim.transport.sampler import stratified, streams
 
@@ -52,31 +49,21 @@ class IndirectTracer(FollowingTracer):
     """Indirect light of a projector, and its caustics, at points of the sensor."""
 
     def __init__(
-        self,
-        scene: mi.Scene,
-        camera: mi.Sensor,
-        projector: ProjectorOptics,
-        mirrors: bool,
-        interreflection: bool,
-        geometry: CameraGeometry | None = None,
-        points: SensorPoints | None = None,
+        self, setup: OpticalSetup, mirrors: bool, interreflection: bool, points: SensorPoints | None = None
     ) -> None:
         """What is followed.
 
         Parameters
         ----------
-        scene, camera, projector
-            as loaded.
+        setup
+            scene, camera and projector.
         mirrors, interreflection
             paths over delta reflections and transmissions, and over other surfaces.
-        geometry
-            stands in for the camera's own.
         points
             where to; the sensor's centre if not given.
         """
-        self.scene, self.projector, self.mirrors, self.interreflection = scene, projector, mirrors, interreflection
-        self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
-        self.points = points or SensorPoints(self.receiver.geometry.half_width)
+        super().__init__(setup, points)
+        self.mirrors, self.interreflection = mirrors, interreflection
         self.adaptive: AdaptiveSamples | None = None
 
     def with_adaptive_counts(self, repeats: Sequence[int]) -> IndirectTracer:
@@ -100,16 +87,15 @@ class IndirectTracer(FollowingTracer):
         """Anchors that each path is connected to: all of them."""
         return self.points.count
 
-    @cached_property
+    @property
     def board(self) -> float:
         """Irradiance [W m^-2] that light compares to."""
-        return self.receiver.of_board(self.rays)
+        return self.setup.board
 
     @property
     def rules(self) -> PathRules:
         """Which paths are followed."""
-        passage, by_line = self.receiver.passage, self.projector.by_line
-        return PathRules(passage, self.mirrors, self.interreflection, self.orders, by_line)
+        return PathRules(self.setup.passage, self.mirrors, self.interreflection, self.orders, self.projector.by_line)
 
     def trace_into(self, accumulators: Sequence[DeviceAccumulator], seed: int, first: int, samples: int) -> PathSamples:
         """As :meth:`trace`, indirect light added up in accumulators as far as it can be: the rest, on the host.
@@ -182,12 +168,12 @@ class ProjectorPaths(PathIntegrator[PathState]):
     def __init__(self, tracer: IndirectTracer, emission: Emission) -> None:
         """Of what a ``tracer`` follows, from an ``emission``."""
         super().__init__(tracer.rules)
-        self.receiver, self.pixel, self.anchor = tracer.receiver, emission.pixel, emission.anchor
+        self.setup, self.pixel, self.anchor = tracer.setup, emission.pixel, emission.anchor
         self.first_turn, rng = emission.first_turn, emission.rng
-        wavelengths, spectral = sample_wavelengths(tracer.receiver.camera, rng, tracer.projector.lines)
+        wavelengths, spectral = sample_wavelengths(tracer.setup.camera, rng, tracer.projector.lines)
         jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
-        ray = tracer.rays.sample(self.pixel, jitter, rng, wavelengths)
-        self.flux = tracer.rays.flux(self.pixel, wavelengths) * spectral * emission.weight
+        ray = tracer.setup.rays.sample(self.pixel, jitter, rng, wavelengths)
+        self.flux = tracer.setup.rays.flux(self.pixel, wavelengths) * spectral * emission.weight
         connections = _OneConnection if tracer.points.count == 1 else _AnchorConnections
         self.connections = connections(tracer.points, emission)
         sightings = self.connections.none(("direct", "indirect") if tracer.mirrors else ("indirect",), tracer.rules)
@@ -214,7 +200,7 @@ class ProjectorPaths(PathIntegrator[PathState]):
         """To the sensor, for light that is kept."""
         # Light that has met nothing but what it passes is the direct tracer's.
         active = paths.active & ~paths.straight & self._is_wanted(paths.scattered + 1)
-        return self.receiver.way(si, sensor, active)
+        return self.setup.way(si, sensor, active)
 
     def _keep_light(
         self,
@@ -226,7 +212,7 @@ class ProjectorPaths(PathIntegrator[PathState]):
     ) -> None:
         """Keep light that surfaces send by a ``way``, or that of an earlier connection, as the numbers ``drawn`` say;
         either stands for both. ``at``: what is held of an anchor, and its number."""
-        reception = self.receiver.received(si, -paths.ray.d, way)
+        reception = self.setup.received(si, -paths.ray.d, way)
         light = reception.irradiance * self.flux * paths.throughput
         caustic = paths.scattered == 0
         light *= dr.select(caustic, 1, 1 - camera_part(reception.pdf))

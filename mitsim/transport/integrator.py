@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import drjit as dr
 import mitsuba as mi
 
+from mitsim.transport.connect import OpticalSetup, SensorPoints
 from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT, PathSamples
 from mitsim.transport.transmission import Passage
 
@@ -112,7 +113,11 @@ class Tracer(ABC):
     """
 
     paths_per_launch: ClassVar[int] = PATHS_PER_LAUNCH
-    projector: ProjectorOptics
+
+    def __init__(self, setup: OpticalSetup, points: SensorPoints | None = None) -> None:
+        """Light that is followed in a ``setup``, to ``points`` of the sensor; to its centre if not given."""
+        self.setup, self.projector = setup, setup.projector
+        self.points = points or SensorPoints(setup.geometry.half_width)
 
     @property
     @abstractmethod

@@ -23,12 +23,11 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.arrays import FloatArray, Labels
-from mitsim.devices.camera import CameraGeometry
-from mitsim.transport.connect import LensHit, sample_wavelengths
+from mitsim.transport.connect import LensHit, OpticalSetup, sample_wavelengths
 from mitsim.transport.from_camera import CameraPaths, CameraState, FromCameraTracer, Paths
 from mitsim.transport.integrator import InFlight, Turn, camera_part
 from mitsim.transport.plugins.base import channels, device_vectors, host_values, turn_and_origin, vectors
-from mitsim.transport.projector import PinholeRays, ProjectorOptics, ProjectorRays, wavelength_sets
+from mitsim.transport.projector import PinholeRays, wavelength_sets
 from mitsim.transport.records import DIRECT, INDIRECT, CellGrid, PathSamples, Sightings
 from mitsim.transport.sampler import panchromatic, streams
 from mitsim.transport.transmission import Passage
@@ -70,23 +69,15 @@ class LeftOut:
         return float(light.sum()), int(np.argmax(light)) if light.any() else None
 
 
-def left_out_light(
-    scene: mi.Scene,
-    camera: mi.Sensor,
-    projector: ProjectorOptics,
-    grid: CellGrid,
-    geometry: CameraGeometry,
-    seed: int,
-    samples: int,
-) -> LeftOut:
+def left_out_light(setup: OpticalSetup, grid: CellGrid, seed: int, samples: int) -> LeftOut:
     """Light that is left out, or may be.
 
     Parameters
     ----------
-    scene, camera, projector
-        what light meets, the sensor that it is received on, and where it comes from.
-    grid, geometry
-        cells that paths start in, and the camera's own.
+    setup
+        scene, camera and projector.
+    grid
+        cells that paths start in.
     seed, samples
         of the random numbers, and paths of each cell.
 
@@ -95,11 +86,12 @@ def left_out_light(
     MitsimError
         when the scene sends NaN or infinite light to the camera.
     """
-    lens = replace(projector, aperture=_LENS * geometry.scene_distance, focus=geometry.scene_distance)
+    far = setup.geometry.scene_distance
+    lens = replace(setup.projector, aperture=_LENS * far, focus=far)
     paths = Paths(mirrors=True, interreflection=True)
-    found = _MissedTracer(scene, camera, lens, grid, paths, geometry).trace(seed, 0, samples)
+    found = _MissedTracer(replace(setup, projector=lens), grid, paths).trace(seed, 0, samples)
     # Path samples name shapes by their number in Dr.Jit's registry.
-    numbers = np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr())).astype(np.int64)
+    numbers = np.array(dr.reinterpret_array(mi.UInt32, setup.scene.shapes_dr())).astype(np.int64)
 
     def by_shape(light: PathSamples, values: FloatArray) -> FloatArray:
         return np.asarray(np.bincount(light.pixel, values, int(numbers.max()) + 1)[numbers] / samples)
@@ -107,7 +99,7 @@ def left_out_light(
     lost, met = (found.where(found.kind == kind) for kind in (INDIRECT, DIRECT))
     mirrors, hits = _equal_hits(by_shape(lost, lost.value), by_shape(lost, np.square(lost.value)))
     # A lens of half the radius is met a quarter as often, and four times as bright.
-    seldom = np.square(projector.aperture / lens.aperture)
+    seldom = np.square(setup.projector.aperture / lens.aperture)
     return LeftOut(mirrors, hits * seldom, *_equal_hits(by_shape(met, met.value), by_shape(met, met.value * met.row)))
 
 
@@ -138,7 +130,6 @@ class _MissedPaths(CameraPaths[_MissedState]):
 
     def __init__(self, tracer: FromCameraTracer, flight: InFlight) -> None:
         super().__init__(tracer, _MissedState, flight)
-        self._rays = ProjectorRays(tracer.projector)
 
     def _connect(self, paths: _MissedState, si: mi.SurfaceInteraction3f, first: bool) -> None:
         """Nothing: what connections find is not left out."""
@@ -160,7 +151,7 @@ class _MissedPaths(CameraPaths[_MissedState]):
     def _projector_light(self, paths: _MissedState, hit: LensHit) -> mi.Float:
         """What a connection of the projector's side, from the first surface to the sensor, brings [W m^-2]."""
         grid = self.tracer.grid
-        flux = self._rays.flux(hit.pixel, paths.ray.wavelengths)
+        flux = self.tracer.setup.rays.flux(hit.pixel, paths.ray.wavelengths)
         # The path's weight without its part of the view; its first surface is at 1 / (inverse depth * slope).
         view = dr.opaque(mi.Float, grid.rows.size * grid.columns.size) * dr.square(dr.square(self.slope))
         distance = paths.inverse_depth * self.slope
@@ -300,23 +291,16 @@ class Highlights:
         return Highlights(self.pixels[seldom], self.irradiance[seldom], self.moments[seldom])
 
 
-def highlights(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, geometry: CameraGeometry) -> Highlights:
-    """Highlights of all glossy balls that the projector's pinhole and the sensor's centre both see.
-
-    Parameters
-    ----------
-    scene, camera, projector
-        as loaded.
-    geometry
-        of the camera.
-    """
+def highlights(setup: OpticalSetup) -> Highlights:
+    """Highlights of all glossy balls of a ``setup`` that the projector's pinhole and the sensor's centre both see."""
+    scene, projector = setup.scene, setup.projector
     balls = [s for s in scene.shapes() if s.class_name() == "Sphere" and s.bsdf() is not None and _glossy(s.bsdf())]
     balls = balls[:: -(-len(balls) // _MOST_BALLS)] if balls else []
     if not balls:
         return Highlights(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
     wavelengths = wavelength_sets(projector.lines)
     rays = PinholeRays(projector, wavelengths)
-    turn, eye = turn_and_origin(camera.world_transform())
+    turn, eye = turn_and_origin(setup.camera.world_transform())
     centre = np.array([np.array(ball.bbox().center(), dtype=np.float64).ravel() for ball in balls])
     radius = np.array([float(np.array(ball.bbox().extents()).max()) / 2 for ball in balls])
     normal = _mirror_normals(centre, radius, rays.origin, eye)
@@ -340,7 +324,7 @@ def highlights(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, g
     )
     sent, facing = _radiance_toward(scene, rays.origin, aimed, eye, np.repeat(radius, _POINTS))
     local = -back @ turn
-    stop = (np.abs(local[:, :2]) <= geometry.tan_half_fov * local[:, 2:]).all(axis=1)
+    stop = (np.abs(local[:, :2]) <= setup.geometry.tan_half_fov * local[:, 2:]).all(axis=1)
     # Part of the window that each point stands for, by the tangents of one pixel, and what it brings.
     seen = np.tile(area, len(balls)) * np.repeat(radius, _POINTS) ** 2 * np.maximum(facing, 0) * far / depth**3
     received = sent * (local[:, 2] / near) / near**2

@@ -86,7 +86,7 @@ class PathReuseTracer(IndirectTracer):
         """Whether what is to be followed can be shared: as the module says."""
         lines = mi.is_monochromatic or (mi.is_spectral and self.projector.lines is not None)
         several = self.points.count > 1 or not lines or mi.is_polarized
-        return self.interreflection and not several and not self.receiver.passage.open
+        return self.interreflection and not several and not self.setup.passage.open
 
     @property
     def lines(self) -> int:
@@ -97,13 +97,13 @@ class PathReuseTracer(IndirectTracer):
     @cached_property
     def diffuse(self) -> frozenset[int]:
         """Places among the scene's shapes of those whose material is diffuse and nothing else: no bumps, no coat."""
-        shapes = enumerate(self.scene.shapes())
+        shapes = enumerate(self.setup.scene.shapes())
         return frozenset(place for place, shape in shapes if _is_diffuse(shape.bsdf()))
 
     @property
     def all_diffuse(self) -> bool:
         """Whether all surfaces are: pairs then take no look at a material."""
-        return len(self.diffuse) == len(self.scene.shapes())
+        return len(self.diffuse) == len(self.setup.scene.shapes())
 
     def _emission(self, flight: InFlight) -> Emission:
         """Of whole blocks of pixels, the members of each one after the other."""
@@ -337,7 +337,7 @@ class ReusedPaths(ProjectorPaths):
             second = met.compute_surface_interaction(ray, active=active)
             toward = dr.normalize(si.p - second.p)
             way = dr.gather(Way, self.to_sensor_way, at, active)
-            reception = self.tracer.receiver.received(second, toward, replace(way, open=way.open & active))
+            reception = self.setup.received(second, toward, replace(way, open=way.open & active))
             connected = self._factors(reception.irradiance * (1 - camera_part(reception.pdf)))
             beyond, turned = (
                 [dr.gather(mi.Float, each, at, active) for each in lines] for lines in (self.beyond, self.own_turn)
@@ -401,7 +401,7 @@ class DiffuseReusedPaths(ReusedPaths):
         self.sensor_side = dr.sign(dr.dot(self.shading, self.to_sensor_way.direction))
         facing = self.shading * self.sensor_side
         way = replace(self.to_sensor_way, open=self.to_sensor_way.open & self.shared)
-        reception = self.tracer.receiver.received(second, facing, way)
+        reception = self.setup.received(second, facing, way)
         self.to_sensor = self._factors(reception.irradiance * dr.abs(dr.dot(self.normal, facing)))
 
     def _sender(self, si: mi.SurfaceInteraction3f) -> Sender:

@@ -20,12 +20,10 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, Labels, mean_of_neighbours
-from mitsim.devices.camera import CameraGeometry
-from mitsim.transport.connect import Receiver, Reception, landing, sample_wavelengths
+from mitsim.transport.connect import OpticalSetup, Reception, landing, sample_wavelengths
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.integrator import InFlight, launches
 from mitsim.transport.plugins.base import rows_columns
-from mitsim.transport.projector import ProjectorOptics, ProjectorRays
 from mitsim.transport.records import check_finite
 from mitsim.transport.sampler import panchromatic, stratified, streams
 from mitsim.transport.transmission import Arrival
@@ -87,9 +85,7 @@ class SharpLight:
         return cls(0.0, 0.0, math.inf, np.zeros(pixels), np.zeros(pixels), math.inf)
 
 
-def sharp_light(
-    scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, geometry: CameraGeometry, seed: int, samples: int
-) -> SharpLight:
+def sharp_light(setup: OpticalSetup, seed: int, samples: int) -> SharpLight:
     """Direct light over lobes too sharp for connections.
 
     Where a shorter look at a wider sensor meets none, there is none. What few rays find comes from small parts of a few
@@ -98,10 +94,8 @@ def sharp_light(
 
     Parameters
     ----------
-    scene, camera, projector
-        what light meets, the sensor it is received on, and where it comes from.
-    geometry
-        of the camera.
+    setup
+        scene, camera and projector.
     seed, samples
         of the random numbers, and rays of every projector pixel.
 
@@ -110,26 +104,26 @@ def sharp_light(
     MitsimError
         when the scene sends NaN or infinite light to the camera.
     """
-    paths_per_sample = projector.n**2
-    lobes = _Lobes(scene, camera, projector, geometry)
+    n, paths_per_sample = setup.projector.n, setup.projector.n**2
+    lobes = _Lobes(setup)
     first = lobes.trace(np.arange(paths_per_sample), seed, 0, -(-samples // _FEWER), _WIDER)
     if not len(first.widths):
         return SharpLight.none(paths_per_sample)
     lobes.least = least = mi.Float(np.clip(_SHARP * first.sharp, _LEAST_SHARP, _SHARP).astype(np.float32))
     found = lobes.trace(np.arange(paths_per_sample), seed, 0, samples)
     if len(found.widths) < _PLENTY:
-        search = _Connections(scene, camera, projector, 1, geometry, spread=True).over(least, sharp=True)
+        search = _Connections(setup, 1, spread=True).over(least, sharp=True)
         lit = np.bincount(
             search.trace(seed, 0, max(1, _SEARCHING // paths_per_sample)).pixel, minlength=paths_per_sample
         )
-        pixels = with_neighbours((found.by_pixel > 0) | (lit > 0), projector.n)
+        pixels = with_neighbours((found.by_pixel > 0) | (lit > 0), n)
         if len(pixels):
             found = lobes.trace(pixels, seed, samples, samples * paths_per_sample // len(pixels))
     total, moment = float(found.by_pixel.sum()), float(found.moments.sum())
     hits = total**2 / moment if moment else 0.0
     rest = 0.0
     if total:
-        others = _Connections(scene, camera, projector, 1, geometry, spread=True).over(least, sharp=False)
+        others = _Connections(setup, 1, spread=True).over(least, sharp=False)
         count = max(1, _CONNECTIONS // paths_per_sample)
         rest = float(others.trace(seed, 0, count).value.sum()) / count
     width = _quantile(found.widths, found.weights, _SHARPEST)
@@ -229,17 +223,13 @@ class _Lobes:
         (n^2,) density [1/sr] above which a lobe counts as sharp, by projector pixel.
     """
 
-    def __init__(
-        self, scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, geometry: CameraGeometry
-    ) -> None:
-        self.camera, self.geometry = camera, geometry
-        self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
-        self.least = dr.full(mi.Float, _LEAST_SHARP, projector.n**2)
+    def __init__(self, setup: OpticalSetup) -> None:
+        self.setup, self.least = setup, dr.full(mi.Float, _LEAST_SHARP, setup.projector.n**2)
 
     def trace(self, pixels: Labels, seed: int, first: int, samples: int, wider: float = 1.0) -> _LobeLight:
         """What rays ``first`` to ``first + samples`` - 1 of ``pixels`` meet on a sensor so many times ``wider``."""
         squares, met, weights = 0.0, [], []
-        by_pixel, moments = np.zeros((2, self.rays.projector.n**2))
+        by_pixel, moments = np.zeros((2, self.setup.projector.n**2))
         turned = dr.zeros(mi.Float, len(by_pixel))
         for sample, place in launches(len(pixels), first, samples):
             pixel = dr.gather(mi.UInt32, mi.UInt32(pixels), place)
@@ -260,14 +250,14 @@ class _Lobes:
     ) -> tuple[Labels, FloatArray, FloatArray, FloatArray]:
         """Pixels of the rays that meet the sensor, and for each x, x I, and density q of one of the points met; sharp
         turns are added to those ``turned`` (n^2,). MitsimError where light is NaN or infinite."""
-        half = dr.opaque(mi.Float, wider * self.geometry.half_width)
+        half = dr.opaque(mi.Float, wider * self.setup.geometry.half_width)
         _, rng = streams(seed, pixel, sample)
         jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
-        wavelengths, spectral = sample_wavelengths(self.camera, rng, self.rays.projector.lines)
-        ray = self.rays.sample(pixel, jitter, rng, wavelengths)
-        flux = self.rays.flux(pixel, wavelengths) * spectral
+        wavelengths, spectral = sample_wavelengths(self.setup.camera, rng, self.setup.projector.lines)
+        ray = self.setup.rays.sample(pixel, jitter, rng, wavelengths)
+        flux = self.setup.rays.flux(pixel, wavelengths) * spectral
         none = _SensorHits(mi.Float(0), mi.Float(0), mi.Float(1), mi.Float(0))
-        met, _ = self.receiver.passage.along(
+        met, _ = self.setup.passage.along(
             ray, flux, (none, rng), partial(self._meet_sensor, half, dr.gather(mi.Float, self.least, pixel))
         )
         # Whole numbers, whose sums in any order are the same.
@@ -294,10 +284,10 @@ class _Lobes:
         density = at.density(turn.wo)
         active = at.active & (turn.pdf > 0) & (density > 0) & ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
         turns = dr.select(active & (density > least), mi.Float(1), 0)
-        place = landing(self.receiver, at.si, at.si.to_world(turn.wo), active)
+        place = landing(self.setup, at.si, at.si.to_world(turn.wo), active)
         active &= place.arrives & (dr.abs(place.x) <= half) & (dr.abs(place.y) <= half)
         sensor = mi.Point3f(place.x, place.y, 0)
-        reception = self.receiver.receive(at.si, -at.direction, sensor, active)
+        reception = self.setup.receive(at.si, -at.direction, sensor, active)
         active &= reception.pdf > least
         per_area = density * reception.solid_angle(sensor)
         connected = dr.select(active, panchromatic(reception.irradiance * at.light), 0)
@@ -364,23 +354,15 @@ class AimedTracer(DirectTracer):
         pairs, anchor * pixels + place of the pixel, that are connected seldom.
     """
 
-    def __init__(
-        self,
-        scene: mi.Scene,
-        camera: mi.Sensor,
-        projector: ProjectorOptics,
-        anchors: int,
-        geometry: CameraGeometry,
-        pixels: Labels,
-    ) -> None:
+    def __init__(self, setup: OpticalSetup, anchors: int, pixels: Labels) -> None:
         """What is followed.
 
         Parameters
         ----------
-        scene, camera, projector, anchors, geometry, pixels
+        setup, anchors, pixels
             as for :class:`DirectTracer`.
         """
-        super().__init__(scene, camera, projector, anchors, geometry, pixels=pixels)
+        super().__init__(setup, anchors, pixels=pixels)
         self._aims = self._aim()
         near = self._is_near().ravel()
         pairs = np.arange(len(near), dtype=np.int64)
@@ -466,10 +448,10 @@ class AimedTracer(DirectTracer):
         pixel = dr.gather(mi.UInt32, mi.UInt32(self._pixels), number)
         shared, rng = streams(_SEED, pixel, sample)
         jitter = stratified(sample, shared)
-        wavelengths, _ = sample_wavelengths(self.receiver.camera, rng, self.projector.lines)
-        ray = self.rays.sample(pixel, jitter, rng, wavelengths)
+        wavelengths, _ = sample_wavelengths(self.setup.camera, rng, self.projector.lines)
+        ray = self.setup.rays.sample(pixel, jitter, rng, wavelengths)
         none = _Axis(mi.Float(0), mi.Float(0), mi.Float(1), mi.Bool(False))
-        axis, _ = self.receiver.passage.along(ray, mi.Spectrum(1), (none, rng), self._axis)
+        axis, _ = self.setup.passage.along(ray, mi.Spectrum(1), (none, rng), self._axis)
         row, column = rows_columns(axis.x, axis.y)
         width, valid = axis.width, axis.known
         dr.eval(jitter, row, column, width, valid)
@@ -483,7 +465,7 @@ class AimedTracer(DirectTracer):
         turn = at.turn(rng.next_float32(), mi.Point2f(0.5))
         sharp = at.active & (turn.pdf > dr.opaque(mi.Float, _SHARP_AXIS))
         sharp &= ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
-        place = landing(self.receiver, at.si, at.si.to_world(turn.wo), sharp & ~axis.known)
+        place = landing(self.setup, at.si, at.si.to_world(turn.wo), sharp & ~axis.known)
         # 1 / sqrt(pi q), q the density on the sensor.
         width = place.length * dr.rsqrt(dr.pi * turn.pdf * place.cosine)
         found = _Axis(place.x, place.y, width, place.arrives)

@@ -17,8 +17,7 @@ pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.robustness("Light"
 
 
 def sharp(bench: Bench, seed: int) -> SharpLight:
-    loaded = bench.loaded
-    return sharp_light(loaded.scene, loaded.camera, bench.projector_optics, bench.geometry, seed, 2**21 // N**2)
+    return sharp_light(bench.setup, seed, 2**21 // N**2)
 
 
 def test_the_lobe_becomes_the_mirror() -> None:

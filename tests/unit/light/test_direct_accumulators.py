@@ -88,7 +88,7 @@ def test_the_middle_of_the_sharpest_lobe_is_light(bench: Bench, variant: str) ->
     square.wi = mi.Vector3f(0, 0, 1)
     brightest = math.pi * float(np.max(np.array(lobe.eval(mi.BSDFContext(), square, mi.Vector3f(0, 0, 1)))))
     assert brightest > 2e7
-    board = tracer.receiver.of_board(tracer.rays)
+    board = tracer.setup.board
     (accumulator,) = simulation.accumulators("anchor_residual", np.zeros(N * N, dtype=np.int64), 1)
     for place, light in enumerate([10 * brightest * board, 1e-5 * board]):
         accumulator.add(mi.Float(light), mi.UInt32(0), mi.UInt32(place), mi.Bool(True))

@@ -43,8 +43,7 @@ def grid(bench: Bench) -> CellGrid:
 
 
 def tracer(bench: Bench, **followed: object) -> FromCameraTracer:
-    loaded = bench.loaded
-    return FromCameraTracer(loaded.scene, loaded.camera, bench.projector_optics, grid(bench), Paths(**followed))
+    return FromCameraTracer(bench.setup, grid(bench), Paths(**followed))
 
 
 @pytest.mark.parametrize("interreflection", [pytest.param(False, marks=pytest.mark.slow), True])

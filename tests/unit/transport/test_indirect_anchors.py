@@ -57,8 +57,7 @@ def beside(shared_scene: Callable[..., Path], variant: str) -> Bench:
 
 
 def anchored(bench: Bench, points: SensorPoints) -> IndirectTracer:
-    loaded = bench.loaded
-    return IndirectTracer(loaded.scene, loaded.camera, bench.projector_optics, True, True, points=points)
+    return IndirectTracer(bench.setup, True, True, points=points)
 
 
 def compared(bench: Bench) -> tuple[int, list[str]]:

@@ -54,8 +54,8 @@ def opened(scene: Path) -> Bench:
 
 def tracers(bench: Bench, spread: bool = False, mirrors: bool = False) -> tuple[IndirectTracer, PathReuseTracer]:
     """Paths of their own, and shared ones."""
-    loaded, points = bench.loaded, SensorPoints(bench.geometry.half_width, spread=spread)
-    parts = loaded.scene, loaded.camera, bench.projector_optics, mirrors, True
+    points = SensorPoints(bench.geometry.half_width, spread=spread)
+    parts = bench.setup, mirrors, True
     return IndirectTracer(*parts, points=points), PathReuseTracer(*parts, points=points)
 
 
@@ -172,8 +172,8 @@ def test_the_ledger_holds_what_the_host_files(shared_scene: Callable[..., Path],
 def test_the_ledger_holds_paths_of_their_own_at_every_anchor(shared_scene: Callable[..., Path], mirrors: bool) -> None:
     """Place by place, all but caustics: those stay on the host."""
     bench = opened(shared_scene(f"anchors {mirrors}", extra=SCENES["mirror wall"]))
-    loaded, points = bench.loaded, SensorPoints(bench.geometry.half_width, anchors=3)
-    tracer = IndirectTracer(loaded.scene, loaded.camera, bench.projector_optics, mirrors, True, points=points)
+    points = SensorPoints(bench.geometry.half_width, anchors=3)
+    tracer = IndirectTracer(bench.setup, mirrors, True, points=points)
     grid = aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov / 3)
     bundle, labels = Bundle(grid, 3, (400.0,)), np.arange(N * N) % 5
     accumulator = DeviceAccumulator(bundle, labels, tracer.board)
