@@ -130,6 +130,7 @@ class _MissedPaths(CameraPaths[_MissedState]):
 
     def __init__(self, tracer: FromCameraTracer, flight: InFlight) -> None:
         super().__init__(tracer, _MissedState, flight)
+        self._rays = tracer.setup.rays  # made before the loop, in which nothing can be evaluated
 
     def _connect(self, paths: _MissedState, si: mi.SurfaceInteraction3f, first: bool) -> None:
         """Nothing: what connections find is not left out."""
@@ -151,7 +152,7 @@ class _MissedPaths(CameraPaths[_MissedState]):
     def _projector_light(self, paths: _MissedState, hit: LensHit) -> mi.Float:
         """What a connection of the projector's side, from the first surface to the sensor, brings [W m^-2]."""
         grid = self.tracer.grid
-        flux = self.tracer.setup.rays.flux(hit.pixel, paths.ray.wavelengths)
+        flux = self._rays.flux(hit.pixel, paths.ray.wavelengths)
         # The path's weight without its part of the view; its first surface is at 1 / (inverse depth * slope).
         view = dr.opaque(mi.Float, grid.rows.size * grid.columns.size) * dr.square(dr.square(self.slope))
         distance = paths.inverse_depth * self.slope
