@@ -20,8 +20,9 @@ from mitsim.light.grids import Grids
 from mitsim.light.settings import Number, Settings
 from mitsim.transport.connect import OpticalSetup, SensorPoints
 from mitsim.transport.direct import DirectTracer
-from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer, LampResponse, LampTracer, Paths
+from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer, LampResponse, LampTracer
 from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.integrator import Paths
 from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.sharp_lobes import AimedTracer
 
@@ -116,10 +117,10 @@ class Tracers(Grids):
         return SensorPoints(self.physics.geometry.half_width, anchors, spread, self.settings.depth)
 
     def _indirect(self, points: SensorPoints, shared: bool = False) -> IndirectTracer | None:
-        paths = self.physics.mirrors, self.physics.interreflection
-        if not any(paths):
+        paths = Paths(self.physics.mirrors, self.physics.interreflection)
+        if not (paths.mirrors or paths.interreflection):
             return None
-        return (PathReuseTracer if shared else IndirectTracer)(self.setup, *paths, points)
+        return (PathReuseTracer if shared else IndirectTracer)(self.setup, paths, points)
 
     def _from_camera(self, points: SensorPoints) -> FromCamera | None:
         physics, counted_lamps = self.physics, self.bench.counted_lamps

@@ -58,7 +58,7 @@ class TracedPass:
         if not accumulators:
             return self.tracer.trace(seed, first, samples)
         assert isinstance(self.tracer, DirectTracer | IndirectTracer), "the others have none"
-        return self.tracer.trace_into(accumulators, seed, first, samples)
+        return self.tracer.trace(seed, first, samples, accumulators)
 
 
 class Simulation(Tracers):

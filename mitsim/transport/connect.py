@@ -112,24 +112,18 @@ class Way:
 
 @dataclass
 class Reception:
-    """Irradiance for each unit of flux [mm^-2], where it is seen from the sensor's centre, and the turn's pdf [1/sr].
-
-    ``row``, ``column`` and ``inverse_depth`` as in :class:`mitsim.transport.records.PathSamples`; ``pdf`` is that of
-    sampling the turn at P from the sensor's side, ``direction`` the unit one in which the light leaves P.
-    """
+    """Irradiance for each unit of flux [mm^-2] that comes by a ``way``, and the turn's ``pdf`` [1/sr]: that of sampling
+    the turn at P from the sensor's side."""
 
     irradiance: mi.Spectrum
-    row: mi.Float
-    column: mi.Float
-    inverse_depth: mi.Float
     pdf: mi.Float
-    direction: mi.Vector3f
+    way: Way
 
     def solid_angle(self, local: mi.Point3f) -> mi.Float:
         """Solid angle at P for each area of the sensor at ``local`` [sr/mm^2]: cos^3 / z^2 of the apparent point."""
         row, column = rows_columns(local.x, local.y)
-        inverse = self.inverse_depth
-        squared = 1 + dr.square(self.row - row * inverse) + dr.square(self.column - column * inverse)
+        inverse = self.way.inverse_depth
+        squared = 1 + dr.square(self.way.row - row * inverse) + dr.square(self.way.column - column * inverse)
         return dr.square(inverse) / (squared * dr.sqrt(squared))
 
     def sightings(self, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32, by_line: bool = False) -> Sightings:
@@ -144,7 +138,7 @@ class Reception:
         by_line
             whether it is told apart by line.
         """
-        return Sightings.of(light, by_line, pixel, self.row, self.column, self.inverse_depth)
+        return Sightings.of(light, by_line, pixel, self.way.row, self.way.column, self.way.inverse_depth)
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +247,7 @@ class OpticalSetup:
         reflected, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(toward), way.open)
         geometric = way.geometric / dr.abs(dr.dot(si.n, toward))
         irradiance = dr.select(way.open, mi.unpolarized_spectrum(reflected) * way.passed * geometric, 0)
-        return Reception(irradiance, way.row, way.column, way.inverse_depth, pdf, way.direction)
+        return Reception(irradiance, pdf, way)
 
 
 def sample_wavelengths(camera: mi.Sensor, rng: mi.PCG32, lines: Lines | None = None) -> tuple[mi.Color0f, mi.Spectrum]:

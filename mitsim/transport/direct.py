@@ -60,31 +60,19 @@ class DirectTracer(Tracer):
         """Connections of one sample: one per projector pixel and anchor."""
         return len(self._pixels) * self.points.count
 
-    def trace_into(self, accumulators: Sequence[DeviceAccumulator], seed: int, first: int, samples: int) -> PathSamples:
-        """The same as :meth:`trace`, all light filed in accumulators; none is left for the host.
+    def _launch(self, flight: InFlight, accumulators: Sequence[DeviceAccumulator] = ()) -> list[PathSamples]:
+        seen, anchor = self._sightings(flight)
+        if not accumulators:
+            return [PathSamples.fetched(seen, DIRECT, anchor)]
+        lights = seen.by_line(len(accumulators))
+        for place, share in accumulators[0].shares(seen, anchor):
+            for accumulator, light in zip(accumulators, lights, strict=True):
+                accumulator.add(light * share, seen.pixel, place, ~(light == 0))  # not a number is refused
+        dr.eval([accumulator.sums for accumulator in accumulators])
+        return []
 
-        Parameters
-        ----------
-        accumulators
-            of light by pixel; of several lines, one for each.
-        seed, first, samples
-            as for :meth:`trace`.
-        """
-        for tracer in self.per_wavelength:
-            for flight in self._in_flight([seed], first, samples):
-                seen, _, anchor = tracer._sightings(flight)
-                lights = seen.by_line(len(accumulators))
-                for place, share in accumulators[0].shares(seen, anchor):
-                    for accumulator, light in zip(accumulators, lights, strict=True):
-                        accumulator.add(light * share, seen.pixel, place, ~(light == 0))  # not a number is refused
-                dr.eval([accumulator.sums for accumulator in accumulators])
-        return PathSamples.none()
-
-    def _launch(self, flight: InFlight) -> list[PathSamples]:
-        return [PathSamples.fetched(*self._sightings(flight))]
-
-    def _sightings(self, flight: InFlight) -> tuple[Sightings, int, tuple[mi.UInt32, mi.UInt32]]:
-        """Light of each sample, its kind, and its anchor."""
+    def _sightings(self, flight: InFlight) -> tuple[Sightings, tuple[mi.UInt32, mi.UInt32]]:
+        """Light of each sample, and its anchor."""
         number, anchor, share = self._pair(flight)
         pixel = dr.gather(mi.UInt32, mi.UInt32(self._pixels), number)
         anchors = dr.opaque(mi.UInt32, self.points.anchors)
@@ -104,7 +92,7 @@ class DirectTracer(Tracer):
 
         by_line = self.projector.by_line
         seen, _ = self.setup.passage.along(ray, flux, (Sightings.none(by_line), rng), add_light)
-        return seen, DIRECT, (row, column)
+        return seen, (row, column)
 
     def _by_connection(self, at: Arrival, sensor: mi.Point3f) -> tuple[Reception, mi.UnpolarizedSpectrum]:
         """What light that comes to surfaces brings to ``sensor`` points."""
@@ -239,7 +227,7 @@ class FluxTracer:
         value = reception.irradiance * at.light
         if not self._glossy:
             return value
-        density = at.density(at.si.to_local(reception.direction))
+        density = at.density(at.si.to_local(reception.way.direction))
         area = 4 * dr.square(dr.opaque(mi.Float, self._sensor.half_width))
         # As a spectrum: by a number, Dr.Jit would multiply with the reciprocal, which is rounded.
         share = mi.UnpolarizedSpectrum(1 + area * density * reception.solid_angle(point))

@@ -31,13 +31,14 @@ import numpy as np
 
 from mitsim.core.spectral_manifests import MOST_LINES
 from mitsim.devices.lamps import SPECTRA_NM, Band, Response
+from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import Connection, OpticalSetup, ProjectorConnector, SensorPoints, sample_wavelengths
 from mitsim.transport.integrator import (
     KINDS,
     FollowingTracer,
     InFlight,
     PathIntegrator,
-    PathRules,
+    Paths,
     PathState,
     Turn,
     camera_part,
@@ -50,19 +51,6 @@ from mitsim.transport.transmission import refracted_way
 
 _MARGIN = 1e-4
 """Part of a cell that paths keep clear of its edges: 2e-7 of tan-angle, above float32's rounding of 3e-8."""
-
-
-@dataclass(frozen=True)
-class Paths:
-    """Which light is followed besides projector - surface - camera.
-
-    ``mirrors``: over delta reflections and transmissions on the camera's side; ``interreflection``: any number of
-    bounces; ``emitters``: other lights of the scene, all of them one class of ambient light.
-    """
-
-    mirrors: bool = False
-    interreflection: bool = False
-    emitters: tuple[mi.Emitter, ...] = ()
 
 
 class FromCameraTracer(FollowingTracer):
@@ -90,18 +78,13 @@ class FromCameraTracer(FollowingTracer):
         points
             where from; the sensor's centre if not given.
         """
-        super().__init__(setup, points)
-        self.grid, self.paths, self.connector = grid, paths, ProjectorConnector(setup.projector)
+        super().__init__(setup, paths, points)
+        self.grid, self.connector = grid, ProjectorConnector(setup.projector)
 
     @property
     def paths_per_sample(self) -> int:
         """Paths in one sample: one per cell and anchor."""
         return self.grid.shape[0] * self.grid.shape[1] * self.points.count
-
-    @property
-    def by_line(self) -> bool:
-        """Whether light is told apart by the wavelengths of its paths."""
-        return self.projector.by_line
 
     def wavelengths(self, rng: mi.PCG32, sample: mi.UInt32, shared: mi.PCG32) -> tuple[mi.Color0f, mi.Spectrum]:
         """Wavelengths of each path, and weights as :func:`mitsim.transport.connect.sample_wavelengths` has them.
@@ -115,13 +98,7 @@ class FromCameraTracer(FollowingTracer):
         """
         return sample_wavelengths(self.setup.camera, rng, self.projector.lines)
 
-    @property
-    def rules(self) -> PathRules:
-        """Which paths are followed."""
-        passage, paths = self.setup.passage, self.paths
-        return PathRules(passage, paths.mirrors, paths.interreflection, self.orders, self.by_line)
-
-    def _launch(self, flight: InFlight) -> list[PathSamples]:
+    def _launch(self, flight: InFlight, accumulators: Sequence[DeviceAccumulator] = ()) -> list[PathSamples]:
         return self._paths(flight).path_samples()
 
     def _paths(self, flight: InFlight) -> CameraPaths[Any]:
@@ -182,7 +159,7 @@ class CameraPaths(PathIntegrator[State]):
         flight
             the samples in flight.
         """
-        super().__init__(tracer.rules)
+        super().__init__(tracer)
         cell, row, column = tracer.points.of(flight.index, tracer.grid.shape[0] * tracer.grid.shape[1])
         self.anchor = row, column
         self.tracer, self.geometry, self.connector = tracer, tracer.setup.geometry, tracer.connector
@@ -362,7 +339,7 @@ class CameraPaths(PathIntegrator[State]):
         # Filed as the sensor's centre sees it.
         row, column = (t + s * paths.inverse_depth for t, s in zip((self.row, self.column), self.origin, strict=True))
         lit = dr.select(active, light, 0)
-        self._join(paths, kind, Sightings.of(lit, self.rules.by_line, pixel, row, column, paths.inverse_depth))
+        self._join(paths, kind, Sightings.of(lit, self.by_line, pixel, row, column, paths.inverse_depth))
 
     def _join(self, paths: State, kind: str, seen: Sightings) -> None:
         """Keep light of one connection a path, or that of an earlier one of its kind, which then stands for both."""
@@ -485,7 +462,7 @@ class LampTracer(FromCameraTracer):
             wavelengths = [sum(own, mi.Float(0))] * len(own)
         return type(dr.zeros(mi.Ray3f).wavelengths)(*wavelengths), mi.Spectrum(*weights)
 
-    def _launch(self, flight: InFlight) -> list[PathSamples]:
+    def _launch(self, flight: InFlight, accumulators: Sequence[DeviceAccumulator] = ()) -> list[PathSamples]:
         return [self._by_band(found) for found in super()._launch(flight)]
 
     def _by_band(self, found: PathSamples) -> PathSamples:

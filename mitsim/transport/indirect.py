@@ -27,13 +27,12 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, mean_of_neighbours
 from mitsim.transport.accumulator import DeviceAccumulator
-from mitsim.transport.connect import OpticalSetup, SensorPoints, Way, sample_wavelengths
+from mitsim.transport.connect import SensorPoints, Way, sample_wavelengths
 from mitsim.transport.integrator import (
     KINDS,
     FollowingTracer,
     InFlight,
     PathIntegrator,
-    PathRules,
     PathState,
     camera_part,
 )
@@ -48,23 +47,7 @@ than the most that a plan tries are a kernel for each number."""
 class IndirectTracer(FollowingTracer):
     """Indirect light of a projector, and its caustics, at points of the sensor."""
 
-    def __init__(
-        self, setup: OpticalSetup, mirrors: bool, interreflection: bool, points: SensorPoints | None = None
-    ) -> None:
-        """What is followed.
-
-        Parameters
-        ----------
-        setup
-            scene, camera and projector.
-        mirrors, interreflection
-            paths over delta reflections and transmissions, and over other surfaces.
-        points
-            where to; the sensor's centre if not given.
-        """
-        super().__init__(setup, points)
-        self.mirrors, self.interreflection = mirrors, interreflection
-        self.adaptive: AdaptiveSamples | None = None
+    adaptive: AdaptiveSamples | None = None
 
     def with_adaptive_counts(self, repeats: Sequence[int]) -> IndirectTracer:
         """The same to one point of the sensor, blocks of pixels (:mod:`mitsim.transport.indirect`) as often as
@@ -92,34 +75,8 @@ class IndirectTracer(FollowingTracer):
         """Irradiance [W m^-2] that light compares to."""
         return self.setup.board
 
-    @property
-    def rules(self) -> PathRules:
-        """Which paths are followed."""
-        return PathRules(self.setup.passage, self.mirrors, self.interreflection, self.orders, self.projector.by_line)
-
-    def trace_into(self, accumulators: Sequence[DeviceAccumulator], seed: int, first: int, samples: int) -> PathSamples:
-        """As :meth:`trace`, indirect light added up in accumulators as far as it can be: the rest, on the host.
-
-        Parameters
-        ----------
-        accumulators
-            of light by pixel, whose unit is :attr:`board`; of several lines, one for each.
-        seed, first, samples
-            as for :meth:`trace`.
-        """
-        flights = (
-            (tracer, flight) for tracer in self.per_wavelength for flight in self._in_flight([seed], first, samples)
-        )
-        return PathSamples.joined(
-            [
-                part
-                for tracer, flight in flights
-                for part in tracer._paths(tracer._emission(flight)).accumulate(accumulators)
-            ]
-        )
-
-    def _launch(self, flight: InFlight) -> list[PathSamples]:
-        return self._paths(self._emission(flight)).path_samples()
+    def _launch(self, flight: InFlight, accumulators: Sequence[DeviceAccumulator] = ()) -> list[PathSamples]:
+        return self._paths(self._emission(flight)).path_samples(accumulators)
 
     def _emission(self, flight: InFlight) -> Emission:
         """Where each path leaves the projector."""
@@ -167,8 +124,8 @@ class ProjectorPaths(PathIntegrator[PathState]):
 
     def __init__(self, tracer: IndirectTracer, emission: Emission) -> None:
         """Of what a ``tracer`` follows, from an ``emission``."""
-        super().__init__(tracer.rules)
-        self.setup, self.pixel, self.anchor = tracer.setup, emission.pixel, emission.anchor
+        super().__init__(tracer)
+        self.pixel, self.anchor = emission.pixel, emission.anchor
         self.first_turn, rng = emission.first_turn, emission.rng
         wavelengths, spectral = sample_wavelengths(tracer.setup.camera, rng, tracer.projector.lines)
         jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
@@ -176,7 +133,7 @@ class ProjectorPaths(PathIntegrator[PathState]):
         self.flux = tracer.setup.rays.flux(self.pixel, wavelengths) * spectral * emission.weight
         connections = _OneConnection if tracer.points.count == 1 else _AnchorConnections
         self.connections = connections(tracer.points, emission)
-        sightings = self.connections.none(("direct", "indirect") if tracer.mirrors else ("indirect",), tracer.rules)
+        sightings = self.connections.none(("direct", "indirect") if self.rules.mirrors else ("indirect",), self.by_line)
         self.paths = PathState(active=mi.Bool(True), ray=ray, rng=rng, sightings=sightings)
 
     def _connect(self, paths: PathState, si: mi.SurfaceInteraction3f, first: bool) -> None:
@@ -219,18 +176,15 @@ class ProjectorPaths(PathIntegrator[PathState]):
         held, number = at
         for kind, chosen in (("direct", caustic), ("indirect", ~caustic)):
             if kind in held:
-                seen = reception.sightings(dr.select(chosen, light, 0), self.pixel, self.rules.by_line)
+                seen = reception.sightings(dr.select(chosen, light, 0), self.pixel, self.by_line)
                 joined = self.connections.load(held, kind, number).joined_by(seen, drawn[kind])
                 self.connections.save(held, kind, number, joined)
 
-    def path_samples(self) -> list[PathSamples]:
-        """Light on the host of every path at every anchor."""
-        held = self.follow(self.paths).sightings
-        return self.connections.fetched(held, tuple(held))
-
-    def accumulate(self, accumulators: Sequence[DeviceAccumulator]) -> list[PathSamples]:
-        """Follow all paths; indirect light goes into ``accumulators``, caustics to the host."""
+    def path_samples(self, accumulators: Sequence[DeviceAccumulator] = ()) -> list[PathSamples]:
+        """Light on the host of every path at every anchor; of indirect light none where there are ``accumulators``."""
         paths = self.follow(self.paths)
+        if not accumulators:
+            return self.connections.fetched(paths.sightings, tuple(paths.sightings))
         drawn = paths.rng.next_float32()
 
         def add(held: Held, number: mi.UInt32) -> None:
@@ -256,9 +210,9 @@ class _OneConnection:
     def __init__(self, points: SensorPoints, emission: Emission) -> None:
         self._anchor, self._sensor = emission.anchor, points.at(*emission.anchor, emission.rng)
 
-    def none(self, kinds: Sequence[str], rules: PathRules) -> Held:
+    def none(self, kinds: Sequence[str], by_line: bool) -> Held:
         """No light yet."""
-        return {kind: Sightings.none(rules.by_line) for kind in kinds}
+        return {kind: Sightings.none(by_line) for kind in kinds}
 
     def anchor(self, number: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
         """Row and column of an anchor by its number."""
@@ -299,8 +253,8 @@ class _AnchorConnections(_OneConnection):
         self._points, self._pixel, self._rng = points, emission.pixel, emission.rng
         self._side, self._count = (dr.opaque(mi.UInt32, each) for each in (points.anchors, points.count))
 
-    def none(self, kinds: Sequence[str], rules: PathRules) -> Held:
-        self._numbers = len(_differing(Sightings.none(rules.by_line)))
+    def none(self, kinds: Sequence[str], by_line: bool) -> Held:
+        self._numbers = len(_differing(Sightings.none(by_line)))
         anchors = next((room for room in _ROOMS if room >= self._points.count), self._points.count)
         return {kind: dr.alloc_local(mi.Float, self._numbers * anchors, mi.Float(0)) for kind in kinds}
 

@@ -21,11 +21,11 @@ import mitsuba as mi
 
 from mitsim.transport.connect import OpticalSetup, SensorPoints
 from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT, PathSamples
-from mitsim.transport.transmission import Passage
 
 if TYPE_CHECKING:
     from typing import Self
 
+    from mitsim.transport.accumulator import DeviceAccumulator
     from mitsim.transport.projector import ProjectorOptics
 
 KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT, "ambient": AMBIENT})
@@ -149,11 +149,13 @@ class Tracer(ABC):
         return again
 
     @abstractmethod
-    def _launch(self, flight: InFlight) -> list[PathSamples]:
-        """Light of the paths of one kernel."""
+    def _launch(self, flight: InFlight, accumulators: Sequence[DeviceAccumulator] = ()) -> list[PathSamples]:
+        """Light of the paths of one kernel, but for what is added up in ``accumulators``."""
 
-    def trace(self, seed: int, first: int = 0, samples: int = 1) -> PathSamples:
-        """Light of some samples, their sum.
+    def trace(
+        self, seed: int, first: int = 0, samples: int = 1, accumulators: Sequence[DeviceAccumulator] = ()
+    ) -> PathSamples:
+        """Light of some samples, their sum; on the host, but for what is added up where it is traced.
 
         Parameters
         ----------
@@ -161,16 +163,23 @@ class Tracer(ABC):
             of the random numbers.
         first, samples
             samples ``first`` .. ``first + samples - 1`` of the seed's sequence are traced.
+        accumulators
+            of light by pixel, whose unit is the tracer's ``board``; of several lines, one for each. From the camera's
+            side none are filled.
 
         Raises
         ------
         MitsimError
             when the scene sends NaN or infinite light to the camera.
         """
-        flights = (
-            (tracer, flight) for tracer in self.per_wavelength for flight in self._in_flight([seed], first, samples)
+        return PathSamples.joined(
+            [
+                part
+                for tracer in self.per_wavelength
+                for flight in self._in_flight([seed], first, samples)
+                for part in tracer._launch(flight, accumulators)
+            ]
         )
-        return PathSamples.joined([part for tracer, flight in flights for part in tracer._launch(flight)])
 
     def trace_replicates(self, seeds: Sequence[int], samples: int = 1) -> list[PathSamples]:
         """``samples`` as :meth:`trace` finds them for each of some ``seeds``, in as few kernels as may be."""
@@ -187,6 +196,20 @@ class Tracer(ABC):
         return found
 
 
+@dataclass(frozen=True)
+class Paths:
+    """Which light is followed besides projector - surface - camera.
+
+    ``mirrors``: over delta reflections and transmissions, from the camera only on its side; ``interreflection``: any
+    number of bounces; ``emitters``: other lights of the scene, all of them one class of ambient light, which the camera
+    alone finds.
+    """
+
+    mirrors: bool = False
+    interreflection: bool = False
+    emitters: tuple[mi.Emitter, ...] = ()
+
+
 class FollowingTracer(Tracer):
     """Light that is followed over any number of surfaces, or of some orders alone.
 
@@ -195,6 +218,26 @@ class FollowingTracer(Tracer):
     """
 
     orders: tuple[int, int] | None = None
+
+    def __init__(self, setup: OpticalSetup, paths: Paths, points: SensorPoints | None = None) -> None:
+        """What is followed.
+
+        Parameters
+        ----------
+        setup
+            scene, camera and projector.
+        paths
+            which of them are followed.
+        points
+            of the sensor, that they lead to or start at; its centre if not given.
+        """
+        super().__init__(setup, points)
+        self.paths = paths
+
+    @property
+    def by_line(self) -> bool:
+        """Whether light is told apart by the wavelengths of its paths."""
+        return self.projector.by_line
 
     def of_orders(self, fewest: int, most: int) -> Self:
         """The same paths, whose light is kept of the orders ``fewest`` to ``most``, and which end where no more can
@@ -254,29 +297,6 @@ class Turn:
     delta: mi.Bool
 
 
-@dataclass(frozen=True, eq=False)
-class PathRules:
-    """Which paths are followed.
-
-    Attributes
-    ----------
-    passage
-        the scene, and what light passes in it.
-    mirrors, interreflection
-        paths over delta reflections and transmissions, and over other surfaces.
-    orders
-        of :class:`FollowingTracer`; None: all.
-    by_line
-        whether light is told apart by line.
-    """
-
-    passage: Passage
-    mirrors: bool
-    interreflection: bool
-    orders: tuple[int, int] | None = None
-    by_line: bool = False
-
-
 class PathIntegrator(ABC, Generic[State]):
     """The paths of one launch, followed from vertex to vertex: the first apart, all others in a loop of one kernel.
 
@@ -291,11 +311,12 @@ class PathIntegrator(ABC, Generic[State]):
     reach: int = 1
     """How many more surfaces that are no mirrors turn the light of a path that goes on, at least."""
 
-    def __init__(self, rules: PathRules) -> None:
-        """Of what ``rules`` say."""
-        self.rules, self.passage, self.scene = rules, rules.passage, rules.passage.scene
-        self.followed = rules.mirrors or rules.interreflection or rules.passage.open
-        self._orders = [dr.opaque(mi.UInt32, order) for order in rules.orders or ()]
+    def __init__(self, tracer: FollowingTracer) -> None:
+        """Of what a ``tracer`` follows."""
+        self.rules, self.setup, self.by_line = tracer.paths, tracer.setup, tracer.by_line
+        self.scene, self.passage = tracer.setup.scene, tracer.setup.passage
+        self.followed = self.rules.mirrors or self.rules.interreflection or self.passage.open
+        self._orders = [dr.opaque(mi.UInt32, order) for order in tracer.orders or ()]
 
     def follow(self, paths: State) -> State:
         """``paths`` at their end, all light of them kept."""

@@ -24,8 +24,8 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.transport.connect import LensHit, OpticalSetup, sample_wavelengths
-from mitsim.transport.from_camera import CameraPaths, CameraState, FromCameraTracer, Paths
-from mitsim.transport.integrator import InFlight, Turn, camera_part
+from mitsim.transport.from_camera import CameraPaths, CameraState, FromCameraTracer
+from mitsim.transport.integrator import InFlight, Paths, Turn, camera_part
 from mitsim.transport.plugins.base import channels, device_vectors, host_values, turn_and_origin, vectors
 from mitsim.transport.projector import PinholeRays, wavelength_sets
 from mitsim.transport.records import DIRECT, INDIRECT, CellGrid, PathSamples, Sightings
@@ -141,7 +141,7 @@ class _MissedPaths(CameraPaths[_MissedState]):
         once = paths.active & (paths.scattered == 1) & (paths.in_mirror != paths.by_delta)
         met = once & (camera_part(paths.density) > 0)
         hit = self.connector.hit(paths.ray, si.t, paths.rng, lost | met, paths.since)
-        light, none, by_line = self._irradiance(paths, hit.radiance), mi.Float(0), self.rules.by_line
+        light, none, by_line = self._irradiance(paths, hit.radiance), mi.Float(0), self.by_line
         missed = dr.select(hit.met & lost, light * paths.part, 0)
         self._join(paths, "indirect", Sightings.of(missed, by_line, paths.mirror, none, none, none))
         met &= hit.met

@@ -86,7 +86,7 @@ class PathReuseTracer(IndirectTracer):
         """Whether what is to be followed can be shared: as the module says."""
         lines = mi.is_monochromatic or (mi.is_spectral and self.projector.lines is not None)
         several = self.points.count > 1 or not lines or mi.is_polarized
-        return self.interreflection and not several and not self.setup.passage.open
+        return self.paths.interreflection and not several and not self.setup.passage.open
 
     @property
     def lines(self) -> int:
@@ -143,9 +143,13 @@ class ReusedPaths(ProjectorPaths):
         self.tracer = tracer
         self.member = dr.arange(mi.UInt32, dr.width(self.pixel)) % MEMBERS
 
-    def path_samples(self) -> list[PathSamples]:
-        """Light on the host: of each pixel's own paths, and of all pairs of pixels and second points."""
+    def path_samples(self, accumulators: Sequence[DeviceAccumulator] = ()) -> list[PathSamples]:
+        """Light on the host of each pixel's own paths; that of pairs of pixels and second points goes into
+        ``accumulators``, one for each line, where there are any."""
         own, count = self._own(), dr.width(self.lit) * MEMBERS
+        if accumulators:
+            self._accumulate(accumulators)
+            return own
         values = [[dr.zeros(mi.Float, count) for _ in range(self.tracer.lines)] for _ in range(2)]
 
         def store(place: mi.UInt32, at: mi.UInt32, light: tuple[ByLine, ByLine], active: mi.Bool) -> None:
@@ -157,9 +161,9 @@ class ReusedPaths(ProjectorPaths):
         dr.eval(values)
         return [*own, self._pair_samples(values[0], self.to_sensor_way), self._pair_samples(values[1], self.further)]
 
-    def accumulate(self, accumulators: Sequence[DeviceAccumulator]) -> list[PathSamples]:
-        """Light of each pixel's own paths on the host; that of pairs in ``accumulators``, one for each line."""
-        own, way = self._own(), self.to_sensor_way
+    def _accumulate(self, accumulators: Sequence[DeviceAccumulator]) -> None:
+        """Add up the light of pairs."""
+        way = self.to_sensor_way
         seen = Sightings(way.geometric, self.pixel, way.row, way.column, way.inverse_depth)
         places = [accumulators[0].place(each, self.paths.rng.next_float32()) for each in (seen, self.further)]
         dr.eval(places)
@@ -171,7 +175,6 @@ class ReusedPaths(ProjectorPaths):
                     accumulator.add(value, self.pixel, dr.gather(mi.UInt32, each, at, lit), lit)
 
         self._pair_light(*self._weights(), store)
-        return own
 
     # ---- the paths themselves ---------------------------------------------------------------------------------------
 
@@ -374,7 +377,7 @@ class ReusedPaths(ProjectorPaths):
             inverse_depth=inverse.astype(np.float64),
             value=light[pairs].astype(np.float64),
             kind=np.full(len(pairs), INDIRECT, dtype=np.int16),
-            lines=lines if self.rules.by_line else None,
+            lines=lines if self.by_line else None,
         )
 
 

@@ -18,6 +18,7 @@ from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.integrator import Paths
 from tests.hard.hard_light import SCALE, SEVEN, SLOW, N, Z, gauss, matt, mean, seen_alone
 from tests.physics.radiosity import Furnace
 from tests.robustness import Recorder
@@ -89,7 +90,7 @@ def furnace(write: Callable[..., Path], albedo: float) -> IndirectTracer:
         f'<boolean name="flip_normals" value="true"/>{matt(albedo)}</shape>'
     )
     bench = open_bench(write("furnace", mask="open", extra=sphere, sheet_z=3000))
-    return IndirectTracer(bench.setup, False, True)
+    return IndirectTracer(bench.setup, Paths(False, True))
 
 
 @SLOW

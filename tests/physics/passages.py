@@ -9,8 +9,9 @@ import numpy as np
 
 from mitsim.api.bench import Bench
 from mitsim.transport.direct import DirectTracer
-from mitsim.transport.from_camera import FromCameraTracer, Paths
+from mitsim.transport.from_camera import FromCameraTracer
 from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.integrator import Paths
 from mitsim.transport.records import aligned_grid
 
 SEEDS, SIGMAS = 8, 7.0
@@ -39,7 +40,7 @@ def all_light(bench: Bench, seed: int, samples: int = 128, lens: float = 0.0, fo
     aim = aligned_grid(*bench.windows, 64, 1, bench.geometry.tan_half_fov + 0.01)
     tracers = (
         (DirectTracer(setup, 1), samples),
-        (IndirectTracer(setup, True, True), 4 * samples),
+        (IndirectTracer(setup, Paths(True, True)), 4 * samples),
         (FromCameraTracer(setup, aim, Paths(True, True, bench.loaded.lamps)), samples),
     )
     light = np.zeros(3)

@@ -25,8 +25,9 @@ from mitsim.core.spectral_manifests import RUN
 from mitsim.light.lamps import lit_by_lamps
 from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.direct import DirectTracer, FluxTracer
-from mitsim.transport.from_camera import FromCameraTracer, LampResponse, LampTracer, Paths
+from mitsim.transport.from_camera import FromCameraTracer, LampResponse, LampTracer
 from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.integrator import Paths
 from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.records import Bundle, PathSamples, aligned_grid
 from mitsim.transport.specular import trace_specular_chains
@@ -70,8 +71,8 @@ def followed(bench: Bench) -> dict[str, PathSamples]:
     aim = aligned_grid(*bench.windows, 32, 1, bench.geometry.tan_half_fov + 0.01)
     tracers = {
         "direct": DirectTracer(bench.setup, 2),
-        "indirect": IndirectTracer(bench.setup, True, True),
-        "shared": PathReuseTracer(bench.setup, True, True),
+        "indirect": IndirectTracer(bench.setup, Paths(True, True)),
+        "shared": PathReuseTracer(bench.setup, Paths(True, True)),
         "from camera": FromCameraTracer(bench.setup, aim, Paths(True, True, ())),
     }
     if not tracers["indirect"].setup.passage.open:
@@ -91,9 +92,9 @@ def filed(bench: Bench) -> list[list[float]]:
     labels = np.arange(N**2) % 5
     bundle = Bundle(aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov), 1, (400.0,))
     found: list[list[float]] = [[] for _ in lines.shares]
-    for tracer in (IndirectTracer(bench.setup, True, True), DirectTracer(bench.setup, 1)):
+    for tracer in (IndirectTracer(bench.setup, Paths(True, True)), DirectTracer(bench.setup, 1)):
         accumulators = [DeviceAccumulator(bundle, labels, tracer.board) for _ in lines.shares]
-        tracer.trace_into(accumulators, 3, 0, SAMPLES)
+        tracer.trace(3, 0, SAMPLES, accumulators)
         for line, accumulator in zip(found, accumulators, strict=True):
             line += np.asarray(accumulator.light()[0].sum(axis=1)).ravel().tolist()
     return found

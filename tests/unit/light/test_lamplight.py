@@ -31,7 +31,8 @@ from mitsim.devices.projector import Spectrum
 from mitsim.light.grids import Grid
 from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation
-from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer, LampTracer, Paths
+from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer, LampTracer
+from mitsim.transport.integrator import Paths
 from mitsim.transport.records import PathSamples
 from tests.conftest import write_small_scene
 from tests.system.conftest import CAMERA

@@ -14,8 +14,9 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
 from mitsim.transport import integrator
 from mitsim.transport.connect import SensorPoints
-from mitsim.transport.from_camera import FromCameraTracer, Paths
+from mitsim.transport.from_camera import FromCameraTracer
 from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.integrator import Paths
 from mitsim.transport.records import DIRECT, INDIRECT, PathSamples, aligned_grid
 from tests.unit.transport.closed_forms import mean, seen
 
@@ -35,7 +36,7 @@ MIRROR = """<shape type="rectangle"><transform name="to_world"><scale x="40" y="
 
 
 def tracer(bench: Bench, mirrors: bool = False, interreflection: bool = True) -> IndirectTracer:
-    return IndirectTracer(bench.setup, mirrors, interreflection)
+    return IndirectTracer(bench.setup, Paths(mirrors, interreflection))
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +114,7 @@ def test_both_sides_find_the_same_light_at_every_anchor(
     points = SensorPoints(geometry.half_width, 2, distance=geometry.scene_distance)
     grid = aligned_grid(*bench.windows, 2 * N, 1, geometry.reach(geometry.scene_distance))
     sides = (
-        (IndirectTracer(bench.setup, False, True, points=points), 1e6),
+        (IndirectTracer(bench.setup, Paths(False, True), points=points), 1e6),
         (FromCameraTracer(bench.setup, grid, Paths(interreflection=True), points=points), 1e-6),
     )
     found = np.zeros((2, SEEDS, 4, 4))
@@ -143,7 +144,7 @@ def test_a_caustic_is_direct_light_where_the_mirror_throws_it(shared_scene: Call
     """
     bench = open_bench(shared_scene("caustic", extra=MIRROR))
     points = SensorPoints(bench.geometry.half_width, anchors)
-    found = IndirectTracer(bench.setup, True, False, points=points).trace(2, 0, 64)
+    found = IndirectTracer(bench.setup, Paths(True, False), points=points).trace(2, 0, 64)
     assert {*found.anchor_row, *found.anchor_column} == set(range(anchors))
     assert found.value.size > 1000 and (found.kind == DIRECT).all()
     places = np.stack([-found.column, -found.row, np.ones(found.value.size)], axis=1) / found.inverse_depth[:, None]

@@ -19,6 +19,7 @@ from mitsim.core.spectral_manifests import RUN
 from mitsim.transport.accumulator import DeviceAccumulator, fetched
 from mitsim.transport.connect import SensorPoints
 from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.integrator import Paths
 from mitsim.transport.records import DIRECT, INDIRECT, Bundle, PathSamples, aligned_grid
 from tests.conftest import write_small_scene
 from tests.unit.transport.test_indirect import CORNER, MIRROR, N
@@ -57,7 +58,7 @@ def beside(shared_scene: Callable[..., Path], variant: str) -> Bench:
 
 
 def anchored(bench: Bench, points: SensorPoints) -> IndirectTracer:
-    return IndirectTracer(bench.setup, True, True, points=points)
+    return IndirectTracer(bench.setup, Paths(True, True), points=points)
 
 
 def compared(bench: Bench) -> tuple[int, list[str]]:
@@ -99,7 +100,7 @@ def in_lines(folder: str) -> tuple[int, list[str], list[list[float]]]:
     tracer, labels = anchored(bench, SensorPoints(bench.geometry.half_width, 3)), np.arange(N**2) % 5
     bundle = Bundle(aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov), 3, (400.0,))
     accumulators = DeviceAccumulator.of_lines(len(LINES), bundle, labels, tracer.board)
-    tracer.trace_into(accumulators, 4, 0, 32)
+    tracer.trace(4, 0, 32, accumulators)
     host = tracer.trace(4, 0, 32)
     light = host.where(host.kind == INDIRECT).by_line(len(LINES))
     held = [float(sums.light()[0].sum()) for sums in fetched(accumulators)]
@@ -129,10 +130,10 @@ def test_ledgers_hold_what_anchors_are_brought(beside: Bench, launch: int, monke
     reach = beside.geometry.reach(beside.geometry.scene_distance)
     bundle = Bundle(aligned_grid(*beside.windows, 2 * N, 1, reach), 3, (400.0, 300.0))
     whole, parts = (DeviceAccumulator(bundle, labels, tracer.board) for _ in range(2))
-    caustics, host = tracer.trace_into([whole], 4, 0, 8), tracer.trace(4, 0, 8)
+    caustics, host = tracer.trace(4, 0, 8, [whole]), tracer.trace(4, 0, 8)
     units = np.array(whole.sums)
     monkeypatch.setattr(IndirectTracer, "paths_per_launch", launch)
-    again = PathSamples.joined([tracer.trace_into([parts], 4, first, 4) for first in (0, 4)])
+    again = PathSamples.joined([tracer.trace(4, first, 4, [parts]) for first in (0, 4)])
     assert units.any() and np.array_equal(np.array(parts.sums), units)
     for name in ("kind", "pixel", "anchor_row", "anchor_column", "value"):
         assert np.array_equal(getattr(again, name), getattr(caustics, name)), name

@@ -10,8 +10,9 @@ import pytest
 from mitsim.api.bench import Bench, open_bench
 from mitsim.devices.patterns import Lighting
 from mitsim.planner.planner import make_plan
-from mitsim.transport.from_camera import FromCameraTracer, Paths
+from mitsim.transport.from_camera import FromCameraTracer
 from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.integrator import Paths
 from mitsim.transport.missed import LeftOut, left_out_light
 from mitsim.transport.records import CellGrid, aligned_grid
 from tests.physics.test_sharp_lobes import on_ball
@@ -103,7 +104,7 @@ def test_hits_are_those_of_the_tracer_that_would_find_the_light(
     name = f"hits{place == SEEN}{alpha}"
     bench = open_bench(shared_scene(name, extra=MIRROR + gloss(place, alpha), sheet_z=-500, fov=30), for_render=True)
     if place == LIT:
-        tracer = IndirectTracer(bench.setup, True, False)
+        tracer = IndirectTracer(bench.setup, Paths(True, False))
     else:
         tracer = FromCameraTracer(bench.setup, cells(bench), Paths(mirrors=True))
     samples = 2**21 // tracer.paths_per_sample

@@ -18,6 +18,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import SensorPoints
 from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.integrator import Paths
 from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.records import INDIRECT, Bundle, PathSamples, aligned_grid
 from tests.unit.transport.closed_forms import seen
@@ -55,7 +56,7 @@ def opened(scene: Path) -> Bench:
 def tracers(bench: Bench, spread: bool = False, mirrors: bool = False) -> tuple[IndirectTracer, PathReuseTracer]:
     """Paths of their own, and shared ones."""
     points = SensorPoints(bench.geometry.half_width, spread=spread)
-    parts = bench.setup, mirrors, True
+    parts = bench.setup, Paths(mirrors, True)
     return IndirectTracer(*parts, points=points), PathReuseTracer(*parts, points=points)
 
 
@@ -154,7 +155,7 @@ def test_the_ledger_holds_what_the_host_files(shared_scene: Callable[..., Path],
     bundle, labels = Bundle(grid, 1, depths), np.arange(N * N) % 5
     tracer = tracers(bench)[1]
     accumulator = DeviceAccumulator(bundle, labels, tracer.board)
-    own = tracer.trace_into([accumulator], 3, 0, 512)
+    own = tracer.trace(3, 0, 512, [accumulator])
     matrix, received, outside = accumulator.light()
     every = tracer.trace(3, 0, 512)
     expected = bundle.accumulate(every, labels).toarray()
@@ -173,11 +174,11 @@ def test_the_ledger_holds_paths_of_their_own_at_every_anchor(shared_scene: Calla
     """Place by place, all but caustics: those stay on the host."""
     bench = opened(shared_scene(f"anchors {mirrors}", extra=SCENES["mirror wall"]))
     points = SensorPoints(bench.geometry.half_width, anchors=3)
-    tracer = IndirectTracer(bench.setup, mirrors, True, points=points)
+    tracer = IndirectTracer(bench.setup, Paths(mirrors, True), points=points)
     grid = aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov / 3)
     bundle, labels = Bundle(grid, 3, (400.0,)), np.arange(N * N) % 5
     accumulator = DeviceAccumulator(bundle, labels, tracer.board)
-    rest = tracer.trace_into([accumulator], 3, 0, 64)
+    rest = tracer.trace(3, 0, 64, [accumulator])
     matrix, received, outside = accumulator.light()
     every = tracer.trace(3, 0, 64)
     indirect = every.where(every.kind == INDIRECT)
@@ -199,7 +200,7 @@ def test_light_that_is_not_a_number_is_refused(small_scene: Callable[..., Path])
     parameters.update()
     with pytest.raises(MitsimError, match="NaN"):
         tracer.trace(0, 0, 256)
-    tracer.trace_into([accumulator], 0, 0, 256)
+    tracer.trace(0, 0, 256, [accumulator])
     with pytest.raises(MitsimError, match="NaN"):
         accumulator.light()
 
@@ -216,7 +217,7 @@ dr.set_thread_count(int(sys.argv[2]))
 tracer = tracers(bench)[1]
 bundle = Bundle(aligned_grid(*bench.windows, 16, 1, bench.geometry.tan_half_fov), 1, (450.0, 300.0))
 accumulator = DeviceAccumulator(bundle, np.arange(256) % 5, tracer.board)
-tracer.trace_into([accumulator], 3, 0, 256)
+tracer.trace(3, 0, 256, [accumulator])
 print(hashlib.sha256(accumulator.light()[0].toarray().tobytes()).hexdigest())
 """
 

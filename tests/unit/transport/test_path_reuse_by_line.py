@@ -91,7 +91,7 @@ def traced(folder: str, names: Sequence[str]) -> dict[str, Any]:
         grid = aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov)
         bundle, labels = Bundle(grid, 1, (400.0,)), np.arange(N * N) % 5
         accumulators = [DeviceAccumulator(bundle, labels, shared.board) for _ in LINES]
-        rest = shared.trace_into(accumulators, 0, 0, SAMPLES)
+        rest = shared.trace(0, 0, SAMPLES, accumulators)
         every = looks[1][0].by_line(len(LINES))
         found[name] = {
             "own": [by_line(look) for look in looks[0]],
