@@ -19,12 +19,11 @@ from mitsim.core.arrays import Labels
 from mitsim.light.grids import Grids
 from mitsim.light.settings import Number, Settings
 from mitsim.transport.connect import OpticalSetup, SensorPoints
-from mitsim.transport.direct import DirectTracer
+from mitsim.transport.direct import AimedTracer, DirectTracer
 from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer, LampResponse, LampTracer
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.integrator import Paths
 from mitsim.transport.path_reuse import PathReuseTracer
-from mitsim.transport.sharp_lobes import AimedTracer
 
 # -------- What traces
 

@@ -34,9 +34,8 @@ from mitsim.planner.pilot_anchors import AnchorRuns, FollowedRuns, PenumbraRuns
 from mitsim.planner.pilot_direct import SMOOTH, DirectRuns, occluded_pixels, sharp_pixels
 from mitsim.planner.pilot_effects import EffectRuns
 from mitsim.planner.pilot_samples import GOOD_ENOUGH, Sample
-from mitsim.scene.darkness import why_dark
-from mitsim.transport.missed import LeftOut, highlights, left_out_light
-from mitsim.transport.sharp_lobes import SharpLight, sharp_light, with_neighbours
+from mitsim.scene.load import why_dark
+from mitsim.transport.missed import LeftOut, SharpLight, highlights, left_out_light, sharp_light, with_neighbours
 
 RUNS = ("cells", "effects", "anchors", "followed", "occluded")
 """What is looked at apart: cells and layers of direct light, effects switched off, anchors, those of followed light,

@@ -28,8 +28,8 @@ from mitsim.optics.image_formation import raster_error
 from mitsim.planner.memory import cells_to_choose, drawing_seconds
 from mitsim.planner.pilot_samples import EVEN_CELLS, GOOD_ENOUGH, Sample, ladder, noise, norm
 from mitsim.transport.direct import DirectTracer
+from mitsim.transport.missed import SharpLight, with_neighbours
 from mitsim.transport.records import PathSamples
-from mitsim.transport.sharp_lobes import SharpLight, with_neighbours
 
 LAYER_LADDER, CELL_LADDER = (1, 2, 3, 4, 6, 8, 12), (1, 2, 4, 8)
 """Numbers that are tried, each step about half the error of the one before or less."""

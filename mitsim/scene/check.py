@@ -21,9 +21,8 @@ import pydantic
 
 from mitsim.devices.camera import CameraGeometry
 from mitsim.scene import limits
-from mitsim.scene.estimators import SMALL_LAMPS, Unfit
 from mitsim.scene.headers import MOST_TEXELS, check_image, check_obj, check_ply, is_grey
-from mitsim.scene.limits import PLUGINS, Range, check_plugin, check_variant, references
+from mitsim.scene.limits import PLUGINS, SMALL_LAMPS, Range, Unfit, check_plugin, check_variant, references
 from mitsim.scene.outline import DEEPEST, MOST_ELEMENTS, Outline, SceneFiles, Tag
 
 _IMAGES = ("bitmap", "envmap")

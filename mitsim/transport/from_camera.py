@@ -44,9 +44,8 @@ from mitsim.transport.integrator import (
     camera_part,
     is_delta,
 )
-from mitsim.transport.plugins.base import rows_columns, x_y
+from mitsim.transport.plugins.base import rows_columns, shuffled, stratified, streams, x_y
 from mitsim.transport.records import CellAxis, CellGrid, PathSamples, Sightings
-from mitsim.transport.sampler import shuffled, stratified, streams
 from mitsim.transport.transmission import refracted_way
 
 _MARGIN = 1e-4

@@ -36,8 +36,8 @@ from mitsim.transport.integrator import (
     PathState,
     camera_part,
 )
+from mitsim.transport.plugins.base import stratified, streams
 from mitsim.transport.records import PathSamples, Sightings
-from mitsim.transport.sampler import stratified, streams
 
 _ROOMS = (4**2, 12**2)
 """Anchors that a path has room for: few numbers of them, as each is a kernel of its own, 0.4 s to compile; more

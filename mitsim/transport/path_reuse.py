@@ -44,8 +44,8 @@ from mitsim.transport.indirect import (
     blocks_of,
 )
 from mitsim.transport.integrator import InFlight, camera_part, shading_correction
+from mitsim.transport.plugins.base import generator, split_by_line, stratified
 from mitsim.transport.records import INDIRECT, PathSamples, Sightings, check_finite
-from mitsim.transport.sampler import generator, split_by_line, stratified
 
 if TYPE_CHECKING:
     ByLine = list[mi.Float]

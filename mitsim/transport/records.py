@@ -22,7 +22,7 @@ from scipy import sparse
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.optics.shadow import Directions
-from mitsim.transport.sampler import panchromatic
+from mitsim.transport.plugins.base import panchromatic
 
 IntArray = npt.NDArray[np.int64]
 AMBIENT, DIRECT, INDIRECT = 0, 1, 2

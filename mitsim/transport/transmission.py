@@ -17,8 +17,8 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
+from mitsim.transport.plugins.base import generator
 from mitsim.transport.plugins.glass import is_glass
-from mitsim.transport.sampler import generator
 
 CLEAR = 32 * 2.0**-24
 """How far a ray starts beyond a surface, for each mm of its coordinates, where a scene transmits light: 32 roundings of

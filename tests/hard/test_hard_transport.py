@@ -9,7 +9,7 @@ import pytest
 from mitsim.api.bench import Bench, open_bench
 from mitsim.devices.patterns import Lighting
 from mitsim.planner.planner import make_plan
-from mitsim.transport.sharp_lobes import SharpLight, sharp_light
+from mitsim.transport.missed import SharpLight, sharp_light
 from tests.hard.hard_light import GLINT, SEVEN, SIGMAS, SLOW, N, glossy, lobe, mean, seen_alone
 from tests.robustness import Recorder
 

@@ -68,8 +68,17 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import BoolArray, Flaws, Mask
 from mitsim.devices.plate import Plate
-from mitsim.transport.plugins.base import RIGID, register_once, rigidity_error, rows_columns, turn_and_origin, x_y
-from mitsim.transport.sampler import generator, shuffled, stratified
+from mitsim.transport.plugins.base import (
+    RIGID,
+    generator,
+    register_once,
+    rigidity_error,
+    rows_columns,
+    shuffled,
+    stratified,
+    turn_and_origin,
+    x_y,
+)
 
 PLUGIN = "mitsim_lensless"
 _BOX_RADIUS = 0.5 + 1e-4

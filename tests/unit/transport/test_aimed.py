@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.transport.direct import DirectTracer
-from mitsim.transport.sharp_lobes import AimedTracer, sharp_light
+from mitsim.transport.direct import AimedTracer, DirectTracer
+from mitsim.transport.missed import sharp_light
 from tests.conftest import write_png
 from tests.physics.test_sharp_lobes import on_ball
 

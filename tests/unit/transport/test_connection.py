@@ -13,9 +13,9 @@ import pytest
 
 from mitsim.transport.connect import Connection, LensHit, ProjectorConnector
 from mitsim.transport.plugins import lens as aperture
+from mitsim.transport.plugins.base import generator
 from mitsim.transport.plugins.lens import aperture_scene_parts
 from mitsim.transport.projector import ProjectorOptics
-from mitsim.transport.sampler import generator
 from tests.unit.transport.closed_forms import stock_projector
 
 pytestmark = pytest.mark.usefixtures("variant")
