@@ -75,9 +75,13 @@ class DirectRuns:
         self._seeds = [integer(seed, "pilot", "fine", replicate) for replicate in range(REPLICATES)]
         self._simulation = simulation = sample.simulation(bench, base)
         self._tracer = tracer_of(simulation, shown_pixels(base, sample), base.anchors)
-        self._path_samples = self._tracer.trace_replicates(self._seeds, sample.fine)
+        self._path_samples = self._trace(self._tracer, sample.fine)
         apart, samples = simulation.sharp, sample.sharp(simulation)
-        self._sharp = apart.trace_replicates(self._seeds, samples) if apart else []
+        self._sharp = self._trace(apart, samples) if apart else []
+
+    def _trace(self, tracer: DirectTracer, samples: int) -> list[PathSamples]:
+        """Replicates of a tracer's light."""
+        return [tracer.trace(seed, 0, samples) for seed in self._seeds]
 
     @property
     def judging(self) -> tuple[float, ...]:
@@ -147,12 +151,12 @@ class DirectRuns:
     @cached_property
     def _spread_noise(self) -> tuple[float, float]:
         tracer = tracer_of(self._simulation, shown_pixels(self.base, self.sample), 1, spread=True)
-        seen = tracer.trace_replicates(self._seeds, self.sample.fine)
+        seen = self._trace(tracer, self.sample.fine)
         return self._noise_of(tracer, self._form(self._simulation, seen, self.sample.fine))
 
     def _noise_of(self, tracer: DirectTracer, many: FloatArray) -> tuple[float, float]:
         """Error of a replicate of the ``tracer`` whose frames of all samples are ``many``, and of one with fewer."""
-        few = tracer.trace_replicates(self._seeds, self._fewer)
+        few = self._trace(tracer, self._fewer)
         return noise(many), noise(self._form(self._simulation, few, self._fewer))
 
     def forming(self, family: Lighting) -> Forming:

@@ -475,7 +475,6 @@ class LampTracer(FromCameraTracer):
             },
             pixel=(found.pixel[:, None] + self.counted.first + np.arange(MOST_LINES)).ravel(),
             value=light * self.counted.units[0],
-            lane=None if found.lane is None else np.repeat(found.lane, MOST_LINES),
         )
         if not self.projector.by_line:
             return several
@@ -505,8 +504,3 @@ class CombinedTracer:
             as there.
         """
         return PathSamples.joined([tracer.trace(seed, first, samples) for tracer in self.tracers])
-
-    def trace_replicates(self, seeds: Sequence[int], samples: int = 1) -> list[PathSamples]:
-        """``samples`` as :meth:`trace` finds them for each of some ``seeds``."""
-        looks = [tracer.trace_replicates(seeds, samples) for tracer in self.tracers]
-        return [PathSamples.joined(parts) for parts in zip(*looks, strict=True)]

@@ -32,9 +32,6 @@ KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT, "ambient": AMB
 """Kinds of light by their names in the loop."""
 PATHS_PER_LAUNCH = 2**22
 """Paths of one kernel: at some 100 bytes of state each, 0.4 GB; and a launch's fixed cost is small beside its work."""
-_TOGETHER, _ALL = 4, 2**30
-"""Seeds whose paths one kernel follows at most, and samples of one seed beyond any that are asked for; the first times
-the second fits 32 bits."""
 _SHARP = 1.0
 """Density [1/sr] of sampling a turn above which its light is looked for from the camera.
 
@@ -78,29 +75,12 @@ def launches(
 
 @dataclass(frozen=True, eq=False)
 class InFlight:
-    """Samples in flight, those of one kernel: of each its ``seed``, the number of its ``sample`` of that, and the
-    ``index`` of its path in the sample, which tells pixel or cell, and anchor."""
+    """Samples in flight, those of one kernel: their ``seed``, the number of each ``sample``, and the ``index`` of its
+    path in the sample, which tells pixel or cell, and anchor."""
 
     seed: mi.UInt32
     sample: mi.UInt32
     index: mi.UInt32
-
-    @classmethod
-    def of(cls, seeds: Sequence[int], samples: int, sample: mi.UInt32, index: mi.UInt32) -> InFlight:
-        """Those of a few seeds one after the other: no division, and one kernel for one seed and for several.
-
-        Parameters
-        ----------
-        seeds, samples
-            a few, and the samples of each.
-        sample, index
-            number of each among the samples of all seeds, and of its path.
-        """
-        count, number = dr.opaque(mi.UInt32, samples), mi.UInt32(0)
-        for before in range(1, _TOGETHER):
-            number += dr.select(sample >= before * count, mi.UInt32(1), 0)
-        padded = mi.UInt32([*seeds, *[0] * (_TOGETHER - len(seeds))])
-        return cls(dr.gather(mi.UInt32, padded, number), sample - number * count, index)
 
 
 class Tracer(ABC):
@@ -129,13 +109,12 @@ class Tracer(ABC):
         """Of those, how many each path of a kernel stands for."""
         return 1
 
-    def _in_flight(self, seeds: Sequence[int], first: int, samples: int) -> Iterator[InFlight]:
-        """Samples ``first`` .. ``first + samples - 1`` of a seed, or of several from the first on, one kernel's at a
-        time."""
-        each, count = samples if len(seeds) > 1 else _ALL, self.connections_per_path
+    def _in_flight(self, seed: int, first: int, samples: int) -> Iterator[InFlight]:
+        """Samples ``first`` .. ``first + samples - 1`` of a seed, one kernel's at a time."""
+        count = self.connections_per_path
         at_once = max(1, self.paths_per_launch // count)
-        for sample, index in launches(self.paths_per_sample // count, first, samples * len(seeds), at_once):
-            yield InFlight.of(seeds, each, sample, index)
+        for sample, index in launches(self.paths_per_sample // count, first, samples, at_once):
+            yield InFlight(dr.opaque(mi.UInt32, seed), sample, index)
 
     @property
     def per_wavelength(self) -> Sequence[Self]:
@@ -176,24 +155,10 @@ class Tracer(ABC):
             [
                 part
                 for tracer in self.per_wavelength
-                for flight in self._in_flight([seed], first, samples)
+                for flight in self._in_flight(seed, first, samples)
                 for part in tracer._launch(flight, accumulators)
             ]
         )
-
-    def trace_replicates(self, seeds: Sequence[int], samples: int = 1) -> list[PathSamples]:
-        """``samples`` as :meth:`trace` finds them for each of some ``seeds``, in as few kernels as may be."""
-        each, found = self.paths_per_sample * samples, list[PathSamples]()
-        together = min(self.paths_per_launch // each, _TOGETHER)
-        if together < 2:
-            return [self.trace(seed, 0, samples) for seed in seeds]
-        for start in range(0, len(seeds), together):
-            few = seeds[start : start + together]
-            (flight,) = self._in_flight(few, 0, samples)
-            parts = [part for tracer in self.per_wavelength for part in tracer._launch(flight)]
-            for start_of_one in range(0, each * len(few), each):
-                found.append(PathSamples.joined([part.of_lanes(start_of_one, start_of_one + each) for part in parts]))
-        return found
 
 
 @dataclass(frozen=True)

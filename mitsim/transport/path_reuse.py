@@ -78,10 +78,6 @@ class PathReuseTracer(IndirectTracer):
         """The same, as :meth:`IndirectTracer.with_adaptive_counts`; ``repeats`` (blocks^2,)."""
         return self._with_counts(np.asarray(repeats, dtype=np.int64))
 
-    def trace_replicates(self, seeds: Sequence[int], samples: int = 1) -> list[PathSamples]:
-        """``samples`` of each of some ``seeds``, one after the other: pairs of paths have no lane of their own."""
-        return [self.trace(seed, 0, samples) for seed in seeds]
-
     def shares(self) -> bool:
         """Whether what is to be followed can be shared: as the module says."""
         lines = mi.is_monochromatic or (mi.is_spectral and self.projector.lines is not None)

@@ -119,8 +119,6 @@ class PathSamples:
         (m,) irradiance [W m^-2].
     kind
         (m,) :data:`DIRECT` or :data:`INDIRECT` light of the projector, or :data:`AMBIENT` light.
-    lane
-        (m,) number of each path in its launch, increasing; None where that is not known.
     lines
         (4, m) ``value`` by line, then zeros, in single precision as it was traced; None where it is not told apart.
     """
@@ -133,7 +131,6 @@ class PathSamples:
     inverse_depth: FloatArray
     value: FloatArray
     kind: npt.NDArray[np.int16]
-    lane: IntArray | None = None
     lines: npt.NDArray[np.float32] | None = None
 
     @classmethod
@@ -193,7 +190,6 @@ class PathSamples:
             inverse_depth=lit_ones(seen.inverse_depth, np.float64),
             value=lit_ones(light, np.float64),
             kind=np.full(lit.size, kind, dtype=np.int16),
-            lane=lit,
             lines=None if seen.lines is None else lit_ones(seen.lines, np.float32),
         )
 
@@ -211,19 +207,11 @@ class PathSamples:
 
     def where(self, chosen: npt.NDArray[np.bool_]) -> PathSamples:
         """The entries that are ``chosen`` (m,)."""
-        return self._select(chosen)
-
-    def of_lanes(self, first: int, last: int) -> PathSamples:
-        """The entries of lanes ``first`` .. ``last`` - 1."""
-        assert self.lane is not None, "known of what one launch brought"
-        return self._select(slice(*np.searchsorted(self.lane, (first, last))))
-
-    def _select(self, which: slice | npt.NDArray[np.bool_]) -> PathSamples:
-        lines = None if self.lines is None else self.lines[:, which]
-        return PathSamples(**{name: getattr(self, name)[which] for name in _ARRAYS}, lines=lines)
+        lines = None if self.lines is None else self.lines[:, chosen]
+        return PathSamples(**{name: getattr(self, name)[chosen] for name in _ARRAYS}, lines=lines)
 
 
-_ARRAYS = tuple(name for name in PathSamples.__dataclass_fields__ if name not in ("lane", "lines"))
+_ARRAYS = tuple(name for name in PathSamples.__dataclass_fields__ if name != "lines")
 """What is told of each entry."""
 
 
