@@ -7,7 +7,6 @@ it meets one is handed out, drawn in proportion to its light."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -60,15 +59,13 @@ class DirectTracer(Tracer):
         """Connections of one sample: one per projector pixel and anchor."""
         return len(self._pixels) * self.points.count
 
-    def _launch(self, flight: InFlight, accumulators: Sequence[DeviceAccumulator] = ()) -> list[PathSamples]:
+    def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
         seen, anchor = self._sightings(flight)
-        if not accumulators:
+        if accumulator is None:
             return [PathSamples.fetched(seen, DIRECT, anchor)]
-        lights = seen.by_line(len(accumulators))
-        for place, share in accumulators[0].shares(seen, anchor):
-            for accumulator, light in zip(accumulators, lights, strict=True):
-                accumulator.add(light * share, seen.pixel, place, ~(light == 0))  # not a number is refused
-        dr.eval([accumulator.sums for accumulator in accumulators])
+        for place, share in accumulator.shares(seen, anchor):
+            accumulator.add([light * share for light in seen.by_line(accumulator.lines)], seen.pixel, place)
+        dr.eval(accumulator.sums)
         return []
 
     def _sightings(self, flight: InFlight) -> tuple[Sightings, tuple[mi.UInt32, mi.UInt32]]:

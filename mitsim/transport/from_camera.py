@@ -97,7 +97,7 @@ class FromCameraTracer(FollowingTracer):
         """
         return sample_wavelengths(self.setup.camera, rng, self.projector.lines)
 
-    def _launch(self, flight: InFlight, accumulators: Sequence[DeviceAccumulator] = ()) -> list[PathSamples]:
+    def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
         return self._paths(flight).path_samples()
 
     def _paths(self, flight: InFlight) -> CameraPaths[Any]:
@@ -461,7 +461,7 @@ class LampTracer(FromCameraTracer):
             wavelengths = [sum(own, mi.Float(0))] * len(own)
         return type(dr.zeros(mi.Ray3f).wavelengths)(*wavelengths), mi.Spectrum(*weights)
 
-    def _launch(self, flight: InFlight, accumulators: Sequence[DeviceAccumulator] = ()) -> list[PathSamples]:
+    def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
         return [self._by_band(found) for found in super()._launch(flight)]
 
     def _by_band(self, found: PathSamples) -> PathSamples:

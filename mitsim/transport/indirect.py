@@ -75,8 +75,8 @@ class IndirectTracer(FollowingTracer):
         """Irradiance [W m^-2] that light compares to."""
         return self.setup.board
 
-    def _launch(self, flight: InFlight, accumulators: Sequence[DeviceAccumulator] = ()) -> list[PathSamples]:
-        return self._paths(self._emission(flight)).path_samples(accumulators)
+    def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
+        return self._paths(self._emission(flight)).path_samples(accumulator)
 
     def _emission(self, flight: InFlight) -> Emission:
         """Where each path leaves the projector."""
@@ -180,22 +180,21 @@ class ProjectorPaths(PathIntegrator[PathState]):
                 joined = self.connections.load(held, kind, number).joined_by(seen, drawn[kind])
                 self.connections.save(held, kind, number, joined)
 
-    def path_samples(self, accumulators: Sequence[DeviceAccumulator] = ()) -> list[PathSamples]:
-        """Light on the host of every path at every anchor; of indirect light none where there are ``accumulators``."""
+    def path_samples(self, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
+        """Light on the host of every path at every anchor; of indirect light none where there is an ``accumulator``."""
         paths = self.follow(self.paths)
-        if not accumulators:
+        if accumulator is None:
             return self.connections.fetched(paths.sightings, tuple(paths.sightings))
         drawn = paths.rng.next_float32()
 
         def add(held: Held, number: mi.UInt32) -> None:
             seen = self.connections.load(held, "indirect", number)
-            place = accumulators[0].place(seen, drawn, self.connections.anchor(number))
-            for accumulator, light in zip(accumulators, seen.by_line(len(accumulators)), strict=True):
-                accumulator.add(light, seen.pixel, place, ~(light == 0))  # not a number is light to be refused
+            place = accumulator.place(seen, drawn, self.connections.anchor(number))
+            accumulator.add(seen.by_line(accumulator.lines), seen.pixel, place)
 
         held = self.connections.at_each(paths.sightings, mi.Bool(True), add)
         caustics = tuple(kind for kind in held if kind == "direct")
-        return self.connections.fetched(held, caustics, [accumulator.sums for accumulator in accumulators])
+        return self.connections.fetched(held, caustics, accumulator.sums)
 
 
 # -------- Connections of a path: to one point of the sensor, or to every anchor

@@ -128,11 +128,11 @@ class Tracer(ABC):
         return again
 
     @abstractmethod
-    def _launch(self, flight: InFlight, accumulators: Sequence[DeviceAccumulator] = ()) -> list[PathSamples]:
-        """Light of the paths of one kernel, but for what is added up in ``accumulators``."""
+    def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
+        """Light of the paths of one kernel, but for what is added up in the ``accumulator``."""
 
     def trace(
-        self, seed: int, first: int = 0, samples: int = 1, accumulators: Sequence[DeviceAccumulator] = ()
+        self, seed: int, first: int = 0, samples: int = 1, accumulator: DeviceAccumulator | None = None
     ) -> PathSamples:
         """Light of some samples, their sum; on the host, but for what is added up where it is traced.
 
@@ -142,9 +142,8 @@ class Tracer(ABC):
             of the random numbers.
         first, samples
             samples ``first`` .. ``first + samples - 1`` of the seed's sequence are traced.
-        accumulators
-            of light by pixel, whose unit is the tracer's ``board``; of several lines, one for each. From the camera's
-            side none are filled.
+        accumulator
+            of light by pixel, whose unit is the tracer's ``board``. From the camera's side none is filled.
 
         Raises
         ------
@@ -156,7 +155,7 @@ class Tracer(ABC):
                 part
                 for tracer in self.per_wavelength
                 for flight in self._in_flight(seed, first, samples)
-                for part in tracer._launch(flight, accumulators)
+                for part in tracer._launch(flight, accumulator)
             ]
         )
 

@@ -139,12 +139,12 @@ class ReusedPaths(ProjectorPaths):
         self.tracer = tracer
         self.member = dr.arange(mi.UInt32, dr.width(self.pixel)) % MEMBERS
 
-    def path_samples(self, accumulators: Sequence[DeviceAccumulator] = ()) -> list[PathSamples]:
-        """Light on the host of each pixel's own paths; that of pairs of pixels and second points goes into
-        ``accumulators``, one for each line, where there are any."""
+    def path_samples(self, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
+        """Light on the host of each pixel's own paths; that of pairs of pixels and second points goes into the
+        ``accumulator`` where there is one."""
         own, count = self._own(), dr.width(self.lit) * MEMBERS
-        if accumulators:
-            self._accumulate(accumulators)
+        if accumulator is not None:
+            self._accumulate(accumulator)
             return own
         values = [[dr.zeros(mi.Float, count) for _ in range(self.tracer.lines)] for _ in range(2)]
 
@@ -157,18 +157,16 @@ class ReusedPaths(ProjectorPaths):
         dr.eval(values)
         return [*own, self._pair_samples(values[0], self.to_sensor_way), self._pair_samples(values[1], self.further)]
 
-    def _accumulate(self, accumulators: Sequence[DeviceAccumulator]) -> None:
+    def _accumulate(self, accumulator: DeviceAccumulator) -> None:
         """Add up the light of pairs."""
         way = self.to_sensor_way
         seen = Sightings(way.geometric, self.pixel, way.row, way.column, way.inverse_depth)
-        places = [accumulators[0].place(each, self.paths.rng.next_float32()) for each in (seen, self.further)]
+        places = [accumulator.place(each, self.paths.rng.next_float32()) for each in (seen, self.further)]
         dr.eval(places)
 
         def store(place: mi.UInt32, at: mi.UInt32, light: tuple[ByLine, ByLine], active: mi.Bool) -> None:
             for each, by_line in zip(places, light, strict=True):
-                for accumulator, value in zip(accumulators, by_line, strict=True):
-                    lit = active & ~(value == 0)  # not a number is light to be refused
-                    accumulator.add(value, self.pixel, dr.gather(mi.UInt32, each, at, lit), lit)
+                accumulator.add(by_line, self.pixel, dr.gather(mi.UInt32, each, at, active), active)
 
         self._pair_light(*self._weights(), store)
 

@@ -93,10 +93,10 @@ def filed(bench: Bench) -> list[list[float]]:
     bundle = Bundle(aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov), 1, (400.0,))
     found: list[list[float]] = [[] for _ in lines.shares]
     for tracer in (IndirectTracer(bench.setup, Paths(True, True)), DirectTracer(bench.setup, 1)):
-        accumulators = [DeviceAccumulator(bundle, labels, tracer.board) for _ in lines.shares]
-        tracer.trace(3, 0, SAMPLES, accumulators)
-        for line, accumulator in zip(found, accumulators, strict=True):
-            line += np.asarray(accumulator.light()[0].sum(axis=1)).ravel().tolist()
+        accumulator = DeviceAccumulator(bundle, labels, tracer.board, len(lines.shares))
+        tracer.trace(3, 0, SAMPLES, accumulator)
+        for line, sums in zip(found, accumulator.fetch(), strict=True):
+            line += np.asarray(sums.light()[0].sum(axis=1)).ravel().tolist()
     return found
 
 

@@ -16,7 +16,7 @@ import pytest
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.spectral_manifests import RUN
-from mitsim.transport.accumulator import DeviceAccumulator, fetched
+from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import SensorPoints
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.integrator import Paths
@@ -99,11 +99,11 @@ def in_lines(folder: str) -> tuple[int, list[str], list[list[float]]]:
     bench = SpectralBench.of(opened, RUN).whole
     tracer, labels = anchored(bench, SensorPoints(bench.geometry.half_width, 3)), np.arange(N**2) % 5
     bundle = Bundle(aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov), 3, (400.0,))
-    accumulators = DeviceAccumulator.of_lines(len(LINES), bundle, labels, tracer.board)
-    tracer.trace(4, 0, 32, accumulators)
+    accumulator = DeviceAccumulator(bundle, labels, tracer.board, len(LINES))
+    tracer.trace(4, 0, 32, accumulator)
     host = tracer.trace(4, 0, 32)
     light = host.where(host.kind == INDIRECT).by_line(len(LINES))
-    held = [float(sums.light()[0].sum()) for sums in fetched(accumulators)]
+    held = [float(sums.light()[0].sum()) for sums in accumulator.fetch()]
     return *compared(bench), [held, [float(bundle.accumulate(each, labels).sum()) for each in light]]
 
 
@@ -130,10 +130,10 @@ def test_ledgers_hold_what_anchors_are_brought(beside: Bench, launch: int, monke
     reach = beside.geometry.reach(beside.geometry.scene_distance)
     bundle = Bundle(aligned_grid(*beside.windows, 2 * N, 1, reach), 3, (400.0, 300.0))
     whole, parts = (DeviceAccumulator(bundle, labels, tracer.board) for _ in range(2))
-    caustics, host = tracer.trace(4, 0, 8, [whole]), tracer.trace(4, 0, 8)
+    caustics, host = tracer.trace(4, 0, 8, whole), tracer.trace(4, 0, 8)
     units = np.array(whole.sums)
     monkeypatch.setattr(IndirectTracer, "paths_per_launch", launch)
-    again = PathSamples.joined([tracer.trace(4, first, 4, [parts]) for first in (0, 4)])
+    again = PathSamples.joined([tracer.trace(4, first, 4, parts) for first in (0, 4)])
     assert units.any() and np.array_equal(np.array(parts.sums), units)
     for name in ("kind", "pixel", "anchor_row", "anchor_column", "value"):
         assert np.array_equal(getattr(again, name), getattr(caustics, name)), name
