@@ -141,7 +141,7 @@ def _row(matrix: sparse.csr_array, row: int) -> Entries:
     return matrix.indices[inside], matrix.data[inside]
 
 
-# ---- Shots as sums of frames that are held ----
+# -------- Shots as sums of frames that are held
 
 
 @dataclass(frozen=True, eq=False)

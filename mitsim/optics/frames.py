@@ -85,7 +85,7 @@ class ClassFrames:
     irradiance: FloatArray
 
 
-# ---- How many frames are held ----
+# -------- How many frames are held
 
 
 def at_once(pixels: float) -> int:
@@ -126,7 +126,7 @@ def mixes(classes: int, shots: int, pixels: float) -> bool:
     return classes <= min(_LARGEST_BASIS, shots, _BASIS_BYTES // (_FLOAT * pixels**2))
 
 
-# ---- All frames of a family ----
+# -------- All frames of a family
 
 
 class ExpectedFrames:
@@ -383,7 +383,7 @@ class ExpectedFrames:
         return in_threads(frame_of, range(len(irradiance)))
 
 
-# ---- The error of frames that were formed ----
+# -------- The error of frames that were formed
 
 
 def monte_carlo_error(frames: Sequence[Frame] | ExpectedFrames) -> float:

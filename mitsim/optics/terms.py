@@ -72,7 +72,7 @@ def shadow_terms(
     return [(geometry.pixel_fill_factor * left, right) for left, right in terms]
 
 
-# ---- A mask that is turned in its plane, or shakes ----
+# -------- A mask that is turned in its plane, or shakes
 #
 # **Turned** by a small angle theta about its centre, a separable mask a(s_row) b(s_col) is
 # ``a(s_row + theta s_col) b(s_col - theta s_row)``: at every place the two profiles are shifted, each by what the other
@@ -162,7 +162,7 @@ def _hats(shift: FloatArray, nodes: FloatArray) -> list[FloatArray]:
     return [np.maximum(1 - np.abs(place - index), 0.0) for index in range(len(nodes))]
 
 
-# ---- A tilted mask ----
+# -------- A tilted mask
 # Where a mask's distance grows by alpha along its rows and by beta along its columns, a ray of slope t that would
 # cross the even plane at s crosses the mask at s + t (alpha s_row + beta s_col) / (1 - t . (alpha, beta)). Along the
 # rows::

@@ -213,7 +213,7 @@ def check_variant(tag: Tag, plugin: str, given: Container[str], variant: str) ->
         raise tag.refusal("type", repr(plugin), rule)
 
 
-# -------- What an estimator cannot render
+# -------- Estimators, and what they cannot render
 #
 # What an estimator cannot render: the tree of a checked scene in; its refusal out, or what is known to be lost.
 #

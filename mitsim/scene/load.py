@@ -205,7 +205,7 @@ def _place_of_wrong(key: str, values: npt.NDArray[np.float32], wrong: npt.NDArra
     return f"bitmap {file}: {texel} is {values[tuple(at)]:g} ({count} such texels)"
 
 
-# -------- Why a scene is dark
+# -------- Darkness: what keeps the projector's light from the camera
 #
 # Why a scene is dark: a loaded scene in, the sentence out that says what keeps the projector's light from the camera.
 #

@@ -377,7 +377,7 @@ def _check_native(scene: Path, folder: Path) -> None:
             raise MitsimError(f"{scene}: {library} would run native code; move it away from the scene")
 
 
-# -------- How many pixels a side a projector's picture lights, where that is known without the renderer
+# -------- Size of a projector's picture, where it is known without the renderer
 
 _MODES_OF_PIXELS = ("1", "L", "RGB")
 """Of pictures whose dark texels are 0 in every channel, and nothing else is."""

@@ -273,7 +273,7 @@ def sample_wavelengths(camera: mi.Sensor, rng: mi.PCG32, lines: Lines | None = N
     return wavelengths, mi.Spectrum(*(dr.opaque(mi.Float, float(weight)) for weight in weights))
 
 
-# -------- Where light lands that leaves surfaces in known directions
+# -------- Landings of light that leaves surfaces in known directions
 #
 # Light that is sampled from a surface goes where its lobe sends it, through flat glass bent by Snell's law, until it
 # crosses the plane of the sensor.

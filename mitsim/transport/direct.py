@@ -232,7 +232,7 @@ class FluxTracer:
         return mi.UnpolarizedSpectrum(dr.select(value > 0, value / share, 0))
 
 
-# -------- Direct light aimed at the anchors that sharp lobes meet ----
+# -------- Direct light aimed at the anchors that sharp lobes meet
 #
 # Connected to an anchor u of the sensor, light over a lobe of roughness alpha comes from a patch of some alpha r about
 # the point that mirrors the projector into u; even rays of a projector pixel seldom meet it. Where in the pixel it lies

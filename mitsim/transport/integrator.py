@@ -109,13 +109,6 @@ class Tracer(ABC):
         """Of those, how many each path of a kernel stands for."""
         return 1
 
-    def _in_flight(self, seed: int, first: int, samples: int) -> Iterator[InFlight]:
-        """Samples ``first`` .. ``first + samples - 1`` of a seed, one kernel's at a time."""
-        count = self.connections_per_path
-        at_once = max(1, self.paths_per_launch // count)
-        for sample, index in launches(self.paths_per_sample // count, first, samples, at_once):
-            yield InFlight(dr.opaque(mi.UInt32, seed), sample, index)
-
     @property
     def per_wavelength(self) -> Sequence[Self]:
         """Itself, or where glass parts light of several wavelengths, the same for each of them alone."""
@@ -150,14 +143,12 @@ class Tracer(ABC):
         MitsimError
             when the scene sends NaN or infinite light to the camera.
         """
-        return PathSamples.joined(
-            [
-                part
-                for tracer in self.per_wavelength
-                for flight in self._in_flight(seed, first, samples)
-                for part in tracer._launch(flight, accumulator)
-            ]
-        )
+        count, parts = self.connections_per_path, list[PathSamples]()
+        at_once = max(1, self.paths_per_launch // count)
+        for tracer in self.per_wavelength:
+            for sample, index in launches(self.paths_per_sample // count, first, samples, at_once):
+                parts += tracer._launch(InFlight(dr.opaque(mi.UInt32, seed), sample, index), accumulator)
+        return PathSamples.joined(parts)
 
 
 @dataclass(frozen=True)

@@ -354,7 +354,7 @@ _SHARPEST = 0.1
 """Part of the light over sharper lobes than the width that is reported: the peak of a GGX lobe is met that often."""
 
 
-# ---- How much light comes over sharp lobes ----
+# ---- Light over sharp lobes, and what it is found from
 
 
 @dataclass(frozen=True, eq=False)
@@ -455,7 +455,7 @@ def with_neighbours(chosen: npt.NDArray[np.bool_], side: int) -> Labels:
     return np.flatnonzero(mean_of_neighbours(chosen.reshape(side, side).astype(np.float64)) > 0)
 
 
-# ---- What is found by pixel, and where it meets the sensor ----
+# ---- Light by pixel, and hits of the sensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -489,7 +489,7 @@ class _SensorHits:
         return _SensorHits(mean, self.moment + more.moment, density, self.turns + more.turns)
 
 
-# ---- What connections find of it ----
+# ---- Connections over sharp lobes alone
 
 
 class _Connections(DirectTracer):
@@ -516,7 +516,7 @@ class _Connections(DirectTracer):
         return reception, dr.select(sharp == self._over_sharp, received, 0)
 
 
-# ---- Rays that sharp lobes send to the sensor ----
+# ---- Rays that sharp lobes send to the sensor
 
 
 class _Lobes:

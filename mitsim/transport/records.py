@@ -31,7 +31,7 @@ _COUNTED = 4
 """Places for each entry of light up to which entries are counted by place; where places are more, sorting is faster."""
 
 
-# ---- Light of connections in the renderer ----
+# -------- Light of connections in the renderer
 
 
 @dataclass
@@ -98,7 +98,7 @@ def check_finite(light: npt.NDArray[Any]) -> None:
         raise MitsimError("the scene reflects NaN or infinite light toward the camera; check its materials")
 
 
-# ---- Path samples, fetched from the renderer ----
+# -------- Path samples, fetched from the renderer
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,7 +215,7 @@ _ARRAYS = tuple(name for name in PathSamples.__dataclass_fields__ if name != "li
 """What is told of each entry."""
 
 
-# ---- Accumulation by layer, anchor and cell ----
+# -------- Accumulation by layer, anchor and cell
 
 
 @dataclass(frozen=True)
@@ -373,7 +373,7 @@ def _index_type(*shape: int) -> type[np.int32] | type[np.int64]:
     return np.int32 if max(shape) < 2**31 else np.int64
 
 
-# ---- The grid of directions on which light is accumulated ----
+# -------- The grid of directions on which light is accumulated
 
 _ROUNDING = 1e-9
 """Part of a pixel by which the field stop may reach over cells: float64 rounds 1e-13 of it, a whole row costs 1 %."""

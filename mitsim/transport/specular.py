@@ -391,7 +391,7 @@ def _join(parts: list[Beams], left: FloatArray) -> Beams:
     return Beams(**arrays, unresolved=float(left[0]), error=math.sqrt(left[1]))
 
 
-# -------- Where mirrors are small: how finely each square of a grid over the window is divided out
+# -------- Small mirrors: how finely each square of a grid over the window is divided
 #
 # A ball of 0.4 mm lies between the rays of a grid of 1 mm, and still sends the projector's light to the sensor. So rays
 # are aimed: each mirror is cut into *spots* no larger than a few squares, and where these are seen, squares are divided

@@ -288,7 +288,7 @@ def _sensor_class() -> type:
     return Lensless
 
 
-# -------- Where a mask is open
+# -------- Openings of a mask
 #
 # A mask is a sum of grids that do not overlap (mitsim.devices.mask.Mask.openings): open where both its row and its
 # column are. On each axis the open length up to a coordinate is piecewise linear and so is its inverse, which makes a
