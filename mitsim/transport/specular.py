@@ -141,6 +141,9 @@ def _ranges(first: IntArray, last: IntArray) -> IntArray:
     return np.asarray(np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts - first, counts))
 
 
+# -------- Nodes: what is known at points of the lattice
+
+
 @dataclass(frozen=True, eq=False)
 class _Nodes:
     """What is known at lattice points of one chain, any shape: whether a ray arrived, and where, how, how bright."""
@@ -188,6 +191,9 @@ def _nodes(crossings: Crossings, chain: Chains, place: IntArray) -> _Nodes:
     valid = key[at] == wanted
     sensor, tangent = (np.where(valid[..., None], v[at], np.nan) for v in (crossings.sensor, crossings.tangent))
     return _Nodes(valid, sensor, tangent, np.where(valid, crossings.throughput[at], 0))
+
+
+# -------- Division of squares until light is bilinear over each
 
 
 def _refine(
