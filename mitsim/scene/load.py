@@ -520,13 +520,7 @@ def straightening(
     return _homography(corners, np.where([[0, 0], [0, 1], [1, 0], [1, 1]], high, low))
 
 
-def _window_corners(
-    where: str,
-    projector: mi.Emitter,
-    camera: mi.Sensor,
-    window: Window,
-    z: float,
-) -> FloatArray:
+def _window_corners(where: str, projector: mi.Emitter, camera: mi.Sensor, window: Window, z: float) -> FloatArray:
     """(4, 2) tan-angles (row, column) of the window's corners on the plane at ``z``, in index coordinates.
 
     Between that plane and the projector's image lies a homography; four probes of the emitter determine it.

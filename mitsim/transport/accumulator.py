@@ -198,11 +198,7 @@ class DeviceAccumulator:
         return [(first, 1 - beyond), (first + 1, beyond)]
 
     def _place(
-        self,
-        seen: Sightings,
-        layer: mi.UInt32,
-        cells: Sequence[mi.UInt32],
-        anchor: tuple[mi.UInt32, mi.UInt32] | None,
+        self, seen: Sightings, layer: mi.UInt32, cells: Sequence[mi.UInt32], anchor: tuple[mi.UInt32, mi.UInt32] | None
     ) -> mi.UInt32:
         """Where light of a ``layer`` and of ``cells`` along rows and columns is accumulated, or its anchor's place for
         what lies beyond all cells."""

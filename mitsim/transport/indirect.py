@@ -28,14 +28,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray, mean_of_neighbours
 from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import SensorPoints, Way, sample_wavelengths
-from mitsim.transport.integrator import (
-    KINDS,
-    FollowingTracer,
-    InFlight,
-    PathIntegrator,
-    PathState,
-    camera_part,
-)
+from mitsim.transport.integrator import KINDS, FollowingTracer, InFlight, PathIntegrator, PathState, camera_part
 from mitsim.transport.plugins.base import stratified, streams
 from mitsim.transport.records import PathSamples, Sightings
 

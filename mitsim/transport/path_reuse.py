@@ -35,14 +35,7 @@ import numpy as np
 
 from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import Way
-from mitsim.transport.indirect import (
-    MEMBERS,
-    SIDE,
-    Emission,
-    IndirectTracer,
-    ProjectorPaths,
-    blocks_of,
-)
+from mitsim.transport.indirect import MEMBERS, SIDE, Emission, IndirectTracer, ProjectorPaths, blocks_of
 from mitsim.transport.integrator import InFlight, camera_part, shading_correction
 from mitsim.transport.plugins.base import generator, split_by_line, stratified
 from mitsim.transport.records import INDIRECT, PathSamples, Sightings, check_finite

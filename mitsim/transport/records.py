@@ -421,11 +421,7 @@ class CellGrid:
 
 
 def aligned_grid(
-    row_window: tuple[float, float],
-    column_window: tuple[float, float],
-    n: int,
-    subdivision: int,
-    tan_half_fov: float,
+    row_window: tuple[float, float], column_window: tuple[float, float], n: int, subdivision: int, tan_half_fov: float
 ) -> CellGrid:
     """Cells that divide the projector's pixels, and more of them to cover the field stop.
 

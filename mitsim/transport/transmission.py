@@ -133,13 +133,7 @@ class Passage:
         _, _, part = dr.while_loop(state, lambda active, *_: active, advance, labels=("active", "ray", "part"))
         return dr.max(part) > 0, part
 
-    def along(
-        self,
-        ray: mi.Ray3f,
-        light: mi.Spectrum,
-        state: State,
-        visit: Callable[[Arrival, State], State],
-    ) -> State:
+    def along(self, ray: mi.Ray3f, light: mi.Spectrum, state: State, visit: Callable[[Arrival, State], State]) -> State:
         """What is made of all surfaces that rays meet one behind another, as far as these let light pass.
 
         Neighbouring rays are taken for coherent, which are found faster.
