@@ -320,7 +320,7 @@ def _is_flat(shape: mi.Shape) -> bool:
 
 
 @dataclass
-class Way:
+class RefractedWay:
     """How light gets from points of surfaces to their targets.
 
     Attributes
@@ -390,7 +390,7 @@ class _Aim:
     eta: mi.Float
 
 
-def refracted_way(passage: Passage, si: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> Way:
+def refracted_way(passage: Passage, si: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> RefractedWay:
     """The way from points to targets through the panes between them; straight where there are none.
 
     Parameters
@@ -413,7 +413,7 @@ def refracted_way(passage: Passage, si: mi.SurfaceInteraction3f, target: mi.Poin
     (aim,) = dr.while_loop((start,), lambda aim: aim.active, lambda aim: (search.correct(aim),))
     seen = active & (aim.miss < _MET) & (dr.max(aim.part) > 0)
     apparent = target - aim.arriving * dr.sqrt(aim.squared)
-    return Way(aim.direction, apparent, aim.length, aim.part, aim.eta, seen)
+    return RefractedWay(aim.direction, apparent, aim.length, aim.part, aim.eta, seen)
 
 
 @dataclass
