@@ -2,7 +2,7 @@
 
 A turned mask, the light that waves leave behind a mask of many terms, and a picture of a point spread function have no
 short closed form; the geometric shadow of a mask of many terms has a long one. Each is drawn on square cells, a whole
-number of which is a sensor pixel seen on the mask, as :mod:`mitsim.optics.fft_shadow` needs them; a cell's value is
+number of which is a sensor pixel seen on the mask, as the correlation below needs them; a cell's value is
 its mean. A point at depth z and tan-angle tau then shades sensor point u by what the raster has at s = u (1 - d/z) + d
 tau, as every mask does.
 

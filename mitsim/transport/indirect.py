@@ -43,8 +43,7 @@ class IndirectTracer(FollowingTracer):
     adaptive: AdaptiveSamples | None = None
 
     def with_adaptive_counts(self, repeats: Sequence[int]) -> IndirectTracer:
-        """The same to one point of the sensor, blocks of pixels (:mod:`mitsim.transport.indirect`) as often as
-        ``repeats`` (blocks^2,) say."""
+        """The same to one point of the sensor, blocks of pixels as often as ``repeats`` (blocks^2,) say."""
         return self._with_counts(by_pixel(repeats, self.projector.n))
 
     def _with_counts(self, repeats: npt.NDArray[np.int64]) -> IndirectTracer:

@@ -3,8 +3,7 @@
 Rays are traced in Mitsuba's float32, which is good to about 1e-4 mm at the sensor: 1 % of a pixel, and as much error
 in a masked frame. So each hit is polished in float64: the ray is met with the tangent plane of the surface that was
 hit, and reflection or refraction is worked out again there. What is left is the surface's own place and normal in
-float32: nothing for a mirror that faces the axis squarely; round ones and smooth meshes are met in float64
-(:mod:`mitsim.transport.specular_rays`).
+float32: nothing for a mirror that faces the axis squarely; round ones and smooth meshes are met in float64 once more.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ Irradiance at sensor point u, in the units of the scene's radiance times steradi
 over t = (x/z, y/z) inside the field stop; M is the mask's transmission, d its distance, h its thickness (both faces
 count, a thin mask has one), cos^n a pixel's angular response, and the last factor is cos(theta) d omega written in t. A
 sample draws u inside its pixel's active square and a place where the mask's near face is open, evenly among all that
-the field stop shows from u (:mod:`mitsim.transport.plugins.lensless`), which makes t. It traces the ray from u and
+the field stop shows from u, which makes t. It traces the ray from u and
 returns weight p M(u + (d + h) t) cos^n (1 + |t|^2)^-2 (2 T)^2 times the fill factor, with T = tan(fov / 2) and p the
 part of the field stop that is open: irradiance is per pixel area. With t drawn over the whole field stop three of four
 rays would end at a separable mask. Where a plate is not open in a few grids, the place is drawn from a rectangle that
