@@ -1,9 +1,10 @@
 """Light that passes surfaces: from two points of a scene to the way between them and the part of the light it keeps.
 
 The hole of a cut-out (``mask``), a thin pane (``thindielectric``), a filter: their *null lobe* lets a part of the light
-go straight on as if nothing were there. Flat glass bends it, but to one way between two points only. No direction that is drawn at random tells such light from that of free space,
-so it is what it would be without the surface, weaker: direct light stays direct, and a light is looked for behind a
-hole as before it. Scenes without such surfaces keep a plain test of visibility."""
+go straight on as if nothing were there. Flat glass bends it, but to one way between two points only. No direction that
+is drawn at random tells such light from that of free space, so it is what it would be without the surface, weaker:
+direct light stays direct, and a light is looked for behind a hole as before it. Scenes without such surfaces keep a
+plain test of visibility."""
 
 from __future__ import annotations
 
