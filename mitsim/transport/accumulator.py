@@ -251,11 +251,6 @@ class DeviceAccumulator:
         found = Lit(np.array(lit), self._rows, self._bundle.size, self._bundle.lamps)
         return [DeviceSums(self, found, np.array(each)) for each in units]
 
-    def light(self, samples: int = 1) -> tuple[sparse.csr_array, float, float]:
-        """As :meth:`DeviceSums.light` of so many ``samples``, of the first line's sums that are there, which are
-        fetched."""
-        return self.fetch()[0].light(samples)
-
 
 @dataclass(frozen=True, eq=False)
 class DeviceSums:

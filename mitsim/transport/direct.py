@@ -405,6 +405,4 @@ class AimedTracer(DirectTracer):
         place = landing(self.setup, at.si, at.si.to_world(turn.wo), sharp & ~axis.known)
         # 1 / sqrt(pi q), q the density on the sensor.
         width = place.length * dr.rsqrt(dr.pi * turn.pdf * place.cosine)
-        found = _Axis(place.x, place.y, width, place.arrives)
-        chosen = (dr.select(place.arrives, getattr(found, name), getattr(axis, name)) for name in vars(axis))
-        return _Axis(*chosen), rng
+        return dr.select(place.arrives, _Axis(place.x, place.y, width, place.arrives), axis), rng

@@ -78,13 +78,10 @@ class Sightings:
         """
         total = self.value + more.value
         new = number * total < more.value
-        places = ((getattr(more, name), getattr(self, name)) for name in ("pixel", "row", "column", "inverse_depth"))
-        joined = Sightings(total, *(dr.select(new, theirs, mine) for theirs, mine in places))
-        if self.lines is not None and more.lines is not None:
-            own, drawn = (
-                dr.select(new, theirs, mine) for theirs, mine in ((more.value, self.value), (more.lines, self.lines))
-            )
-            joined.lines = dr.select(own == 0, 0, drawn * (total / own))
+        joined: Sightings = dr.select(new, more, self)
+        own, joined.value = joined.value, total
+        if joined.lines is not None:
+            joined.lines = dr.select(own == 0, 0, joined.lines * (total / own))
         return joined
 
     def by_line(self, lines: int) -> list[mi.Float]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -70,13 +70,6 @@ class Crossings:
     tangent: FloatArray
     throughput: FloatArray
 
-    @classmethod
-    def joined(cls, parts: Sequence[Crossings]) -> Crossings:
-        """All ``parts`` in one."""
-        pair = np.zeros((0, 2))
-        none = cls(np.zeros(0, np.int64), np.zeros(0, np.uint64), pair, pair, np.zeros(0))
-        return cls(*(np.concatenate([getattr(part, name) for part in (none, *parts)]) for name in vars(none)))
-
 
 @dataclass(frozen=True, eq=False)
 class _Rays:
@@ -89,9 +82,13 @@ class _Rays:
     chain: Chains
     spectrum: FloatArray
 
-    @classmethod
-    def joined(cls, parts: Sequence[_Rays]) -> _Rays:
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
+
+Some = TypeVar("Some", Crossings, _Rays)
+
+
+def _join(parts: Sequence[Some]) -> Some:
+    """All of one or more ``parts`` in one."""
+    return type(parts[0])(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
 
 
 class SpecularRays:
@@ -147,8 +144,8 @@ class SpecularRays:
             onward = self._bounce(rays, si, ~arrived & np.isfinite(distance))
             if not onward:
                 break
-            rays = _Rays.joined(onward)
-        return Crossings.joined(crossings)
+            rays = _join(onward)
+        return _join(crossings)
 
     def _intersect(self, rays: _Rays) -> mi.SurfaceInteraction3f:
         ray = mi.Ray3f(mi.Point3f(*device_vectors(rays.start)), mi.Vector3f(*device_vectors(rays.direction)))

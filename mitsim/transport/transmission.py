@@ -485,8 +485,9 @@ class _Search:
             turn(ray.direction_a), turn(ray.direction_b), ray.length + distance, ray.part * passed.part,
             ray.eta * passed.eta,
         )  # fmt: skip
-        chosen = {name: dr.select(before, getattr(refracted, name), getattr(ray, name)) for name in vars(ray)}
-        return _Ray(**{**chosen, "active": before})
+        chosen: _Ray = dr.select(before, refracted, ray)
+        chosen.active = before
+        return chosen
 
 
 # -------- Surfaces in contact with what lets light through

@@ -92,5 +92,5 @@ def test_the_middle_of_the_sharpest_lobe_is_light(bench: Bench, variant: str) ->
     accumulator = simulation.accumulator("anchor_residual", np.zeros(N * N, dtype=np.int64), 1)
     for place, light in enumerate([10 * brightest * board, 1e-5 * board]):
         accumulator.add([mi.Float(light)], mi.UInt32(0), mi.UInt32(place))
-    filed, *_ = accumulator.light()
+    filed, *_ = accumulator.fetch()[0].light()
     np.testing.assert_allclose(filed.toarray()[0, :2] / board, [10 * brightest, 1e-5], rtol=0.02)

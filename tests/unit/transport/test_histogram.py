@@ -181,7 +181,7 @@ def test_small_light_beside_great_light_is_counted() -> None:
     assert alone.accumulate(fetched, LABELS).sum() == 2.0**24 + 4096
     accumulator = DeviceAccumulator(alone, LABELS, one=2.0**24)
     accumulator.add([seen.value], seen.pixel, accumulator.place(seen, mi.Float(0.5)))
-    assert accumulator.light()[1] == 2.0**24 + 4096
+    assert accumulator.fetch()[0].light()[1] == 2.0**24 + 4096
 
 
 @pytest.mark.usefixtures("variant")
@@ -209,7 +209,7 @@ def test_ledgers_of_several_lines_are_fetched_together() -> None:
     for accumulator, some in zip(single, lit, strict=True):
         accumulator.add([light.value], light.pixel, place, some)
     for own, counted in zip(single, together.fetch(), strict=True):
-        (matrix, *sums), (expected, *own_sums) = counted.light(4), own.light(4)
+        (matrix, *sums), (expected, *own_sums) = counted.light(4), own.fetch()[0].light(4)
         assert np.array_equal(matrix.toarray(), expected.toarray()) and sums == own_sums
     for counted in together.fetch():
         assert counted.light()[1] == 0.0 and not counted.light()[0].nnz

@@ -139,7 +139,7 @@ def test_ledgers_hold_what_anchors_are_brought(beside: Bench, launch: int, monke
         assert np.array_equal(getattr(again, name), getattr(caustics, name)), name
     assert np.array_equal(caustics.value, host.value[host.kind == DIRECT]) and caustics.value.size
     expected = bundle.accumulate(host.where(host.kind == INDIRECT), labels)
-    found = whole.light()[0]
+    found = whole.fetch()[0].light()[0]
     # Which layer light is filed in is drawn: all layers together are the same.
     by_place = [np.asarray(light.toarray()).reshape(light.shape[0], 2, -1).sum(axis=1) for light in (expected, found)]
     near = np.isclose(*by_place, rtol=1e-5, atol=1e-7 * by_place[0].max())

@@ -156,7 +156,7 @@ def test_the_ledger_holds_what_the_host_files(shared_scene: Callable[..., Path],
     tracer = tracers(bench)[1]
     accumulator = DeviceAccumulator(bundle, labels, tracer.board)
     own = tracer.trace(3, 0, 512, accumulator)
-    matrix, received, outside = accumulator.light()
+    matrix, received, outside = accumulator.fetch()[0].light()
     every = tracer.trace(3, 0, 512)
     expected = bundle.accumulate(every, labels).toarray()
     found = (matrix + bundle.accumulate(own, labels)).toarray()
@@ -179,7 +179,7 @@ def test_the_ledger_holds_paths_of_their_own_at_every_anchor(shared_scene: Calla
     bundle, labels = Bundle(grid, 3, (400.0,)), np.arange(N * N) % 5
     accumulator = DeviceAccumulator(bundle, labels, tracer.board)
     rest = tracer.trace(3, 0, 64, accumulator)
-    matrix, received, outside = accumulator.light()
+    matrix, received, outside = accumulator.fetch()[0].light()
     every = tracer.trace(3, 0, 64)
     indirect = every.where(every.kind == INDIRECT)
     assert (len(rest.value) > 0) == mirrors and len(rest.value) + len(indirect.value) == len(every.value)
@@ -202,7 +202,7 @@ def test_light_that_is_not_a_number_is_refused(small_scene: Callable[..., Path])
         tracer.trace(0, 0, 256)
     tracer.trace(0, 0, 256, accumulator)
     with pytest.raises(MitsimError, match="NaN"):
-        accumulator.light()
+        accumulator.fetch()[0].light()
 
 
 _PRINT = """
@@ -218,7 +218,7 @@ tracer = tracers(bench)[1]
 bundle = Bundle(aligned_grid(*bench.windows, 16, 1, bench.geometry.tan_half_fov), 1, (450.0, 300.0))
 accumulator = DeviceAccumulator(bundle, np.arange(256) % 5, tracer.board)
 tracer.trace(3, 0, 256, accumulator)
-print(hashlib.sha256(accumulator.light()[0].toarray().tobytes()).hexdigest())
+print(hashlib.sha256(accumulator.fetch()[0].light()[0].toarray().tobytes()).hexdigest())
 """
 
 
