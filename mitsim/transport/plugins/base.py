@@ -1,4 +1,4 @@
-"""What plugins and tracers share: registration once for each variant, coordinates, and arrays on the host.
+"""What plugins and tracers share: the base of BSDFs, coordinates, arrays on the host, and random numbers.
 
 Index coordinates grow as rows and columns of images do: row = -y, column = -x in Mitsuba's camera frame, as lengths or
 as tan-angles.
@@ -7,7 +7,6 @@ as tan-angles.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from typing import Any, TypeAlias
 
 import drjit as dr
@@ -17,34 +16,6 @@ import numpy.typing as npt
 from pydantic import BaseModel
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
-
-_REGISTERED: set[tuple[str, str]] = set()
-
-
-def register_once(kind: str, plugin: str, build: Callable[[], type]) -> None:
-    """Make a plugin known to the current variant, unless it is.
-
-    Parameters
-    ----------
-    kind
-        "sensor", "emitter" or "bsdf".
-    plugin
-        name in scene files.
-    build
-        makes the class: Mitsuba's base classes exist per variant.
-
-    Raises
-    ------
-    MitsimError
-        when no variant is selected.
-    """
-    variant = mi.variant()
-    if variant is None:
-        raise MitsimError("no Mitsuba variant is selected; call mitsim.core.environment.load_variant first")
-    if (variant, plugin) not in _REGISTERED:
-        getattr(mi, f"register_{kind}")(plugin, build())
-        _REGISTERED.add((variant, plugin))
 
 
 def numbers(text: str) -> list[float]:

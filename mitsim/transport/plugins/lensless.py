@@ -71,7 +71,6 @@ from mitsim.devices.plate import Plate
 from mitsim.transport.plugins.base import (
     RIGID,
     generator,
-    register_once,
     rigidity_error,
     rows_columns,
     shuffled,
@@ -83,11 +82,6 @@ from mitsim.transport.plugins.base import (
 PLUGIN = "mitsim_lensless"
 _BOX_RADIUS = 0.5 + 1e-4
 """Radius [pixels] of a filter that keeps light in its pixel; Mitsuba's box says 0.5 in float32."""
-
-
-def register() -> None:
-    """Make ``mitsim_lensless`` known to the current variant; calling it again does nothing."""
-    register_once("sensor", PLUGIN, _sensor_class)
 
 
 def _geometry(props: mi.Properties, film: mi.Film) -> CameraGeometry:
@@ -111,7 +105,7 @@ def _check_rigid(transform: mi.AffineTransform4f) -> None:
         )
 
 
-def _sensor_class() -> type:
+def plugin_class() -> type:
     """The plugin for the variant in use: Mitsuba's base classes exist per variant."""
 
     class Lensless(mi.Sensor):  # type: ignore[misc]
