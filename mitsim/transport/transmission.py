@@ -485,9 +485,8 @@ class _Search:
             turn(ray.direction_a), turn(ray.direction_b), ray.length + distance, ray.part * passed.part,
             ray.eta * passed.eta,
         )  # fmt: skip
-        chosen: _Ray = dr.select(before, refracted, ray)
-        chosen.active = before
-        return chosen
+        chosen = {name: dr.select(before, getattr(refracted, name), getattr(ray, name)) for name in vars(ray)}
+        return _Ray(**{**chosen, "active": before})
 
 
 # -------- Surfaces in contact with what lets light through
