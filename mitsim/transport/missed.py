@@ -317,9 +317,8 @@ def _radiance_toward(
     active = si.is_valid() & ~scene.ray_test(si.spawn_ray_to(target))
     value, density = si.bsdf().eval_pdf(context, si, way, active)
     count = len(aimed)
-    light = channels(mi.unpolarized_spectrum(dr.select(active & (density > _LEAST_SHARP), value, 0)), count).mean(
-        axis=1
-    )
+    sharp = dr.select(active & (density > _LEAST_SHARP), value, 0)
+    light = channels(mi.unpolarized_spectrum(sharp), count).mean(axis=1)
     met = np.linalg.norm(vectors(si.p, count) - aimed, axis=1) < _ON_BALL * radius + 1e-4 * np.abs(aimed).max(axis=1)
     return light * met, host_values(dr.abs(mi.Frame3f.cos_theta(si.wi)), count)
 
