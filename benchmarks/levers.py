@@ -35,7 +35,6 @@ from mitsim.api.bench import Bench
 from mitsim.devices.patterns import PatternFamily, parse_patterns
 from mitsim.light.grids import LightEstimate
 from mitsim.light.simulation import Simulation
-from mitsim.transport.accumulator import fetched
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.indirect import adaptive_counts, block_moments
 from mitsim.transport.records import INDIRECT
@@ -90,9 +89,9 @@ def traced(
     simulation: Simulation, name: str, labels: np.ndarray, seed: int, samples: int, device: bool
 ) -> LightEstimate:
     """Light of one group, per sample."""
-    accumulators = simulation.accumulators(name, labels, 1) if device else ()
-    light = simulation.accumulate(name, simulation.passes[name].trace(seed, 0, samples, accumulators), labels, samples)
-    for sums in fetched(accumulators) if accumulators else ():
+    accumulator = simulation.accumulator(name, labels, 1) if device else None
+    light = simulation.accumulate(name, simulation.passes[name].trace(seed, 0, samples, accumulator), labels, samples)
+    for sums in accumulator.fetch() if accumulator else ():
         light = light + simulation.accumulate(name, sums, labels, samples)
     dr.sync_thread()
     return light

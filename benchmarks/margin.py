@@ -29,9 +29,8 @@ import numpy as np
 import mitsim as ms
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.metrics import psnr
-from mitsim.optics.separable import best_term
 from mitsim.optics.shadow import Directions
-from mitsim.optics.terms import shadow_terms
+from mitsim.optics.terms import best_term, shadow_terms
 from mitsim.reconstruct.solver import prepare
 from mitsim.studies.framework.setup import SIDE, TEST_IMAGES, picture
 

@@ -21,9 +21,8 @@ from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.plate import Plate
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.image_formation import FrameOptics, raster_error
-from mitsim.optics.separable import best_term
 from mitsim.optics.shadow import Directions, ShadowGeometry, geometric_terms
-from mitsim.optics.terms import shadow_terms, tilted_terms
+from mitsim.optics.terms import best_term, shadow_terms, tilted_terms
 
 N, HALF = 128, 60 / 400
 DEPTH_MM = 400.0

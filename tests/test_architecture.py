@@ -411,7 +411,7 @@ KNOWS_BACKENDS = {
 }
 SUMS = {"sum", "mean", "prod", "prefix_sum", "cumsum", "block_sum", "block_reduce", "block_prefix_sum", "reduce"}
 OF_A_LANE = {
-    "mitsim.transport.sampler": "the channels of a spectrum",
+    "mitsim.transport.plugins.base": "the channels of a spectrum",
     "mitsim.transport.plugins.grating": "the orders of a grating",
 }
 

@@ -22,7 +22,7 @@ from mitsim.devices.drift import Drift
 from mitsim.devices.patterns import PatternFamily
 from mitsim.devices.sensor import SensorModel
 from mitsim.optics.frames import Frame
-from mitsim.scene.window import window_at
+from mitsim.scene.load import window_at
 from mitsim.sensor.chain import Digital, ripple_level, ripple_response
 
 _OF_TERMS = ("mask_rotation_mrad", "mask_tilt_rows_mrad", "mask_tilt_columns_mrad", "vibration_um")

@@ -23,8 +23,8 @@ from mitsim.devices.camera import Rig
 from mitsim.devices.patterns import PatternFamily, Shot
 from mitsim.devices.sensor import SensorModel
 from mitsim.light.settings import GROUPS, Estimate
+from mitsim.optics.forming import bound_of
 from mitsim.optics.frames import ExpectedFrames, Frame
-from mitsim.optics.replicates import bound_of
 from mitsim.optics.speckle import add_speckle
 from mitsim.planner.memory import frames_at_once
 from mitsim.sensor.chain import Digital, dn_to_electrons, electrons_from_irradiance, expose

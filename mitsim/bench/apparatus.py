@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from mitsim.devices.projector import Lines, ProjectorModel, Spectrum
     from mitsim.devices.sensor import SensorModel
     from mitsim.scene.load import LoadedScene
+    from mitsim.transport.connect import OpticalSetup
     from mitsim.transport.projector import ProjectorOptics
 
 
@@ -111,6 +112,13 @@ class Apparatus:
         )
 
     @property
+    def setup(self) -> OpticalSetup:
+        """What light is traced in."""
+        from mitsim.transport.connect import OpticalSetup
+
+        return OpticalSetup(self.loaded.scene, self.loaded.camera, self.projector_optics, self.geometry)
+
+    @property
     def spectrum(self) -> Spectrum:
         """The projector's photons by wavelength."""
         return self.projector.spectrum
@@ -143,7 +151,7 @@ class Apparatus:
         if depth == self.geometry.scene_distance:
             return self.windows
         if depth not in self._windows:
-            from mitsim.scene.window import window_at
+            from mitsim.scene.load import window_at
 
             loaded = self.loaded
             found = window_at(str(loaded.path), loaded.projector, loaded.camera, loaded.pixels, depth)

@@ -15,7 +15,7 @@ from mitsim.bench.open import Opened
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError
 from mitsim.devices.session import CELLS, BoardShape
-from mitsim.scene.estimators import Unfit
+from mitsim.scene.limits import Unfit
 from mitsim.transport.plugins.base import host_values, turn_and_origin
 from mitsim.transport.projector import PinholeRays
 

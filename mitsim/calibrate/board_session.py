@@ -33,9 +33,8 @@ from mitsim.light.plan import Plan
 from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation
 from mitsim.optics.frames import Frame, at_once, mixes
-from mitsim.optics.separable import best_term, centred
 from mitsim.optics.shadow import Directions, SeparableTerms
-from mitsim.optics.terms import shadow_terms
+from mitsim.optics.terms import best_term, centred, shadow_terms
 from mitsim.planner.memory import frame_seconds, frames_at_once, light_bytes
 from mitsim.planner.planner import make_plan
 from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, decibels

@@ -43,7 +43,7 @@ from mitsim.devices.session import SIDES, load_recipe
 from mitsim.light.light import SampledLight
 from mitsim.light.plan import Plan
 from mitsim.optics.frames import Frame
-from mitsim.optics.separable import Lacking, lacking
+from mitsim.optics.terms import Lacking, lacking
 from mitsim.reconstruct.colour import behind
 from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, Estimate, ResponseFit, StripeSums, stripe_sums
 from mitsim.reconstruct.factors import Factors, load_calibration

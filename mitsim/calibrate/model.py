@@ -32,7 +32,7 @@ from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import SIDES, UNITS, Model, Modelling, SessionRecipe, Side, frames_of, load_recipe
 from mitsim.optics.camera_model import ModelledCamera
 from mitsim.optics.frames import Frame
-from mitsim.optics.separable import best_term
+from mitsim.optics.terms import best_term
 from mitsim.reconstruct.captured_session import chosen_responses
 from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, decibels, squared_condition
 from mitsim.reconstruct.factors import Factors

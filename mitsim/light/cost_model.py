@@ -19,8 +19,8 @@ from mitsim.devices.plate import FEW
 from mitsim.light.passes import PASSES
 from mitsim.light.pilot_result import Forming, PilotResult, SampleCost
 from mitsim.light.settings import GROUPS, Number, Settings
+from mitsim.optics.forming import PROBES
 from mitsim.optics.frames import formed_frames, mixes
-from mitsim.optics.replicates import PROBES
 from mitsim.transport.accumulator import MOST_PLACES
 
 ROUNDS, CHECKED_SHOTS = 1.5, 16

@@ -26,8 +26,8 @@ from mitsim.light.sampling import Group, first_samples, next_samples, trace_grou
 from mitsim.light.settings import GROUPS, MOST_PATHS, Estimate, Settings
 from mitsim.light.simulation import Simulation, expected_of
 from mitsim.light.truth import Truth, trace_truth
+from mitsim.optics.forming import bound_of, shares_of_bound
 from mitsim.optics.frames import ExpectedFrames
-from mitsim.optics.replicates import bound_of, shares_of_bound
 
 Target = Callable[[ExpectedFrames], float]
 """The relative Monte Carlo error to stop at, from the frames seen so far."""

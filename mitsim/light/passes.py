@@ -18,12 +18,12 @@ from mitsim.bench.effects import names
 from mitsim.core.arrays import Labels
 from mitsim.light.grids import Grids
 from mitsim.light.settings import Number, Settings
-from mitsim.transport.connect import SensorPoints
-from mitsim.transport.direct import DirectTracer
-from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer, LampResponse, LampTracer, Paths
+from mitsim.transport.connect import OpticalSetup, SensorPoints
+from mitsim.transport.direct import AimedTracer, DirectTracer
+from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer, LampResponse, LampTracer
 from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.integrator import Paths
 from mitsim.transport.path_reuse import PathReuseTracer
-from mitsim.transport.sharp_lobes import AimedTracer
 
 # -------- What traces
 
@@ -35,6 +35,11 @@ PassTracer = DirectTracer | IndirectTracer | FromCamera
 
 class Tracers(Grids):
     """What is traced of a bench with settings; its parameters are those of :class:`mitsim.light.grids.Grids`."""
+
+    @cached_property
+    def setup(self) -> OpticalSetup:
+        """What light is traced in."""
+        return replace(self.bench.setup, projector=self.physics.projector, geometry=self.physics.geometry)
 
     # ---- Direct light
 
@@ -64,18 +69,15 @@ class Tracers(Grids):
     @cached_property
     def sharp(self) -> AimedTracer | None:
         """Follows direct light of the sharp pixels to their anchors; none where there are none."""
-        loaded, physics, sharp = self.bench.loaded, self.physics, self.settings.sharp
-        if sharp is None:
-            return None
-        parts = loaded.scene, loaded.camera, physics.projector, sharp.anchors, physics.geometry
-        return AimedTracer(*parts, np.array(sharp.pixels))
+        sharp = self.settings.sharp
+        return AimedTracer(self.setup, sharp.anchors, np.array(sharp.pixels)) if sharp else None
 
     def _direct(self, anchors: int, without: Labels | tuple[int, ...] = (), spread: bool = False) -> DirectTracer:
         """Of all pixels that are not sharp, ``without`` some."""
-        loaded, physics, sharp = self.bench.loaded, self.physics, self.settings.sharp
+        sharp = self.settings.sharp
         absent = np.union1d(without, sharp.pixels if sharp else ()).astype(np.int64)
         pixels = np.setdiff1d(np.arange(self.bench.n**2), absent) if len(absent) else None
-        return DirectTracer(loaded.scene, loaded.camera, physics.projector, anchors, physics.geometry, spread, pixels)
+        return DirectTracer(self.setup, anchors, spread, pixels)
 
     # ---- Light that is followed further
 
@@ -114,21 +116,18 @@ class Tracers(Grids):
         return SensorPoints(self.physics.geometry.half_width, anchors, spread, self.settings.depth)
 
     def _indirect(self, points: SensorPoints, shared: bool = False) -> IndirectTracer | None:
-        loaded, physics = self.bench.loaded, self.physics
-        paths = physics.mirrors, physics.interreflection
-        if not any(paths):
+        paths = Paths(self.physics.mirrors, self.physics.interreflection)
+        if not (paths.mirrors or paths.interreflection):
             return None
-        parts = loaded.scene, loaded.camera, physics.projector, *paths, physics.geometry, points
-        return PathReuseTracer(*parts) if shared else IndirectTracer(*parts)
+        return (PathReuseTracer if shared else IndirectTracer)(self.setup, paths, points)
 
     def _from_camera(self, points: SensorPoints) -> FromCamera | None:
-        loaded, physics, counted_lamps = self.bench.loaded, self.physics, self.bench.counted_lamps
+        physics, counted_lamps = self.physics, self.bench.counted_lamps
         of_projector = self._from_camera_of_projector
         if not (physics.lamps or of_projector):
             return None
         paths = Paths(physics.mirrors, physics.interreflection, physics.lamps)
-        parts = loaded.scene, loaded.camera, physics.projector
-        tracer = FromCameraTracer(*parts, self.aim, paths, physics.geometry, points)
+        tracer = FromCameraTracer(self.setup, self.aim, paths, points)
         if counted_lamps is None or not physics.lamps:
             return tracer
         # Lamps have wavelengths of their own, and filters of each colour count them on their own.
@@ -139,7 +138,7 @@ class Tracers(Grids):
             own = [unit * response.part for unit in units]
             lamps.append(LampTracer(tracer, LampResponse(response, counted_lamps.bands[rows], own, rows.start)))
         if of_projector:
-            lamps.insert(0, FromCameraTracer(*parts, self.aim, replace(paths, emitters=()), physics.geometry, points))
+            lamps.insert(0, FromCameraTracer(self.setup, self.aim, replace(paths, emitters=()), points))
         return lamps[0] if len(lamps) == 1 else CombinedTracer(*lamps)
 
 

@@ -238,7 +238,7 @@ class PilotResult:
     apart
         effects that are no part of the expected frames, with the independent error of leaving each out.
     unresolved
-        part of the direct light in lobes that sampling would miss (:mod:`mitsim.transport.sharp_lobes`).
+        part of the direct light in lobes that sampling would miss (:mod:`mitsim.transport.missed`).
     shared, repeats
         as in :class:`mitsim.light.settings.Settings`, where that takes less for as little noise: what indirect light
         takes is then of that.

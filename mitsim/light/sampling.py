@@ -21,7 +21,7 @@ from mitsim.light.grids import LightEstimate
 from mitsim.light.passes import EVEN, PASSES, even
 from mitsim.light.settings import GROUPS, PATHS_AT_ONCE
 from mitsim.light.simulation import Simulation
-from mitsim.transport.accumulator import DeviceSums, fetched
+from mitsim.transport.accumulator import DeviceSums
 from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.records import PathSamples
 
@@ -89,21 +89,19 @@ class Group:
             samples = wanted.get(name, 0)
             if self.done.get(name, 0) >= samples:
                 continue
-            seed, accumulators = (
-                integer(self.seed, each.row.stream),
-                self.simulation.accumulators(name, self.labels, self._lines),
-            )
+            seed = integer(self.seed, each.row.stream)
+            accumulator = self.simulation.accumulator(name, self.labels, self._lines)
             if name in self.done:
                 accumulating.wait()
                 self._spread(name, samples / self.done[name])
             while (done := self.done.get(name, 0)) < samples:
                 count = min(max(1, at_once // each.tracer.paths_per_sample), samples - done)
-                path_samples = each.trace(seed, done, count, accumulators)
+                path_samples = each.trace(seed, done, count, accumulator)
                 accumulating.give(self._accumulations(name, path_samples.by_line(self._lines), samples))
                 self.done[name] = done + count
                 self.paths += count * each.tracer.paths_per_sample
-            if accumulators:
-                accumulating.give(self._accumulations(name, fetched(accumulators), samples))
+            if accumulator is not None:
+                accumulating.give(self._accumulations(name, accumulator.fetch(), samples))
 
     def _accumulations(
         self, name: str, by_line: Sequence[PathSamples | DeviceSums], samples: int

@@ -45,20 +45,20 @@ class TracedPass:
         """Samples of a group with which the prediction is kept."""
         return int(self.row.whole(self.predicted))
 
-    def trace(self, seed: int, first: int, samples: int, accumulators: Sequence[DeviceAccumulator] = ()) -> PathSamples:
-        """Light of some samples, but for what is added up in the ``accumulators``.
+    def trace(self, seed: int, first: int, samples: int, accumulator: DeviceAccumulator | None = None) -> PathSamples:
+        """Light of some samples, but for what is added up in the ``accumulator``.
 
         Parameters
         ----------
         seed, first, samples
             as for :meth:`mitsim.transport.integrator.Tracer.trace`.
-        accumulators
-            of :meth:`Simulation.accumulators`.
+        accumulator
+            of :meth:`Simulation.accumulator`.
         """
-        if not accumulators:
+        if accumulator is None:
             return self.tracer.trace(seed, first, samples)
         assert isinstance(self.tracer, DirectTracer | IndirectTracer), "the others have none"
-        return self.tracer.trace_into(accumulators, seed, first, samples)
+        return self.tracer.trace(seed, first, samples, accumulator)
 
 
 class Simulation(Tracers):
@@ -91,8 +91,8 @@ class Simulation(Tracers):
 
     # ---- Accumulation
 
-    def accumulators(self, name: str, labels: Labels, lines: int) -> tuple[DeviceAccumulator, ...]:
-        """What light of each line is added up in on the device; none where the pass has none, or no room.
+    def accumulator(self, name: str, labels: Labels, lines: int) -> DeviceAccumulator | None:
+        """What light of the lines is added up in on the device; none where the pass has none, or no room.
 
         Parameters
         ----------
@@ -105,15 +105,15 @@ class Simulation(Tracers):
         """
         each, bundle = self.passes[name], self.grids[PASSES[name].grids[-1]].bundle
         if not each.row.device:
-            return ()
+            return None
         assert isinstance(each.tracer, DirectTracer | IndirectTracer), "has sums on the device"
         paths = each.predicted * each.tracer.paths_per_sample if each.row.device == "pays" else math.inf
         if each.row.flux:  # which is told pixel by pixel
             pixels, labels = self._pixels_of(each.row), np.zeros_like(labels)
             labels[pixels] = np.arange(len(pixels))
         if not DeviceAccumulator.holds(bundle, labels, lines, paths):
-            return ()
-        return DeviceAccumulator.of_lines(lines, bundle, labels, each.tracer.board)
+            return None
+        return DeviceAccumulator(bundle, labels, each.tracer.board, lines)
 
     def accumulate(self, name: str, found: PathSamples | DeviceSums, labels: Labels, samples: int) -> LightEstimate:
         """Light of a pass per sample: by grid, beyond its mean over the anchors where these have a residual.
@@ -123,7 +123,7 @@ class Simulation(Tracers):
         name
             of the pass.
         found
-            paths' light on the host, or sums of :meth:`accumulators`.
+            paths' light on the host, or sums of an :meth:`accumulator`.
         labels
             (n^2,) class of each projector pixel.
         samples

@@ -7,7 +7,7 @@ where the frames' light is noisy tells where the truth is to be sampled.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -117,7 +117,8 @@ class _Flux:
 
     def __init__(self, bench: Apparatus, effects: frozenset[str], seed: int, name: str, samples: int) -> None:
         physics, loaded, pixels = Physics.simulated(bench, effects), bench.loaded, bench.n**2
-        self._tracer = FluxTracer(loaded.scene, loaded.camera, physics.projector, physics.geometry, loaded.glossy)
+        setup = replace(bench.setup, projector=physics.projector, geometry=physics.geometry)
+        self._tracer = FluxTracer(setup, loaded.glossy)
         self._seed = integer(seed, "truth", name)
         lines = len(bench.lines.shares) if physics.projector.by_line and bench.lines else 1
         self._sums, self._samples = np.zeros((lines, TRUTH_GROUPS, pixels)), np.zeros(pixels, np.int64)

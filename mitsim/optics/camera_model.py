@@ -22,9 +22,8 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Spectrum
-from mitsim.optics.separable import best_term, centred
 from mitsim.optics.shadow import Directions, SeparableTerms
-from mitsim.optics.terms import shadow_terms
+from mitsim.optics.terms import best_term, centred, shadow_terms
 
 _ANGLE = 2.0
 """Half the power of a cosine that light of a flat board to a flat sensor falls with: four."""

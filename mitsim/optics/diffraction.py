@@ -39,14 +39,7 @@ from mitsim.devices.mask import Mask
 from mitsim.devices.plate import FEW, Plate
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.edge_profile import Steps, smooth_box_means
-from mitsim.optics.shadow import (
-    Directions,
-    SeparableTerms,
-    ShadowGeometry,
-    both_axes,
-    lagrange_weights,
-    nodes_between,
-)
+from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, both_axes, lagrange_weights, nodes_between
 
 ComplexArray = npt.NDArray[np.complex128]
 _STEP_MM = 2.5e-4

@@ -2,7 +2,7 @@
 
 A turned mask, the light that waves leave behind a mask of many terms, and a picture of a point spread function have no
 short closed form; the geometric shadow of a mask of many terms has a long one. Each is drawn on square cells, a whole
-number of which is a sensor pixel seen on the mask, as :mod:`mitsim.optics.fft_shadow` needs them; a cell's value is
+number of which is a sensor pixel seen on the mask, as the correlation below needs them; a cell's value is
 its mean. A point at depth z and tan-angle tau then shades sensor point u by what the raster has at s = u (1 - d/z) + d
 tau, as every mask does.
 
@@ -17,7 +17,7 @@ Behind a turned mask there is the same light, turned.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import cast
 
@@ -328,12 +328,15 @@ class Correlation:
         return cells.reshape(len(cells) // rows, rows, -1, columns).transpose(1, 3, 0, 2)
 
 
+@dataclass(frozen=True, eq=False)
 class _Side:
     """One axis: its pixels, raster cells in each of them, the first cell that pixel 0 sees, and how it weighs them
     (cells, c) for each direction."""
 
-    def __init__(self, pixels: int, phases: int, first: int, weights: FloatArray) -> None:
-        self.pixels, self.phases, self.first, self.weights = pixels, phases, first, weights
+    pixels: int
+    phases: int
+    first: int
+    weights: FloatArray
 
     @classmethod
     def of(cls, shadow: ShadowGeometry, directions: Directions) -> _Side:
@@ -367,7 +370,7 @@ def _part(values: FloatArray, first: int, count: int) -> FloatArray:
     return result
 
 
-# -------- A mask as functions that can be asked for means
+# -------- Samplers of a mask: functions that can be asked for means
 # A term is ``(weight, row sampler, column sampler)``. A sampler takes arrays of centres s and widths w (mm, index
 # coordinates in the mask plane) and of tan-angles t, and gives the mean over each [s - w/2, s + w/2] of a mask
 # profile for light that comes under t. :func:`geometric_samplers` makes them for a thin mask's geometric shadow,

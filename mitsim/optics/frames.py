@@ -1,6 +1,6 @@
 """Frames of a family: from light of its classes to the expected irradiance of every shot, and its Monte Carlo error.
 
-Frames are formed by :mod:`mitsim.optics.forming`; their error is told by :mod:`mitsim.optics.replicates`.
+Frames are formed, and their error told, by :mod:`mitsim.optics.forming`.
 """
 
 from __future__ import annotations
@@ -17,9 +17,18 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.parallel import in_threads
 from mitsim.devices.camera import side_of
 from mitsim.devices.patterns import Lighting
-from mitsim.optics.forming import Filed, Mixture, form_frames, mix_frames, pair_shots, probe_frames
+from mitsim.optics.forming import (
+    Filed,
+    Mixture,
+    bound_of,
+    form_frames,
+    mix_frames,
+    noise_of_groups,
+    pair_shots,
+    probe_frames,
+    probe_vectors,
+)
 from mitsim.optics.image_formation import IntArray
-from mitsim.optics.replicates import bound_of, noise_of_groups, probe_vectors
 
 _AT_ONCE, _BYTES_AT_ONCE = 32, 2**27
 """Frames formed at a time: enough to keep all processors busy; and their bytes, where fewer have as many: 4 frames of a
@@ -76,7 +85,7 @@ class ClassFrames:
     irradiance: FloatArray
 
 
-# ---- How many frames are held ----
+# -------- How many frames are held
 
 
 def at_once(pixels: float) -> int:
@@ -117,7 +126,7 @@ def mixes(classes: int, shots: int, pixels: float) -> bool:
     return classes <= min(_LARGEST_BASIS, shots, _BASIS_BYTES // (_FLOAT * pixels**2))
 
 
-# ---- All frames of a family ----
+# -------- All frames of a family
 
 
 class ExpectedFrames:
@@ -374,7 +383,7 @@ class ExpectedFrames:
         return in_threads(frame_of, range(len(irradiance)))
 
 
-# ---- The error of frames that were formed ----
+# -------- The error of frames that were formed
 
 
 def monte_carlo_error(frames: Sequence[Frame] | ExpectedFrames) -> float:

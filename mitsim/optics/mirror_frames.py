@@ -105,11 +105,7 @@ class SpecularFrames(ClassFrames):
 
 
 def specular_frames(
-    beams: Beams,
-    geometry: CameraGeometry,
-    terms: Sequence[SampledTerm],
-    labels: IntArray,
-    boxes_per_pixel: int = 2,
+    beams: Beams, geometry: CameraGeometry, terms: Sequence[SampledTerm], labels: IntArray, boxes_per_pixel: int = 2
 ) -> SpecularFrames:
     """Frames of the classes that mirrors bring to the sensor; memory is one frame for each of them.
 

@@ -37,7 +37,7 @@ from mitsim.light.cost_model import (
 from mitsim.light.passes import FOLLOWED, PASSES
 from mitsim.light.pilot_result import COUNTED, SURE, Approximation, PilotResult, SampleCost
 from mitsim.light.settings import GROUPS, Estimate, Number, Settings
-from mitsim.optics.replicates import bound_over_error
+from mitsim.optics.forming import bound_over_error
 
 _MARGIN = 0.95
 """Part of the accuracy that is planned for: frames that the pilot looks at differ from all by a few percent, and so do

@@ -462,7 +462,7 @@ def unseen_lamps(loaded: LoadedScene, paths: float, estimator: str) -> Iterator[
     estimator
         whose they are, in words.
     """
-    from mitsim.transport.missed import part_of_view, shines_in
+    from mitsim.transport.connect import part_of_view, shines_in
 
     for lamp, tag in loaded.small_lamps:
         if shines_in(loaded.scene, loaded.camera, lamp):

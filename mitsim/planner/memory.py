@@ -15,8 +15,8 @@ from mitsim.light.cost_model import Numbers, entries
 from mitsim.light.settings import GROUPS, Settings
 from mitsim.light.simulation import Simulation
 from mitsim.optics.fft_shadow import cells_a_side, cells_per_pixel, points_per_cell
+from mitsim.optics.forming import PROBES
 from mitsim.optics.frames import frames_in_memory
-from mitsim.optics.replicates import PROBES
 
 _LAUNCH_BYTES = 380e6
 """Paths in flight, compiled kernels, LLVM; measured about 350e6, once a little above it."""

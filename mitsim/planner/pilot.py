@@ -34,9 +34,8 @@ from mitsim.planner.pilot_anchors import AnchorRuns, FollowedRuns, PenumbraRuns
 from mitsim.planner.pilot_direct import SMOOTH, DirectRuns, occluded_pixels, sharp_pixels
 from mitsim.planner.pilot_effects import EffectRuns
 from mitsim.planner.pilot_samples import GOOD_ENOUGH, Sample
-from mitsim.scene.darkness import why_dark
-from mitsim.transport.missed import LeftOut, highlights, left_out_light
-from mitsim.transport.sharp_lobes import SharpLight, sharp_light, with_neighbours
+from mitsim.scene.load import why_dark
+from mitsim.transport.missed import LeftOut, SharpLight, highlights, left_out_light, sharp_light, with_neighbours
 
 RUNS = ("cells", "effects", "anchors", "followed", "occluded")
 """What is looked at apart: cells and layers of direct light, effects switched off, anchors, those of followed light,
@@ -267,10 +266,9 @@ class PilotRuns:
     @property
     def _unmet(self) -> float:
         """Irradiance of glossy balls' highlights that neither the search for lobes nor the looks' rays meet."""
-        loaded, geometry = self.bench.loaded, self.bench.geometry
-        if not loaded.glossy:
+        if not self.bench.loaded.glossy:
             return 0.0
-        every = highlights(loaded.scene, loaded.camera, self._seen.physics.projector, geometry)
+        every = highlights(self._seen.setup)
         unmet = every.unmet(self.samples["cells"].fine * REPLICATES)
         if not len(unmet.pixels):
             return 0.0
@@ -379,22 +377,18 @@ def _enough(sample: Sample, hits: float, bench: Apparatus) -> Sample:
 
 def _sharp(simulation: Simulation, seed: int) -> SharpLight:
     """Direct light over lobes that are too sharp to be met by connections."""
-    loaded = simulation.bench.loaded
-    if not loaded.glossy:
-        return SharpLight.none(simulation.bench.n**2)
-    parts = loaded.scene, loaded.camera, simulation.physics.projector, simulation.physics.geometry
-    return sharp_light(*parts, integer(seed, "pilot", "lobes"), max(1, _LOBE_RAYS // simulation.bench.n**2))
+    pixels = simulation.bench.n**2
+    if not simulation.bench.loaded.glossy:
+        return SharpLight.none(pixels)
+    return sharp_light(simulation.setup, integer(seed, "pilot", "lobes"), max(1, _LOBE_RAYS // pixels))
 
 
 def _left_out(simulation: Simulation, seed: int) -> LeftOut:
     """Light that no tracer finds, or connections may not meet."""
-    loaded, physics = simulation.bench.loaded, simulation.physics
-    if not loaded.mirrors:
+    if not simulation.bench.loaded.mirrors:
         return LeftOut.none()
     samples = max(1, _CAUSTIC_PATHS // (simulation.aim.shape[0] * simulation.aim.shape[1]))
-    own = integer(seed, "pilot", "caustics")
-    parts = loaded.scene, loaded.camera, physics.projector, simulation.aim
-    return left_out_light(*parts, physics.geometry, own, samples)
+    return left_out_light(simulation.setup, simulation.aim, integer(seed, "pilot", "caustics"), samples)
 
 
 # ---- Where light is first seen, and how many rays bring it ----

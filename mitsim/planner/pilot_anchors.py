@@ -154,7 +154,8 @@ class AnchorRuns:
     def _trace(self, simulation: Simulation) -> list[PathSamples]:
         """Light to every anchor, replicate by replicate."""
         anchors = self._grids(simulation)[0].bundle.anchors
-        return tracer_of(simulation, self.pixels, anchors).trace_replicates(self._seeds, self._samples)
+        tracer = tracer_of(simulation, self.pixels, anchors)
+        return [tracer.trace(seed, 0, self._samples) for seed in self._seeds]
 
     def _form(self, grids: Sequence[Grid], replicates: Sequence[PathSamples], samples: int | None = None) -> FloatArray:
         """(replicates, shots, places, places) frames of light in ``grids``; of so many ``samples``, if not of as many
@@ -245,7 +246,7 @@ class FollowedRuns(AnchorRuns):
     def _few_by_tracer(self) -> list[list[PathSamples]]:
         """The same by tracer."""
         tracers = _tracers(self._simulation(self.few))
-        return [tracer.trace_replicates(self._seeds, self._samples) for tracer in tracers]
+        return [[tracer.trace(seed, 0, self._samples) for seed in self._seeds] for tracer in tracers]
 
     def _at_anchors(self, anchors: int) -> FloatArray:
         simulation, samples = self._simulation(anchors), self._samples
@@ -256,12 +257,7 @@ class FollowedRuns(AnchorRuns):
         found = []
         for first in range(0, samples, each):
             some = min(each, samples - first)
-            traced = [
-                tracer.trace_replicates(self._seeds, some)
-                if some == samples
-                else [tracer.trace(seed, first, some) for seed in self._seeds]
-                for tracer in tracers
-            ]
+            traced = [[tracer.trace(seed, first, some) for seed in self._seeds] for tracer in tracers]
             found.append(self._form(grids, _join(traced)))
         return np.asarray(sum(found))
 

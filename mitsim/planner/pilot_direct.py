@@ -28,8 +28,8 @@ from mitsim.optics.image_formation import raster_error
 from mitsim.planner.memory import cells_to_choose, drawing_seconds
 from mitsim.planner.pilot_samples import EVEN_CELLS, GOOD_ENOUGH, Sample, ladder, noise, norm
 from mitsim.transport.direct import DirectTracer
+from mitsim.transport.missed import SharpLight, with_neighbours
 from mitsim.transport.records import PathSamples
-from mitsim.transport.sharp_lobes import SharpLight, with_neighbours
 
 LAYER_LADDER, CELL_LADDER = (1, 2, 3, 4, 6, 8, 12), (1, 2, 4, 8)
 """Numbers that are tried, each step about half the error of the one before or less."""
@@ -75,9 +75,13 @@ class DirectRuns:
         self._seeds = [integer(seed, "pilot", "fine", replicate) for replicate in range(REPLICATES)]
         self._simulation = simulation = sample.simulation(bench, base)
         self._tracer = tracer_of(simulation, shown_pixels(base, sample), base.anchors)
-        self._path_samples = self._tracer.trace_replicates(self._seeds, sample.fine)
+        self._path_samples = self._trace(self._tracer, sample.fine)
         apart, samples = simulation.sharp, sample.sharp(simulation)
-        self._sharp = apart.trace_replicates(self._seeds, samples) if apart else []
+        self._sharp = self._trace(apart, samples) if apart else []
+
+    def _trace(self, tracer: DirectTracer, samples: int) -> list[PathSamples]:
+        """Replicates of a tracer's light."""
+        return [tracer.trace(seed, 0, samples) for seed in self._seeds]
 
     @property
     def judging(self) -> tuple[float, ...]:
@@ -147,12 +151,12 @@ class DirectRuns:
     @cached_property
     def _spread_noise(self) -> tuple[float, float]:
         tracer = tracer_of(self._simulation, shown_pixels(self.base, self.sample), 1, spread=True)
-        seen = tracer.trace_replicates(self._seeds, self.sample.fine)
+        seen = self._trace(tracer, self.sample.fine)
         return self._noise_of(tracer, self._form(self._simulation, seen, self.sample.fine))
 
     def _noise_of(self, tracer: DirectTracer, many: FloatArray) -> tuple[float, float]:
         """Error of a replicate of the ``tracer`` whose frames of all samples are ``many``, and of one with fewer."""
-        few = tracer.trace_replicates(self._seeds, self._fewer)
+        few = self._trace(tracer, self._fewer)
         return noise(many), noise(self._form(self._simulation, few, self._fewer))
 
     def forming(self, family: Lighting) -> Forming:
@@ -250,9 +254,7 @@ def tracer_of(simulation: Simulation, pixels: Labels, anchors: int, spread: bool
     anchors, spread
         to so many anchors a side, or spread over the sensor.
     """
-    loaded, physics = simulation.bench.loaded, simulation.physics
-    parts = loaded.scene, loaded.camera, physics.projector, anchors, physics.geometry
-    return DirectTracer(*parts, spread=spread, pixels=pixels)
+    return DirectTracer(simulation.setup, anchors, spread, pixels)
 
 
 # -------- Projector pixels whose light is hidden from part of the sensor
@@ -328,8 +330,7 @@ def _roughness(simulation: Simulation, pixels: Labels, samples: int, seed: int) 
     seed
         of the rays.
     """
-    loaded, physics = simulation.bench.loaded, simulation.physics
-    tracer = DirectTracer(loaded.scene, loaded.camera, physics.projector, _ANCHORS, physics.geometry, pixels=pixels)
+    tracer = DirectTracer(simulation.setup, _ANCHORS, pixels=pixels)
     seen = tracer.trace(seed, 0, samples)
     place = (np.searchsorted(pixels, seen.pixel) * _ANCHORS + seen.anchor_row) * _ANCHORS + seen.anchor_column
     light = np.bincount(place, seen.value / samples, len(pixels) * _ANCHORS**2).reshape(-1, _ANCHORS, _ANCHORS)
@@ -457,9 +458,7 @@ def _paths(moments: FloatArray, even: float, pixels: int, anchors: int) -> Float
 
 def _window(simulation: Simulation, pixels: Labels, seed: int) -> tuple[float, float, float, float]:
     """First and last tan-angle, along rows and along columns, of the surfaces that ``pixels`` light."""
-    loaded, physics = simulation.bench.loaded, simulation.physics
-    parts = loaded.scene, loaded.camera, physics.projector, 2, physics.geometry
-    seen = DirectTracer(*parts, pixels=pixels).trace(seed, 0, _LOOKS)
+    seen = DirectTracer(simulation.setup, 2, pixels=pixels).trace(seed, 0, _LOOKS)
     if not seen.value.size:
         return (0.0, 0.0, 0.0, 0.0)
     return float(seen.row.min()), float(seen.row.max()), float(seen.column.min()), float(seen.column.max())

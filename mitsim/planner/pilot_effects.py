@@ -122,7 +122,7 @@ class EffectRuns:
         if more <= samples:
             return replicates, samples
         # Seeds of their own: that the first replicates are vague says nothing of these.
-        return tracer.trace_replicates([integer(seed, "closer") for seed in self.seeds], more), more
+        return [tracer.trace(integer(seed, "closer"), 0, more) for seed in self.seeds], more
 
     @property
     def received(self) -> float:
@@ -239,14 +239,14 @@ class EffectRuns:
         return self._form(simulation, direct, followed, sharp)
 
     def _direct(self, simulation: Simulation) -> list[PathSamples]:
-        return simulation.direct.trace_replicates(self.seeds, self.sample.direct)
+        return [simulation.direct.trace(seed, 0, self.sample.direct) for seed in self.seeds]
 
     def _follow(self, simulation: Simulation, name: str) -> list[PathSamples]:
         """Light of the pass ``name``, replicate by replicate."""
         tracer = PASSES[name].tracer(simulation)
         if tracer is None:
             return [PathSamples.none()] * REPLICATES
-        return tracer.trace_replicates([integer(seed, name) for seed in self.seeds], self.sample.followed)
+        return [tracer.trace(integer(seed, name), 0, self.sample.followed) for seed in self.seeds]
 
     @staticmethod
     def _by_kind(followed: dict[str, list[PathSamples]]) -> dict[str, list[PathSamples]]:
@@ -261,8 +261,7 @@ class EffectRuns:
         tracer, samples = simulation.sharp, self.sample.sharp(simulation)
         if tracer is None:
             return []
-        found: list[PathSamples] = tracer.trace_replicates([integer(seed, "sharp") for seed in self.seeds], samples)
-        return found
+        return [tracer.trace(integer(seed, "sharp"), 0, samples) for seed in self.seeds]
 
     def _form(
         self,

@@ -223,9 +223,9 @@ def _range(pilot_result: PilotResult, plan: Plan) -> tuple[float, float] | None:
 
 def _seconds(simulation: Simulation, name: str, seed: int, labels: Labels, samples: int) -> float:
     """What so many ``samples`` of a pass take to be traced and accumulated."""
-    accumulators = simulation.accumulators(name, labels, 1)
+    accumulator = simulation.accumulator(name, labels, 1)
     started = time.perf_counter()
-    simulation.accumulate(name, simulation.passes[name].trace(seed, 0, samples, accumulators), labels, samples)
+    simulation.accumulate(name, simulation.passes[name].trace(seed, 0, samples, accumulator), labels, samples)
     # What is added up on the device is not waited for.
     dr.sync_thread()
     return time.perf_counter() - started

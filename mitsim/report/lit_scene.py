@@ -39,9 +39,8 @@ from mitsim.metrics import Quality, psnr, relative_error
 from mitsim.optics.forming import Filed
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.image_formation import FrameOptics
-from mitsim.optics.separable import best_term, centred, relative_difference
 from mitsim.optics.shadow import Directions, SeparableTerms
-from mitsim.optics.terms import shadow_terms
+from mitsim.optics.terms import best_term, centred, relative_difference, shadow_terms
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import Accumulator, Prepared, prepare

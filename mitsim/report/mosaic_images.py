@@ -31,7 +31,7 @@ from mitsim.core.runs import MosaicCapture, load_mosaic
 from mitsim.core.spectral_manifests import JOINT, ColourManifest, check_way
 from mitsim.devices.chart import ChartPlace
 from mitsim.metrics import Quality
-from mitsim.optics.separable import BestTerm, best_term
+from mitsim.optics.terms import BestTerm, best_term
 from mitsim.reconstruct.colour import PLANES, JointMosaic
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.misfit import UNEXPLAINED

@@ -21,9 +21,8 @@ import pydantic
 
 from mitsim.devices.camera import CameraGeometry
 from mitsim.scene import limits
-from mitsim.scene.estimators import SMALL_LAMPS, Unfit
-from mitsim.scene.headers import MOST_TEXELS, check_image, check_obj, check_ply, is_grey
-from mitsim.scene.limits import PLUGINS, Range, check_plugin, check_variant, references
+from mitsim.scene.headers import MOST_TEXELS, check_image, check_obj, check_ply
+from mitsim.scene.limits import PLUGINS, SMALL_LAMPS, Range, Unfit, check_plugin, check_variant, references
 from mitsim.scene.outline import DEEPEST, MOST_ELEMENTS, Outline, SceneFiles, Tag
 
 _IMAGES = ("bitmap", "envmap")
@@ -231,8 +230,9 @@ class _Tree:
         path = self.files.resource(tag, name)
         try:
             if plugin in _IMAGES:
-                self.texels += check_image(path)
-                if not is_grey(path):
+                texels, grey = check_image(path)
+                self.texels += texels
+                if not grey:
                     self.coloured.append(tag)
             else:
                 given = (check_ply if plugin == "ply" else check_obj)(path)

@@ -9,15 +9,12 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from mitsim.core import exr
-
-if TYPE_CHECKING:
-    from PIL.ImageFile import ImageFile
 
 MOST_TEXELS = 1 << 25
 """An environment map of 8192 x 4096."""
@@ -41,34 +38,25 @@ _MOST_TEXT = 64 << 20
 """Chosen so that its words, some ten million Python objects, stay below 1 GiB."""
 
 
-def check_image(path: Path) -> int:
-    """Number of texels of the PNG, JPEG, OpenEXR, Radiance (.hdr) or PFM image at ``path``."""
+def check_image(path: Path) -> tuple[int, bool]:
+    """Number of texels of the PNG, JPEG, OpenEXR, Radiance (.hdr) or PFM image at ``path``, and whether its header says
+    that it has no colours."""
     with open(path, "rb") as file:
         start = file.read(_HEADER)
     if start.startswith(exr.MAGIC):
         header = exr.read_header(path)
-        width, height = header.width, header.height
+        width, height, grey = header.width, header.height, header.channels < 3
     elif start.startswith(b"#?"):
-        height, width = _two_numbers(rb"-Y (\d{1,9}) \+X (\d{1,9})", _resolution(start))
+        # The first line that Mitsuba could take for the size.
+        size = next((line for line in start.split(b"\n") if b"-Y" in line), b"")
+        (height, width), grey = _two_numbers(rb"-Y (\d{1,9}) \+X (\d{1,9})", size), False
     elif start[:2] in (b"PF", b"Pf"):
-        width, height = _two_numbers(rb"P[Ff]\s+(\d{1,9})\s+(\d{1,9})\s.*", start)
+        (width, height), grey = _two_numbers(rb"P[Ff]\s+(\d{1,9})\s+(\d{1,9})\s.*", start), start[:2] == b"Pf"
     else:
-        width, height = _pillow_size(path, start)
+        (width, height), grey = _pillow_size(path, start)
     if width * height == 0 or width * height > MOST_TEXELS:
         raise ValueError(f"has {width}x{height} texels; 1 to {MOST_TEXELS} are allowed")
-    return width * height
-
-
-def is_grey(path: Path) -> bool:
-    """Whether the header of the picture at ``path``, which :func:`check_image` passes, says that it has no colours."""
-    with open(path, "rb") as file:
-        start = file.read(len(exr.MAGIC))
-    if start == exr.MAGIC:
-        return exr.read_header(path).channels < 3
-    if start.startswith((b"#?", b"PF", b"Pf")):
-        return start.startswith(b"Pf")
-    with _pillow(path, start) as image:
-        return image.mode in _GREY
+    return width * height, grey
 
 
 def check_ply(path: Path) -> bool:
@@ -118,11 +106,21 @@ def _check_points(points: npt.NDArray[np.float64]) -> None:
         raise ValueError(f"has vertices that are not finite or beyond {FARTHEST:g} mm; mend the mesh")
 
 
-def _pillow_size(path: Path, start: bytes) -> tuple[int, int]:
-    """Width and height in the header of a PNG or JPEG file, of which what is stored is what is seen."""
+def _pillow_size(path: Path, start: bytes) -> tuple[tuple[int, int], bool]:
+    """Width and height in the header of a PNG or JPEG file, of which what is stored is what is seen, and whether it has
+    no colours. Not by ``PIL.Image.open``, which warns of large images."""
     from PIL.Image import Exif
+    from PIL.JpegImagePlugin import JpegImageFile
+    from PIL.PngImagePlugin import PngImageFile
 
-    with _pillow(path, start) as image:
+    reader = {b"\x89PN": PngImageFile, b"\xff\xd8\xff": JpegImageFile}.get(start[:3])
+    if reader is None:
+        raise ValueError("is no PNG, JPEG, OpenEXR, Radiance or PFM image; convert it")
+    try:
+        opened = reader(path)
+    except (SyntaxError, OSError, ValueError):
+        raise ValueError("is a damaged PNG or JPEG image; save it again") from None
+    with opened as image:
         exif = Exif()  # not by getexif, which looks for it behind a PNG's pixels too, and decodes them
         try:
             exif.load(image.info.get("exif", b""))
@@ -133,26 +131,7 @@ def _pillow_size(path: Path, start: bytes) -> tuple[int, int]:
             raise ValueError(f"has the orientation {turned}, which Mitsuba passes over; save it turned as it is seen")
         if getattr(image, "custom_mimetype", None) == "image/apng":
             raise ValueError("is animated, and Mitsuba shows its first picture alone; save that")
-        return image.size
-
-
-def _pillow(path: Path, start: bytes) -> ImageFile:
-    """A PNG or JPEG file, its header read. Not by ``PIL.Image.open``, which warns of large images."""
-    from PIL.JpegImagePlugin import JpegImageFile
-    from PIL.PngImagePlugin import PngImageFile
-
-    reader = {b"\x89PN": PngImageFile, b"\xff\xd8\xff": JpegImageFile}.get(start[:3])
-    if reader is None:
-        raise ValueError("is no PNG, JPEG, OpenEXR, Radiance or PFM image; convert it")
-    try:
-        return reader(path)
-    except (SyntaxError, OSError, ValueError):
-        raise ValueError("is a damaged PNG or JPEG image; save it again") from None
-
-
-def _resolution(start: bytes) -> bytes:
-    """The first line that Mitsuba could take for the size of a Radiance image."""
-    return next((line for line in start.split(b"\n") if b"-Y" in line), b"")
+        return image.size, image.mode in _GREY
 
 
 def _two_numbers(pattern: bytes, header: bytes) -> tuple[int, int]:

@@ -377,7 +377,7 @@ def _check_native(scene: Path, folder: Path) -> None:
             raise MitsimError(f"{scene}: {library} would run native code; move it away from the scene")
 
 
-# -------- How many pixels a side a projector's picture lights, where that is known without the renderer
+# -------- Size of a projector's picture, where it is known without the renderer
 
 _MODES_OF_PIXELS = ("1", "L", "RGB")
 """Of pictures whose dark texels are 0 in every channel, and nothing else is."""
@@ -387,7 +387,7 @@ _MOST_TEXELS = 1 << 24
 
 def lit_side(picture: Path) -> int | None:
     """Rows and columns of the lit square in the PNG file ``picture``; None where it is no such picture: what is wrong
-    with it, :func:`mitsim.scene.window.locate_projector` says."""
+    with it, :func:`mitsim.scene.load.locate_projector` says."""
     from PIL.PngImagePlugin import PngImageFile
 
     try:

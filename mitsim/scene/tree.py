@@ -21,7 +21,7 @@ from mitsim.scene.check import CheckedScene
 from mitsim.scene.limits import PLUGINS, references
 from mitsim.scene.outline import Outline, Tag
 
-# ---- The camera moved to the origin, or a refusal ----
+# -------- The camera moved to the origin, or a refusal
 #
 # Mitsuba makes objects in single precision, which leaves 0.03 mm at 300 m: 2e-2 of frames. The tree is in double
 # precision, so what stands far from the origin is moved there before objects are made of it. The vertices of a mesh
@@ -180,7 +180,7 @@ def _shift(point: mi.ScalarPoint3d) -> FloatArray:
     return matrix
 
 
-# ---- Thin cylinders and small lamps as meshes ----
+# -------- Thin cylinders and small lamps as meshes
 #
 # Mitsuba solves a quadratic in single precision for the point where a ray meets a cylinder: with a radius r at a
 # distance D its discriminant is off by 6e-8 (D / r)^2, by as much as itself for 0.15 mm at 400 mm, which loses 3 to 7
@@ -389,7 +389,7 @@ def _write(path: Path, mesh: Mesh) -> None:
     path.write_bytes("\n".join(header).encode() + vertices.tobytes() + faces.tobytes())
 
 
-# ---- Lamps that are meshes emit by their faces ----
+# -------- Lamps that are meshes emit by their faces
 #
 # Mitsuba draws points of a mesh emitter with the normals of its vertices, and weighs the light by their cosine instead
 # of the face's: of normals 30 and 60 degrees off it keeps 0.85 and 0.47. ``face_normals`` drops them. They also say

@@ -144,8 +144,7 @@ def dn_to_electrons(dn: npt.ArrayLike, model: SensorModel) -> FloatArray:
     return (np.asarray(dn, dtype=np.float64) - model.superpixel_black_level_dn) / model.gain_dn_per_e
 
 
-# ---- the stages, in order
-# -------------------------------------------------------------------------------------
+# -------- Stages of a frame, in order
 
 
 def add_dark_current(expected_electrons: npt.ArrayLike, exposure_s: float, model: SensorModel) -> FloatArray:
@@ -352,7 +351,7 @@ def checked_light(values: npt.ArrayLike, name: str) -> FloatArray:
     return array
 
 
-# -------- Stages of a frame as one compiled kernel
+# -------- Compiled kernel of the stages
 # Once light is known, noise is most of what a frame costs: two normal deviates a pixel and some twenty operations.
 # Dr.Jit makes one kernel of them for all processors, which takes a quarter of the time of numpy in as many threads.
 #
@@ -451,7 +450,7 @@ def _run(
         room[...] = np.asarray(part)[: len(room)]
 
 
-# -------- A ripple of the light and a camera's shutter in
+# -------- Ripple of the light
 # Light whose power is 1 + c cos(2 pi f t + phi) has over the exposure of a row, from t_r to t_r + T, the mean
 #
 #     1 + c sinc(f T) cos(2 pi f (t_r + T/2) + phi),   sinc(x) = sin(pi x) / (pi x),
@@ -498,7 +497,7 @@ def ripple_level(response: npt.NDArray[np.complex128], amplitude: float, phase: 
     return np.asarray(1 + amplitude * (response * np.exp(1j * phase)).real[:, None])
 
 
-# ---- Energy of a photon ----
+# -------- Energy of a photon
 
 PLANCK = 6.62607015e-34
 """Planck constant, J s (exact, SI 2019)."""

@@ -45,7 +45,7 @@ from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation, TracedPass, expected_of
 from mitsim.light.truth import Truth
 from mitsim.optics.frames import ClassFrames, ExpectedFrames
-from mitsim.scene.window import straightening
+from mitsim.scene.load import straightening
 from mitsim.transport.accumulator import DeviceAccumulator, DeviceSums
 from mitsim.transport.integrator import ANY, FollowingTracer
 from mitsim.transport.plugins.base import rows_columns, turn_and_origin
@@ -210,11 +210,10 @@ class _Filing(Simulation):
     def passes(self) -> Mapping[str, TracedPass]:
         return {name: each for name, each in super().passes.items() if each.row.even == self._only_direct}
 
-    def accumulators(self, name: str, labels: Labels, lines: int) -> tuple[DeviceAccumulator, ...]:
+    def accumulator(self, name: str, labels: Labels, lines: int) -> DeviceAccumulator | None:
         # What is added up on the device lies where it was traced.
-        return (
-            () if self._off & {DEPTH, KEYSTONE} and PASSES[name].anchors else super().accumulators(name, labels, lines)
-        )
+        moved = self._off & {DEPTH, KEYSTONE} and PASSES[name].anchors
+        return None if moved else super().accumulator(name, labels, lines)
 
     def accumulate(self, name: str, found: PathSamples | DeviceSums, labels: Labels, samples: int) -> LightEstimate:
         if isinstance(found, DeviceSums) or not (name == "direct" or PASSES[name].anchors):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from copy import copy
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from itertools import pairwise, product
@@ -40,7 +39,7 @@ A place would hold 4096 such paths."""
 
 @dataclass(frozen=True, eq=False)
 class Lit:
-    """Sums that hold light in any of some accumulators of one kind, and how they lie in a matrix, which is found once.
+    """Sums that hold light of any line, and how they lie in a matrix, which is found once.
 
     Attributes
     ----------
@@ -80,29 +79,6 @@ class Lit:
         return sparse.csr_array((light[layout.data], layout.indices, layout.indptr), shape=layout.shape)
 
 
-class _Held:
-    """Sums on the device of so many ``lines``, those of an entry side by side: a path brings light of every line to one
-    entry, and memory that is not at hand is fetched once for all of them."""
-
-    def __init__(self, entries: int, lines: int) -> None:
-        self._entries, self.lines = entries, lines
-        self.empty()
-
-    def empty(self) -> None:
-        """Hold no light."""
-        self.sums = dr.zeros(mi.UInt64, self._entries * self.lines)
-
-    def of_line(self, line: int, entries: mi.UInt32 | None = None) -> mi.UInt64:
-        """Sums of a ``line``, of some ``entries`` or of all."""
-        if entries is None and self.lines == 1:
-            return self.sums
-        if entries is None:
-            entries = dr.arange(mi.UInt32, self._entries)
-        if not len(entries):  # of which there are no multiples
-            return mi.UInt64()
-        return dr.gather(mi.UInt64, self.sums, entries * self.lines + line)
-
-
 class DeviceAccumulator:
     """Sums of light by row and place.
 
@@ -114,43 +90,35 @@ class DeviceAccumulator:
         (n^2,) row of each projector pixel.
     one
         irradiance [W m^-2] of about a bright path's.
+    lines
+        that light is told apart by.
 
     Attributes
     ----------
     sums
-        (places * rows + 1,) on the device, in units, or of all lines that it was made with, side by side. A place's
-        rows lie side by side: neighbouring pixels, which are of different rows, bring light to one place at a time.
+        ((places * rows + 1) * lines,) on the device, in units. A place's rows lie side by side: neighbouring pixels,
+        which are of different rows, bring light to one place at a time. So do the lines of an entry: a path brings
+        light of every line, and memory that is not at hand is fetched once for all of them.
     """
 
-    def __init__(self, bundle: Bundle, labels: Labels, one: float) -> None:
-        self._bundle, self._rows = bundle, int(labels.max()) + 1
+    def __init__(self, bundle: Bundle, labels: Labels, one: float, lines: int = 1) -> None:
+        self._bundle, self._rows, self.lines = bundle, int(labels.max()) + 1, lines
         self._width = self._places(bundle)
         self._unit = 2.0 ** (math.floor(math.log2(one)) - _UNIT_BITS)
         self._labels = mi.UInt32(labels.astype(np.uint32))
-        # A last one that counts what is no light.
-        self._line, self._held = 0, _Held(self._rows * self._width + 1, 1)
+        # A last entry that counts what is no light.
+        self._entries = self._rows * self._width + 1
+        self.sums = dr.zeros(mi.UInt64, self._entries * lines)
 
-    @classmethod
-    def of_lines(cls, lines: int, bundle: Bundle, labels: Labels, one: float) -> tuple[DeviceAccumulator, ...]:
-        """One for each of so many ``lines``, which are :func:`fetched` together.
-
-        Parameters
-        ----------
-        lines
-            their number.
-        bundle, labels, one
-            as for one alone.
-        """
-        first = cls(bundle, labels, one)
-        first._held = _Held(first._rows * first._width + 1, lines)
-        accumulators = first, *(copy(first) for _ in range(1, lines))
-        for line, accumulator in enumerate(accumulators):
-            accumulator._line = line
-        return accumulators
-
-    @property
-    def sums(self) -> mi.UInt64:
-        return self._held.sums
+    def _of_line(self, line: int, entries: mi.UInt32 | None = None) -> mi.UInt64:
+        """Sums of a ``line``, of some ``entries`` or of all."""
+        if entries is None and self.lines == 1:
+            return self.sums
+        if entries is None:
+            entries = dr.arange(mi.UInt32, self._entries)
+        if not len(entries):  # of which there are no multiples
+            return mi.UInt64()
+        return dr.gather(mi.UInt64, self.sums, entries * self.lines + line)
 
     @staticmethod
     def _places(bundle: Bundle) -> int:
@@ -158,21 +126,19 @@ class DeviceAccumulator:
         return bundle.size + bundle.anchors**2
 
     @staticmethod
-    def holds(bundle: Bundle, labels: Labels, accumulators: int = 1, paths: float = math.inf) -> bool:
-        """Whether so many accumulators have room, and take less time than the host.
+    def holds(bundle: Bundle, labels: Labels, lines: int = 1, paths: float = math.inf) -> bool:
+        """Whether an accumulator has room, and takes less time than the host.
 
         Parameters
         ----------
-        bundle, labels
-            of each.
-        accumulators
-            their number.
+        bundle, labels, lines
+            of the accumulator.
         paths
-            that they add up.
+            that it adds up.
         """
         entries = (int(labels.max()) + 1) * DeviceAccumulator._places(bundle)
         parts = (4 if bundle.between else 1) * min(len(bundle.depths), 2)
-        return accumulators * entries < MOST_PLACES and entries < _PAYS * parts * paths
+        return lines * entries < MOST_PLACES and entries < _PAYS * parts * paths
 
     def place(self, seen: Sightings, chosen: mi.Float, anchor: tuple[mi.UInt32, mi.UInt32] | None = None) -> mi.UInt32:
         """Where light is accumulated, all of it in one place.
@@ -232,11 +198,7 @@ class DeviceAccumulator:
         return [(first, 1 - beyond), (first + 1, beyond)]
 
     def _place(
-        self,
-        seen: Sightings,
-        layer: mi.UInt32,
-        cells: Sequence[mi.UInt32],
-        anchor: tuple[mi.UInt32, mi.UInt32] | None,
+        self, seen: Sightings, layer: mi.UInt32, cells: Sequence[mi.UInt32], anchor: tuple[mi.UInt32, mi.UInt32] | None
     ) -> mi.UInt32:
         """Where light of a ``layer`` and of ``cells`` along rows and columns is accumulated, or its anchor's place for
         what lies beyond all cells."""
@@ -250,13 +212,15 @@ class DeviceAccumulator:
         place = ((layer * anchors + line) * rows + cells[0]) * (anchors * columns) + column * columns + cells[1]
         return dr.select(inside, place, dr.opaque(mi.UInt32, self._bundle.size) + line * anchors + column)
 
-    def add(self, light: mi.Float, pixel: mi.UInt32, place: mi.UInt32, active: mi.Bool) -> None:
-        """File light.
+    def add(
+        self, lights: Sequence[mi.Float], pixel: mi.UInt32, place: mi.UInt32, active: mi.Bool | bool = True
+    ) -> None:
+        """Add up light.
 
         Parameters
         ----------
-        light
-            [W m^-2].
+        lights
+            [W m^-2] of each line.
         pixel
             projector pixels that it is of.
         place
@@ -264,22 +228,33 @@ class DeviceAccumulator:
         active
             lanes that count.
         """
-        units = light * dr.opaque(mi.Float, 1 / self._unit)
-        fits = (units >= 0) & (units < 2.0**_MOST_BITS)
-        row = dr.gather(mi.UInt32, self._labels, pixel, active)
-        entry = dr.select(fits, place * dr.opaque(mi.UInt32, self._rows) + row, self._rows * self._width)
-        index = entry * self._held.lines + self._line
-        amount = dr.select(fits, mi.UInt64(dr.round(units)), mi.UInt64(1))
-        dr.scatter_reduce(dr.ReduceOp.Add, self.sums, amount, index, active, mode=dr.ReduceMode.Direct)
+        for line, light in enumerate(lights):
+            units = light * dr.opaque(mi.Float, 1 / self._unit)
+            fits = (units >= 0) & (units < 2.0**_MOST_BITS)
+            lit = mi.Bool(active) & ~(light == 0)  # not a number is light to be refused
+            row = dr.gather(mi.UInt32, self._labels, pixel, lit)
+            entry = dr.select(fits, place * dr.opaque(mi.UInt32, self._rows) + row, self._rows * self._width)
+            amount = dr.select(fits, mi.UInt64(dr.round(units)), mi.UInt64(1))
+            index = entry * self.lines + line
+            dr.scatter_reduce(dr.ReduceOp.Add, self.sums, amount, index, lit, mode=dr.ReduceMode.Direct)
 
-    def light(self, samples: int = 1) -> tuple[sparse.csr_array, float, float]:
-        """As :meth:`DeviceSums.light` of so many ``samples``, of the sums that are there, which are fetched."""
-        return fetched((self,))[0].light(samples)
+    def fetch(self) -> list[DeviceSums]:
+        """The sums of each line on the host; they are empty then.
+
+        Which of them hold light is told of all lines together, as it is nearly the same of each.
+        """
+        lines = range(self.lines)
+        lit = dr.compress(reduce(or_, (self._of_line(line) != 0 for line in lines)))
+        units = [self._of_line(line, lit) for line in lines]
+        dr.eval(lit, units)
+        self.sums = dr.zeros(mi.UInt64, self._entries * self.lines)
+        found = Lit(np.array(lit), self._rows, self._bundle.size, self._bundle.lamps)
+        return [DeviceSums(self, found, np.array(each)) for each in units]
 
 
 @dataclass(frozen=True, eq=False)
 class DeviceSums:
-    """Sums of one accumulator on the host: what a pass brought in all its samples.
+    """Sums of one line on the host: what a pass brought in all its samples.
 
     Attributes
     ----------
@@ -326,20 +301,3 @@ class DeviceSums:
         found[lit.numbers[lit.inside :] - np.uint32(rows * accumulator._bundle.size)] = self.units[lit.inside :]
         by_row = np.moveaxis(found[:-1].reshape(anchors, anchors, rows), 2, 0)
         return np.asarray(by_row * (accumulator._unit / samples))
-
-
-def fetched(accumulators: Sequence[DeviceAccumulator]) -> list[DeviceSums]:
-    """The sums of ``accumulators`` of one kind, one for each line, on the host; they are empty then.
-
-    Which sums hold light is told of all together, as it is nearly the same of each.
-    """
-    first = accumulators[0]
-    lit = dr.compress(reduce(or_, (accumulator._held.of_line(accumulator._line) != 0 for accumulator in accumulators)))
-    units = [accumulator._held.of_line(accumulator._line, lit) for accumulator in accumulators]
-    dr.eval(lit, units)
-    for accumulator in accumulators:
-        accumulator._held.empty()
-    found = Lit(np.array(lit), first._rows, first._bundle.size, first._bundle.lamps)
-    return [
-        DeviceSums(accumulator, found, np.array(each)) for accumulator, each in zip(accumulators, units, strict=True)
-    ]

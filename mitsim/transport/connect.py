@@ -1,7 +1,6 @@
 """Connections: from a lit surface point to the irradiance that it casts on the sensor, and to the projector's lens.
 
-The bare sensor is a receiver.
-A surface point P that receives the flux phi irradiates the sensor point with::
+The bare sensor is a receiver. A surface point P that receives the flux phi irradiates the sensor point with::
 
     E = f(P) cos_s / cos_g  phi  cos_P cos_a / r^2  r(t)        [W m^-2]
 
@@ -16,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -25,10 +25,9 @@ from mitsim.core.arrays import FloatArray
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Lines
 from mitsim.optics.image_formation import anchor_positions
-from mitsim.transport.plugins.base import rows_columns, x_y
+from mitsim.transport.plugins.base import generator, panchromatic, rows_columns, streams, x_y
 from mitsim.transport.projector import ProjectorOptics, ProjectorRays, line_wavelengths
 from mitsim.transport.records import Sightings
-from mitsim.transport.sampler import generator, panchromatic
 from mitsim.transport.transmission import Passage, refracted_way
 
 
@@ -112,24 +111,18 @@ class Way:
 
 @dataclass
 class Reception:
-    """Irradiance for each unit of flux [mm^-2], where it is seen from the sensor's centre, and the turn's pdf [1/sr].
-
-    ``row``, ``column`` and ``inverse_depth`` as in :class:`mitsim.transport.records.PathSamples`; ``pdf`` is that of
-    sampling the turn at P from the sensor's side, ``direction`` the unit one in which the light leaves P.
-    """
+    """Irradiance for each unit of flux [mm^-2] that comes by a ``way``, and the turn's ``pdf`` [1/sr]: that of sampling
+    the turn at P from the sensor's side."""
 
     irradiance: mi.Spectrum
-    row: mi.Float
-    column: mi.Float
-    inverse_depth: mi.Float
     pdf: mi.Float
-    direction: mi.Vector3f
+    way: Way
 
     def solid_angle(self, local: mi.Point3f) -> mi.Float:
         """Solid angle at P for each area of the sensor at ``local`` [sr/mm^2]: cos^3 / z^2 of the apparent point."""
         row, column = rows_columns(local.x, local.y)
-        inverse = self.inverse_depth
-        squared = 1 + dr.square(self.row - row * inverse) + dr.square(self.column - column * inverse)
+        inverse = self.way.inverse_depth
+        squared = 1 + dr.square(self.way.row - row * inverse) + dr.square(self.way.column - column * inverse)
         return dr.square(inverse) / (squared * dr.sqrt(squared))
 
     def sightings(self, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32, by_line: bool = False) -> Sightings:
@@ -144,30 +137,44 @@ class Reception:
         by_line
             whether it is told apart by line.
         """
-        return Sightings.of(light, by_line, pixel, self.row, self.column, self.inverse_depth)
+        return Sightings.of(light, by_line, pixel, self.way.row, self.way.column, self.way.inverse_depth)
 
 
-class Receiver:
-    """Prepared once for a scene and a camera.
+@dataclass(frozen=True, eq=False)
+class OpticalSetup:
+    """What light is traced in: a scene with its camera and its projector, and how its surfaces reach the sensor.
 
-    Parameters
+    Attributes
     ----------
     scene, camera
         as loaded.
+    projector
+        where light comes from.
     geometry
-        stands in for the camera's own.
+        of the camera; may stand in for the loaded one's own.
     """
 
-    def __init__(self, scene: mi.Scene, camera: mi.Sensor, geometry: CameraGeometry | None = None) -> None:
-        self.scene, self.camera, self.passage = scene, camera, Passage(scene)
-        self.geometry: CameraGeometry = geometry or camera.geometry
+    scene: mi.Scene
+    camera: mi.Sensor
+    projector: ProjectorOptics
+    geometry: CameraGeometry
 
-    def of_board(self, rays: ProjectorRays) -> float:
-        """Irradiance [W m^-2] by the light of a projector pixel, from a white board at the rig's distance; ``rays`` are
-        the projector's."""
-        pixel = dr.arange(mi.UInt32, rays.projector.n**2)
-        wavelengths, spectral = sample_wavelengths(self.camera, generator(mi.UInt32(0), pixel), rays.projector.lines)
-        flux = np.array(panchromatic(rays.flux(pixel, wavelengths) * spectral))
+    @cached_property
+    def passage(self) -> Passage:
+        """What light passes in the scene."""
+        return Passage(self.scene)
+
+    @cached_property
+    def rays(self) -> ProjectorRays:
+        """Rays of the projector."""
+        return ProjectorRays(self.projector)
+
+    @cached_property
+    def board(self) -> float:
+        """Irradiance [W m^-2] by the light of a projector pixel, from a white board at the rig's distance."""
+        pixel = dr.arange(mi.UInt32, self.projector.n**2)
+        wavelengths, spectral = sample_wavelengths(self.camera, generator(mi.UInt32(0), pixel), self.projector.lines)
+        flux = np.array(panchromatic(self.rays.flux(pixel, wavelengths) * spectral))
         return float(flux.mean(dtype=np.float64)) / (math.pi * self.geometry.scene_distance**2)
 
     def receive(
@@ -239,7 +246,7 @@ class Receiver:
         reflected, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(toward), way.open)
         geometric = way.geometric / dr.abs(dr.dot(si.n, toward))
         irradiance = dr.select(way.open, mi.unpolarized_spectrum(reflected) * way.passed * geometric, 0)
-        return Reception(irradiance, way.row, way.column, way.inverse_depth, pdf, way.direction)
+        return Reception(irradiance, pdf, way)
 
 
 def sample_wavelengths(camera: mi.Sensor, rng: mi.PCG32, lines: Lines | None = None) -> tuple[mi.Color0f, mi.Spectrum]:
@@ -266,7 +273,7 @@ def sample_wavelengths(camera: mi.Sensor, rng: mi.PCG32, lines: Lines | None = N
     return wavelengths, mi.Spectrum(*(dr.opaque(mi.Float, float(weight)) for weight in weights))
 
 
-# -------- Where light lands that leaves surfaces in known directions
+# -------- Landings of light that leaves surfaces in known directions
 #
 # Light that is sampled from a surface goes where its lobe sends it, through flat glass bent by Snell's law, until it
 # crosses the plane of the sensor.
@@ -283,12 +290,12 @@ class Landing:
     arrives: mi.Bool
 
 
-def landing(receiver: Receiver, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> Landing:
+def landing(setup: OpticalSetup, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> Landing:
     """Where light crosses the plane of the sensor from the front; whether something opaque hides it is not asked.
 
     Parameters
     ----------
-    receiver
+    setup
         the sensor, and the scene with its panes.
     si
         points of surfaces.
@@ -297,7 +304,7 @@ def landing(receiver: Receiver, si: mi.SurfaceInteraction3f, direction: mi.Vecto
     active
         lanes that count.
     """
-    inverse, passage = receiver.camera.world_transform().inverse(), receiver.passage
+    inverse, passage = setup.camera.world_transform().inverse(), setup.passage
     ray, length = mi.Ray3f(si.p, direction, si.time, si.wavelengths), mi.Float(0)
 
     def further(active: mi.Bool, ray: mi.Ray3f, length: mi.Float) -> tuple[object, ...]:
@@ -450,3 +457,71 @@ class ProjectorConnector:
         ds, weight = self.emitter.sample_direction(at, mi.Point2f(0.5), active)
         power = weight * (dr.square(image.z) * image.z / dr.norm(image))
         return self.projector.pixel_at(ds.uv), power, active & (ds.pdf > 0)
+
+
+# -------- Light of a lamp onto the sensor, over no surface
+#
+# No path runs into a point, spot or directional lamp, few run into a small one that has a surface, and no tracer
+# connects the sensor itself to either.
+
+_SENSOR_POINTS = 9
+"""Points along each side of the sensor, its edges with them: things in the way are larger than an eighth of it."""
+_LAMP_POINTS = 2**10
+"""Points of a lamp: how much of it is seen is known to some percent."""
+
+
+def shines_in(scene: mi.Scene, camera: mi.Sensor, lamp: mi.Emitter) -> bool:
+    """Whether a point of the sensor sees the ``lamp`` within the field stop.
+
+    Parameters
+    ----------
+    scene, camera
+        what may stand in the way, and the sensor.
+    lamp
+        a point, spot or directional one.
+    """
+    edge = np.linspace(-1, 1, _SENSOR_POINTS) * camera.geometry.half_width
+    x, y = (mi.Float(axis.ravel()) for axis in np.meshgrid(edge, edge))
+    to_world, sensor = camera.world_transform(), dr.zeros(mi.SurfaceInteraction3f, _SENSOR_POINTS**2)
+    sensor.p = to_world @ mi.Point3f(x, y, 0)
+    _, rng = streams(0, dr.arange(mi.UInt32, _SENSOR_POINTS**2), mi.UInt32(0))
+    sensor.wavelengths, _ = sample_wavelengths(camera, rng)
+    ds, light = lamp.sample_direction(sensor, mi.Point2f(0.5), True)
+    met = _in_view(camera, ds.d) & (dr.max(mi.unpolarized_spectrum(light)) > 0)
+    seen, _ = Passage(scene).between(sensor, ds.p, met)
+    return bool(np.array(met & seen).any())
+
+
+def part_of_view(scene: mi.Scene, camera: mi.Sensor, shape: mi.Shape) -> float:
+    """Part of the field stop, in tan-angles, in which the sensor's centre sees a ``shape`` that shines; where nothing
+    is before it.
+
+    Parameters
+    ----------
+    scene, camera, shape
+        as of :func:`shines_in`; the side that shines counts.
+    """
+    _, rng = streams(0, dr.arange(mi.UInt32, _LAMP_POINTS), mi.UInt32(0))
+    to_world, place = (
+        camera.world_transform(),
+        shape.sample_position(0, mi.Point2f(rng.next_float32(), rng.next_float32())),
+    )
+    sensor = dr.zeros(mi.SurfaceInteraction3f, _LAMP_POINTS)
+    sensor.p = to_world @ mi.Point3f(0)
+    way = place.p - sensor.p
+    distance = dr.norm(way)
+    way /= distance
+    facing = -dr.dot(place.n, way)
+    met = _in_view(camera, way) & (facing > 0)
+    seen, _ = Passage(scene).between(sensor, place.p, met)
+    # Of dA on the lamp, in solid angle and on the plane at unit distance.
+    area = facing / distance**2 / (to_world.inverse() @ way).z ** 3
+    total = float(np.array(dr.select(met & seen, area, 0)).mean()) * float(shape.surface_area()[0])
+    return total / float(2 * camera.geometry.tan_half_fov) ** 2
+
+
+def _in_view(camera: mi.Sensor, direction: mi.Vector3f) -> mi.Bool:
+    """Whether light from a ``direction`` comes through the field stop."""
+    toward = camera.world_transform().inverse() @ direction
+    stop = camera.geometry.tan_half_fov * toward.z
+    return (dr.abs(toward.x) <= stop) & (dr.abs(toward.y) <= stop)

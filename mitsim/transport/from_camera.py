@@ -30,41 +30,26 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.spectral_manifests import MOST_LINES
-from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.lamps import SPECTRA_NM, Band, Response
-from mitsim.transport.connect import Connection, ProjectorConnector, SensorPoints, sample_wavelengths
+from mitsim.transport.accumulator import DeviceAccumulator
+from mitsim.transport.connect import Connection, OpticalSetup, ProjectorConnector, SensorPoints, sample_wavelengths
 from mitsim.transport.integrator import (
     KINDS,
     FollowingTracer,
     InFlight,
     PathIntegrator,
-    PathRules,
+    Paths,
     PathState,
     Turn,
     camera_part,
     is_delta,
 )
-from mitsim.transport.plugins.base import rows_columns, x_y
-from mitsim.transport.projector import ProjectorOptics
+from mitsim.transport.plugins.base import rows_columns, shuffled, stratified, streams, x_y
 from mitsim.transport.records import CellAxis, CellGrid, PathSamples, Sightings
-from mitsim.transport.sampler import shuffled, stratified, streams
-from mitsim.transport.transmission import Passage, refracted_way
+from mitsim.transport.transmission import refracted_way
 
 _MARGIN = 1e-4
 """Part of a cell that paths keep clear of its edges: 2e-7 of tan-angle, above float32's rounding of 3e-8."""
-
-
-@dataclass(frozen=True)
-class Paths:
-    """Which light is followed besides projector - surface - camera.
-
-    ``mirrors``: over delta reflections and transmissions on the camera's side; ``interreflection``: any number of
-    bounces; ``emitters``: other lights of the scene, all of them one class of ambient light.
-    """
-
-    mirrors: bool = False
-    interreflection: bool = False
-    emitters: tuple[mi.Emitter, ...] = ()
 
 
 class FromCameraTracer(FollowingTracer):
@@ -78,45 +63,27 @@ class FromCameraTracer(FollowingTracer):
 
     of_projector: ClassVar[bool] = True
 
-    def __init__(
-        self,
-        scene: mi.Scene,
-        camera: mi.Sensor,
-        projector: ProjectorOptics,
-        grid: CellGrid,
-        paths: Paths,
-        geometry: CameraGeometry | None = None,
-        points: SensorPoints | None = None,
-    ) -> None:
+    def __init__(self, setup: OpticalSetup, grid: CellGrid, paths: Paths, points: SensorPoints | None = None) -> None:
         """What is followed.
 
         Parameters
         ----------
-        scene, camera, projector
-            as loaded.
+        setup
+            scene, camera and projector.
         grid
             cells that paths start in, one each.
         paths
             which of them are followed.
-        geometry
-            stands in for the camera's own.
         points
             where from; the sensor's centre if not given.
         """
-        self.geometry: CameraGeometry = geometry or camera.geometry
-        self.points = points or SensorPoints(self.geometry.half_width)
-        self.scene, self.camera, self.projector, self.grid, self.paths = scene, camera, projector, grid, paths
-        self.connector, self.passage = ProjectorConnector(projector), Passage(scene)
+        super().__init__(setup, paths, points)
+        self.grid, self.connector = grid, ProjectorConnector(setup.projector)
 
     @property
     def paths_per_sample(self) -> int:
         """Paths in one sample: one per cell and anchor."""
         return self.grid.shape[0] * self.grid.shape[1] * self.points.count
-
-    @property
-    def by_line(self) -> bool:
-        """Whether light is told apart by the wavelengths of its paths."""
-        return self.projector.by_line
 
     def wavelengths(self, rng: mi.PCG32, sample: mi.UInt32, shared: mi.PCG32) -> tuple[mi.Color0f, mi.Spectrum]:
         """Wavelengths of each path, and weights as :func:`mitsim.transport.connect.sample_wavelengths` has them.
@@ -128,14 +95,9 @@ class FromCameraTracer(FollowingTracer):
         sample, shared
             number of each path's sample, and the numbers that all samples of its cell share.
         """
-        return sample_wavelengths(self.camera, rng, self.projector.lines)
+        return sample_wavelengths(self.setup.camera, rng, self.projector.lines)
 
-    @property
-    def rules(self) -> PathRules:
-        """Which paths are followed."""
-        return PathRules(self.passage, self.paths.mirrors, self.paths.interreflection, self.orders, self.by_line)
-
-    def _launch(self, flight: InFlight) -> list[PathSamples]:
+    def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
         return self._paths(flight).path_samples()
 
     def _paths(self, flight: InFlight) -> CameraPaths[Any]:
@@ -196,10 +158,10 @@ class CameraPaths(PathIntegrator[State]):
         flight
             the samples in flight.
         """
-        super().__init__(tracer.rules)
+        super().__init__(tracer)
         cell, row, column = tracer.points.of(flight.index, tracer.grid.shape[0] * tracer.grid.shape[1])
         self.anchor = row, column
-        self.tracer, self.geometry, self.connector = tracer, tracer.geometry, tracer.connector
+        self.tracer, self.geometry, self.connector = tracer, tracer.setup.geometry, tracer.connector
         self.emitters, self.lens = tracer.paths.emitters, tracer.projector.aperture > 0
         # What a path runs into has been turned once less than what it is connected to.
         self.reach = 0 if self.emitters or self.lens else 1
@@ -216,7 +178,7 @@ class CameraPaths(PathIntegrator[State]):
         squared = 1 + dr.square(self.row) + dr.square(self.column)
         self.slope = dr.rsqrt(squared)
         wavelengths, spectral = tracer.wavelengths(rng, flight.sample, shared)
-        to_world = tracer.camera.world_transform()
+        to_world = tracer.setup.camera.world_transform()
         direction = mi.Vector3f(*x_y(self.row, self.column), 1) * self.slope
         ray = mi.Ray3f(to_world @ sensor, to_world @ direction, 0.0, wavelengths)
         stop = dr.opaque(mi.Float, self.geometry.tan_half_fov)
@@ -376,7 +338,7 @@ class CameraPaths(PathIntegrator[State]):
         # Filed as the sensor's centre sees it.
         row, column = (t + s * paths.inverse_depth for t, s in zip((self.row, self.column), self.origin, strict=True))
         lit = dr.select(active, light, 0)
-        self._join(paths, kind, Sightings.of(lit, self.rules.by_line, pixel, row, column, paths.inverse_depth))
+        self._join(paths, kind, Sightings.of(lit, self.by_line, pixel, row, column, paths.inverse_depth))
 
     def _join(self, paths: State, kind: str, seen: Sightings) -> None:
         """Keep light of one connection a path, or that of an earlier one of its kind, which then stands for both."""
@@ -450,7 +412,7 @@ class LampTracer(FromCameraTracer):
         counted
             bands, and what they count.
         """
-        super().__init__(like.scene, like.camera, like.projector, like.grid, like.paths, like.geometry, like.points)
+        super().__init__(like.setup, like.grid, like.paths, like.points)
         self.counted = counted
         self._alone: mi.UInt32 | None = None
 
@@ -499,7 +461,7 @@ class LampTracer(FromCameraTracer):
             wavelengths = [sum(own, mi.Float(0))] * len(own)
         return type(dr.zeros(mi.Ray3f).wavelengths)(*wavelengths), mi.Spectrum(*weights)
 
-    def _launch(self, flight: InFlight) -> list[PathSamples]:
+    def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
         return [self._by_band(found) for found in super()._launch(flight)]
 
     def _by_band(self, found: PathSamples) -> PathSamples:
@@ -513,7 +475,6 @@ class LampTracer(FromCameraTracer):
             },
             pixel=(found.pixel[:, None] + self.counted.first + np.arange(MOST_LINES)).ravel(),
             value=light * self.counted.units[0],
-            lane=None if found.lane is None else np.repeat(found.lane, MOST_LINES),
         )
         if not self.projector.by_line:
             return several
@@ -543,8 +504,3 @@ class CombinedTracer:
             as there.
         """
         return PathSamples.joined([tracer.trace(seed, first, samples) for tracer in self.tracers])
-
-    def trace_replicates(self, seeds: Sequence[int], samples: int = 1) -> list[PathSamples]:
-        """``samples`` as :meth:`trace` finds them for each of some ``seeds``."""
-        looks = [tracer.trace_replicates(seeds, samples) for tracer in self.tracers]
-        return [PathSamples.joined(parts) for parts in zip(*looks, strict=True)]

@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import drjit as dr
@@ -27,21 +26,11 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, mean_of_neighbours
-from mitsim.devices.camera import CameraGeometry
 from mitsim.transport.accumulator import DeviceAccumulator
-from mitsim.transport.connect import Receiver, SensorPoints, Way, sample_wavelengths
-from mitsim.transport.integrator import (
-    KINDS,
-    FollowingTracer,
-    InFlight,
-    PathIntegrator,
-    PathRules,
-    PathState,
-    camera_part,
-)
-from mitsim.transport.projector import ProjectorOptics, ProjectorRays
+from mitsim.transport.connect import SensorPoints, Way, sample_wavelengths
+from mitsim.transport.integrator import KINDS, FollowingTracer, InFlight, PathIntegrator, PathState, camera_part
+from mitsim.transport.plugins.base import stratified, streams
 from mitsim.transport.records import PathSamples, Sightings
-from mitsim.transport.sampler import stratified, streams
 
 _ROOMS = (4**2, 12**2)
 """Anchors that a path has room for: few numbers of them, as each is a kernel of its own, 0.4 s to compile; more
@@ -51,37 +40,10 @@ than the most that a plan tries are a kernel for each number."""
 class IndirectTracer(FollowingTracer):
     """Indirect light of a projector, and its caustics, at points of the sensor."""
 
-    def __init__(
-        self,
-        scene: mi.Scene,
-        camera: mi.Sensor,
-        projector: ProjectorOptics,
-        mirrors: bool,
-        interreflection: bool,
-        geometry: CameraGeometry | None = None,
-        points: SensorPoints | None = None,
-    ) -> None:
-        """What is followed.
-
-        Parameters
-        ----------
-        scene, camera, projector
-            as loaded.
-        mirrors, interreflection
-            paths over delta reflections and transmissions, and over other surfaces.
-        geometry
-            stands in for the camera's own.
-        points
-            where to; the sensor's centre if not given.
-        """
-        self.scene, self.projector, self.mirrors, self.interreflection = scene, projector, mirrors, interreflection
-        self.rays, self.receiver = ProjectorRays(projector), Receiver(scene, camera, geometry)
-        self.points = points or SensorPoints(self.receiver.geometry.half_width)
-        self.adaptive: AdaptiveSamples | None = None
+    adaptive: AdaptiveSamples | None = None
 
     def with_adaptive_counts(self, repeats: Sequence[int]) -> IndirectTracer:
-        """The same to one point of the sensor, blocks of pixels (:mod:`mitsim.transport.indirect`) as often as
-        ``repeats`` (blocks^2,) say."""
+        """The same to one point of the sensor, blocks of pixels as often as ``repeats`` (blocks^2,) say."""
         return self._with_counts(by_pixel(repeats, self.projector.n))
 
     def _with_counts(self, repeats: npt.NDArray[np.int64]) -> IndirectTracer:
@@ -100,40 +62,13 @@ class IndirectTracer(FollowingTracer):
         """Anchors that each path is connected to: all of them."""
         return self.points.count
 
-    @cached_property
+    @property
     def board(self) -> float:
         """Irradiance [W m^-2] that light compares to."""
-        return self.receiver.of_board(self.rays)
+        return self.setup.board
 
-    @property
-    def rules(self) -> PathRules:
-        """Which paths are followed."""
-        passage, by_line = self.receiver.passage, self.projector.by_line
-        return PathRules(passage, self.mirrors, self.interreflection, self.orders, by_line)
-
-    def trace_into(self, accumulators: Sequence[DeviceAccumulator], seed: int, first: int, samples: int) -> PathSamples:
-        """As :meth:`trace`, indirect light added up in accumulators as far as it can be: the rest, on the host.
-
-        Parameters
-        ----------
-        accumulators
-            of light by pixel, whose unit is :attr:`board`; of several lines, one for each.
-        seed, first, samples
-            as for :meth:`trace`.
-        """
-        flights = (
-            (tracer, flight) for tracer in self.per_wavelength for flight in self._in_flight([seed], first, samples)
-        )
-        return PathSamples.joined(
-            [
-                part
-                for tracer, flight in flights
-                for part in tracer._paths(tracer._emission(flight)).accumulate(accumulators)
-            ]
-        )
-
-    def _launch(self, flight: InFlight) -> list[PathSamples]:
-        return self._paths(self._emission(flight)).path_samples()
+    def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
+        return self._paths(self._emission(flight)).path_samples(accumulator)
 
     def _emission(self, flight: InFlight) -> Emission:
         """Where each path leaves the projector."""
@@ -181,16 +116,16 @@ class ProjectorPaths(PathIntegrator[PathState]):
 
     def __init__(self, tracer: IndirectTracer, emission: Emission) -> None:
         """Of what a ``tracer`` follows, from an ``emission``."""
-        super().__init__(tracer.rules)
-        self.receiver, self.pixel, self.anchor = tracer.receiver, emission.pixel, emission.anchor
+        super().__init__(tracer)
+        self.pixel, self.anchor = emission.pixel, emission.anchor
         self.first_turn, rng = emission.first_turn, emission.rng
-        wavelengths, spectral = sample_wavelengths(tracer.receiver.camera, rng, tracer.projector.lines)
+        wavelengths, spectral = sample_wavelengths(tracer.setup.camera, rng, tracer.projector.lines)
         jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
-        ray = tracer.rays.sample(self.pixel, jitter, rng, wavelengths)
-        self.flux = tracer.rays.flux(self.pixel, wavelengths) * spectral * emission.weight
+        ray = tracer.setup.rays.sample(self.pixel, jitter, rng, wavelengths)
+        self.flux = tracer.setup.rays.flux(self.pixel, wavelengths) * spectral * emission.weight
         connections = _OneConnection if tracer.points.count == 1 else _AnchorConnections
         self.connections = connections(tracer.points, emission)
-        sightings = self.connections.none(("direct", "indirect") if tracer.mirrors else ("indirect",), tracer.rules)
+        sightings = self.connections.none(("direct", "indirect") if self.rules.mirrors else ("indirect",), self.by_line)
         self.paths = PathState(active=mi.Bool(True), ray=ray, rng=rng, sightings=sightings)
 
     def _connect(self, paths: PathState, si: mi.SurfaceInteraction3f, first: bool) -> None:
@@ -214,7 +149,7 @@ class ProjectorPaths(PathIntegrator[PathState]):
         """To the sensor, for light that is kept."""
         # Light that has met nothing but what it passes is the direct tracer's.
         active = paths.active & ~paths.straight & self._is_wanted(paths.scattered + 1)
-        return self.receiver.way(si, sensor, active)
+        return self.setup.way(si, sensor, active)
 
     def _keep_light(
         self,
@@ -226,36 +161,32 @@ class ProjectorPaths(PathIntegrator[PathState]):
     ) -> None:
         """Keep light that surfaces send by a ``way``, or that of an earlier connection, as the numbers ``drawn`` say;
         either stands for both. ``at``: what is held of an anchor, and its number."""
-        reception = self.receiver.received(si, -paths.ray.d, way)
+        reception = self.setup.received(si, -paths.ray.d, way)
         light = reception.irradiance * self.flux * paths.throughput
         caustic = paths.scattered == 0
         light *= dr.select(caustic, 1, 1 - camera_part(reception.pdf))
         held, number = at
         for kind, chosen in (("direct", caustic), ("indirect", ~caustic)):
             if kind in held:
-                seen = reception.sightings(dr.select(chosen, light, 0), self.pixel, self.rules.by_line)
+                seen = reception.sightings(dr.select(chosen, light, 0), self.pixel, self.by_line)
                 joined = self.connections.load(held, kind, number).joined_by(seen, drawn[kind])
                 self.connections.save(held, kind, number, joined)
 
-    def path_samples(self) -> list[PathSamples]:
-        """Light on the host of every path at every anchor."""
-        held = self.follow(self.paths).sightings
-        return self.connections.fetched(held, tuple(held))
-
-    def accumulate(self, accumulators: Sequence[DeviceAccumulator]) -> list[PathSamples]:
-        """Follow all paths; indirect light goes into ``accumulators``, caustics to the host."""
+    def path_samples(self, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
+        """Light on the host of every path at every anchor; of indirect light none where there is an ``accumulator``."""
         paths = self.follow(self.paths)
+        if accumulator is None:
+            return self.connections.fetched(paths.sightings, tuple(paths.sightings))
         drawn = paths.rng.next_float32()
 
         def add(held: Held, number: mi.UInt32) -> None:
             seen = self.connections.load(held, "indirect", number)
-            place = accumulators[0].place(seen, drawn, self.connections.anchor(number))
-            for accumulator, light in zip(accumulators, seen.by_line(len(accumulators)), strict=True):
-                accumulator.add(light, seen.pixel, place, ~(light == 0))  # not a number is light to be refused
+            place = accumulator.place(seen, drawn, self.connections.anchor(number))
+            accumulator.add(seen.by_line(accumulator.lines), seen.pixel, place)
 
         held = self.connections.at_each(paths.sightings, mi.Bool(True), add)
         caustics = tuple(kind for kind in held if kind == "direct")
-        return self.connections.fetched(held, caustics, [accumulator.sums for accumulator in accumulators])
+        return self.connections.fetched(held, caustics, accumulator.sums)
 
 
 # -------- Connections of a path: to one point of the sensor, or to every anchor
@@ -270,9 +201,9 @@ class _OneConnection:
     def __init__(self, points: SensorPoints, emission: Emission) -> None:
         self._anchor, self._sensor = emission.anchor, points.at(*emission.anchor, emission.rng)
 
-    def none(self, kinds: Sequence[str], rules: PathRules) -> Held:
+    def none(self, kinds: Sequence[str], by_line: bool) -> Held:
         """No light yet."""
-        return {kind: Sightings.none(rules.by_line) for kind in kinds}
+        return {kind: Sightings.none(by_line) for kind in kinds}
 
     def anchor(self, number: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
         """Row and column of an anchor by its number."""
@@ -313,8 +244,8 @@ class _AnchorConnections(_OneConnection):
         self._points, self._pixel, self._rng = points, emission.pixel, emission.rng
         self._side, self._count = (dr.opaque(mi.UInt32, each) for each in (points.anchors, points.count))
 
-    def none(self, kinds: Sequence[str], rules: PathRules) -> Held:
-        self._numbers = len(_differing(Sightings.none(rules.by_line)))
+    def none(self, kinds: Sequence[str], by_line: bool) -> Held:
+        self._numbers = len(_differing(Sightings.none(by_line)))
         anchors = next((room for room in _ROOMS if room >= self._points.count), self._points.count)
         return {kind: dr.alloc_local(mi.Float, self._numbers * anchors, mi.Float(0)) for kind in kinds}
 

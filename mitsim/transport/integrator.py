@@ -19,21 +19,19 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import drjit as dr
 import mitsuba as mi
 
+from mitsim.transport.connect import OpticalSetup, SensorPoints
 from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT, PathSamples
-from mitsim.transport.transmission import Passage
 
 if TYPE_CHECKING:
     from typing import Self
 
+    from mitsim.transport.accumulator import DeviceAccumulator
     from mitsim.transport.projector import ProjectorOptics
 
 KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT, "ambient": AMBIENT})
 """Kinds of light by their names in the loop."""
 PATHS_PER_LAUNCH = 2**22
 """Paths of one kernel: at some 100 bytes of state each, 0.4 GB; and a launch's fixed cost is small beside its work."""
-_TOGETHER, _ALL = 4, 2**30
-"""Seeds whose paths one kernel follows at most, and samples of one seed beyond any that are asked for; the first times
-the second fits 32 bits."""
 _SHARP = 1.0
 """Density [1/sr] of sampling a turn above which its light is looked for from the camera.
 
@@ -77,29 +75,12 @@ def launches(
 
 @dataclass(frozen=True, eq=False)
 class InFlight:
-    """Samples in flight, those of one kernel: of each its ``seed``, the number of its ``sample`` of that, and the
-    ``index`` of its path in the sample, which tells pixel or cell, and anchor."""
+    """Samples in flight, those of one kernel: their ``seed``, the number of each ``sample``, and the ``index`` of its
+    path in the sample, which tells pixel or cell, and anchor."""
 
     seed: mi.UInt32
     sample: mi.UInt32
     index: mi.UInt32
-
-    @classmethod
-    def of(cls, seeds: Sequence[int], samples: int, sample: mi.UInt32, index: mi.UInt32) -> InFlight:
-        """Those of a few seeds one after the other: no division, and one kernel for one seed and for several.
-
-        Parameters
-        ----------
-        seeds, samples
-            a few, and the samples of each.
-        sample, index
-            number of each among the samples of all seeds, and of its path.
-        """
-        count, number = dr.opaque(mi.UInt32, samples), mi.UInt32(0)
-        for before in range(1, _TOGETHER):
-            number += dr.select(sample >= before * count, mi.UInt32(1), 0)
-        padded = mi.UInt32([*seeds, *[0] * (_TOGETHER - len(seeds))])
-        return cls(dr.gather(mi.UInt32, padded, number), sample - number * count, index)
 
 
 class Tracer(ABC):
@@ -112,7 +93,11 @@ class Tracer(ABC):
     """
 
     paths_per_launch: ClassVar[int] = PATHS_PER_LAUNCH
-    projector: ProjectorOptics
+
+    def __init__(self, setup: OpticalSetup, points: SensorPoints | None = None) -> None:
+        """Light that is followed in a ``setup``, to ``points`` of the sensor; to its centre if not given."""
+        self.setup, self.projector = setup, setup.projector
+        self.points = points or SensorPoints(setup.geometry.half_width)
 
     @property
     @abstractmethod
@@ -123,14 +108,6 @@ class Tracer(ABC):
     def connections_per_path(self) -> int:
         """Of those, how many each path of a kernel stands for."""
         return 1
-
-    def _in_flight(self, seeds: Sequence[int], first: int, samples: int) -> Iterator[InFlight]:
-        """Samples ``first`` .. ``first + samples - 1`` of a seed, or of several from the first on, one kernel's at a
-        time."""
-        each, count = samples if len(seeds) > 1 else _ALL, self.connections_per_path
-        at_once = max(1, self.paths_per_launch // count)
-        for sample, index in launches(self.paths_per_sample // count, first, samples * len(seeds), at_once):
-            yield InFlight.of(seeds, each, sample, index)
 
     @property
     def per_wavelength(self) -> Sequence[Self]:
@@ -144,11 +121,13 @@ class Tracer(ABC):
         return again
 
     @abstractmethod
-    def _launch(self, flight: InFlight) -> list[PathSamples]:
-        """Light of the paths of one kernel."""
+    def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
+        """Light of the paths of one kernel, but for what is added up in the ``accumulator``."""
 
-    def trace(self, seed: int, first: int = 0, samples: int = 1) -> PathSamples:
-        """Light of some samples, their sum.
+    def trace(
+        self, seed: int, first: int = 0, samples: int = 1, accumulator: DeviceAccumulator | None = None
+    ) -> PathSamples:
+        """Light of some samples, their sum; on the host, but for what is added up where it is traced.
 
         Parameters
         ----------
@@ -156,30 +135,34 @@ class Tracer(ABC):
             of the random numbers.
         first, samples
             samples ``first`` .. ``first + samples - 1`` of the seed's sequence are traced.
+        accumulator
+            of light by pixel, whose unit is the tracer's ``board``. From the camera's side none is filled.
 
         Raises
         ------
         MitsimError
             when the scene sends NaN or infinite light to the camera.
         """
-        flights = (
-            (tracer, flight) for tracer in self.per_wavelength for flight in self._in_flight([seed], first, samples)
-        )
-        return PathSamples.joined([part for tracer, flight in flights for part in tracer._launch(flight)])
+        count, parts = self.connections_per_path, list[PathSamples]()
+        at_once = max(1, self.paths_per_launch // count)
+        for tracer in self.per_wavelength:
+            for sample, index in launches(self.paths_per_sample // count, first, samples, at_once):
+                parts += tracer._launch(InFlight(dr.opaque(mi.UInt32, seed), sample, index), accumulator)
+        return PathSamples.joined(parts)
 
-    def trace_replicates(self, seeds: Sequence[int], samples: int = 1) -> list[PathSamples]:
-        """``samples`` as :meth:`trace` finds them for each of some ``seeds``, in as few kernels as may be."""
-        each, found = self.paths_per_sample * samples, list[PathSamples]()
-        together = min(self.paths_per_launch // each, _TOGETHER)
-        if together < 2:
-            return [self.trace(seed, 0, samples) for seed in seeds]
-        for start in range(0, len(seeds), together):
-            few = seeds[start : start + together]
-            (flight,) = self._in_flight(few, 0, samples)
-            parts = [part for tracer in self.per_wavelength for part in tracer._launch(flight)]
-            for start_of_one in range(0, each * len(few), each):
-                found.append(PathSamples.joined([part.of_lanes(start_of_one, start_of_one + each) for part in parts]))
-        return found
+
+@dataclass(frozen=True)
+class Paths:
+    """Which light is followed besides projector - surface - camera.
+
+    ``mirrors``: over delta reflections and transmissions, from the camera only on its side; ``interreflection``: any
+    number of bounces; ``emitters``: other lights of the scene, all of them one class of ambient light, which the camera
+    alone finds.
+    """
+
+    mirrors: bool = False
+    interreflection: bool = False
+    emitters: tuple[mi.Emitter, ...] = ()
 
 
 class FollowingTracer(Tracer):
@@ -190,6 +173,26 @@ class FollowingTracer(Tracer):
     """
 
     orders: tuple[int, int] | None = None
+
+    def __init__(self, setup: OpticalSetup, paths: Paths, points: SensorPoints | None = None) -> None:
+        """What is followed.
+
+        Parameters
+        ----------
+        setup
+            scene, camera and projector.
+        paths
+            which of them are followed.
+        points
+            of the sensor, that they lead to or start at; its centre if not given.
+        """
+        super().__init__(setup, points)
+        self.paths = paths
+
+    @property
+    def by_line(self) -> bool:
+        """Whether light is told apart by the wavelengths of its paths."""
+        return self.projector.by_line
 
     def of_orders(self, fewest: int, most: int) -> Self:
         """The same paths, whose light is kept of the orders ``fewest`` to ``most``, and which end where no more can
@@ -249,29 +252,6 @@ class Turn:
     delta: mi.Bool
 
 
-@dataclass(frozen=True, eq=False)
-class PathRules:
-    """Which paths are followed.
-
-    Attributes
-    ----------
-    passage
-        the scene, and what light passes in it.
-    mirrors, interreflection
-        paths over delta reflections and transmissions, and over other surfaces.
-    orders
-        of :class:`FollowingTracer`; None: all.
-    by_line
-        whether light is told apart by line.
-    """
-
-    passage: Passage
-    mirrors: bool
-    interreflection: bool
-    orders: tuple[int, int] | None = None
-    by_line: bool = False
-
-
 class PathIntegrator(ABC, Generic[State]):
     """The paths of one launch, followed from vertex to vertex: the first apart, all others in a loop of one kernel.
 
@@ -286,11 +266,12 @@ class PathIntegrator(ABC, Generic[State]):
     reach: int = 1
     """How many more surfaces that are no mirrors turn the light of a path that goes on, at least."""
 
-    def __init__(self, rules: PathRules) -> None:
-        """Of what ``rules`` say."""
-        self.rules, self.passage, self.scene = rules, rules.passage, rules.passage.scene
-        self.followed = rules.mirrors or rules.interreflection or rules.passage.open
-        self._orders = [dr.opaque(mi.UInt32, order) for order in rules.orders or ()]
+    def __init__(self, tracer: FollowingTracer) -> None:
+        """Of what a ``tracer`` follows."""
+        self.rules, self.setup, self.by_line = tracer.paths, tracer.setup, tracer.by_line
+        self.scene, self.passage = tracer.setup.scene, tracer.setup.passage
+        self.followed = self.rules.mirrors or self.rules.interreflection or self.passage.open
+        self._orders = [dr.opaque(mi.UInt32, order) for order in tracer.orders or ()]
 
     def follow(self, paths: State) -> State:
         """``paths`` at their end, all light of them kept."""

@@ -8,30 +8,40 @@ paths run into it. A lens of the projector's own they run into as well, but seld
 So do paths over one mirror and one sharp lobe. Connections may meet such a lobe by chance: of the projector's side from
 the lobe to the sensor, of the camera's side from the lobe, seen in a mirror, to the projector. With x the light of a
 path that runs into the lens and I that of the connection along the same way, E[x I] is a connection's second moment, so
-a sample of connections sees the light L of a shape's lobes as ``L^2 / E[x I]`` equal hits would
-(:mod:`mitsim.transport.sharp_lobes`). Whether that is enough, whoever asks knows: lobes of curved surfaces are met
-seldom however broad they are.
+a sample of connections sees the light L of a shape's lobes as ``L^2 / E[x I]`` equal hits would. Whether that is
+enough, whoever asks knows: lobes of curved surfaces are met seldom however broad they are.
+
+Lobes that the projector lights itself, and the highlights of glossy balls, are looked for from the surface.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import numpy.typing as npt
 
-from mitsim.core.arrays import FloatArray, Labels
-from mitsim.devices.camera import CameraGeometry
-from mitsim.transport.connect import LensHit, sample_wavelengths
-from mitsim.transport.from_camera import CameraPaths, CameraState, FromCameraTracer, Paths
-from mitsim.transport.integrator import InFlight, Turn, camera_part
-from mitsim.transport.plugins.base import channels, device_vectors, host_values, turn_and_origin, vectors
-from mitsim.transport.projector import PinholeRays, ProjectorOptics, ProjectorRays, wavelength_sets
-from mitsim.transport.records import DIRECT, INDIRECT, CellGrid, PathSamples, Sightings
-from mitsim.transport.sampler import panchromatic, streams
-from mitsim.transport.transmission import Passage
+from mitsim.core.arrays import FloatArray, Labels, mean_of_neighbours
+from mitsim.transport.connect import LensHit, OpticalSetup, Reception, landing, sample_wavelengths
+from mitsim.transport.direct import DirectTracer
+from mitsim.transport.from_camera import CameraPaths, CameraState, FromCameraTracer
+from mitsim.transport.integrator import InFlight, Paths, Turn, camera_part, launches
+from mitsim.transport.plugins.base import (
+    channels,
+    device_vectors,
+    host_values,
+    panchromatic,
+    streams,
+    turn_and_origin,
+    vectors,
+)
+from mitsim.transport.projector import PinholeRays, wavelength_sets
+from mitsim.transport.records import DIRECT, INDIRECT, CellGrid, PathSamples, Sightings, check_finite
+from mitsim.transport.transmission import Arrival
 
 _LENS = 0.02
 """Radius of the lens over the scene's distance: 8 mm at 400, which one path in 3000 meets from a matt surface."""
@@ -70,23 +80,15 @@ class LeftOut:
         return float(light.sum()), int(np.argmax(light)) if light.any() else None
 
 
-def left_out_light(
-    scene: mi.Scene,
-    camera: mi.Sensor,
-    projector: ProjectorOptics,
-    grid: CellGrid,
-    geometry: CameraGeometry,
-    seed: int,
-    samples: int,
-) -> LeftOut:
+def left_out_light(setup: OpticalSetup, grid: CellGrid, seed: int, samples: int) -> LeftOut:
     """Light that is left out, or may be.
 
     Parameters
     ----------
-    scene, camera, projector
-        what light meets, the sensor that it is received on, and where it comes from.
-    grid, geometry
-        cells that paths start in, and the camera's own.
+    setup
+        scene, camera and projector.
+    grid
+        cells that paths start in.
     seed, samples
         of the random numbers, and paths of each cell.
 
@@ -95,11 +97,12 @@ def left_out_light(
     MitsimError
         when the scene sends NaN or infinite light to the camera.
     """
-    lens = replace(projector, aperture=_LENS * geometry.scene_distance, focus=geometry.scene_distance)
+    far = setup.geometry.scene_distance
+    lens = replace(setup.projector, aperture=_LENS * far, focus=far)
     paths = Paths(mirrors=True, interreflection=True)
-    found = _MissedTracer(scene, camera, lens, grid, paths, geometry).trace(seed, 0, samples)
+    found = _MissedTracer(replace(setup, projector=lens), grid, paths).trace(seed, 0, samples)
     # Path samples name shapes by their number in Dr.Jit's registry.
-    numbers = np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr())).astype(np.int64)
+    numbers = np.array(dr.reinterpret_array(mi.UInt32, setup.scene.shapes_dr())).astype(np.int64)
 
     def by_shape(light: PathSamples, values: FloatArray) -> FloatArray:
         return np.asarray(np.bincount(light.pixel, values, int(numbers.max()) + 1)[numbers] / samples)
@@ -107,7 +110,7 @@ def left_out_light(
     lost, met = (found.where(found.kind == kind) for kind in (INDIRECT, DIRECT))
     mirrors, hits = _equal_hits(by_shape(lost, lost.value), by_shape(lost, np.square(lost.value)))
     # A lens of half the radius is met a quarter as often, and four times as bright.
-    seldom = np.square(projector.aperture / lens.aperture)
+    seldom = np.square(setup.projector.aperture / lens.aperture)
     return LeftOut(mirrors, hits * seldom, *_equal_hits(by_shape(met, met.value), by_shape(met, met.value * met.row)))
 
 
@@ -138,7 +141,7 @@ class _MissedPaths(CameraPaths[_MissedState]):
 
     def __init__(self, tracer: FromCameraTracer, flight: InFlight) -> None:
         super().__init__(tracer, _MissedState, flight)
-        self._rays = ProjectorRays(tracer.projector)
+        self._rays = tracer.setup.rays  # made before the loop, in which nothing can be evaluated
 
     def _connect(self, paths: _MissedState, si: mi.SurfaceInteraction3f, first: bool) -> None:
         """Nothing: what connections find is not left out."""
@@ -149,7 +152,7 @@ class _MissedPaths(CameraPaths[_MissedState]):
         once = paths.active & (paths.scattered == 1) & (paths.in_mirror != paths.by_delta)
         met = once & (camera_part(paths.density) > 0)
         hit = self.connector.hit(paths.ray, si.t, paths.rng, lost | met, paths.since)
-        light, none, by_line = self._irradiance(paths, hit.radiance), mi.Float(0), self.rules.by_line
+        light, none, by_line = self._irradiance(paths, hit.radiance), mi.Float(0), self.by_line
         missed = dr.select(hit.met & lost, light * paths.part, 0)
         self._join(paths, "indirect", Sightings.of(missed, by_line, paths.mirror, none, none, none))
         met &= hit.met
@@ -183,74 +186,6 @@ def polished_shapes(scene: mi.Scene) -> tuple[int, ...]:
     return tuple(number for number, shape in shapes if shape.bsdf() is not None and shape.bsdf().flags() & polished)
 
 
-# -------- Light of a lamp onto the sensor, over no surface
-#
-# No path runs into a point, spot or directional lamp, few run into a small one that has a surface, and no tracer
-# connects the sensor itself to either.
-
-_SENSOR_POINTS = 9
-"""Points along each side of the sensor, its edges with them: things in the way are larger than an eighth of it."""
-_LAMP_POINTS = 2**10
-"""Points of a lamp: how much of it is seen is known to some percent."""
-
-
-def shines_in(scene: mi.Scene, camera: mi.Sensor, lamp: mi.Emitter) -> bool:
-    """Whether a point of the sensor sees the ``lamp`` within the field stop.
-
-    Parameters
-    ----------
-    scene, camera
-        what may stand in the way, and the sensor.
-    lamp
-        a point, spot or directional one.
-    """
-    edge = np.linspace(-1, 1, _SENSOR_POINTS) * camera.geometry.half_width
-    x, y = (mi.Float(axis.ravel()) for axis in np.meshgrid(edge, edge))
-    to_world, sensor = camera.world_transform(), dr.zeros(mi.SurfaceInteraction3f, _SENSOR_POINTS**2)
-    sensor.p = to_world @ mi.Point3f(x, y, 0)
-    _, rng = streams(0, dr.arange(mi.UInt32, _SENSOR_POINTS**2), mi.UInt32(0))
-    sensor.wavelengths, _ = sample_wavelengths(camera, rng)
-    ds, light = lamp.sample_direction(sensor, mi.Point2f(0.5), True)
-    met = _in_view(camera, ds.d) & (dr.max(mi.unpolarized_spectrum(light)) > 0)
-    seen, _ = Passage(scene).between(sensor, ds.p, met)
-    return bool(np.array(met & seen).any())
-
-
-def part_of_view(scene: mi.Scene, camera: mi.Sensor, shape: mi.Shape) -> float:
-    """Part of the field stop, in tan-angles, in which the sensor's centre sees a ``shape`` that shines; where nothing
-    is before it.
-
-    Parameters
-    ----------
-    scene, camera, shape
-        as of :func:`shines_in`; the side that shines counts.
-    """
-    _, rng = streams(0, dr.arange(mi.UInt32, _LAMP_POINTS), mi.UInt32(0))
-    to_world, place = (
-        camera.world_transform(),
-        shape.sample_position(0, mi.Point2f(rng.next_float32(), rng.next_float32())),
-    )
-    sensor = dr.zeros(mi.SurfaceInteraction3f, _LAMP_POINTS)
-    sensor.p = to_world @ mi.Point3f(0)
-    way = place.p - sensor.p
-    distance = dr.norm(way)
-    way /= distance
-    facing = -dr.dot(place.n, way)
-    met = _in_view(camera, way) & (facing > 0)
-    seen, _ = Passage(scene).between(sensor, place.p, met)
-    # Of dA on the lamp, in solid angle and on the plane at unit distance.
-    area = facing / distance**2 / (to_world.inverse() @ way).z ** 3
-    total = float(np.array(dr.select(met & seen, area, 0)).mean()) * float(shape.surface_area()[0])
-    return total / float(2 * camera.geometry.tan_half_fov) ** 2
-
-
-def _in_view(camera: mi.Sensor, direction: mi.Vector3f) -> mi.Bool:
-    """Whether light from a ``direction`` comes through the field stop."""
-    toward = camera.world_transform().inverse() @ direction
-    stop = camera.geometry.tan_half_fov * toward.z
-    return (dr.abs(toward.x) <= stop) & (dr.abs(toward.y) <= stop)
-
-
 # -------- Highlights of glossy balls
 #
 # The light that a ball of radius r sends to a point comes from a spot of some alpha r: rays that are spread over the
@@ -262,8 +197,6 @@ _POINTS, _NEAREST = 512, 1e-4
 """Points about each spot, which tell its light to some 5 %, and the angle from its middle that they begin at."""
 _MOST_BALLS = 2**12
 """Balls that are looked at, every so many of more: two million points, some 0.5 s."""
-_SHARP = 10.0
-"""Density [1/sr] of a turn below which its light is left to connections, as in :mod:`mitsim.transport.sharp_lobes`."""
 _GOLDEN = math.pi * (3 - math.sqrt(5))
 """Angle by which points about a spot follow each other: evenly spread at any number."""
 _FEWEST_MET = 3.0
@@ -300,23 +233,16 @@ class Highlights:
         return Highlights(self.pixels[seldom], self.irradiance[seldom], self.moments[seldom])
 
 
-def highlights(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, geometry: CameraGeometry) -> Highlights:
-    """Highlights of all glossy balls that the projector's pinhole and the sensor's centre both see.
-
-    Parameters
-    ----------
-    scene, camera, projector
-        as loaded.
-    geometry
-        of the camera.
-    """
+def highlights(setup: OpticalSetup) -> Highlights:
+    """Highlights of all glossy balls of a ``setup`` that the projector's pinhole and the sensor's centre both see."""
+    scene, projector = setup.scene, setup.projector
     balls = [s for s in scene.shapes() if s.class_name() == "Sphere" and s.bsdf() is not None and _glossy(s.bsdf())]
     balls = balls[:: -(-len(balls) // _MOST_BALLS)] if balls else []
     if not balls:
         return Highlights(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
     wavelengths = wavelength_sets(projector.lines)
     rays = PinholeRays(projector, wavelengths)
-    turn, eye = turn_and_origin(camera.world_transform())
+    turn, eye = turn_and_origin(setup.camera.world_transform())
     centre = np.array([np.array(ball.bbox().center(), dtype=np.float64).ravel() for ball in balls])
     radius = np.array([float(np.array(ball.bbox().extents()).max()) / 2 for ball in balls])
     normal = _mirror_normals(centre, radius, rays.origin, eye)
@@ -340,7 +266,7 @@ def highlights(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, g
     )
     sent, facing = _radiance_toward(scene, rays.origin, aimed, eye, np.repeat(radius, _POINTS))
     local = -back @ turn
-    stop = (np.abs(local[:, :2]) <= geometry.tan_half_fov * local[:, 2:]).all(axis=1)
+    stop = (np.abs(local[:, :2]) <= setup.geometry.tan_half_fov * local[:, 2:]).all(axis=1)
     # Part of the window that each point stands for, by the tangents of one pixel, and what it brings.
     seen = np.tile(area, len(balls)) * np.repeat(radius, _POINTS) ** 2 * np.maximum(facing, 0) * far / depth**3
     received = sent * (local[:, 2] / near) / near**2
@@ -391,6 +317,285 @@ def _radiance_toward(
     active = si.is_valid() & ~scene.ray_test(si.spawn_ray_to(target))
     value, density = si.bsdf().eval_pdf(context, si, way, active)
     count = len(aimed)
-    light = channels(mi.unpolarized_spectrum(dr.select(active & (density > _SHARP), value, 0)), count).mean(axis=1)
+    sharp = dr.select(active & (density > _LEAST_SHARP), value, 0)
+    light = channels(mi.unpolarized_spectrum(sharp), count).mean(axis=1)
     met = np.linalg.norm(vectors(si.p, count) - aimed, axis=1) < _ON_BALL * radius + 1e-4 * np.abs(aimed).max(axis=1)
     return light * met, host_values(dr.abs(mi.Frame3f.cos_theta(si.wi)), count)
+
+
+# -------- Direct light over sharp lobes
+#
+# Direct light over sharp lobes, found from the surface: how much of it there is, and whether connections can see it.
+#
+# Direct light is found by connecting lit points to the sensor. A connection rarely meets a lobe that is far narrower
+# than the projector's window: then no estimate holds its light, no spread of estimates tells of it, and the frames
+# would lack it in silence. Sampled from the surface instead, such a lobe meets the sensor easily. With I the irradiance
+# that a ray's connection to a sensor point stands for, uniform over the sensor's area A, and q the density [1/mm^2] of
+# meeting that point by sampling the surface, a met point estimates the mean irradiance by x = I / (A q), and the second
+# moment of a connection by x I. So N connections see the light L of the lobes as ``N L^2 / E[x I]`` equal hits would.
+
+_SHARP, _LEAST_SHARP = 100.0, 10.0
+"""Density [1/sr] of a turn above which its lobe counts as sharp where all turns of a pixel are, as a GGX lobe of
+roughness 0.03 does; where a part of them is, that part of it, but no less than the second: as a lobe of roughness 0.02
+does that takes a twentieth of the light.
+
+Such a lobe fills 0.01 sr, a tenth of the shipped projector's window: connections from all of it meet broader ones.
+"""
+_PLENTY = 2**12
+"""Rays met on the sensor that tell the light of a few pixels to a few percent; fewer are followed by a second look."""
+_CONNECTIONS = 2**18
+"""Connections that tell all other light, some 0.1 s: it is bounded, so a percent of it or less is left open."""
+_SEARCHING = 2**20
+"""Connections that look for lobes which take little of the light, and are therefore seldom sampled, some 0.1 s: varnish
+of roughness 0.005 that reflects a twentieth, on a ball of 100 mm at 390, is met eleven times, and sampled twice."""
+_FEWER, _WIDER = 16, 16.0
+"""A look at a sensor so many times as wide takes so many times fewer rays, and meets 16 times as much: where it meets
+nothing, the full look, which is far longer, is spared."""
+_SHARPEST = 0.1
+"""Part of the light over sharper lobes than the width that is reported: the peak of a GGX lobe is met that often."""
+
+
+# ---- Light over sharp lobes, and what it is found from
+
+
+@dataclass(frozen=True, eq=False)
+class SharpLight:
+    """Light over sharp lobes, without the mask.
+
+    Attributes
+    ----------
+    irradiance, error
+        mean over the sensor [W m^-2], and its Monte Carlo error.
+    hits
+        of one connection of every projector pixel, those that would meet a lobe, as far as noise goes.
+    by_pixel, moments
+        (n^2,) ``irradiance`` of each projector pixel, and the second moment of its connection [W^2 m^-4].
+    width
+        radius of the lobes on the sensor [mm], sqrt(P / (pi q)) of all but the sharpest tenth of the light: with P the
+        part of a pixel's turns that are sharp, q / P is the density of a lobe by itself.
+    rest
+        all other direct light, mean over the sensor [W m^-2].
+    """
+
+    irradiance: float
+    error: float
+    hits: float
+    by_pixel: FloatArray
+    moments: FloatArray
+    width: float
+    rest: float = 0.0
+
+    @classmethod
+    def none(cls, pixels: int) -> SharpLight:
+        """Of a projector of so many ``pixels`` that lights no sharp lobe."""
+        return cls(0.0, 0.0, math.inf, np.zeros(pixels), np.zeros(pixels), math.inf)
+
+
+def sharp_light(setup: OpticalSetup, seed: int, samples: int) -> SharpLight:
+    """Direct light over lobes too sharp for connections.
+
+    Where a shorter look at a wider sensor meets none, there is none. What few rays find comes from small parts of a few
+    pixels, as off curved surfaces: these pixels, those that connections find, and their neighbours are looked at once
+    more, with as many rays.
+
+    Parameters
+    ----------
+    setup
+        scene, camera and projector.
+    seed, samples
+        of the random numbers, and rays of every projector pixel.
+
+    Raises
+    ------
+    MitsimError
+        when the scene sends NaN or infinite light to the camera.
+    """
+    n, paths_per_sample = setup.projector.n, setup.projector.n**2
+    lobes = _Lobes(setup)
+    first = lobes.trace(np.arange(paths_per_sample), seed, 0, -(-samples // _FEWER), _WIDER)
+    if not len(first.widths):
+        return SharpLight.none(paths_per_sample)
+    lobes.least = least = mi.Float(np.clip(_SHARP * first.sharp, _LEAST_SHARP, _SHARP).astype(np.float32))
+    found = lobes.trace(np.arange(paths_per_sample), seed, 0, samples)
+    if len(found.widths) < _PLENTY:
+        search = _Connections(setup, 1, spread=True).over(least, sharp=True)
+        lit = np.bincount(
+            search.trace(seed, 0, max(1, _SEARCHING // paths_per_sample)).pixel, minlength=paths_per_sample
+        )
+        pixels = with_neighbours((found.by_pixel > 0) | (lit > 0), n)
+        if len(pixels):
+            found = lobes.trace(pixels, seed, samples, samples * paths_per_sample // len(pixels))
+    total, moment = float(found.by_pixel.sum()), float(found.moments.sum())
+    hits = total**2 / moment if moment else 0.0
+    rest = 0.0
+    if total:
+        others = _Connections(setup, 1, spread=True).over(least, sharp=False)
+        count = max(1, _CONNECTIONS // paths_per_sample)
+        rest = float(others.trace(seed, 0, count).value.sum()) / count
+    width = _quantile(found.widths, found.weights, _SHARPEST)
+    return SharpLight(total, found.error, hits, found.by_pixel, found.moments, width, rest)
+
+
+def _quantile(values: FloatArray, weights: FloatArray, part: float) -> float:
+    """Value below which ``part`` of the ``weights`` lie; inf for none."""
+    order = np.argsort(values)
+    sums = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(sums, part * sums[-1])]) if values.size else math.inf
+
+
+def with_neighbours(chosen: npt.NDArray[np.bool_], side: int) -> Labels:
+    """Numbers of the pixels that are chosen, and of all that touch one of them.
+
+    Parameters
+    ----------
+    chosen
+        (side^2,) of a square of pixels, row by row.
+    side
+        of the square.
+    """
+    return np.flatnonzero(mean_of_neighbours(chosen.reshape(side, side).astype(np.float64)) > 0)
+
+
+# ---- Light by pixel, and hits of the sensor
+
+
+@dataclass(frozen=True, eq=False)
+class _LobeLight:
+    """Irradiance and second moment of every projector pixel, the part of its turns that are sharp, the irradiance's
+    error, and width and weight of each lobe."""
+
+    by_pixel: FloatArray
+    moments: FloatArray
+    sharp: FloatArray
+    error: float
+    widths: FloatArray
+    weights: FloatArray
+
+
+@dataclass
+class _SensorHits:
+    """Of points met on the sensor: estimates x of the mean irradiance, x I, and density q of one, drawn by x; and sharp
+    turns, wherever they went."""
+
+    mean: mi.Float
+    moment: mi.Float
+    density: mi.Float
+    turns: mi.Float
+
+    def joined_by(self, more: _SensorHits, rng: mi.PCG32) -> _SensorHits:
+        """These and ``more``; in x I, points that are met over one surface are no points of another."""
+        mean = self.mean + more.mean
+        new = rng.next_float32() * mean < more.mean
+        density = dr.select(new, more.density, self.density)
+        return _SensorHits(mean, self.moment + more.moment, density, self.turns + more.turns)
+
+
+# ---- Connections over sharp lobes alone
+
+
+class _Connections(DirectTracer):
+    """Direct light over sharp lobes alone, or all other."""
+
+    _over_sharp: bool
+    _least: mi.Float
+    _own_least: mi.Float
+
+    def over(self, least: mi.Float, sharp: bool) -> _Connections:
+        """The same over ``sharp`` lobes, of at ``least`` such a density [1/sr] by pixel, or over all others."""
+        self._least, self._over_sharp = least, sharp
+        return self
+
+    def _place(
+        self, number: mi.UInt32, row: mi.UInt32, column: mi.UInt32, jitter: mi.Point2f
+    ) -> tuple[mi.Point2f, mi.Float]:
+        self._own_least = dr.gather(mi.Float, self._least, number)
+        return super()._place(number, row, column, jitter)
+
+    def _by_connection(self, at: Arrival, sensor: mi.Point3f) -> tuple[Reception, mi.UnpolarizedSpectrum]:
+        reception, received = super()._by_connection(at, sensor)
+        sharp = reception.pdf > self._own_least
+        return reception, dr.select(sharp == self._over_sharp, received, 0)
+
+
+# ---- Rays that sharp lobes send to the sensor
+
+
+class _Lobes:
+    """Rays of the projector that sharp lobes of the surfaces that they light send to the sensor.
+
+    Attributes
+    ----------
+    least
+        (n^2,) density [1/sr] above which a lobe counts as sharp, by projector pixel.
+    """
+
+    def __init__(self, setup: OpticalSetup) -> None:
+        self.setup, self.least = setup, dr.full(mi.Float, _LEAST_SHARP, setup.projector.n**2)
+
+    def trace(self, pixels: Labels, seed: int, first: int, samples: int, wider: float = 1.0) -> _LobeLight:
+        """What rays ``first`` to ``first + samples`` - 1 of ``pixels`` meet on a sensor so many times ``wider``."""
+        squares, met, weights = 0.0, [], []
+        by_pixel, moments = np.zeros((2, self.setup.projector.n**2))
+        turned = dr.zeros(mi.Float, len(by_pixel))
+        for sample, place in launches(len(pixels), first, samples):
+            pixel = dr.gather(mi.UInt32, mi.UInt32(pixels), place)
+            number, mean, product, density = self.meet(seed, sample, pixel, wider, turned)
+            by_pixel += np.bincount(number, mean, minlength=len(by_pixel)) / samples
+            moments += np.bincount(number, product, minlength=len(by_pixel)) / samples
+            squares += float(np.square(mean).sum())
+            met.append((number, density))
+            weights.append(mean)
+        sharp = np.array(turned, dtype=np.float64) / samples
+        variance = max(squares / samples - float(by_pixel.sum()) ** 2 / len(pixels), 0.0)
+        pixel_of, densities = (np.concatenate(parts) for parts in zip(*met, strict=True))
+        widths = np.sqrt(sharp[pixel_of] / (np.pi * densities))
+        return _LobeLight(by_pixel, moments, sharp, math.sqrt(variance / samples), widths, np.concatenate(weights))
+
+    def meet(
+        self, seed: int, sample: mi.UInt32, pixel: mi.UInt32, wider: float, turned: mi.Float
+    ) -> tuple[Labels, FloatArray, FloatArray, FloatArray]:
+        """Pixels of the rays that meet the sensor, and for each x, x I, and density q of one of the points met; sharp
+        turns are added to those ``turned`` (n^2,). MitsimError where light is NaN or infinite."""
+        half = dr.opaque(mi.Float, wider * self.setup.geometry.half_width)
+        _, rng = streams(seed, pixel, sample)
+        jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
+        wavelengths, spectral = sample_wavelengths(self.setup.camera, rng, self.setup.projector.lines)
+        ray = self.setup.rays.sample(pixel, jitter, rng, wavelengths)
+        flux = self.setup.rays.flux(pixel, wavelengths) * spectral
+        none = _SensorHits(mi.Float(0), mi.Float(0), mi.Float(1), mi.Float(0))
+        met, _ = self.setup.passage.along(
+            ray, flux, (none, rng), partial(self._meet_sensor, half, dr.gather(mi.Float, self.least, pixel))
+        )
+        # Whole numbers, whose sums in any order are the same.
+        dr.scatter_reduce(dr.ReduceOp.Add, turned, met.turns, pixel, met.turns > 0)
+        dr.eval(met, turned)
+        # Few rays meet the sensor: of the others nothing is fetched. What is not a number is no zero either.
+        lit = dr.compress(~(met.mean == 0))
+        number = np.array(dr.gather(mi.UInt32, pixel, lit), dtype=np.int64)
+        mean, product, density = (
+            np.array(dr.gather(mi.Float, values, lit), dtype=np.float64)
+            for values in (met.mean, met.moment, met.density)
+        )
+        check_finite(mean)
+        check_finite(product)
+        return number, mean, product, density
+
+    def _meet_sensor(
+        self, half: mi.Float, least: mi.Float, at: Arrival, state: tuple[_SensorHits, mi.PCG32]
+    ) -> tuple[_SensorHits, mi.PCG32]:
+        """What a turn that is sampled at the surface meets on a sensor of a ``half`` width, over lobes of ``least``
+        density."""
+        met, rng = state
+        turn = at.turn(rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
+        density = at.density(turn.wo)
+        active = at.active & (turn.pdf > 0) & (density > 0) & ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
+        turns = dr.select(active & (density > least), mi.Float(1), 0)
+        place = landing(self.setup, at.si, at.si.to_world(turn.wo), active)
+        active &= place.arrives & (dr.abs(place.x) <= half) & (dr.abs(place.y) <= half)
+        sensor = mi.Point3f(place.x, place.y, 0)
+        reception = self.setup.receive(at.si, -at.direction, sensor, active)
+        active &= reception.pdf > least
+        per_area = density * reception.solid_angle(sensor)
+        connected = dr.select(active, panchromatic(reception.irradiance * at.light), 0)
+        mean = dr.select(active, connected / (4 * dr.square(half) * per_area), 0)
+        return met.joined_by(_SensorHits(mean, mean * connected, per_area, turns), rng), rng

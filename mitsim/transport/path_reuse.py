@@ -35,17 +35,10 @@ import numpy as np
 
 from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import Way
-from mitsim.transport.indirect import (
-    MEMBERS,
-    SIDE,
-    Emission,
-    IndirectTracer,
-    ProjectorPaths,
-    blocks_of,
-)
+from mitsim.transport.indirect import MEMBERS, SIDE, Emission, IndirectTracer, ProjectorPaths, blocks_of
 from mitsim.transport.integrator import InFlight, camera_part, shading_correction
+from mitsim.transport.plugins.base import generator, split_by_line, stratified
 from mitsim.transport.records import INDIRECT, PathSamples, Sightings, check_finite
-from mitsim.transport.sampler import generator, split_by_line, stratified
 
 if TYPE_CHECKING:
     ByLine = list[mi.Float]
@@ -78,15 +71,11 @@ class PathReuseTracer(IndirectTracer):
         """The same, as :meth:`IndirectTracer.with_adaptive_counts`; ``repeats`` (blocks^2,)."""
         return self._with_counts(np.asarray(repeats, dtype=np.int64))
 
-    def trace_replicates(self, seeds: Sequence[int], samples: int = 1) -> list[PathSamples]:
-        """``samples`` of each of some ``seeds``, one after the other: pairs of paths have no lane of their own."""
-        return [self.trace(seed, 0, samples) for seed in seeds]
-
     def shares(self) -> bool:
         """Whether what is to be followed can be shared: as the module says."""
         lines = mi.is_monochromatic or (mi.is_spectral and self.projector.lines is not None)
         several = self.points.count > 1 or not lines or mi.is_polarized
-        return self.interreflection and not several and not self.receiver.passage.open
+        return self.paths.interreflection and not several and not self.setup.passage.open
 
     @property
     def lines(self) -> int:
@@ -97,13 +86,13 @@ class PathReuseTracer(IndirectTracer):
     @cached_property
     def diffuse(self) -> frozenset[int]:
         """Places among the scene's shapes of those whose material is diffuse and nothing else: no bumps, no coat."""
-        shapes = enumerate(self.scene.shapes())
+        shapes = enumerate(self.setup.scene.shapes())
         return frozenset(place for place, shape in shapes if _is_diffuse(shape.bsdf()))
 
     @property
     def all_diffuse(self) -> bool:
         """Whether all surfaces are: pairs then take no look at a material."""
-        return len(self.diffuse) == len(self.scene.shapes())
+        return len(self.diffuse) == len(self.setup.scene.shapes())
 
     def _emission(self, flight: InFlight) -> Emission:
         """Of whole blocks of pixels, the members of each one after the other."""
@@ -143,9 +132,13 @@ class ReusedPaths(ProjectorPaths):
         self.tracer = tracer
         self.member = dr.arange(mi.UInt32, dr.width(self.pixel)) % MEMBERS
 
-    def path_samples(self) -> list[PathSamples]:
-        """Light on the host: of each pixel's own paths, and of all pairs of pixels and second points."""
+    def path_samples(self, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
+        """Light on the host of each pixel's own paths; that of pairs of pixels and second points goes into the
+        ``accumulator`` where there is one."""
         own, count = self._own(), dr.width(self.lit) * MEMBERS
+        if accumulator is not None:
+            self._accumulate(accumulator)
+            return own
         values = [[dr.zeros(mi.Float, count) for _ in range(self.tracer.lines)] for _ in range(2)]
 
         def store(place: mi.UInt32, at: mi.UInt32, light: tuple[ByLine, ByLine], active: mi.Bool) -> None:
@@ -157,21 +150,18 @@ class ReusedPaths(ProjectorPaths):
         dr.eval(values)
         return [*own, self._pair_samples(values[0], self.to_sensor_way), self._pair_samples(values[1], self.further)]
 
-    def accumulate(self, accumulators: Sequence[DeviceAccumulator]) -> list[PathSamples]:
-        """Light of each pixel's own paths on the host; that of pairs in ``accumulators``, one for each line."""
-        own, way = self._own(), self.to_sensor_way
+    def _accumulate(self, accumulator: DeviceAccumulator) -> None:
+        """Add up the light of pairs."""
+        way = self.to_sensor_way
         seen = Sightings(way.geometric, self.pixel, way.row, way.column, way.inverse_depth)
-        places = [accumulators[0].place(each, self.paths.rng.next_float32()) for each in (seen, self.further)]
+        places = [accumulator.place(each, self.paths.rng.next_float32()) for each in (seen, self.further)]
         dr.eval(places)
 
         def store(place: mi.UInt32, at: mi.UInt32, light: tuple[ByLine, ByLine], active: mi.Bool) -> None:
             for each, by_line in zip(places, light, strict=True):
-                for accumulator, value in zip(accumulators, by_line, strict=True):
-                    lit = active & ~(value == 0)  # not a number is light to be refused
-                    accumulator.add(value, self.pixel, dr.gather(mi.UInt32, each, at, lit), lit)
+                accumulator.add(by_line, self.pixel, dr.gather(mi.UInt32, each, at, active), active)
 
         self._pair_light(*self._weights(), store)
-        return own
 
     # ---- the paths themselves ---------------------------------------------------------------------------------------
 
@@ -337,7 +327,7 @@ class ReusedPaths(ProjectorPaths):
             second = met.compute_surface_interaction(ray, active=active)
             toward = dr.normalize(si.p - second.p)
             way = dr.gather(Way, self.to_sensor_way, at, active)
-            reception = self.tracer.receiver.received(second, toward, replace(way, open=way.open & active))
+            reception = self.setup.received(second, toward, replace(way, open=way.open & active))
             connected = self._factors(reception.irradiance * (1 - camera_part(reception.pdf)))
             beyond, turned = (
                 [dr.gather(mi.Float, each, at, active) for each in lines] for lines in (self.beyond, self.own_turn)
@@ -374,7 +364,7 @@ class ReusedPaths(ProjectorPaths):
             inverse_depth=inverse.astype(np.float64),
             value=light[pairs].astype(np.float64),
             kind=np.full(len(pairs), INDIRECT, dtype=np.int16),
-            lines=lines if self.rules.by_line else None,
+            lines=lines if self.by_line else None,
         )
 
 
@@ -401,7 +391,7 @@ class DiffuseReusedPaths(ReusedPaths):
         self.sensor_side = dr.sign(dr.dot(self.shading, self.to_sensor_way.direction))
         facing = self.shading * self.sensor_side
         way = replace(self.to_sensor_way, open=self.to_sensor_way.open & self.shared)
-        reception = self.tracer.receiver.received(second, facing, way)
+        reception = self.setup.received(second, facing, way)
         self.to_sensor = self._factors(reception.irradiance * dr.abs(dr.dot(self.normal, facing)))
 
     def _sender(self, si: mi.SurfaceInteraction3f) -> Sender:

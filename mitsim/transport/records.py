@@ -22,7 +22,7 @@ from scipy import sparse
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.optics.shadow import Directions
-from mitsim.transport.sampler import panchromatic
+from mitsim.transport.plugins.base import panchromatic
 
 IntArray = npt.NDArray[np.int64]
 AMBIENT, DIRECT, INDIRECT = 0, 1, 2
@@ -31,7 +31,7 @@ _COUNTED = 4
 """Places for each entry of light up to which entries are counted by place; where places are more, sorting is faster."""
 
 
-# ---- Light of connections in the renderer ----
+# -------- Light of connections in the renderer
 
 
 @dataclass
@@ -78,13 +78,10 @@ class Sightings:
         """
         total = self.value + more.value
         new = number * total < more.value
-        places = ((getattr(more, name), getattr(self, name)) for name in ("pixel", "row", "column", "inverse_depth"))
-        joined = Sightings(total, *(dr.select(new, theirs, mine) for theirs, mine in places))
-        if self.lines is not None and more.lines is not None:
-            own, drawn = (
-                dr.select(new, theirs, mine) for theirs, mine in ((more.value, self.value), (more.lines, self.lines))
-            )
-            joined.lines = dr.select(own == 0, 0, drawn * (total / own))
+        joined: Sightings = dr.select(new, more, self)
+        own, joined.value = joined.value, total
+        if joined.lines is not None:
+            joined.lines = dr.select(own == 0, 0, joined.lines * (total / own))
         return joined
 
     def by_line(self, lines: int) -> list[mi.Float]:
@@ -98,7 +95,7 @@ def check_finite(light: npt.NDArray[Any]) -> None:
         raise MitsimError("the scene reflects NaN or infinite light toward the camera; check its materials")
 
 
-# ---- Path samples, fetched from the renderer ----
+# -------- Path samples, fetched from the renderer
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,8 +116,6 @@ class PathSamples:
         (m,) irradiance [W m^-2].
     kind
         (m,) :data:`DIRECT` or :data:`INDIRECT` light of the projector, or :data:`AMBIENT` light.
-    lane
-        (m,) number of each path in its launch, increasing; None where that is not known.
     lines
         (4, m) ``value`` by line, then zeros, in single precision as it was traced; None where it is not told apart.
     """
@@ -133,7 +128,6 @@ class PathSamples:
     inverse_depth: FloatArray
     value: FloatArray
     kind: npt.NDArray[np.int16]
-    lane: IntArray | None = None
     lines: npt.NDArray[np.float32] | None = None
 
     @classmethod
@@ -193,7 +187,6 @@ class PathSamples:
             inverse_depth=lit_ones(seen.inverse_depth, np.float64),
             value=lit_ones(light, np.float64),
             kind=np.full(lit.size, kind, dtype=np.int16),
-            lane=lit,
             lines=None if seen.lines is None else lit_ones(seen.lines, np.float32),
         )
 
@@ -211,23 +204,15 @@ class PathSamples:
 
     def where(self, chosen: npt.NDArray[np.bool_]) -> PathSamples:
         """The entries that are ``chosen`` (m,)."""
-        return self._select(chosen)
-
-    def of_lanes(self, first: int, last: int) -> PathSamples:
-        """The entries of lanes ``first`` .. ``last`` - 1."""
-        assert self.lane is not None, "known of what one launch brought"
-        return self._select(slice(*np.searchsorted(self.lane, (first, last))))
-
-    def _select(self, which: slice | npt.NDArray[np.bool_]) -> PathSamples:
-        lines = None if self.lines is None else self.lines[:, which]
-        return PathSamples(**{name: getattr(self, name)[which] for name in _ARRAYS}, lines=lines)
+        lines = None if self.lines is None else self.lines[:, chosen]
+        return PathSamples(**{name: getattr(self, name)[chosen] for name in _ARRAYS}, lines=lines)
 
 
-_ARRAYS = tuple(name for name in PathSamples.__dataclass_fields__ if name not in ("lane", "lines"))
+_ARRAYS = tuple(name for name in PathSamples.__dataclass_fields__ if name != "lines")
 """What is told of each entry."""
 
 
-# ---- Accumulation by layer, anchor and cell ----
+# -------- Accumulation by layer, anchor and cell
 
 
 @dataclass(frozen=True)
@@ -385,7 +370,7 @@ def _index_type(*shape: int) -> type[np.int32] | type[np.int64]:
     return np.int32 if max(shape) < 2**31 else np.int64
 
 
-# ---- The grid of directions on which light is accumulated ----
+# -------- The grid of directions on which light is accumulated
 
 _ROUNDING = 1e-9
 """Part of a pixel by which the field stop may reach over cells: float64 rounds 1e-13 of it, a whole row costs 1 %."""
@@ -433,11 +418,7 @@ class CellGrid:
 
 
 def aligned_grid(
-    row_window: tuple[float, float],
-    column_window: tuple[float, float],
-    n: int,
-    subdivision: int,
-    tan_half_fov: float,
+    row_window: tuple[float, float], column_window: tuple[float, float], n: int, subdivision: int, tan_half_fov: float
 ) -> CellGrid:
     """Cells that divide the projector's pixels, and more of them to cover the field stop.
 

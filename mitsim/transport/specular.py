@@ -13,7 +13,9 @@ so a beam holds that times its area on this plane.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import mitsuba as mi
@@ -23,9 +25,9 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.optics.mirror_frames import Beams
-from mitsim.transport.projector import ProjectorOptics
-from mitsim.transport.specular_rays import Chains, Crossings, IntArray, Mask, SpecularRays, delta_bsdfs
-from mitsim.transport.specular_search import first_squares, grazing
+from mitsim.transport.plugins.base import turn_and_origin
+from mitsim.transport.projector import PinholeRays, ProjectorOptics
+from mitsim.transport.specular_rays import Boxes, Chains, Crossings, IntArray, Mask, SpecularRays, delta_bsdfs, grazing
 
 _UNIT = 2**24
 """Lattice points a projector pixel's side: what a ball of 10 um sends to a sensor leaves a projector pixel of 2 mm
@@ -139,6 +141,9 @@ def _ranges(first: IntArray, last: IntArray) -> IntArray:
     return np.asarray(np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts - first, counts))
 
 
+# -------- Nodes: what is known at points of the lattice
+
+
 @dataclass(frozen=True, eq=False)
 class _Nodes:
     """What is known at lattice points of one chain, any shape: whether a ray arrived, and where, how, how bright."""
@@ -186,6 +191,9 @@ def _nodes(crossings: Crossings, chain: Chains, place: IntArray) -> _Nodes:
     valid = key[at] == wanted
     sensor, tangent = (np.where(valid[..., None], v[at], np.nan) for v in (crossings.sensor, crossings.tangent))
     return _Nodes(valid, sensor, tangent, np.where(valid, crossings.throughput[at], 0))
+
+
+# -------- Division of squares until light is bilinear over each
 
 
 def _refine(
@@ -387,3 +395,159 @@ def _join(parts: list[Beams], left: FloatArray) -> Beams:
     names = ("pixel", "flux", "sensor", "tangent", "throughput")
     arrays = {name: np.concatenate([getattr(part, name) for part in (none, *parts)]) for name in names}
     return Beams(**arrays, unresolved=float(left[0]), error=math.sqrt(left[1]))
+
+
+# -------- Small mirrors: how finely each square of a grid over the window is divided
+#
+# A ball of 0.4 mm lies between the rays of a grid of 1 mm, and still sends the projector's light to the sensor. So rays
+# are aimed: each mirror is cut into *spots* no larger than a few squares, and where these are seen, squares are divided
+# until several rays meet the smallest of them.
+
+_ACROSS_BALL = 0.25
+"""Step of the finer grid in radii of a ball, disk or wire: some 50 rays meet a ball."""
+_ACROSS_FACE = 1 / 3
+"""The same in heights of a flat facet: its inscribed circle, of two thirds, holds a point of any such grid."""
+_ACROSS_SMOOTH = 1.0
+"""The same in heights of a smooth mesh's faces: their neighbours' normals go over into each other."""
+_SPOT_MARGIN = 1.5
+"""Radius of a spot in the window over its radius at the axis: perspective stretches by 1 / cos^2, 1.3 at 30 degrees."""
+_BOXES_AT_ONCE = 2**20
+"""Squares that boxes cover, looked up at a time: some tens of MB."""
+_MOST_SPOTS = 2**21
+"""Spots of all mirrors, some 300 MB; of a mesh of more faces some are left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Spots:
+    """Pieces of mirrors: centre (k, 3), radius (k,), and the step (k,) of rays that finds what is on them [mm]."""
+
+    centre: FloatArray
+    radius: FloatArray
+    step: FloatArray
+
+
+def first_squares(
+    mirrors: Sequence[mi.Shape], rays: PinholeRays, n: int, unit: int, size: int, least: int, more: Sequence[Boxes] = ()
+) -> Iterator[tuple[int, IntArray, IntArray]]:
+    """Squares that tile the window, small ones where small mirrors are seen: size, first rows and first columns.
+
+    Parameters
+    ----------
+    mirrors
+        shapes whose light is looked for.
+    rays
+        of the projector.
+    n, unit
+        projector pixels along the window's side, and points of the lattice a pixel.
+    size, least
+        of the largest squares and the smallest, in points of the lattice.
+    more
+        boxes that are looked through besides, as finely as they say.
+    """
+    line = np.arange(0, n * unit, size)
+    row, column = (axis.ravel() for axis in np.meshgrid(line, line, indexing="ij"))
+    cell = size / unit * np.sqrt(rays.area)  # side of a square at unit distance
+    spots = [_window_boxes(_spots(shape, rays, cell), rays, unit) for shape in mirrors]
+    spots = [(low, high, np.maximum(step, least)) for low, high, step in spots]
+    low, high, step = (np.concatenate(parts) for parts in zip(*spots, *more, strict=True))
+    while len(row):
+        small = step < size
+        low, high, step = low[small], high[small], step[small]
+        divided = _squares_in_boxes(row // size, column // size, low / size, high / size)
+        yield size, row[~divided], column[~divided]
+        size //= 2
+        row, column = (
+            np.concatenate([axis[divided] + offset * size for offset in offsets])
+            for axis, offsets in ((row, (0, 0, 1, 1)), (column, (0, 1, 0, 1)))
+        )
+
+
+def _squares_in_boxes(row: IntArray, column: IntArray, low: FloatArray, high: FloatArray) -> Mask:
+    """(q,) whether squares (row, column) meet one of the boxes from ``low`` to ``high`` (k, 2), in squares."""
+    found = np.zeros(len(row), dtype=bool)
+    if not len(low):
+        return found
+    first, last = np.floor(low).astype(np.int64), np.floor(high).astype(np.int64)
+    (rows, columns), start = (last - first + 1).T, np.zeros(len(low), np.int64)
+    stride = int(max(column.max(), last[:, 1].max())) + 2
+    keys = row * stride + column
+    order = np.argsort(keys)
+    counts = rows * columns
+    ends = np.cumsum(counts)
+    start = np.searchsorted(ends, np.arange(0, ends[-1] + _BOXES_AT_ONCE, _BOXES_AT_ONCE), side="left")
+    for begin, end in pairwise([*np.unique(np.minimum(start, len(counts) - 1)), len(counts)]):
+        chosen = slice(begin, end)
+        box = np.repeat(np.arange(begin, end), counts[chosen])
+        place = np.arange(len(box)) - np.repeat(np.cumsum(counts[chosen]) - counts[chosen], counts[chosen])
+        down, across = np.divmod(place, columns[box])
+        wanted = np.unique((first[box, 0] + down) * stride + first[box, 1] + across)
+        at = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
+        found[order[at[keys[order][at] == wanted]]] = True
+    return found
+
+
+def _window_boxes(spots: _Spots, rays: PinholeRays, unit: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Boxes (k, 2) that hold ``spots`` in the window, and steps, in points of the lattice."""
+    place, depth = rays.points(spots.centre)
+    front = (depth > 0) & np.isfinite(place).all(axis=1)
+    place, scale = place[front] * unit, unit / (np.sqrt(rays.area) * depth[front])
+    reach = (_SPOT_MARGIN * spots.radius[front] + spots.step[front]) * scale
+    return place - reach[:, None], place + reach[:, None], spots.step[front] * scale
+
+
+def _spots(shape: mi.Shape, rays: PinholeRays, cell: float) -> _Spots:
+    """Spots of one mirror; ``cell`` is a square's side at unit distance."""
+    if shape.is_mesh() and shape.class_name() != "Rectangle":
+        return _of_faces(shape, rays, cell)
+    box = shape.bbox()
+    if shape.class_name() == "Sphere":
+        centre, radius = np.array(box.center()).ravel(), float(np.array(box.extents()).max()) / 2
+        return _Spots(centre[None], np.array([radius]), np.array([_ACROSS_BALL * radius]))
+    turn, origin = turn_and_origin(mi.traverse(shape)["to_world"])
+    sides = np.linalg.norm(turn, axis=0)
+    if shape.class_name() == "Cylinder":
+        return _along(origin, turn[:, 2], sides[0], _ACROSS_BALL * sides[0], cell * _depth(rays, origin))
+    # A rectangle or disk: two half sides.
+    short, long = sorted((0, 1), key=lambda i: float(sides[i]))
+    step = sides[short] * (_ACROSS_BALL if shape.class_name() == "Disk" else 2 * _ACROSS_FACE)
+    start = origin - turn[:, long]
+    return _along(start, 2 * turn[:, long], sides[short], step, cell * _depth(rays, origin))
+
+
+def _along(start: FloatArray, way: FloatArray, radius: float, step: float, square: float) -> _Spots:
+    """Spots along a line, no further apart than their radius or a ``square`` [mm]."""
+    length = float(np.linalg.norm(way))
+    count = min(max(1, int(np.ceil(length / max(radius, square, 1e-9)))), _MOST_SPOTS)
+    middle = (np.arange(count) + 0.5) / count
+    reach = np.hypot(length / count / 2, radius)
+    return _Spots(start + middle[:, None] * way, np.full(count, reach), np.full(count, step))
+
+
+def _of_faces(shape: mi.Shape, rays: PinholeRays, cell: float) -> _Spots:
+    """Spots of a mesh: its faces, long ones in pieces."""
+    count = shape.face_count()
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _MOST_SPOTS // 4)).astype(np.uint32))
+    corners = np.array(shape.face_indices(mi.UInt32(chosen))).T
+    places = np.array(shape.vertex_position(mi.UInt32(corners.ravel()))).T.astype(np.float64).reshape(-1, 3, 3)
+    edges = places[:, [1, 2, 0]] - places
+    lengths = np.linalg.norm(edges, axis=2)
+    longest = lengths.max(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        height = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / longest
+    whole = np.flatnonzero(height > 0)
+    smooth = shape.has_vertex_normals() and not shape.has_face_normals()
+    square = cell * _depth(rays, places.mean(axis=(0, 1)))
+    pieces = np.maximum(1, np.ceil(longest / np.maximum(height, square)))[whole].astype(np.int64)
+    pieces = np.minimum(pieces, max(1, _MOST_SPOTS // max(1, len(whole))))
+    face = np.repeat(whole, pieces)
+    middle = (np.arange(len(face)) - np.repeat(np.cumsum(pieces) - pieces, pieces) + 0.5) / np.repeat(pieces, pieces)
+    at = np.argmax(lengths, axis=1)[face]
+    # Pieces lie along the longest edge, and reach across by the height.
+    centre = places[face, at] + middle[:, None] * edges[face, at]
+    reach = np.hypot(longest[face] / np.repeat(pieces, pieces) / 2, height[face])
+    return _Spots(centre, reach, (_ACROSS_SMOOTH if smooth else _ACROSS_FACE) * height[face])
+
+
+def _depth(rays: PinholeRays, place: FloatArray) -> float:
+    """Depth [mm] of a place in front of the projector, at least some."""
+    return max(float(rays.points(place[None])[1][0]), 1.0)

@@ -3,15 +3,15 @@
 Rays are traced in Mitsuba's float32, which is good to about 1e-4 mm at the sensor: 1 % of a pixel, and as much error
 in a masked frame. So each hit is polished in float64: the ray is met with the tangent plane of the surface that was
 hit, and reflection or refraction is worked out again there. What is left is the surface's own place and normal in
-float32: nothing for a mirror that faces the axis squarely; round ones and smooth meshes are met in float64
-(:mod:`mitsim.transport.specular_rays`).
+float32: nothing for a mirror that faces the axis squarely; round ones and smooth meshes are met in float64 once more.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -70,13 +70,6 @@ class Crossings:
     tangent: FloatArray
     throughput: FloatArray
 
-    @classmethod
-    def joined(cls, parts: Sequence[Crossings]) -> Crossings:
-        """All ``parts`` in one."""
-        pair = np.zeros((0, 2))
-        none = cls(np.zeros(0, np.int64), np.zeros(0, np.uint64), pair, pair, np.zeros(0))
-        return cls(*(np.concatenate([getattr(part, name) for part in (none, *parts)]) for name in vars(none)))
-
 
 @dataclass(frozen=True, eq=False)
 class _Rays:
@@ -89,9 +82,13 @@ class _Rays:
     chain: Chains
     spectrum: FloatArray
 
-    @classmethod
-    def joined(cls, parts: Sequence[_Rays]) -> _Rays:
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
+
+Some = TypeVar("Some", Crossings, _Rays)
+
+
+def _join(parts: Sequence[Some]) -> Some:
+    """All of one or more ``parts`` in one."""
+    return type(parts[0])(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
 
 
 class SpecularRays:
@@ -147,8 +144,8 @@ class SpecularRays:
             onward = self._bounce(rays, si, ~arrived & np.isfinite(distance))
             if not onward:
                 break
-            rays = _Rays.joined(onward)
-        return Crossings.joined(crossings)
+            rays = _join(onward)
+        return _join(crossings)
 
     def _intersect(self, rays: _Rays) -> mi.SurfaceInteraction3f:
         ray = mi.Ray3f(mi.Point3f(*device_vectors(rays.start)), mi.Vector3f(*device_vectors(rays.direction)))
@@ -444,3 +441,129 @@ class _Mesh:
 def _edges(triangles: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """First corner, and the edges from it to the others."""
     return triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+
+
+# -------- Balls of glass, whose light comes from close to their rim
+
+_ACROSS = 2**10
+"""Rays across a ball of glass: their light turns by a third of a degree from ray to ray, half a sensor at 400 mm."""
+_TO_RIM = 0.25
+"""Step of the finer grid where light comes from near a rim, over the distance to it."""
+_TOO_CLOSE = 1 / 64
+"""Distance to the rim, in radii, within which light is counted and not looked for: of a ball of glass of index 1.5 it
+is 4 % of what comes back, and 98 % of the squares."""
+_FINEST = 2**10
+"""Points of the lattice below which the same holds of a step: squares are divided ten times more."""
+_PIECE, _MOST_PIECES = 4.0, 2**10
+"""Steps along each piece of an arc, and pieces of one at most: boxes about long ones would be mostly empty."""
+Boxes = tuple[FloatArray, FloatArray, FloatArray]
+"""Corners (k, 2) of boxes in the window, least and greatest, and the step (k,) of rays that finds what is in them, in
+points of the lattice."""
+
+
+def grazing(tracer: SpecularRays, half_width: float, unit: int) -> tuple[list[Boxes], float]:
+    """Where balls of glass send light to the sensor from close to their rim, and flux [W m^-2 mm^2] that comes from too
+    close to it to be looked for.
+
+    What is reflected inside of a ball leaves it the more steeply the closer to the rim it came in: two thirds of the
+    light that a ball of glass sends back may come from its last thirtieth, which squares that the rim cuts do not show.
+    Rays across the middle of each ball, in its plane with projector and sensor, tell where that is; by symmetry the
+    rest lies on an arc.
+
+    Parameters
+    ----------
+    tracer
+        mirrors, and the projector's rays.
+    half_width
+        of the sensor [mm].
+    unit
+        points of the lattice a pixel.
+    """
+    glass = int(mi.BSDFFlags.DeltaTransmission)
+    balls = [s for s in tracer.mirrors if s.class_name() == "Sphere" and s.bsdf().flags() & glass]
+    if not balls:
+        return [], 0.0
+    across = np.sin((np.arange(_ACROSS) + 0.5) / _ACROSS * np.pi - np.pi / 2)
+    planes = [_Plane.of(ball, tracer) for ball in balls]
+    met = tracer.follow(np.concatenate([tracer.rays.points(plane.places(across, 0 * across))[0] for plane in planes]))
+    found, left = [], 0.0
+    for chain in np.unique(met.chain):
+        own = np.flatnonzero(met.chain == chain)
+        order = own[np.argsort(met.ray[own], kind="stable")]
+        one, other = order[:-1], order[1:]
+        beside = (met.ray[other] == met.ray[one] + 1) & (met.ray[other] % _ACROSS != 0)
+        one, other = one[beside], other[beside]
+        distance = np.linalg.norm(met.sensor[other] - met.sensor[one], axis=1)
+        near = (
+            np.linalg.norm((met.sensor[one] + met.sensor[other]) / 2, axis=1) < distance / 2 + math.sqrt(2) * half_width
+        )
+        for first, width in zip(one[near], distance[near], strict=True):
+            ball, place = divmod(int(met.ray[first]), _ACROSS)
+            plane, part = planes[ball], across[place : place + 2]
+            arc = plane.arc(part, half_width, tracer.rays, unit)
+            if 1 - np.abs(part).max() > _TOO_CLOSE and arc[2].min() > _FINEST:
+                found.append(arc)
+            else:
+                met_by = min(2 * half_width / width, 1.0) * float(met.throughput[first])
+                left += met_by * plane.flux(part, half_width, tracer.rays)
+    return found, left
+
+
+@dataclass(frozen=True, eq=False)
+class _Plane:
+    """The plane through a projector, a ball's centre and a sensor: place of the projector and directions to the ball,
+    across in the plane, and out of it; the ball's distance and radius, and the sensor's from the line through both."""
+
+    origin: FloatArray
+    axes: tuple[FloatArray, FloatArray, FloatArray]
+    distance: float
+    radius: float
+    aside: float
+
+    @classmethod
+    def of(cls, ball: mi.Shape, tracer: SpecularRays) -> _Plane:
+        """Of a ``ball`` and what a ``tracer`` knows."""
+        box, origin = ball.bbox(), tracer.rays.origin
+        to_ball = np.array(box.center(), dtype=np.float64).ravel() - origin
+        distance = float(np.linalg.norm(to_ball))
+        ahead, to_sensor = to_ball / distance, tracer.camera_place - origin
+        across = to_sensor - (to_sensor @ ahead) * ahead
+        aside = float(np.linalg.norm(across))
+        if aside < 1e-9 * distance:  # all directions are alike
+            across = np.cross(ahead, np.eye(3)[np.argmin(np.abs(ahead))])
+        across /= np.linalg.norm(across)
+        axes = ahead, across, np.cross(ahead, across)
+        return cls(origin, axes, distance, float(np.array(box.extents()).max()) / 2, aside)
+
+    def places(self, across: FloatArray, turned: FloatArray) -> FloatArray:
+        """(k, 3) places beside the ball's centre that rays pass the centre by so many radii toward (k,), ``turned`` out
+        of the plane by angles (k,)."""
+        sine = across * min(self.radius / self.distance, 1.0)
+        ahead, aside, out = self.axes
+        to = np.cos(turned)[:, None] * aside + np.sin(turned)[:, None] * out
+        return np.asarray(self.origin + self.distance * (np.sqrt(1 - sine**2)[:, None] * ahead + sine[:, None] * to))
+
+    def arc(self, across: FloatArray, half_width: float, rays: PinholeRays, unit: int) -> Boxes:
+        """Boxes that find what rays ``across`` (2,) send to the sensor, and those beside the plane."""
+        step, wide = _TO_RIM * (1 - float(np.abs(across).max())), self._half_angle(half_width)
+        low, high = float(across.min()) - step, float(across.max()) + step
+        count = min(math.ceil(2 * wide / (_PIECE * step)), _MOST_PIECES)
+        ends = np.linspace(-wide, wide, count + 1)
+        corners = [
+            rays.points(self.places(np.full(count, part), turned))[0] * unit
+            for part in (low, high)
+            for turned in (ends[:-1], ends[1:])
+        ]
+        scale = unit / (
+            math.sqrt(rays.area) * float(rays.points((self.origin + self.distance * self.axes[0])[None])[1][0])
+        )
+        return np.min(corners, axis=0), np.max(corners, axis=0), np.full(count, step * self.radius * scale)
+
+    def flux(self, across: FloatArray, half_width: float, rays: PinholeRays) -> float:
+        """Flux between the arcs of two rays ``across`` (2,)."""
+        ring = abs(across[1] ** 2 - across[0] ** 2) / 2 * (self.radius / self.distance) ** 2
+        return float(rays.power.mean() * ring * 2 * self._half_angle(half_width))
+
+    def _half_angle(self, half_width: float) -> float:
+        """Angle to either side, about the line from the projector to the ball, that light on the sensor leaves at."""
+        return min(math.pi, math.sqrt(2) * half_width / max(self.aside, half_width / 4))

@@ -1,10 +1,10 @@
 """Light that passes surfaces: from two points of a scene to the way between them and the part of the light it keeps.
 
 The hole of a cut-out (``mask``), a thin pane (``thindielectric``), a filter: their *null lobe* lets a part of the light
-go straight on as if nothing were there. Flat glass bends it, but to one way between two points only
-(:mod:`mitsim.transport.transmission`). No direction that is drawn at random tells such light from that of free space,
-so it is what it would be without the surface, weaker: direct light stays direct, and a light is looked for behind a
-hole as before it. Scenes without such surfaces keep a plain test of visibility."""
+go straight on as if nothing were there. Flat glass bends it, but to one way between two points only. No direction that
+is drawn at random tells such light from that of free space, so it is what it would be without the surface, weaker:
+direct light stays direct, and a light is looked for behind a hole as before it. Scenes without such surfaces keep a
+plain test of visibility."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
+from mitsim.transport.plugins.base import generator
 from mitsim.transport.plugins.glass import is_glass
-from mitsim.transport.sampler import generator
 
 CLEAR = 32 * 2.0**-24
 """How far a ray starts beyond a surface, for each mm of its coordinates, where a scene transmits light: 32 roundings of
@@ -133,13 +133,7 @@ class Passage:
         _, _, part = dr.while_loop(state, lambda active, *_: active, advance, labels=("active", "ray", "part"))
         return dr.max(part) > 0, part
 
-    def along(
-        self,
-        ray: mi.Ray3f,
-        light: mi.Spectrum,
-        state: State,
-        visit: Callable[[Arrival, State], State],
-    ) -> State:
+    def along(self, ray: mi.Ray3f, light: mi.Spectrum, state: State, visit: Callable[[Arrival, State], State]) -> State:
         """What is made of all surfaces that rays meet one behind another, as far as these let light pass.
 
         Neighbouring rays are taken for coherent, which are found faster.
@@ -326,7 +320,7 @@ def _is_flat(shape: mi.Shape) -> bool:
 
 
 @dataclass
-class Way:
+class RefractedWay:
     """How light gets from points of surfaces to their targets.
 
     Attributes
@@ -396,7 +390,7 @@ class _Aim:
     eta: mi.Float
 
 
-def refracted_way(passage: Passage, si: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> Way:
+def refracted_way(passage: Passage, si: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> RefractedWay:
     """The way from points to targets through the panes between them; straight where there are none.
 
     Parameters
@@ -419,7 +413,7 @@ def refracted_way(passage: Passage, si: mi.SurfaceInteraction3f, target: mi.Poin
     (aim,) = dr.while_loop((start,), lambda aim: aim.active, lambda aim: (search.correct(aim),))
     seen = active & (aim.miss < _MET) & (dr.max(aim.part) > 0)
     apparent = target - aim.arriving * dr.sqrt(aim.squared)
-    return Way(aim.direction, apparent, aim.length, aim.part, aim.eta, seen)
+    return RefractedWay(aim.direction, apparent, aim.length, aim.part, aim.eta, seen)
 
 
 @dataclass

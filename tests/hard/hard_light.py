@@ -33,8 +33,7 @@ def matt(albedo: float) -> str:
 
 def seen_alone(bench: Bench, seeds: int, samples: int, anchors: int = 1, pixels: np.ndarray | None = None):
     """(seeds, anchors, anchors) direct irradiance of the unmasked sensor at each anchor."""
-    loaded = bench.loaded
-    tracer = DirectTracer(loaded.scene, loaded.camera, bench.projector_optics, anchors, pixels=pixels)
+    tracer = DirectTracer(bench.setup, anchors, pixels=pixels)
     totals = np.zeros((seeds, anchors, anchors))
     for seed in range(seeds):
         found = tracer.trace(seed, 0, samples)

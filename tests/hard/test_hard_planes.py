@@ -132,10 +132,7 @@ def test_a_plane_that_reaches_beside_and_behind_the_camera(
     """A wall from z = -500 to 500 through the plane z = 0: what lies before the camera shines, nothing else."""
     centre, normal = np.array([x, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])
     bench = plane(centre, normal, half=500.0, fov=60)
-    found = [
-        DirectTracer(bench.loaded.scene, bench.loaded.camera, bench.projector_optics, 1).trace(s, 0, 256)
-        for s in range(8)
-    ]
+    found = [DirectTracer(bench.setup, 1).trace(s, 0, 256) for s in range(8)]
     totals = np.array([one.value.sum() / 256 for one in found])
     # Quadrature over z alone sees the lit part: smaller square about it.
     if x == -300.0:
@@ -192,7 +189,7 @@ def test_no_light_leaks_through_a_gap(measured: Recorder, small_scene: Callable[
     """
     card = plate(f'<scale x="{CARD}" y="{CARD}"/><translate z="{Z - gap}"/>', matt(0.0))
     bench = open_bench(small_scene(extra=card))
-    tracer = DirectTracer(bench.loaded.scene, bench.loaded.camera, bench.projector_optics, 1)
+    tracer = DirectTracer(bench.setup, 1)
     found = [tracer.trace(seed, 0, 1024) for seed in range(8)]
     (x, dx), (y, dy) = gauss(-60, 60), gauss(-60, 60)
     whole = 0.5 * SCALE / Z**4 * dx @ (1 + (x[:, None] / Z) ** 2 + (y / Z) ** 2) ** -2.0 @ dy

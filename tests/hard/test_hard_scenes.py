@@ -18,6 +18,7 @@ from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.integrator import Paths
 from tests.hard.hard_light import SCALE, SEVEN, SLOW, N, Z, gauss, matt, mean, seen_alone
 from tests.physics.radiosity import Furnace
 from tests.robustness import Recorder
@@ -89,7 +90,7 @@ def furnace(write: Callable[..., Path], albedo: float) -> IndirectTracer:
         f'<boolean name="flip_normals" value="true"/>{matt(albedo)}</shape>'
     )
     bench = open_bench(write("furnace", mask="open", extra=sphere, sheet_z=3000))
-    return IndirectTracer(bench.loaded.scene, bench.loaded.camera, bench.projector_optics, False, True)
+    return IndirectTracer(bench.setup, Paths(False, True))
 
 
 @SLOW
@@ -134,9 +135,7 @@ def test_one_pixel_is_captured(small_scene: Callable[..., Path], tmp_path: Path)
 @given(row=st.integers(0, N - 1), column=st.integers(0, N - 1))
 def test_one_lit_pixel_of_many(white: Bench, row: int, column: int) -> None:
     """Its own light and no other: albedo scale / Z^2 times the integral of the falloff over the pixel."""
-    found = DirectTracer(white.loaded.scene, white.loaded.camera, white.projector_optics, 1).trace(
-        row * N + column, 0, 64
-    )
+    found = DirectTracer(white.setup, 1).trace(row * N + column, 0, 64)
     (x, dx), (y, dy) = (gauss(-0.15 + at * PIXEL, -0.15 + (at + 1) * PIXEL) for at in (column, row))
     expected = 0.5 * SCALE / Z**2 * dx @ (1 + x[:, None] ** 2 + y**2) ** -2.0 @ dy
     mine = found.where(found.pixel == row * N + column)

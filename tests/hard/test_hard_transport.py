@@ -9,7 +9,7 @@ import pytest
 from mitsim.api.bench import Bench, open_bench
 from mitsim.devices.patterns import Lighting
 from mitsim.planner.planner import make_plan
-from mitsim.transport.sharp_lobes import SharpLight, sharp_light
+from mitsim.transport.missed import SharpLight, sharp_light
 from tests.hard.hard_light import GLINT, SEVEN, SIGMAS, SLOW, N, glossy, lobe, mean, seen_alone
 from tests.robustness import Recorder
 
@@ -17,8 +17,7 @@ pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.robustness("Light"
 
 
 def sharp(bench: Bench, seed: int) -> SharpLight:
-    loaded = bench.loaded
-    return sharp_light(loaded.scene, loaded.camera, bench.projector_optics, bench.geometry, seed, 2**21 // N**2)
+    return sharp_light(bench.setup, seed, 2**21 // N**2)
 
 
 def test_the_lobe_becomes_the_mirror() -> None:

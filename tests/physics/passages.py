@@ -9,8 +9,9 @@ import numpy as np
 
 from mitsim.api.bench import Bench
 from mitsim.transport.direct import DirectTracer
-from mitsim.transport.from_camera import FromCameraTracer, Paths
+from mitsim.transport.from_camera import FromCameraTracer
 from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.integrator import Paths
 from mitsim.transport.records import aligned_grid
 
 SEEDS, SIGMAS = 8, 7.0
@@ -29,20 +30,18 @@ def plate(z: float, bsdf: str, half: float = 25.0, x: float = 0.0, turn: float =
 
 def direct_light(bench: Bench, seed: int, samples: int = 64) -> float:
     """Of the projector over one surface, at the sensor's centre."""
-    loaded = bench.loaded
-    tracer = DirectTracer(loaded.scene, loaded.camera, bench.projector_optics, 1)
+    tracer = DirectTracer(bench.setup, 1)
     return float(tracer.trace(seed, 0, samples).value.sum()) / samples
 
 
 def all_light(bench: Bench, seed: int, samples: int = 128, lens: float = 0.0, focus: float = 400.0) -> np.ndarray:
     """(3,) of each kind at the sensor's centre: ambient, direct, indirect; ``lens`` and ``focus`` of the projector."""
-    loaded, optics = bench.loaded, replace(bench.projector_optics, aperture=lens, focus=focus)
+    setup = replace(bench.setup, projector=replace(bench.projector_optics, aperture=lens, focus=focus))
     aim = aligned_grid(*bench.windows, 64, 1, bench.geometry.tan_half_fov + 0.01)
-    parts = loaded.scene, loaded.camera, optics
     tracers = (
-        (DirectTracer(*parts, 1), samples),
-        (IndirectTracer(*parts, True, True), 4 * samples),
-        (FromCameraTracer(*parts, aim, Paths(True, True, loaded.lamps)), samples),
+        (DirectTracer(setup, 1), samples),
+        (IndirectTracer(setup, Paths(True, True)), 4 * samples),
+        (FromCameraTracer(setup, aim, Paths(True, True, bench.loaded.lamps)), samples),
     )
     light = np.zeros(3)
     for tracer, count in tracers:

@@ -34,7 +34,7 @@ found = {}
 for path in map(Path, sys.argv[4:]):
     bench = open_bench(path, variant)
     from mitsim.transport.direct import DirectTracer
-    tracer = DirectTracer(bench.loaded.scene, bench.loaded.camera, bench.projector_optics, 1)
+    tracer = DirectTracer(bench.setup, 1)
     found[f"{path.stem} total"] = tracer.trace(0, 0, 64).value.sum()
     forced = {"diffraction": False, "black-level": False, "interreflection": path.stem == "walls"}
     for name in ("reference", "factored"):

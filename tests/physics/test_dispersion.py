@@ -25,8 +25,9 @@ from mitsim.core.spectral_manifests import RUN
 from mitsim.light.lamps import lit_by_lamps
 from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.direct import DirectTracer, FluxTracer
-from mitsim.transport.from_camera import FromCameraTracer, LampResponse, LampTracer, Paths
+from mitsim.transport.from_camera import FromCameraTracer, LampResponse, LampTracer
 from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.integrator import Paths
 from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.records import Bundle, PathSamples, aligned_grid
 from mitsim.transport.specular import trace_specular_chains
@@ -67,16 +68,14 @@ def seen(light: PathSamples) -> list[float]:
 
 def followed(bench: Bench) -> dict[str, PathSamples]:
     """Light of a bench by the way that it is followed."""
-    loaded, optics = bench.loaded, bench.projector_optics
     aim = aligned_grid(*bench.windows, 32, 1, bench.geometry.tan_half_fov + 0.01)
-    parts = loaded.scene, loaded.camera, optics
     tracers = {
-        "direct": DirectTracer(*parts, 2),
-        "indirect": IndirectTracer(*parts, True, True),
-        "shared": PathReuseTracer(*parts, True, True),
-        "from camera": FromCameraTracer(*parts, aim, Paths(True, True, ())),
+        "direct": DirectTracer(bench.setup, 2),
+        "indirect": IndirectTracer(bench.setup, Paths(True, True)),
+        "shared": PathReuseTracer(bench.setup, Paths(True, True)),
+        "from camera": FromCameraTracer(bench.setup, aim, Paths(True, True, ())),
     }
-    if not tracers["indirect"].receiver.passage.open:
+    if not tracers["indirect"].setup.passage.open:
         tracers["looks"] = tracers["indirect"]
     else:
         del tracers["shared"]
@@ -88,23 +87,22 @@ def followed(bench: Bench) -> dict[str, PathSamples]:
 
 def filed(bench: Bench) -> list[list[float]]:
     """(lines, kinds and classes) indirect and direct light that is filed on the device."""
-    lines, parts = bench.lines, (bench.loaded.scene, bench.loaded.camera, bench.projector_optics)
+    lines = bench.lines
     assert lines is not None
     labels = np.arange(N**2) % 5
     bundle = Bundle(aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov), 1, (400.0,))
     found: list[list[float]] = [[] for _ in lines.shares]
-    for tracer in (IndirectTracer(*parts, True, True), DirectTracer(*parts, 1)):
-        accumulators = [DeviceAccumulator(bundle, labels, tracer.board) for _ in lines.shares]
-        tracer.trace_into(accumulators, 3, 0, SAMPLES)
-        for line, accumulator in zip(found, accumulators, strict=True):
-            line += np.asarray(accumulator.light()[0].sum(axis=1)).ravel().tolist()
+    for tracer in (IndirectTracer(bench.setup, Paths(True, True)), DirectTracer(bench.setup, 1)):
+        accumulator = DeviceAccumulator(bundle, labels, tracer.board, len(lines.shares))
+        tracer.trace(3, 0, SAMPLES, accumulator)
+        for line, sums in zip(found, accumulator.fetch(), strict=True):
+            line += np.asarray(sums.light()[0].sum(axis=1)).ravel().tolist()
     return found
 
 
 def flux(bench: Bench) -> list[list[float]]:
     """(lines, 2) mean irradiance of the sensor, by truth's tracer: all pixels, and the first half of them."""
-    loaded = bench.loaded
-    tracer = FluxTracer(loaded.scene, loaded.camera, bench.projector_optics, bench.geometry)
+    tracer = FluxTracer(bench.setup)
     pixels = np.arange(N**2)
     sums = tracer.sums(7, 1, pixels, np.zeros(N**2, dtype=np.int64), 64)[:, 0]
     return [[float(line.sum()), float(line[: N**2 // 2].sum())] for line in sums]
@@ -122,8 +120,7 @@ def lamps(bench: Bench) -> list[list[float]]:
     lit = lit_by_lamps(bench, {}, 1)
     assert lit.counted_lamps is not None
     aim = aligned_grid(*bench.windows, 32, 1, bench.geometry.tan_half_fov + 0.01)
-    parts = bench.loaded.scene, bench.loaded.camera, bench.projector_optics, aim
-    like = FromCameraTracer(*parts, Paths(True, True, bench.loaded.lamps))
+    like = FromCameraTracer(bench.setup, aim, Paths(True, True, bench.loaded.lamps))
     bands = [(nm - 0.01, nm + 0.01) for nm in LINES] + [(830.0, 830.0)]
     found = LampTracer(like, LampResponse(lit.counted_lamps.responses[0], bands, (1.0,))).trace(3, 0, SAMPLES)
     return [seen(found.where(found.pixel == N**2 + band)) for band in range(len(LINES))]

@@ -176,9 +176,10 @@ def reference_with_lens(bench: Bench, shown: np.ndarray, spp: int) -> tuple[np.n
     """Mean and its variance by the reference, the projector's lens a disk that shines."""
     import mitsuba as mi
 
-    from mitsim.transport.plugins.lens import aperture_scene_parts, register
+    from mitsim.transport import plugins
+    from mitsim.transport.plugins.lens import aperture_scene_parts
 
-    register()
+    plugins.register()
     with projected(bench, shown):
         parts = aperture_scene_parts(
             bench.loaded.projector, bench.projector_optics.aperture, bench.projector_optics.focus

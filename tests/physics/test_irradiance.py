@@ -130,7 +130,7 @@ bench = open_bench(Path(sys.argv[2]), sys.argv[1])
 import mitsuba as mi
 from mitsim.transport.direct import DirectTracer
 frame = np.array(mi.render(bench.loaded.scene, spp=64, seed=1), dtype=np.float64)[..., 0]
-tracer = DirectTracer(bench.loaded.scene, bench.loaded.camera, bench.projector_optics, 1)
+tracer = DirectTracer(bench.setup, 1)
 totals = [tracer.trace(seed, 0, 64).value.sum() / 64 for seed in range(24)]
 print(json.dumps({"reference": [frame.mean(), frame.std(ddof=1) / frame.size**0.5],
                   "factored": [np.mean(totals), np.std(totals, ddof=1) / 24**0.5]}))

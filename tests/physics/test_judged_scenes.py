@@ -27,8 +27,8 @@ as Mitsuba's own cylinders, none of the print by Mitsuba's offsets.)"""
 @pytest.mark.parametrize("name", DIRECT)
 def test_direct_light(tmp_path: Path, name: str) -> None:
     judged, (samples, most) = scenes()[name], DIRECT[name]
-    loaded = (bench := opened(judged, tmp_path, open_bench)).loaded
-    tracer = DirectTracer(loaded.scene, loaded.camera, bench.projector_optics, 1)
+    bench = opened(judged, tmp_path, open_bench)
+    tracer = DirectTracer(bench.setup, 1)
     light = [tracer.trace(seed, 0, samples).value.sum() / samples for seed in range(SEEDS)]
     found, error = float(np.mean(light)), float(np.std(light, ddof=1) / SEEDS**0.5)
     right = judge.direct(replace(judged.scene, camera=OPEN), MIDDLE, fine=8)

@@ -21,7 +21,8 @@ from mitsim.light.light import Sampling, trace_light
 from mitsim.optics.fft_shadow import geometric_samplers
 from mitsim.optics.mirror_frames import SpecularFrames, specular_frames
 from mitsim.planner.planner import make_plan
-from mitsim.transport.plugins.lens import aperture_scene_parts, register
+from mitsim.transport import plugins
+from mitsim.transport.plugins.lens import aperture_scene_parts
 from mitsim.transport.projector import ProjectorOptics
 from mitsim.transport.specular import trace_specular_chains
 from mitsim.transport.specular_rays import SpecularRays
@@ -524,7 +525,7 @@ def test_a_perfect_mirror_with_an_aperture_in_the_reference(variant: str) -> Non
 
     Paths that hit the lens: 4e6 x 1.6e-2, so the mean is good to half a percent.
     """
-    register()
+    plugins.register()
     place, radius = (30.0, 0.0, 400.0), 20.0
     rig = Rig((60, 0, 0))
     pinhole = rig.scene(mask="open", pixels=64, pitch=0.09375, mirror=mirror(place, BACK))

@@ -20,7 +20,8 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.transport.plugins.lens import aperture_scene_parts, register
+from mitsim.transport import plugins
+from mitsim.transport.plugins.lens import aperture_scene_parts
 from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT
 from tests.physics.passages import LAMP, METAL, MIRROR, SEEDS, SIGMAS, THIN, all_light, direct_light, mean, plate
 from tests.unit.transport.test_panes import WALL, slab
@@ -55,7 +56,7 @@ def scene(shared_scene: Callable[..., Path], variant: str) -> Callable[..., Benc
 
 def reference_with_lens(bench: Bench, spp: int) -> tuple[float, float]:
     """Mean over the sensor, and its standard error."""
-    register()
+    plugins.register()
     loaded = bench.loaded
     shapes = {f"shape{i}": shape for i, shape in enumerate(loaded.scene.shapes())}
     parts = aperture_scene_parts(loaded.projector, LENS, WALL)

@@ -47,7 +47,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from mitsim.core.configuration import read_toml, shipped, validate
 from mitsim.core.errors import MitsimError
-from mitsim.transport.plugins.base import bsdf_class, numbers, register_once
+from mitsim.transport.plugins.base import bsdf_class, numbers
 
 PLUGIN = "mitsim_glass"
 _USUAL = "n-bk7"
@@ -81,11 +81,6 @@ _LOOKED_AT = 48
 _MOST_INDEX = 5.0
 """Above germanium's 4: more is no glass."""
 Length = TypeVar("Length", float, Any)
-
-
-def register() -> None:
-    """Make ``mitsim_glass`` known to the current variant; calling it again does nothing."""
-    register_once("bsdf", PLUGIN, _bsdf_class)
 
 
 class GlassModel(BaseModel):
@@ -168,7 +163,7 @@ def tune(scene: mi.Scene, wavelength_nm: float) -> None:
     parameters.update()
 
 
-def _bsdf_class() -> type:
+def plugin_class() -> type:
     """The plugin for the variant in use: Mitsuba's base classes exist per variant."""
 
     class DispersiveGlass(bsdf_class()):  # type: ignore[misc]

@@ -71,7 +71,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from mitsim.core.configuration import read_toml, shipped, validate
 from mitsim.core.errors import MitsimError
-from mitsim.transport.plugins.base import bsdf_class, numbers, register_once
+from mitsim.transport.plugins.base import bsdf_class, numbers
 
 PLUGIN = "mitsim_grating"
 _ORDERS = 16
@@ -82,11 +82,6 @@ _ROUNDING = 1e-6
 Part = Annotated[float, Field(ge=0, le=1)]
 Wavelength = Annotated[float, Field(ge=1, le=1e6)]
 Share = Annotated[float, Field(ge=0, le=1e9)]
-
-
-def register() -> None:
-    """Make ``mitsim_grating`` known to the current variant; calling it again does nothing."""
-    register_once("bsdf", PLUGIN, _bsdf_class)
 
 
 class GratingModel(BaseModel):
@@ -160,7 +155,7 @@ def _numbers(name: str, value: Any) -> object:
         raise MitsimError(f"{PLUGIN}: {name}: got {value!r}; give numbers separated by commas") from None
 
 
-def _bsdf_class() -> type:
+def plugin_class() -> type:
     """The plugin for the variant in use: Mitsuba's base classes exist per variant."""
 
     class Grating(bsdf_class()):  # type: ignore[misc]

@@ -50,15 +50,10 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.errors import MitsimError
-from mitsim.transport.plugins.base import RIGID, register_once, rigidity_error
+from mitsim.transport.plugins.base import RIGID, rigidity_error
 from mitsim.transport.projector import CanvasMap
 
 PLUGIN = "mitsim_projector"
-
-
-def register() -> None:
-    """Make ``mitsim_projector`` known to the current variant; calling it again does nothing."""
-    register_once("emitter", PLUGIN, _emitter_class)
 
 
 def aperture_scene_parts(projector: mi.Emitter, radius: float, focus: float) -> dict[str, Any]:
@@ -118,7 +113,7 @@ def _number(props: mi.Properties, name: str, low: float, high: float) -> float:
     return value
 
 
-def _emitter_class() -> type:
+def plugin_class() -> type:
     """The plugin for the variant in use: Mitsuba's base classes exist per variant."""
 
     class ApertureProjector(mi.Emitter):  # type: ignore[misc]

@@ -9,7 +9,7 @@ Irradiance at sensor point u, in the units of the scene's radiance times steradi
 over t = (x/z, y/z) inside the field stop; M is the mask's transmission, d its distance, h its thickness (both faces
 count, a thin mask has one), cos^n a pixel's angular response, and the last factor is cos(theta) d omega written in t. A
 sample draws u inside its pixel's active square and a place where the mask's near face is open, evenly among all that
-the field stop shows from u (:mod:`mitsim.transport.plugins.lensless`), which makes t. It traces the ray from u and
+the field stop shows from u, which makes t. It traces the ray from u and
 returns weight p M(u + (d + h) t) cos^n (1 + |t|^2)^-2 (2 T)^2 times the fill factor, with T = tan(fov / 2) and p the
 part of the field stop that is open: irradiance is per pixel area. With t drawn over the whole field stop three of four
 rays would end at a separable mask. Where a plate is not open in a few grids, the place is drawn from a rectangle that
@@ -68,17 +68,20 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import BoolArray, Flaws, Mask
 from mitsim.devices.plate import Plate
-from mitsim.transport.plugins.base import RIGID, register_once, rigidity_error, rows_columns, turn_and_origin, x_y
-from mitsim.transport.sampler import generator, shuffled, stratified
+from mitsim.transport.plugins.base import (
+    RIGID,
+    generator,
+    rigidity_error,
+    rows_columns,
+    shuffled,
+    stratified,
+    turn_and_origin,
+    x_y,
+)
 
 PLUGIN = "mitsim_lensless"
 _BOX_RADIUS = 0.5 + 1e-4
 """Radius [pixels] of a filter that keeps light in its pixel; Mitsuba's box says 0.5 in float32."""
-
-
-def register() -> None:
-    """Make ``mitsim_lensless`` known to the current variant; calling it again does nothing."""
-    register_once("sensor", PLUGIN, _sensor_class)
 
 
 def _geometry(props: mi.Properties, film: mi.Film) -> CameraGeometry:
@@ -102,7 +105,7 @@ def _check_rigid(transform: mi.AffineTransform4f) -> None:
         )
 
 
-def _sensor_class() -> type:
+def plugin_class() -> type:
     """The plugin for the variant in use: Mitsuba's base classes exist per variant."""
 
     class Lensless(mi.Sensor):  # type: ignore[misc]
@@ -279,7 +282,7 @@ def _sensor_class() -> type:
     return Lensless
 
 
-# -------- Where a mask is open
+# -------- Openings of a mask
 #
 # A mask is a sum of grids that do not overlap (mitsim.devices.mask.Mask.openings): open where both its row and its
 # column are. On each axis the open length up to a coordinate is piecewise linear and so is its inverse, which makes a

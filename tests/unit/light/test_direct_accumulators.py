@@ -14,7 +14,6 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.light.grids import LightEstimate
 from mitsim.light.settings import Settings, SharpPixels
 from mitsim.light.simulation import Simulation
-from mitsim.transport.accumulator import fetched
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, SAMPLES = 16, 96
@@ -42,10 +41,11 @@ def bench(shared_scene: Callable[..., Path], variant: str) -> Bench:
 def both(simulation: Simulation, name: str, labels: np.ndarray) -> tuple[LightEstimate, LightEstimate]:
     """Light of a pass by the host and by the device."""
     each = simulation.passes[name]
-    path_samples, accumulators = each.trace(3, 0, SAMPLES), simulation.accumulators(name, labels, 1)
-    rest = each.trace(3, 0, SAMPLES, accumulators)
+    path_samples, accumulator = each.trace(3, 0, SAMPLES), simulation.accumulator(name, labels, 1)
+    assert accumulator is not None
+    rest = each.trace(3, 0, SAMPLES, accumulator)
     assert not len(rest.value) and len(path_samples.value) > 1000
-    (sums,) = fetched(accumulators)
+    (sums,) = accumulator.fetch()
     host, device = (simulation.accumulate(name, found, labels, SAMPLES) for found in (path_samples, sums))
     return host, device
 
@@ -73,8 +73,8 @@ def test_few_paths_for_many_cells_are_left_to_the_host(bench: Bench) -> None:
     names = "anchor_residual", "sharp"
     few = Simulation(bench, replace(SETTINGS, samples=dict.fromkeys(names, 1.0)))
     many = Simulation(bench, replace(SETTINGS, samples=dict.fromkeys(names, 1000.0)))
-    assert all(few.accumulators(name, labels, 1) == () for name in names)
-    assert all(len(many.accumulators(name, labels, 3)) == 3 for name in names)
+    assert all(few.accumulator(name, labels, 1) is None for name in names)
+    assert all(many.accumulator(name, labels, 3) is not None for name in names)
 
 
 def test_the_middle_of_the_sharpest_lobe_is_light(bench: Bench, variant: str) -> None:
@@ -88,9 +88,9 @@ def test_the_middle_of_the_sharpest_lobe_is_light(bench: Bench, variant: str) ->
     square.wi = mi.Vector3f(0, 0, 1)
     brightest = math.pi * float(np.max(np.array(lobe.eval(mi.BSDFContext(), square, mi.Vector3f(0, 0, 1)))))
     assert brightest > 2e7
-    board = tracer.receiver.of_board(tracer.rays)
-    (accumulator,) = simulation.accumulators("anchor_residual", np.zeros(N * N, dtype=np.int64), 1)
+    board = tracer.setup.board
+    accumulator = simulation.accumulator("anchor_residual", np.zeros(N * N, dtype=np.int64), 1)
     for place, light in enumerate([10 * brightest * board, 1e-5 * board]):
-        accumulator.add(mi.Float(light), mi.UInt32(0), mi.UInt32(place), mi.Bool(True))
-    filed, *_ = accumulator.light()
+        accumulator.add([mi.Float(light)], mi.UInt32(0), mi.UInt32(place))
+    filed, *_ = accumulator.fetch()[0].light()
     np.testing.assert_allclose(filed.toarray()[0, :2] / board, [10 * brightest, 1e-5], rtol=0.02)

@@ -31,7 +31,8 @@ from mitsim.devices.projector import Spectrum
 from mitsim.light.grids import Grid
 from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation
-from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer, LampTracer, Paths
+from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer, LampTracer
+from mitsim.transport.integrator import Paths
 from mitsim.transport.records import PathSamples
 from tests.conftest import write_small_scene
 from tests.system.conftest import CAMERA
@@ -123,8 +124,8 @@ def traced(folder: str) -> list[dict[str, Any]]:
         looks = [simulation.from_camera.trace(seed, 0, SAMPLES) for seed in range(SEEDS)]
         lines = [[light.value.sum() / SAMPLES for light in look.by_line(len(LINES))] for look in looks]
         bands = [np.bincount(look.pixel - whole.n**2, look.value) / SAMPLES for look in looks]
-        parts = whole.loaded.scene, whole.loaded.camera, simulation.physics.projector, simulation.aim
-        mirrored = CombinedTracer(FromCameraTracer(*parts, Paths(mirrors=True)), simulation.from_camera)
+        mirrors = FromCameraTracer(simulation.setup, simulation.aim, Paths(mirrors=True))
+        mirrored = CombinedTracer(mirrors, simulation.from_camera)
         both = mirrored.trace(0, 0, SAMPLES).by_line(len(LINES)) if lamp == "flat" else []
         labels = np.zeros(whole.n**2, dtype=np.int64)
         filed = [simulation.accumulate("indirect", look.by_line(3)[2], labels, SAMPLES)["fine"] for look in looks[:1]]

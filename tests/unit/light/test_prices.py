@@ -19,7 +19,7 @@ from mitsim.light.cost_model import (
 )
 from mitsim.light.pilot_result import Forming, Noise, SampleCost
 from mitsim.light.settings import GROUPS, Settings
-from mitsim.optics.replicates import PROBES
+from mitsim.optics.forming import PROBES
 from tests.unit.planner.invented_evidence import PILOT_RESULT, plan
 
 FORMING = Forming(pixels=50, cells=10, lit=0.5, terms=3.0, shots=4, classes=4)

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from mitsim.optics.forming import Filed
+from mitsim.optics.forming import Filed, bound_of, probe_vectors, shares_of_bound
 from mitsim.optics.frames import ClassFrames, monte_carlo_bound, monte_carlo_error
 from mitsim.optics.image_formation import FrameOptics
-from mitsim.optics.replicates import bound_of, probe_vectors, shares_of_bound
 from mitsim.optics.shadow import Directions
 from tests.unit.optics.small_camera import (
     BESIDE,

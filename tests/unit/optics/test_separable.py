@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import hadamard
 
-from mitsim.optics.separable import best_term, centred, lacking, relative_difference
+from mitsim.optics.terms import best_term, centred, lacking, relative_difference
 from mitsim.reconstruct.estimate_factors import estimate_factors
 
 Terms = list[tuple[np.ndarray, np.ndarray]]

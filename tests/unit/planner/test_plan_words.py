@@ -13,7 +13,7 @@ from mitsim.light.cost_model import unit_costs_of
 from mitsim.light.pilot_result import Approximation, PilotResult
 from mitsim.light.settings import Settings
 from mitsim.planner.explain import SceneFacts, explain_plan
-from mitsim.scene.estimators import Unfit
+from mitsim.scene.limits import Unfit
 from mitsim.scene.outline import Tag
 from tests.unit.planner.invented_evidence import PILOT_RESULT, SIZES, changes, plan, rows, stages, with_occluded
 

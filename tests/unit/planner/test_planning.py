@@ -17,7 +17,7 @@ from mitsim.light.cost_model import FIXED
 from mitsim.light.pilot_result import REPLICATES, Noise, SampleCost
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, MOST_PATHS
-from mitsim.optics.replicates import bound_of
+from mitsim.optics.forming import bound_of
 from mitsim.planner import pilot, planner
 from mitsim.planner.choose import _BOUND_OVER_ERROR, FIRST_ACCURACY, Candidate, _samples_for, cheapest
 from tests.unit.planner.invented_evidence import ONE_CLASS, plan

@@ -8,7 +8,7 @@ import pytest
 
 from mitsim.core.exr import MAGIC
 from mitsim.scene.check import check_file
-from mitsim.scene.headers import check_image, is_grey
+from mitsim.scene.headers import check_image
 from tests.conftest import write_png
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -66,5 +66,5 @@ def test_pictures_of_numbers_are_told_by_their_channels(tmp_path: Path) -> None:
     for name, channels, grey in (("one.exr", 1, True), ("three.exr", 3, False), ("one.pfm", 1, True)):
         path = tmp_path / name
         mi.Bitmap(np.ones((2, 2, channels), dtype=np.float32)).write(str(path))
-        assert check_image(path) == 4 and is_grey(path) == grey
+        assert check_image(path) == (4, grey)
     assert (tmp_path / "one.exr").read_bytes().startswith(MAGIC)

@@ -14,9 +14,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import hadamard_matrix
 from mitsim.devices.projector import Spectrum
 from mitsim.metrics import relative_error
-from mitsim.optics.separable import best_term, centred
 from mitsim.optics.shadow import Directions
-from mitsim.optics.terms import shadow_terms
+from mitsim.optics.terms import best_term, centred, shadow_terms
 from mitsim.reconstruct.estimate_factors import estimate_factors
 from mitsim.report import lit_scene
 from mitsim.report.lit_scene import IdealCamera

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.transport.direct import DirectTracer
-from mitsim.transport.sharp_lobes import AimedTracer, sharp_light
+from mitsim.transport.direct import AimedTracer, DirectTracer
+from mitsim.transport.missed import sharp_light
 from tests.conftest import write_png
 from tests.physics.test_sharp_lobes import on_ball
 
@@ -72,8 +72,7 @@ def lit(small_scene: Callable[..., Path], variant: str) -> Callable[[str], tuple
         yy, xx = np.mgrid[:64, :64]
         write_png(path.parent / "bumps.png", 127 + 60 * np.sin(xx * 0.7) * np.cos(yy * 0.5))
         bench = open_bench(path, variant, for_render=True)
-        loaded = bench.loaded
-        found = sharp_light(loaded.scene, loaded.camera, bench.projector_optics, bench.geometry, 1, 2**18 // n**2)
+        found = sharp_light(bench.setup, 1, 2**18 // n**2)
         return bench, np.sort(np.argsort(-found.by_pixel)[:8])
 
     return load
@@ -89,8 +88,8 @@ def totals(tracer: DirectTracer, samples: int) -> np.ndarray:
 
 
 def both(bench: Bench, pixels: np.ndarray, samples: int) -> tuple[np.ndarray, np.ndarray]:
-    parts = bench.loaded.scene, bench.loaded.camera, bench.projector_optics, 3, bench.geometry
-    return totals(AimedTracer(*parts, pixels), samples), totals(DirectTracer(*parts, pixels=pixels), 4 * samples)
+    even = DirectTracer(bench.setup, 3, pixels=pixels)
+    return totals(AimedTracer(bench.setup, 3, pixels), samples), totals(even, 4 * samples)
 
 
 @pytest.mark.parametrize(
@@ -116,15 +115,11 @@ def test_lobes_are_found_behind_what_lets_light_pass(
     """
     bench, pixels = lit(plate(metal(1e-2)) + before)
     alone = lit(plate(metal(1e-2)))[0]
-    found, expected = (
-        sharp_light(each.loaded.scene, each.loaded.camera, each.projector_optics, each.geometry, 3, 2**19 // N**2)
-        for each in (bench, alone)
-    )
+    found, expected = (sharp_light(each.setup, 3, 2**19 // N**2) for each in (bench, alone))
     gate = 5 * np.hypot(found.error, part * expected.error)
     assert gate < 0.35 * found.irradiance and abs(found.irradiance - part * expected.irradiance) < gate
     assert found.width == pytest.approx(expected.width, rel=0.1)
-    parts = bench.loaded.scene, bench.loaded.camera, bench.projector_optics, 3, bench.geometry
-    assert AimedTracer(*parts, pixels)._aims.known.any()
+    assert AimedTracer(bench.setup, 3, pixels)._aims.known.any()
 
 
 @LONGER
@@ -135,8 +130,7 @@ def test_a_highlight_that_few_rays_meet_is_looked_at_again(lit: Callable[..., tu
     errors of four looks, 15 % (without the rest, 20 % are missing).
     """
     bench, _ = lit(ball(metal(5e-3)))
-    parts = bench.loaded.scene, bench.loaded.camera, bench.projector_optics, bench.geometry
-    found = [sharp_light(*parts, seed, 2**22 // N**2) for seed in range(4)]
+    found = [sharp_light(bench.setup, seed, 2**22 // N**2) for seed in range(4)]
     irradiance, error = (np.array([getattr(each, name) for each in found]) for name in ("irradiance", "error"))
     assert (error < 0.1 * irradiance).all()
     whole, expected = irradiance + [each.rest for each in found], on_ball(5e-3, np.zeros(3))
@@ -150,8 +144,7 @@ def test_the_width_of_a_lobe_is_not_that_of_its_share(lit: Callable[..., tuple[B
     widths = []
     for bsdf in (metal(3e-3), varnish(3e-3)):
         bench, _ = lit(plate(bsdf))
-        parts = bench.loaded.scene, bench.loaded.camera, bench.projector_optics, bench.geometry
-        widths.append(sharp_light(*parts, 5, 2**19 // N**2).width)
+        widths.append(sharp_light(bench.setup, 5, 2**19 // N**2).width)
     assert widths[1] == pytest.approx(widths[0], rel=0.1)
 
 
@@ -163,8 +156,7 @@ def test_a_faint_highlight_that_few_turns_meet_is_found(lit: Callable[..., tuple
     sharp. (Planted: no search by connections. All four looks find nothing.)
     """
     bench, _ = lit(ball(varnish(5e-3)))
-    parts = bench.loaded.scene, bench.loaded.camera, bench.projector_optics, bench.geometry
-    found = [sharp_light(*parts, seed, 2**22 // N**2) for seed in range(4)]
+    found = [sharp_light(bench.setup, seed, 2**22 // N**2) for seed in range(4)]
     irradiance, error = (np.array([getattr(each, name) for each in found]) for name in ("irradiance", "error"))
     expected = 0.05 * on_ball(5e-3, np.zeros(3)) * (1 - 5e-3 * np.sqrt(4 * np.pi * 10 / 0.05))
     assert (irradiance > 0).all()
@@ -181,8 +173,7 @@ def test_aimed_rays_find_sharp_lobes_faster(lit: Callable[[str], tuple[Bench, np
 def test_tails_that_are_seldom_connected_are_whole(lit: Callable[..., tuple[Bench, np.ndarray]]) -> None:
     """At roughness 3e-4 most anchors lie beyond the lobes of a pixel's light; connected seldom, they get all of it."""
     bench, pixels = lit(plate(metal(3e-4)), 64)
-    parts = bench.loaded.scene, bench.loaded.camera, bench.projector_optics, 5, bench.geometry
-    aimed, even = AimedTracer(*parts, pixels), DirectTracer(*parts, pixels=pixels)
+    aimed, even = AimedTracer(bench.setup, 5, pixels), DirectTracer(bench.setup, 5, pixels=pixels)
     assert aimed.paths_per_sample < 0.7 * even.paths_per_sample
     sums = np.zeros((2, SEEDS))
     for index, (tracer, samples) in enumerate(((aimed, 2048), (even, 512))):

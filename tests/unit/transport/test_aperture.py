@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.transport.plugins import lens
+from mitsim.transport import plugins
 from mitsim.transport.plugins.lens import aperture_scene_parts
 from tests.unit.transport.closed_forms import stock_projector
 
@@ -18,7 +18,7 @@ SCALE, ALBEDO, N = 111000.0, 0.5, 16
 
 @pytest.fixture(autouse=True)
 def plugin(variant: str) -> None:
-    lens.register()
+    plugins.register()
 
 
 def stock(place: tuple[float, float, float] = (60, 0, 0), turn: float = 0.0, canvas: np.ndarray | None = None):

@@ -11,11 +11,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsim.transport import plugins
 from mitsim.transport.connect import Connection, LensHit, ProjectorConnector
-from mitsim.transport.plugins import lens as aperture
+from mitsim.transport.plugins.base import generator
 from mitsim.transport.plugins.lens import aperture_scene_parts
 from mitsim.transport.projector import ProjectorOptics
-from mitsim.transport.sampler import generator
 from tests.unit.transport.closed_forms import stock_projector
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -166,7 +166,7 @@ def test_light_found_by_chance_is_that_of_a_connection() -> None:
 
 def test_the_radiance_is_that_of_the_reference_estimators_projector() -> None:
     """Plugin ``mitsim_projector``, whose disk a ray meets: radiance texel by texel (random texels tell them apart)."""
-    aperture.register()
+    plugins.register()
     light = emitter(4.0, np.random.default_rng(5).uniform(0.2, 1, (N, 2 * N)))
     made = connector(light, aperture=6.0, focus=300.0)
     points = board(350.0)

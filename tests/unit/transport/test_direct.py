@@ -25,8 +25,8 @@ SIGMAS = 5.0
 
 
 def tracer(bench: Bench, anchors: int = 1, geometry: CameraGeometry | None = None, **lens: float) -> DirectTracer:
-    loaded = bench.loaded
-    return DirectTracer(loaded.scene, loaded.camera, replace(bench.projector_optics, **lens), anchors, geometry)
+    projector = replace(bench.projector_optics, **lens)
+    return DirectTracer(replace(bench.setup, projector=projector, geometry=geometry or bench.geometry), anchors)
 
 
 @pytest.fixture(scope="module")
@@ -91,8 +91,7 @@ def test_all_anchors_see_the_same_points(large: Bench) -> None:
 
 def test_a_spread_sensor_is_the_mean_over_it(large: Bench) -> None:
     """Random points of the sensor, filed as one anchor: the mean of the irradiance over the sensor."""
-    loaded = large.loaded
-    spread = DirectTracer(loaded.scene, loaded.camera, large.projector_optics, 1, spread=True)
+    spread = DirectTracer(large.setup, 1, spread=True)
     totals = np.array([by_pixel(spread.trace(seed, 0, 16), 16).sum() for seed in range(8)])
     node, weight = np.polynomial.legendre.leggauss(4)
     half = large.geometry.half_width
@@ -106,8 +105,7 @@ def test_a_spread_sensor_is_the_mean_over_it(large: Bench) -> None:
 def test_points_of_a_spread_sensor_are_even(large: Bench) -> None:
     """Of 32 samples of each pixel, over eight seeds. The light changes by 1.4 % (rms) over the sensor of 40 mm and the
     pixel; smooth as it is, 0.006 of the variance of plain random points is left."""
-    loaded = large.loaded
-    spread = DirectTracer(loaded.scene, loaded.camera, large.projector_optics, 1, spread=True)
+    spread = DirectTracer(large.setup, 1, spread=True)
     light = np.array([by_pixel(spread.trace(seed, 0, 32), 32) for seed in range(8)])
     once = np.array([by_pixel(spread.trace(seed, 0, 1), 1) for seed in range(32)])
     plain = once.var(axis=0, ddof=1).mean() / 32
@@ -209,8 +207,8 @@ def test_light_that_is_not_a_number_is_refused(small_scene: Callable[..., Path])
 
 
 def test_chosen_pixels_are_traced_as_among_all(white: Bench) -> None:
-    loaded, chosen = white.loaded, np.array([3, 17, 250])
-    some = DirectTracer(loaded.scene, loaded.camera, white.projector_optics, 1, pixels=chosen)
+    chosen = np.array([3, 17, 250])
+    some = DirectTracer(white.setup, 1, pixels=chosen)
     assert some.paths_per_sample == 3
     mine, whole = some.trace(5, 0, 4), tracer(white).trace(5, 0, 4)
     expected = whole.where(np.isin(whole.pixel, chosen))

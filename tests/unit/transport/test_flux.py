@@ -41,8 +41,7 @@ LIT = (N * np.arange(6, 10)[:, None] + np.array([2, 3, 4, 5, 10, 11, 12, 13])).r
 
 
 def flux(bench: Bench, glossy: bool, samples: int, pixels: np.ndarray | None = None) -> tuple[float, float]:
-    loaded = bench.loaded
-    tracer = FluxTracer(loaded.scene, loaded.camera, bench.projector_optics, bench.geometry, glossy)
+    tracer = FluxTracer(bench.setup, glossy)
     pixels = np.arange(N * N) if pixels is None else pixels
     sums = tracer.sums(0, SEEDS, pixels, np.zeros_like(pixels), samples)[0].sum(axis=1) / samples
     return float(np.mean(sums)), float(np.std(sums, ddof=1) / np.sqrt(SEEDS))
@@ -98,8 +97,7 @@ def test_sums_are_those_of_blocks_however_they_are_traced(
     (Planted: a sample's number without the block's first; the same stream in all groups.)
     """
     rig = bench(0.3, 0.5)
-    loaded = rig.loaded
-    tracer = FluxTracer(loaded.scene, loaded.camera, rig.projector_optics, rig.geometry, True)
+    tracer = FluxTracer(rig.setup, True)
     first = np.full_like(LIT, 3)
     whole = tracer.sums(5, 2, LIT, first, 40)[0]
     lit = whole[0] > 0

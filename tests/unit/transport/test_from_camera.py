@@ -15,7 +15,8 @@ import pytest
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
 from mitsim.transport import integrator
-from mitsim.transport.from_camera import FromCameraTracer, Paths
+from mitsim.transport.from_camera import FromCameraTracer
+from mitsim.transport.integrator import Paths
 from mitsim.transport.records import AMBIENT, CellGrid, PathSamples, aligned_grid
 from tests.unit.transport.closed_forms import mean, seen
 
@@ -43,8 +44,7 @@ def grid(bench: Bench) -> CellGrid:
 
 
 def tracer(bench: Bench, **followed: object) -> FromCameraTracer:
-    loaded = bench.loaded
-    return FromCameraTracer(loaded.scene, loaded.camera, bench.projector_optics, grid(bench), Paths(**followed))
+    return FromCameraTracer(bench.setup, grid(bench), Paths(**followed))
 
 
 @pytest.mark.parametrize("interreflection", [pytest.param(False, marks=pytest.mark.slow), True])

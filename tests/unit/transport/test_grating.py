@@ -408,9 +408,3 @@ def test_orders_are_symmetric_unless_both_sides_are_given() -> None:
     assert grating(efficiencies="0.3, 0.2, 0.1").model.orders == {-2: 0.1, -1: 0.2, 0: 0.3, 1: 0.2, 2: 0.1}
     blazed = grating(efficiencies="0.3, 0.2", negative_efficiencies="0.05, 0.4").model
     assert blazed.orders == {-2: 0.4, -1: 0.05, 0: 0.3, 1: 0.2}
-
-
-def test_registering_needs_a_variant() -> None:
-    program = "from mitsim.transport.plugins import grating; grating.register()"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.returncode == 1 and "MitsimError: no Mitsuba variant is selected" in done.stderr

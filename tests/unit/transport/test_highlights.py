@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mitsim.transport.connect import OpticalSetup
 from mitsim.transport.missed import Highlights, highlights
 from mitsim.transport.projector import ProjectorOptics
 from tests.physics.test_mirror import SCALE, N, Rig
@@ -20,7 +21,8 @@ def found(alpha: float, radius: float, **more: dict) -> Highlights:
     }
     scene = Rig((60, 0, 0)).scene("open", 64, **balls, **more)
     projector = ProjectorOptics(scene.emitters()[0], N, 0, N, (N, 2 * N))
-    return highlights(scene, scene.sensors()[0], projector, scene.sensors()[0].geometry)
+    camera = scene.sensors()[0]
+    return highlights(OpticalSetup(scene, camera, projector, camera.geometry))
 
 
 @pytest.mark.parametrize(("alpha", "radius"), [(0.003, 0.4), (0.003, 5.0), (0.01, 0.02)])

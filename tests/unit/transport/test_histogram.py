@@ -180,8 +180,8 @@ def test_small_light_beside_great_light_is_counted() -> None:
     assert fetched.value.dtype == np.float64 and fetched.value.sum() == 2.0**24 + 4096
     assert alone.accumulate(fetched, LABELS).sum() == 2.0**24 + 4096
     accumulator = DeviceAccumulator(alone, LABELS, one=2.0**24)
-    accumulator.add(seen.value, seen.pixel, accumulator.place(seen, mi.Float(0.5)), mi.Bool(True))
-    assert accumulator.light()[1] == 2.0**24 + 4096
+    accumulator.add([seen.value], seen.pixel, accumulator.place(seen, mi.Float(0.5)))
+    assert accumulator.fetch()[0].light()[1] == 2.0**24 + 4096
 
 
 @pytest.mark.usefixtures("variant")
@@ -191,31 +191,31 @@ def test_ledgers_of_several_lines_are_fetched_together() -> None:
     (Planted: light in the order of its numbers; what is lit by the first line; light of all lines filed as the first's,
     or fetched as that; sums that are not emptied.)
     """
+    import drjit as dr
     import mitsuba as mi
 
     from mitsim.core.errors import MitsimError
-    from mitsim.transport.accumulator import DeviceAccumulator, fetched
+    from mitsim.transport.accumulator import DeviceAccumulator
 
     found, alone = path_samples(inside=False), bundle(anchors=1)
     pixel = np.minimum(found.pixel, PIXELS - 1).astype(np.uint32)
     seen = [mi.Float(each.astype(np.float32)) for each in (found.value, found.row, found.column, found.inverse_depth)]
     light = Sightings(seen[0], mi.UInt32(pixel), *seen[1:])
-    together = DeviceAccumulator.of_lines(3, alone, LABELS, one=1.0)
+    together = DeviceAccumulator(alone, LABELS, one=1.0, lines=3)
     single = [DeviceAccumulator(alone, LABELS, one=1.0) for _ in range(3)]
     lit = [mi.Bool(found.pixel % 2 == 0), mi.Bool(found.pixel % 3 == 0), mi.Bool(False)]
-    for accumulators in (together, single):
-        place = accumulators[0].place(light, mi.Float(0.5))
-        for accumulator, some in zip(accumulators, lit, strict=True):
-            accumulator.add(light.value, light.pixel, place, some)
-    for own, counted in zip(single, fetched(together), strict=True):
-        (matrix, *sums), (expected, *own_sums) = counted.light(4), own.light(4)
+    place = together.place(light, mi.Float(0.5))
+    together.add([dr.select(some, light.value, 0) for some in lit], light.pixel, place)
+    for accumulator, some in zip(single, lit, strict=True):
+        accumulator.add([light.value], light.pixel, place, some)
+    for own, counted in zip(single, together.fetch(), strict=True):
+        (matrix, *sums), (expected, *own_sums) = counted.light(4), own.fetch()[0].light(4)
         assert np.array_equal(matrix.toarray(), expected.toarray()) and sums == own_sums
-    for counted in fetched(together):
+    for counted in together.fetch():
         assert counted.light()[1] == 0.0 and not counted.light()[0].nnz
     assert own_sums == [0.0, 0.0] and not expected.nnz, "the last line is dark"
-    for accumulator, value in zip(together, (1.0, np.nan, 1.0), strict=True):
-        accumulator.add(mi.Float(value), mi.UInt32(0), mi.UInt32(0), mi.Bool(True))
-    broken = fetched(together)
+    together.add([mi.Float(value) for value in (1.0, np.nan, 1.0)], mi.UInt32(0), mi.UInt32(0))
+    broken = together.fetch()
     assert [broken[line].light()[1] for line in (0, 2)] == [1.0, 1.0]
     with pytest.raises(MitsimError, match="NaN"):
         broken[1].light()

@@ -14,8 +14,9 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
 from mitsim.transport import integrator
 from mitsim.transport.connect import SensorPoints
-from mitsim.transport.from_camera import FromCameraTracer, Paths
+from mitsim.transport.from_camera import FromCameraTracer
 from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.integrator import Paths
 from mitsim.transport.records import DIRECT, INDIRECT, PathSamples, aligned_grid
 from tests.unit.transport.closed_forms import mean, seen
 
@@ -35,8 +36,7 @@ MIRROR = """<shape type="rectangle"><transform name="to_world"><scale x="40" y="
 
 
 def tracer(bench: Bench, mirrors: bool = False, interreflection: bool = True) -> IndirectTracer:
-    loaded = bench.loaded
-    return IndirectTracer(loaded.scene, loaded.camera, bench.projector_optics, mirrors, interreflection)
+    return IndirectTracer(bench.setup, Paths(mirrors, interreflection))
 
 
 @pytest.fixture(scope="module")
@@ -79,12 +79,11 @@ def test_both_sides_together_find_all_light(shared_scene: Callable[..., Path], m
     """
     bench = open_bench(shared_scene("shiny", extra=SPHERE.format(bsdf=SHINY), sheet_z=3000))
     grid = aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov)
-    loaded = bench.loaded
 
     def found(side: str, sharp: float, seeds: int = 16) -> np.ndarray:
         monkeypatch.setattr(integrator, "_SHARP", sharp)
-        parts = loaded.scene, loaded.camera, bench.projector_optics, grid, Paths(interreflection=True)
-        one = tracer(bench) if side == "projector" else FromCameraTracer(*parts)
+        camera = FromCameraTracer(bench.setup, grid, Paths(interreflection=True))
+        one = tracer(bench) if side == "projector" else camera
         return np.array([one.trace(seed, 0, 256).value.sum() / 256 for seed in range(seeds)])
 
     projector, camera = found("projector", 1.0), found("camera", 1.0)
@@ -111,13 +110,12 @@ def test_both_sides_find_the_same_light_at_every_anchor(
     (Planted: the camera's paths filed as their start sees them.)
     """
     bench = open_bench(shared_scene("wall", extra=CORNER, pitch=0.375, mask_feature=0.3), for_render=True)
-    loaded, geometry = bench.loaded, bench.geometry
+    geometry = bench.geometry
     points = SensorPoints(geometry.half_width, 2, distance=geometry.scene_distance)
     grid = aligned_grid(*bench.windows, 2 * N, 1, geometry.reach(geometry.scene_distance))
-    parts = loaded.scene, loaded.camera, bench.projector_optics
     sides = (
-        (IndirectTracer(*parts, False, True, points=points), 1e6),
-        (FromCameraTracer(*parts, grid, Paths(interreflection=True), points=points), 1e-6),
+        (IndirectTracer(bench.setup, Paths(False, True), points=points), 1e6),
+        (FromCameraTracer(bench.setup, grid, Paths(interreflection=True), points=points), 1e-6),
     )
     found = np.zeros((2, SEEDS, 4, 4))
     for side, (tracer_, sharp) in enumerate(sides):
@@ -145,8 +143,8 @@ def test_a_caustic_is_direct_light_where_the_mirror_throws_it(shared_scene: Call
     0.5 / pi cos^2 / r^2 of it, from wherever on the sensor.
     """
     bench = open_bench(shared_scene("caustic", extra=MIRROR))
-    parts, points = (bench.loaded.scene, bench.loaded.camera), SensorPoints(bench.geometry.half_width, anchors)
-    found = IndirectTracer(*parts, bench.projector_optics, True, False, points=points).trace(2, 0, 64)
+    points = SensorPoints(bench.geometry.half_width, anchors)
+    found = IndirectTracer(bench.setup, Paths(True, False), points=points).trace(2, 0, 64)
     assert {*found.anchor_row, *found.anchor_column} == set(range(anchors))
     assert found.value.size > 1000 and (found.kind == DIRECT).all()
     places = np.stack([-found.column, -found.row, np.ones(found.value.size)], axis=1) / found.inverse_depth[:, None]

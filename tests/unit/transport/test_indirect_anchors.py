@@ -16,9 +16,10 @@ import pytest
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.spectral_manifests import RUN
-from mitsim.transport.accumulator import DeviceAccumulator, fetched
+from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import SensorPoints
 from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.integrator import Paths
 from mitsim.transport.records import DIRECT, INDIRECT, Bundle, PathSamples, aligned_grid
 from tests.conftest import write_small_scene
 from tests.unit.transport.test_indirect import CORNER, MIRROR, N
@@ -57,8 +58,7 @@ def beside(shared_scene: Callable[..., Path], variant: str) -> Bench:
 
 
 def anchored(bench: Bench, points: SensorPoints) -> IndirectTracer:
-    loaded = bench.loaded
-    return IndirectTracer(loaded.scene, loaded.camera, bench.projector_optics, True, True, points=points)
+    return IndirectTracer(bench.setup, Paths(True, True), points=points)
 
 
 def compared(bench: Bench) -> tuple[int, list[str]]:
@@ -99,11 +99,11 @@ def in_lines(folder: str) -> tuple[int, list[str], list[list[float]]]:
     bench = SpectralBench.of(opened, RUN).whole
     tracer, labels = anchored(bench, SensorPoints(bench.geometry.half_width, 3)), np.arange(N**2) % 5
     bundle = Bundle(aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov), 3, (400.0,))
-    accumulators = DeviceAccumulator.of_lines(len(LINES), bundle, labels, tracer.board)
-    tracer.trace_into(accumulators, 4, 0, 32)
+    accumulator = DeviceAccumulator(bundle, labels, tracer.board, len(LINES))
+    tracer.trace(4, 0, 32, accumulator)
     host = tracer.trace(4, 0, 32)
     light = host.where(host.kind == INDIRECT).by_line(len(LINES))
-    held = [float(sums.light()[0].sum()) for sums in fetched(accumulators)]
+    held = [float(sums.light()[0].sum()) for sums in accumulator.fetch()]
     return *compared(bench), [held, [float(bundle.accumulate(each, labels).sum()) for each in light]]
 
 
@@ -130,16 +130,16 @@ def test_ledgers_hold_what_anchors_are_brought(beside: Bench, launch: int, monke
     reach = beside.geometry.reach(beside.geometry.scene_distance)
     bundle = Bundle(aligned_grid(*beside.windows, 2 * N, 1, reach), 3, (400.0, 300.0))
     whole, parts = (DeviceAccumulator(bundle, labels, tracer.board) for _ in range(2))
-    caustics, host = tracer.trace_into([whole], 4, 0, 8), tracer.trace(4, 0, 8)
+    caustics, host = tracer.trace(4, 0, 8, whole), tracer.trace(4, 0, 8)
     units = np.array(whole.sums)
     monkeypatch.setattr(IndirectTracer, "paths_per_launch", launch)
-    again = PathSamples.joined([tracer.trace_into([parts], 4, first, 4) for first in (0, 4)])
+    again = PathSamples.joined([tracer.trace(4, first, 4, parts) for first in (0, 4)])
     assert units.any() and np.array_equal(np.array(parts.sums), units)
     for name in ("kind", "pixel", "anchor_row", "anchor_column", "value"):
         assert np.array_equal(getattr(again, name), getattr(caustics, name)), name
     assert np.array_equal(caustics.value, host.value[host.kind == DIRECT]) and caustics.value.size
     expected = bundle.accumulate(host.where(host.kind == INDIRECT), labels)
-    found = whole.light()[0]
+    found = whole.fetch()[0].light()[0]
     # Which layer light is filed in is drawn: all layers together are the same.
     by_place = [np.asarray(light.toarray()).reshape(light.shape[0], 2, -1).sum(axis=1) for light in (expected, found)]
     near = np.isclose(*by_place, rtol=1e-5, atol=1e-7 * by_place[0].max())

@@ -10,8 +10,9 @@ import pytest
 from mitsim.api.bench import Bench, open_bench
 from mitsim.devices.patterns import Lighting
 from mitsim.planner.planner import make_plan
-from mitsim.transport.from_camera import FromCameraTracer, Paths
+from mitsim.transport.from_camera import FromCameraTracer
 from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.integrator import Paths
 from mitsim.transport.missed import LeftOut, left_out_light
 from mitsim.transport.records import CellGrid, aligned_grid
 from tests.physics.test_sharp_lobes import on_ball
@@ -27,9 +28,8 @@ MIRROR = """<shape type="rectangle"><transform name="to_world"><scale x="115" y=
 
 
 def left_out_of(bench: Bench, seed: int, paths: int = 2**21) -> LeftOut:
-    loaded, grid = bench.loaded, cells(bench)
-    parts = loaded.scene, loaded.camera, bench.projector_optics, grid, bench.geometry
-    return left_out_light(*parts, seed, paths // (grid.shape[0] * grid.shape[1]))
+    grid = cells(bench)
+    return left_out_light(bench.setup, grid, seed, paths // (grid.shape[0] * grid.shape[1]))
 
 
 def cells(bench: Bench) -> CellGrid:
@@ -103,11 +103,10 @@ def test_hits_are_those_of_the_tracer_that_would_find_the_light(
     """
     name = f"hits{place == SEEN}{alpha}"
     bench = open_bench(shared_scene(name, extra=MIRROR + gloss(place, alpha), sheet_z=-500, fov=30), for_render=True)
-    scene, camera, optics, geometry = bench.loaded.scene, bench.loaded.camera, bench.projector_optics, bench.geometry
     if place == LIT:
-        tracer = IndirectTracer(scene, camera, optics, True, False, geometry)
+        tracer = IndirectTracer(bench.setup, Paths(True, False))
     else:
-        tracer = FromCameraTracer(scene, camera, optics, cells(bench), Paths(mirrors=True), geometry)
+        tracer = FromCameraTracer(bench.setup, cells(bench), Paths(mirrors=True))
     samples = 2**21 // tracer.paths_per_sample
     connected = tracer.trace(0, 0, samples).value
     light, moment = connected.sum() / samples, np.square(connected).sum() / samples

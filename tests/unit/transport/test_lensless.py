@@ -157,15 +157,15 @@ def test_a_narrow_view_keeps_its_light(fov: float) -> None:
 def test_registering_twice_does_nothing() -> None:
     import mitsuba as mi
 
-    from mitsim.transport.plugins import lensless
+    from mitsim.transport import plugins
 
-    lensless.register()
-    lensless.register()
+    plugins.register()
+    plugins.register()
     assert mi.load_dict({"type": "mitsim_lensless", **plugin(CameraGeometry(pixels=2))}).geometry.pixels == 2
 
 
 def test_registering_needs_a_variant() -> None:
-    program = "from mitsim.transport.plugins import lensless; lensless.register()"
+    program = "from mitsim.transport import plugins; plugins.register()"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 1 and "MitsimError: no Mitsuba variant is selected" in done.stderr
 

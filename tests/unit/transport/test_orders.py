@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.transport.from_camera import FromCameraTracer, Paths
+from mitsim.transport.from_camera import FromCameraTracer
 from mitsim.transport.indirect import IndirectTracer
-from mitsim.transport.integrator import ANY, FollowingTracer
+from mitsim.transport.integrator import ANY, FollowingTracer, Paths
 from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT, PathSamples, aligned_grid
 from tests.unit.transport.closed_forms import mean, seen
@@ -30,7 +30,7 @@ def test_each_reflection_in_a_sphere_keeps_the_albedo(
 ) -> None:
     """Light of order k is even in a diffuse sphere: E_k = Phi rho^k / (pi A) for k >= 2, Phi being the projector's."""
     bench = open_bench(shared_scene(f"orders_{kind.__name__}", extra=SPHERE.format(bsdf=MATT), sheet_z=3000))
-    all_orders = kind(bench.loaded.scene, bench.loaded.camera, bench.projector_optics, False, True)
+    all_orders = kind(bench.setup, Paths(False, True))
     second = np.pi * 111000 * 0.3**2 * RHO**2 / np.pi / (4 * np.pi * 1000**2) * seen(bench.geometry.tan_half_fov)
     for (fewest, most), part in {(2, 2): 1.0, (3, 3): RHO, (3, ANY): RHO / (1 - RHO)}.items():
         tracer = all_orders.of_orders(fewest, most)
@@ -48,15 +48,14 @@ def hall(shared_scene: Callable[..., Path], variant: str) -> Bench:
 
 def tracers(bench: Bench) -> dict[str, FollowingTracer]:
     """Of both sides."""
-    loaded, optics = bench.loaded, replace(bench.projector_optics, aperture=30.0)
-    parts = loaded.scene, loaded.camera, bench.projector_optics
+    lens = replace(bench.setup, projector=replace(bench.projector_optics, aperture=30.0))
     grid = aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov)
-    paths = Paths(mirrors=True, interreflection=True, emitters=loaded.lamps)
+    paths = Paths(mirrors=True, interreflection=True, emitters=bench.loaded.lamps)
     return {
-        "projector": IndirectTracer(*parts, True, True),
-        "neighbours": PathReuseTracer(*parts, False, True),
-        "camera": FromCameraTracer(*parts, grid, paths),
-        "lens": FromCameraTracer(loaded.scene, loaded.camera, optics, grid, paths),
+        "projector": IndirectTracer(bench.setup, Paths(True, True)),
+        "neighbours": PathReuseTracer(bench.setup, Paths(False, True)),
+        "camera": FromCameraTracer(bench.setup, grid, paths),
+        "lens": FromCameraTracer(lens, grid, paths),
     }
 
 

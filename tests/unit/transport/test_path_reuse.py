@@ -18,6 +18,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import SensorPoints
 from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.integrator import Paths
 from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.records import INDIRECT, Bundle, PathSamples, aligned_grid
 from tests.unit.transport.closed_forms import seen
@@ -54,8 +55,8 @@ def opened(scene: Path) -> Bench:
 
 def tracers(bench: Bench, spread: bool = False, mirrors: bool = False) -> tuple[IndirectTracer, PathReuseTracer]:
     """Paths of their own, and shared ones."""
-    loaded, points = bench.loaded, SensorPoints(bench.geometry.half_width, spread=spread)
-    parts = loaded.scene, loaded.camera, bench.projector_optics, mirrors, True
+    points = SensorPoints(bench.geometry.half_width, spread=spread)
+    parts = bench.setup, Paths(mirrors, True)
     return IndirectTracer(*parts, points=points), PathReuseTracer(*parts, points=points)
 
 
@@ -154,8 +155,8 @@ def test_the_ledger_holds_what_the_host_files(shared_scene: Callable[..., Path],
     bundle, labels = Bundle(grid, 1, depths), np.arange(N * N) % 5
     tracer = tracers(bench)[1]
     accumulator = DeviceAccumulator(bundle, labels, tracer.board)
-    own = tracer.trace_into([accumulator], 3, 0, 512)
-    matrix, received, outside = accumulator.light()
+    own = tracer.trace(3, 0, 512, accumulator)
+    matrix, received, outside = accumulator.fetch()[0].light()
     every = tracer.trace(3, 0, 512)
     expected = bundle.accumulate(every, labels).toarray()
     found = (matrix + bundle.accumulate(own, labels)).toarray()
@@ -172,13 +173,13 @@ def test_the_ledger_holds_what_the_host_files(shared_scene: Callable[..., Path],
 def test_the_ledger_holds_paths_of_their_own_at_every_anchor(shared_scene: Callable[..., Path], mirrors: bool) -> None:
     """Place by place, all but caustics: those stay on the host."""
     bench = opened(shared_scene(f"anchors {mirrors}", extra=SCENES["mirror wall"]))
-    loaded, points = bench.loaded, SensorPoints(bench.geometry.half_width, anchors=3)
-    tracer = IndirectTracer(loaded.scene, loaded.camera, bench.projector_optics, mirrors, True, points=points)
+    points = SensorPoints(bench.geometry.half_width, anchors=3)
+    tracer = IndirectTracer(bench.setup, Paths(mirrors, True), points=points)
     grid = aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov / 3)
     bundle, labels = Bundle(grid, 3, (400.0,)), np.arange(N * N) % 5
     accumulator = DeviceAccumulator(bundle, labels, tracer.board)
-    rest = tracer.trace_into([accumulator], 3, 0, 64)
-    matrix, received, outside = accumulator.light()
+    rest = tracer.trace(3, 0, 64, accumulator)
+    matrix, received, outside = accumulator.fetch()[0].light()
     every = tracer.trace(3, 0, 64)
     indirect = every.where(every.kind == INDIRECT)
     assert (len(rest.value) > 0) == mirrors and len(rest.value) + len(indirect.value) == len(every.value)
@@ -199,9 +200,9 @@ def test_light_that_is_not_a_number_is_refused(small_scene: Callable[..., Path])
     parameters.update()
     with pytest.raises(MitsimError, match="NaN"):
         tracer.trace(0, 0, 256)
-    tracer.trace_into([accumulator], 0, 0, 256)
+    tracer.trace(0, 0, 256, accumulator)
     with pytest.raises(MitsimError, match="NaN"):
-        accumulator.light()
+        accumulator.fetch()[0].light()
 
 
 _PRINT = """
@@ -216,8 +217,8 @@ dr.set_thread_count(int(sys.argv[2]))
 tracer = tracers(bench)[1]
 bundle = Bundle(aligned_grid(*bench.windows, 16, 1, bench.geometry.tan_half_fov), 1, (450.0, 300.0))
 accumulator = DeviceAccumulator(bundle, np.arange(256) % 5, tracer.board)
-tracer.trace_into([accumulator], 3, 0, 256)
-print(hashlib.sha256(accumulator.light()[0].toarray().tobytes()).hexdigest())
+tracer.trace(3, 0, 256, accumulator)
+print(hashlib.sha256(accumulator.fetch()[0].light()[0].toarray().tobytes()).hexdigest())
 """
 
 

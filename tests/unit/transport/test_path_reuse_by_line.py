@@ -90,8 +90,8 @@ def traced(folder: str, names: Sequence[str]) -> dict[str, Any]:
         looks = [[side.trace(seed, 0, SAMPLES) for seed in range(SEEDS)] for side in (own, shared)]
         grid = aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov)
         bundle, labels = Bundle(grid, 1, (400.0,)), np.arange(N * N) % 5
-        accumulators = [DeviceAccumulator(bundle, labels, shared.board) for _ in LINES]
-        rest = shared.trace_into(accumulators, 0, 0, SAMPLES)
+        accumulator = DeviceAccumulator(bundle, labels, shared.board, len(LINES))
+        rest = shared.trace(0, 0, SAMPLES, accumulator)
         every = looks[1][0].by_line(len(LINES))
         found[name] = {
             "own": [by_line(look) for look in looks[0]],
@@ -100,8 +100,8 @@ def traced(folder: str, names: Sequence[str]) -> dict[str, Any]:
                 [look.value.sum(), look.lines[: len(LINES)].sum()] for look in looks[1] if look.lines is not None
             ],
             "ledgers": [
-                (accumulator.light()[0] + bundle.accumulate(light, labels)).sum(axis=1).tolist()
-                for accumulator, light in zip(accumulators, rest.by_line(len(LINES)), strict=True)
+                (sums.light()[0] + bundle.accumulate(light, labels)).sum(axis=1).tolist()
+                for sums, light in zip(accumulator.fetch(), rest.by_line(len(LINES)), strict=True)
             ],
             "host": [bundle.accumulate(light, labels).sum(axis=1).tolist() for light in every],
             "tan": bench.geometry.tan_half_fov,

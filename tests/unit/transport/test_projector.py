@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from mitsim.transport.connect import ProjectorConnector
-from mitsim.transport.plugins.base import RIGID, rigidity_error, rows_columns, turn_and_origin, x_y
+from mitsim.transport.plugins.base import RIGID, generator, rigidity_error, rows_columns, turn_and_origin, x_y
 from mitsim.transport.projector import PinholeRays, ProjectorOptics, ProjectorRays
-from mitsim.transport.sampler import generator
 from tests.unit.transport.closed_forms import stock_projector
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsim.transport.sampler import generator, shuffled, stratified
+from mitsim.transport.plugins.base import generator, shuffled, stratified
 
 pytestmark = pytest.mark.usefixtures("variant")
 SIGMAS = 5.0

@@ -255,8 +255,8 @@ import runpy, sys
 import numpy as np
 from mitsim.core.environment import load_variant
 mi = load_variant(sys.argv[1])
-from mitsim.transport import lensless
-lensless.register()
+from mitsim.transport import plugins
+plugins.register()
 tests = runpy.run_path(sys.argv[2])
 half = {"type": "conductor", "specular_reflectance": {"type": "rgb", "value": [0.5, 0.5, 0.5]}}
 print(tests["flux"](tests["scene_with"](sheet=tests["plane"](0, 400, half))))
