@@ -155,7 +155,7 @@ class PilotRuns:
         """Repeat a ``run`` with so many more samples that its standard errors are halved."""
         self.samples[run] = self._finer(run)
         self._measure(run)
-        vars(self).pop("evidence", None)
+        vars(self).pop("pilot_result", None)
 
     def work(self, run: str) -> float:
         """Work of repeating a ``run``, in seconds at fixed unit costs; infinite where it has all the samples it may."""

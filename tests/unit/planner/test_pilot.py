@@ -385,3 +385,14 @@ def test_a_mirror_shows_some_shots_only(shipped_bench: Callable[..., Bench]) -> 
     everything = black * seen.sum(axis=0)
     actual = np.linalg.norm(everything - black * seen) / np.linalg.norm(everything + (1 - black) * seen)
     assert found.value == pytest.approx(actual, rel=0.1)
+
+
+def test_a_refined_run_is_in_what_was_found(bench: Bench) -> None:
+    """More samples of a run tell its changes with half of the standard error. (Planted: what was found before is kept.)"""
+    runs = pilot.PilotRuns(bench, parse_patterns("dots:4", N).lighting, 1e-2, seed=3)
+    before, cells = runs.pilot_result, Approximation("cells", 1)
+    runs.refine("cells")
+    after = runs.pilot_result
+    spread = [each.bound**2 - each.value**2 for each in (result.error(cells) for result in (before, after))]
+    assert after is not before
+    assert spread[1] != spread[0]
