@@ -39,13 +39,13 @@ from mitsim.core.runs import AMBIENT, Capture, LineTruth, MosaicCapture, Recorde
 from mitsim.core.spectral_manifests import MOSAIC, RUN, ColourManifest, MosaicManifest, write_colours
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import load_recipe
+from mitsim.light.cost_model import frame_seconds, frames_cost
 from mitsim.light.light import SampledLight, trace_light, trace_lines
 from mitsim.light.light_file import write_light
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, Settings
 from mitsim.light.truth import Truth
 from mitsim.planner.explain import known_losses
-from mitsim.planner.memory import frame_seconds, frames_cost
 
 _FIREFLIES = 0.72
 """Part of the variance in one of four groups: a single heavy path gives 0.75, and ordinary noise 0.3 to 0.5.

@@ -23,8 +23,7 @@ from typing import Generic
 import numpy as np
 
 from mitsim.acquire.spectral import SpectralBench, line_alone, plan_request
-from mitsim.bench.apparatus import Apparatus
-from mitsim.bench.open import Opened, reopened
+from mitsim.bench.apparatus import Apparatus, Opened, reopened
 from mitsim.bench.request import Request, check_untimed
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer

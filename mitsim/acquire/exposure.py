@@ -22,11 +22,11 @@ from mitsim.core.seeds import stream
 from mitsim.devices.camera import Rig
 from mitsim.devices.patterns import PatternFamily, Shot
 from mitsim.devices.sensor import SensorModel
+from mitsim.light.cost_model import frames_at_once
 from mitsim.light.settings import GROUPS, Estimate
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.optics.replicates import bound_of
 from mitsim.optics.speckle import add_speckle
-from mitsim.planner.memory import frames_at_once
 from mitsim.sensor.chain import Digital, dn_to_electrons, electrons_from_irradiance, expose
 from mitsim.sensor.moments import mean_variance, saturated_pixels
 from mitsim.sensor.specimen import specimen

@@ -27,8 +27,7 @@ from typing import Any
 import numpy as np
 
 from mitsim.acquire.exposure import NoiseTarget
-from mitsim.bench.apparatus import Apparatus
-from mitsim.bench.open import Opened
+from mitsim.bench.apparatus import Apparatus, Opened
 from mitsim.bench.request import Request, check_untimed
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
@@ -36,6 +35,7 @@ from mitsim.core.seeds import integer
 from mitsim.core.spectral_manifests import MOSAIC, ColourManifest, Line, MosaicManifest, spectral_of
 from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.devices.projector import Lines
+from mitsim.light.cost_model import frame_seconds, frames_cost
 from mitsim.light.lamps import lit_by_lamps
 from mitsim.light.light import SampledLight, Sampling
 from mitsim.light.plan import Plan
@@ -43,7 +43,6 @@ from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation
 from mitsim.light.truth import Truth, trace_truths
 from mitsim.optics.frames import ExpectedFrames, Frame
-from mitsim.planner.memory import frame_seconds, frames_cost
 from mitsim.planner.planner import make_plan, plan_within
 from mitsim.reconstruct.mosaic import PLANES, behind
 from mitsim.transport.records import PathSamples

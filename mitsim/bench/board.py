@@ -10,8 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsim.bench.apparatus import check_depth
-from mitsim.bench.open import Opened
+from mitsim.bench.apparatus import Opened, check_depth
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError
 from mitsim.devices.session import CELLS, BoardShape

@@ -26,7 +26,7 @@ from mitsim.devices.camera import CameraGeometry, side_of
 from mitsim.devices.patterns import Lighting, stripe_signs
 from mitsim.devices.projector import Spectrum
 from mitsim.devices.session import UNIFORM, BoardShape, Half, SessionRecipe, taken
-from mitsim.light.cost_model import FIXED, Numbers, forming_seconds
+from mitsim.light.cost_model import FIXED, Numbers, forming_seconds, frame_seconds, frames_at_once, light_bytes
 from mitsim.light.light import SampledLight, Sampling, trace_lines
 from mitsim.light.pilot_result import Forming
 from mitsim.light.plan import Plan
@@ -36,7 +36,6 @@ from mitsim.optics.frames import Frame, at_once, mixes
 from mitsim.optics.separable import best_term, centred
 from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import shadow_terms
-from mitsim.planner.memory import frame_seconds, frames_at_once, light_bytes
 from mitsim.planner.planner import make_plan
 from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, decibels
 

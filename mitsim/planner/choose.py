@@ -44,7 +44,7 @@ _MARGIN = 0.95
 shots whose error is seen, where it is not that of all."""
 _MOST_ENTRIES = 2.0**25
 """Entries of one group's accumulated light beyond which settings are not chosen: 12 GB in all
-(`mitsim.planner.memory`)."""
+(`mitsim.light.cost_model`)."""
 _LUCKY = -1.0
 """Standard errors below an estimate at which what keeps no accuracy for certain may still keep it: one case in six."""
 _AS_GOOD = 1.1

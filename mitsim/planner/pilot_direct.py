@@ -18,6 +18,7 @@ from mitsim.core.resources import workers
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum
+from mitsim.light.cost_model import cells_to_choose, drawing_seconds
 from mitsim.light.pilot_result import REPLICATES, Approximation, Drawn, Forming, Noise, SampleCost
 from mitsim.light.settings import GROUPS, Estimate, Settings, SharpPixels
 from mitsim.light.simulation import Simulation, emitted
@@ -25,7 +26,6 @@ from mitsim.optics.fft_shadow import cells_per_pixel
 from mitsim.optics.forming import Filed
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.image_formation import raster_error
-from mitsim.planner.memory import cells_to_choose, drawing_seconds
 from mitsim.planner.pilot_samples import EVEN_CELLS, GOOD_ENOUGH, Sample, ladder, noise, norm
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.records import PathSamples

@@ -22,9 +22,8 @@ from mitsim.light.pilot_result import REPLICATES, Approximation, ErrorCovariance
 from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation
 from mitsim.optics.frames import monte_carlo_error
-from mitsim.planner import pilot, pilot_anchors, pilot_direct, pilot_samples
-from mitsim.planner.pilot_anchors import AnchorRuns, FollowedRuns
-from mitsim.planner.pilot_effects import EffectRuns
+from mitsim.planner import pilot, pilot_direct, pilot_effects, pilot_samples
+from mitsim.planner.pilot_effects import AnchorRuns, EffectRuns, FollowedRuns
 from mitsim.transport.records import PathSamples
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -97,7 +96,7 @@ def test_what_is_measured(bench: Bench, pilot_result: PilotResult) -> None:
         coarsest, finest = (max(errors), 1) if name == "followed_width" else (1, max(errors))
         assert len(errors) == 1 or errors[coarsest].value > errors[finest].value
     widths = ladders["followed_width"]
-    assert tuple(widths) == pilot_anchors.WIDTHS and widths[1].value < widths[2].value < widths[4].value
+    assert tuple(widths) == pilot_effects.WIDTHS and widths[1].value < widths[2].value < widths[4].value
     assert {1, 2} <= set(ladders["followed_anchors"]) <= set(FollowedRuns.ladder)
     assert 0 < pilot_result.forming.seconds < 1
     assert (
@@ -200,7 +199,7 @@ def test_light_to_many_anchors_is_traced_in_parts(
     """All of it at once takes gigabytes. Parts of two samples make the same ladder but for the order of sums.
     (Planted: every part from the first sample on.)"""
     monkeypatch.setattr(
-        pilot_anchors,
+        pilot_effects,
         "_AT_ONCE",
         2 * 9 * (pilot_result.sample_costs["indirect_residual"].paths + pilot_result.sample_costs["from_camera"].paths),
     )
@@ -388,7 +387,7 @@ def test_a_mirror_shows_some_shots_only(shipped_bench: Callable[..., Bench]) -> 
 
 
 def test_a_refined_run_is_in_what_was_found(bench: Bench) -> None:
-    """More samples of a run tell its changes with half of the standard error. (Planted: what was found before is kept.)"""
+    """More samples of a run tell its changes with half of the standard error. (Planted: the former is kept.)"""
     runs = pilot.PilotRuns(bench, parse_patterns("dots:4", N).lighting, 1e-2, seed=3)
     before, cells = runs.pilot_result, Approximation("cells", 1)
     runs.refine("cells")
