@@ -14,8 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from mitsim.acquire.drifting import levels
-from mitsim.acquire.exposure import camera_warnings
+from mitsim.acquire.exposure import camera_warnings, levels
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.board import before_board, missed_pixels
 from mitsim.core.arrays import FloatArray
@@ -28,9 +27,8 @@ from mitsim.devices.projector import Spectrum
 from mitsim.devices.session import UNIFORM, BoardShape, Half, SessionRecipe, taken
 from mitsim.light.cost_model import FIXED, Numbers, forming_seconds, frame_seconds, frames_at_once, light_bytes
 from mitsim.light.light import SampledLight, Sampling, trace_lines
-from mitsim.light.pilot_result import Forming
 from mitsim.light.plan import Plan
-from mitsim.light.settings import Settings
+from mitsim.light.settings import Forming, Settings
 from mitsim.light.simulation import Simulation
 from mitsim.optics.frames import Frame, at_once, mixes
 from mitsim.optics.separable import best_term, centred

@@ -23,8 +23,7 @@ from mitsim.devices.patterns import Lighting
 from mitsim.devices.plate import FEW, Plate
 from mitsim.devices.projector import Spectrum
 from mitsim.light.passes import PASSES
-from mitsim.light.pilot_result import Forming, PilotResult, SampleCost
-from mitsim.light.settings import GROUPS, Number, Settings
+from mitsim.light.settings import GROUPS, Forming, Number, PilotResult, SampleCost, Settings
 from mitsim.light.simulation import Simulation
 from mitsim.optics.fft_shadow import cells_a_side, cells_per_pixel, points_per_cell
 from mitsim.optics.frames import formed_frames, frames_in_memory, mixes
@@ -474,7 +473,7 @@ def truth_seconds(pilot_result: PilotResult, settings: Settings, costs: UnitCost
     )
 
 
-# -------- Memory, disk, and what frames take
+# -------- Memory and disk, and seconds of exposing and writing
 
 _LAUNCH_BYTES = 380e6
 """Paths in flight, compiled kernels, LLVM; measured about 350e6, once a little above it."""

@@ -35,8 +35,17 @@ from mitsim.light.cost_model import (
     truth_seconds,
 )
 from mitsim.light.passes import FOLLOWED, PASSES
-from mitsim.light.pilot_result import COUNTED, SURE, Approximation, PilotResult, SampleCost
-from mitsim.light.settings import GROUPS, Estimate, Number, Settings
+from mitsim.light.settings import (
+    COUNTED,
+    GROUPS,
+    SURE,
+    Approximation,
+    Estimate,
+    Number,
+    PilotResult,
+    SampleCost,
+    Settings,
+)
 from mitsim.optics.replicates import bound_over_error
 
 _MARGIN = 0.95

@@ -28,9 +28,8 @@ from mitsim.light.cost_model import (
     unit_costs_of,
 )
 from mitsim.light.passes import FOLLOWED
-from mitsim.light.pilot_result import PilotResult
 from mitsim.light.plan import Plan, PlanRow, State
-from mitsim.light.settings import Estimate, Settings
+from mitsim.light.settings import Estimate, PilotResult, Settings
 from mitsim.planner.choose import Candidate, cheapest, predicted
 from mitsim.transport.missed import polished_shapes
 

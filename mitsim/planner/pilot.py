@@ -19,7 +19,7 @@ from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.light.cost_model import FIXED, Numbers, forming_seconds
 from mitsim.light.passes import PASSES
-from mitsim.light.pilot_result import (
+from mitsim.light.settings import (
     REPLICATES,
     Approximation,
     Drawn,
@@ -27,8 +27,8 @@ from mitsim.light.pilot_result import (
     Forming,
     PilotResult,
     SampleCost,
+    Settings,
 )
-from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation
 from mitsim.planner.pilot_direct import SMOOTH, DirectRuns, occluded_pixels, sharp_pixels
 from mitsim.planner.pilot_effects import AnchorRuns, EffectRuns, FollowedRuns, PenumbraRuns

@@ -19,8 +19,18 @@ from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum
 from mitsim.light.cost_model import cells_to_choose, drawing_seconds
-from mitsim.light.pilot_result import REPLICATES, Approximation, Drawn, Forming, Noise, SampleCost
-from mitsim.light.settings import GROUPS, Estimate, Settings, SharpPixels
+from mitsim.light.settings import (
+    GROUPS,
+    REPLICATES,
+    Approximation,
+    Drawn,
+    Estimate,
+    Forming,
+    Noise,
+    SampleCost,
+    Settings,
+    SharpPixels,
+)
 from mitsim.light.simulation import Simulation, emitted
 from mitsim.optics.fft_shadow import cells_per_pixel
 from mitsim.optics.forming import Filed

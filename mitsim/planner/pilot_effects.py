@@ -1,5 +1,5 @@
-"""A bench with all effects, with each switched off, and with few anchors of the sensor: what that changes of the frames,
-and noise of each pass."""
+"""A bench with all effects, with each switched off, and with few anchors: what that changes of the frames, and noise of
+each pass."""
 
 from __future__ import annotations
 
@@ -19,8 +19,7 @@ from mitsim.core.seeds import integer
 from mitsim.light.cost_model import SHARED_COST
 from mitsim.light.grids import Grid
 from mitsim.light.passes import PASSES, PassTracer
-from mitsim.light.pilot_result import REPLICATES, Approximation, ErrorCovariance, Noise, SampleCost
-from mitsim.light.settings import Settings
+from mitsim.light.settings import REPLICATES, Approximation, ErrorCovariance, Noise, SampleCost, Settings
 from mitsim.light.simulation import Simulation, emitted
 from mitsim.planner.pilot_direct import SHARP_RATE, shown_pixels, tracer_of
 from mitsim.planner.pilot_samples import EVEN_CELLS, Known, Sample, coarsened, heavy_paths, ladder, noise, norm

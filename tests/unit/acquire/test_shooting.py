@@ -12,10 +12,10 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.runs import Recorder
 from mitsim.devices.patterns import parse_patterns
+from mitsim.light import cost_model
 from mitsim.light.cost_model import frames_at_once, frames_bytes
 from mitsim.light.settings import GROUPS
 from mitsim.optics import frames as forming
-from mitsim.light import cost_model
 from tests.unit.acquire.test_exposer import PIXELS, exposer, frame
 from tests.unit.optics.small_camera import LABELS, SPLIT, expected_frames, random_groups, small_optics
 

@@ -21,9 +21,8 @@ from mitsim.devices.patterns import Lighting, parse_patterns
 from mitsim.light import cost_model
 from mitsim.light import light as module
 from mitsim.light.light import SampledLight, Sampling, trace_light
-from mitsim.light.pilot_result import PilotResult
 from mitsim.light.plan import Plan
-from mitsim.light.settings import GROUPS, Settings
+from mitsim.light.settings import GROUPS, PilotResult, Settings
 from mitsim.light.simulation import Simulation
 from mitsim.optics.frames import ExpectedFrames, monte_carlo_error
 from mitsim.planner import choose, planner

@@ -18,8 +18,7 @@ from mitsim.bench.effects import EFFECTS
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import parse_patterns
-from mitsim.light.pilot_result import REPLICATES, Approximation, ErrorCovariance, PilotResult
-from mitsim.light.settings import Settings
+from mitsim.light.settings import REPLICATES, Approximation, ErrorCovariance, PilotResult, Settings
 from mitsim.light.simulation import Simulation
 from mitsim.optics.frames import monte_carlo_error
 from mitsim.planner import pilot, pilot_direct, pilot_effects, pilot_samples
