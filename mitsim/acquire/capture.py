@@ -446,8 +446,8 @@ def _of_ambient_light(shooting: Shooting, accuracy: float, of_projector: float) 
 
 
 # -------- Light by projector pixel in; one HDF5 file out, of which NumPy and SciPy form the frame of any pattern
-# A frame is dense: through a mask each projector pixel lights most of the sensor. What is sparse is the light before the
-# mask, from each projector pixel to the directions and depths at which it is seen. The file holds that as sparse
+# A frame is dense: through a mask each projector pixel lights most of the sensor. What is sparse is the light before
+# the mask, from each projector pixel to the directions and depths at which it is seen. The file holds that as sparse
 # matrices, and the mask's shadow as pairs of dense factors. docs/exchange.md has the layout, and the lines that make a
 # frame of it.
 

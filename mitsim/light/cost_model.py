@@ -292,18 +292,16 @@ def forming_seconds(forming: Forming, numbers: Numbers, frames: Number, costs: U
     costs
         of this machine, or the fixed ones.
     """
-    several = np.asarray(numbers.anchors) > 1
-    coarse = numbers.coarse_cells, numbers.coarse_layers
-    lit, every = (forming.lit, forming.lit), (1.0, 1.0)
-    products = (
-        _products(forming, numbers, lit, numbers.cells, numbers.layers, 1.0)
-        + several * _products(forming, numbers, lit, *coarse, numbers.anchors)
-        + (np.asarray(numbers.occluded_anchors) > 1)
-        * _products(forming, numbers, _lit_by_occluded(forming, numbers), *coarse, numbers.occluded_anchors)
-        + numbers.indirect * _products(forming, numbers, every, *coarse, 1.0)
-        + (np.asarray(numbers.followed_anchors) > 1)
-        * _products(forming, numbers, every, *numbers.of_followed, numbers.followed_anchors)
+    lit, every, coarse = (forming.lit, forming.lit), (1.0, 1.0), (numbers.coarse_cells, numbers.coarse_layers)
+    of_occluded = _lit_by_occluded(forming, numbers)
+    by_grid = (
+        (1.0, lit, numbers.cells, numbers.layers, 1.0),
+        (np.asarray(numbers.anchors) > 1, lit, *coarse, numbers.anchors),
+        (np.asarray(numbers.occluded_anchors) > 1, of_occluded, *coarse, numbers.occluded_anchors),
+        (numbers.indirect, every, *coarse, 1.0),
+        (np.asarray(numbers.followed_anchors) > 1, every, *numbers.of_followed, numbers.followed_anchors),
     )
+    products = sum(formed * _products(forming, numbers, *grid) for formed, *grid in by_grid)
     if mixes(forming.classes, forming.shots, forming.pixels):
         products = products + numbers.mixed * forming.classes * forming.pixels**2
     return cast(Number, forming.lines * frames * (costs.frame + costs.product * products))
@@ -420,24 +418,23 @@ def entries(pixels: int, classes: int, numbers: Numbers, samples: Settings | Map
         return row.whole(row.predicted(samples) if isinstance(samples, Settings) else samples.get(name, 1.0))
 
     coarse, layers = np.square(numbers.coarse_cells), np.minimum(numbers.coarse_layers, _SPLIT)
-    several, followed = (np.asarray(count) > 1 for count in (numbers.anchors, numbers.followed_anchors))
-    found = np.minimum(of("direct"), _EDGES * np.square(numbers.cells)) * np.minimum(numbers.layers, _SPLIT)
-    if np.any(several):
-        seen = _EDGES * np.minimum(of("anchor_residual"), coarse) * layers
-        found = found + several * _EDGES * np.square(numbers.anchors) * seen
-    beyond = numbers.occluded / pixels * (np.asarray(numbers.occluded_anchors) > 1)
-    if np.any(beyond):
-        seen = _EDGES * np.minimum(of("penumbra"), coarse) * layers
-        found = found + beyond * _EDGES * np.square(numbers.occluded_anchors) * seen
+
+    def at(anchors: Number, name: str, part: Number = 1.0) -> Number:
+        seen = _EDGES * np.minimum(of(name), coarse) * layers
+        return part * (np.asarray(anchors) > 1) * _EDGES * np.square(anchors) * seen
+
     # Pixels of the projector, not of all cells: light from beyond its window is a small part.
     places = classes * coarse * numbers.coarse_layers
-    if np.any(numbers.indirect):
-        found = found + numbers.indirect * np.minimum(_SPLIT * of("indirect"), places)
-    if np.any(followed):
-        cells, seen_in = numbers.of_followed
-        most = np.maximum(of("indirect_residual"), of("camera_residual"))
-        seen = np.minimum(_SPLIT * most, classes * np.square(cells) * seen_in)
-        found = found + followed * _EDGES * np.square(numbers.followed_anchors) * seen
+    cells, seen_in = numbers.of_followed
+    most = np.maximum(of("indirect_residual"), of("camera_residual"))
+    followed = np.minimum(_SPLIT * most, classes * np.square(cells) * seen_in)
+    found = (
+        np.minimum(of("direct"), _EDGES * np.square(numbers.cells)) * np.minimum(numbers.layers, _SPLIT)
+        + at(numbers.anchors, "anchor_residual")
+        + at(numbers.occluded_anchors, "penumbra", numbers.occluded / pixels)
+        + numbers.indirect * np.minimum(_SPLIT * of("indirect"), places)
+        + (np.asarray(numbers.followed_anchors) > 1) * _EDGES * np.square(numbers.followed_anchors) * followed
+    )
     return cast(Number, pixels * found)
 
 

@@ -208,6 +208,20 @@ class SampleCost:
         """Of light that there is none of."""
         return cls(Noise(0.0, 1, 0.5), 0)
 
+    @classmethod
+    def relative(cls, error: float, light: float, samples: int, paths: int, rate: float = 0.5) -> SampleCost:
+        """Of replicates of so many ``samples`` that are off by an ``error``, where frames of all light have the norm
+        ``light``.
+
+        Parameters
+        ----------
+        error, light, samples
+            as above; nothing is known to be noisy where there is no light.
+        paths, rate
+            of a sample, and the power of the samples that the error falls with.
+        """
+        return cls(Noise(error / light if light else 0.0, samples, rate), paths)
+
     @property
     def variance(self) -> float:
         """Relative variance of one sample, where the error falls with the square root of their number."""

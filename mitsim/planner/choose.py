@@ -410,7 +410,10 @@ class _Table:
     @cached_property
     def needed(self) -> dict[str, FloatArray]:
         """(m,) samples of a group by kind of light, or the part of one: the least work for a sum of variances."""
-        parts = {name: np.sqrt(self._by_row(name, _variance) * price) for name, price in self._work_of_sample.items()}
+        parts = {
+            name: np.sqrt(self._by_row(name, lambda cost: cost.variance) * price)
+            for name, price in self._work_of_sample.items()
+        }
         every = sum(parts.values()) + np.zeros(len(self.rows))
         single = self.target * math.sqrt(GROUPS) / _BOUND_OVER_ERROR
         found = {}
@@ -429,7 +432,7 @@ class _Table:
         """(m,) Monte Carlo error that these samples leave."""
         total = np.zeros(len(self.rows))
         for name, count in self.samples.items():
-            left = self._by_row(name, partial(_noise_after, samples=count))
+            left = self._by_row(name, lambda cost, count=count: cost.noise.left(count))
             total = total + (PASSES[name].connections(self.numbers) > 0) * np.square(left) / GROUPS
         return np.sqrt(total)
 
@@ -458,10 +461,6 @@ class _Table:
         return np.asarray(tracing + accumulating + shown)
 
 
-def _variance(kind: SampleCost) -> Number:
-    return kind.variance
-
-
 def _samples_for(kind: SampleCost, target: Number) -> Number:
     """Samples at which sampling may stop at a ``target``: by a bound, which lies the further above the error the fewer
     paths make it."""
@@ -474,23 +473,15 @@ def _samples_for(kind: SampleCost, target: Number) -> Number:
     return needed
 
 
-def _noise_after(kind: SampleCost, samples: Number) -> Number:
-    return kind.noise.left(samples)
-
-
 def counted(settings: Settings) -> tuple[int, ...]:
     """The numbers in ``settings`` that :data:`COUNTED` names."""
     numbers = Numbers.of(settings)
     return tuple(int(getattr(numbers, name)) for name in COUNTED)
 
 
-def _counts(pilot_result: PilotResult, name: str) -> list[int]:
-    return list(pilot_result.ladders[name])
-
-
 def _choices(pilot_result: PilotResult, name: str, switches: Mapping[str, bool]) -> list[int]:
     """Numbers of ``name`` that the user leaves to choose from."""
-    counts = _counts(pilot_result, name)
+    counts = list(pilot_result.ladders[name])
     if name not in switches or len(counts) == 1:
         return counts
     return [count for count in counts if (count > 1) == switches[name]]

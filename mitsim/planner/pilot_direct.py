@@ -26,7 +26,6 @@ from mitsim.light.settings import (
     Drawn,
     Estimate,
     Forming,
-    Noise,
     SampleCost,
     Settings,
     SharpPixels,
@@ -138,8 +137,7 @@ class DirectRuns:
         many, few = noises
         steep = many > 0 and few > 0 and self._fewer < self.sample.fine
         rate = math.log(few / many) / math.log(self.sample.fine / self._fewer) if steep else 0.5
-        relative = many / light if light else 0.0
-        return SampleCost(Noise(relative, self.sample.fine, min(max(rate, 0.5), _STEEPEST)), self.bench.n**2)
+        return SampleCost.relative(many, light, self.sample.fine, self.bench.n**2, min(max(rate, 0.5), _STEEPEST))
 
     @property
     def _fewer(self) -> int:

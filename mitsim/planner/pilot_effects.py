@@ -151,8 +151,7 @@ class EffectRuns:
         if name not in self._noise:
             return SampleCost.none()
         error, samples, paths_per_sample = self._noise[name]
-        relative = error / self.light if self.light else 0.0
-        return SampleCost(Noise(relative, samples, 0.5), paths_per_sample)
+        return SampleCost.relative(error, self.light, samples, paths_per_sample)
 
     def with_more(self, samples: int) -> SampleCost:
         """The same of what is followed from the camera, by replicates of so many ``samples`` of their own."""
@@ -195,8 +194,7 @@ class EffectRuns:
         samples = max(1, self._closer[1] // SHARED_COST)
         seen = [tracer.trace(integer(seed, "shared"), 0, samples) for seed in self.seeds]
         error = noise(self._form(self._sharing, followed=self._by_kind({"indirect": seen}), samples=samples))
-        error /= self.light
-        shared = SampleCost(Noise(error, samples, 0.5), SHARED_COST * tracer.paths_per_sample)
+        shared = SampleCost.relative(error, self.light, samples, SHARED_COST * tracer.paths_per_sample)
         less = shared.variance * shared.paths < plain.variance * plain.paths
         return (shared, True) if less else (plain, False)
 
@@ -213,10 +211,8 @@ class EffectRuns:
 
     def _sharp_cost(self, paths_per_sample: int) -> SampleCost:
         """That of pixels that are traced apart, their rate being that of stratified rays."""
-        samples = self.sample.sharp(self.simulation)
-        error = noise(self._form(self.simulation, sharp=self.sharp))
-        relative = error / self.light if self.light else 0.0
-        return SampleCost(Noise(relative, samples, SHARP_RATE), paths_per_sample)
+        samples, error = self.sample.sharp(self.simulation), noise(self._form(self.simulation, sharp=self.sharp))
+        return SampleCost.relative(error, self.light, samples, paths_per_sample, SHARP_RATE)
 
     @cached_property
     def _noise(self) -> dict[str, tuple[float, int, int]]:
@@ -389,8 +385,7 @@ class AnchorRuns:
     def sample_costs(self, light: float) -> dict[str, SampleCost]:
         """Monte Carlo error of one estimate of what a few anchors see beyond their mean, relative to all ``light``, by
         pass."""
-        relative = noise(self._beyond_mean()) / light if light else 0.0
-        return {self._pass.name: SampleCost(Noise(relative, self._samples, 0.5), self._lanes)}
+        return {self._pass.name: SampleCost.relative(noise(self._beyond_mean()), light, self._samples, self._lanes)}
 
     def _coarsen(self, cells: int, layers: tuple[float, ...]) -> FloatArray:
         coarse = {"coarse_cells": cells, "coarse_layers": bool(layers), "layers": layers}
@@ -492,10 +487,11 @@ class FollowedRuns(AnchorRuns):
         else:
             from_camera = self._beyond(self._simulation(self.few), self._few_by_tracer[1])
             seen = every - from_camera, from_camera
-        errors = (noise(each) / light if light else 0.0 for each in seen)
         return {
-            name: SampleCost(Noise(error, self._samples, 0.5), tracer.paths_per_sample) if tracer else SampleCost.none()
-            for name, error, tracer in zip(self.passes, errors, tracers, strict=True)
+            name: SampleCost.relative(noise(each), light, self._samples, tracer.paths_per_sample)
+            if tracer
+            else SampleCost.none()
+            for name, each, tracer in zip(self.passes, seen, tracers, strict=True)
         }
 
     def with_more(self, light: float, samples: int) -> SampleCost:
