@@ -235,7 +235,8 @@ def capture(
         check(Settings(bench.whole.geometry.scene_distance), exposing)
         if colours:
             places.enter_context(colour_folder(task, colours))
-        heads = [RunHead.of(_configuration(each, request)) for each in readings]
+        asked = {**request.deciding, "versions": deciding_versions()}
+        heads = [RunHead.of({**each.provenance(), **each.identity(), **asked}) for each in readings]
         recorders = [
             places.enter_context(claimed(place, head, task.resume)) if place else Recorder()
             for place, head in zip(folders, heads, strict=True)
@@ -312,11 +313,6 @@ def _run(
     if foreign and not manifest.warnings:  # within the accuracy: said, but no reason to flag the run
         warnings.warn(foreign, stacklevel=5)
     return Capture.recorded(recorder, manifest)
-
-
-def _configuration(bench: Apparatus, request: Request) -> dict[str, Any]:
-    """All that decides the frames."""
-    return {**bench.provenance(), **bench.identity(), **request.deciding, "versions": deciding_versions()}
 
 
 @contextmanager
@@ -445,7 +441,7 @@ def _of_ambient_light(shooting: Shooting, accuracy: float, of_projector: float) 
         )
 
 
-# -------- Light by projector pixel in; one HDF5 file out, of which NumPy and SciPy form the frame of any pattern
+# -------- Light by projector pixel in an HDF5 file, of which NumPy and SciPy form the frame of any pattern
 # A frame is dense: through a mask each projector pixel lights most of the sensor. What is sparse is the light before
 # the mask, from each projector pixel to the directions and depths at which it is seen. The file holds that as sparse
 # matrices, and the mask's shadow as pairs of dense factors. docs/exchange.md has the layout, and the lines that make a

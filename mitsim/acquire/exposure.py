@@ -273,7 +273,7 @@ def taken_off(exposer: Exposer, family: PatternFamily, expected: ExpectedFrames)
     return exposer.rate(AmbientFrame.exposed(exposer, expected, ambient_shots(family)).digital)
 
 
-# -------- Expected frames of a family in, noisy ones in their place out
+# -------- Shots of a family: expected frames made noisy, and recorded
 
 
 @dataclass(frozen=True)

@@ -514,7 +514,7 @@ class _Look:
         tracer, stream
             whose paths they are, and their random numbers.
         """
-        first, last = response.range_nm
+        (first, last), (begin, end) = response.range_nm, SPECTRA_NM
         parts = math.ceil((last - first) / MOST_LINES / _STEP_NM)
 
         def seen(*bands: Band) -> FloatArray:
@@ -525,7 +525,7 @@ class _Look:
         # (bands, parts)
         light = np.stack([seen(*response.bands(MOST_LINES, part, parts)) for part in range(parts)], axis=1)
         middles = [[(low + high) / 2 for low, high in response.bands(MOST_LINES, part, parts)] for part in range(parts)]
-        unknown = seen((SPECTRA_NM[0], first), (last, SPECTRA_NM[1]), *_ends())
+        unknown = seen((begin, first), (last, end), (end - _END_NM, end), (end, end))
         return cls(
             light.sum(axis=1),
             tuple(map(_spectrum, np.array(middles).T, light)),
@@ -538,11 +538,6 @@ def _spectrum(wavelengths: FloatArray, light: FloatArray) -> Spectrum:
     lit = light > 0 if light.any() else np.ones(len(light), dtype=bool)
     weights = light[lit] if light.any() else np.ones(len(light))
     return Spectrum(wavelengths[lit], weights / weights.sum())
-
-
-def _ends() -> tuple[Band, Band]:
-    """Last wavelengths of spectra, and none."""
-    return (SPECTRA_NM[1] - _END_NM, SPECTRA_NM[1]), (SPECTRA_NM[1], SPECTRA_NM[1])
 
 
 def _unknown(response: Response, light: FloatArray, counted: float) -> float:

@@ -308,7 +308,7 @@ def session_cost(board: Apparatus, count: int, settings: Settings, seconds: floa
     return Cost(seconds=seconds, memory_bytes=light_bytes(board, n * n, settings) + memory_bytes)
 
 
-# -------- Light by projector pixel and a side's stripes in
+# -------- Frames of a side's stripes
 # Where frames of single lines can be held, those of patterns are mixed from them: by :class:`ExpectedFrames` up to
 # 256 lines, and here beyond. Otherwise they are formed in lots: which pixels each of 512 patterns lights would be 2
 # GiB.

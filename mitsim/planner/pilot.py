@@ -161,32 +161,25 @@ class PilotRuns:
         now, finer = self.samples[run], self._finer(run)
         if (finer.fine, finer.direct) == (now.fine, now.direct):
             return math.inf
-        costs, changes = FIXED.passes, 0
+        costs, followed = FIXED.passes, self.switched.paths_per_sample
         one = forming_seconds(self.forming, Numbers.coarsest(), _FRAMES_AS_MANY, FIXED)
-        pixels, shown = self.bench.n**2, len(finer.shown)
         if run == "cells":
-            paths, changes = costs["direct"] * shown * finer.fine, len(self.fine.changes)
+            paths, changes = costs["direct"] * len(finer.shown) * finer.fine, len(self.fine.changes)
         elif run == "anchors":
-            connections = sum(part.count**2 for part in self.anchored.changes if part.name == run)
-            paths = costs["anchor_residual"] * shown * finer.anchored * connections
+            paths = costs["anchor_residual"] * len(finer.shown) * finer.anchored * self.anchored.connections
             changes = len(self.anchored.changes)
+        elif run == "followed":
+            paths = costs["indirect_residual"] * sum(followed.values()) * finer.followed * self.followed.connections
+            changes = len(self.followed.changes)
         elif run == "occluded":
             count = len(self.occluded.pixels) if self.occluded else 0
             if self.occluded is None or finer.occluded(count) == now.occluded(count):
                 return math.inf
-            connections = sum(part.count**2 for part in self.occluded.changes if " " not in part.name)
-            paths = costs["penumbra"] * FINER * self.occluded.paths / REPLICATES * connections
+            paths = costs["penumbra"] * FINER * self.occluded.paths / REPLICATES * self.occluded.connections
             changes = len(self.occluded.changes)
-        elif run == "followed":
-            connections = sum(part.count**2 for part in self.followed.changes if part.name == "followed_anchors")
-            paths_per_sample = sum(self.switched.paths_per_sample.values())
-            paths = costs["indirect_residual"] * paths_per_sample * finer.followed * connections
-            changes = len(self.followed.changes)
         else:
-            followed = sum(
-                costs[name] * paths_per_sample for name, paths_per_sample in self.switched.paths_per_sample.items()
-            )
-            paths = costs["direct"] * pixels * finer.direct + followed * finer.followed
+            indirect = sum(costs[name] * paths_per_sample for name, paths_per_sample in followed.items())
+            paths = costs["direct"] * self.bench.n**2 * finer.direct + indirect * finer.followed
             changes = _OF_EFFECTS * len(self.present)
         return REPLICATES * paths + changes * float(one)
 

@@ -368,6 +368,11 @@ class AnchorRuns:
         """Paths of all replicates to one anchor."""
         return REPLICATES * len(self.pixels) * self._samples
 
+    @property
+    def connections(self) -> int:
+        """Connections of each path to all anchors that were tried."""
+        return sum(part.count**2 for part in self.changes if part.name == self._pass.anchors)
+
     @cached_property
     def changes(self) -> dict[Approximation, FloatArray]:
         """Change of the frames by every number of anchors that was tried, and by coarse cells for what they see."""

@@ -19,7 +19,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import parse_patterns
 from mitsim.light.settings import REPLICATES, Approximation, ErrorCovariance, PilotResult, Settings
-from mitsim.light.simulation import Simulation
+from mitsim.light.simulation import Simulation, expected_of
 from mitsim.optics.frames import monte_carlo_error
 from mitsim.planner import pilot, pilot_direct, pilot_effects, pilot_samples
 from mitsim.planner.pilot_effects import AnchorRuns, EffectRuns, FollowedRuns
@@ -69,7 +69,7 @@ def frames(bench: Bench, settings: Settings, many: int = 64, other: int = 24) ->
         for name, each in made.passes.items()
     ]
     light = sum(parts[1:], parts[0])
-    expected = made.expected([light], np.arange(16), lighting, 0)
+    expected = expected_of([(made, [light])], np.arange(16), lighting, 0)
     return np.stack([frame.irradiance for frame in expected])
 
 
@@ -120,7 +120,7 @@ def test_gloss_makes_noise_at_random_points_of_the_sensor(small_scene: Callable[
     found, lighting = measured(bench, 1), parse_patterns("dots:4", N).lighting.shots(SHOWN)
     made = Simulation(bench, Settings(depth=found.depth, anchors=2))
     groups = [made.accumulate("direct", made.direct.trace(seed, 0, 16), lighting.labels, 16) for seed in range(8)]
-    actual = monte_carlo_error(made.expected(groups, np.arange(16), lighting, 0)) * 8**0.5
+    actual = monte_carlo_error(expected_of([(made, groups)], np.arange(16), lighting, 0)) * 8**0.5
     assert promised(float(found.spread.noise.left(16)), actual)
     assert found.spread.noise.left(16) > 10 * found.sample_costs["direct"].noise.left(16)
 
@@ -252,7 +252,7 @@ def test_noise_comes_true(bench: Bench, pilot_result: PilotResult) -> None:
         traced = [each.tracer.trace(integer(9, kind, index), 0, samples) for index in range(6)]
         groups = [made.accumulate(kind, found, labels, samples) for found in traced]
         found = [
-            np.stack([frame.irradiance for frame in made.expected([light], np.arange(16), lighting, 0)])
+            np.stack([frame.irradiance for frame in expected_of([(made, [light])], np.arange(16), lighting, 0)])
             for light in groups
         ]
         spread = np.sqrt(np.square(np.std(found, axis=0, ddof=1)).sum())
@@ -280,7 +280,7 @@ def test_frames_of_looks_are_those_that_a_capture_forms(bench: Bench, monkeypatc
         for pilot_direct, *pilot_indirect in zip(found.direct, *found.followed.values(), strict=True)
     ]
     assert made.physics.lamps and made.physics.black_level and sample.shape == (5, 4) and bench.geometry.pixels > 5
-    formed = [made.expected([light], sample.rows, sample.lighting, 0) for light in filed]
+    formed = [expected_of([(made, [light])], sample.rows, sample.lighting, 0) for light in filed]
     expected = np.array([[frame.irradiance[np.ix_(*sample.places)] for frame in one] for one in formed])
     np.testing.assert_allclose(found.frames, expected, rtol=1e-9)
 
