@@ -166,18 +166,18 @@ class Candidates:
 
 
 def predicted(
-    accuracy: float, pilot_result: PilotResult, settings: Settings, switches: Mapping[str, bool], sure: float = SURE
+    accuracy: float, pilot_result: PilotResult, settings: Settings, switches: Mapping[str, bool]
 ) -> Candidate:
     """What ``settings`` leave and take with samples of their own for the rest of the budget.
 
     Parameters
     ----------
-    accuracy, pilot_result, switches, sure
+    accuracy, pilot_result, switches
         as for :func:`cheapest`.
     settings
         effects and numbers.
     """
-    return _table_of(accuracy, pilot_result, settings, switches, sure).candidate(0)
+    return _table_of(accuracy, pilot_result, settings, switches, SURE).candidate(0)
 
 
 def _table_of(

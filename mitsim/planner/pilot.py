@@ -251,11 +251,6 @@ class PilotRuns:
 
     # ---- Light that neither rays nor connections find ----
 
-    def _rows_and_columns(self, pixels: tuple[int, ...]) -> tuple[float, float]:
-        """Parts of the projector's rows and of its columns that ``pixels`` lie in."""
-        rows, columns = (np.unique(each).size / self.bench.n for each in np.divmod(pixels, self.bench.n))
-        return rows, columns
-
     @property
     def _unmet(self) -> float:
         """Irradiance of glossy balls' highlights that neither the search for lobes nor the looks' rays meet."""
@@ -290,6 +285,7 @@ class PilotRuns:
         if self.occluded:
             seen |= self.occluded.changes
         light, sharp, apart = switched.light, self._sharp, self._base.sharp
+        rows, columns = (np.unique(each).size / self.bench.n for each in np.divmod(self._base.occluded, self.bench.n))
         samples = self.samples["effects"].followed * REPLICATES
         indirect, shared, repeats = switched.indirect_cost()
         sample_costs = {
@@ -313,7 +309,7 @@ class PilotRuns:
             spread=fine.spread(light),
             shared=shared,
             repeats=repeats,
-            forming=replace(self.forming, lines=self._lines, occluded=self._rows_and_columns(self._base.occluded)),
+            forming=replace(self.forming, lines=self._lines, occluded=(rows, columns)),
             apart=switched.apart,
             unresolved=unresolved / (self._light + sharp.irradiance + unmet) if unresolved else 0.0,
             left_out=left_out / (left_out + found) if left_out else 0.0,
@@ -325,20 +321,6 @@ class PilotRuns:
             raster=self._raster,
             hits=self._hits,
         )
-
-
-# ---- The shortest pilot ----
-
-
-def measure(bench: Apparatus, lighting: Lighting, accuracy: float, seed: int) -> PilotResult:
-    """What the shortest :class:`PilotRuns` of these arguments finds.
-
-    Parameters
-    ----------
-    bench, lighting, accuracy, seed
-        as there.
-    """
-    return PilotRuns(bench, lighting, accuracy, seed).pilot_result
 
 
 def run_of(part: Approximation) -> str:

@@ -47,7 +47,7 @@ def bench(shared_scene: Callable[..., Path], variant: str) -> Bench:
 
 
 def measured(bench: Bench, seed: int, accuracy: float = 1e-2) -> PilotResult:
-    return pilot.measure(bench, parse_patterns("dots:4", N).lighting, accuracy, seed)
+    return pilot.PilotRuns(bench, parse_patterns("dots:4", N).lighting, accuracy, seed).pilot_result
 
 
 @pytest.fixture(scope="module")
@@ -325,7 +325,7 @@ def test_indirect_light_is_looked_at_closer_where_noise_hides_what_coarse_cells_
 def test_the_pilot_is_reproducible(bench: Bench) -> None:
     """Of few shots and at a loose accuracy: all parts of the pilot have their turn."""
     lighting = parse_patterns("dots:2", N).lighting
-    one, again = (pilot.measure(bench, lighting, 0.1, 3) for _ in range(2))
+    one, again = (pilot.PilotRuns(bench, lighting, 0.1, 3).pilot_result for _ in range(2))
     for name in ("depth", "layers", "effects", "ladders"):
         assert getattr(again, name) == getattr(one, name)
     assert np.array_equal(again.changes.products, one.changes.products)
@@ -374,7 +374,7 @@ def test_a_mirror_shows_some_shots_only(shipped_bench: Callable[..., Bench]) -> 
     closed form, (1 - b) of a class and b of all. (Planted: four shots, as of a print: 6.0e-5 of 8.8e-5.)"""
     bench = shipped_bench("mirror")
     lighting = parse_patterns("dots:7", bench.n).lighting
-    found = pilot.measure(bench, lighting, 1e-3, 1).effects["black-level"]
+    found = pilot.PilotRuns(bench, lighting, 1e-3, 1).pilot_result.effects["black-level"]
     made = Simulation(bench, Settings(depth=400.0, effects=frozenset(effects.present(bench))))
     glint, black = made.specular_frames(lighting.labels), made.physics.black_level
     assert glint is not None
