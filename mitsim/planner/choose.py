@@ -432,7 +432,7 @@ class _Table:
         """(m,) Monte Carlo error that these samples leave."""
         total = np.zeros(len(self.rows))
         for name, count in self.samples.items():
-            left = self._by_row(name, lambda cost, count=count: cost.noise.left(count))
+            left = self._by_row(name, partial(_noise_after, samples=count))
             total = total + (PASSES[name].connections(self.numbers) > 0) * np.square(left) / GROUPS
         return np.sqrt(total)
 
@@ -471,6 +471,10 @@ def _samples_for(kind: SampleCost, target: Number) -> Number:
             above = 1 + np.sqrt(noise.spread * noise.samples / needed) * (bound_over_error(1.0, GROUPS) ** 2 - 1)
             needed = light * np.maximum(above / _BOUND_OVER_ERROR**2, 1.0)
     return needed
+
+
+def _noise_after(kind: SampleCost, samples: Number) -> Number:
+    return kind.noise.left(samples)
 
 
 def counted(settings: Settings) -> tuple[int, ...]:
