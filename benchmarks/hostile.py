@@ -118,7 +118,7 @@ def unloaded(*_: object, **__: object) -> None:
 def serve(kind: str, command: Sequence[str], stdout: Path, stderr: Path) -> None:
     """Run a command as the worker does, in this process, and end it."""
     if kind in CHECKED:
-        vars(sys.modules["mitsim.bench.open"])["_loaded"] = unloaded
+        vars(sys.modules["mitsim.bench.apparatus"])["_loaded"] = unloaded
     for number, path in ((1, stdout), (2, stderr)):
         os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT), number)
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)

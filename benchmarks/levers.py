@@ -34,7 +34,7 @@ import mitsim as ms
 from mitsim.api.bench import Bench
 from mitsim.devices.patterns import PatternFamily, parse_patterns
 from mitsim.light.grids import LightEstimate
-from mitsim.light.simulation import Simulation
+from mitsim.light.simulation import Simulation, expected_of
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.indirect import adaptive_counts, block_moments
 from mitsim.transport.records import INDIRECT
@@ -128,7 +128,7 @@ def measured(
                     # The first turn, not counted, compiles the kernels.
                     lights[name].append(light)
     errors = {
-        name: simulations[name].expected(light, rows, shots, 0, leaking=False).sampling_error()[0]
+        name: expected_of([(simulations[name], light)], rows, shots, 0, leaking=False).sampling_error()[0]
         for name, light in lights.items()
     }
     first, *_ = found

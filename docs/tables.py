@@ -31,12 +31,11 @@ from mitsim.core.manifests import (
 from mitsim.core.spectral_manifests import ColourManifest, Line, MosaicManifest
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.chart import ChartPlace
-from mitsim.devices.drift import Drift
 from mitsim.devices.framelist import DarkFile, FrameList, StripeFile
 from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.projector import Coherence, ProjectorModel
 from mitsim.devices.sensor import EfficiencyCurve, SensorModel
-from mitsim.devices.session import BoardShape, SessionRecipe
+from mitsim.devices.session import BoardShape, Drift, SessionRecipe
 
 FORMATS = Path(__file__).with_name("formats.md")
 MODELS = (

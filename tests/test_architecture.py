@@ -475,7 +475,7 @@ LONG = 450
 """Lines of a file that a reader does not scroll without headings; chosen: some six screens."""
 HEADING = re.compile(r"^\s*# -{4,} ?\w", flags=re.M)
 UNNAMED = {"__init__", "__main__"}
-ALIKE: set[str] = {"lamps", "projector", "request"}
+ALIKE: set[str] = {"projector", "request"}
 """Names that files of several rooms have still: a change takes some away, and adds none."""
 PARTICIPLE = re.compile(
     "begun|bent|bound|broken|brought|built|caught|chosen|done|drawn|driven|fallen|felt|filed|forgotten|formed|found"

@@ -23,8 +23,7 @@ from typing import Generic
 import numpy as np
 
 from mitsim.acquire.spectral import SpectralBench, line_alone, plan_request
-from mitsim.bench.apparatus import Apparatus
-from mitsim.bench.open import Opened, reopened
+from mitsim.bench.apparatus import Apparatus, Opened, reopened
 from mitsim.bench.request import Request, check_untimed
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
@@ -34,7 +33,7 @@ from mitsim.devices.projector import Lines
 from mitsim.light.cost_model import traced_for
 from mitsim.light.plan import ColourCandidate, ColourChoice, Plan
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation
+from mitsim.light.simulation import Simulation, expected_of
 from mitsim.transport.records import PathSamples
 
 _RAYS_OF_BANDS, _SHOTS = 4, 4
@@ -229,7 +228,7 @@ class _Look(Generic[Opened]):
         simulation, lighting = Simulation(bench, self._settings), self._lighting
         filed = simulation.accumulate("direct", path_samples, lighting.labels, _RAYS_OF_BANDS)
         rows = np.arange(lighting.weights.shape[1])
-        frames = simulation.expected([filed], rows, lighting, self._seed, leaking=False)
+        frames = expected_of([(simulation, [filed])], rows, lighting, self._seed, leaking=False)
         wavelength = bench.projector.effective_wavelength_nm
         each = bench.sensor.efficiency(wavelength) * wavelength
         return np.stack([frame.irradiance for frame in frames]) * each

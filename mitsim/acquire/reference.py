@@ -23,9 +23,9 @@ from mitsim.core.job import Job
 from mitsim.core.resources import Cost
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
+from mitsim.light.cost_model import frames_cost
 from mitsim.light.light import Sampling, trace_light
 from mitsim.planner.explain import unseen_lamps
-from mitsim.planner.memory import frames_cost
 from mitsim.planner.planner import make_plan
 
 if TYPE_CHECKING:

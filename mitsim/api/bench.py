@@ -9,8 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mitsim.bench.apparatus import Apparatus
-from mitsim.bench.open import open_apparatus, reopened
+from mitsim.bench.apparatus import Apparatus, open_apparatus, reopened
 from mitsim.bench.request import Request, SessionRequest, Task
 from mitsim.core.arguments import checked
 from mitsim.core.environment import DEFAULT_VARIANT

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -10,18 +11,24 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsim.bench.apparatus import check_depth
-from mitsim.bench.open import Opened
+from mitsim.bench.apparatus import Opened, check_depth
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError
-from mitsim.devices.session import CELLS, BoardShape
+from mitsim.devices.session import BoardShape
 from mitsim.scene.limits import Unfit
 from mitsim.transport.plugins.base import host_values, turn_and_origin
 from mitsim.transport.projector import PinholeRays
 
 if TYPE_CHECKING:
     from mitsim.bench.apparatus import Apparatus
+    from mitsim.devices.camera import CameraGeometry
 
+_BEYOND = 1.1
+"""Half side of a board without a size, as a part of what the sensor's edge sees; chosen: more than rounding."""
+_GRAZING = 0.05
+"""Least part by which a board without a size recedes from a ray: it is at most 20 times what is seen of a flat one."""
+CELLS = 64
+"""Facets a side of a bowed board: they lie up to 1/4096 of the bow off the paraboloid."""
 _INSIDE = 1e-3
 """Projector pixels from a pixel's corners to the rays that are tried: more than rounding moves a board's edge."""
 
@@ -61,10 +68,10 @@ def board_object(bench: Apparatus, reflectance: float, shape: BoardShape, depth:
     depth
         of its middle [mm].
     """
-    half = shape.half_side(bench.geometry, depth)
+    half = _half_side(shape, bench.geometry, depth)
     bsdf = {"type": "diffuse", "reflectance": {"type": "uniform", "value": reflectance}}
     turned, camera = np.eye(4), np.eye(4)
-    turned[:3, :3] = shape.turn
+    turned[:3, :3] = turn_of(shape)
     camera[:3, :3], camera[:3, 3] = camera_place(bench)
     middle = mi.ScalarAffineTransform4f().translate([0, 0, depth])
     place = middle @ mi.ScalarAffineTransform4f(turned.tolist())
@@ -72,6 +79,53 @@ def board_object(bench: Apparatus, reflectance: float, shape: BoardShape, depth:
     if shape.bow_mm:
         return _bowed_mesh(shape, half, np.array((world @ place).matrix, dtype=np.float64), bsdf)
     return {"type": "rectangle", "to_world": world @ place.rotate([0, 1, 0], 180).scale([half, half, 1]), "bsdf": bsdf}
+
+
+def turn_of(shape: BoardShape) -> FloatArray:
+    """(3, 3) rotation of a board of that ``shape`` in the camera's frame, by the smallest angle that gives it its
+    slopes: its plane is z = tan(tilt_row) s_row + tan(tilt_column) s_column, s_row = -y and s_column = -x. So no axis
+    comes first."""
+    slope = np.array([-math.tan(math.radians(tilt)) for tilt in (shape.tilt_column_deg, shape.tilt_row_deg)])
+    steep = float(np.linalg.norm(slope))
+    if steep == 0:
+        return np.eye(3)
+    angle = math.atan(steep)
+    uphill = slope / steep
+    # Rodrigues' formula about the level line: points uphill of the middle move away along z.
+    axis = np.array([uphill[1], -uphill[0], 0.0])
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.asarray(np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross)
+
+
+def _half_side(shape: BoardShape, geometry: CameraGeometry, z: float) -> float:
+    """Half of the board's side [mm] at a distance ``z`` [mm] from a camera of that ``geometry``; without a size, beyond
+    what the camera sees of it."""
+    if shape.size_mm is not None:
+        return shape.size_mm / 2
+    half = _BEYOND * (geometry.tan_half_fov * z + geometry.half_width)
+    steep = math.hypot(*(math.tan(math.radians(tilt)) for tilt in (shape.tilt_row_deg, shape.tilt_column_deg)))
+    if steep == 0:
+        return half
+    # Along the slope a ray of tan-angle u meets the board at u z / (cos - u sin) from its middle.
+    angle, corner = math.atan(steep), math.sqrt(2) * half / z
+    return half * math.sqrt(2) / max(math.cos(angle) - corner * math.sin(angle), _GRAZING)
+
+
+def bowed_surface(shape: BoardShape, half: float) -> tuple[FloatArray, FloatArray]:
+    """Points and normals (CELLS + 1, CELLS + 1, 3) of a bowed board in its own frame, its camera's side towards -z: the
+    paraboloid z = bow (x^2 + y^2) / half^2.
+
+    Parameters
+    ----------
+    shape, half
+        its bow, and half of its side [mm].
+    """
+    line = np.linspace(-half, half, CELLS + 1)
+    x, y = np.meshgrid(line, line)
+    part = shape.bow_mm / half**2
+    normals = np.stack([2 * part * x, 2 * part * y, -np.ones_like(x)], axis=-1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    return np.stack([x, y, part * (x**2 + y**2)], axis=-1), normals
 
 
 def missed_pixels(bench: Apparatus) -> int:
@@ -107,7 +161,7 @@ def _bowed_mesh(shape: BoardShape, half: float, place: FloatArray, bsdf: dict[st
     bsdf
         of its surface.
     """
-    points, normals = shape.surface(half)
+    points, normals = bowed_surface(shape, half)
     side = CELLS + 1
     corner = (np.arange(CELLS)[:, None] * side + np.arange(CELLS)).reshape(-1, 1)
     # Both triangles of a facet turn their front to -z, where the camera is.

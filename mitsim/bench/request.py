@@ -108,14 +108,9 @@ class Exposure:
     fraction: float = 0.8
 
     def __post_init__(self) -> None:
-        shortest, longest = EXPOSURE_S
-        if self.seconds is not None and not shortest <= self.seconds <= longest:
-            raise ArgumentError("exposure", f"{self.seconds:g}: give {shortest:g} to {longest:g} seconds, or auto")
-        least, most = EXPOSURE_FRACTION
-        if not least <= self.fraction <= most:
-            raise ArgumentError(
-                "exposure_fraction", f"{self.fraction:g}: give a part of the full well, {least:g} to {most:g}"
-            )
+        if self.seconds is not None:
+            _check_range("exposure", self.seconds, *EXPOSURE_S, "{} seconds, or auto")
+        _check_range("exposure_fraction", self.fraction, *EXPOSURE_FRACTION, "a part of the full well, {}")
 
     def check(self, sensor: SensorModel, camera_file: Path | str) -> None:
         """MitsimError when the ``sensor``, of a ``camera_file``, sees through colour filters, whose frames are captured
@@ -142,20 +137,21 @@ class Exposure:
         return exposure_for_peak(peak_irradiance, self.fraction, rig.sensor, wavelength)
 
 
+def _check_range(name: str, value: float, least: float, most: float, rule: str) -> float:
+    """``value``, or ArgumentError with the ``rule``, which has {} in place of the least and the most."""
+    if not least <= value <= most:
+        raise ArgumentError(name, f"{value:g}: give {rule.format(f'{least:g} to {most:g}')}")
+    return value
+
+
 def check_accuracy(accuracy: float) -> float:
     """``accuracy``, or ArgumentError when it is outside what the estimator can promise."""
-    if not LOWEST_ACCURACY <= accuracy <= HIGHEST_ACCURACY:
-        raise ArgumentError(
-            "accuracy", f"{accuracy}: give a relative error from {LOWEST_ACCURACY:g} to {HIGHEST_ACCURACY:g}"
-        )
-    return accuracy
+    return _check_range("accuracy", accuracy, LOWEST_ACCURACY, HIGHEST_ACCURACY, "a relative error from {}")
 
 
 def check_psnr(psnr: float) -> float:
     """``psnr`` [dB], or ArgumentError when no image of worth has it."""
-    if not PSNR_DB[0] <= psnr <= PSNR_DB[1]:
-        raise ArgumentError("psnr", f"{psnr:g}: give {PSNR_DB[0]:g} to {PSNR_DB[1]:g} dB")
-    return psnr
+    return _check_range("psnr", psnr, *PSNR_DB, "{} dB")
 
 
 def check_samples(estimator: str, spp: int | None) -> None:
@@ -187,18 +183,13 @@ def _some_time(seconds: float) -> float:
 
 
 def _worth_it(fraction: float) -> float:
-    if not _LEAST_NOISE <= fraction <= 1:
-        raise ArgumentError(
-            "noise_fraction", f"{fraction}: give a part of the sensor's noise from {_LEAST_NOISE:g} to 1"
-        )
-    return fraction
+    return _check_range("noise_fraction", fraction, _LEAST_NOISE, 1, "a part of the sensor's noise from {}")
 
 
 def _some_shots(shots: int) -> int:
     from mitsim.core.manifests import MOST_SHOTS  # here: it takes 7 ms to import, and most requests have no shots
 
-    if not 1 <= shots <= MOST_SHOTS:
-        raise ArgumentError("ambient_shots", f"{shots}: give 1 to {MOST_SHOTS} shots, or none for the patterns' own")
+    _check_range("ambient_shots", shots, 1, MOST_SHOTS, "{} shots, or none for the patterns' own")
     return shots
 
 
@@ -304,9 +295,7 @@ def check_image(path: Path) -> None:
 
 def check_wavelength(wavelength_nm: float) -> None:
     """ArgumentError for light of a ``wavelength_nm`` [nm] that there is not."""
-    low, high = _WAVELENGTHS_NM
-    if not low <= wavelength_nm <= high:
-        raise ArgumentError("wavelength", f"{wavelength_nm:g}: give {low:g} to {high:g} nm")
+    _check_range("wavelength", wavelength_nm, *_WAVELENGTHS_NM, "{} nm")
 
 
 def check_f_number(f_number: float) -> None:

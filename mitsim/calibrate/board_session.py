@@ -14,8 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from mitsim.acquire.drifting import levels
-from mitsim.acquire.exposure import camera_warnings
+from mitsim.acquire.exposure import camera_warnings, levels
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.board import before_board, missed_pixels
 from mitsim.core.arrays import FloatArray
@@ -26,16 +25,14 @@ from mitsim.devices.camera import CameraGeometry, side_of
 from mitsim.devices.patterns import Lighting, stripe_signs
 from mitsim.devices.projector import Spectrum
 from mitsim.devices.session import UNIFORM, BoardShape, Half, SessionRecipe, taken
-from mitsim.light.cost_model import FIXED, Numbers, forming_seconds
+from mitsim.light.cost_model import FIXED, Numbers, forming_seconds, frame_seconds, frames_at_once, light_bytes
 from mitsim.light.light import SampledLight, Sampling, trace_lines
-from mitsim.light.pilot_result import Forming
 from mitsim.light.plan import Plan
-from mitsim.light.settings import Settings
+from mitsim.light.settings import Forming, Settings
 from mitsim.light.simulation import Simulation
 from mitsim.optics.frames import Frame, at_once, mixes
 from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import best_term, centred, shadow_terms
-from mitsim.planner.memory import frame_seconds, frames_at_once, light_bytes
 from mitsim.planner.planner import make_plan
 from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, decibels
 
@@ -310,7 +307,7 @@ def session_cost(board: Apparatus, count: int, settings: Settings, seconds: floa
     return Cost(seconds=seconds, memory_bytes=light_bytes(board, n * n, settings) + memory_bytes)
 
 
-# -------- Light by projector pixel and a side's stripes in
+# -------- Frames of a side's stripes
 # Where frames of single lines can be held, those of patterns are mixed from them: by :class:`ExpectedFrames` up to
 # 256 lines, and here beyond. Otherwise they are formed in lots: which pixels each of 512 patterns lights would be 2
 # GiB.

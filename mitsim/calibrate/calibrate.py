@@ -358,7 +358,7 @@ def session_sums(lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Ch
         each = [response(kind, sums[0].side, *shown) for kind in kinds]
         return [(own.seen(one.rate, shown[0], one.light), one.saturated) for own, one in zip(sums, each, strict=True)]
 
-    stripes = SessionSums.kept(checkpoint, kinds, session)
+    stripes = SessionSums.kept(checkpoint, kinds)
     if stripes is None:
         stripes = SessionSums({}, 0)
         with job.clock.stage("sensor"):

@@ -27,7 +27,6 @@ from PIL import Image
 from scipy import sparse
 
 from mitsim.calibrate.board_session import Session
-from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import PARTS, output_folder, plain, read_json, sweep, whole_file, write_json
 from mitsim.core.manifests import MANIFEST, Digital, resumable
@@ -202,47 +201,29 @@ class SessionSums:
         arrays: dict[str, npt.ArrayLike] = {"saturated": self.saturated}
         for kind, both in self.sums.items():
             for sums in both:
-                name, done = f"{kind}_{sums.side}", sums.done
-                arrays[f"{name}_common"], arrays[f"{name}_vectors"] = sums.common, sums.vectors[:, :done]
-                arrays[f"{name}_sums"] = [sums.misfit, sums.energy]
-                arrays[f"{name}_each"] = [each[:done] for each in (sums.misfits, sums.energies, sums.fluxes)]
-                if sums.pairs:
-                    pairs = PairLight.together(sums.pairs)
-                    arrays[f"{name}_light"] = pairs.light
-                    arrays[f"{name}_rows"], arrays[f"{name}_columns"] = pairs.rows, pairs.columns
+                own = {**vars(sums), **(vars(PairLight.together(sums.pairs)) if sums.pairs else {})}
+                del own["side"], own["pairs"]
+                arrays |= {f"{kind}_{sums.side}_{name}": value for name, value in own.items()}
         checkpoint.save("stripes", arrays)
 
     @classmethod
-    def kept(cls, checkpoint: Checkpoint, kinds: Sequence[str], session: Session) -> SessionSums | None:
-        """Those of an interrupted session; None where there are none.
-
-        Parameters
-        ----------
-        checkpoint
-            that may hold them.
-        kinds, session
-            of responses, and what they are responses to.
-        """
+    def kept(cls, checkpoint: Checkpoint, kinds: Sequence[str]) -> SessionSums | None:
+        """Those of an interrupted session in a ``checkpoint``, of some ``kinds`` of responses; None where there are
+        none."""
         arrays = checkpoint.load("stripes")
         if arrays is None:
             return None
-        by_kind = {
-            kind: (_kept_sums(arrays, f"{kind}_", SIDES[0], session), _kept_sums(arrays, f"{kind}_", SIDES[1], session))
-            for kind in kinds
-        }
+        horizontal, vertical = SIDES
+        by_kind = {kind: (_kept_sums(arrays, kind, horizontal), _kept_sums(arrays, kind, vertical)) for kind in kinds}
         return cls(by_kind, int(arrays["saturated"]))
 
 
-def _kept_sums(arrays: Mapping[str, FloatArray], kind: str, side: Side, session: Session) -> StripeSums:
-    """Sums of one ``kind`` and ``side`` of a ``session``, from what :meth:`SessionSums.save` put down."""
-    own = {name.removeprefix(f"{kind}{side}_"): values for name, values in arrays.items()}
-    done = own["vectors"].shape[1]
-    vectors = np.empty((len(own["vectors"]), session.signs.shape[1]))
-    vectors[:, :done] = own["vectors"]
-    misfit, energy = map(float, own["sums"])
-    sums = StripeSums(side, session.centre, own["common"], vectors, misfit, energy, done)
-    for each, finished in zip((sums.misfits, sums.energies, sums.fluxes), own["each"], strict=True):
-        each[:done] = finished
+def _kept_sums(arrays: Mapping[str, Any], kind: str, side: Side) -> StripeSums:
+    """Sums of one ``kind`` and ``side``, from what :meth:`SessionSums.save` put down."""
+    own = {name.removeprefix(f"{kind}_{side}_"): values for name, values in arrays.items()}
+    single = float(own["misfit"]), float(own["energy"]), int(own["done"])
+    sums = StripeSums(side, bool(own["centre"]), own["common"], own["vectors"], *single)
+    sums.misfits, sums.energies, sums.fluxes = own["misfits"], own["energies"], own["fluxes"]
     if "light" in own:
         sums.pairs = [PairLight(*parts) for parts in zip(own["light"].T, own["rows"], own["columns"], strict=True)]
     return sums

@@ -64,7 +64,7 @@ class Coloured(Devices):
         """
         if self.colour == NO:
             return variant
-        from mitsim.bench.open import check_devices
+        from mitsim.bench.apparatus import check_devices
         from mitsim.devices.sensor import load_sensor
 
         path, _ = check_devices(self.camera, None)
@@ -99,7 +99,7 @@ class Coloured(Devices):
         """
         if self.colour == NO:
             return
-        from mitsim.bench.open import check_devices
+        from mitsim.bench.apparatus import check_devices
         from mitsim.bench.request import check_untimed
         from mitsim.core.configuration import load_model
 

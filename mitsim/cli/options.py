@@ -190,7 +190,7 @@ class LitScene:
     def check(self, scene: str, *patterns: str) -> None:
         """MitsimError, before the renderer is imported, for ``patterns`` that the ``scene``'s projector has too few
         pixels for."""
-        from mitsim.bench.open import check_scene
+        from mitsim.bench.apparatus import check_scene
 
         check_scene(scene, self.parameters, self.outside, patterns)
 
@@ -231,7 +231,7 @@ class Devices(LitScene):
 
     def check_exposure(self, exposure: Exposure) -> None:
         """MitsimError, before the renderer is imported, for an ``exposure`` that the camera cannot have."""
-        from mitsim.bench.open import check_devices
+        from mitsim.bench.apparatus import check_devices
         from mitsim.devices.sensor import load_sensor
 
         path, _ = check_devices(self.camera, None)

@@ -184,7 +184,7 @@ def scope_of(name: str, scope: Scope, patterns: str, over: Sequence[str], measur
 def _check_setup(scope: Scope, scene: str | None) -> None:
     """MitsimError where the files that a ``scope`` names cannot be used, before the renderer is imported; a study
     without a ``scene`` of its own may take others."""
-    from mitsim.bench.open import check_devices, check_scene
+    from mitsim.bench.apparatus import check_devices, check_scene
     from mitsim.bench.request import Exposure
     from mitsim.core.configuration import load_model
     from mitsim.devices.sensor import load_sensor

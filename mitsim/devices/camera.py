@@ -18,11 +18,11 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import Configuration, validate
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import FRAME_LIMITS, fits_a_frame
-from mitsim.devices.drift import MaskMotion
 from mitsim.devices.mask import CameraMask, Mask, mls_mask
 from mitsim.devices.plate import FEW, Plate, within
 from mitsim.devices.projector import ProjectorModel
 from mitsim.devices.sensor import SensorModel
+from mitsim.devices.session import MaskMotion
 
 _NODES_PER_PIXEL = 14
 """Nodes of a tilted mask for each pixel that its shadow is moved by: 2 more leave 4e-5 of frames of dots:7, 2 to 20

@@ -248,7 +248,7 @@ def _is_odd_prime(number: int) -> bool:
     return number > 2 and all(number % divisor for divisor in range(2, int(number**0.5) + 1))
 
 
-# -------- A picture of a point spread function in
+# -------- Pictures of point spread functions
 # Studies take it as a camera that shifts it (:mod:`mitsim.reconstruct.convolution`), a camera file's mask of the kind
 # ``psf`` as a shadow that grows as the point comes nearer (:class:`mitsim.devices.mask_profile.MaskProfile`).
 #

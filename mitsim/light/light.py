@@ -198,7 +198,7 @@ class SampledLight:
         seed
             of the probes that tell their error.
         leaking
-            whether black pixels leak, as :meth:`Simulation.expected` takes it.
+            whether black pixels leak, as :func:`mitsim.light.simulation.expected_of` takes it.
 
         Raises
         ------
@@ -207,7 +207,7 @@ class SampledLight:
         """
         rows = self.rows_of(lighting)
         probed = self.looked.at(self, rows, lighting.weights.shape[1]) if self.looked and seed == self.seed else None
-        return self.simulation.expected(self.groups, rows, lighting, seed, leaking, probed)
+        return expected_of([(self.simulation, self.groups)], rows, lighting, seed, leaking, probed)
 
     @checked
     def rows_of(self, lighting: Lighting) -> Labels:

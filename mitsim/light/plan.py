@@ -18,6 +18,11 @@ if TYPE_CHECKING:
     from mitsim.core.resources import Cost
 
 State = Literal["exact", "approximate", "off"]
+_REPORTED = (
+    "effects", "accuracy", "predicted_seconds", "predicted", "settings", "warnings", "predicted_range",
+    "sampling_target", "systematic_error", "systematic_bound", "asked_seconds", "colour",
+)  # fmt: skip
+"""What the command line says of a plan, besides bytes."""
 
 
 @dataclass(frozen=True)
@@ -180,17 +185,10 @@ class Plan:
 
     def payload(self) -> dict[str, Any]:
         """What the command line reports."""
-        keys = ("effects", "accuracy", "predicted_seconds", "predicted", "settings", "warnings")
         block = {**self.block(), "warnings": self.warnings}
         cost = {"memory": self.cost.memory_bytes, "disk": self.cost.disk_bytes} if self.cost else {}
         return {
-            **{key: block[key] for key in keys},
-            "predicted_range": self.predicted_range,
-            "sampling_target": self.sampling_target,
-            "systematic_error": self.systematic_error,
-            "systematic_bound": self.systematic_bound,
-            "asked_seconds": self.asked_seconds,
-            "colour": block.get("colour"),
+            **{key: block.get(key) for key in _REPORTED},
             **{f"predicted_{what}_bytes": count for what, count in cost.items()},
         }
 

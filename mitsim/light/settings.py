@@ -1,12 +1,17 @@
-"""What is simulated, and how finely: what pilot, plan and passes have in common."""
+"""What is simulated, and how finely; and what the pilot measured, by which that is chosen."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
 
+import numpy as np
+
 from mitsim.core.arrays import FloatArray
+from mitsim.core.parallel import single_threaded_blas
 
 Number = float | FloatArray
 GROUPS = 4
@@ -23,6 +28,9 @@ class Estimate(NamedTuple):
 
     value: float
     bound: float
+
+
+# -------- What is simulated, and how finely
 
 
 @dataclass(frozen=True)
@@ -121,3 +129,313 @@ class Settings:
     def with_own_anchors(self) -> tuple[int, ...]:
         """Occluded pixels, where they have anchors of their own."""
         return self.occluded if self.occluded_anchors > 1 else ()
+
+
+# -------- What the pilot measured, by which a plan is made
+
+COUNTED = ("anchors", "layers", "cells", "followed_anchors", "occluded_anchors", "followed_width")
+"""What a plan counts: points of the sensor a side for direct light, depths, cells a side of a projector pixel, points
+of the sensor a side for light that is followed over several surfaces or from the camera, and for direct light of
+occluded pixels, and projector pixels a side of a cell for what the former see beyond their mean."""
+_FEWEST_SAMPLES = 1e-3
+"""Samples of light without noise: next to none, and above 0 because costs are ratios."""
+REPLICATES = 4
+"""Independent replicates of the pilot, the fewest whose spread tells a standard error worth its name."""
+SURE = 2.35
+"""Standard errors from an estimate to its 95 % bound: Student's distribution with ``REPLICATES`` - 1 degrees of
+freedom."""
+RASTER_RATE = 1.5
+"""Power of a raster's cells along a pixel that its error falls with: from 6 to 12 cells, in frames of dots, 1.4 (a
+picture of light) to 2.9 (a mask turned by 0.3 degrees)."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Monte Carlo error of one estimate: ``error`` at ``samples`` a cell, falling with samples^-rate; ``spread`` is the
+    relative variance of its square among estimates, 0 where many paths make it; ``heavy`` the number of equal paths
+    that would make it as unevenly, infinite where nobody counted them."""
+
+    error: float
+    samples: float
+    rate: float
+    spread: float = 0.0
+    heavy: float = math.inf
+
+    @classmethod
+    def among(cls, seen: FloatArray, light: float, samples: int, paths: FloatArray) -> Noise:
+        """Of one of several replicates, by random paths of which few may be heavy.
+
+        Parameters
+        ----------
+        seen
+            (replicates, ...) frames.
+        light
+            norm of the frames of all light, which the error is relative to.
+        samples
+            of a replicate.
+        paths
+            light that each path of all replicates brought.
+        """
+        energies = np.square(seen - seen.mean(axis=0)).reshape(len(seen), -1).sum(axis=1)
+        mean = float(energies.mean())
+        spread = float(energies.var(ddof=1)) / mean**2 if mean else 0.0
+        squares = np.square(paths)
+        heavy = float(squares.sum()) ** 2 / float(np.square(squares).sum() or 1.0)
+        return cls(math.sqrt(float(energies.sum()) / (len(seen) - 1)) / light, samples, 0.5, spread, heavy)
+
+    def samples_for(self, target: Number) -> Number:
+        """Samples a cell at which the error is ``target``."""
+        if self.error <= 0:
+            return _FEWEST_SAMPLES + 0 * target
+        return self.samples * (self.error / target) ** (1 / self.rate)
+
+    def left(self, samples: Number) -> Number:
+        """The error at so many ``samples`` a cell."""
+        return self.error * (samples / self.samples) ** -self.rate
+
+
+@dataclass(frozen=True)
+class SampleCost:
+    """What one kind of light takes: its noise relative to all light, paths in a sample, and seconds to trace and
+    accumulate a path, 0 where nobody has timed it."""
+
+    noise: Noise
+    paths: int
+    seconds: float = 0.0
+
+    @classmethod
+    def none(cls) -> SampleCost:
+        """Of light that there is none of."""
+        return cls(Noise(0.0, 1, 0.5), 0)
+
+    @classmethod
+    def relative(cls, error: float, light: float, samples: int, paths: int, rate: float = 0.5) -> SampleCost:
+        """Of replicates of so many ``samples`` that are off by an ``error``, where frames of all light have the norm
+        ``light``.
+
+        Parameters
+        ----------
+        error, light, samples
+            as above; nothing is known to be noisy where there is no light.
+        paths, rate
+            of a sample, and the power of the samples that the error falls with.
+        """
+        return cls(Noise(error / light if light else 0.0, samples, rate), paths)
+
+    @property
+    def variance(self) -> float:
+        """Relative variance of one sample, where the error falls with the square root of their number."""
+        return self.noise.samples * self.noise.error**2
+
+
+@dataclass(frozen=True, order=True)
+class Approximation:
+    """What a plan may leave out (an effect; ``count`` 0), or a number that it may choose (anchors, layers, cells)."""
+
+    name: str
+    count: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorCovariance:
+    """What each part changes in the frames, as inner products between independent replicates: the sum of any of them,
+    with its signs, without the replicates' noise.
+
+    Attributes
+    ----------
+    parts
+        what was changed.
+    products
+        (replicates, replicates, parts, parts) inner products of the changes, relative to the squared norm of all light;
+        those of a replicate with itself hold its noise, and are not used.
+    """
+
+    parts: tuple[Approximation, ...]
+    products: FloatArray
+
+    @classmethod
+    def between(cls, seen: Mapping[Approximation, FloatArray], energy: float) -> ErrorCovariance:
+        """Of changes (replicates, ...) that were ``seen`` of frames whose squared norm is ``energy``."""
+        flat = np.array([change.reshape(REPLICATES, -1) for change in seen.values()]).reshape(
+            len(seen) * REPLICATES, -1
+        )
+        with single_threaded_blas():  # sums of several threads depend on their number in the last bits
+            pairs = (flat @ flat.T).reshape(len(seen), REPLICATES, len(seen), REPLICATES)
+        products = np.ascontiguousarray(pairs.transpose(1, 3, 0, 2))
+        return cls(tuple(seen), products / energy if energy > 0 else products)
+
+    def squared(self, chosen: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(m,) squared changes by m sums of parts and their standard errors, from ``chosen`` (m, parts) weights.
+
+        The mean product of two different replicates, and its jackknife over replicates.
+        """
+        replicates = len(self.products)
+        pairs = np.zeros((replicates, replicates, len(chosen)))
+        for i, j in zip(*np.triu_indices(replicates, 1), strict=True):
+            pairs[i, j] = np.einsum("mp,mp->m", chosen @ self.products[i, j], chosen)
+        total, kept = pairs.sum(axis=(0, 1)), replicates * (replicates - 1) / 2
+        of_look = pairs.sum(axis=0) + pairs.sum(axis=1)
+        without = (total - of_look) / (kept - replicates + 1)
+        spread = np.sqrt((replicates - 1) * np.square(without - without.mean(axis=0)).mean(axis=0))
+        return total / kept, spread
+
+    def estimate(self, parts: Collection[Approximation]) -> Estimate:
+        """Relative change of the frames by all ``parts`` together; parts that were not measured change nothing."""
+        chosen = np.array([[part in parts for part in self.parts]], dtype=np.float64)
+        squared, spread = (float(values[0]) for values in self.squared(chosen))
+        least = max(squared, 0.0)
+        return Estimate(math.sqrt(least), math.sqrt(least + SURE * spread))
+
+
+@dataclass(frozen=True)
+class Forming:
+    """What forming frames depends on besides settings.
+
+    Attributes
+    ----------
+    pixels, cells
+        a side of the sensor, and of the grid with one cell a projector pixel.
+    lit
+        part of the rows of cells that hold light in a frame.
+    terms, geometric_terms
+        of the wave-optical shadow, and of the geometric one.
+    shots, classes
+        of the family.
+    seconds
+        that the pilot measured for a frame of one anchor, layer and cell a pixel, with a wave-optical shadow.
+    product
+        seconds of a multiplication in a large product of matrices, on all processors; 0 where nobody has timed it.
+    correlated
+        whether frames without diffraction, and with it, are always correlations with a shadow on a raster, and never
+        sums of separable terms.
+    phases
+        raster cells that a pixel has at least, where a shadow is drawn on one.
+    drawing
+        seconds of drawing a shadow on as few, without diffraction and with it, for each layer.
+    lines
+        each with frames of its own.
+    parted
+        whether glass sends each line its own way, so that they share no paths.
+    occluded
+        parts of the projector's rows and of its columns that occluded pixels lie in.
+    """
+
+    pixels: float
+    cells: int
+    lit: float
+    terms: float
+    shots: int
+    classes: int
+    seconds: float = 0.0
+    product: float = 0.0
+    geometric_terms: float = 1.0
+    correlated: tuple[bool, bool] = (False, False)
+    phases: float = 16.0
+    drawing: tuple[float, float] = (0.0, 0.0)
+    lines: int = 1
+    parted: bool = False
+    occluded: tuple[float, float] = (1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A mask's shadow on a raster: what that leaves of the frames, None where it is none to choose, whether there is no
+    other way, and numbers of raster cells along a pixel, of which the first leaves that."""
+
+    error: Estimate | None = None
+    needed: bool = False
+    cells: tuple[int, ...] = (4,)
+
+    def left(self, cells: int) -> Estimate | None:
+        """What a raster of so many ``cells`` a pixel leaves; 0: the fewest."""
+        finer = (cells or self.cells[0]) / self.cells[0]
+        return self.error and Estimate(*(error * finer**-RASTER_RATE for error in self.error))
+
+
+@dataclass(frozen=True)
+class PilotResult:
+    """What a short replicate at the scene measured (:mod:`mitsim.planner.pilot`); all errors are relative.
+
+    Attributes
+    ----------
+    depth, layers
+        depth of the light [mm]; candidates for the layers' depths, by their number.
+    changes
+        of the frames by each effect that the bench has when it is left out, by each number of anchors, layers and
+        cells that was tried, and by one coarse cell a pixel, or one layer, for light that lies in coarse cells.
+    sample_costs
+        what each pass takes, by its name (:mod:`mitsim.light.passes`); of light at anchors: paths to one of them.
+    spread
+        what direct light takes that goes to random points of the sensor, and not to its centre.
+    forming
+        how frames are formed.
+    apart
+        effects that are no part of the expected frames, with the independent error of leaving each out.
+    unresolved
+        part of the direct light in lobes that sampling would miss (:mod:`mitsim.transport.missed`).
+    shared, repeats
+        as in :class:`mitsim.light.settings.Settings`, where that takes less for as little noise: what indirect light
+        takes is then of that.
+    left_out
+        light that no tracer finds, over that and what is found (:mod:`mitsim.transport.missed`).
+    glint
+        light over mirrors alone whose place on the sensor is not known, over all light.
+    mirror
+        place, among the scene's shapes, of what most of that comes over.
+    reach, sharp, occluded
+        as in :class:`mitsim.light.settings.Settings`.
+    raster
+        what a shadow on a raster leaves of the frames, without diffraction and with it (:class:`Drawn`).
+    hits
+        rays that bring all direct light if each projector pixel sends one, where these are few; else infinite.
+    """
+
+    depth: float
+    layers: Mapping[int, tuple[float, ...]]
+    changes: ErrorCovariance
+    sample_costs: Mapping[str, SampleCost]
+    spread: SampleCost
+    forming: Forming
+    apart: Mapping[str, float] = field(default_factory=dict)
+    unresolved: float = 0.0
+    left_out: float = 0.0
+    glint: float = 0.0
+    mirror: int | None = None
+    shared: bool = False
+    repeats: tuple[int, ...] = ()
+    reach: float | None = None
+    sharp: SharpPixels | None = None
+    occluded: tuple[int, ...] = ()
+    raster: tuple[Drawn, Drawn] = (Drawn(), Drawn())
+    hits: float = math.inf
+
+    def with_sample_costs(self, found: Mapping[str, SampleCost]) -> PilotResult:
+        """The same, where some passes take what was ``found``."""
+        return replace(self, sample_costs={**self.sample_costs, **found})
+
+    def forms(self, waves: bool) -> tuple[int, ...]:
+        """Raster cells along a pixel that frames may be formed of, 0 for a sum of terms; with ``waves`` or not."""
+        drawn = self.raster[waves]
+        if drawn.error is None:
+            return (drawn.cells[0] if drawn.needed else 0,)
+        return drawn.cells if drawn.needed else (0, *drawn.cells)
+
+    def error(self, *parts: Approximation) -> Estimate:
+        """Relative change of the frames by all ``parts`` together."""
+        apart = sum(self.apart.get(part.name, 0.0) ** 2 for part in parts)
+        value, bound = self.changes.estimate(parts)
+        return Estimate(math.hypot(value, math.sqrt(apart)), math.hypot(bound, math.sqrt(apart)))
+
+    @cached_property
+    def effects(self) -> dict[str, Estimate]:
+        """Error of leaving out each effect that the bench has."""
+        measured = [part.name for part in self.changes.parts if part.count == 0]
+        return {name: self.error(Approximation(name)) for name in (*measured, *self.apart)}
+
+    @cached_property
+    def ladders(self) -> dict[str, dict[int, Estimate]]:
+        """Error of each number of anchors, layers and cells that was tried, fewest first."""
+        found: dict[str, dict[int, Estimate]] = {name: {} for name in COUNTED}
+        for part in sorted(part for part in self.changes.parts if part.name in COUNTED):
+            found[part.name][part.count] = self.error(part)
+        return {name: errors or {1: Estimate(0.0, 0.0)} for name, errors in found.items()}

@@ -238,34 +238,6 @@ class Simulation(Tracers):
             return found
         return replace(found, irradiance=found.irradiance[:, self.places[0]][:, :, self.places[1]])
 
-    def expected(
-        self,
-        groups: Sequence[LightEstimate],
-        rows: Labels,
-        lighting: Lighting,
-        seed: int,
-        leaking: bool = True,
-        probed: FloatArray | None = None,
-    ) -> ExpectedFrames:
-        """Expected frames of all shots of a lighting.
-
-        Parameters
-        ----------
-        groups
-            independent estimates of the light.
-        rows
-            (groups' rows,) class of ``lighting`` that each row of the estimates belongs to.
-        lighting
-            the shots.
-        seed
-            of the probes that tell the Monte Carlo error.
-        leaking
-            whether black pixels leak, so that every shot lights all of them; without, shots of few pixels form faster.
-        probed
-            what the frames of other shots say of the same classes, as :class:`ExpectedFrames` takes it.
-        """
-        return expected_of([(self, groups)], rows, lighting, seed, leaking, probed)
-
 
 def _rows(light: sparse.csr_array, first: int, last: int) -> sparse.csr_array:
     """Rows ``first`` .. ``last`` - 1 of ``light``, not copied."""
@@ -287,10 +259,18 @@ def expected_of(
     Parameters
     ----------
     parts
-        simulations of the same devices, each with the light that it accumulated; black pixels leak as the first says,
-        specular chains are those of the last.
-    rows, lighting, seed, leaking, probed
-        as for :meth:`Simulation.expected`.
+        simulations of the same devices, each with independent estimates of the light that it accumulated; black pixels
+        leak as the first says, specular chains are those of the last.
+    rows
+        (groups' rows,) class of ``lighting`` that each row of the estimates belongs to.
+    lighting
+        the shots.
+    seed
+        of the probes that tell the Monte Carlo error.
+    leaking
+        whether black pixels leak, so that every shot lights all of them; without, shots of few pixels form faster.
+    probed
+        what the frames of other shots say of the same classes, as :class:`ExpectedFrames` takes it.
     """
     light = emitted(parts[0][0].physics, lighting, leaking)
     formed = [simulation.with_optics(groups, len(rows)) for simulation, groups in parts]
@@ -307,7 +287,7 @@ def emitted(physics: Physics, lighting: Lighting, leaking: bool = True) -> Float
     physics
         of the projector.
     lighting, leaking
-        as for :meth:`Simulation.expected`.
+        as for :func:`expected_of`.
     """
     black = physics.black_level if leaking else 0.0
     return np.asarray(black + (1 - black) * lighting.weights)

@@ -35,8 +35,17 @@ from mitsim.light.cost_model import (
     truth_seconds,
 )
 from mitsim.light.passes import FOLLOWED, PASSES
-from mitsim.light.pilot_result import COUNTED, SURE, Approximation, PilotResult, SampleCost
-from mitsim.light.settings import GROUPS, Estimate, Number, Settings
+from mitsim.light.settings import (
+    COUNTED,
+    GROUPS,
+    SURE,
+    Approximation,
+    Estimate,
+    Number,
+    PilotResult,
+    SampleCost,
+    Settings,
+)
 from mitsim.optics.forming import bound_over_error
 
 _MARGIN = 0.95
@@ -44,7 +53,7 @@ _MARGIN = 0.95
 shots whose error is seen, where it is not that of all."""
 _MOST_ENTRIES = 2.0**25
 """Entries of one group's accumulated light beyond which settings are not chosen: 12 GB in all
-(`mitsim.planner.memory`)."""
+(`mitsim.light.cost_model`)."""
 _LUCKY = -1.0
 """Standard errors below an estimate at which what keeps no accuracy for certain may still keep it: one case in six."""
 _AS_GOOD = 1.1
@@ -157,18 +166,18 @@ class Candidates:
 
 
 def predicted(
-    accuracy: float, pilot_result: PilotResult, settings: Settings, switches: Mapping[str, bool], sure: float = SURE
+    accuracy: float, pilot_result: PilotResult, settings: Settings, switches: Mapping[str, bool]
 ) -> Candidate:
     """What ``settings`` leave and take with samples of their own for the rest of the budget.
 
     Parameters
     ----------
-    accuracy, pilot_result, switches, sure
+    accuracy, pilot_result, switches
         as for :func:`cheapest`.
     settings
         effects and numbers.
     """
-    return _table_of(accuracy, pilot_result, settings, switches, sure).candidate(0)
+    return _table_of(accuracy, pilot_result, settings, switches, SURE).candidate(0)
 
 
 def _table_of(
@@ -401,7 +410,10 @@ class _Table:
     @cached_property
     def needed(self) -> dict[str, FloatArray]:
         """(m,) samples of a group by kind of light, or the part of one: the least work for a sum of variances."""
-        parts = {name: np.sqrt(self._by_row(name, _variance) * price) for name, price in self._work_of_sample.items()}
+        parts = {
+            name: np.sqrt(self._by_row(name, lambda cost: cost.variance) * price)
+            for name, price in self._work_of_sample.items()
+        }
         every = sum(parts.values()) + np.zeros(len(self.rows))
         single = self.target * math.sqrt(GROUPS) / _BOUND_OVER_ERROR
         found = {}
@@ -449,10 +461,6 @@ class _Table:
         return np.asarray(tracing + accumulating + shown)
 
 
-def _variance(kind: SampleCost) -> Number:
-    return kind.variance
-
-
 def _samples_for(kind: SampleCost, target: Number) -> Number:
     """Samples at which sampling may stop at a ``target``: by a bound, which lies the further above the error the fewer
     paths make it."""
@@ -475,13 +483,9 @@ def counted(settings: Settings) -> tuple[int, ...]:
     return tuple(int(getattr(numbers, name)) for name in COUNTED)
 
 
-def _counts(pilot_result: PilotResult, name: str) -> list[int]:
-    return list(pilot_result.ladders[name])
-
-
 def _choices(pilot_result: PilotResult, name: str, switches: Mapping[str, bool]) -> list[int]:
     """Numbers of ``name`` that the user leaves to choose from."""
-    counts = _counts(pilot_result, name)
+    counts = list(pilot_result.ladders[name])
     if name not in switches or len(counts) == 1:
         return counts
     return [count for count in counts if (count > 1) == switches[name]]

@@ -28,9 +28,8 @@ from mitsim.light.cost_model import (
     unit_costs_of,
 )
 from mitsim.light.passes import FOLLOWED
-from mitsim.light.pilot_result import PilotResult
 from mitsim.light.plan import Plan, PlanRow, State
-from mitsim.light.settings import Estimate, Settings
+from mitsim.light.settings import Estimate, PilotResult, Settings
 from mitsim.planner.choose import Candidate, cheapest, predicted
 from mitsim.transport.missed import polished_shapes
 
@@ -265,19 +264,16 @@ class _Words:
     def _seconds(self, **changes: Any) -> float:
         """What the settings take beyond those with ``changes``."""
         settings, costs = self.chosen.settings, unit_costs_of(self.pilot_result)
-        both = (
+        with_it, without = (
             sum(_stages(self.pilot_result, each, costs).values()) for each in (settings, replace(settings, **changes))
         )
-        with_it, without = both
         return max(with_it - without, 0.0)
 
     def _without(self, settings: Settings) -> str:
         """What the total error would be with other ``settings``."""
-        return f"without it the error would be up to {self._total(settings):.1e}, and {self.accuracy:g} is allowed"
-
-    def _total(self, settings: Settings) -> float:
         other = predicted(self.accuracy, self.pilot_result, settings, {})
-        return math.hypot(other.systematic.bound, self.chosen.noise)
+        total = math.hypot(other.systematic.bound, self.chosen.noise)
+        return f"without it the error would be up to {total:.1e}, and {self.accuracy:g} is allowed"
 
     def _anchors(self) -> PlanRow:
         side = self.chosen.settings.anchors

@@ -19,7 +19,7 @@ from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.light.cost_model import FIXED, Numbers, forming_seconds
 from mitsim.light.passes import PASSES
-from mitsim.light.pilot_result import (
+from mitsim.light.settings import (
     REPLICATES,
     Approximation,
     Drawn,
@@ -27,12 +27,11 @@ from mitsim.light.pilot_result import (
     Forming,
     PilotResult,
     SampleCost,
+    Settings,
 )
-from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation
-from mitsim.planner.pilot_anchors import AnchorRuns, FollowedRuns, PenumbraRuns
 from mitsim.planner.pilot_direct import SMOOTH, DirectRuns, occluded_pixels, sharp_pixels
-from mitsim.planner.pilot_effects import EffectRuns
+from mitsim.planner.pilot_effects import AnchorRuns, EffectRuns, FollowedRuns, PenumbraRuns
 from mitsim.planner.pilot_samples import GOOD_ENOUGH, Sample
 from mitsim.scene.load import why_dark
 from mitsim.transport.missed import LeftOut, SharpLight, highlights, left_out_light, sharp_light, with_neighbours
@@ -154,39 +153,32 @@ class PilotRuns:
         """Repeat a ``run`` with so many more samples that its standard errors are halved."""
         self.samples[run] = self._finer(run)
         self._measure(run)
-        vars(self).pop("evidence", None)
+        vars(self).pop("pilot_result", None)
 
     def work(self, run: str) -> float:
         """Work of repeating a ``run``, in seconds at fixed unit costs; infinite where it has all the samples it may."""
         now, finer = self.samples[run], self._finer(run)
         if (finer.fine, finer.direct) == (now.fine, now.direct):
             return math.inf
-        costs, changes = FIXED.passes, 0
+        costs, followed = FIXED.passes, self.switched.paths_per_sample
         one = forming_seconds(self.forming, Numbers.coarsest(), _FRAMES_AS_MANY, FIXED)
-        pixels, shown = self.bench.n**2, len(finer.shown)
         if run == "cells":
-            paths, changes = costs["direct"] * shown * finer.fine, len(self.fine.changes)
+            paths, changes = costs["direct"] * len(finer.shown) * finer.fine, len(self.fine.changes)
         elif run == "anchors":
-            connections = sum(part.count**2 for part in self.anchored.changes if part.name == run)
-            paths = costs["anchor_residual"] * shown * finer.anchored * connections
+            paths = costs["anchor_residual"] * len(finer.shown) * finer.anchored * self.anchored.connections
             changes = len(self.anchored.changes)
+        elif run == "followed":
+            paths = costs["indirect_residual"] * sum(followed.values()) * finer.followed * self.followed.connections
+            changes = len(self.followed.changes)
         elif run == "occluded":
             count = len(self.occluded.pixels) if self.occluded else 0
             if self.occluded is None or finer.occluded(count) == now.occluded(count):
                 return math.inf
-            connections = sum(part.count**2 for part in self.occluded.changes if " " not in part.name)
-            paths = costs["penumbra"] * FINER * self.occluded.paths / REPLICATES * connections
+            paths = costs["penumbra"] * FINER * self.occluded.paths / REPLICATES * self.occluded.connections
             changes = len(self.occluded.changes)
-        elif run == "followed":
-            connections = sum(part.count**2 for part in self.followed.changes if part.name == "followed_anchors")
-            paths_per_sample = sum(self.switched.paths_per_sample.values())
-            paths = costs["indirect_residual"] * paths_per_sample * finer.followed * connections
-            changes = len(self.followed.changes)
         else:
-            followed = sum(
-                costs[name] * paths_per_sample for name, paths_per_sample in self.switched.paths_per_sample.items()
-            )
-            paths = costs["direct"] * pixels * finer.direct + followed * finer.followed
+            indirect = sum(costs[name] * paths_per_sample for name, paths_per_sample in followed.items())
+            paths = costs["direct"] * self.bench.n**2 * finer.direct + indirect * finer.followed
             changes = _OF_EFFECTS * len(self.present)
         return REPLICATES * paths + changes * float(one)
 
@@ -258,11 +250,6 @@ class PilotRuns:
 
     # ---- Light that neither rays nor connections find ----
 
-    def _rows_and_columns(self, pixels: tuple[int, ...]) -> tuple[float, float]:
-        """Parts of the projector's rows and of its columns that ``pixels`` lie in."""
-        rows, columns = (np.unique(each).size / self.bench.n for each in np.divmod(pixels, self.bench.n))
-        return rows, columns
-
     @property
     def _unmet(self) -> float:
         """Irradiance of glossy balls' highlights that neither the search for lobes nor the looks' rays meet."""
@@ -296,6 +283,7 @@ class PilotRuns:
         if self.occluded:
             seen |= self.occluded.changes
         light, sharp, apart = switched.light, self._sharp, self._base.sharp
+        rows, columns = (np.unique(each).size / self.bench.n for each in np.divmod(self._base.occluded, self.bench.n))
         samples = self.samples["effects"].followed * REPLICATES
         indirect, shared, repeats = switched.indirect_cost()
         sample_costs = {
@@ -319,7 +307,7 @@ class PilotRuns:
             spread=fine.spread(light),
             shared=shared,
             repeats=repeats,
-            forming=replace(self.forming, lines=self._lines, occluded=self._rows_and_columns(self._base.occluded)),
+            forming=replace(self.forming, lines=self._lines, occluded=(rows, columns)),
             apart=switched.apart,
             unresolved=unresolved / (self._light + sharp.irradiance + unmet) if unresolved else 0.0,
             left_out=left_out / (left_out + found) if left_out else 0.0,
@@ -331,20 +319,6 @@ class PilotRuns:
             raster=self._raster,
             hits=self._hits,
         )
-
-
-# ---- The shortest pilot ----
-
-
-def measure(bench: Apparatus, lighting: Lighting, accuracy: float, seed: int) -> PilotResult:
-    """What the shortest :class:`PilotRuns` of these arguments finds.
-
-    Parameters
-    ----------
-    bench, lighting, accuracy, seed
-        as there.
-    """
-    return PilotRuns(bench, lighting, accuracy, seed).pilot_result
 
 
 def run_of(part: Approximation) -> str:

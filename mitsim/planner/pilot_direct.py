@@ -18,14 +18,23 @@ from mitsim.core.resources import workers
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum
-from mitsim.light.pilot_result import REPLICATES, Approximation, Drawn, Forming, Noise, SampleCost
-from mitsim.light.settings import GROUPS, Estimate, Settings, SharpPixels
+from mitsim.light.cost_model import cells_to_choose, drawing_seconds
+from mitsim.light.settings import (
+    GROUPS,
+    REPLICATES,
+    Approximation,
+    Drawn,
+    Estimate,
+    Forming,
+    SampleCost,
+    Settings,
+    SharpPixels,
+)
 from mitsim.light.simulation import Simulation, emitted
 from mitsim.optics.fft_shadow import cells_per_pixel
 from mitsim.optics.forming import Filed
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.image_formation import raster_error
-from mitsim.planner.memory import cells_to_choose, drawing_seconds
 from mitsim.planner.pilot_samples import EVEN_CELLS, GOOD_ENOUGH, Sample, ladder, noise, norm
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.missed import SharpLight, with_neighbours
@@ -132,8 +141,7 @@ class DirectRuns:
         many, few = noises
         steep = many > 0 and few > 0 and self._fewer < self.sample.fine
         rate = math.log(few / many) / math.log(self.sample.fine / self._fewer) if steep else 0.5
-        relative = many / light if light else 0.0
-        return SampleCost(Noise(relative, self.sample.fine, min(max(rate, 0.5), _STEEPEST)), self.bench.n**2)
+        return SampleCost.relative(many, light, self.sample.fine, self.bench.n**2, min(max(rate, 0.5), _STEEPEST))
 
     @property
     def _fewer(self) -> int:

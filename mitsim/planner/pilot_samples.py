@@ -16,8 +16,7 @@ from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.parallel import in_threads
 from mitsim.devices.patterns import Lighting
 from mitsim.light.grids import Grid
-from mitsim.light.pilot_result import Approximation
-from mitsim.light.settings import Settings
+from mitsim.light.settings import Approximation, Settings
 from mitsim.light.simulation import Simulation
 from mitsim.optics.image_formation import Entries
 from mitsim.optics.shadow import Places

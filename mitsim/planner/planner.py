@@ -15,10 +15,9 @@ from mitsim.core.arrays import Labels
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
-from mitsim.light.cost_model import FIXED, tracing_seconds, unit_costs_of
-from mitsim.light.pilot_result import REPLICATES, PilotResult, SampleCost
+from mitsim.light.cost_model import FIXED, frame_seconds, tracing_seconds, unit_costs_of
 from mitsim.light.plan import Plan
-from mitsim.light.settings import GROUPS, MOST_PATHS
+from mitsim.light.settings import GROUPS, MOST_PATHS, REPLICATES, PilotResult, SampleCost
 from mitsim.light.simulation import Simulation
 from mitsim.optics.diffraction import check_openings
 from mitsim.planner import pilot
@@ -33,7 +32,6 @@ from mitsim.planner.choose import (
     value_of_refining,
 )
 from mitsim.planner.explain import SceneFacts, explain_plan
-from mitsim.planner.memory import frame_seconds
 
 OPENING_S = 1.5
 """Seconds of starting the program and opening a scene (shipped ones: 1.2 to 1.6 on two cores)."""

@@ -23,10 +23,18 @@ from mitsim.core.job import Job
 from mitsim.devices.patterns import PatternFamily
 from mitsim.light.light import SampledLight, Sampling, Target, trace_light, traced_again
 from mitsim.light.passes import PASSES
-from mitsim.light.pilot_result import COUNTED, REPLICATES, Approximation, ErrorCovariance, PilotResult
 from mitsim.light.plan import Plan
 from mitsim.light.sampling import first_samples
-from mitsim.light.settings import GROUPS, Estimate, Settings
+from mitsim.light.settings import (
+    COUNTED,
+    GROUPS,
+    REPLICATES,
+    Approximation,
+    ErrorCovariance,
+    Estimate,
+    PilotResult,
+    Settings,
+)
 from mitsim.light.simulation import Simulation
 from mitsim.metrics import relative_error
 from mitsim.optics.frames import ExpectedFrames

@@ -33,9 +33,9 @@ from mitsim.bench.request import Request, Task
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.core.runs import Capture
+from mitsim.light.cost_model import frame_seconds
 from mitsim.light.passes import PASSES
 from mitsim.light.settings import Settings
-from mitsim.planner.memory import frame_seconds
 from mitsim.report import plots
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.studies.accuracy_findings import AccuracyFindings, Budget, Row, Timed

@@ -28,9 +28,8 @@ from mitsim.core.job import Job
 from mitsim.core.manifests import SIDES as FACTORS
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.devices.drift import WORDS, Drift
 from mitsim.devices.sensor import digital_of
-from mitsim.devices.session import SIDES, BoardShape, SessionRecipe, load_recipe
+from mitsim.devices.session import DRIFT_WORDS, SIDES, BoardShape, Drift, SessionRecipe, load_recipe
 from mitsim.light.light import SampledLight
 from mitsim.reconstruct.estimate_factors import Estimate, decibels
 from mitsim.reconstruct.factors import Factors
@@ -545,7 +544,7 @@ class CalibrationFindings(Findings):
         rows = [
             (
                 _WHERE[row.of],
-                WORDS.get(row.source, row.source),
+                DRIFT_WORDS.get(row.source, row.source),
                 row.amount,
                 with_error(row.lost_db, row.error_db),
                 ""

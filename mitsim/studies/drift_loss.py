@@ -17,15 +17,21 @@ from functools import cached_property
 
 import numpy as np
 
-from mitsim.acquire.drifting import DriftedExposer, drift_mask, drift_projector, levels, warmer
-from mitsim.acquire.exposure import ambient_shots, takes_ambient_frame
+from mitsim.acquire.exposure import (
+    DriftedExposer,
+    ambient_shots,
+    drift_mask,
+    drift_projector,
+    levels,
+    takes_ambient_frame,
+    warmer,
+)
 from mitsim.bench.apparatus import Apparatus
 from mitsim.calibrate.board_session import Session
 from mitsim.core.arrays import FloatArray
-from mitsim.devices.drift import Drift
 from mitsim.devices.patterns import PatternFamily, stripe_signs
 from mitsim.devices.projector import Spectrum
-from mitsim.devices.session import SIDES, SessionRecipe
+from mitsim.devices.session import SIDES, Drift, SessionRecipe
 from mitsim.light.light import SampledLight
 from mitsim.metrics import psnr
 from mitsim.optics.frames import ExpectedFrames

@@ -15,13 +15,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mitsim.acquire.capture import trace_request
-from mitsim.acquire.drifting import drift_projector
+from mitsim.acquire.exposure import drift_projector
 from mitsim.core.configuration import DEFAULT_CAMERA, locate, shipped
 from mitsim.core.errors import MitsimError
-from mitsim.devices.drift import UNITS, WORDS, Drift, amount_in_words
 from mitsim.devices.patterns import read_name
 from mitsim.devices.sensor import load_sensor
-from mitsim.devices.session import SessionRecipe, load_recipe
+from mitsim.devices.session import DRIFT_UNITS, DRIFT_WORDS, Drift, SessionRecipe, amount_in_words, load_recipe
 from mitsim.reconstruct.factors import Factors
 from mitsim.report.lit_scene import LitScene
 from mitsim.report.plots import curves, pair_chart
@@ -54,7 +53,7 @@ def _points(scope: Scope) -> Sequence[Point]:
         load_sensor(locate(scope.setup.camera or DEFAULT_CAMERA, "calibration", ".toml")).known_line_time_s()
     found = [
         Point.of(
-            _setup(scope, kind), recipe=scope.recipe, patterns=scope.patterns, kind=kind, unit=UNITS[kind],
+            _setup(scope, kind), recipe=scope.recipe, patterns=scope.patterns, kind=kind, unit=DRIFT_UNITS[kind],
             amount=amount, seed=seed,
         )
         for seed in scope.chosen(range(first, first + _SEEDS), scope.seeds)
@@ -138,7 +137,7 @@ def _first_amounts(table: Table) -> Mapping[str, Table]:
     for kind in table.distinct("kind"):
         rows = table.where(kind=kind)
         amount = rows.rows[0]["amount"]
-        name = f"{WORDS[kind]}, {amount_in_words(str(kind), rows.numbers('amount')[0])}"
+        name = f"{DRIFT_WORDS[kind]}, {amount_in_words(str(kind), rows.numbers('amount')[0])}"
         found[name] = rows.where(amount=amount)
     return found
 
@@ -179,7 +178,9 @@ def _figures(results: Results) -> Mapping[str, Figure]:
         if len(rows.distinct("amount")) > 1:
             both = {amount: _both(rows.where(amount=amount)) for amount in rows.distinct("amount")}
             lines = {name: {amount: pair[index] for amount, pair in both.items()} for index, name in enumerate(_LINES)}
-            drawn[f"{kind}.png"] = curves({"": lines}, f"{WORDS[kind]} [{rows.rows[0]['unit']}]", "PSNR lost [dB]")
+            drawn[f"{kind}.png"] = curves(
+                {"": lines}, f"{DRIFT_WORDS[kind]} [{rows.rows[0]['unit']}]", "PSNR lost [dB]"
+            )
     return drawn
 
 

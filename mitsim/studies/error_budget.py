@@ -25,8 +25,7 @@ import numpy as np
 from mitsim.calibrate.lit_session import LitSession
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.devices.drift import WORDS, Drift, amount_in_words
-from mitsim.devices.session import SIDES
+from mitsim.devices.session import DRIFT_WORDS, SIDES, Drift, amount_in_words
 from mitsim.reconstruct.factors import Factors
 from mitsim.report.lit_scene import SPECKLE
 from mitsim.studies import ablation
@@ -76,7 +75,7 @@ class LossRow:
         """In words."""
         if self.of == UNEXPLAINED:
             return self.source
-        what = WORDS.get(self.source, self.source) if self.of == DRIFT else f"{self.of}: {self.source}"
+        what = DRIFT_WORDS.get(self.source, self.source) if self.of == DRIFT else f"{self.of}: {self.source}"
         return f"{what}, {self.amount}" if self.amount else what
 
 

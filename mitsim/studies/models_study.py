@@ -17,8 +17,7 @@ from matplotlib.figure import Figure
 from mitsim.api.bench import Bench
 from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.lit_session import LitSession
-from mitsim.calibrate.model import model_of, modelled_factors, simulate_responses
-from mitsim.calibrate.placement import fit_placement
+from mitsim.calibrate.model import fit_placement, model_of, modelled_factors, simulate_responses
 from mitsim.calibrate.session_plan import PredictedSession
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest

@@ -21,8 +21,7 @@ from mitsim.core import parallel
 from mitsim.core.exr import read_frame
 from mitsim.light import sampling
 from mitsim.light.light import trace_light
-from mitsim.light.pilot_result import REPLICATES, Approximation, ErrorCovariance
-from mitsim.light.settings import GROUPS, Settings
+from mitsim.light.settings import GROUPS, REPLICATES, Approximation, ErrorCovariance, Settings
 from mitsim.optics import forming
 from mitsim.planner import pilot_direct, pilot_samples
 from mitsim.planner.planner import make_plan

@@ -21,7 +21,7 @@ from mitsim.devices.patterns import Lighting
 from mitsim.light.light import Sampling, trace_light
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Estimate, Settings
-from mitsim.light.simulation import Simulation
+from mitsim.light.simulation import Simulation, expected_of
 from mitsim.optics.frames import monte_carlo_bound, monte_carlo_error
 
 GROUPS = 6
@@ -67,7 +67,7 @@ def answer(bench: Bench, shots: Lighting, depth: float, seed: int, effort: Effor
         ]
         groups.append(sum(parts[1:], parts[0]))
     rows = np.arange(shots.weights.shape[1])
-    formed = [simulation.expected([group], rows, shots, 0) for group in groups]
+    formed = [expected_of([(simulation, [group])], rows, shots, 0) for group in groups]
     return np.array([[frame.irradiance for frame in frames] for frames in formed])
 
 

@@ -18,11 +18,10 @@ import numpy as np
 import pytest
 
 from mitsim.acquire.reference import reference
-from mitsim.acquire.spectral import SpectralBench, line_alone
+from mitsim.acquire.spectral import SpectralBench, line_alone, lit_by_lamps
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
 from mitsim.core.spectral_manifests import RUN
-from mitsim.light.lamps import lit_by_lamps
 from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.direct import DirectTracer, FluxTracer
 from mitsim.transport.from_camera import FromCameraTracer, LampResponse, LampTracer
@@ -75,14 +74,9 @@ def followed(bench: Bench) -> dict[str, PathSamples]:
         "shared": PathReuseTracer(bench.setup, Paths(True, True)),
         "from camera": FromCameraTracer(bench.setup, aim, Paths(True, True, ())),
     }
-    if not tracers["indirect"].setup.passage.open:
-        tracers["looks"] = tracers["indirect"]
-    else:
+    if tracers["indirect"].setup.passage.open:
         del tracers["shared"]
-    return {
-        name: tracer.trace_replicates([3, 5], SAMPLES)[1] if name == "looks" else tracer.trace(3, 0, SAMPLES)
-        for name, tracer in tracers.items()
-    }
+    return {name: tracer.trace(3, 0, SAMPLES) for name, tracer in tracers.items()}
 
 
 def filed(bench: Bench) -> list[list[float]]:

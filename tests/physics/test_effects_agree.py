@@ -20,7 +20,7 @@ from mitsim.core.configuration import shipped
 from mitsim.devices.patterns import Lighting
 from mitsim.light.light import Sampling, trace_light
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation
+from mitsim.light.simulation import Simulation, expected_of
 from mitsim.planner.planner import make_plan
 from tests.physics.radiosity import gauss, solid_angle
 from tests.physics.test_estimators_agree import (
@@ -59,7 +59,7 @@ def ambient_frame(bench: Bench, samples: int = 8, anchors: int = 3, interreflect
     uniform = Lighting.uniform(bench.n)
     light = simulation.accumulate("indirect", simulation.from_camera.trace(5, 0, samples), uniform.labels, samples)
     dark = Lighting(uniform.labels, 0 * uniform.weights)
-    return next(iter(simulation.expected([light], np.zeros(1, np.int64), dark, 0))).irradiance
+    return next(iter(expected_of([(simulation, [light])], np.zeros(1, np.int64), dark, 0))).irradiance
 
 
 def by_lamp(x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -82,7 +82,7 @@ def factored(scene: Path, spp: int, seed: int) -> Measured:
     """
     from mitsim.api.bench import open_bench
     from mitsim.light.settings import Settings
-    from mitsim.light.simulation import Simulation
+    from mitsim.light.simulation import Simulation, expected_of
 
     bench = open_bench(scene, for_render=True)
     family = bench.family(f"dots:{K}", 0)
@@ -103,7 +103,7 @@ def factored(scene: Path, spp: int, seed: int) -> Measured:
             for names, count in ((("direct", "anchor_residual"), samples), (("indirect",), 64 * samples))
         )
         for light in (sum(one[1:], one[0]), more[0]):
-            frames = [frame.irradiance for frame in simulation.expected([light], np.arange(K**2), lighting, 0)]
+            frames = [frame.irradiance for frame in expected_of([(simulation, [light])], np.arange(K**2), lighting, 0)]
             quadrants.append(np.reshape(frames, (K**2, 2, PIXELS // 2, 2, PIXELS // 2)).mean(axis=(2, 4)))
     values = np.reshape(quadrants, (GROUPS, 2, K**2, 2, 2))
     mean, error = values.mean(axis=0), values.std(axis=0, ddof=1) / np.sqrt(GROUPS)

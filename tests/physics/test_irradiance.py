@@ -183,13 +183,13 @@ def factored_frame(path: Path, light: np.ndarray) -> np.ndarray:
     """Frame of the factored estimator when projector pixel (r, c) emits ``light[r, c]`` of its power."""
     from mitsim.api.bench import open_bench
     from mitsim.light.settings import Settings
-    from mitsim.light.simulation import Simulation
+    from mitsim.light.simulation import Simulation, expected_of
 
     simulation = Simulation(open_bench(path), Settings(depth=Z, subdivision=4))
     labels = np.arange(light.size)
     groups = [simulation.accumulate("direct", simulation.direct.trace(seed, 0, 16), labels, 16) for seed in range(4)]
     lighting = Lighting(labels, light.reshape(1, -1))
-    return next(iter(simulation.expected(groups, labels, lighting, 0))).irradiance
+    return next(iter(expected_of([(simulation, groups)], labels, lighting, 0))).irradiance
 
 
 PIXELS = [(0, 0), (0, 15), (3, 11)]

@@ -22,13 +22,13 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.projector import Spectrum
+from mitsim.light.cost_model import cells_to_choose
 from mitsim.optics import fft_shadow as rasters
 from mitsim.optics.fft_shadow import Correlation, raster
 from mitsim.optics.image_formation import FrameOptics, raster_error
 from mitsim.optics.shadow import Directions, ShadowGeometry
 from mitsim.optics.terms import shadow_terms
 from mitsim.planner.explain import SceneFacts
-from mitsim.planner.memory import cells_to_choose
 
 BARE = CameraGeometry(pixels=40, mask_offset_row=0.013)
 LINES = Spectrum(np.array([450.0, 638.0]), np.array([0.4, 0.6]))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from mitsim.bench.open import check_scene
+from mitsim.bench.apparatus import check_scene
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.files import read_json, sweep, write_json

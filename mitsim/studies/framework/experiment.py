@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from mitsim.bench.request import Request
 from mitsim.core.errors import MitsimError
-from mitsim.devices.drift import Drift
 from mitsim.devices.patterns import read_name
+from mitsim.devices.session import Drift
 from mitsim.report import CONVENTIONS
 from mitsim.studies import ALL, EXPERIMENTS, STUDIES
 from mitsim.studies.framework.setup import Point, Setup

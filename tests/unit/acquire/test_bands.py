@@ -238,17 +238,18 @@ def test_a_look_is_at_few_rays_of_four_shots(monkeypatch: pytest.MonkeyPatch) ->
             asked.update(traced=(seed, first, rays), settings=settings)
             return SimpleNamespace(by_line=lambda count: ["light"] * count)
 
-        def expected(filed: Any, rows: Any, lighting: Any, seed: int, leaking: bool) -> Any:
-            asked.update(rows=list(rows), lighting=lighting, leaking=leaking)
-            return [SimpleNamespace(irradiance=np.full((2, 2), float(number))) for number in range(2)]
-
         def accumulate(name: str, found: Any, of_labels: Any, rays: int) -> Any:
             asked.update(filed=(found, rays), labels=of_labels)
             return "filed"
 
-        return SimpleNamespace(direct=SimpleNamespace(trace=trace), accumulate=accumulate, expected=expected)
+        return SimpleNamespace(direct=SimpleNamespace(trace=trace), accumulate=accumulate)
+
+    def expected(parts: Any, rows: Any, lighting: Any, seed: int, leaking: bool) -> Any:
+        asked.update(rows=list(rows), lighting=lighting, leaking=leaking)
+        return [SimpleNamespace(irradiance=np.full((2, 2), float(number))) for number in range(2)]
 
     monkeypatch.setattr(bands, "Simulation", simulation)
+    monkeypatch.setattr(bands, "expected_of", expected)
     of: Any = SimpleNamespace(
         family=lambda patterns, seed: family,
         geometry=SimpleNamespace(diffracts=True, scene_distance=400.0),

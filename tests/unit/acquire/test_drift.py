@@ -10,20 +10,18 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from mitsim.acquire.drifting import DriftedExposer, drift_mask, levels, warmer
-from mitsim.acquire.exposure import AmbientFrame, Exposer, taken_off
+from mitsim.acquire.exposure import AmbientFrame, DriftedExposer, Exposer, drift_mask, levels, taken_off, warmer
 from mitsim.api.bench import Bench
 from mitsim.calibrate.board_session import Session
 from mitsim.core.configuration import load_model, shipped
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
 from mitsim.devices.camera import CameraGeometry, Rig
-from mitsim.devices.drift import Drift
 from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.patterns import parse_patterns
 from mitsim.devices.projector import ProjectorModel
 from mitsim.devices.sensor import load_sensor
-from mitsim.devices.session import SIDES, load_recipe
+from mitsim.devices.session import SIDES, Drift, load_recipe
 from mitsim.optics.frames import Frame
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms

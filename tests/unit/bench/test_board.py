@@ -13,11 +13,11 @@ import pytest
 from pydantic import ValidationError
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.bench.board import missed_pixels
+from mitsim.bench.board import CELLS, bowed_surface, missed_pixels, turn_of
 from mitsim.bench.effects import EFFECTS
 from mitsim.calibrate.board_session import Session
 from mitsim.devices.patterns import Lighting
-from mitsim.devices.session import CELLS, BoardShape, load_recipe
+from mitsim.devices.session import BoardShape, load_recipe
 from mitsim.light.light import trace_light
 from mitsim.planner.planner import make_plan
 
@@ -93,7 +93,7 @@ def test_light_of_a_board_is_its_closed_form(bench: Bench, shape: BoardShape) ->
 @pytest.mark.parametrize(("row", "column"), [(0.0, 0.0), (20.0, 0.0), (0.0, -40.0), (-35.0, 50.0)])
 def test_slopes_of_a_tilted_board_are_the_tangents_of_its_tilts(row: float, column: float) -> None:
     """z = tan(row) s_row + tan(column) s_column with s_row = -y, s_column = -x; and it is only turned."""
-    turn = BoardShape(tilt_row_deg=row, tilt_column_deg=column).turn
+    turn = turn_of(BoardShape(tilt_row_deg=row, tilt_column_deg=column))
     np.testing.assert_allclose(turn.T @ turn, np.eye(3), atol=1e-12)
     assert np.linalg.det(turn) == pytest.approx(1)
     for x, y in ((1.0, 0.0), (0.3, -2.0)):
@@ -105,7 +105,7 @@ def test_slopes_of_a_tilted_board_are_the_tangents_of_its_tilts(row: float, colu
 
 
 def test_a_bow_is_the_height_over_the_middles_of_the_edges() -> None:
-    points, normals = BoardShape(bow_mm=2.0, size_mm=50.0).surface(25.0)
+    points, normals = bowed_surface(BoardShape(bow_mm=2.0, size_mm=50.0), 25.0)
     middle = CELLS // 2
     assert points[middle, middle] == pytest.approx([0, 0, 0])
     assert points[0, middle] == pytest.approx([0, -25, 2]) and points[middle, -1] == pytest.approx([25, 0, 2])

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from mitsim.api.bench import open_bench
-from mitsim.bench import open as opening
+from mitsim.bench import apparatus as opening
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
 from mitsim.devices import mask_profile

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from mitsim.calibrate.placement import Fitted, Shown, fit_placement
+from mitsim.calibrate.model import Fitted, Shown, fit_placement
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.devices.camera import CameraGeometry

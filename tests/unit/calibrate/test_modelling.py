@@ -12,8 +12,7 @@ import pytest
 import mitsim as ms
 from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.lit_session import LitSession
-from mitsim.calibrate.model import model_of, simulate_responses
-from mitsim.calibrate.placement import fit_placement
+from mitsim.calibrate.model import fit_placement, model_of, simulate_responses
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.devices.session import Modelling, load_recipe

@@ -9,16 +9,15 @@ import pytest
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.drift import STILL, UNITS, WORDS, Drift, MaskMotion
-from mitsim.devices.session import load_recipe
+from mitsim.devices.session import DRIFT_PARAMETERS, DRIFT_UNITS, DRIFT_WORDS, Drift, MaskMotion, load_recipe
 
 
 def test_nothing_moves_where_nothing_is_said() -> None:
     """(Planted: a rotation of 1 by default.)"""
     none = Drift()
     assert none.kinds == () and none.mask_mm == (0, 0, 0) and none.motion is None and load_recipe().drift == none
-    assert set(UNITS) == set(WORDS)
-    assert set(UNITS) == {*Drift.model_fields} - set(STILL)
+    assert set(DRIFT_UNITS) == set(DRIFT_WORDS)
+    assert set(DRIFT_UNITS) == {*Drift.model_fields} - set(DRIFT_PARAMETERS)
 
 
 def test_one_kind_alone() -> None:
@@ -54,7 +53,7 @@ def test_what_cannot_be_is_one_line(kind: str, amount: float, said: str) -> None
 def test_the_shipped_drift_is_of_the_shipped_session(tmp_path: Path) -> None:
     """All kinds move in it; its session is that of session.toml. (Planted: another exposure there.)"""
     recipe = load_recipe(shipped("calibration", "drift.toml"))
-    assert recipe.drift.kinds == tuple(UNITS)
+    assert recipe.drift.kinds == tuple(DRIFT_UNITS)
     bare = {"drift": Drift(), "source": ""}
     assert recipe.model_copy(update=bare) == load_recipe().model_copy(update=bare)
     bad = tmp_path / "bad.toml"

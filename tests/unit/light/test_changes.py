@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsim.light.passes import even
-from mitsim.light.pilot_result import REPLICATES, Approximation, ErrorCovariance, Noise
+from mitsim.light.settings import REPLICATES, Approximation, ErrorCovariance, Noise
 from tests.unit.planner.invented_evidence import PILOT_RESULT, SIZES, changes, plan, rows
 
 

@@ -28,7 +28,7 @@ import numpy as np
 import mitsim as ms
 from mitsim.light.cost_model import FIXED, tracing_seconds
 from mitsim.light.light import trace_light
-from mitsim.light.light_file import write_light
+from mitsim.acquire.capture import write_light
 from mitsim.light.sampling import next_samples
 from mitsim.planner import pilot
 assert pathlib.Path(ms.__file__).parents[1] == pathlib.Path.cwd(), ms.__file__
@@ -38,7 +38,7 @@ for name in ("plain", "veiled"):
     bench = ms.open_bench(scene, projector=folder / f"{name}.toml")
     lighting = bench.family("dots:2").lighting
     plan = bench.plan("dots:2", accuracy=5e-3)
-    result = pilot.measure(bench, lighting, 5e-3, 0)
+    result = pilot.PilotRuns(bench, lighting, 5e-3, 0).pilot_result
     light = trace_light(bench, plan, lighting, 0)
     write_light(folder / f"{name}.h5", light)
     grown = next_samples(light.simulation, light.samples, {each: float(each == "veil") for each in light.samples}, 2.0)

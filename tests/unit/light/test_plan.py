@@ -9,9 +9,8 @@ import pytest
 from mitsim.bench.effects import EFFECTS, SWITCHES
 from mitsim.bench.request import check_accuracy
 from mitsim.core.errors import MitsimError
-from mitsim.light.pilot_result import Approximation, Drawn
 from mitsim.light.plan import Plan
-from mitsim.light.settings import Estimate
+from mitsim.light.settings import Approximation, Drawn, Estimate
 from tests.unit.planner.invented_evidence import ACCURACIES, FACTS, ONE_CLASS, PILOT_RESULT, SIZES, changes, plan, rows
 
 

@@ -17,8 +17,7 @@ from mitsim.light.cost_model import (
     truth_seconds,
     unit_costs_of,
 )
-from mitsim.light.pilot_result import Forming, Noise, SampleCost
-from mitsim.light.settings import GROUPS, Settings
+from mitsim.light.settings import GROUPS, Forming, Noise, SampleCost, Settings
 from mitsim.optics.forming import PROBES
 from tests.unit.planner.invented_evidence import PILOT_RESULT, plan
 

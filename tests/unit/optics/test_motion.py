@@ -7,8 +7,8 @@ import pytest
 from scipy.special import erf
 
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.drift import MaskMotion
 from mitsim.devices.projector import Spectrum
+from mitsim.devices.session import MaskMotion
 from mitsim.optics.diffraction import wave_profiles
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry

@@ -19,7 +19,8 @@ from mitsim.light.cost_model import (
     tracing_seconds,
     truth_seconds,
 )
-from mitsim.light.pilot_result import (
+from mitsim.light.plan import Plan, PlanRow
+from mitsim.light.settings import (
     REPLICATES,
     Approximation,
     ErrorCovariance,
@@ -27,9 +28,8 @@ from mitsim.light.pilot_result import (
     Noise,
     PilotResult,
     SampleCost,
+    Settings,
 )
-from mitsim.light.plan import Plan, PlanRow
-from mitsim.light.settings import Settings
 from mitsim.planner.explain import SceneFacts, explain_plan
 
 FACTS = SceneFacts(notes={"diffraction": "Fresnel number 3.2"}, keystone=0.0)

@@ -8,16 +8,18 @@ import pytest
 
 from mitsim.bench.effects import parse_switches
 from mitsim.light.cost_model import FIXED, Numbers, entries
-from mitsim.light.pilot_result import (
+from mitsim.light.settings import (
     COUNTED,
+    GROUPS,
     REPLICATES,
     Approximation,
     ErrorCovariance,
     Noise,
     PilotResult,
     SampleCost,
+    Settings,
+    SharpPixels,
 )
-from mitsim.light.settings import GROUPS, Settings, SharpPixels
 from mitsim.planner.choose import cheapest, counted, predicted, value_of_refining
 from mitsim.planner.pilot import run_of
 from tests.unit.planner.invented_evidence import (

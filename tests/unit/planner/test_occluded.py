@@ -127,7 +127,7 @@ def test_where_a_shot_shows_none_or_nothing_else_all_have_the_same_anchors(
     if shows != "none":
         lit = np.isin(np.arange(N**2), occluded_pixels(Simulation(bench, Settings(depth=Z)), 1e-3, 0))
     lighting = Lighting((~lit).astype(np.int64), np.array([[1.0, 0.0]]))
-    pilot_result = pilot.measure(bench, lighting, 1e-3, 0)
+    pilot_result = pilot.PilotRuns(bench, lighting, 1e-3, 0).pilot_result
     assert pilot_result.occluded == () and {1, 2, 3} <= set(pilot_result.ladders["anchors"])
 
 
@@ -137,7 +137,7 @@ def test_pixels_that_are_traced_apart_are_no_occluded_ones(bench: Bench, monkeyp
     found = occluded_pixels(Simulation(bench, Settings(depth=Z)), 1e-3, 0)
     sharp = SharpPixels(found[::2], 2, (-0.1, 0.1, -0.1, 0.1))
     monkeypatch.setattr("mitsim.planner.pilot.sharp_pixels", lambda *_: sharp)
-    pilot_result = pilot.measure(bench, parse_patterns("dots:3", N).lighting, 1e-3, 0)
+    pilot_result = pilot.PilotRuns(bench, parse_patterns("dots:3", N).lighting, 1e-3, 0).pilot_result
     assert pilot_result.occluded and not set(pilot_result.occluded) & set(sharp.pixels)
 
 

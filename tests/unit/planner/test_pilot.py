@@ -18,13 +18,11 @@ from mitsim.bench.effects import EFFECTS
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import parse_patterns
-from mitsim.light.pilot_result import REPLICATES, Approximation, ErrorCovariance, PilotResult
-from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation
+from mitsim.light.settings import REPLICATES, Approximation, ErrorCovariance, PilotResult, Settings
+from mitsim.light.simulation import Simulation, expected_of
 from mitsim.optics.frames import monte_carlo_error
-from mitsim.planner import pilot, pilot_anchors, pilot_direct, pilot_samples
-from mitsim.planner.pilot_anchors import AnchorRuns, FollowedRuns
-from mitsim.planner.pilot_effects import EffectRuns
+from mitsim.planner import pilot, pilot_direct, pilot_effects, pilot_samples
+from mitsim.planner.pilot_effects import AnchorRuns, EffectRuns, FollowedRuns
 from mitsim.transport.records import PathSamples
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -49,7 +47,7 @@ def bench(shared_scene: Callable[..., Path], variant: str) -> Bench:
 
 
 def measured(bench: Bench, seed: int, accuracy: float = 1e-2) -> PilotResult:
-    return pilot.measure(bench, parse_patterns("dots:4", N).lighting, accuracy, seed)
+    return pilot.PilotRuns(bench, parse_patterns("dots:4", N).lighting, accuracy, seed).pilot_result
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +69,7 @@ def frames(bench: Bench, settings: Settings, many: int = 64, other: int = 24) ->
         for name, each in made.passes.items()
     ]
     light = sum(parts[1:], parts[0])
-    expected = made.expected([light], np.arange(16), lighting, 0)
+    expected = expected_of([(made, [light])], np.arange(16), lighting, 0)
     return np.stack([frame.irradiance for frame in expected])
 
 
@@ -97,7 +95,7 @@ def test_what_is_measured(bench: Bench, pilot_result: PilotResult) -> None:
         coarsest, finest = (max(errors), 1) if name == "followed_width" else (1, max(errors))
         assert len(errors) == 1 or errors[coarsest].value > errors[finest].value
     widths = ladders["followed_width"]
-    assert tuple(widths) == pilot_anchors.WIDTHS and widths[1].value < widths[2].value < widths[4].value
+    assert tuple(widths) == pilot_effects.WIDTHS and widths[1].value < widths[2].value < widths[4].value
     assert {1, 2} <= set(ladders["followed_anchors"]) <= set(FollowedRuns.ladder)
     assert 0 < pilot_result.forming.seconds < 1
     assert (
@@ -122,7 +120,7 @@ def test_gloss_makes_noise_at_random_points_of_the_sensor(small_scene: Callable[
     found, lighting = measured(bench, 1), parse_patterns("dots:4", N).lighting.shots(SHOWN)
     made = Simulation(bench, Settings(depth=found.depth, anchors=2))
     groups = [made.accumulate("direct", made.direct.trace(seed, 0, 16), lighting.labels, 16) for seed in range(8)]
-    actual = monte_carlo_error(made.expected(groups, np.arange(16), lighting, 0)) * 8**0.5
+    actual = monte_carlo_error(expected_of([(made, groups)], np.arange(16), lighting, 0)) * 8**0.5
     assert promised(float(found.spread.noise.left(16)), actual)
     assert found.spread.noise.left(16) > 10 * found.sample_costs["direct"].noise.left(16)
 
@@ -200,7 +198,7 @@ def test_light_to_many_anchors_is_traced_in_parts(
     """All of it at once takes gigabytes. Parts of two samples make the same ladder but for the order of sums.
     (Planted: every part from the first sample on.)"""
     monkeypatch.setattr(
-        pilot_anchors,
+        pilot_effects,
         "_AT_ONCE",
         2 * 9 * (pilot_result.sample_costs["indirect_residual"].paths + pilot_result.sample_costs["from_camera"].paths),
     )
@@ -254,7 +252,7 @@ def test_noise_comes_true(bench: Bench, pilot_result: PilotResult) -> None:
         traced = [each.tracer.trace(integer(9, kind, index), 0, samples) for index in range(6)]
         groups = [made.accumulate(kind, found, labels, samples) for found in traced]
         found = [
-            np.stack([frame.irradiance for frame in made.expected([light], np.arange(16), lighting, 0)])
+            np.stack([frame.irradiance for frame in expected_of([(made, [light])], np.arange(16), lighting, 0)])
             for light in groups
         ]
         spread = np.sqrt(np.square(np.std(found, axis=0, ddof=1)).sum())
@@ -282,7 +280,7 @@ def test_frames_of_looks_are_those_that_a_capture_forms(bench: Bench, monkeypatc
         for pilot_direct, *pilot_indirect in zip(found.direct, *found.followed.values(), strict=True)
     ]
     assert made.physics.lamps and made.physics.black_level and sample.shape == (5, 4) and bench.geometry.pixels > 5
-    formed = [made.expected([light], sample.rows, sample.lighting, 0) for light in filed]
+    formed = [expected_of([(made, [light])], sample.rows, sample.lighting, 0) for light in filed]
     expected = np.array([[frame.irradiance[np.ix_(*sample.places)] for frame in one] for one in formed])
     np.testing.assert_allclose(found.frames, expected, rtol=1e-9)
 
@@ -327,7 +325,7 @@ def test_indirect_light_is_looked_at_closer_where_noise_hides_what_coarse_cells_
 def test_the_pilot_is_reproducible(bench: Bench) -> None:
     """Of few shots and at a loose accuracy: all parts of the pilot have their turn."""
     lighting = parse_patterns("dots:2", N).lighting
-    one, again = (pilot.measure(bench, lighting, 0.1, 3) for _ in range(2))
+    one, again = (pilot.PilotRuns(bench, lighting, 0.1, 3).pilot_result for _ in range(2))
     for name in ("depth", "layers", "effects", "ladders"):
         assert getattr(again, name) == getattr(one, name)
     assert np.array_equal(again.changes.products, one.changes.products)
@@ -376,7 +374,7 @@ def test_a_mirror_shows_some_shots_only(shipped_bench: Callable[..., Bench]) -> 
     closed form, (1 - b) of a class and b of all. (Planted: four shots, as of a print: 6.0e-5 of 8.8e-5.)"""
     bench = shipped_bench("mirror")
     lighting = parse_patterns("dots:7", bench.n).lighting
-    found = pilot.measure(bench, lighting, 1e-3, 1).effects["black-level"]
+    found = pilot.PilotRuns(bench, lighting, 1e-3, 1).pilot_result.effects["black-level"]
     made = Simulation(bench, Settings(depth=400.0, effects=frozenset(effects.present(bench))))
     glint, black = made.specular_frames(lighting.labels), made.physics.black_level
     assert glint is not None
@@ -385,3 +383,14 @@ def test_a_mirror_shows_some_shots_only(shipped_bench: Callable[..., Bench]) -> 
     everything = black * seen.sum(axis=0)
     actual = np.linalg.norm(everything - black * seen) / np.linalg.norm(everything + (1 - black) * seen)
     assert found.value == pytest.approx(actual, rel=0.1)
+
+
+def test_a_refined_run_is_in_what_was_found(bench: Bench) -> None:
+    """More samples of a run tell its changes with half of the standard error. (Planted: the former is kept.)"""
+    runs = pilot.PilotRuns(bench, parse_patterns("dots:4", N).lighting, 1e-2, seed=3)
+    before, cells = runs.pilot_result, Approximation("cells", 1)
+    runs.refine("cells")
+    after = runs.pilot_result
+    spread = [each.bound**2 - each.value**2 for each in (result.error(cells) for result in (before, after))]
+    assert after is not before
+    assert spread[1] != spread[0]

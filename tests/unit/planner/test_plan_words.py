@@ -10,8 +10,7 @@ import pytest
 from mitsim.api.bench import Bench
 from mitsim.bench.effects import EFFECTS
 from mitsim.light.cost_model import unit_costs_of
-from mitsim.light.pilot_result import Approximation, PilotResult
-from mitsim.light.settings import Settings
+from mitsim.light.settings import Approximation, PilotResult, Settings
 from mitsim.planner.explain import SceneFacts, explain_plan
 from mitsim.scene.limits import Unfit
 from mitsim.scene.outline import Tag

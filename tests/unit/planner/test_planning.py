@@ -14,9 +14,8 @@ import pytest
 
 from mitsim.devices.patterns import Lighting
 from mitsim.light.cost_model import FIXED
-from mitsim.light.pilot_result import REPLICATES, Noise, SampleCost
 from mitsim.light.plan import Plan
-from mitsim.light.settings import GROUPS, MOST_PATHS
+from mitsim.light.settings import GROUPS, MOST_PATHS, REPLICATES, Noise, SampleCost
 from mitsim.optics.forming import bound_of
 from mitsim.planner import pilot, planner
 from mitsim.planner.choose import _BOUND_OVER_ERROR, FIRST_ACCURACY, Candidate, _samples_for, cheapest

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mitsim.bench.open import check_scene
+from mitsim.bench.apparatus import check_scene
 from mitsim.core.errors import MitsimError
 from mitsim.scene.outline import lit_side
 

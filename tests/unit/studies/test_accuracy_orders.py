@@ -8,7 +8,7 @@ import pytest
 
 from mitsim.api.bench import open_bench
 from mitsim.core.job import Job
-from mitsim.light.pilot_result import Approximation
+from mitsim.light.settings import Approximation
 from mitsim.studies import accuracy_findings
 from mitsim.studies.accuracy_findings import Budget, PartCost, Spread
 from mitsim.studies.accuracy_parts import Judge, Orders, Stand, with_samples

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.devices.drift import Drift
 from mitsim.devices.patterns import parse_patterns, stripe_signs
+from mitsim.devices.session import Drift
 from mitsim.report.lit_scene import SPECKLE
 from mitsim.studies import ablation, error_budget
 from mitsim.studies.drift_loss import AMBIENT, SESSION

@@ -12,12 +12,11 @@ from typing import cast
 import numpy as np
 import pytest
 
-from mitsim.acquire.drifting import drift_mask, drift_projector
+from mitsim.acquire.exposure import drift_mask, drift_projector
 from mitsim.cli.study_verb import recipe_for, scope_of
 from mitsim.core.configuration import shipped
 from mitsim.core.errors import MitsimError
-from mitsim.devices.drift import UNITS, Drift
-from mitsim.devices.session import load_recipe
+from mitsim.devices.session import DRIFT_UNITS, Drift, load_recipe
 from mitsim.report import RENDERED
 from mitsim.report.lit_scene import LitScene
 from mitsim.report.table import Table
@@ -200,7 +199,7 @@ def test_points_are_every_kind_alone() -> None:
     sheet.)"""
     experiment = find_experiment("drift")
     points, few = (experiment.points(Scope(Setup(), ("astronaut", "page"), quick=quick)) for quick in (False, True))
-    assert {point["kind"] for point in points} == set(UNITS) and len(points) == 4 * len(UNITS)
+    assert {point["kind"] for point in points} == set(DRIFT_UNITS) and len(points) == 4 * len(DRIFT_UNITS)
     assert len({point.key for point in points}) == len(points) and {p.key for p in few} <= {p.key for p in points}
     drift = load_recipe(shipped("calibration", "drift.toml")).drift
     assert all(point["amount"] == getattr(drift, point["kind"]) for point in points)

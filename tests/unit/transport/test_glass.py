@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import open_bench
-from mitsim.bench.open import reopened
+from mitsim.bench.apparatus import reopened
 from mitsim.core.errors import MitsimError
 from mitsim.devices.projector import Lines
 from mitsim.transport.plugins.glass import GlassModel, is_glass, tune

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mitsim.acquire import spectral as counted_lamps
 from mitsim.core.seeds import integer
 from mitsim.devices.lamps import SPECTRA_NM, Response, line_units
 from mitsim.devices.projector import Lines
-from mitsim.light import lamps as counted_lamps
 from tests.invented import sensor
 
 LINES = Lines((638.0, 445.0), (0.5, 0.5))
