@@ -23,6 +23,7 @@ from mitsim.transport.direct import DirectTracer
 from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer, LampResponse, LampTracer, Paths
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.path_reuse import PathReuseTracer
+from mitsim.transport.projector import ProjectorOptics
 from mitsim.transport.sharp_lobes import AimedTracer
 
 # -------- What traces
@@ -97,6 +98,19 @@ class Tracers(Grids):
         points = self._points(self.settings.followed_anchors)
         return self._indirect(points), self._from_camera(points)
 
+    # ---- Light that the projector's lens scatters
+
+    @cached_property
+    def glare(self) -> CombinedTracer | None:
+        """Follows light that the projector's lens scatters, to the same points; none where it scatters none."""
+        loaded, physics, scattered = self.bench.loaded, self.physics, self.physics.projector.scattered
+        if scattered.share == 0:
+            return None
+        spread = self.settings.anchors > 1
+        direct = DirectTracer(loaded.scene, loaded.camera, scattered, 1, physics.geometry, spread)
+        indirect = self._indirect(self._mean_points, projector=scattered)
+        return CombinedTracer(*filter(None, (direct, indirect)))
+
     @property
     def _mean_points(self) -> SensorPoints:
         return self._points(1, self.settings.followed_anchors > 1)
@@ -113,12 +127,15 @@ class Tracers(Grids):
     def _points(self, anchors: int, spread: bool = False) -> SensorPoints:
         return SensorPoints(self.physics.geometry.half_width, anchors, spread, self.settings.depth)
 
-    def _indirect(self, points: SensorPoints, shared: bool = False) -> IndirectTracer | None:
+    def _indirect(
+        self, points: SensorPoints, shared: bool = False, projector: ProjectorOptics | None = None
+    ) -> IndirectTracer | None:
+        """Of the ``projector``, if not of all light that its lens does not scatter."""
         loaded, physics = self.bench.loaded, self.physics
         paths = physics.mirrors, physics.interreflection
         if not any(paths):
             return None
-        parts = loaded.scene, loaded.camera, physics.projector, *paths, physics.geometry, points
+        parts = loaded.scene, loaded.camera, projector or physics.projector, *paths, physics.geometry, points
         return PathReuseTracer(*parts) if shared else IndirectTracer(*parts)
 
     def _from_camera(self, points: SensorPoints) -> FromCamera | None:
@@ -257,6 +274,8 @@ _ROWS = (
          effects=FOLLOWED, anchors="followed_anchors", device="room", pilot="followed", key="followed"),
     Pass("camera_residual", "from camera at anchors", lambda made: made.at_anchors[1], 1.3e-7, "indirect_residual",
          effects=FOLLOWED, anchors="followed_anchors", pilot="followed", key="followed_from_camera"),
+    Pass("glare", "glare", lambda made: made.glare, 3e-7, "fine", "indirect",
+         effects=frozenset({"glare"})),
 )  # fmt: skip
 """In the order in which they are traced and their light is added up. Unit costs were chosen near what was measured of
 eight shipped scenes on two cores (plans at 1e-3, November 2026); only their ratios decide. Direct light takes half as
