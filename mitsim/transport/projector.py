@@ -43,9 +43,10 @@ class ProjectorOptics:
     a pixel where it has moved.
 
     ``aperture`` is the lens radius [mm] (0: a pinhole), ``focus`` the distance of the sharp plane [mm], ``blur`` the
-    standard deviation of a projector pixel's spot, in projector pixels. ``share`` is the part of a pixel's light that
-    leaves so; the lens scatters the rest with a standard deviation of ``glare_spread`` pixels. ``lines`` are those that spectral variants
+    standard deviation of a projector pixel's spot, in projector pixels. ``lines`` are those that spectral variants
     trace its light at; None: wavelengths drawn from all. ``parted`` tells that glass sends each wavelength its own way.
+    ``share`` is the part of a pixel's light that leaves by the pixel; the lens scatters the rest, with a standard
+    deviation of ``glare_spread`` pixels.
     """
 
     emitter: mi.Emitter

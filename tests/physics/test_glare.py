@@ -1,4 +1,4 @@
-"""Light that the projector's lens scatters: both estimators, the reference being shown a picture that is scattered already.
+"""Light that the projector's lens scatters: both estimators, the reference shown a picture that is scattered already.
 
 Its picture is made here, by SciPy's Gaussian of 4 x 4 points a pixel, on a canvas three windows wide, as light leaves
 the window; the fast estimator traces rays. Compared by the sums of :mod:`tests.physics.test_estimators_agree`, at the
