@@ -5,11 +5,12 @@ from itertools import product
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from mitsim.light.cost_model import FIXED, SHARED_COST
 from mitsim.light.passes import EVEN, even
-from mitsim.light.sampling import SampledPass, cheapest_samples, first_samples, next_samples
+from mitsim.light.sampling import Group, SampledPass, cheapest_samples, first_samples, next_samples, trace_groups
 from mitsim.transport.path_reuse import PathReuseTracer
 
 LIGHTS = (
@@ -77,6 +78,43 @@ def simulated(**tracers: tuple[Any, float]) -> Any:
 
 def of_lanes(paths_per_sample: int) -> Any:
     return SimpleNamespace(paths_per_sample=paths_per_sample)
+
+
+class Counted:
+    """Light of a pass in place of paths': that of sample i is i, and one launch takes four of them."""
+
+    name, row, paths_per_sample = "indirect", SimpleNamespace(stream="own"), 5
+
+    def __init__(self) -> None:
+        self.traced: list[int] = []
+        self.simulation: Any = SimpleNamespace(
+            passes={self.name: SimpleNamespace(tracer=self, row=self.row, trace=self.trace)},
+            paths_at_once=4 * self.paths_per_sample,
+            accumulators=lambda name, labels, lines: (),
+            accumulate=lambda name, found, labels, samples: found / samples,
+        )
+
+    def trace(self, seed: int, first: int, samples: int, accumulators: object) -> Any:
+        assert 0 < samples <= 4
+        numbers = range(first, first + samples)
+        self.traced += numbers
+        return SimpleNamespace(by_line=lambda lines: [float(sum(numbers)) * (line + 1) for line in range(lines)])
+
+
+def test_rounds_go_on_where_the_last_one_ended() -> None:
+    """What groups hold is the mean over their samples, each traced once, after every round; of every line.
+
+    (Planted: the first round's mean not spread over the samples of both; groups not traced.)
+    """
+    lights = [Counted(), Counted()]
+    groups = [Group(each.simulation, np.zeros(4, dtype=np.int64), 3, lines=2) for each in lights]
+    for samples in (3, 10, 10):
+        trace_groups(groups, {"indirect": samples})
+        for each, group in zip(lights, groups, strict=True):
+            assert each.traced == list(range(samples)) and group.done == {"indirect": samples}
+            assert group.paths == 5 * samples
+            mean = (samples - 1) / 2
+            assert (group.light(), group.light(1), group.part("indirect")) == pytest.approx((mean, 2 * mean, mean))
 
 
 def test_sampling_begins_with_what_is_predicted_or_less_where_most_is_followed() -> None:
