@@ -120,6 +120,8 @@ class Apparatus:
             model.blur_pixels,
             self.lines,
             bool(self.loaded.parting),
+            1 - model.glare,
+            model.glare_spread * grid.n,
         )
 
     @property

@@ -255,6 +255,13 @@ EFFECTS: Mapping[str, Effect] = _registry(
         first_look=True,
         in_truth=True,
     ),
+    Effect(
+        "glare",
+        {"projector.share": 1.0},
+        absent="the projector file gives no ANSI contrast",
+        note=lambda bench: f"the projector's lens scatters {1 - bench.projector_optics.share:.2g} of its light",
+        retraced=_always(DIRECT, FOLLOWED),
+    ),
     Effect("black-level", {"black_level": 0.0}, absent="the projector's black is black"),
     Effect("speckle", {"speckle": 0.0}, absent="the projector file gives no speckle contrast", in_frames=False),
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
+from statistics import NormalDist, mean
 from typing import Annotated, Literal
 
 import numpy as np
@@ -17,6 +18,8 @@ from mitsim.core.spectral_manifests import MOST_LINES
 
 _ROUNDING = 1e-6
 """How far the weights of a spectrum may sum from 1: six written digits."""
+_FIELDS = 4
+"""Of a chessboard, a side (IEC 61947-1, ANSI IT7.228)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,6 +167,18 @@ class Coherence(Configuration):
         return self
 
 
+def chessboard_means(spread: float) -> tuple[float, float]:
+    """What a Gaussian of standard deviation ``spread`` leaves of a picture of side 1 at the middles of its four fields
+    along one axis: of an even picture, and of one that is +1 and -1 in turn, times the field's own sign; means."""
+    even, signed = [], []
+    for field in range(_FIELDS):
+        below = [NormalDist((field + 0.5) / _FIELDS, spread).cdf(edge / _FIELDS) for edge in range(_FIELDS + 1)]
+        parts = [after - before for before, after in pairwise(below)]
+        even.append(sum(parts))
+        signed.append(sum(part * (-1) ** (other - field) for other, part in enumerate(parts)))
+    return mean(even), mean(signed)
+
+
 class ProjectorModel(Configuration):
     """A projector's light and lens, and where their numbers come from.
 
@@ -185,6 +200,14 @@ class ProjectorModel(Configuration):
     """Light of a white pixel over that of a black one.
 
     Without an upper end: inf is a black that is black."""
+    ansi_contrast: float | None = Field(default=None, gt=1)
+    """Light of the white fields of a chessboard of 4 x 4 over that of the black ones; none: the lens scatters nothing.
+
+    IEC 61947-1; projectors have 100 to 1000."""
+    glare_spread: float = Field(default=0.25, ge=0.1, le=2)
+    """Standard deviation of the light that the lens scatters, over the side of the picture.
+
+    A tenth: half a field of the chessboard; 2: nearly even over the picture."""
     aperture_radius_mm: float = Field(default=0.0, ge=0, le=1000)
     """Radius of the lens [mm]; 0: pinhole.
 
@@ -254,6 +277,22 @@ class ProjectorModel(Configuration):
         return self
 
     @model_validator(mode="after")
+    def _a_chessboard_can_have_its_contrast(self) -> ProjectorModel:
+        if self.ansi_contrast is None:
+            return self
+        if not self.ansi_contrast < self.contrast_ratio:
+            raise ValueError(
+                f"ansi_contrast: got {self.ansi_contrast:g}, and black pixels leave {self.contrast_ratio:g} "
+                "(contrast_ratio); give less"
+            )
+        if not self.glare < 1:
+            raise ValueError(
+                f"ansi_contrast: got {self.ansi_contrast:g}, which a lens that scatters all light exceeds at "
+                f"glare_spread {self.glare_spread:g}; give more"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _listed_fields_exist(self) -> ProjectorModel:
         unknown = [name for name in (*self.assumed, *self.derived) if name not in type(self).model_fields]
         if unknown:
@@ -264,6 +303,17 @@ class ProjectorModel(Configuration):
     def black_level(self) -> float:
         """Light of a black pixel, as a part of a white one's."""
         return 1 / self.contrast_ratio
+
+    @property
+    def glare(self) -> float:
+        """Part of a pixel's light that the lens scatters: that with which a chessboard has the ``ansi_contrast``."""
+        if self.ansi_contrast is None:
+            return 0.0
+        contrast, black = self.ansi_contrast, self.black_level
+        even, fields = chessboard_means(self.glare_spread)
+        white, dark = ((1 + black) / 2 * even**2 + sign * (1 - black) / 2 * fields**2 for sign in (1, -1))
+        direct = 1 - contrast * black
+        return direct / (direct + contrast * dark - white)
 
     @property
     def lines(self) -> Lines:

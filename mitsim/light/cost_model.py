@@ -213,7 +213,8 @@ def unit_costs_of(pilot_result: PilotResult) -> UnitCosts:
 
 def costly_effects() -> frozenset[str]:
     """Names of effects that take time; to have the others on costs nothing."""
-    return names(lambda effect: effect.followed or effect.in_shadow) | {MIXING}
+    traced = frozenset[str]().union(*(row.effects for row in PASSES.values()))
+    return traced | names(lambda effect: effect.in_shadow) | {MIXING}
 
 
 def sample_costs(pilot_result: PilotResult, effects: frozenset[str]) -> dict[str, SampleCost]:

@@ -99,6 +99,18 @@ class Tracers(Grids):
         points = self._points(self.settings.followed_anchors)
         return self._indirect(points), self._from_camera(points)
 
+    # ---- Light that the projector's lens scatters
+
+    @cached_property
+    def glare(self) -> CombinedTracer | None:
+        """Follows light that the projector's lens scatters, to the same points; none where it scatters none."""
+        scattered = replace(self.setup, projector=self.setup.projector.scattered)
+        if scattered.projector.share == 0:
+            return None
+        direct = DirectTracer(scattered, 1, self.settings.anchors > 1)
+        indirect = self._indirect(self._mean_points, setup=scattered)
+        return CombinedTracer(*filter(None, (direct, indirect)))
+
     @property
     def _mean_points(self) -> SensorPoints:
         return self._points(1, self.settings.followed_anchors > 1)
@@ -115,11 +127,14 @@ class Tracers(Grids):
     def _points(self, anchors: int, spread: bool = False) -> SensorPoints:
         return SensorPoints(self.physics.geometry.half_width, anchors, spread, self.settings.depth)
 
-    def _indirect(self, points: SensorPoints, shared: bool = False) -> IndirectTracer | None:
+    def _indirect(
+        self, points: SensorPoints, shared: bool = False, setup: OpticalSetup | None = None
+    ) -> IndirectTracer | None:
+        """In the ``setup``, if not in that of all light that the lens does not scatter."""
         paths = Paths(self.physics.mirrors, self.physics.interreflection)
         if not (paths.mirrors or paths.interreflection):
             return None
-        return (PathReuseTracer if shared else IndirectTracer)(self.setup, paths, points)
+        return (PathReuseTracer if shared else IndirectTracer)(setup or self.setup, paths, points)
 
     def _from_camera(self, points: SensorPoints) -> FromCamera | None:
         physics, counted_lamps = self.physics, self.bench.counted_lamps
@@ -256,6 +271,8 @@ _ROWS = (
          effects=FOLLOWED, anchors="followed_anchors", device="room", pilot="followed", key="followed"),
     Pass("camera_residual", "from camera at anchors", lambda made: made.at_anchors[1], 1.3e-7, "indirect_residual",
          effects=FOLLOWED, anchors="followed_anchors", pilot="followed", key="followed_from_camera"),
+    Pass("glare", "glare", lambda made: made.glare, 3e-7, "fine", "indirect",
+         effects=frozenset({"glare"})),
 )  # fmt: skip
 """In the order in which they are traced and their light is added up. Unit costs were chosen near what was measured of
 eight shipped scenes on two cores (plans at 1e-3, November 2026); only their ratios decide. Direct light takes half as

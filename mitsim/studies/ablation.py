@@ -20,7 +20,7 @@ under the geometric shadow of the mask. Between that and the light itself nothin
   effect of nature, but what the simulation adds at its accuracy.
 
 The truth is the same for all. Not taken out: what lies in the idealised model as well (response of pixels, thickness of
-the mask); light of sharp lobes is not moved, and indirect light stays where it is seen.
+the mask), and glare; it and light of sharp lobes are not moved, and indirect light stays where it is seen.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.light.grids import LightEstimate
 from mitsim.light.light import SampledLight, traced_again
-from mitsim.light.passes import PASSES
+from mitsim.light.passes import FOLLOWED, PASSES
 from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation, TracedPass, expected_of
 from mitsim.light.truth import Truth
@@ -123,7 +123,8 @@ class Ablation:
         bench, moved = self.light.bench, off & _MOVED
         # Light over mirrors lies among direct light, and only tracing tells one from the other.
         direct = self._trace(direct=True, off=moved) if moved or MIRRORS in self.effects else self.light
-        flux = self._exact if RENDER_NOISE in off else self.light.flux
+        share = self.light.simulation.physics.projector.share  # the truth has no glare
+        flux = share * self._exact if RENDER_NOISE in off else self.light.flux
         by_pixel = np.divide(flux, direct.flux, out=np.ones_like(flux), where=direct.flux > 0)
         groups = tuple(_scale(group, np.append(by_pixel * self._brightness(off), 0.0)) for group in direct.groups)
         if GLOSS in off:
@@ -200,7 +201,7 @@ class AblatedLight(SampledLight):
 
 
 class _Filing(Simulation):
-    """Direct light, or all other, accumulated where it would be seen without the effects ``off``."""
+    """Direct light with its glare, or all other, accumulated where it would be seen without the effects ``off``."""
 
     def __init__(self, bench: Apparatus, settings: Settings, direct: bool, off: frozenset[str]) -> None:
         super().__init__(bench, settings)
@@ -208,7 +209,9 @@ class _Filing(Simulation):
 
     @cached_property
     def passes(self) -> Mapping[str, TracedPass]:
-        return {name: each for name, each in super().passes.items() if each.row.even == self._only_direct}
+        return {
+            name: each for name, each in super().passes.items() if (each.row.effects >= FOLLOWED) != self._only_direct
+        }
 
     def accumulator(self, name: str, labels: Labels, lines: int) -> DeviceAccumulator | None:
         # What is added up on the device lies where it was traced.

@@ -40,6 +40,7 @@ from mitsim.transport.integrator import (
     PathIntegrator,
     Paths,
     PathState,
+    Tracer,
     Turn,
     camera_part,
     is_delta,
@@ -486,7 +487,7 @@ class LampTracer(FromCameraTracer):
 class CombinedTracer:
     """Light that several tracers follow, of the same samples of each."""
 
-    def __init__(self, *tracers: FromCameraTracer) -> None:
+    def __init__(self, *tracers: Tracer) -> None:
         """``tracers`` of one scene."""
         self.tracers = tracers
 

@@ -45,6 +45,8 @@ class ProjectorOptics:
     ``aperture`` is the lens radius [mm] (0: a pinhole), ``focus`` the distance of the sharp plane [mm], ``blur`` the
     standard deviation of a projector pixel's spot, in projector pixels. ``lines`` are those that spectral variants
     trace its light at; None: wavelengths drawn from all. ``parted`` tells that glass sends each wavelength its own way.
+    ``share`` is the part of a pixel's light that leaves by the pixel; the lens scatters the rest, with a standard
+    deviation of ``glare_spread`` pixels.
     """
 
     emitter: mi.Emitter
@@ -57,6 +59,14 @@ class ProjectorOptics:
     blur: float = 0.0
     lines: Lines | None = None
     parted: bool = False
+    share: float = 1.0
+    glare_spread: float = 0.0
+
+    @property
+    def scattered(self) -> ProjectorOptics:
+        """The light that the lens scatters, as if it were another projector's: wide spots."""
+        spread = math.hypot(self.blur, self.glare_spread)
+        return replace(self, share=1 - self.share, blur=spread, glare_spread=0.0)
 
     @property
     def per_wavelength(self) -> tuple[ProjectorOptics, ...]:
@@ -207,7 +217,7 @@ class ProjectorRays:
         at.wavelengths = wavelengths
         at.p = self._origin + mi.Matrix3f(self._map.turn.tolist()) @ (centre * _FAR)
         _, weight = self.projector.emitter.sample_direction(at, mi.Point2f(0.5), True)
-        area = self._map.pixel_area(self.projector.canvas)
+        area = self._map.pixel_area(self.projector.canvas) * self.projector.share
         return weight * (_FAR**2 * dr.rsqrt(dr.squared_norm(centre)) * area)
 
     @property

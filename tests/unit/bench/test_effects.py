@@ -27,6 +27,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 N, Z = 16, 400.0
 IDEAL = 'name = "pinhole"\neffective_wavelength_nm = 562.0\n'
 REAL = f"{IDEAL}contrast_ratio = 100.0\naperture_radius_mm = 3.0\nblur_pixels = 0.6\nspeckle_contrast = 0.02\n"
+REAL += "ansi_contrast = 50.0\n"
 NUMBERS = (
     '<float name="mask_thickness" value="0.05"/><float name="pixel_fill_factor" value="0.6"/>'
     '<float name="angular_exponent" value="3"/>'

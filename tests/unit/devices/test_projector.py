@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from mitsim.core.configuration import load_model, shipped, validate
 from mitsim.core.errors import MitsimError
@@ -44,6 +45,8 @@ def test_a_mistyped_field_is_refused_with_the_field_it_resembles(tmp_path: Path)
         ("speckle_contrast", 1.5, "range: 0 to 1"),
         ("effective_wavelength_nm", 0.0, r"range: 1 to 1e\+06"),
         ("contrast_ratio", 1.0, "greater than 1"),
+        ("ansi_contrast", 1.0, "greater than 1"),
+        ("glare_spread", 0.0, "range: 0.1 to 2"),
         ("luminous_efficacy_lm_per_w", 900.0, "range: 0 to 684"),
         ("columns", 1920.0, "integer"),
         ("laser_class", "5", "'3R'"),
@@ -54,6 +57,37 @@ def test_a_mistyped_field_is_refused_with_the_field_it_resembles(tmp_path: Path)
 def test_a_value_beyond_any_device_is_refused_with_its_range(field: str, value: object, rule: str) -> None:
     with pytest.raises(MitsimError, match=rf"^here: [^\n]*{field}[^\n]*{rule}[^\n]*$"):
         validate(ProjectorModel, {**BASE, field: value}, "here")
+
+
+@pytest.mark.parametrize(("contrast", "black", "spread"), [(200.0, 0.0, 0.25), (20.0, 2e-3, 0.25), (6.0, 0.01, 0.1)])
+def test_a_scattered_chessboard_has_the_ansi_contrast(contrast: float, black: float, spread: float) -> None:
+    """Scattered by SciPy's Gaussian, 160 points a side; the middles lie between four of them."""
+    ratio = 1 / black if black else math.inf
+    model = ProjectorModel(**BASE, contrast_ratio=ratio, ansi_contrast=contrast, glare_spread=spread)
+    side, field = 160, 40
+    white = np.add.outer(np.arange(side) // field, np.arange(side) // field) % 2 == 1
+    board = np.where(white, 1.0, black)
+    spots = gaussian_filter(np.pad(board, 2 * side), spread * side, mode="constant", truncate=8.0)
+    light = (1 - model.glare) * board + model.glare * spots[2 * side : -2 * side, 2 * side : -2 * side]
+    middles = [place for start in range(field // 2 - 1, side, field) for place in (start, start + 1)]
+    seen, bright = light[np.ix_(middles, middles)], white[np.ix_(middles, middles)]
+    assert seen[bright].mean() / seen[~bright].mean() == pytest.approx(contrast, rel=1e-3)
+
+
+def test_a_lens_scatters_nothing_unless_its_file_says_so() -> None:
+    assert ProjectorModel(**BASE).glare == ProjectorModel(**BASE, contrast_ratio=100.0).glare == 0
+
+
+@pytest.mark.parametrize(
+    ("given", "rule"),
+    [
+        ({"ansi_contrast": 100.0, "contrast_ratio": 100.0}, r"got 100, and black pixels leave 100 \(contrast_ratio\)"),
+        ({"ansi_contrast": 1.2, "glare_spread": 0.1}, "got 1.2, which a lens that scatters all light exceeds"),
+    ],
+)
+def test_a_contrast_that_no_lens_leaves_is_refused(given: dict[str, float], rule: str) -> None:
+    with pytest.raises(MitsimError, match=rf"^here: [^\n]*ansi_contrast: {rule}[^\n]*give[^\n]*$"):
+        validate(ProjectorModel, {**BASE, **given}, "here")
 
 
 def test_a_spectrum_is_of_photons_and_some_line_has_power() -> None:

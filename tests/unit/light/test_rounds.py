@@ -5,11 +5,12 @@ from itertools import product
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from mitsim.light.cost_model import FIXED, SHARED_COST
 from mitsim.light.passes import EVEN, even
-from mitsim.light.sampling import SampledPass, cheapest_samples, first_samples, next_samples
+from mitsim.light.sampling import Group, SampledPass, cheapest_samples, first_samples, next_samples, trace_groups
 from mitsim.transport.path_reuse import PathReuseTracer
 
 LIGHTS = (
@@ -64,6 +65,32 @@ def test_a_heavy_path_makes_its_own_light_grow() -> None:
     assert found == {"direct": 32, "indirect": grown, "penumbra": 6, "from_camera": 9, "indirect_residual": 9}
 
 
+def test_two_lights_share_the_work_whatever_their_sizes() -> None:
+    """Against every number of samples of the first, of variances, samples and work over decades.
+
+    (Planted: a light rests by another power of what the others' next sample gains.)
+    """
+    rng = np.random.default_rng(7)
+    for _ in range(40):
+        variances, works = 10 ** rng.uniform(-2, 0, 2), 10 ** rng.uniform(-3, 1, 2)
+        done = rng.integers(2, 60, 2)
+        lights = [
+            SampledPass(name, int(count), variance, work)
+            for name, count, variance, work in zip(("indirect", "from_camera"), done, variances, works, strict=True)
+        ]
+        allowed = variances.sum() / rng.uniform(1.1, 6)
+        found = cheapest_samples(lights, allowed)
+        assert sum(light.left(found[light.name]) for light in lights) <= allowed * (1 + 1e-9)
+        assert all(found[light.name] >= light.done for light in lights)
+        first = np.arange(done[0], 40 * done[0] + 1)
+        rest = allowed - variances[0] * done[0] / first
+        second = np.maximum(
+            np.divide(variances[1] * done[1], rest, out=np.full(len(rest), np.inf), where=rest > 0), done[1]
+        )
+        least = float((works[0] * first + works[1] * second).min())
+        assert works[0] * found["indirect"] + works[1] * found["from_camera"] <= least + works.sum()
+
+
 def test_where_nothing_is_enough_all_grow_as_far_as_they_may() -> None:
     lights = [SampledPass("direct", 24, 0.5, 3.0), SampledPass("indirect", 10, 0.5, 2.0)]
     assert cheapest_samples(lights, 0.0) == {"direct": 192, "indirect": 80}
@@ -79,6 +106,43 @@ def of_lanes(paths_per_sample: int) -> Any:
     return SimpleNamespace(paths_per_sample=paths_per_sample)
 
 
+class Counted:
+    """Light of a pass in place of paths': that of sample i is i, and one launch takes four of them."""
+
+    name, row, paths_per_sample = "indirect", SimpleNamespace(stream="own"), 5
+
+    def __init__(self) -> None:
+        self.traced: list[int] = []
+        self.simulation: Any = SimpleNamespace(
+            passes={self.name: SimpleNamespace(tracer=self, row=self.row, trace=self.trace)},
+            paths_at_once=4 * self.paths_per_sample,
+            accumulators=lambda name, labels, lines: (),
+            accumulate=lambda name, found, labels, samples: found / samples,
+        )
+
+    def trace(self, seed: int, first: int, samples: int, accumulators: object) -> Any:
+        assert 0 < samples <= 4
+        numbers = range(first, first + samples)
+        self.traced += numbers
+        return SimpleNamespace(by_line=lambda lines: [float(sum(numbers)) * (line + 1) for line in range(lines)])
+
+
+def test_rounds_go_on_where_the_last_one_ended() -> None:
+    """What groups hold is the mean over their samples, each traced once, after every round; of every line.
+
+    (Planted: the first round's mean not spread over the samples of both; groups not traced.)
+    """
+    lights = [Counted(), Counted()]
+    groups = [Group(each.simulation, np.zeros(4, dtype=np.int64), 3, lines=2) for each in lights]
+    for samples in (3, 10, 10):
+        trace_groups(groups, {"indirect": samples})
+        for each, group in zip(lights, groups, strict=True):
+            assert each.traced == list(range(samples)) and group.done == {"indirect": samples}
+            assert group.paths == 5 * samples
+            mean = (samples - 1) / 2
+            assert (group.light(), group.light(1), group.part("indirect")) == pytest.approx((mean, 2 * mean, mean))
+
+
 def test_sampling_begins_with_what_is_predicted_or_less_where_most_is_followed() -> None:
     assert first_samples(simulated(direct=(of_lanes(10), 24.0), indirect=(of_lanes(10), 20.0))) == {
         "direct": 24,
@@ -88,6 +152,8 @@ def test_sampling_begins_with_what_is_predicted_or_less_where_most_is_followed()
         "direct": 24,
         "indirect": 32,
     }
+    few = simulated(direct=(of_lanes(1000), 24.0), indirect=(of_lanes(10), 40.0))
+    assert first_samples(few) == {"direct": 24, "indirect": 40}, "paths count, not samples"
 
 
 def test_the_next_round_lowers_the_variance_by_what_is_missing_and_a_twentieth() -> None:

@@ -27,6 +27,7 @@ contrast_ratio = 100.0
 aperture_radius_mm = 3.0
 focus_mm = 300.0
 blur_pixels = 0.6
+ansi_contrast = 20.0
 """
 NUMBERS = (
     '<float name="mask_thickness" value="0.05"/><float name="pixel_fill_factor" value="0.6"/>'
@@ -85,7 +86,7 @@ def test_every_effect_off_is_the_geometric_model(bench: Bench) -> None:
 def test_neutral_parts(bench: Bench) -> None:
     off = simulation(bench)
     assert off.physics.projector.ideal and off.physics.black_level == 0
-    assert off.from_camera is off.indirect is off.anchored is None
+    assert off.from_camera is off.indirect is off.anchored is off.glare is None
     assert (
         not off.physics.lamps
         and off.physics.spectrum is None
@@ -101,7 +102,7 @@ def test_a_plan_says_how_large_the_spots_of_a_lens_are(bench: Bench) -> None:
 
 PARTS = (
     *("interreflection", "mirrors", "ambient", "diffraction", "mask-thickness", "pixel-response", "aperture", "blur"),
-    "black-level",
+    *("glare", "black-level"),
 )
 """Effects that are told by what is simulated here."""
 
@@ -115,6 +116,7 @@ def test_each_effect_changes_its_own_part(bench: Bench, effect: str) -> None:
         "pixel-response": (on.physics.geometry.pixel_fill_factor, on.physics.geometry.angular_exponent) == (0.6, 3.0),
         "aperture": (on.physics.projector.aperture, on.physics.projector.focus) == (3.0, 300.0),
         "blur": on.physics.projector.blur == 0.6,
+        "glare": on.physics.projector.share < 1 and on.glare is not None,
         "black-level": on.physics.black_level == pytest.approx(BLACK),
         "diffraction": on.physics.spectrum is not None,
         "ambient": bool(on.physics.lamps) and on.from_camera is not None and len(on.from_camera.paths.emitters) == 1,

@@ -149,6 +149,20 @@ def test_falloff_over_pixels_is_that_of_a_matt_sheet(turned: SampledLight) -> No
     assert lit.mean() > 0.9 and np.allclose((even * truth.board_flux)[lit], truth.board_flux.mean())
 
 
+def test_light_that_moves_keeps_its_glare(shared_scene: Callable[..., Path], variant: str, tmp_path: Path) -> None:
+    """Of a projector of ANSI contrast 10, a fifth of all light: without blur or render noise frames are as bright.
+    (Planted: glare among light that is followed further; the truth's whole flux for a pixel's own.)"""
+    device = tmp_path / "device.toml"
+    device.write_text(PROJECTOR + "ansi_contrast = 10.0\n")
+    path = shared_scene("glare", reflectance=PRINT)
+    light = ms.open_bench(path, variant, projector=device).light(FAMILY, accuracy=1e-2)
+    assert 0.15 < light.bench.projector.glare < 0.25
+    for effect in (ablation.DEFOCUS, ablation.RENDER_NOISE):
+        assert frames(Ablation.of(light).without(frozenset({effect}))).sum() == pytest.approx(
+            frames(light).sum(), rel=0.02
+        )
+
+
 def test_falloff_is_the_fourth_power_of_the_cosine(far: SampledLight) -> None:
     """Of a shifted lens, seen from the sensor's centre: (1 + tan^2)^-2. (Planted: the square root.)"""
     rows, columns = (np.linspace(*window, far.bench.n + 1) for window in far.bench.windows)
