@@ -17,8 +17,7 @@ from mitsim.report.lit_scene import Unexposed
 from mitsim.report.plots import curves
 from mitsim.report.table import Mean, Table, Value
 from mitsim.studies.framework.claims import by_patterns, difference, finding, images, verdict, within
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
-from mitsim.studies.framework.setup import Point
+from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope
 from mitsim.studies.framework.studio import Studio
 
 RADIANCES = (1.17, 11.7, 117.0, 1170.0, 11700.0)

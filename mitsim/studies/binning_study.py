@@ -14,8 +14,7 @@ from mitsim.report import EQUAL_PEAK, MODELS, label
 from mitsim.report.plots import curves
 from mitsim.report.table import Value
 from mitsim.studies.framework import claims
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
-from mitsim.studies.framework.setup import Point
+from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope
 from mitsim.studies.framework.studio import Image, Studio
 
 BINNINGS = (1, 2, 4, 8)

@@ -32,8 +32,7 @@ from mitsim.report.table import Table, Value
 from mitsim.studies import daylight as by_lux
 from mitsim.studies.daylight import BY_LUX, GOAL, DaylitLine
 from mitsim.studies.framework.claims import difference, every, sample_mean, verdict, within
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, PageTable, Results, Scope
-from mitsim.studies.framework.setup import Point
+from mitsim.studies.framework.experiment import Claim, Experiment, Found, PageTable, Point, Results, Scope
 from mitsim.studies.framework.studio import Studio
 from mitsim.studies.lit_lines import LitLine, available_ways, daylight_frame, lit_lines, mosaic_shots, serving
 

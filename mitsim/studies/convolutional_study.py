@@ -41,8 +41,17 @@ from mitsim.report.plots import curves, image_grid
 from mitsim.report.table import Mean, Table, Value
 from mitsim.sensor.chain import dn_to_electrons, electrons_from_irradiance, expose, exposure_for_peak
 from mitsim.studies.framework.claims import Holds, every, image_array, near, sample_mean, verdict, verdict_at, within
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
-from mitsim.studies.framework.setup import QUICK_IMAGES, SIDE, Point, picture
+from mitsim.studies.framework.experiment import (
+    QUICK_IMAGES,
+    SIDE,
+    Claim,
+    Experiment,
+    Found,
+    Point,
+    Results,
+    Scope,
+    picture,
+)
 from mitsim.studies.framework.studio import Studio
 
 MEASURED, TRACED = "measured", "rendered"

@@ -42,8 +42,7 @@ from mitsim.report.plots import curves
 from mitsim.report.table import Mean, Table
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.studies.framework.claims import verdict, within
-from mitsim.studies.framework.experiment import Claim, Found, PageTable, Scope
-from mitsim.studies.framework.setup import Point, Setup
+from mitsim.studies.framework.experiment import Claim, Found, PageTable, Point, Scope, Setup
 from mitsim.studies.lit_lines import LitLine, expose_rates, peak_seconds
 
 LUMENS_A_WATT = 205.0

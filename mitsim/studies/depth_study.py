@@ -29,8 +29,7 @@ from mitsim.studies.framework.claims import (
     verdict,
     within,
 )
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope, group_by_setup
-from mitsim.studies.framework.setup import Point
+from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope, group_by_setup
 from mitsim.studies.framework.studio import Image, Studio
 
 CALIBRATED_MM = 400.0

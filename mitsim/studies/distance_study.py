@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, MODELS, label
 from mitsim.studies.framework import claims
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
-from mitsim.studies.framework.setup import Point
+from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope
 from mitsim.studies.framework.studio import Studio
 
 DISTANCES_MM = (0.5, 0.75, 1.0, 2.0, 4.0, 8.0)

@@ -28,8 +28,18 @@ from mitsim.report.plots import curves, pair_chart
 from mitsim.report.table import Mean, Table
 from mitsim.studies.drift_loss import DriftStand
 from mitsim.studies.framework.claims import difference, verdict, within
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope, group_by_setup, number_of
-from mitsim.studies.framework.setup import TEST_IMAGES, Point, Setup
+from mitsim.studies.framework.experiment import (
+    TEST_IMAGES,
+    Claim,
+    Experiment,
+    Found,
+    Point,
+    Results,
+    Scope,
+    Setup,
+    group_by_setup,
+    number_of,
+)
 from mitsim.studies.framework.studio import Studio
 
 _SEEDS = 4

@@ -18,8 +18,7 @@ from mitsim.report.lit_scene import Unexposed
 from mitsim.report.plots import quality_bars
 from mitsim.report.table import Mean
 from mitsim.studies.framework import claims
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
-from mitsim.studies.framework.setup import Point
+from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope
 from mitsim.studies.framework.studio import Image, Studio
 
 FRAMES = 49

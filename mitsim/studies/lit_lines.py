@@ -40,7 +40,7 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.mosaic import behind
 from mitsim.report.lit_scene import LAMBDAS, LitScene
 from mitsim.report.mosaic_images import MosaicCamera, Solver, solver_of
-from mitsim.studies.framework.setup import Setup
+from mitsim.studies.framework.experiment import Setup
 
 _SPECTRUM = re.compile(r'value="(\s*[\d.]+\s*:[^"]*)"')
 """Wavelengths and values, nm:value, as Mitsuba reads them."""

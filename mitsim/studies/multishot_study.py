@@ -48,8 +48,7 @@ from mitsim.report.lit_scene import IdealCamera, LitScene, Pair, Unexposed
 from mitsim.report.table import Table
 from mitsim.studies.framework import claims
 from mitsim.studies.framework.claims import Lines, image_array, images
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
-from mitsim.studies.framework.setup import QUICK_IMAGES, Point
+from mitsim.studies.framework.experiment import QUICK_IMAGES, Claim, Experiment, Found, Point, Results, Scope
 from mitsim.studies.framework.studio import Image, Studio, reason_of
 
 REACH = 15.0

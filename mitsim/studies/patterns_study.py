@@ -16,8 +16,7 @@ from mitsim.report.plots import singular_values
 from mitsim.report.table import Table
 from mitsim.studies.framework import claims
 from mitsim.studies.framework.claims import Lines
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
-from mitsim.studies.framework.setup import Point
+from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope
 from mitsim.studies.framework.studio import Studio
 
 FAMILIES = (

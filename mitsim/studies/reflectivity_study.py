@@ -41,8 +41,7 @@ from mitsim.report.plots import curves, image_grid
 from mitsim.report.table import Mean, Table, Value
 from mitsim.sensor.moments import frame_moments
 from mitsim.studies.framework.claims import Holds, difference, every, sample_mean, single_precision, verdict_at, within
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
-from mitsim.studies.framework.setup import Point, Setup
+from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope, Setup
 from mitsim.studies.framework.studio import Studio
 
 # -------- Light of a glossy scene and of its matt twin in

@@ -23,8 +23,7 @@ from mitsim.report.table import Table
 from mitsim.studies.diffraction_study import contrast, modulation, slanted_edge
 from mitsim.studies.framework import claims
 from mitsim.studies.framework.claims import Holds, image_array
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
-from mitsim.studies.framework.setup import PRINT_MM, Point
+from mitsim.studies.framework.experiment import PRINT_MM, Claim, Experiment, Found, Point, Results, Scope
 from mitsim.studies.framework.studio import Studio
 
 PAIRS_A_MM = (0.13, 0.17, 0.21, 0.26, 0.35, 0.43, 0.52, 0.6)

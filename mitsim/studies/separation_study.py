@@ -26,8 +26,7 @@ from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import LitScene, Unexposed
 from mitsim.report.plots import image_grid
 from mitsim.studies.framework.claims import every, sample_mean, single_precision, verdict, within
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
-from mitsim.studies.framework.setup import Point
+from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope
 from mitsim.studies.framework.studio import Studio
 from mitsim.studies.reflectivity_study import direct_of
 

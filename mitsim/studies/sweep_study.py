@@ -20,13 +20,14 @@ from mitsim.studies.framework.experiment import (
     OTHERS,
     Experiment,
     PageTable,
+    Point,
     Results,
     Scope,
+    Setup,
     check_sweep,
     group_by_setup,
     number_of,
 )
-from mitsim.studies.framework.setup import Point, Setup
 
 
 def _points(scope: Scope) -> Sequence[Point]:

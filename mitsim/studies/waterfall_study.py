@@ -52,8 +52,7 @@ from mitsim.report.table import Mean, Table
 from mitsim.studies import ablation
 from mitsim.studies.ablation import Ablation
 from mitsim.studies.framework.claims import TOLERANCE_DB, difference, single_precision, verdict, within
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
-from mitsim.studies.framework.setup import QUICK_IMAGES, Point
+from mitsim.studies.framework.experiment import QUICK_IMAGES, Claim, Experiment, Found, Point, Results, Scope
 from mitsim.studies.framework.studio import Studio
 
 # -------- A scene, its camera and names of effects in

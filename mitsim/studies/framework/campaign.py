@@ -20,9 +20,8 @@ from mitsim.core.files import read_json, sweep, write_json
 from mitsim.core.job import Job
 from mitsim.core.resources import workers
 from mitsim.studies import ALL, EXPERIMENTS, PAPER
-from mitsim.studies.framework.experiment import HEADS, Claim, Experiment, Found, Scope, find_experiment
+from mitsim.studies.framework.experiment import HEADS, Claim, Experiment, Found, Point, Scope, find_experiment
 from mitsim.studies.framework.run import POINTS, Shard, Store, batches, check_study_folder, study_folder, write_figures
-from mitsim.studies.framework.setup import Point
 from mitsim.studies.framework.workers import in_processes, on_cluster
 
 # What draws is imported where it is used: a study that cannot be is refused without it.

@@ -19,8 +19,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.report import EQUAL_PEAK, IDEALISED, MODELS, RENDERED, label
 from mitsim.report.plots import Curve, curves, image_grid
 from mitsim.report.table import Mean, Table, Value
-from mitsim.studies.framework.experiment import IMAGE, Claim, Found, Results
-from mitsim.studies.framework.setup import QUICK_IMAGES, Point
+from mitsim.studies.framework.experiment import IMAGE, QUICK_IMAGES, Claim, Found, Point, Results
 from mitsim.studies.framework.studio import Studio
 
 CONFIRMED, NOT_CONFIRMED, UNDECIDED = "confirmed", "not confirmed", "not decided at this size"

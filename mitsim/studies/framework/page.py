@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 
 from mitsim.core.environment import versions
 from mitsim.report.html import page_figure, render_page, write_html
-from mitsim.studies.framework.experiment import KNOBS, Claim, Experiment, PageTable, Results, Scope
-from mitsim.studies.framework.setup import TEST_IMAGES, Setup
+from mitsim.studies.framework.experiment import KNOBS, TEST_IMAGES, Claim, Experiment, PageTable, Results, Scope, Setup
 
 _NUMBER = re.compile(r"[+-]?\d|nothing$")
 """How a cell of a column of numbers begins."""

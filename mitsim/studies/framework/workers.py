@@ -17,8 +17,7 @@ from multiprocessing.process import BaseProcess
 from typing import TYPE_CHECKING, Any, cast
 
 from mitsim.core.errors import MitsimError
-from mitsim.studies.framework.experiment import Found
-from mitsim.studies.framework.setup import Point
+from mitsim.studies.framework.experiment import Found, Point
 
 if TYPE_CHECKING:
     from mitsim.studies.framework.studio import Studio

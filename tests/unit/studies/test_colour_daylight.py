@@ -16,8 +16,7 @@ from mitsim.report.table import Mean, Table
 from mitsim.studies import daylight as by_lux
 from mitsim.studies.daylight import BY_LUX, LEAST, METHODS, DaylitLine, claim_of, expected_delta_e, kept_lx, most
 from mitsim.studies.framework.claims import UNDECIDED
-from mitsim.studies.framework.experiment import Scope
-from mitsim.studies.framework.setup import Setup
+from mitsim.studies.framework.experiment import Scope, Setup
 
 N, PIXELS = 8, 15
 BOXES = ((0, 2, 1, 4), (3, 8, 5, 7), *[(0, 1, 0, 1)] * 22)

@@ -23,8 +23,7 @@ from mitsim.report.lit_scene import LitScene
 from mitsim.report.table import Table
 from mitsim.studies.drift_loss import SESSION, DriftStand, Outcome
 from mitsim.studies.drift_study import _move_projector
-from mitsim.studies.framework.experiment import Results, Scope, find_experiment
-from mitsim.studies.framework.setup import Setup
+from mitsim.studies.framework.experiment import Results, Scope, Setup, find_experiment
 from mitsim.studies.framework.studio import Studio
 
 pytestmark = pytest.mark.usefixtures("kept_plans")

@@ -18,8 +18,7 @@ from mitsim.report.lit_scene import LitScene
 from mitsim.report.table import Mean, Table
 from mitsim.studies.ablation import BLACK_LEVEL, DEPTH, FALLOFF, Ablation
 from mitsim.studies.framework.claims import UNDECIDED
-from mitsim.studies.framework.experiment import Results, Scope
-from mitsim.studies.framework.setup import Setup
+from mitsim.studies.framework.experiment import Results, Scope, Setup
 from mitsim.studies.framework.studio import Studio
 from mitsim.studies.waterfall_study import (
     ALONE,
