@@ -40,7 +40,7 @@ from mitsim.report.lit_scene import LitScene
 from mitsim.report.plots import bars
 from mitsim.report.table import Mean, Table
 from mitsim.studies.ablation import ablations, reform
-from mitsim.studies.drift_loss import SESSION, DriftStand, squared_error
+from mitsim.studies.drift_study import SESSION, DriftStand, squared_error
 from mitsim.studies.error_budget import (
     CAPTURE,
     DRIFT,

@@ -31,7 +31,7 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.report.lit_scene import SPECKLE
 from mitsim.studies import ablation
 from mitsim.studies.ablation import Ablation
-from mitsim.studies.drift_loss import AMBIENT, SESSION, DriftStand, Prediction, squared_error
+from mitsim.studies.drift_study import AMBIENT, SESSION, DriftStand, Prediction, squared_error
 from mitsim.studies.perturbation import Noise, Scatter
 
 CAPTURE, SCENE, DRIFT, SOLVER, UNEXPLAINED = "capture", "scene", "drift", "solver", "unexplained"

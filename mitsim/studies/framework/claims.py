@@ -272,6 +272,33 @@ def images(
     return {file: image_grid(grid, names or [str(value) for value in columns], title)} if grid else {}
 
 
+def family_images(
+    results: Results,
+    table: Table,
+    families: Sequence[str],
+    across: str,
+    columns: Sequence[Value],
+    title: str,
+    names: Sequence[str] | None = None,
+) -> dict[str, Figure]:
+    """A grid of the images of each shown print in both models for each pattern family, by file name.
+
+    Parameters
+    ----------
+    results, across, columns, names
+        as for :func:`images`.
+    table, families
+        rows of the results, and which of their families have a grid.
+    title
+        of a grid; braces are its family.
+    """
+    drawn: dict[str, Figure] = {}
+    for family in families:
+        file, lines = f"images_{family.replace(':', '')}.png", by_print(table.where(patterns=family))
+        drawn |= images(file, results, lines, across, columns, title.format(label(family)), names)
+    return drawn
+
+
 def by_exposure(
     table: Table, lines: Callable[[Table], Lines], by: str, axis: str, title: str, log: bool = False
 ) -> dict[str, Figure]:

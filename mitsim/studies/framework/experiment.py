@@ -22,7 +22,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.drift import Drift
 from mitsim.devices.patterns import read_name
 from mitsim.report import CONVENTIONS
-from mitsim.studies import ALL, EXPERIMENTS, STUDIES
+from mitsim.studies import ALL, EXPERIMENTS, SHARED, STUDIES
 
 if TYPE_CHECKING:
     import numpy as np
@@ -295,9 +295,10 @@ def find_experiment(name: str) -> Experiment:
     """
     if not is_experiment(name) or name == ALL:
         raise MitsimError(f"study {name!r}: there is no such study; use {', '.join((*STUDIES, *EXPERIMENTS))}")
-    module = name if "." in name else f"mitsim.studies.{name}_study"
+    module = name if "." in name else f"mitsim.studies.{SHARED.get(name, f'{name}_study')}"
     try:
-        found: Experiment = importlib.import_module(module).EXPERIMENT
+        loaded = importlib.import_module(module)
+        found: Experiment = loaded.EXPERIMENTS[name] if name in SHARED else loaded.EXPERIMENT
     except (ImportError, AttributeError) as error:
         raise MitsimError(
             f"study {name}: the module {module} cannot be used ({error}); it needs an EXPERIMENT"
