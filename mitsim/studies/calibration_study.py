@@ -421,49 +421,6 @@ class CalibrationFindings(Findings):
             if row.of == UNEXPLAINED and abs(row.squared_error) > SURE * row.deviation
         ]
 
-    def lines(self) -> list[str]:
-        """For people."""
-        entries = [
-            f"{row.factor:>5} factor: error {row.error:.2e}, predicted {row.predicted_error:.2e}; chi-square "
-            f"{row.chi_square:.3f} an entry, largest {row.largest:.1f} deviations"
-            for row in self.entries
-        ]
-        offs = np.array([row.off for row in self.singular if row.predicted_angle < _APART])
-        causes = [
-            f"{row.cause:>16}: {abs(row.part):.1e} ({decibels(abs(row.part)):.1f} dB)"
-            + (" less without it" if row.part > 0 else " more without it")
-            if row.part
-            else f"{row.cause:>16}: nothing"
-            for row in self.causes
-        ]
-        return [
-            *entries,
-            f"singular values: {len(offs)} of {len(self.singular)} stand apart from others"
-            + (f", rms {np.sqrt(np.mean(offs**2)):.2f} standard errors off" if len(offs) else ""),
-            f"separability residual {self.residual[1]:.2e}, {self.residual[0]:.2e} without noise; by cause:",
-            *causes,
-            f"{self.session['frames']:.0f} frames, {self.session['exposure_seconds']:.3g} s of exposure, "
-            f"{self.session['photons']:.3g} photons on the sensor",
-            *self._image_lines(),
-        ]
-
-    def _image_lines(self) -> Iterator[str]:
-        if not self.image:
-            return
-        image = self.image
-        yield (
-            f"image under {image['patterns']}: PSNR {image['psnr_db']:.2f} dB, {image['predicted_psnr_db']:.2f} as "
-            f"all its sources say, {image['frames']} frames, "
-            f"{image['exposure_seconds']:.3g} s of exposure, {image['photons']:.3g} photons; it loses by"
-        )
-        yield from (
-            f"{row.name:>42}: {row.lost_db:z.2f} +- {row.error_db:.2f} dB"
-            for row in self.losses
-            if abs(row.lost_db) >= _SAID_DB or row.of == UNEXPLAINED
-        )
-        yield from (_verdict(row) for row in self.losses if row.of == UNEXPLAINED)
-        yield from (f"not predicted: {text}" for text in self.not_predicted)
-
     def figures(self) -> dict[str, Figure]:
         """Maps of the entries' errors, singular values with their errors, and the residual by cause."""
         parts = {_cause(row): row.part for row in self.causes if row.part > 0}
@@ -490,37 +447,31 @@ class CalibrationFindings(Findings):
 
     def parts(self) -> Sequence[Part]:
         """Of the page: what an image loses, light and time, errors of the factors, what is not separable."""
-        found = [self._light_part()]
-        if self.losses:
-            found.insert(0, self._losses_part())
         entries = [
-            (
-                row.factor,
-                f"{row.error:.2e}",
-                f"{row.predicted_error:.2e}",
-                f"{row.chi_square:.3f}",
-                f"{row.largest:.1f}",
-            )
+            (row.factor, *(f"{each:.2e}" for each in (row.error, row.predicted_error)),
+             f"{row.chi_square:.3f}", f"{row.largest:.1f}")
             for row in self.entries
+        ]  # fmt: skip
+        offs = np.array([row.off for row in self.singular if row.predicted_angle < _APART])
+        rms = f", rms {np.sqrt(np.mean(offs**2)):.2f} standard errors off" if len(offs) else ""
+        causes = [
+            (_cause(row), f"{row.residual:.2e}", "nothing" if not row.part else f"{row.part:+.1e}")
+            for row in self.causes
         ]
-        found.append(
+        return [
+            *([self._losses_part()] if self.losses else []),
+            self._light_part(),
             Part(
                 "Errors of the factors",
                 "The left factor takes rows of the scene to rows of the sensor, the right one columns. Noisy factors "
                 "against those of frames without noise of the same light: relative error, found and predicted "
                 "from the sensor's closed form; mean square (1 if the prediction holds) and largest error of an entry, "
                 "in predicted standard deviations. Then each singular value's error, beside its predicted standard "
-                "error.",
+                f"error: {len(offs)} of {len(self.singular)} stand apart from others{rms}.",
                 ("Factor", "Relative error", "Predicted", "Chi-square an entry", "Largest [deviations]"),
                 tuple(entries),
-                (*self.maps_files, "singular.png"),
-            )
-        )
-        causes = [
-            (_cause(row), f"{row.residual:.2e}", "nothing" if not row.part else f"{row.part:+.1e}")
-            for row in self.causes
-        ]
-        found.append(
+                (*(f"{name}.png" for name in self.maps), "singular.png"),
+            ),
             Part(
                 "What is not separable",
                 f"No separable camera explains {self.residual[1]:.2e} of the noisy responses, {self.residual[0]:.2e} "
@@ -529,14 +480,8 @@ class CalibrationFindings(Findings):
                 ("Cause", "Residual without it", "Part"),
                 tuple(causes),
                 ("causes.png",),
-            )
-        )
-        return found
-
-    @property
-    def maps_files(self) -> tuple[str, ...]:
-        """Figures of the maps."""
-        return tuple(f"{name}.png" for name in self.maps)
+            ),
+        ]
 
     def _losses_part(self) -> Part:
         whole, image = sum(row.squared_error for row in self.losses) or np.nan, self.image

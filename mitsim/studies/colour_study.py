@@ -24,7 +24,6 @@ from matplotlib.figure import Figure
 from mitsim.acquire.capture import expose
 from mitsim.acquire.exposure import ambient_shots
 from mitsim.core.arrays import FloatArray
-from mitsim.core.display import lightness
 from mitsim.devices.chart import ChartPlace, load_chart
 from mitsim.metrics import psnr
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
@@ -33,7 +32,7 @@ from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.request import MARKOV, TIKHONOV
 from mitsim.report import label
 from mitsim.report.colour_image import by_patch, halves
-from mitsim.report.plots import BLUE, FONT, VERMILION, curves, figure_of, label_axes, panels_of
+from mitsim.report.plots import bars, curves, image_grid
 from mitsim.report.table import Mean, Table, Value
 from mitsim.studies.framework.claims import difference, every, sample_mean, verdict, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, PageTable, Point, Results, Scope, Setup
@@ -393,26 +392,15 @@ def _by_patch(table: Table) -> Figure:
 
 
 def _by_way(table: Table) -> Figure:
-    """Mean Delta E of each way to see colour, under 49 dots."""
+    """Mean Delta E of each way to see colour, under 49 dots, above the floor."""
     rows = table.where(patterns=_SHOWN)
-    ways = [way for way in rows.distinct("way") if way != BY_LUX]
-    figure, axes = figure_of(0.42 * len(ways) + 1.0)
-    means = [rows.mean("delta_e", way=way).value for way in ways]
-    bars = axes.barh(ways, means, color=BLUE)
-    axes.bar_label(
-        bars,
-        [f"{mean:.2f}, {rows.mean('psnr_db', way=way).value:.1f} dB" for mean, way in zip(means, ways, strict=True)],
-        padding=3,
-        fontsize=FONT - 1,
-    )
-    floor = rows.mean("floor").value
-    axes.axvline(floor, color=VERMILION, lw=1.5)
-    axes.text(floor, -0.75, f"floor {floor:.2f}", color=VERMILION, fontsize=FONT - 1, ha="center", va="bottom")
-    axes.invert_yaxis()
-    axes.margins(x=0.25)
-    axes.tick_params(labelsize=FONT - 1)
-    label_axes(axes, f"mean Delta E 2000 of 24 patches, {label(_SHOWN)}", "", grid="x")
-    return figure
+    means = {
+        f"{way}, {rows.mean('psnr_db', way=way).value:.1f} dB": rows.mean("delta_e", way=way)._replace(error=0.0)
+        for way in rows.distinct("way")
+        if way != BY_LUX
+    }
+    floor = {"floor, no camera": rows.mean("floor")._replace(error=0.0)}
+    return bars({"found": means, "floor": floor}, f"mean Delta E 2000 of 24 patches, {label(_SHOWN)}")
 
 
 def _patches(rows: Sequence[Mapping[str, Any]]) -> Figure:
@@ -425,17 +413,13 @@ def _patches(rows: Sequence[Mapping[str, Any]]) -> Figure:
 
 def _images(results: Results) -> Figure:
     """What each family of patterns recovers, in colour."""
-    figure, (places,) = panels_of(1, len(FAMILIES), 3.2)
-    for axes, family in zip(places, FAMILIES, strict=True):
-        row = results.table.where(way=OWN, patterns=family).rows[0]
-        image = results.array(row, _IMAGE)
-        if image is not None:
-            axes.imshow(lightness(linear_srgb(image)), interpolation="none")
-        axes.set(xticks=[], yticks=[])
-        mean = results.table.mean("delta_e", way=OWN, patterns=family).value
-        axes.set_title(label(family), fontsize=FONT)
-        axes.set_xlabel(f"{row['psnr_db']:.1f} dB, mean Delta E {mean:.2f}", fontsize=FONT - 1)
-    return figure
+    cells = []
+    for family in FAMILIES:
+        rows = results.table.where(way=OWN, patterns=family)
+        image = results.array(rows.rows[0], _IMAGE)
+        caption = f"{rows.rows[0]['psnr_db']:.1f} dB, mean Delta E {rows.mean('delta_e').value:.2f}"
+        cells += [(linear_srgb(image), caption)] if image is not None else []
+    return image_grid({OWN: cells}, [label(family) for family in FAMILIES])
 
 
 def _tables(results: Results) -> Sequence[PageTable]:

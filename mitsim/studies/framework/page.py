@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import wrap
 
 from matplotlib.figure import Figure
 
@@ -16,6 +17,8 @@ from mitsim.studies.framework.experiment import KNOBS, TEST_IMAGES, Claim, Exper
 
 _NUMBER = re.compile(r"[+-]?\d|nothing$")
 """How a cell of a column of numbers begins."""
+_LETTERS = 100
+"""Of a line of text, as wide as most terminals."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,14 @@ class Part:
         """Of which columns all cells begin with a number: these stand to the right."""
         columns = zip(*self.rows, strict=True)
         return tuple(any(cells) and all(not cell or _NUMBER.match(cell) for cell in cells) for cells in columns)
+
+    def lines(self) -> list[str]:
+        """As text: the title, what leads to the table, and the table, its columns as wide as they need be."""
+        table = [self.head, *self.rows] if self.rows else []
+        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+        sides = [str.rjust if right else str.ljust for right in self.numeric]
+        lines = ["  ".join(side(*cell) for side, *cell in zip(sides, row, widths, strict=True)) for row in table]
+        return [f"{self.title}:", *wrap(self.lead, _LETTERS), *(line.rstrip() for line in lines)]
 
 
 def flag_warnings(name: str, results: Results) -> tuple[str, ...]:

@@ -53,8 +53,8 @@ class Findings:
         raise NotImplementedError
 
     def lines(self) -> list[str]:
-        """For people."""
-        raise NotImplementedError
+        """For people: the page's parts, where the study says nothing shorter."""
+        return [line for part in self.parts() for line in part.lines()]
 
     def figures(self) -> Mapping[str, Figure]:
         """By file name."""

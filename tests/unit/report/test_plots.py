@@ -110,11 +110,14 @@ def test_legends_cover_no_point_and_lie_inside_the_figure() -> None:
 
 
 def test_solver_costs_shows_every_row_in_the_panel_of_its_lambda() -> None:
+    """And rings around what nothing beats."""
     figure = solver_study.solver_costs(SOLVER_ROWS)
     for axes, lam in zip(figure.axes, LAMBDAS, strict=True):
         assert axes.get_title().endswith(typeset(f"{lam:.0e}"))
         shown = [(line.get_xdata()[0], line.get_ydata()[0]) for line in axes.lines[:-1]]
         assert sorted(shown) == sorted((row.seconds, row.error) for row in SOLVER_ROWS if row.lambda_rel == lam)
+        front = plots.pareto_front(shown)
+        assert list(zip(*axes.lines[-1].get_data(), strict=True)) == front
     looks = {(line.get_color(), line.get_marker()) for line in figure.axes[0].lines[:-1]}
     assert len(looks) == len(METHODS) * len(LAYOUTS) * len(PRECISIONS)
 

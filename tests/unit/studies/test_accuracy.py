@@ -177,11 +177,11 @@ def test_what_is_written(result: StudyResult, study: AccuracyFindings, folder: P
 
 def test_extrapolated_points_are_hollow(study: AccuracyFindings) -> None:
     runs, reference = study.figures()["accuracy.png"].axes
-    faces = [
-        [line.get_markerfacecolor() for line in axes.lines if line.get_marker() in "os"] for axes in (runs, reference)
-    ]
-    assert len(faces[0]) == len([row for row in study.rows if not row.extrapolated]) and "white" not in faces[0]
-    assert len(faces[1]) == 3 + 1 and set(faces[1]) == {"white"}, "three points and the legend's"
+    count = len([row for row in study.rows if not row.extrapolated])
+    faces = [[line.get_markerfacecolor() for line in axes.lines] for axes in (runs, reference)]
+    assert len(faces[0]) == count + 1 + 2 and "white" not in faces[0], "points, rings, judge and sensor noise"
+    assert faces[1] == ["white"] * 3 + ["none"], "points and rings"
+    assert {text.get_text() for text in runs.texts} >= {"0.001"}
 
 
 def test_what_does_not_fit_is_left_out_and_named(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
