@@ -171,7 +171,7 @@ _TOLD = 0.1
 _SEEN, _BESIDE = slice(16, -16), slice(8, -8)
 """Pixels that are looked at: the margin is beside the bars of the sheet's other half, or beyond the print."""
 _FINEST = 0.52  # the paper's group 5
-_COARSE = 0.35
+_SHOWN_CYCLES = 0.35
 """Cycles a pixel up to which the truth must show bars: pixels that average over them leave 0.8 of their contrast."""
 _SHOWS = 0.4
 """Contrast that the truth must have of such bars: half of what print and pixels leave."""
@@ -199,7 +199,7 @@ def _resolution_measure(studio: Studio, point: Point) -> Found:
         pairs = zip(cycles / pixel_mm, transfer, strict=True)
         return Found(tuple({**row, "pairs_a_mm": float(each), "transfer": float(value)} for each, value in pairs))
     own = float(frequency) * pixel_mm
-    if own < _COARSE and (there := _contrast(lit.truth, own)) < _SHOWS:
+    if own < _SHOWN_CYCLES and (there := _contrast(lit.truth, own)) < _SHOWS:
         raise MitsimError(
             f"scene {point.setup.scene}: bars of {frequency} line pairs a mm show a contrast of {there:.2f} in its "
             f"truth; the study needs a print {PRINT_MM:g} mm wide, flat and facing the camera, that fills the image"

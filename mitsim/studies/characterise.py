@@ -9,12 +9,13 @@ thousand sessions of such statistics are evaluated as that of the frames is (GUM
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mitsim.core.arrays import FloatArray
@@ -42,6 +43,7 @@ from mitsim.sensor.emva import (
 from mitsim.sensor.moments import frame_moments
 from mitsim.sensor.specimen import dark_current_variance, mean_dark_current, response_variance
 from mitsim.studies.emva_options import Procedure, capacity_of, efficiency_of
+from mitsim.studies.framework.page import text_table
 from mitsim.studies.framework.run import study_folder, write_figures
 
 UNITS: Mapping[str, tuple[str, str]] = {
@@ -158,20 +160,18 @@ class Characterisation:
 
     def lines(self) -> list[str]:
         """For people."""
-        names = ("set", "expected", "found", "std. error")
-        head = f"{'figure':<26}{'symbol':<18}{'unit':<10}" + "".join(f"{name:>12}" for name in names) + f"{'off by':>8}"
-        lines = [
-            f"{self.sensor.name}: {self.procedure.pixels} x {self.procedure.pixels} pixels, "
-            f"{self.procedure.steps} steps of light"
-        ]
-        lines += [head]
-        for row in self.rows:
-            expected = "" if row.expected is None else f"{row.expected:.5g}"
-            lines.append(
-                f"{row.name:<26}{row.symbol:<18}{row.unit:<10}{row.set:>12.5g}{expected:>12}"
-                f"{round_to_error(row.found, row.standard_error):>12}"
-                f"{round_to_error(row.standard_error, row.standard_error):>12}{row.deviations:>8.1f}"
+        head = ("figure", "symbol", "unit", "set", "expected", "found", "std. error", "off by")
+        rows = [
+            (
+                row.name, row.symbol, row.unit, f"{row.set:.5g}",
+                "" if row.expected is None else f"{row.expected:.5g}",
+                *(round_to_error(number, row.standard_error) for number in (row.found, row.standard_error)),
+                f"{row.deviations:.1f}",
             )
+            for row in self.rows
+        ]  # fmt: skip
+        procedure = f"{self.procedure.pixels} x {self.procedure.pixels} pixels, {self.procedure.steps} steps of light"
+        lines = [f"{self.sensor.name}: {procedure}", *text_table(head, rows)]
         if any(row.expected is not None for row in self.rows):
             lines.append(
                 "expected: where the procedure finds another figure than the one set, at these steps and frames"
@@ -182,7 +182,8 @@ class Characterisation:
 
     def figures(self) -> Mapping[str, Figure]:
         """Plots by file name."""
-        return figures_of(self)
+        drawn = _photon_transfer(self), _linearity(self), _dark_current(self), _deviations(self)
+        return dict(zip(_FILES, drawn, strict=True))
 
 
 def characterise(
@@ -288,6 +289,7 @@ def _row(frames: Frames, name: str, found: FloatArray, sessions: FloatArray) -> 
 
 # -------- A characterisation in, its plots out
 
+_FILES = ("photon_transfer.png", "linearity.png", "dark_current.png", "deviations.png")
 _CLOSED: dict[str, Any] = {"color": GREY, "lw": 1.5, "label": "closed form"}
 _PAIRS: dict[str, Any] = {"color": BLUE, "lw": 0, "marker": "o", "ms": 5, "label": "pairs of frames"}
 """How what is expected and what was found are drawn."""
@@ -295,67 +297,64 @@ MOST_OFF = 5.0
 """Standard errors from which a figure is off: one of twenty figures is so by chance in 1e5 characterisations."""
 
 
-def figures_of(done: Characterisation) -> Mapping[str, Figure]:
-    """Plots of ``done``, by file name."""
-    return {
-        "photon_transfer.png": _photon_transfer(done),
-        "linearity.png": _linearity(done),
-        "dark_current.png": _dark_current(done),
-        "deviations.png": _deviations(done),
-    }
+def _chart(
+    done: Characterisation, seen: Callable[[Session], tuple[FloatArray, FloatArray]], title: str, x: str, y: str
+) -> tuple[Figure, Axes]:
+    """What is ``seen`` of the expected session, and of that of the frames."""
+    figure, axes = figure_of(0.45 * WIDTH)
+    for session, style in ((done.expected, _CLOSED), (done.session, _PAIRS)):
+        axes.plot(*seen(session), **style)
+    axes.set_title(title, fontsize=FONT + 1)
+    label_axes(axes, x, y)
+    return figure, axes
 
 
 def _photon_transfer(done: Characterisation) -> Figure:
     """Variance over signal, as found and as closed forms have it, and the line whose slope is the gain."""
-    figure, axes = figure_of(0.5 * WIDTH)
-    session, expected = done.session, done.expected
-    signal = session.ladder.mean - session.dark.mean
-    axes.plot(expected.ladder.mean - expected.dark.mean, expected.ladder.variance, **_CLOSED)
-    axes.plot(signal, session.ladder.variance, **_PAIRS)
-    gain = _figure(done, "system_gain").found
-    full = float(signal[int(session.ladder.variance.argmax())])
-    line = np.array([0.0, 0.7 * full])
-    label = "fit to 70 % of saturation"
-    axes.plot(line, session.dark.variance + gain * line, color=VERMILION, lw=2, ls="--", label=label)
+
+    def seen(session: Session) -> tuple[FloatArray, FloatArray]:
+        return session.ladder.mean - session.dark.mean, session.ladder.variance
+
+    title = f"Photon transfer: the gain is {_figure_text(done, 'system_gain')}"
+    figure, axes = _chart(done, seen, title, "signal less dark signal [DN]", "temporal variance [DN$^2$]")
+    signal, variance = seen(done.session)
+    full = float(signal[int(variance.argmax())])
+    line, label = np.array([0.0, 0.7 * full]), "fit to 70 % of saturation"
+    fit = done.session.dark.variance + _figure(done, "system_gain").found * line
+    axes.plot(line, fit, color=VERMILION, lw=2, ls="--", label=label)
     axes.axvline(full, color=ORANGE, lw=1.5, ls=":", label="largest variance: saturation")
-    axes.set_title(f"Photon transfer: the gain is {_figure_text(done, 'system_gain')}", fontsize=FONT + 1)
-    label_axes(axes, "signal less dark signal [DN]", "temporal variance [DN$^2$]")
     axes.legend(fontsize=FONT - 1, frameon=False, loc="upper left")
     return figure
 
 
 def _linearity(done: Characterisation) -> Figure:
     """Relative deviation of the signal from a line, over the photons."""
-    figure, axes = figure_of(0.42 * WIDTH)
-    for session, style in ((done.expected, _CLOSED), (done.session, _PAIRS)):
+
+    def seen(session: Session) -> tuple[FloatArray, FloatArray]:
         signal = session.ladder.mean - session.dark.mean
         full = signal[int(session.ladder.variance.argmax())]
         used = (signal >= 0.05 * full) & (signal <= 0.95 * full)
         slope, start = np.polyfit(session.photons[used], signal[used], 1, w=1 / signal[used])
-        line = start + slope * session.photons[used]
-        axes.plot(session.photons[used], 100 * (signal[used] / line - 1), **style)
-    axes.axhline(0, color=BLACK, lw=1)
+        return session.photons[used], 100 * (signal[used] / (start + slope * session.photons[used]) - 1)
+
     light = "photons on a pixel [1]" if done.sensor.states_efficiency else "photoelectrons of a pixel [e$^-$]"
     ends = [_figure(done, f"linearity_{end}").found for end in ("min", "max")]
-    axes.set_title(
-        f"Linearity: {typeset(f'{ends[0]:.2g}')} to {typeset(f'{ends[1]:+.2g}')} % off a line",
-        fontsize=FONT + 1,
-        loc="left",
-    )
-    label_axes(axes, light, "deviation from a line [%]")
-    axes.legend(fontsize=FONT - 1, frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1))
+    title = f"Linearity: {typeset(f'{ends[0]:.2g}')} to {typeset(f'{ends[1]:+.2g}')} % off a line"
+    figure, axes = _chart(done, seen, title, light, "deviation from a line [%]")
+    axes.axhline(0, color=BLACK, lw=1)
+    axes.legend(fontsize=FONT - 1, frameon=False)
     return figure
 
 
 def _dark_current(done: Characterisation) -> Figure:
     """Dark signal over exposure time."""
-    figure, axes = figure_of(0.42 * WIDTH)
-    gain = _figure(done, "system_gain").found
-    for session, style in ((done.expected, _CLOSED), (done.session, _PAIRS)):
-        dark = (session.dark_series.mean - done.sensor.superpixel_black_level_dn) / gain
-        axes.plot(session.dark_times, dark, **style)
-    axes.set_title(f"The dark current is {_figure_text(done, 'dark_current')}", fontsize=FONT + 1)
-    label_axes(axes, "exposure time [s]", "dark signal less black level [e$^-$]")
+
+    def seen(session: Session) -> tuple[FloatArray, FloatArray]:
+        signal = session.dark_series.mean - done.sensor.superpixel_black_level_dn
+        return session.dark_times, signal / _figure(done, "system_gain").found
+
+    title = f"The dark current is {_figure_text(done, 'dark_current')}"
+    figure, axes = _chart(done, seen, title, "exposure time [s]", "dark signal less black level [e$^-$]")
     axes.legend(fontsize=FONT - 1, frameon=False)
     return figure
 

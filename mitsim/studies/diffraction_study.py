@@ -53,6 +53,7 @@ from mitsim.report.lit_scene import (
     point_profiles,
     shadow_row,
 )
+from mitsim.report.table import Mean
 from mitsim.studies.ablation import reform
 from mitsim.studies.framework.run import Findings
 
@@ -140,11 +141,6 @@ class DiffractionFindings(Findings):
 
     def figures(self) -> dict[str, Figure]:
         """Image quality by the solver's factors, and shadows of a point."""
-        quality = [
-            (f"{row.frames}, {row.mask},\n{row.light}", row.factors, row.psnr_db)
-            for row in self.quality
-            if row.patterns == self.patterns
-        ]
         profiles = point_profiles(self.bench)
         # It lies on the projector's lines, to the width of a plotted line.
         del profiles[LINE]
@@ -152,7 +148,9 @@ class DiffractionFindings(Findings):
         message = f"A point's shadow in the projector's light is {100 * off.point_source:.0f} % off the geometric one"
         position = self.bench.geometry.centres(0)
         return {
-            "quality.png": quality_by_factors(quality, self.verdict),
+            "quality.png": quality_by_factors(
+                [row for row in self.quality if row.patterns == self.patterns], self.verdict
+            ),
             "shadow.png": shadow_profiles(position, profiles, _PROFILE_MM, message),
         }
 
@@ -262,26 +260,20 @@ _TITLE_LETTERS = 100
 """Of a line above a figure of the page's width."""
 
 
-def quality_by_factors(rows: Sequence[tuple[str, str, float]], message: str) -> Figure:
-    """PSNR [dB] of each system by the factors that its solver used, ``rows`` (system, factors, PSNR), first on top;
-    ``message`` above."""
-    systems = list(dict.fromkeys(system for system, _, _ in rows))[::-1]
-    factors = list(dict.fromkeys(name for _, name, _ in rows))
-    figure, axes = plots.figure_of(1.3 + 0.46 * len(systems))
-    for place, system in enumerate(systems):
-        values = [value for name, _, value in rows if name == system]
-        axes.plot([min(values), max(values)], [place, place], color=plots.LINK, lw=2, zorder=1)
-    for index, name in enumerate(factors):
-        points = [(value, systems.index(system)) for system, kind, value in rows if kind == name]
-        style = {
-            "color": (plots.VERMILION, plots.BLUE, plots.GREEN)[index % 3],
-            "marker": plots.MARKERS[index % len(plots.MARKERS)],
+def quality_by_factors(rows: Sequence[QualityRow], message: str) -> Figure:
+    """PSNR [dB] of each system in ``rows``, with geometric factors and with those that fit it; ``message`` above."""
+    assumed, fitting = (
+        {
+            f"{row.frames}, {row.mask}, {row.light}": Mean(row.psnr_db, np.nan, 1)
+            for row in rows
+            if (row.factors == ASSUMED) == geometric
         }
-        axes.plot(*zip(*points, strict=True), ls="", ms=8, label=name, zorder=3, **style)
-    axes.set_yticks(range(len(systems)), systems, fontsize=plots.FONT - 2)
-    plots.label_axes(axes, "PSNR of the image [dB]", "", grid="x")
+        for geometric in (True, False)
+    )
+    # Light that does not diffract is solved with the factors that fit it alone.
+    pairs = {system: (mean, fitting.get(system, mean)) for system, mean in assumed.items()}
+    figure = plots.pair_chart(pairs, (ASSUMED, f"{SEPARABLE}, or {CALIBRATED}"), "PSNR of the image [dB]")
     figure.suptitle(fill(message, _TITLE_LETTERS), fontsize=plots.FONT)
-    plots.legend_below(figure, len(factors), *axes.get_legend_handles_labels())
     return figure
 
 

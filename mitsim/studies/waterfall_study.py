@@ -426,9 +426,7 @@ def waterfall(panels: Mapping[str, Fall], seen: float) -> Figure:
         label_axes(axes, "PSNR [dB]" if axes is places[-1, 0] else "", "", grid="x")
     small = ", ".join(name for name in names if 0 < change[name] < seen)
     none = ", ".join(name for name in names if change[name] == 0)
-    sentences = [
-        "Changes of PSNR [dB] by each effect: bars in order, beside names alone and to the whole."
-    ]
+    sentences = ["Changes of PSNR [dB] by each effect: bars in order, beside names alone and to the whole."]
     sentences += [f"Less than {seen:g} dB each, in the bar called others: {small}."] if small else []
     sentences += [f"Nothing at all, as the scene does not call for them: {none}."] if none else []
     lines = [line for sentence in sentences for line in wrap(sentence, _LETTERS)]

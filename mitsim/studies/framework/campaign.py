@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from mitsim.studies.framework.page import Section
     from mitsim.studies.framework.studio import Studio
 
+# -------- A study by its name and scope in, its folder out
+
 
 @dataclass(frozen=True)
 class Where:

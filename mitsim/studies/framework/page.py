@@ -92,16 +92,25 @@ class Part:
     @property
     def numeric(self) -> tuple[bool, ...]:
         """Of which columns all cells begin with a number: these stand to the right."""
-        columns = zip(*self.rows, strict=True)
-        return tuple(any(cells) and all(not cell or _NUMBER.match(cell) for cell in cells) for cells in columns)
+        return _numeric(self.rows)
 
     def lines(self) -> list[str]:
-        """As text: the title, what leads to the table, and the table, its columns as wide as they need be."""
-        table = [self.head, *self.rows] if self.rows else []
-        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-        sides = [str.rjust if right else str.ljust for right in self.numeric]
-        lines = ["  ".join(side(*cell) for side, *cell in zip(sides, row, widths, strict=True)) for row in table]
-        return [f"{self.title}:", *wrap(self.lead, _LETTERS), *(line.rstrip() for line in lines)]
+        """As text: the title, what leads to the table, and the table."""
+        return [f"{self.title}:", *wrap(self.lead, _LETTERS), *text_table(self.head, self.rows)]
+
+
+def text_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table of ``rows`` under their ``head``, its columns as wide as they need be; none without rows."""
+    table = [head, *rows] if rows else []
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    sides = [str.rjust if right else str.ljust for right in _numeric(rows)]
+    lines = ["  ".join(side(*cell) for side, *cell in zip(sides, row, widths, strict=True)) for row in table]
+    return [line.rstrip() for line in lines]
+
+
+def _numeric(rows: Sequence[Sequence[str]]) -> tuple[bool, ...]:
+    columns = zip(*rows, strict=True)
+    return tuple(any(cells) and all(not cell or _NUMBER.match(cell) for cell in cells) for cells in columns)
 
 
 def flag_warnings(name: str, results: Results) -> tuple[str, ...]:
