@@ -56,6 +56,9 @@ _SHORT_AXIS = 30.0
 """Range of a logarithmic axis below which powers of ten alone leave one tick or none."""
 
 
+# -------- Figures
+
+
 def curves(
     panels: Mapping[str, Mapping[str, Curve]],
     x: str,

@@ -444,7 +444,7 @@ def _draw_fall(axes: Any, fall: Fall, large: Collection[str]) -> None:
     colours = [PALE, *(VERMILION if change < 0 else GREEN for change in changes), BLUE]
     starts, ends = [low, *levels[:-1], low], [fall.first.value, *levels[1:], fall.last.value]
     axes.barh(range(len(starts)), np.subtract(ends, starts), left=starts, color=colours)
-    texts = [f"{fall.first} dB", *(_signed(step.in_order) for step in steps), f"{fall.last} dB"]
+    texts = [f"{fall.first} dB", *(_with_sign(step.in_order) for step in steps), f"{fall.last} dB"]
     for row, (end, text) in enumerate(zip(np.maximum(starts, ends), texts, strict=True)):
         axes.annotate(text, (end, row), (5, 0), textcoords="offset points", fontsize=FONT - 2, va="center")
     axes.set_yticks(range(len(starts)), ["idealised", *map(_step_name, steps), "rendered"])
@@ -454,10 +454,10 @@ def _draw_fall(axes: Any, fall: Fall, large: Collection[str]) -> None:
 def _step_name(step: Step) -> str:
     """Name of a ``step``, and its changes the other two ways."""
     ways = {"alone": step.alone, "left out": step.left_out}
-    return ", ".join([step.name, *(f"{way} {_signed(mean)}" for way, mean in ways.items() if mean)])
+    return ", ".join([step.name, *(f"{way} {_with_sign(mean)}" for way, mean in ways.items() if mean)])
 
 
-def _signed(mean: Mean) -> str:
+def _with_sign(mean: Mean) -> str:
     return f"{mean:+}".replace("-", "\N{MINUS SIGN}")
 
 
