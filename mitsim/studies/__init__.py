@@ -34,6 +34,7 @@ EXPERIMENTS = (*PAPER, "colour", "drift", "models", "sweep")
 SHARED = {
     **dict.fromkeys(("distance", "binning", "resolution"), "camera_studies"),
     **dict.fromkeys(("patterns", "exposure", "ambient"), "light_studies"),
+    **dict.fromkeys(("reflectivity", "separation"), "scene_studies"),
 }
 """Modules of several studies of many points, whose ``EXPERIMENTS`` have each by its name."""
 ALL = "all"
