@@ -261,7 +261,8 @@ class MosaicShots:
 
         MitsimError for demosaicing without colour-demosaicing.
         """
-        solver = solver_of(WAYS[way], self.camera, patterns_of(self.family))
+        patterns = self.family.left.astype(np.float64), self.family.right.astype(np.float64)
+        solver = solver_of(WAYS[way], self.camera, patterns)
         with single_threaded_blas():
             return self._best(solver, way)
 
@@ -285,11 +286,6 @@ class MosaicShots:
         """Factors of all lines, and filters."""
         factors = [(line.factors.left, line.factors.right) for line in self.lines]
         return MosaicCamera.of(factors, filter_weights(self.lines), ARRAY)
-
-
-def patterns_of(family: PatternFamily) -> tuple[FloatArray, FloatArray]:
-    """P_L (n, K) and P_R (n', K') of a ``family``."""
-    return family.left.astype(np.float64), family.right.astype(np.float64)
 
 
 def mosaic_shots(lines: Lines, patterns: str, seed: int) -> MosaicShots:

@@ -277,15 +277,8 @@ def _measure(studio: Studio, point: Point) -> Found:
         )
         for model in MODELS
     ]
-    return Found(tuple(rows), _end_images(way, effect, without, having))
-
-
-def _end_images(
-    way: str, effect: str, without: Mapping[str, FloatArray], having: Mapping[str, FloatArray]
-) -> dict[str, FloatArray]:
-    """Images of the two ends, by model, as findings keep them."""
     ends_of = {EFFECTS[0]: without, EFFECTS[-1]: having} if way == IN_ORDER else {}
-    return single_precision(ends_of.get(effect, {}))
+    return Found(tuple(rows), single_precision(ends_of.get(effect, {})))
 
 
 def ends(way: str, effect: str) -> tuple[frozenset[str], frozenset[str]]:
