@@ -39,19 +39,10 @@ from mitsim.report.html import with_error
 from mitsim.report.lit_scene import LitScene
 from mitsim.report.plots import bars
 from mitsim.report.table import Mean, Table
+from mitsim.studies import error_budget
 from mitsim.studies.ablation import ablations, reform
 from mitsim.studies.drift_study import SESSION, DriftStand, squared_error
-from mitsim.studies.error_budget import (
-    CAPTURE,
-    DRIFT,
-    SCENE,
-    SOLVER,
-    SURE,
-    UNEXPLAINED,
-    LossRow,
-    entry_variances,
-    losses,
-)
+from mitsim.studies.error_budget import LossRow
 from mitsim.studies.framework.page import Part
 from mitsim.studies.framework.run import Findings
 
@@ -96,8 +87,8 @@ def measure(bench: Bench, request: Request, job: Job, recipe: SessionRecipe | No
     found = judge_session(lit, noisy, clean, tuple(_by_source(lit, noisy, clean, job)))
     scene = LitScene(bench.light(request.patterns, job, accuracy=request.accuracy, seed=request.seed))
     stand = DriftStand(scene, _factors(lit, noisy), recipe, family, request.seed)
-    rows, refused = losses(stand, lit, _factors(lit, clean))
-    explained = sum(row.squared_error for row in rows if row.of != UNEXPLAINED)
+    rows, refused = error_budget.losses(stand, lit, _factors(lit, clean))
+    explained = sum(row.squared_error for row in rows if row.of != error_budget.UNEXPLAINED)
     return replace(found, image=_image(stand, explained), losses=tuple(rows), not_predicted=tuple(refused))
 
 
@@ -181,7 +172,7 @@ def entry_deviation(lit: LitSession, clean: Estimate, side: str) -> FloatArray:
     side
         whose stripes give the factor.
     """
-    variances = entry_variances(lit, (clean.left, clean.right), side)
+    variances = error_budget.entry_variances(lit, (clean.left, clean.right), side)
     return np.asarray(np.sqrt(sum(variances.values(), np.zeros(1))))
 
 
@@ -285,8 +276,14 @@ def _row(cause: str, residual: float, left: float) -> ErrorSourceRow:
 _APART = 0.3
 """Predicted turn of its vectors [rad] up to which a singular value stands apart from others: beyond, noise mixes them,
 and bias and angle to first order do not hold."""
-_WHERE = {CAPTURE: "noise of the capture", SESSION: "noise of the session", SCENE: "light of the scene",
-          DRIFT: "drift, not in this image", SOLVER: "the solver", UNEXPLAINED: "anywhere"}  # fmt: skip
+_WHERE = {
+    error_budget.CAPTURE: "noise of the capture",
+    error_budget.SCENE: "light of the scene",
+    error_budget.DRIFT: "drift, not in this image",
+    error_budget.SOLVER: "the solver",
+    error_budget.UNEXPLAINED: "anywhere",
+    SESSION: "noise of the session",
+}
 """Where a loss comes from, in words."""
 _HAS, _WOULD = "has lost by noise, light and solver", "would lose by a drift"
 """What becomes of the image, as the figure calls it."""
@@ -418,7 +415,7 @@ class CalibrationFindings(Findings):
             "squared error, which may have a share in every other row; look for what the scene or the camera has that "
             "no row names"
             for row in self.losses
-            if row.of == UNEXPLAINED and abs(row.squared_error) > SURE * row.deviation
+            if row.of == error_budget.UNEXPLAINED and abs(row.squared_error) > error_budget.SURE * row.deviation
         ]
 
     def figures(self) -> dict[str, Figure]:
@@ -440,7 +437,7 @@ class CalibrationFindings(Findings):
         rated: dict[str, dict[str, Mean]] = {_HAS: {}, _WOULD: {}}
         for row in self.losses:
             if abs(row.lost_db) >= _SAID_DB:
-                rated[_WOULD if row.of == DRIFT else _HAS][row.name] = Mean(row.lost_db, row.error_db, 1)
+                rated[_WOULD if row.of == error_budget.DRIFT else _HAS][row.name] = Mean(row.lost_db, row.error_db, 1)
         if any(rated.values()):
             found["losses.png"] = bars(rated, "PSNR lost [dB]")
         return found
@@ -485,7 +482,7 @@ class CalibrationFindings(Findings):
 
     def _losses_part(self) -> Part:
         whole, image = sum(row.squared_error for row in self.losses) or np.nan, self.image
-        rest = [row for row in self.losses if row.of == UNEXPLAINED]
+        rest = [row for row in self.losses if row.of == error_budget.UNEXPLAINED]
         ordered = sorted((row for row in self.losses if row not in rest), key=lambda row: -row.lost_db)
         rows = [
             (
@@ -494,7 +491,7 @@ class CalibrationFindings(Findings):
                 row.amount,
                 with_error(row.lost_db, row.error_db),
                 ""
-                if row.of == DRIFT
+                if row.of == error_budget.DRIFT
                 else with_error(100 * row.squared_error / whole, 100 * row.deviation / whole, " %"),
             )
             for row in [*(row for row in ordered if abs(row.lost_db) >= _SAID_DB), *rest]
@@ -506,7 +503,7 @@ class CalibrationFindings(Findings):
             "What an image loses",
             f"The image of this scene under {image['patterns']} has a PSNR of {image['psnr_db']:.2f} dB with "
             f"these factors; all sources together say {image['predicted_psnr_db']:.2f} dB.{others}"
-            + ("" if any(row.of == DRIFT for row in self.losses) else _NO_DRIFT)
+            + ("" if any(row.of == error_budget.DRIFT for row in self.losses) else _NO_DRIFT)
             + untold,
             ("Where", "Source", "Amount", "PSNR lost [dB]", "Part of the error"),
             tuple(rows),
@@ -546,7 +543,7 @@ def _verdict(row: LossRow) -> str:
     if errors <= 1:
         return "what is not explained is within its standard error"
     size = f"what is not explained is {errors:.1f} of its standard errors"
-    if errors <= SURE:
+    if errors <= error_budget.SURE:
         return f"{size}, of which chance makes {math.erfc(errors / math.sqrt(2)):.1%} of all studies see as much"
     return f"{size}: the sources do not make the image's error, and a cause is missing"
 

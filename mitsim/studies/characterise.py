@@ -27,19 +27,9 @@ from mitsim.core.seeds import stream
 from mitsim.devices.sensor import EXPOSURE_S, SensorModel
 from mitsim.report.html import round_to_error, typeset
 from mitsim.report.plots import BLACK, BLUE, FONT, GREY, ORANGE, VERMILION, WIDTH, figure_of, label_axes
+from mitsim.sensor import emva
 from mitsim.sensor.chain import expose
-from mitsim.sensor.emva import (
-    LEAST_DARK,
-    QUANTISATION,
-    SPLIT,
-    Pair,
-    Session,
-    Stack,
-    figures,
-    pair_of,
-    pairs_of,
-    stack_of,
-)
+from mitsim.sensor.emva import Session
 from mitsim.sensor.moments import frame_moments
 from mitsim.sensor.specimen import dark_current_variance, mean_dark_current, response_variance
 from mitsim.studies.emva_options import Procedure, capacity_of, efficiency_of
@@ -57,8 +47,8 @@ UNITS: Mapping[str, tuple[str, str]] = {
     "linearity_max": ("LE_max", "%"),
     "dark_current": ("mu_I.mean", "e-/s"),
     "dark_current_by_variance": ("mu_I.var", "e-/s"),
-    **{f"dsnu_{part}": (f"DSNU1288.{part}", "e-") for part in SPLIT},
-    **{f"prnu_{part}": (f"PRNU1288.{part}", "%") for part in SPLIT},
+    **{f"dsnu_{part}": (f"DSNU1288.{part}", "e-") for part in emva.SPLIT},
+    **{f"prnu_{part}": (f"PRNU1288.{part}", "%") for part in emva.SPLIT},
 }
 """Symbol of the standard, and unit, of each figure in the order in which they are shown."""
 _SQUARES = ("row_noise", "dsnu", "prnu")
@@ -226,9 +216,9 @@ def _characterise(
 ) -> Characterisation:
     frames = Frames.of(sensor, procedure, capacity)
     expected = frames.expected()
-    spread = figures(draw_sessions(frames, expected))
+    spread = emva.figures(draw_sessions(frames, expected))
     session = frames.measured(job)
-    found = figures(session)
+    found = emva.figures(session)
     # Without a quantum efficiency light is counted in electrons, and there is none to find.
     names = [name for name in UNITS if sensor.states_efficiency or name != "quantum_efficiency"]
     rows = tuple(_row(frames, name, found[name], spread[name]) for name in names)
@@ -271,7 +261,7 @@ def _row(frames: Frames, name: str, found: FloatArray, sessions: FloatArray) -> 
     method |= bool(sensor.row_noise_e) and name.startswith(("dsnu", "prnu"))
     bias = 0.0 if method or not spread or sensor.bits is None else (centre - given) / spread
     method |= abs(bias) > _BIASED
-    if name == "dark_noise" and (given * sensor.gain_dn_per_e) ** 2 + QUANTISATION < LEAST_DARK:
+    if name == "dark_noise" and (given * sensor.gain_dn_per_e) ** 2 + emva.QUANTISATION < emva.LEAST_DARK:
         bias = 0.0  # it is found as the standard's limit, as it should be
     if name == "saturation_capacity":
         spread = math.hypot(spread, float(frames.electrons[0]) / math.sqrt(12))
@@ -470,8 +460,8 @@ class Frames:
         shot, read = (stream(self.procedure.seed, "characterise", noise, *names) for noise in ("shot", "read"))
         return np.asarray(expose(np.full(self.shape, electrons), exposure_s, self.sensor, shot, read), dtype=np.float64)
 
-    def _pair(self, electrons: float, exposure_s: float, name: str, index: int = 0) -> Pair:
-        return pair_of(*(self._frame(electrons, exposure_s, name, index, side) for side in (0, 1)))
+    def _pair(self, electrons: float, exposure_s: float, name: str, index: int = 0) -> emva.Pair:
+        return emva.pair_of(*(self._frame(electrons, exposure_s, name, index, side) for side in (0, 1)))
 
     def measured(self, job: Job) -> Session:
         """What the frames say, which are taken one after the other; ``job`` is told how far it is."""
@@ -483,16 +473,16 @@ class Frames:
         dark = in_threads(lambda step: self._pair(0.0, step[1], "dark series", step[0]), [*enumerate(self.dark_times)])
         job.progress("stacks", 0.5)
         stacks = in_threads(
-            lambda light: stack_of(self._frames(*light)), [(0.0, "dark stack"), (self.half, "bright stack")]
+            lambda light: emva.stack_of(self._frames(*light)), [(0.0, "dark stack"), (self.half, "bright stack")]
         )
         return Session(
             shape=self.shape,
             photons=self.photons,
-            ladder=pairs_of(steps),
+            ladder=emva.pairs_of(steps),
             dark=self._pair(0.0, self.exposure_s, "dark"),
             overexposed=np.asarray(self._frame(self.beyond, self.exposure_s, "overexposed").mean()),
             dark_times=self.dark_times,
-            dark_series=pairs_of(dark),
+            dark_series=emva.pairs_of(dark),
             dark_stack=stacks[0],
             bright_stack=stacks[1],
             rounded=self.sensor.bits is not None,
@@ -513,13 +503,13 @@ class Frames:
             dark=dark,
             overexposed=self._expected_pair(self.beyond).mean,
             dark_times=self.dark_times,
-            dark_series=pairs_of(series),
+            dark_series=emva.pairs_of(series),
             dark_stack=self._expected_stack(dark.mean, 0.0),
             bright_stack=self._expected_stack(self._expected_pair(self.half).mean, self.half),
             rounded=self.sensor.bits is not None,
         )
 
-    def _expected_pair(self, electrons: FloatArray | float, exposure_s: float | None = None) -> Pair:
+    def _expected_pair(self, electrons: FloatArray | float, exposure_s: float | None = None) -> emva.Pair:
         """Means over all pixels: undamaged ones, and dead ones, which see the dark."""
         time = self.exposure_s if exposure_s is None else exposure_s
         (lit, noise), (dark, still) = (
@@ -529,20 +519,20 @@ class Frames:
         mean, variance = (1 - dead) * lit + dead * dark, (1 - dead) * noise + dead * still
         rows = (self.sensor.superpixel_row_noise_e * self.sensor.gain_dn_per_e) ** 2
         pair = mean, variance, np.minimum(rows, variance)
-        return Pair(*(part if np.ndim(electrons) else part[0] for part in pair))
+        return emva.Pair(*(part if np.ndim(electrons) else part[0] for part in pair))
 
-    def _expected_stack(self, mean: FloatArray, electrons: float) -> Stack:
+    def _expected_stack(self, mean: FloatArray, electrons: float) -> emva.Stack:
         rows, columns, pixel = (self.slope(electrons) ** 2 * part for part in self.parts(electrons))
         m, n = self.shape
         parts = rows + columns + pixel, rows + pixel / n, columns + pixel / m
-        return Stack(mean, *(np.asarray(part) for part in parts))
+        return emva.Stack(mean, *(np.asarray(part) for part in parts))
 
     @property
     def alike(self) -> SensorModel:
         """The sensor with pixels that are all alike, of the same mean dark current, lit evenly."""
         names = (
-            *(f"dsnu_{part}_e" for part in SPLIT[1:]),
-            *(f"prnu_{part}" for part in SPLIT[1:]),
+            *(f"dsnu_{part}_e" for part in emva.SPLIT[1:]),
+            *(f"prnu_{part}" for part in emva.SPLIT[1:]),
             *("dark_current_spread_e_per_s", "hot_pixels", "hot_dark_current_e_per_s", "dead_pixels", "crosstalk"),
         )
         mean = self.sensor.dark_current_e_per_s + self.sensor.hot_pixels * self.sensor.hot_dark_current_e_per_s
@@ -580,7 +570,7 @@ def draw_sessions(frames: Frames, expected: Session) -> Session:
     leak = rng.standard_normal((_SESSIONS, 1)) * math.sqrt(dark_current_variance(sensor) / m / n)
     dark_electrons = mean_dark_current(sensor)
 
-    def pairs(pair: Pair, electrons: FloatArray, times: FloatArray | float) -> Pair:
+    def pairs(pair: emva.Pair, electrons: FloatArray, times: FloatArray | float) -> emva.Pair:
         mean, variance, rows = (np.atleast_1d(part)[None, :] for part in (pair.mean, pair.variance, pair.rows))
         own = variance - rows
         z = rng.standard_normal((3, _SESSIONS, mean.shape[1]))
@@ -590,7 +580,7 @@ def draw_sessions(frames: Frames, expected: Session) -> Session:
         spread = (2 * own**2 + fourth + 4 * own * rows) / m / n
         shared = np.sqrt(2.0 / m) * rows * z[2]
         alone = np.sqrt(2.0 / m) * own / n * rng.standard_normal(z[2].shape)
-        return Pair(mean, variance + np.sqrt(spread) * z[1] + shared, rows + shared + alone)
+        return emva.Pair(mean, variance + np.sqrt(spread) * z[1] + shared, rows + shared + alone)
 
     ladder = pairs(expected.ladder, frames.electrons, frames.exposure_s)
     dark = pairs(expected.dark, np.zeros(1), frames.exposure_s)
@@ -601,7 +591,7 @@ def draw_sessions(frames: Frames, expected: Session) -> Session:
         frames.shape,
         frames.photons,
         ladder,
-        Pair(*(part[:, 0] for part in (dark.mean, dark.variance, dark.rows))),
+        emva.Pair(*(part[:, 0] for part in (dark.mean, dark.variance, dark.rows))),
         beyond,
         frames.dark_times,
         series,
@@ -610,7 +600,7 @@ def draw_sessions(frames: Frames, expected: Session) -> Session:
     )
 
 
-def _drawn_stacks(frames: Frames, expected: Session, rng: np.random.Generator) -> tuple[Stack, Stack]:
+def _drawn_stacks(frames: Frames, expected: Session, rng: np.random.Generator) -> tuple[emva.Stack, emva.Stack]:
     """Dark and bright stacks as they may come out: sums of squares of offsets, responses and what is left of noise.
 
     By row, column and pixel these are independent; of f degrees of freedom, squares are chi-square and products of two
@@ -644,7 +634,7 @@ def _drawn_stacks(frames: Frames, expected: Session, rng: np.random.Generator) -
         total = (row * n + column * m + pixel) / (m * n - 1)
         mean = np.full(_SESSIONS, float(stack.mean))
         taken = each / count
-        stacks.append(Stack(mean, total - taken, row / m - taken / n, column / n - taken / m))
+        stacks.append(emva.Stack(mean, total - taken, row / m - taken / n, column / n - taken / m))
     return stacks[0], stacks[1]
 
 

@@ -34,21 +34,10 @@ from mitsim.report import label
 from mitsim.report.colour_image import by_patch, halves
 from mitsim.report.plots import bars, curves, image_grid
 from mitsim.report.table import Mean, Table, Value
+from mitsim.studies import lit_lines
 from mitsim.studies.framework.claims import difference, every, sample_mean, verdict, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, PageTable, Point, Results, Scope, Setup
 from mitsim.studies.framework.studio import Studio
-from mitsim.studies.lit_lines import (
-    FULL_LX,
-    DaylitLine,
-    LitLine,
-    available_ways,
-    daylight_frame,
-    expected_delta_e,
-    lit_lines,
-    mosaic_shots,
-    most,
-    serving,
-)
 
 # -------- Beside daylight of any brightness
 
@@ -84,7 +73,9 @@ def ladder_points(scope: Scope, setup: Setup) -> list[Point]:
     ]
 
 
-def measure_ladder(lines: Sequence[LitLine], light: tuple[FloatArray, float], point: Point, place: ChartPlace) -> Found:
+def measure_ladder(
+    lines: Sequence[lit_lines.LitLine], light: tuple[FloatArray, float], point: Point, place: ChartPlace
+) -> Found:
     """A row for every exposure and method, and one of the least for every illuminance.
 
     Parameters
@@ -105,22 +96,22 @@ def measure_ladder(lines: Sequence[LitLine], light: tuple[FloatArray, float], po
     def judged(means: FloatArray) -> FloatArray:
         return delta_e(model.xyz(means * board), known.xyz)
 
-    lit = [DaylitLine.of(line, light, str(point["patterns"]), int(point["seed"])) for line in lines]
+    lit = [lit_lines.DaylitLine.of(line, light, str(point["patterns"]), int(point["seed"])) for line in lines]
     draws = list(product(ladder, range(int(point["draws"]))))
-    exposures = [(lux / FULL_LX, draw) for lux, draw in draws]
+    exposures = [(lux / lit_lines.FULL_LX, draw) for lux, draw in draws]
     images = [each.images(exposures, [each.model, each.model.correlated()], each.shots) for each in lit]
     truth = place.means(np.stack([line.lit.truth for line in lines], axis=-1))
     goal = float(delta_e(model.xyz(known.at(model.wavelengths_nm)), known.xyz).mean()) + GOAL
 
     def least(lux: float, repeats: float = 1.0) -> float:
-        variances = [each.least_variance(lux / FULL_LX, place) / repeats for each in lit]
-        return expected_delta_e(truth, np.stack(variances, axis=-1), judged)
+        variances = [each.least_variance(lux / lit_lines.FULL_LX, place) / repeats for each in lit]
+        return lit_lines.expected_delta_e(truth, np.stack(variances, axis=-1), judged)
 
     def repeats(lux: float) -> float | None:
-        part = most(lambda part: least(lux, 1 / part) <= goal, *_VARIANCES)
+        part = lit_lines.most(lambda part: least(lux, 1 / part) <= goal, *_VARIANCES)
         return float(np.ceil(1 / part)) if part else None
 
-    kept = most(lambda lux: least(lux) <= goal, *_BETWEEN_LX)
+    kept = lit_lines.most(lambda lux: least(lux) <= goal, *_BETWEEN_LX)
     rows = [
         point.row(lux=lux, draw=draw, method=method, mean_delta_e=float(judged(place.means(image)).mean()))
         for (lux, draw), by_line in zip(draws, zip(*images, strict=True), strict=True)
@@ -250,7 +241,7 @@ def _points(scope: Scope) -> Sequence[Point]:
         OWN: FAMILIES,
         ONE: scope.chosen(FAMILIES, (_SHOWN,)),
         **{way: scope.chosen(FAMILIES, (_SHOWN,)) for way in DAYLIGHT},
-        **{f"mosaic, {way}": scope.chosen((_SHOWN, "hadamard:8"), (_SHOWN,)) for way in available_ways()},
+        **{f"mosaic, {way}": scope.chosen((_SHOWN, "hadamard:8"), (_SHOWN,)) for way in lit_lines.available_ways()},
     }
     points = [
         Point.of(setup, way=way, patterns=patterns, seed=seed)
@@ -263,36 +254,36 @@ def _points(scope: Scope) -> Sequence[Point]:
 
 def _measure(studio: Studio, point: Point) -> Found:
     setup, way, patterns, seed = point.setup, str(point["way"]), str(point["patterns"]), int(point["seed"])
-    lines = studio.once("lines", 1, (setup, seed), lambda: lit_lines(setup, seed))
+    lines = studio.once("lines", 1, (setup, seed), lambda: lit_lines.light_lines(setup, seed))
     if way.startswith("mosaic"):
-        shots = studio.once("mosaic", 1, (setup, patterns, seed), lambda: mosaic_shots(lines, patterns, seed))
+        shots = studio.once("mosaic", 1, (setup, patterns, seed), lambda: lit_lines.mosaic_shots(lines, patterns, seed))
         images = np.moveaxis(shots.images(way.removeprefix("mosaic, ")), 0, -1)
     elif way in (*DAYLIGHT, BY_LUX):
-        light = studio.once("daylight", 1, setup, lambda: daylight_frame(setup, studio.folder("daylight")))
+        light = studio.once("daylight", 1, setup, lambda: lit_lines.daylight_frame(setup, studio.folder("daylight")))
         if way == BY_LUX:
             return measure_ladder(lines, light, point, _place(setup.scene))
         images = _under_daylight(lines, light, DAYLIGHT[way], patterns, seed)
     else:
         middle = lines[len(lines) // 2]
-        factors = [line.factors if way == OWN else serving(line, middle) for line in lines]
+        factors = [line.factors if way == OWN else lit_lines.serving(line, middle) for line in lines]
         images = np.stack([_solve(*pair, patterns, seed) for pair in zip(lines, factors, strict=True)], axis=-1)
     truth = np.stack([line.lit.truth for line in lines], axis=-1)
     board = lines[0].factors.manifest.board_reflectance or 1.0
     return _judge(point, [line.wavelength_nm for line in lines], images * board, truth * board)
 
 
-def _solve(line: LitLine, factors: Factors, patterns: str, seed: int) -> FloatArray:
+def _solve(line: lit_lines.LitLine, factors: Factors, patterns: str, seed: int) -> FloatArray:
     """(n, n) image of a line, as a user's own frames are exposed and reconstructed."""
     return reconstruct(expose(line.lit.light, patterns, seed=line.seed(seed)), factors).image
 
 
 def _under_daylight(
-    lines: Sequence[LitLine], light: tuple[FloatArray, float], part: float, patterns: str, seed: int
+    lines: Sequence[lit_lines.LitLine], light: tuple[FloatArray, float], part: float, patterns: str, seed: int
 ) -> FloatArray:
     """(n, n, lines) images of frames beside a ``part`` of a lamp's ``light`` (irradiance and wavelength), less it."""
     images = []
     for line in lines:
-        lit = DaylitLine.of(line, light, patterns, seed)
+        lit = lit_lines.DaylitLine.of(line, light, patterns, seed)
         shots = 0 if lit.family.signed else ambient_shots(lit.family)
         images += lit.images([(part, seed)], [lit.model], shots)[0]
     return np.stack(images, axis=-1)

@@ -102,7 +102,7 @@ class LitLine:
         return integer(seed, "line", self.name)
 
 
-def lit_lines(setup: Setup, seed: int) -> tuple[LitLine, ...]:
+def light_lines(setup: Setup, seed: int) -> tuple[LitLine, ...]:
     """The scene of a setup in the light of each line.
 
     Parameters
