@@ -174,7 +174,6 @@ def _choose_samples(stand: Stand, settings: Settings) -> tuple[float, float, Set
 
 
 def _has(settings: Settings, name: str) -> bool:
-    """Whether ``settings`` have a part."""
     numbers = {
         "anchors": settings.anchors,
         "layers": len(settings.depths),

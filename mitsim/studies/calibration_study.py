@@ -93,7 +93,6 @@ def measure(bench: Bench, request: Request, job: Job, recipe: SessionRecipe | No
 
 
 def _factors(lit: LitSession, estimate: Estimate) -> Factors:
-    """The ``estimate`` of a session ``lit`` as factors of its camera."""
     session = lit.session
     manifest = CalibrationManifest(
         camera=session.bench.identity(),
@@ -549,5 +548,4 @@ def _verdict(row: LossRow) -> str:
 
 
 def _cause(row: ErrorSourceRow) -> str:
-    """The cause of a ``row`` in words."""
     return _ERROR_SOURCES.get(row.cause, row.cause.replace("-", " "))

@@ -290,7 +290,6 @@ MOST_OFF = 5.0
 def _chart(
     done: Characterisation, seen: Callable[[Session], tuple[FloatArray, FloatArray]], title: str, x: str, y: str
 ) -> tuple[Figure, Axes]:
-    """What is ``seen`` of the expected session, and of that of the frames."""
     figure, axes = figure_of(0.45 * WIDTH)
     for session, style in ((done.expected, _CLOSED), (done.session, _PAIRS)):
         axes.plot(*seen(session), **style)
@@ -318,8 +317,6 @@ def _photon_transfer(done: Characterisation) -> Figure:
 
 
 def _linearity(done: Characterisation) -> Figure:
-    """Relative deviation of the signal from a line, over the photons."""
-
     def seen(session: Session) -> tuple[FloatArray, FloatArray]:
         signal = session.ladder.mean - session.dark.mean
         full = signal[int(session.ladder.variance.argmax())]
@@ -337,8 +334,6 @@ def _linearity(done: Characterisation) -> Figure:
 
 
 def _dark_current(done: Characterisation) -> Figure:
-    """Dark signal over exposure time."""
-
     def seen(session: Session) -> tuple[FloatArray, FloatArray]:
         signal = session.dark_series.mean - done.sensor.superpixel_black_level_dn
         return session.dark_times, signal / _figure(done, "system_gain").found
@@ -350,7 +345,6 @@ def _dark_current(done: Characterisation) -> Figure:
 
 
 def _figure(done: Characterisation, name: str) -> Row:
-    """The figure of that ``name``."""
     return next(row for row in done.rows if row.name == name)
 
 
@@ -510,7 +504,6 @@ class Frames:
         )
 
     def _expected_pair(self, electrons: FloatArray | float, exposure_s: float | None = None) -> emva.Pair:
-        """Means over all pixels: undamaged ones, and dead ones, which see the dark."""
         time = self.exposure_s if exposure_s is None else exposure_s
         (lit, noise), (dark, still) = (
             frame_moments(np.atleast_1d(light), time, self.alike) for light in (electrons, np.zeros_like(electrons))

@@ -273,7 +273,6 @@ def _measure(studio: Studio, point: Point) -> Found:
 
 
 def _solve(line: lit_lines.LitLine, factors: Factors, patterns: str, seed: int) -> FloatArray:
-    """(n, n) image of a line, as a user's own frames are exposed and reconstructed."""
     return reconstruct(expose(line.lit.light, patterns, seed=line.seed(seed)), factors).image
 
 
@@ -373,7 +372,6 @@ def _figures(results: Results) -> Mapping[str, Figure]:
 
 
 def _by_patch(table: Table) -> Figure:
-    """Delta E of each patch: the floor, and what each family of patterns comes to."""
     names = [str(name) for name in table.distinct("patch")]
     found = {
         label(family): [table.mean("delta_e", patch=name, patterns=family).value for name in names]

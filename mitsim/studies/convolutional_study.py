@@ -97,7 +97,6 @@ def _points(scope: Scope) -> Sequence[Point]:
 
 @cache
 def _psf(file: str | None, variant: str) -> FloatArray:
-    """Of a picture, or of a rendered diffuser."""
     return rendered_psf(_SHAPE, _PITCH_MM, variant) if file is None else load_psf(file, _REDUCE)
 
 
@@ -194,17 +193,7 @@ def _psnr_claim(rows: Table, name: str, band: tuple[float, float]) -> Claim:
 
 
 def _judge(rows: Table, claim: str, paper: str, judge: Judge) -> Claim:
-    """A claim judged with each point spread function that was measured with; the measured one stands under "idealised".
-
-    Parameters
-    ----------
-    rows
-        what was measured.
-    claim, paper
-        what the paper says.
-    judge
-        from a point spread function to what is said of it, and whether the claim holds for it.
-    """
+    """A claim judged with each point spread function in ``rows``; that of the measured one stands under "idealised"."""
     said = {psf: judge(psf) for psf in rows.distinct("psf")}
     texts = {psf: f"{psf} PSF: {text}" for psf, (text, _) in said.items()}
     holds = claims.verdict(claims.every(*(each for _, each in said.values())))
@@ -474,7 +463,6 @@ def race(classes: Classes, whole: Classes, truth: FloatArray, sensor: SensorMode
 
 
 def _time(factorised: FactorisedClasses, frames: FloatArray, tolerance: float) -> tuple[Solution, float]:
-    """Solution of frames, and its CPU seconds."""
     start = time.process_time()
     solution = factorised.solve(factorised.classes.projected(frames), tolerance)
     return solution, time.process_time() - start

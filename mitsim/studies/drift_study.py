@@ -223,7 +223,6 @@ class DriftStand:
 
     @cached_property
     def _before(self) -> Solution:
-        """The image without any drift."""
         (sums,) = accumulate(self._frames.exposer(self.exposure_s), self.family, self._expected, [self._model])
         return self._model.solve(sums, "auto")
 
@@ -298,7 +297,6 @@ class DriftStand:
 
     @property
     def _noise(self) -> Noise:
-        """Of the frames, of the ambient frame, and of the session."""
         return sum(self.noises.values(), Noise())
 
     @cached_property

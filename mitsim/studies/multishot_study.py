@@ -86,7 +86,6 @@ def _measure(studio: Studio, point: Point) -> Found:
 
 
 def _still(studio: Studio, point: Point, lit: LitScene) -> dict[str, Image]:
-    """Images of as many uniform frames, or dots, as a point has, by exposure."""
     model, seed, n = point["model"], int(point["seed"]), lit.bench.n
     if point["patterns"] == DOTS:
         family = lit.bench.family(f"dots:{round(point['frames'] ** 0.5)}")
@@ -98,7 +97,6 @@ def _still(studio: Studio, point: Point, lit: LitScene) -> dict[str, Image]:
 
 
 def _moving(studio: Studio, point: Point, lit: LitScene) -> dict[str, Image]:
-    """Images through the moved mask, by exposure."""
     model, feature = point["model"], lit.bench.geometry.mask_feature
     columns: tuple[float, ...]
     if point["patterns"] == LINE:
@@ -129,7 +127,6 @@ def _factors(studio: Studio, point: Point, lit: LitScene) -> Places:
 
 
 def _spread(count: int, feature_mm: float) -> tuple[float, ...]:
-    """So many places [mm], evenly from one end to the other."""
     return tuple(float(place) for place in np.linspace(-REACH, REACH, count) * feature_mm)
 
 

@@ -313,7 +313,6 @@ def _reflectivity_figures(results: Results) -> Mapping[str, Figure]:
 
 
 def _curves(rows: Table) -> dict[str, dict[Value, Mean]]:
-    """PSNR of the image, and of an image with the errors of one cause alone, by roughness."""
     columns = {"psnr_matt_db": "image", **{f"{cause}_db": f"{name} alone" for cause, name in _NAMES.items()}}
     return {name: rows.means(column, "roughness") for column, name in columns.items()}
 

@@ -135,7 +135,6 @@ class Sessions:
         )
 
     def _estimate(self, off: frozenset[str]) -> Estimate:
-        """Factors of expected frames."""
         own = off & self._effects
         if own not in self._kept:
             self._kept[own] = self._by_lines(own)
@@ -445,7 +444,6 @@ def _draw_fall(axes: Any, fall: Fall, large: Collection[str]) -> None:
 
 
 def _step_name(step: Step) -> str:
-    """Name of a ``step``, and its changes the other two ways."""
     ways = {"alone": step.alone, "left out": step.left_out}
     return ", ".join([step.name, *(f"{way} {_with_sign(mean)}" for way, mean in ways.items() if mean)])
 
