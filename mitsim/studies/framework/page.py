@@ -104,8 +104,8 @@ def text_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     table = [head, *rows] if rows else []
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     sides = [str.rjust if right else str.ljust for right in _numeric(rows)]
-    lines = ["  ".join(side(*cell) for side, *cell in zip(sides, row, widths, strict=True)) for row in table]
-    return [line.rstrip() for line in lines]
+    lines = [[side(*cell) for side, cell in zip(sides, zip(row, widths, strict=True), strict=True)] for row in table]
+    return ["  ".join(cells).rstrip() for cells in lines]
 
 
 def _numeric(rows: Sequence[Sequence[str]]) -> tuple[bool, ...]:
