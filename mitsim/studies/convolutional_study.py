@@ -218,14 +218,14 @@ def _figures(results: Results) -> Mapping[str, Figure]:
         )
     drawn["seconds.png"] = _seconds(speed, psfs)
     few = [each for each in quality.distinct("patterns") if each in (1, 9, 49)]
-    lines = {
+    by_scene = {
         f"{name or 'scene'}, {psf}": quality.where(psf=psf, picture=name, exposure=EQUAL_FRAME)
         for psf in psfs
         for name in (*QUICK_IMAGES, None)
     }
     title = f"Images, exposure {EQUAL_FRAME}, best lambda"
     columns = [f"{count} frame{'s' if count > 1 else ''}" for count in few]
-    return drawn | claims.images("images.png", results, lines, "patterns", few, title, columns)
+    return drawn | claims.images("images.png", results, by_scene, "patterns", few, title, columns)
 
 
 def _seconds(speed: Table, psfs: Sequence[str]) -> Figure:
@@ -368,8 +368,8 @@ def best_by_psnr(solve: Callable[[float], Solution], truth: FloatArray, largest:
         if found > reached:
             best, reached = solution, found
     for step in _FINER:
-        claims.near = [solve(best.lam * 10**move) for move in (-step, step)]
-        best = max([best, *claims.near], key=lambda solution: psnr(solution.image, truth))
+        beside = [solve(best.lam * 10**move) for move in (-step, step)]
+        best = max([best, *beside], key=lambda solution: psnr(solution.image, truth))
     return best, psnr(best.image, truth)
 
 
