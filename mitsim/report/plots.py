@@ -293,8 +293,17 @@ def quality_bars(quality: Mapping[str, tuple[Mean, Mean]], title: str = "") -> F
 def error_bars(
     errors: Mapping[str, float], limit: float | None = None, bounds: Mapping[str, float] | None = None
 ) -> Figure:
-    """Relative ``errors`` by name, >= 0 (one of 0 has no dot), on a logarithmic axis, largest on top, and the ``limit``
-    asked for; numbers stand beside the axes, where no line crosses them. Lines run on to the ``bounds`` of errors."""
+    """Relative errors on a logarithmic axis, largest on top; numbers stand beside the axes, where no line crosses them.
+
+    Parameters
+    ----------
+    errors
+        by name, >= 0: one of 0 has no dot.
+    limit
+        accuracy asked for.
+    bounds
+        what each error is below at some confidence, by name: a line runs on to it.
+    """
     ordered = sorted(errors.items(), key=lambda item: item[1])
     figure, axes = figure_of(0.7 + 0.36 * len(ordered))
     values = np.array([value for _, value in ordered], dtype=np.float64)

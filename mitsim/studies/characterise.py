@@ -288,11 +288,11 @@ MOST_OFF = 5.0
 
 
 def _chart(
-    done: Characterisation, seen: Callable[[Session], tuple[FloatArray, FloatArray]], title: str, x: str, y: str
+    done: Characterisation, points: Callable[[Session], tuple[FloatArray, FloatArray]], title: str, x: str, y: str
 ) -> tuple[Figure, Axes]:
     figure, axes = figure_of(0.45 * WIDTH)
     for session, style in ((done.expected, _CLOSED), (done.session, _PAIRS)):
-        axes.plot(*seen(session), **style)
+        axes.plot(*points(session), **style)
     axes.set_title(title, fontsize=FONT + 1)
     label_axes(axes, x, y)
     return figure, axes
@@ -301,12 +301,12 @@ def _chart(
 def _photon_transfer(done: Characterisation) -> Figure:
     """Variance over signal, as found and as closed forms have it, and the line whose slope is the gain."""
 
-    def seen(session: Session) -> tuple[FloatArray, FloatArray]:
+    def points(session: Session) -> tuple[FloatArray, FloatArray]:
         return session.ladder.mean - session.dark.mean, session.ladder.variance
 
     title = f"Photon transfer: the gain is {_figure_text(done, 'system_gain')}"
-    figure, axes = _chart(done, seen, title, "signal less dark signal [DN]", "temporal variance [DN$^2$]")
-    signal, variance = seen(done.session)
+    figure, axes = _chart(done, points, title, "signal less dark signal [DN]", "temporal variance [DN$^2$]")
+    signal, variance = points(done.session)
     full = float(signal[int(variance.argmax())])
     line, label = np.array([0.0, 0.7 * full]), "fit to 70 % of saturation"
     fit = done.session.dark.variance + _figure(done, "system_gain").found * line
@@ -317,7 +317,7 @@ def _photon_transfer(done: Characterisation) -> Figure:
 
 
 def _linearity(done: Characterisation) -> Figure:
-    def seen(session: Session) -> tuple[FloatArray, FloatArray]:
+    def points(session: Session) -> tuple[FloatArray, FloatArray]:
         signal = session.ladder.mean - session.dark.mean
         full = signal[int(session.ladder.variance.argmax())]
         used = (signal >= 0.05 * full) & (signal <= 0.95 * full)
@@ -327,19 +327,19 @@ def _linearity(done: Characterisation) -> Figure:
     light = "photons on a pixel [1]" if done.sensor.states_efficiency else "photoelectrons of a pixel [e$^-$]"
     ends = [_figure(done, f"linearity_{end}").found for end in ("min", "max")]
     title = f"Linearity: {typeset(f'{ends[0]:.2g}')} to {typeset(f'{ends[1]:+.2g}')} % off a line"
-    figure, axes = _chart(done, seen, title, light, "deviation from a line [%]")
+    figure, axes = _chart(done, points, title, light, "deviation from a line [%]")
     axes.axhline(0, color=BLACK, lw=1)
     axes.legend(fontsize=FONT - 1, frameon=False)
     return figure
 
 
 def _dark_current(done: Characterisation) -> Figure:
-    def seen(session: Session) -> tuple[FloatArray, FloatArray]:
+    def points(session: Session) -> tuple[FloatArray, FloatArray]:
         signal = session.dark_series.mean - done.sensor.superpixel_black_level_dn
         return session.dark_times, signal / _figure(done, "system_gain").found
 
     title = f"The dark current is {_figure_text(done, 'dark_current')}"
-    figure, axes = _chart(done, seen, title, "exposure time [s]", "dark signal less black level [e$^-$]")
+    figure, axes = _chart(done, points, title, "exposure time [s]", "dark signal less black level [e$^-$]")
     axes.legend(fontsize=FONT - 1, frameon=False)
     return figure
 
