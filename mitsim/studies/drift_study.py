@@ -465,11 +465,6 @@ _RIPPLES = "power_ripple", "lamp_ripple"
 _LAMP_SCENE, _LAMP = "lamp_bench", "11.7"
 """Scene with a lamp beside the projector, a tenth as bright on the sheet, for what lamps do where no scene is given."""
 _LINES = ("measured", "predicted")
-_COLUMNS = (
-    "before_db", "after_db", "lost_db", "lost_auto_db",
-    "predicted_before_db", "predicted_db", "predicted_lost_db", "predicted_error_db",
-)  # fmt: skip
-"""Of the table, as :class:`Outcome` has them."""
 AGREE_DB = 0.5
 """Decibels between predicted and measured loss that a prediction is good for: the issue asks as much of plans."""
 
@@ -532,7 +527,13 @@ def _measure(studio: Studio, point: Point) -> Found:
     if kind.startswith("projector"):
         moved = studio.once("moved projector", 6, (setup, drift), lambda: _move_projector(lit, drift))
     found = known.outcome(drift, session, moved)
-    return Found((point.row(**{name: getattr(found, name) for name in _COLUMNS}),))
+    measured = {
+        "before_db": found.before_db, "after_db": found.after_db,
+        "lost_db": found.lost_db, "lost_auto_db": found.lost_auto_db,
+        "predicted_before_db": found.predicted_before_db, "predicted_db": found.predicted_db,
+        "predicted_lost_db": found.predicted_lost_db, "predicted_error_db": found.predicted_error_db,
+    }  # fmt: skip
+    return Found((point.row(**measured),))
 
 
 def _session(studio: Studio, point: Point, recipe: SessionRecipe, drift: Drift) -> Factors:
