@@ -270,8 +270,9 @@ def quality_by_factors(rows: Sequence[QualityRow], message: str) -> Figure:
         }
         for geometric in (True, False)
     )
-    # Light that does not diffract is solved with the factors that fit it alone.
-    pairs = {system: (mean, fitting.get(system, mean)) for system, mean in assumed.items()}
+    # Of light that does not diffract the geometric factors are the true ones, and no others are tried.
+    untried = Mean(np.nan, np.nan, 0)
+    pairs = {system: (mean, fitting.get(system, untried)) for system, mean in assumed.items()}
     figure = plots.pair_chart(pairs, (ASSUMED, f"{SEPARABLE}, or {CALIBRATED}"), "PSNR of the image [dB]")
     figure.suptitle(fill(message, _TITLE_LETTERS), fontsize=plots.FONT)
     return figure
