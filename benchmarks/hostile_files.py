@@ -25,9 +25,8 @@ from mitsim.core.environment import versions
 from mitsim.core.exr import write_frame
 from mitsim.core.files import stderr_silenced
 from mitsim.exchange.formats import export_run
-from mitsim.studies.framework.experiment import Found, Scope
+from mitsim.studies.framework.experiment import Found, Point, Scope, Setup
 from mitsim.studies.framework.run import Store
-from mitsim.studies.framework.setup import Point, Setup
 from tests.exchanged import made
 from tests.hard.fuzz import bytes_changed
 from tests.real_session import RealSession

@@ -32,7 +32,7 @@ from mitsim.metrics import psnr
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import best_term, shadow_terms
 from mitsim.reconstruct.solver import prepare
-from mitsim.studies.framework.setup import SIDE, TEST_IMAGES, picture
+from mitsim.studies.framework.experiment import SIDE, TEST_IMAGES, picture
 
 CARD = 11
 """Columns of cells beside the window that the field stop of 20 degrees lets through."""

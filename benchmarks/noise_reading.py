@@ -29,7 +29,7 @@ from mitsim.devices.camera import CameraGeometry, centred_edges
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.report import CONVENTIONS, EQUAL_PEAK, EQUAL_TOTAL
-from mitsim.studies.framework.setup import SIDE, TEST_IMAGES, picture
+from mitsim.studies.framework.experiment import SIDE, TEST_IMAGES, picture
 from mitsim.studies.solver_study import dots
 
 N, WIDTH_MM = 128, 120.0

@@ -139,8 +139,7 @@ def _only(scenes: list[str] | None) -> str | None:
 def _scope(scene: str | None, devices: Devices, variant: str, quick: bool) -> Scope:
     """How much of a study a command line asks for: eight test images on the photograph's sheet (two, where it is
     ``quick``), or one ``scene``."""
-    from mitsim.studies.framework.experiment import Scope
-    from mitsim.studies.framework.setup import QUICK_IMAGES, TEST_IMAGES, Setup
+    from mitsim.studies.framework.experiment import QUICK_IMAGES, TEST_IMAGES, Scope, Setup
 
     parameters = tuple(sorted(devices.parameters.items()))
     where = devices.camera, devices.projector, variant, devices.outside

@@ -7,6 +7,7 @@ draws stands with that study.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from textwrap import fill
 from typing import Any, Literal
 
@@ -53,6 +54,9 @@ Point = tuple[float, float]
 """Wall seconds, relative error."""
 _SHORT_AXIS = 30.0
 """Range of a logarithmic axis below which powers of ten alone leave one tick or none."""
+
+
+# -------- Figures
 
 
 def curves(
@@ -286,9 +290,20 @@ def quality_bars(quality: Mapping[str, tuple[Mean, Mean]], title: str = "") -> F
     return figure
 
 
-def error_bars(errors: Mapping[str, float], limit: float | None = None) -> Figure:
-    """Relative ``errors`` by name, >= 0 (one of 0 has no dot), on a logarithmic axis, largest on top, and the ``limit``
-    asked for; numbers stand beside the axes, where no line crosses them."""
+def error_bars(
+    errors: Mapping[str, float], limit: float | None = None, bounds: Mapping[str, float] | None = None
+) -> Figure:
+    """Relative errors on a logarithmic axis, largest on top; numbers stand beside the axes, where no line crosses them.
+
+    Parameters
+    ----------
+    errors
+        by name, >= 0: one of 0 has no dot.
+    limit
+        accuracy asked for.
+    bounds
+        what each error is below at some confidence, by name: a line runs on to it.
+    """
     ordered = sorted(errors.items(), key=lambda item: item[1])
     figure, axes = figure_of(0.7 + 0.36 * len(ordered))
     values = np.array([value for _, value in ordered], dtype=np.float64)
@@ -298,8 +313,12 @@ def error_bars(errors: Mapping[str, float], limit: float | None = None) -> Figur
     seen = np.flatnonzero(values > 0)
     axes.hlines(seen, left, values[seen], color=LINK, lw=2)
     axes.plot(values[seen], seen, "o", color=BLUE, ms=8, zorder=3)
+    if bounds:
+        axes.hlines(seen, values[seen], [bounds[ordered[row][0]] for row in seen], color=BLUE, lw=1)
     for row, (_, value) in enumerate(ordered):
-        beside(axes, row, 8, scientific(value))
+        place: Any = axes.get_yaxis_transform()
+        style = {"xycoords": place, "textcoords": "offset points", "va": "center", "fontsize": FONT}
+        axes.annotate(scientific(value), (1.0, row), (8, 0), **style)
     if limit is not None:
         axes.axvline(limit, color=VERMILION, lw=1.5, ls="--")
         where: Any = axes.get_xaxis_transform()
@@ -310,6 +329,57 @@ def error_bars(errors: Mapping[str, float], limit: float | None = None) -> Figur
     axes.set_yticks(range(len(values)), [name for name, _ in ordered], fontsize=FONT)
     axes.set_ylim(-0.6, len(values) - 0.4)
     label_axes(axes, "relative error [1]", "", grid="x")
+    return figure
+
+
+@dataclass(frozen=True)
+class Cost:
+    """An ``error``, and the median, least and most ``seconds`` of the work called ``name``; ``text`` stands beside it.
+    It is hollow where it was not ``measured``."""
+
+    name: str
+    error: float
+    seconds: tuple[float, float, float]
+    text: str = ""
+    measured: bool = True
+
+
+def costs(panels: Mapping[str, Sequence[Cost]], error: str, levels: Mapping[str, float] | None = None) -> Figure:
+    """Error against time, in panels side by side; rings are around what no other in the panel beats in both.
+
+    Parameters
+    ----------
+    panels
+        points by the panels' titles, one at least each.
+    error
+        name of the axis of errors, with its unit.
+    levels
+        errors that others are held against, by name.
+    """
+    figure, (places,) = panels_of(1, len(panels), 0.55 * WIDTH, sharey=True)
+    names = list(dict.fromkeys(point.name for points in panels.values() for point in points))
+    shown: dict[str, Any] = {}
+    for axes, (title, points) in zip(places, panels.items(), strict=True):
+        for point in points:
+            row, column = divmod(names.index(point.name), len(_PALETTE))
+            median, least, most = point.seconds
+            style = {"color": _PALETTE[column], "mfc": _PALETTE[column] if point.measured else "white", "zorder": 3}
+            axes.hlines([point.error], least, most, color=_PALETTE[column], lw=1.5)
+            (shown[point.name],) = axes.plot([median], [point.error], MARKERS[row], ms=8, **style)
+            axes.annotate(point.text, (median, point.error), (6, 6), textcoords="offset points", fontsize=FONT - 2)
+        front = np.array(pareto_front([(point.seconds[0], point.error) for point in points]))
+        ring: dict[str, Any] = {"ms": 13, "mfc": "none", "mec": GREY, "ls": ":", "drawstyle": "steps-post", "zorder": 2}
+        (shown["best for its time"],) = axes.plot(*front.T, "o", color=GREY, **ring)
+        axes.set(xscale="log", yscale="log", xmargin=0.2)
+        axes.set_title(title, fontsize=FONT)
+        log_ticks(axes)
+        label_axes(axes, "wall time [s]", error if axes is places[0] else "")
+    for text, level in (levels or {}).items():
+        where: Any = places[0].get_yaxis_transform()
+        places[0].axhline(level, color=GREY, lw=1.5, ls="--")
+        places[0].annotate(f"{text}: {scientific(level)}", (0.01, level), (2, 3), xycoords=where,
+                           textcoords="offset points", fontsize=FONT - 2, color=GREY)  # fmt: skip
+    legend_below(figure, 3, shown.values(), shown.keys())
     return figure
 
 
@@ -332,22 +402,6 @@ def _name_rows(axes: Axes, names: Sequence[str]) -> None:
     axes.set_ylim(-0.6, len(names) - 0.4)
     if len(axes.get_legend_handles_labels()[0]) > 1:
         axes.legend(fontsize=FONT - 1, frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
-
-
-def beside(axes: Axes, row: float, points: float, text: str, **style: Any) -> None:
-    """Text at a row, to the right of the axes.
-
-    Parameters
-    ----------
-    axes, row
-        that it stands beside.
-    points
-        from the axes.
-    text, **style
-        what is said, and matplotlib's options of it.
-    """
-    options = {"xycoords": axes.get_yaxis_transform(), "textcoords": "offset points", "va": "center", "fontsize": FONT}
-    axes.annotate(text, (1.0, row), (points, 0), **{**options, **style})
 
 
 def _bar_errors(errors: FloatArray) -> FloatArray | None:

@@ -1,6 +1,6 @@
 """Experiments: capture, calibrate and reconstruct together, judged against the truth and shown to people.
 
-This file has their names alone. The study NAME is the module ``mitsim.studies.NAME_study``.
+This file has their names alone. The study NAME is the module ``mitsim.studies.NAME_study``, or one of :data:`SHARED`.
 """
 
 from __future__ import annotations
@@ -31,5 +31,11 @@ PAPER = (
 order."""
 EXPERIMENTS = (*PAPER, "colour", "drift", "models", "sweep")
 """Studies of many points: their modules have an ``EXPERIMENT``."""
+SHARED = {
+    **dict.fromkeys(("distance", "binning", "resolution"), "camera_studies"),
+    **dict.fromkeys(("patterns", "exposure", "ambient"), "light_studies"),
+    **dict.fromkeys(("reflectivity", "separation"), "scene_studies"),
+}
+"""Modules of several studies of many points, whose ``EXPERIMENTS`` have each by its name."""
 ALL = "all"
 """What the study of all experiments of the paper is called."""

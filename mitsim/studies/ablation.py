@@ -154,11 +154,9 @@ class Ablation:
         return replace(light, groups=groups, simulation=self._simulated(plain))
 
     def _brightness(self, off: frozenset[str]) -> FloatArray:
-        """(n^2,) what each pixel's light is multiplied by."""
         return self._even if FALLOFF in off else np.ones_like(self._even)
 
     def _trace(self, direct: bool, off: frozenset[str]) -> SampledLight:
-        """Direct light, or all other, accumulated without some effects."""
         if (direct, off) not in self._kept:
             settings, bench = self.light.simulation.settings, self.light.bench
             own = off
@@ -361,7 +359,6 @@ def _even_lobes(sharp: sparse.csr_array, simulation: Simulation) -> sparse.csr_a
 
 
 def _scale(light: LightEstimate, by: FloatArray) -> LightEstimate:
-    """``light`` whose rows are multiplied ``by`` (rows,)."""
     return light.with_light({name: _weigh(each, by) for name, each in light.light.items()})
 
 

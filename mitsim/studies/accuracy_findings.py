@@ -8,12 +8,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mitsim.report.html import scientific
-from mitsim.report.plots import BLUE, FONT, GREY, LINK, VERMILION, WIDTH, label_axes, log_ticks, panels_of
+from mitsim.report.plots import FONT, Cost, costs, error_bars
 from mitsim.studies.framework.run import Findings
 
 SOLVER = "mitsim study solver"
@@ -236,179 +233,39 @@ class AccuracyFindings(Findings):
 
     def figures(self) -> dict[str, Figure]:
         """Error against the time of whole runs, and what each part buys for how much."""
-        return {
-            "accuracy.png": front(self.rows, self.judge.error, self.sensor_noise),
-            "effects.png": parts(self.effects, self.parts_accuracy),
-        }
+        panels: dict[str, list[Cost]] = {}
+        for row in self.rows:
+            whole = row.estimator == "factored"
+            title = "opening the scene to the last file" if whole else "light alone; one frame was measured"
+            seconds = row.spread.median, row.spread.least, row.spread.most
+            cost = Cost(
+                "whole runs" if whole else "reference, extrapolated",
+                row.error,
+                seconds,
+                row.setting.removeprefix("accuracy "),
+                not row.extrapolated,
+            )
+            panels.setdefault(title, []).append(cost)
+        levels = {"error of what all is compared with": self.judge.error}
+        levels |= {"sensor noise, exposure equal peak": self.sensor_noise} if self.sensor_noise else {}
+        drawn = {"accuracy.png": costs(panels, "relative error of the frames [1]", levels)}
+        return drawn | {"effects.png": part_chart(self.effects, self.parts_accuracy)}
 
 
-# -------- Figures of the accuracy study
-
-_FAINT = "#f3f4f6"
-"""Behind the data: what no error can be told in."""
-_NARROW = 30.0
-"""Range of a logarithmic axis below which powers of ten alone leave one tick or none."""
-_FEWEST, _FEW, _MANY = 8.0, (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)
-"""Range below which more ticks are needed, and ticks in a decade above and below it."""
-_BESIDE, _BESIDE_PARTS = 0.2, 0.7
-"""Part of an axis that is left free for what stands beside its last point."""
-_ROOM = 2.0
-"""Factor between the smallest error and the lower end of the axis."""
-_ROW_IN, _AROUND_IN = 0.36, 1.3
-"""Inches of a row of the chart of parts, and of title and axes."""
-
-
-def front(rows: Sequence[Row], judge: float, noise: float | None) -> Figure:
-    """Error against time: whole runs on the left, the reference on the right, hollow where it is extrapolated.
-
-    Parameters
-    ----------
-    rows
-        whole runs, and those of the reference.
-    judge, noise
-        error of the judge, below which no error means anything, and the sensor's noise at equal peak.
-    """
-    runs = [row for row in rows if row.estimator == "factored"]
-    others = [row for row in rows if row.estimator != "factored"]
-    ratios = {"width_ratios": (3, 2)} if others else None
-    figure, (panels,) = panels_of(1, 2 if others else 1, 0.5 * WIDTH, gridspec_kw=ratios)
-    _draw(panels[0], runs, BLUE, "o")
-    titles = [f"whole runs, opening the scene to the last file\n{_count_points(runs)}"]
-    if others:
-        _draw(panels[1], others, VERMILION, "s")
-        panels[1].plot([], [], "s", mfc="white", mec=VERMILION, label="extrapolated")
-        panels[1].legend(fontsize=FONT - 1, frameon=True, loc="lower left")
-        titles.append("reference, light alone\n(one frame was measured)")
-    for axes, title, shown in zip(panels, titles, (runs, others), strict=False):
-        errors = [row.error for row in shown]
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.margins(x=0.12)
-        low, high = axes.get_xlim()
-        axes.set_xlim(low, high * (high / low) ** _BESIDE)
-        axes.set_ylim(min(*errors, judge) / _ROOM, _ROOM * max(*errors, noise or 0.0))
-        axes.axhspan(axes.get_ylim()[0], judge, color=_FAINT, zorder=0)
-        if noise is not None:
-            axes.axhline(noise, color=GREY, lw=1.5, ls="--", zorder=1)
-        axes.set_title(title, fontsize=FONT)
-        low, high = axes.get_xlim()
-        log_ticks(axes, _FEW if high > _FEWEST * low else _MANY)
-        label_axes(axes, "wall time of all frames [s]", "")
-    panels[0].set_ylabel("relative error of the frames [1]", fontsize=FONT)
-    figure.suptitle("What accuracy costs in time", fontsize=FONT + 1)
-    said = {"error of what all is compared with": judge}
-    said |= {"sensor noise, exposure equal peak": noise} if noise is not None else {}
-    for text, error in said.items():
-        where: Any = panels[0].get_yaxis_transform()
-        style = {"fontsize": FONT - 2, "color": GREY, "xycoords": where, "textcoords": "offset points"}
-        panels[0].annotate(f"{text}: {scientific(error)}", (0.01, error), (2, 3), **style)
-    return figure
-
-
-def parts(costs: Sequence[PartCost], accuracy: float) -> Figure:
-    """What each part buys, and what it takes: the error that is left without it, and beside it the seconds where any
-    part was timed, row by row.
-
-    Parameters
-    ----------
-    costs
-        of parts, those first that matter most; shares of one stand after it.
-    accuracy
-        whose samples they were timed with.
-    """
-    timed = any(part.extra is not None for part in costs)
-    figure, (panels,) = panels_of(1, 1 + timed, _AROUND_IN + _ROW_IN * max(len(costs), 1), sharey=True)
-    places = range(len(costs))[::-1]
-    errors = panels[0]
-    figure.suptitle(f"What each part of the light buys{', and what it takes' if timed else ''}", fontsize=FONT + 1)
-    told = [part.error_if_off for part in costs if part.error_if_off > 0]
-    floor = min(told, default=1e-6) / 3
-    spans = [part.extra.most for part in costs if part.extra is not None and part.extra.most > 0]
-    shortest = min(spans, default=0.01) / 10
-    for place, part in zip(places, costs, strict=True):
-        face = BLUE if part.in_plan else "white"
-        dot = {"color": BLUE, "mfc": face, "ms": 6 if part.of else 8, "zorder": 3}
-        if part.error_if_off > 0:
-            errors.plot([floor, part.error_if_off], [place, place], color=LINK, lw=2, zorder=1)
-            errors.plot([part.error_if_off, part.error_bound], [place, place], "|-", color=BLUE, lw=1, zorder=2)
-            errors.plot([part.error_if_off], [place], "o", **dot)
-            _beside(errors, part.error_bound, place, scientific(part.error_if_off))
-        else:
-            _beside(errors, floor, place, "none")
-        if timed:
-            _draw_seconds(panels[1], part, place, shortest)
-    for axes, title in zip(panels, ("error that is left without it", "seconds that it takes"), strict=False):
-        axes.set_xscale("log")
-        axes.set_title(title, fontsize=FONT)
-        axes.margins(x=0.05)
-        low, high = axes.get_xlim()
-        axes.set_xlim(low, high * (high / low) ** _BESIDE_PARTS)
-    errors.set_yticks(list(places), [part.label for part in costs], fontsize=FONT)
-    errors.set_ylim(-0.7, len(costs) - 0.3)
-    label_axes(errors, "relative error of the frames [1]", "", grid="x")
-    if timed:
-        label_axes(panels[1], f"wall time of light and frames at {accuracy:g} [s]", "", grid="x")
-    if any(part.error_bound > part.error_if_off for part in costs):
-        errors.plot([], [], "|-", color=BLUE, lw=1, label="below this at 95 %")
-    if not all(part.in_plan for part in costs):
-        errors.plot([], [], "o", color=BLUE, mfc="white", ms=8, label="left out by the plan")
-    if errors.get_legend_handles_labels()[0]:
-        figure.legend(fontsize=FONT - 1, frameon=False, loc="outside lower center", ncols=2)
-    return figure
-
-
-def _draw_seconds(axes: Axes, part: PartCost, place: int, shortest: float) -> None:
-    """What a ``part`` takes, in the row at ``place``; lines begin at ``shortest``."""
-    extra = part.extra
-    if extra is None:
-        axes.plot([shortest], [place], ls="")  # an axis that holds the words
-        _beside(axes, shortest, place, "not timed")
-    elif extra.within_noise:
-        most = max(extra.most, shortest)
-        axes.plot([shortest, most], [place, place], color=LINK, lw=2, ls=":", zorder=1)
-        _beside(axes, most, place, "within noise" + (f", below {extra.most:.1g} s" if extra.most > 0 else ""))
-    else:
-        axes.plot([extra.least, extra.most], [place, place], color=VERMILION, lw=2, zorder=2)
-        axes.plot([extra.median], [place], "o", color=VERMILION, ms=6 if part.of else 8, zorder=3)
-        _beside(axes, extra.most, place, f"{extra.median:.2g} s")
-
-
-def _draw(axes: Axes, rows: Sequence[Row], colour: str, marker: str) -> None:
-    """Points with the spread of their time, joined; extrapolated ones hollow, with their settings beside them."""
-    ordered = sorted(rows, key=lambda row: -row.error)
-    alike = len({row.spread.repeats for row in rows}) == 1
-    axes.plot(
-        [row.spread.median for row in ordered],
-        [row.error for row in ordered],
-        color=colour,
-        lw=1.0,
-        ls=":" if any(row.extrapolated for row in rows) else "-",
-        zorder=2,
+def part_chart(parts: Sequence[PartCost], accuracy: float) -> Figure:
+    """The error that is left without each of some ``parts``, and what it is below at 95 %, by the part's name and the
+    seconds that it takes with the samples of an ``accuracy``."""
+    names = [
+        f"{part.label}, {'not timed' if part.extra is None else part.extra}{'' if part.in_plan else ', not planned'}"
+        for part in parts
+    ]
+    errors, bounds = (
+        dict(zip(names, [getattr(part, name) for part in parts], strict=True))
+        for name in ("error_if_off", "error_bound")
     )
-    for row in ordered:
-        spread = row.spread
-        around = np.array([[spread.median - spread.least], [spread.most - spread.median]])
-        face = "white" if row.extrapolated else colour
-        style: dict[str, Any] = {"fmt": marker, "color": colour, "mfc": face, "ms": 8, "capsize": 3, "zorder": 3}
-        axes.errorbar([spread.median], [row.error], xerr=around, **style)
-        said = row.setting.removeprefix("accuracy ") + ("" if alike else f" ({_times(spread.repeats)})")
-        axes.annotate(said, (spread.median, row.error), (6, 6), textcoords="offset points", fontsize=FONT - 2)
-
-
-def _count_points(rows: Sequence[Row]) -> str:
-    """What the points stand for."""
-    repeats = {row.spread.repeats for row in rows}
-    if repeats == {1}:
-        return "(each once; beside it the accuracy asked for)"
-    return "(median, least and most; beside it the accuracy asked for)"
-
-
-def _times(repeats: int) -> str:
-    return "once" if repeats == 1 else f"{repeats} runs"
-
-
-def _beside(axes: Axes, at: float, place: float, text: str) -> None:
-    axes.annotate(text, (at, place), (8, 0), textcoords="offset points", va="center", fontsize=FONT - 1)
+    figure = error_bars(errors, bounds=bounds)
+    figure.suptitle(f"Error that is left without each part of the light, and its time at {accuracy:g}", fontsize=FONT)
+    return figure
 
 
 # -------- Repeated times in, what they tell out

@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import cache, cached_property, reduce
 from operator import add
 
 import numpy as np
@@ -59,7 +59,6 @@ class _Left:
 
     name: str
     error: Estimate
-    trial: Trial
     timed: Timed
 
 
@@ -83,7 +82,7 @@ class Parts:
         full = _fill(self._plan.settings, stand.finest(self._plan).settings)
         self.accuracy, self.seconds, settings = _choose_samples(stand, full)
         self.full = replace(self._plan, settings=settings)
-        self._whole = self._time(Trial("parts", "all", stand.bench, self.full, at_once))
+        self._whole = self._time(stand.bench, self.full)
         self._left = sorted(self._parts(settings), key=lambda part: -part.error.value)
 
     def measure(self, budget: Budget, share: float) -> None:
@@ -137,19 +136,23 @@ class Parts:
             yield self._without(_LINES, Estimate(error, error), mono, self.full)
 
     def _without(self, name: str, error: Estimate, bench: Apparatus, plan: Plan) -> _Left:
-        trial = Trial("parts", f"no {name}", bench, plan, at_once)
-        return _Left(name, error, trial, self._time(trial))
+        return _Left(name, error, self._time(bench, plan))
 
-    def _time(self, trial: Trial) -> Timed:
-        """The light of a ``trial`` and its frames, with kernels compiled before the first time."""
+    def _time(self, bench: Apparatus, plan: Plan) -> Timed:
+        """The light of a ``plan`` and its frames, with kernels compiled before the first time."""
         stand = self._stand
-        ready = warm_up(stand, trial)
+
+        @cache
+        def warm_up() -> None:
+            once = replace(plan, settings=with_samples(plan.settings, 1))
+            stand.trace(once, stand.seed, bench, at_once)
 
         def again() -> float:
             """Seconds of transport and optics."""
-            ready()
+            warm_up()
             started = time.perf_counter()
-            stack_frames(stand.trace(trial, stand.seed).frames(stand.family.lighting, stand.seed))
+            light = stand.trace(plan, stand.seed, bench, at_once)
+            stack_frames(light.frames(stand.family.lighting, stand.seed))
             return time.perf_counter() - started
 
         return Timed(again)
@@ -179,7 +182,6 @@ def _choose_samples(stand: Stand, settings: Settings) -> tuple[float, float, Set
 
 
 def _has(settings: Settings, name: str) -> bool:
-    """Whether ``settings`` have a part."""
     numbers = {
         "anchors": settings.anchors,
         "layers": len(settings.depths),
@@ -230,7 +232,7 @@ class Judge:
         if work > seconds:
             # With a plan's own numbers; what they leave is stated with the judge.
             finest, _ = _within(stand, plan, seconds)
-        light = stand.trace(Trial("judge", "", stand.bench, finest), seed)
+        light = stand.trace(finest, seed)
         expected = light.frames(stand.family.lighting, seed)
         frames, mc_error = stack_frames(expected)
         facts = JudgeFacts(mc_error, stand.discretisation(finest.settings), time.perf_counter() - started, seed)
@@ -270,7 +272,7 @@ class Judge:
         if not any(EFFECTS[name].retraced(Physics.of(stand.bench)) for name in absent & plan.settings.effects):
             return reform(self.light, absent)
         plain = replace(plan, settings=replace(plan.settings, effects=plan.settings.effects - absent))
-        return stand.trace(Trial("judge", "reference", stand.bench, plain), self.facts.seed)
+        return stand.trace(plain, self.facts.seed)
 
     @cached_property
     def sensor_noise(self) -> float | None:
@@ -414,18 +416,6 @@ _FEW_SHOTS = 8
 """Shots whose frames tell what changes all of them: they differ by a few percent."""
 
 
-@dataclass(frozen=True)
-class Trial:
-    """One setting of the factored estimator: what was turned, to what, and the bench and plan that it makes; ``target``
-    is the error to stop at where it is not the plan's own."""
-
-    knob: str
-    setting: str
-    bench: Apparatus
-    plan: Plan
-    target: Target | None = None
-
-
 def at_once(expected: ExpectedFrames) -> float:
     """A target that any error of the ``expected`` frames meets: sampling stops after its first round."""
     return float("inf")
@@ -500,24 +490,22 @@ class Stand:
             *(Approximation(*both) for both in zip(COUNTED, counted(settings), strict=True))
         ).value
 
-    def trace(self, trial: Trial, seed: int) -> SampledLight:
-        """Light of a ``trial``, by the family's classes, from a ``seed``."""
-        sampling = Sampling(by_pixel=False, target=trial.target)
-        return trace_light(trial.bench, trial.plan, self.family.lighting, seed, sampling, self.job.progress)
+    def trace(
+        self, plan: Plan, seed: int, bench: Apparatus | None = None, target: Target | None = None
+    ) -> SampledLight:
+        """Light by the family's classes.
 
-
-def warm_up(stand: Stand, trial: Trial) -> Callable[[], None]:
-    """What compiles the kernels of a ``trial`` at a ``stand`` by one sample, the first time that it is called."""
-    done: list[bool] = []
-
-    def ready() -> None:
-        """Trace one sample, once."""
-        if not done:
-            once = replace(trial.plan, settings=with_samples(trial.plan.settings, 1))
-            stand.trace(replace(trial, plan=once, target=at_once), stand.seed)
-            done.append(True)
-
-    return ready
+        Parameters
+        ----------
+        plan, seed
+            of the light.
+        bench
+            another one than the stand's own.
+        target
+            error to stop at where it is not the plan's own.
+        """
+        sampling = Sampling(by_pixel=False, target=target)
+        return trace_light(bench or self.bench, plan, self.family.lighting, seed, sampling, self.job.progress)
 
 
 def stack_frames(expected: ExpectedFrames) -> tuple[FloatArray, float]:

@@ -195,7 +195,9 @@ class Runs:
         lit: dict[Settings, float] = {}
         for accuracy in sorted(accuracies, reverse=True):
             plan = self._stand.plan(accuracy)
-            settings = _begun_with(plan.settings)
+            # With the samples that are taken: parts of one are as good as a whole one.
+            taken = {row.name: float(row.whole(row.predicted(plan.settings))) for row in PASSES.values()}
+            settings = replace(plan.settings, samples=taken)
             groups.setdefault(settings, []).append(accuracy)
             lit[settings] = plan.predicted_seconds
         around = self._stand.look.seconds + sum(
@@ -230,11 +232,6 @@ class Runs:
         rig = self._stand.bench.rig
         unit = electrons_from_irradiance(1.0, shots.exposure_s, rig.sensor, rig.projector.effective_wavelength_nm)
         return np.asarray(shots.electrons, dtype=np.float64) / unit
-
-
-def _begun_with(settings: Settings) -> Settings:
-    """The same ``settings`` with the samples that are taken: parts of one are as good as a whole one."""
-    return replace(settings, samples={row.name: float(row.whole(row.predicted(settings))) for row in PASSES.values()})
 
 
 def _list(accuracies: Sequence[float]) -> str:

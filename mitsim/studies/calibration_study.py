@@ -38,19 +38,10 @@ from mitsim.report.html import with_error
 from mitsim.report.lit_scene import LitScene
 from mitsim.report.plots import bars
 from mitsim.report.table import Mean, Table
+from mitsim.studies import error_budget
 from mitsim.studies.ablation import ablations, reform
-from mitsim.studies.drift_loss import SESSION, DriftStand, squared_error
-from mitsim.studies.error_budget import (
-    CAPTURE,
-    DRIFT,
-    SCENE,
-    SOLVER,
-    SURE,
-    UNEXPLAINED,
-    LossRow,
-    entry_variances,
-    losses,
-)
+from mitsim.studies.drift_study import SESSION, DriftStand, squared_error
+from mitsim.studies.error_budget import LossRow
 from mitsim.studies.framework.page import Part
 from mitsim.studies.framework.run import Findings
 
@@ -95,13 +86,12 @@ def measure(bench: Bench, request: Request, job: Job, recipe: SessionRecipe | No
     found = judge_session(lit, noisy, clean, tuple(_by_source(lit, noisy, clean, job)))
     scene = LitScene(bench.light(request.patterns, job, accuracy=request.accuracy, seed=request.seed))
     stand = DriftStand(scene, _factors(lit, noisy), recipe, family, request.seed)
-    rows, refused = losses(stand, lit, _factors(lit, clean))
-    explained = sum(row.squared_error for row in rows if row.of != UNEXPLAINED)
+    rows, refused = error_budget.losses(stand, lit, _factors(lit, clean))
+    explained = sum(row.squared_error for row in rows if row.of != error_budget.UNEXPLAINED)
     return replace(found, image=_image(stand, explained), losses=tuple(rows), not_predicted=tuple(refused))
 
 
 def _factors(lit: LitSession, estimate: Estimate) -> Factors:
-    """The ``estimate`` of a session ``lit`` as factors of its camera."""
     session = lit.session
     manifest = CalibrationManifest(
         camera=session.bench.identity(),
@@ -180,7 +170,7 @@ def entry_deviation(lit: LitSession, clean: Estimate, side: str) -> FloatArray:
     side
         whose stripes give the factor.
     """
-    variances = entry_variances(lit, (clean.left, clean.right), side)
+    variances = error_budget.entry_variances(lit, (clean.left, clean.right), side)
     return np.asarray(np.sqrt(sum(variances.values(), np.zeros(1))))
 
 
@@ -284,8 +274,14 @@ def _row(cause: str, residual: float, left: float) -> ErrorSourceRow:
 _APART = 0.3
 """Predicted turn of its vectors [rad] up to which a singular value stands apart from others: beyond, noise mixes them,
 and bias and angle to first order do not hold."""
-_WHERE = {CAPTURE: "noise of the capture", SESSION: "noise of the session", SCENE: "light of the scene",
-          DRIFT: "drift, not in this image", SOLVER: "the solver", UNEXPLAINED: "anywhere"}  # fmt: skip
+_WHERE = {
+    error_budget.CAPTURE: "noise of the capture",
+    error_budget.SCENE: "light of the scene",
+    error_budget.DRIFT: "drift, not in this image",
+    error_budget.SOLVER: "the solver",
+    error_budget.UNEXPLAINED: "anywhere",
+    SESSION: "noise of the session",
+}
 """Where a loss comes from, in words."""
 _HAS, _WOULD = "has lost by noise, light and solver", "would lose by a drift"
 """What becomes of the image, as the figure calls it."""
@@ -417,51 +413,8 @@ class CalibrationFindings(Findings):
             "squared error, which may have a share in every other row; look for what the scene or the camera has that "
             "no row names"
             for row in self.losses
-            if row.of == UNEXPLAINED and abs(row.squared_error) > SURE * row.deviation
+            if row.of == error_budget.UNEXPLAINED and abs(row.squared_error) > error_budget.SURE * row.deviation
         ]
-
-    def lines(self) -> list[str]:
-        """For people."""
-        entries = [
-            f"{row.factor:>5} factor: error {row.error:.2e}, predicted {row.predicted_error:.2e}; chi-square "
-            f"{row.chi_square:.3f} an entry, largest {row.largest:.1f} deviations"
-            for row in self.entries
-        ]
-        offs = np.array([row.off for row in self.singular if row.predicted_angle < _APART])
-        causes = [
-            f"{row.cause:>16}: {abs(row.part):.1e} ({decibels(abs(row.part)):.1f} dB)"
-            + (" less without it" if row.part > 0 else " more without it")
-            if row.part
-            else f"{row.cause:>16}: nothing"
-            for row in self.causes
-        ]
-        return [
-            *entries,
-            f"singular values: {len(offs)} of {len(self.singular)} stand apart from others"
-            + (f", rms {np.sqrt(np.mean(offs**2)):.2f} standard errors off" if len(offs) else ""),
-            f"separability residual {self.residual[1]:.2e}, {self.residual[0]:.2e} without noise; by cause:",
-            *causes,
-            f"{self.session['frames']:.0f} frames, {self.session['exposure_seconds']:.3g} s of exposure, "
-            f"{self.session['photons']:.3g} photons on the sensor",
-            *self._image_lines(),
-        ]
-
-    def _image_lines(self) -> Iterator[str]:
-        if not self.image:
-            return
-        image = self.image
-        yield (
-            f"image under {image['patterns']}: PSNR {image['psnr_db']:.2f} dB, {image['predicted_psnr_db']:.2f} as "
-            f"all its sources say, {image['frames']} frames, "
-            f"{image['exposure_seconds']:.3g} s of exposure, {image['photons']:.3g} photons; it loses by"
-        )
-        yield from (
-            f"{row.name:>42}: {row.lost_db:z.2f} +- {row.error_db:.2f} dB"
-            for row in self.losses
-            if abs(row.lost_db) >= _SAID_DB or row.of == UNEXPLAINED
-        )
-        yield from (_verdict(row) for row in self.losses if row.of == UNEXPLAINED)
-        yield from (f"not predicted: {text}" for text in self.not_predicted)
 
     def figures(self) -> dict[str, Figure]:
         """Maps of the entries' errors, singular values with their errors, and the residual by cause."""
@@ -482,44 +435,38 @@ class CalibrationFindings(Findings):
         rated: dict[str, dict[str, Mean]] = {_HAS: {}, _WOULD: {}}
         for row in self.losses:
             if abs(row.lost_db) >= _SAID_DB:
-                rated[_WOULD if row.of == DRIFT else _HAS][row.name] = Mean(row.lost_db, row.error_db, 1)
+                rated[_WOULD if row.of == error_budget.DRIFT else _HAS][row.name] = Mean(row.lost_db, row.error_db, 1)
         if any(rated.values()):
             found["losses.png"] = bars(rated, "PSNR lost [dB]")
         return found
 
     def parts(self) -> Sequence[Part]:
         """Of the page: what an image loses, light and time, errors of the factors, what is not separable."""
-        found = [self._light_part()]
-        if self.losses:
-            found.insert(0, self._losses_part())
         entries = [
-            (
-                row.factor,
-                f"{row.error:.2e}",
-                f"{row.predicted_error:.2e}",
-                f"{row.chi_square:.3f}",
-                f"{row.largest:.1f}",
-            )
+            (row.factor, *(f"{each:.2e}" for each in (row.error, row.predicted_error)),
+             f"{row.chi_square:.3f}", f"{row.largest:.1f}")
             for row in self.entries
+        ]  # fmt: skip
+        offs = np.array([row.off for row in self.singular if row.predicted_angle < _APART])
+        rms = f", rms {np.sqrt(np.mean(offs**2)):.2f} standard errors off" if len(offs) else ""
+        causes = [
+            (_cause(row), f"{row.residual:.2e}", "nothing" if not row.part else f"{row.part:+.1e}")
+            for row in self.causes
         ]
-        found.append(
+        return [
+            *([self._losses_part()] if self.losses else []),
+            self._light_part(),
             Part(
                 "Errors of the factors",
                 "The left factor takes rows of the scene to rows of the sensor, the right one columns. Noisy factors "
                 "against those of frames without noise of the same light: relative error, found and predicted "
                 "from the sensor's closed form; mean square (1 if the prediction holds) and largest error of an entry, "
                 "in predicted standard deviations. Then each singular value's error, beside its predicted standard "
-                "error.",
+                f"error: {len(offs)} of {len(self.singular)} stand apart from others{rms}.",
                 ("Factor", "Relative error", "Predicted", "Chi-square an entry", "Largest [deviations]"),
                 tuple(entries),
-                (*self.maps_files, "singular.png"),
-            )
-        )
-        causes = [
-            (_cause(row), f"{row.residual:.2e}", "nothing" if not row.part else f"{row.part:+.1e}")
-            for row in self.causes
-        ]
-        found.append(
+                (*(f"{name}.png" for name in self.maps), "singular.png"),
+            ),
             Part(
                 "What is not separable",
                 f"No separable camera explains {self.residual[1]:.2e} of the noisy responses, {self.residual[0]:.2e} "
@@ -528,18 +475,12 @@ class CalibrationFindings(Findings):
                 ("Cause", "Residual without it", "Part"),
                 tuple(causes),
                 ("causes.png",),
-            )
-        )
-        return found
-
-    @property
-    def maps_files(self) -> tuple[str, ...]:
-        """Figures of the maps."""
-        return tuple(f"{name}.png" for name in self.maps)
+            ),
+        ]
 
     def _losses_part(self) -> Part:
         whole, image = sum(row.squared_error for row in self.losses) or np.nan, self.image
-        rest = [row for row in self.losses if row.of == UNEXPLAINED]
+        rest = [row for row in self.losses if row.of == error_budget.UNEXPLAINED]
         ordered = sorted((row for row in self.losses if row not in rest), key=lambda row: -row.lost_db)
         rows = [
             (
@@ -548,7 +489,7 @@ class CalibrationFindings(Findings):
                 row.amount,
                 with_error(row.lost_db, row.error_db),
                 ""
-                if row.of == DRIFT
+                if row.of == error_budget.DRIFT
                 else with_error(100 * row.squared_error / whole, 100 * row.deviation / whole, " %"),
             )
             for row in [*(row for row in ordered if abs(row.lost_db) >= _SAID_DB), *rest]
@@ -560,7 +501,7 @@ class CalibrationFindings(Findings):
             "What an image loses",
             f"The image of this scene under {image['patterns']} has a PSNR of {image['psnr_db']:.2f} dB with "
             f"these factors; all sources together say {image['predicted_psnr_db']:.2f} dB.{others}"
-            + ("" if any(row.of == DRIFT for row in self.losses) else _NO_DRIFT)
+            + ("" if any(row.of == error_budget.DRIFT for row in self.losses) else _NO_DRIFT)
             + untold,
             ("Where", "Source", "Amount", "PSNR lost [dB]", "Part of the error"),
             tuple(rows),
@@ -600,11 +541,10 @@ def _verdict(row: LossRow) -> str:
     if errors <= 1:
         return "what is not explained is within its standard error"
     size = f"what is not explained is {errors:.1f} of its standard errors"
-    if errors <= SURE:
+    if errors <= error_budget.SURE:
         return f"{size}, of which chance makes {math.erfc(errors / math.sqrt(2)):.1%} of all studies see as much"
     return f"{size}: the sources do not make the image's error, and a cause is missing"
 
 
 def _cause(row: ErrorSourceRow) -> str:
-    """The cause of a ``row`` in words."""
     return _ERROR_SOURCES.get(row.cause, row.cause.replace("-", " "))

@@ -9,25 +9,31 @@ thousand sessions of such statistics are evaluated as that of the frames is (GUM
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import versions
 from mitsim.core.files import write_json
 from mitsim.core.job import Job
-from mitsim.devices.sensor import SensorModel
+from mitsim.core.parallel import in_threads
+from mitsim.core.seeds import stream
+from mitsim.devices.sensor import EXPOSURE_S, SensorModel
 from mitsim.report.html import round_to_error, typeset
 from mitsim.report.plots import BLACK, BLUE, FONT, GREY, ORANGE, VERMILION, WIDTH, figure_of, label_axes
-from mitsim.sensor.emva import LEAST_DARK, QUANTISATION, SPLIT, Session, figures
-from mitsim.sensor.specimen import mean_dark_current
+from mitsim.sensor import emva
+from mitsim.sensor.chain import expose
+from mitsim.sensor.emva import Session
+from mitsim.sensor.moments import frame_moments
+from mitsim.sensor.specimen import dark_current_variance, mean_dark_current, response_variance
 from mitsim.studies.emva_options import Procedure, capacity_of, efficiency_of
-from mitsim.studies.emva_procedure import Frames, draw_sessions
+from mitsim.studies.framework.page import text_table
 from mitsim.studies.framework.run import study_folder, write_figures
 
 UNITS: Mapping[str, tuple[str, str]] = {
@@ -41,8 +47,8 @@ UNITS: Mapping[str, tuple[str, str]] = {
     "linearity_max": ("LE_max", "%"),
     "dark_current": ("mu_I.mean", "e-/s"),
     "dark_current_by_variance": ("mu_I.var", "e-/s"),
-    **{f"dsnu_{part}": (f"DSNU1288.{part}", "e-") for part in SPLIT},
-    **{f"prnu_{part}": (f"PRNU1288.{part}", "%") for part in SPLIT},
+    **{f"dsnu_{part}": (f"DSNU1288.{part}", "e-") for part in emva.SPLIT},
+    **{f"prnu_{part}": (f"PRNU1288.{part}", "%") for part in emva.SPLIT},
 }
 """Symbol of the standard, and unit, of each figure in the order in which they are shown."""
 _SQUARES = ("row_noise", "dsnu", "prnu")
@@ -144,20 +150,18 @@ class Characterisation:
 
     def lines(self) -> list[str]:
         """For people."""
-        names = ("set", "expected", "found", "std. error")
-        head = f"{'figure':<26}{'symbol':<18}{'unit':<10}" + "".join(f"{name:>12}" for name in names) + f"{'off by':>8}"
-        lines = [
-            f"{self.sensor.name}: {self.procedure.pixels} x {self.procedure.pixels} pixels, "
-            f"{self.procedure.steps} steps of light"
-        ]
-        lines += [head]
-        for row in self.rows:
-            expected = "" if row.expected is None else f"{row.expected:.5g}"
-            lines.append(
-                f"{row.name:<26}{row.symbol:<18}{row.unit:<10}{row.set:>12.5g}{expected:>12}"
-                f"{round_to_error(row.found, row.standard_error):>12}"
-                f"{round_to_error(row.standard_error, row.standard_error):>12}{row.deviations:>8.1f}"
+        head = ("figure", "symbol", "unit", "set", "expected", "found", "std. error", "off by")
+        rows = [
+            (
+                row.name, row.symbol, row.unit, f"{row.set:.5g}",
+                "" if row.expected is None else f"{row.expected:.5g}",
+                *(round_to_error(number, row.standard_error) for number in (row.found, row.standard_error)),
+                f"{row.deviations:.1f}",
             )
+            for row in self.rows
+        ]  # fmt: skip
+        procedure = f"{self.procedure.pixels} x {self.procedure.pixels} pixels, {self.procedure.steps} steps of light"
+        lines = [f"{self.sensor.name}: {procedure}", *text_table(head, rows)]
         if any(row.expected is not None for row in self.rows):
             lines.append(
                 "expected: where the procedure finds another figure than the one set, at these steps and frames"
@@ -168,7 +172,8 @@ class Characterisation:
 
     def figures(self) -> Mapping[str, Figure]:
         """Plots by file name."""
-        return figures_of(self)
+        drawn = _photon_transfer(self), _linearity(self), _dark_current(self), _deviations(self)
+        return dict(zip(_FILES, drawn, strict=True))
 
 
 def characterise(
@@ -211,9 +216,9 @@ def _characterise(
 ) -> Characterisation:
     frames = Frames.of(sensor, procedure, capacity)
     expected = frames.expected()
-    spread = figures(draw_sessions(frames, expected))
+    spread = emva.figures(draw_sessions(frames, expected))
     session = frames.measured(job)
-    found = figures(session)
+    found = emva.figures(session)
     # Without a quantum efficiency light is counted in electrons, and there is none to find.
     names = [name for name in UNITS if sensor.states_efficiency or name != "quantum_efficiency"]
     rows = tuple(_row(frames, name, found[name], spread[name]) for name in names)
@@ -256,7 +261,7 @@ def _row(frames: Frames, name: str, found: FloatArray, sessions: FloatArray) -> 
     method |= bool(sensor.row_noise_e) and name.startswith(("dsnu", "prnu"))
     bias = 0.0 if method or not spread or sensor.bits is None else (centre - given) / spread
     method |= abs(bias) > _BIASED
-    if name == "dark_noise" and (given * sensor.gain_dn_per_e) ** 2 + QUANTISATION < LEAST_DARK:
+    if name == "dark_noise" and (given * sensor.gain_dn_per_e) ** 2 + emva.QUANTISATION < emva.LEAST_DARK:
         bias = 0.0  # it is found as the standard's limit, as it should be
     if name == "saturation_capacity":
         spread = math.hypot(spread, float(frames.electrons[0]) / math.sqrt(12))
@@ -274,6 +279,7 @@ def _row(frames: Frames, name: str, found: FloatArray, sessions: FloatArray) -> 
 
 # -------- A characterisation in, its plots out
 
+_FILES = ("photon_transfer.png", "linearity.png", "dark_current.png", "deviations.png")
 _CLOSED: dict[str, Any] = {"color": GREY, "lw": 1.5, "label": "closed form"}
 _PAIRS: dict[str, Any] = {"color": BLUE, "lw": 0, "marker": "o", "ms": 5, "label": "pairs of frames"}
 """How what is expected and what was found are drawn."""
@@ -281,73 +287,64 @@ MOST_OFF = 5.0
 """Standard errors from which a figure is off: one of twenty figures is so by chance in 1e5 characterisations."""
 
 
-def figures_of(done: Characterisation) -> Mapping[str, Figure]:
-    """Plots of ``done``, by file name."""
-    return {
-        "photon_transfer.png": _photon_transfer(done),
-        "linearity.png": _linearity(done),
-        "dark_current.png": _dark_current(done),
-        "deviations.png": _deviations(done),
-    }
+def _chart(
+    done: Characterisation, points: Callable[[Session], tuple[FloatArray, FloatArray]], title: str, x: str, y: str
+) -> tuple[Figure, Axes]:
+    figure, axes = figure_of(0.45 * WIDTH)
+    for session, style in ((done.expected, _CLOSED), (done.session, _PAIRS)):
+        axes.plot(*points(session), **style)
+    axes.set_title(title, fontsize=FONT + 1)
+    label_axes(axes, x, y)
+    return figure, axes
 
 
 def _photon_transfer(done: Characterisation) -> Figure:
     """Variance over signal, as found and as closed forms have it, and the line whose slope is the gain."""
-    figure, axes = figure_of(0.5 * WIDTH)
-    session, expected = done.session, done.expected
-    signal = session.ladder.mean - session.dark.mean
-    axes.plot(expected.ladder.mean - expected.dark.mean, expected.ladder.variance, **_CLOSED)
-    axes.plot(signal, session.ladder.variance, **_PAIRS)
-    gain = _figure(done, "system_gain").found
-    full = float(signal[int(session.ladder.variance.argmax())])
-    line = np.array([0.0, 0.7 * full])
-    label = "fit to 70 % of saturation"
-    axes.plot(line, session.dark.variance + gain * line, color=VERMILION, lw=2, ls="--", label=label)
+
+    def points(session: Session) -> tuple[FloatArray, FloatArray]:
+        return session.ladder.mean - session.dark.mean, session.ladder.variance
+
+    title = f"Photon transfer: the gain is {_figure_text(done, 'system_gain')}"
+    figure, axes = _chart(done, points, title, "signal less dark signal [DN]", "temporal variance [DN$^2$]")
+    signal, variance = points(done.session)
+    full = float(signal[int(variance.argmax())])
+    line, label = np.array([0.0, 0.7 * full]), "fit to 70 % of saturation"
+    fit = done.session.dark.variance + _figure(done, "system_gain").found * line
+    axes.plot(line, fit, color=VERMILION, lw=2, ls="--", label=label)
     axes.axvline(full, color=ORANGE, lw=1.5, ls=":", label="largest variance: saturation")
-    axes.set_title(f"Photon transfer: the gain is {_figure_text(done, 'system_gain')}", fontsize=FONT + 1)
-    label_axes(axes, "signal less dark signal [DN]", "temporal variance [DN$^2$]")
     axes.legend(fontsize=FONT - 1, frameon=False, loc="upper left")
     return figure
 
 
 def _linearity(done: Characterisation) -> Figure:
-    """Relative deviation of the signal from a line, over the photons."""
-    figure, axes = figure_of(0.42 * WIDTH)
-    for session, style in ((done.expected, _CLOSED), (done.session, _PAIRS)):
+    def points(session: Session) -> tuple[FloatArray, FloatArray]:
         signal = session.ladder.mean - session.dark.mean
         full = signal[int(session.ladder.variance.argmax())]
         used = (signal >= 0.05 * full) & (signal <= 0.95 * full)
         slope, start = np.polyfit(session.photons[used], signal[used], 1, w=1 / signal[used])
-        line = start + slope * session.photons[used]
-        axes.plot(session.photons[used], 100 * (signal[used] / line - 1), **style)
-    axes.axhline(0, color=BLACK, lw=1)
+        return session.photons[used], 100 * (signal[used] / (start + slope * session.photons[used]) - 1)
+
     light = "photons on a pixel [1]" if done.sensor.states_efficiency else "photoelectrons of a pixel [e$^-$]"
     ends = [_figure(done, f"linearity_{end}").found for end in ("min", "max")]
-    axes.set_title(
-        f"Linearity: {typeset(f'{ends[0]:.2g}')} to {typeset(f'{ends[1]:+.2g}')} % off a line",
-        fontsize=FONT + 1,
-        loc="left",
-    )
-    label_axes(axes, light, "deviation from a line [%]")
-    axes.legend(fontsize=FONT - 1, frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1))
+    title = f"Linearity: {typeset(f'{ends[0]:.2g}')} to {typeset(f'{ends[1]:+.2g}')} % off a line"
+    figure, axes = _chart(done, points, title, light, "deviation from a line [%]")
+    axes.axhline(0, color=BLACK, lw=1)
+    axes.legend(fontsize=FONT - 1, frameon=False)
     return figure
 
 
 def _dark_current(done: Characterisation) -> Figure:
-    """Dark signal over exposure time."""
-    figure, axes = figure_of(0.42 * WIDTH)
-    gain = _figure(done, "system_gain").found
-    for session, style in ((done.expected, _CLOSED), (done.session, _PAIRS)):
-        dark = (session.dark_series.mean - done.sensor.superpixel_black_level_dn) / gain
-        axes.plot(session.dark_times, dark, **style)
-    axes.set_title(f"The dark current is {_figure_text(done, 'dark_current')}", fontsize=FONT + 1)
-    label_axes(axes, "exposure time [s]", "dark signal less black level [e$^-$]")
+    def points(session: Session) -> tuple[FloatArray, FloatArray]:
+        signal = session.dark_series.mean - done.sensor.superpixel_black_level_dn
+        return session.dark_times, signal / _figure(done, "system_gain").found
+
+    title = f"The dark current is {_figure_text(done, 'dark_current')}"
+    figure, axes = _chart(done, points, title, "exposure time [s]", "dark signal less black level [e$^-$]")
     axes.legend(fontsize=FONT - 1, frameon=False)
     return figure
 
 
 def _figure(done: Characterisation, name: str) -> Row:
-    """The figure of that ``name``."""
     return next(row for row in done.rows if row.name == name)
 
 
@@ -377,3 +374,266 @@ def _deviations(done: Characterisation) -> Figure:
         axes, f"found less set or expected [predicted standard errors]; shaded: within {MOST_OFF:g}", "", grid="x"
     )
     return figure
+
+
+# -------- Which frames are taken, and what they tell: measured, expected, and drawn
+
+_TO = 1.15
+"""Light of the brightest step over what saturates: 7 steps of 50 are saturated, so the largest variance is inside."""
+_DARK_STEPS = 6
+"""Exposures of the dark series: the least that EMVA 1288 4.0 takes."""
+_DARK_FILL, _DARK_ELECTRONS = 0.4, 2000.0
+"""Dark electrons at the longest of them: a part of saturation, or as many as tell the current to a permille."""
+_LONGEST_S = 10.0
+"""Of a camera without dark current [s]."""
+_FILLED_BY_DARK = 0.01
+"""Part of saturation that dark current may fill at the ladder's exposure."""
+_SESSIONS = 1000
+"""Drawn statistics of sessions: they tell a standard error to 2 %."""
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Which frames are taken of a camera.
+
+    Attributes
+    ----------
+    sensor, procedure
+        of what, and how.
+    electrons
+        (steps,) light of the ladder's pairs [electrons a pixel].
+    half, beyond
+        that of the bright stack, and of overexposed frames.
+    exposure_s
+        of all of these [s].
+    dark_times
+        exposures of the dark series [s].
+    """
+
+    sensor: SensorModel
+    procedure: Procedure
+    electrons: FloatArray
+    half: float
+    beyond: float
+    exposure_s: float
+    dark_times: FloatArray
+
+    @classmethod
+    def of(cls, sensor: SensorModel, procedure: Procedure, capacity: float) -> Frames:
+        """Those that a camera is characterised by.
+
+        Parameters
+        ----------
+        sensor, procedure
+            of what, and how.
+        capacity
+            electrons that saturate a pixel.
+        """
+        steps = capacity * _TO * np.arange(1, procedure.steps + 1) / procedure.steps
+        hottest = (
+            sensor.binning**2 * sensor.dark_factor * (sensor.dark_current_e_per_s + sensor.hot_dark_current_e_per_s)
+        )
+        mean = mean_dark_current(sensor)
+        longest = min(_DARK_FILL * capacity / hottest, _DARK_ELECTRONS / mean) if hottest else _LONGEST_S
+        longest = min(max(longest, EXPOSURE_S[0] * _DARK_STEPS), EXPOSURE_S[1])
+        exposure_s = min(0.01, _FILLED_BY_DARK * capacity / hottest) if hottest else 0.01
+        times = longest * np.arange(_DARK_STEPS) / (_DARK_STEPS - 1)
+        return cls(sensor, procedure, steps, capacity / 2, 2 * capacity + 20 * math.sqrt(capacity), exposure_s, times)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.procedure.pixels, self.procedure.pixels
+
+    @property
+    def photons(self) -> FloatArray:
+        """(steps,) light of the ladder in photons a pixel."""
+        return self.electrons / efficiency_of(self.sensor, self.procedure)
+
+    def _frame(self, electrons: float, exposure_s: float, *names: str | int) -> FloatArray:
+        shot, read = (stream(self.procedure.seed, "characterise", noise, *names) for noise in ("shot", "read"))
+        return np.asarray(expose(np.full(self.shape, electrons), exposure_s, self.sensor, shot, read), dtype=np.float64)
+
+    def _pair(self, electrons: float, exposure_s: float, name: str, index: int = 0) -> emva.Pair:
+        return emva.pair_of(*(self._frame(electrons, exposure_s, name, index, side) for side in (0, 1)))
+
+    def measured(self, job: Job) -> Session:
+        """What the frames say, which are taken one after the other; ``job`` is told how far it is."""
+        job.progress("light", 0.0)
+        steps = in_threads(
+            lambda step: self._pair(step[1], self.exposure_s, "ladder", step[0]), [*enumerate(self.electrons)]
+        )
+        job.progress("dark", 0.4)
+        dark = in_threads(lambda step: self._pair(0.0, step[1], "dark series", step[0]), [*enumerate(self.dark_times)])
+        job.progress("stacks", 0.5)
+        stacks = in_threads(
+            lambda light: emva.stack_of(self._frames(*light)), [(0.0, "dark stack"), (self.half, "bright stack")]
+        )
+        return Session(
+            shape=self.shape,
+            photons=self.photons,
+            ladder=emva.pairs_of(steps),
+            dark=self._pair(0.0, self.exposure_s, "dark"),
+            overexposed=np.asarray(self._frame(self.beyond, self.exposure_s, "overexposed").mean()),
+            dark_times=self.dark_times,
+            dark_series=emva.pairs_of(dark),
+            dark_stack=stacks[0],
+            bright_stack=stacks[1],
+            rounded=self.sensor.bits is not None,
+        )
+
+    def _frames(self, electrons: float, name: str) -> Iterator[FloatArray]:
+        for index in range(self.procedure.frames):
+            yield self._frame(electrons, self.exposure_s, name, index)
+
+    def expected(self) -> Session:
+        """The same statistics as closed forms expect them of all specimens; nonuniformity as it was set."""
+        ladder, dark = self._expected_pair(self.electrons), self._expected_pair(0.0)
+        series = [self._expected_pair(0.0, time) for time in self.dark_times]
+        return Session(
+            shape=self.shape,
+            photons=self.photons,
+            ladder=ladder,
+            dark=dark,
+            overexposed=self._expected_pair(self.beyond).mean,
+            dark_times=self.dark_times,
+            dark_series=emva.pairs_of(series),
+            dark_stack=self._expected_stack(dark.mean, 0.0),
+            bright_stack=self._expected_stack(self._expected_pair(self.half).mean, self.half),
+            rounded=self.sensor.bits is not None,
+        )
+
+    def _expected_pair(self, electrons: FloatArray | float, exposure_s: float | None = None) -> emva.Pair:
+        time = self.exposure_s if exposure_s is None else exposure_s
+        (lit, noise), (dark, still) = (
+            frame_moments(np.atleast_1d(light), time, self.alike) for light in (electrons, np.zeros_like(electrons))
+        )
+        dead = self.sensor.dead_pixels
+        mean, variance = (1 - dead) * lit + dead * dark, (1 - dead) * noise + dead * still
+        rows = (self.sensor.superpixel_row_noise_e * self.sensor.gain_dn_per_e) ** 2
+        pair = mean, variance, np.minimum(rows, variance)
+        return emva.Pair(*(part if np.ndim(electrons) else part[0] for part in pair))
+
+    def _expected_stack(self, mean: FloatArray, electrons: float) -> emva.Stack:
+        rows, columns, pixel = (self.slope(electrons) ** 2 * part for part in self.parts(electrons))
+        m, n = self.shape
+        parts = rows + columns + pixel, rows + pixel / n, columns + pixel / m
+        return emva.Stack(mean, *(np.asarray(part) for part in parts))
+
+    @property
+    def alike(self) -> SensorModel:
+        """The sensor with pixels that are all alike, of the same mean dark current, lit evenly."""
+        names = (
+            *(f"dsnu_{part}_e" for part in emva.SPLIT[1:]),
+            *(f"prnu_{part}" for part in emva.SPLIT[1:]),
+            *("dark_current_spread_e_per_s", "hot_pixels", "hot_dark_current_e_per_s", "dead_pixels", "crosstalk"),
+        )
+        mean = self.sensor.dark_current_e_per_s + self.sensor.hot_pixels * self.sensor.hot_dark_current_e_per_s
+        return self.sensor.model_copy(update={**dict.fromkeys(names, 0.0), "dark_current_e_per_s": mean})
+
+    def slope(self, electrons: float) -> float:
+        """Digital numbers for another electron, around so many ``electrons``."""
+        if not self.sensor.linearity:
+            return self.sensor.gain_dn_per_e
+        around = np.array([electrons * 0.999, electrons * 1.001 + 1])
+        mean, _ = frame_moments(around, self.exposure_s, self.alike)
+        return float(np.diff(mean)[0] / np.diff(around)[0])
+
+    def parts(self, electrons: float) -> tuple[float, float, float]:
+        """Set spatial variances by row, column and pixel [e-^2] under light of so many ``electrons``."""
+        pixel, row, column = (part**2 for part in self.sensor.offset_parts)
+        dark = dark_current_variance(self.sensor) * self.exposure_s**2
+        _, row_response, column_response = (part**2 for part in self.sensor.response_parts)
+        own = response_variance(self.sensor) - row_response - column_response
+        light = electrons**2
+        return row + row_response * light, column + column_response * light, pixel + dark + own * light
+
+
+def draw_sessions(frames: Frames, expected: Session) -> Session:
+    """Statistics of :data:`_SESSIONS` sessions, each as far off the ``expected`` ones of ``frames`` as noise and
+    specimen make them.
+
+    A variance of n pixels whose rows share v_r of v has the variance (2 v_o^2 + k_4 / 2)/n + 4 v_o v_r/n + 2 v_r^2/M,
+    v_o = v - v_r, k_4 = K^4 mu the fourth cumulant of the counts, dark ones among them.
+    """
+    sensor, rng = frames.sensor, stream(frames.procedure.seed, "characterise", "sessions")
+    m, n = frames.shape
+    gain, (pixel, row, column) = sensor.gain_dn_per_e, sensor.response_parts
+    response = rng.standard_normal((_SESSIONS, 1)) * math.sqrt(row**2 / m + column**2 / n + pixel**2 / m / n)
+    leak = rng.standard_normal((_SESSIONS, 1)) * math.sqrt(dark_current_variance(sensor) / m / n)
+    dark_electrons = mean_dark_current(sensor)
+
+    def pairs(pair: emva.Pair, electrons: FloatArray, times: FloatArray | float) -> emva.Pair:
+        mean, variance, rows = (np.atleast_1d(part)[None, :] for part in (pair.mean, pair.variance, pair.rows))
+        own = variance - rows
+        z = rng.standard_normal((3, _SESSIONS, mean.shape[1]))
+        specimen = gain * (electrons * response + np.asarray(times) * leak) * (own > 0)
+        mean = mean + specimen + z[0] * np.sqrt((own / m / n + rows / m) / 2)
+        fourth = gain**4 * (electrons + dark_electrons * np.asarray(times)) / 2
+        spread = (2 * own**2 + fourth + 4 * own * rows) / m / n
+        shared = np.sqrt(2.0 / m) * rows * z[2]
+        alone = np.sqrt(2.0 / m) * own / n * rng.standard_normal(z[2].shape)
+        return emva.Pair(mean, variance + np.sqrt(spread) * z[1] + shared, rows + shared + alone)
+
+    ladder = pairs(expected.ladder, frames.electrons, frames.exposure_s)
+    dark = pairs(expected.dark, np.zeros(1), frames.exposure_s)
+    series = pairs(expected.dark_series, np.zeros(_DARK_STEPS), frames.dark_times)
+    stacks = _drawn_stacks(frames, expected, rng)
+    beyond = expected.overexposed + np.sqrt(expected.dark.variance / m / n) * rng.standard_normal(_SESSIONS)
+    return Session(
+        frames.shape,
+        frames.photons,
+        ladder,
+        emva.Pair(*(part[:, 0] for part in (dark.mean, dark.variance, dark.rows))),
+        beyond,
+        frames.dark_times,
+        series,
+        *stacks,
+        expected.rounded,
+    )
+
+
+def _drawn_stacks(frames: Frames, expected: Session, rng: np.random.Generator) -> tuple[emva.Stack, emva.Stack]:
+    """Dark and bright stacks as they may come out: sums of squares of offsets, responses and what is left of noise.
+
+    By row, column and pixel these are independent; of f degrees of freedom, squares are chi-square and products of two
+    parts normal. Offsets are the same in both stacks.
+    """
+    m, n = frames.shape
+    count = frames.procedure.frames
+    noise = [
+        float(np.interp(light, [0, *frames.electrons], [expected.dark.variance, *expected.ladder.variance]))
+        for light in (0.0, frames.half)
+    ]
+    shared = min(float(expected.dark.rows), min(noise))
+    sizes = {"row": (m - 1, n), "column": (n - 1, m), "pixel": ((m - 1) * (n - 1), 1)}
+    squares: dict[str, list[FloatArray]] = {}
+    dark, bright = frames.parts(0.0), frames.parts(frames.half)
+    for index, (name, (freedom, averaged)) in enumerate(sizes.items()):
+        of_pixel = dark[2] / averaged if averaged > 1 else 0.0
+        offset = (dark[index] + of_pixel) * frames.slope(0.0) ** 2
+        light = bright[index] - dark[index] + ((bright[2] - dark[2]) / averaged if averaged > 1 else 0.0)
+        light *= frames.slope(frames.half) ** 2
+        left = [((each - shared) / averaged + (shared if name == "row" else 0.0)) / count for each in noise]
+        parts = np.sqrt([offset, light, *left])
+        products = _products(freedom, len(parts), rng)
+        squares[name] = [
+            freedom * np.einsum("i,ijs,j->s", parts[used], products[np.ix_(used, used)], parts[used])
+            for used in ([0, 2], [0, 1, 3])
+        ]
+    stacks = []
+    for side, (stack, each) in enumerate(zip((expected.dark_stack, expected.bright_stack), noise, strict=True)):
+        row, column, pixel = (squares[name][side] for name in ("row", "column", "pixel"))
+        total = (row * n + column * m + pixel) / (m * n - 1)
+        mean = np.full(_SESSIONS, float(stack.mean))
+        taken = each / count
+        stacks.append(emva.Stack(mean, total - taken, row / m - taken / n, column / n - taken / m))
+    return stacks[0], stacks[1]
+
+
+def _products(freedom: int, count: int, rng: np.random.Generator) -> FloatArray:
+    """(count, count, sessions) mean products of as many independent normal samples of some degrees of ``freedom``."""
+    products = rng.standard_normal((count, count, _SESSIONS)) / math.sqrt(freedom)
+    products = (products + products.transpose(1, 0, 2)) / math.sqrt(2)
+    products[np.arange(count), np.arange(count)] = rng.chisquare(freedom, (count, _SESSIONS)) / freedom
+    return np.asarray(products)

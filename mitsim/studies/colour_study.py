@@ -4,12 +4,17 @@
 *Rendered*: frames of every line with the sensor's noise, a calibration and a solve for each. *One calibration for all*:
 the middle line's factors serve all lines. *D65*: a lamp of daylight shines on the chart, its frame taken off. *Mosaic*:
 all lines at once behind colour filters (:mod:`mitsim.studies.lit_lines`).
+
+Daylight of any illuminance is measured by two ways to solve the same frames, beside the least that any linear image
+without bias comes to, from which follows what keeps the goal in more light: repeats, or laser power. Frames of k times
+the power in k times the daylight are the same at a k-th of the exposure, so that power counts as less daylight does.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -19,29 +24,213 @@ from matplotlib.figure import Figure
 from mitsim.acquire.capture import expose
 from mitsim.acquire.exposure import ambient_shots
 from mitsim.core.arrays import FloatArray
-from mitsim.core.display import lightness
 from mitsim.devices.chart import ChartPlace, load_chart
 from mitsim.metrics import psnr
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
+from mitsim.reconstruct.request import MARKOV, TIKHONOV
 from mitsim.report import label
 from mitsim.report.colour_image import by_patch, halves
-from mitsim.report.plots import BLUE, FONT, VERMILION, figure_of, label_axes, panels_of
-from mitsim.report.table import Table, Value
-from mitsim.studies import daylight as by_lux
-from mitsim.studies.daylight import BY_LUX, GOAL, DaylitLine
+from mitsim.report.plots import bars, curves, image_grid
+from mitsim.report.table import Mean, Table, Value
+from mitsim.studies import lit_lines
 from mitsim.studies.framework.claims import difference, every, sample_mean, verdict, within
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, PageTable, Results, Scope
-from mitsim.studies.framework.setup import Point
+from mitsim.studies.framework.experiment import Claim, Experiment, Found, PageTable, Point, Results, Scope, Setup
 from mitsim.studies.framework.studio import Studio
-from mitsim.studies.lit_lines import LitLine, available_ways, daylight_frame, lit_lines, mosaic_shots, serving
+
+# -------- Beside daylight of any brightness
+
+GOAL = 0.5
+"""Most that 49 dots may add to the floor's mean Delta E."""
+BY_LUX = "D65, by its illuminance"
+"""Rows of the mean Delta E under :data:`LADDER_LX`, by ``method``; they have no patches."""
+LADDER_LX, DRAWS = (0.0, 5.0, 10.0, 20.0, 60.0, 200.0, 600.0), 3
+"""Illuminances of daylight [lx], dark, dusk, a dim room, a bright office; and exposures at each."""
+LEAST = "least without bias"
+METHODS = TIKHONOV, MARKOV, LEAST
+"""Of the column ``method``: two ways to solve the same frames, and what no linear image without bias is below."""
+_FEW_LX, _ASKED_LX = (0.0, 60.0), (60.0, 600.0)
+"""Of a quick look: the dark, and where the goal is near its end; and those for which the page says what they take."""
+_LADDER_FAMILIES = ("dots:7", "hadamard:8")
+_BETWEEN_LX, _VARIANCES = (1e-2, 1e5), (1e-6, 1.0)
+"""Where the illuminance that keeps the goal, and the part of one exposure's variance that does, are looked for."""
+
+
+def ladder_points(scope: Scope, setup: Setup) -> list[Point]:
+    """A point for each family: all of its exposures share its frames.
+
+    Parameters
+    ----------
+    scope, setup
+        how much is wanted, and of what.
+    """
+    ladder, draws = (_FEW_LX, 2) if scope.quick else (LADDER_LX, DRAWS)
+    lux = " ".join(f"{each:g}" for each in ladder)
+    return [
+        Point.of(setup, way=BY_LUX, patterns=patterns, seed=scope.seeds[0], ladder=lux, draws=draws)
+        for patterns in scope.chosen(_LADDER_FAMILIES, _LADDER_FAMILIES[:1])
+    ]
+
+
+def measure_ladder(
+    lines: Sequence[lit_lines.LitLine], light: tuple[FloatArray, float], point: Point, place: ChartPlace
+) -> Found:
+    """A row for every exposure and method, and one of the least for every illuminance.
+
+    Parameters
+    ----------
+    lines
+        the scene in each line's light.
+    light
+        daylight as bright as the projector: irradiance (m, m') [W m^-2], and wavelength [nm] of its photons.
+    point
+        of :func:`ladder_points`.
+    place
+        of the chart's patches.
+    """
+    ladder = [float(lux) for lux in str(point["ladder"]).split()]
+    model, known = ColourModel.of_lines([line.wavelength_nm for line in lines]), chart()
+    board = lines[0].factors.manifest.board_reflectance or 1.0
+
+    def judged(means: FloatArray) -> FloatArray:
+        return delta_e(model.xyz(means * board), known.xyz)
+
+    lit = [lit_lines.DaylitLine.of(line, light, str(point["patterns"]), int(point["seed"])) for line in lines]
+    draws = list(product(ladder, range(int(point["draws"]))))
+    exposures = [(lux / lit_lines.FULL_LX, draw) for lux, draw in draws]
+    images = [each.images(exposures, [each.model, each.model.correlated()], each.shots) for each in lit]
+    truth = place.means(np.stack([line.lit.truth for line in lines], axis=-1))
+    goal = float(delta_e(model.xyz(known.at(model.wavelengths_nm)), known.xyz).mean()) + GOAL
+
+    def least(lux: float, repeats: float = 1.0) -> float:
+        variances = [each.least_variance(lux / lit_lines.FULL_LX, place) / repeats for each in lit]
+        return lit_lines.expected_delta_e(truth, np.stack(variances, axis=-1), judged)
+
+    def repeats(lux: float) -> float | None:
+        part = lit_lines.most(lambda part: least(lux, 1 / part) <= goal, *_VARIANCES)
+        return float(np.ceil(1 / part)) if part else None
+
+    kept = lit_lines.most(lambda lux: least(lux) <= goal, *_BETWEEN_LX)
+    rows = [
+        point.row(lux=lux, draw=draw, method=method, mean_delta_e=float(judged(place.means(image)).mean()))
+        for (lux, draw), by_line in zip(draws, zip(*images, strict=True), strict=True)
+        for method, image in zip((TIKHONOV, MARKOV), np.moveaxis(np.array(by_line), 0, -1), strict=True)
+    ]
+    for lux in ladder:
+        power = lux / kept if kept else None
+        needed = {"kept_lx": kept, "repeats": repeats(lux), "power": power}
+        rows.append(point.row(lux=lux, method=LEAST, mean_delta_e=least(lux), **needed))
+    return Found(tuple({**row, "goal_delta_e": goal} for row in rows))
+
+
+def ladder_claim(rows: Table, patterns: str) -> Claim:
+    """Up to which illuminance a family keeps the goal.
+
+    Parameters
+    ----------
+    rows, patterns
+        those of :data:`BY_LUX`, and the family.
+    """
+    own = rows.where(patterns=patterns)
+    by_lux, goal = own.where(method=MARKOV).means("mean_delta_e", "lux"), own.mean("goal_delta_e").value
+    kept, last = kept_lx(by_lux, goal), max(by_lux)
+    limit = f"the brightest tried, {last:g} lx" if kept == last else f"{_digits(kept)} lx"
+    least = own.mean("kept_lx", method=LEAST).value
+    holds = within(by_lux[last if kept == last else min(by_lux)], high=goal) if kept in (0, last) else True
+    return Claim(
+        f"{label(patterns)} add at most {GOAL:g} to the floor's mean Delta E 2000 beside D65 ({MARKOV})", "", "",
+        f"kept up to {limit}; without bias at best up to {_digits(least)} lx",
+        verdict(holds) if kept in (0, last) else f"confirmed only if D65 has at most {_digits(kept)} lx",
+    )  # fmt: skip
+
+
+def kept_lx(by_lux: Mapping[float, Mean], goal: float) -> float:
+    """Illuminance [lx] up to which a mean Delta E is at most a goal; 0 where it never is.
+
+    Parameters
+    ----------
+    by_lux
+        by illuminance [lx]; straight between two over the logarithm, from the dark on over the illuminance itself.
+    goal
+        the most.
+    """
+    order = sorted(by_lux)
+    if by_lux[order[0]].value > goal:
+        return 0.0
+    for low, high in pairwise(order):
+        first, second = by_lux[low].value, by_lux[high].value
+        if second > goal:
+            share = (goal - first) / (second - first)
+            return float(low * (high / low) ** share if low else high * share)
+    return order[-1]
+
+
+def _digits(value: float) -> str:
+    """A ``value`` to two digits, without a power of ten."""
+    return f"{float(f'{value:.2g}'):g}"
+
+
+def ladder_figure(rows: Table) -> Figure:
+    """Mean Delta E by the illuminance of daylight, measured and least, and what is allowed; ``rows`` of
+    :data:`BY_LUX`."""
+    panels = {}
+    for patterns in rows.distinct("patterns"):
+        own = rows.where(patterns=patterns)
+        shown = {method: own.where(method=method).means("mean_delta_e", "lux") for method in METHODS}
+        shown[f"floor + {GOAL:g}"] = own.means("goal_delta_e", "lux")
+        panels[label(patterns)] = {
+            name: {lux: mean for lux, mean in curve.items() if lux} for name, curve in shown.items()
+        }
+    return curves(panels, "D65 on the chart [lx]", "mean Delta E 2000 of 24 patches", log=True)
+
+
+def ladder_tables(rows: Table) -> tuple[PageTable, PageTable]:
+    """Mean Delta E by illuminance, and what keeps the goal; ``rows`` of :data:`BY_LUX`."""
+    families = [str(patterns) for patterns in rows.distinct("patterns")]
+    pairs = list(product(families, METHODS))
+    chosen = [lux for lux in rows.distinct("lux") if lux in _ASKED_LX]
+
+    def cell(lux: float, family: str, method: str) -> str:
+        mean = rows.mean("mean_delta_e", lux=lux, patterns=family, method=method)
+        return f"{mean.value:.2f}" if mean.of == 1 else f"{mean.value:.2f} \N{PLUS-MINUS SIGN} {mean.error:.2f}"
+
+    def needs(family: str) -> tuple[str, ...]:
+        least = rows.where(patterns=family, method=LEAST)
+        by_lux = rows.where(patterns=family, method=MARKOV).means("mean_delta_e", "lux")
+        kept = kept_lx(by_lux, least.mean("goal_delta_e").value), least.mean("kept_lx").value
+        needed = [(least.numbers("repeats", lux=lux), least.numbers("power", lux=lux)) for lux in chosen]
+        return (
+            label(family), *map(_digits, kept),
+            *(f"{count[0]:g}; {_digits(max(power[0], 1))}" if count and power else "never" for count, power in needed),
+        )  # fmt: skip
+
+    count = len(rows.where(method=MARKOV).distinct("draw"))
+    return (
+        PageTable(
+            "Mean Delta E 2000 of 24 patches by the illuminance of D65 on the chart: mean and standard error of "
+            f"{count} exposures, less a frame of as many shots as patterns",
+            ("D65 [lx]", *(f"{label(family)}, {method}" for family, method in pairs)),
+            tuple((f"{lux:g}", *(cell(lux, *pair) for pair in pairs)) for lux in rows.distinct("lux")),
+        ),
+        PageTable(
+            f"What keeps the mean Delta E at most {GOAL:g} above the floor: D65 [lx] with one exposure a pattern; in "
+            "more light repeats of all exposures, or times the laser power (the same as a filter that lets through "
+            "one over that part of D65), by the least noise without bias",
+            ("Patterns", f"Most [lx], {MARKOV}", f"Most [lx], {LEAST}",
+             *(f"{lux:g} lx: repeats; power" for lux in chosen)),
+            tuple(map(needs, families)),
+        ),
+    )  # fmt: skip
+
+
+# -------- Every way to see the colours of the chart
 
 FAMILIES = ("uniform", "dots:7", "hadamard:8")
 OWN, ONE = "one line at a time", "one calibration for all lines"
 DAYLIGHT = {"D65 a tenth as bright as the projector": 0.1, "D65 as bright as the projector": 1.0}
 """Irradiance of daylight on the chart's middle over that of the projector's white light: some 60 and 600 lx, a dim room
-and a bright office (:data:`mitsim.studies.daylight.FULL_LX`)."""
+and a bright office (:data:`mitsim.studies.lit_lines.FULL_LX`)."""
 _IMAGE = "xyz"
 _SHOWN = "dots:7"
 
@@ -52,7 +241,7 @@ def _points(scope: Scope) -> Sequence[Point]:
         OWN: FAMILIES,
         ONE: scope.chosen(FAMILIES, (_SHOWN,)),
         **{way: scope.chosen(FAMILIES, (_SHOWN,)) for way in DAYLIGHT},
-        **{f"mosaic, {way}": scope.chosen((_SHOWN, "hadamard:8"), (_SHOWN,)) for way in available_ways()},
+        **{f"mosaic, {way}": scope.chosen((_SHOWN, "hadamard:8"), (_SHOWN,)) for way in lit_lines.available_ways()},
     }
     points = [
         Point.of(setup, way=way, patterns=patterns, seed=seed)
@@ -60,41 +249,40 @@ def _points(scope: Scope) -> Sequence[Point]:
         for way, families in seen.items()
         for patterns in (families if seed in scope.seeds else (_SHOWN,))
     ]
-    return points + by_lux.points_of(scope, setup)
+    return points + ladder_points(scope, setup)
 
 
 def _measure(studio: Studio, point: Point) -> Found:
     setup, way, patterns, seed = point.setup, str(point["way"]), str(point["patterns"]), int(point["seed"])
-    lines = studio.once("lines", 1, (setup, seed), lambda: lit_lines(setup, seed))
+    lines = studio.once("lines", 1, (setup, seed), lambda: lit_lines.light_lines(setup, seed))
     if way.startswith("mosaic"):
-        shots = studio.once("mosaic", 1, (setup, patterns, seed), lambda: mosaic_shots(lines, patterns, seed))
+        shots = studio.once("mosaic", 1, (setup, patterns, seed), lambda: lit_lines.mosaic_shots(lines, patterns, seed))
         images = np.moveaxis(shots.images(way.removeprefix("mosaic, ")), 0, -1)
     elif way in (*DAYLIGHT, BY_LUX):
-        light = studio.once("daylight", 1, setup, lambda: daylight_frame(setup, studio.folder("daylight")))
+        light = studio.once("daylight", 1, setup, lambda: lit_lines.daylight_frame(setup, studio.folder("daylight")))
         if way == BY_LUX:
-            return by_lux.measure_ladder(lines, light, point, _place(setup.scene))
+            return measure_ladder(lines, light, point, _place(setup.scene))
         images = _under_daylight(lines, light, DAYLIGHT[way], patterns, seed)
     else:
         middle = lines[len(lines) // 2]
-        factors = [line.factors if way == OWN else serving(line, middle) for line in lines]
+        factors = [line.factors if way == OWN else lit_lines.serving(line, middle) for line in lines]
         images = np.stack([_solve(*pair, patterns, seed) for pair in zip(lines, factors, strict=True)], axis=-1)
     truth = np.stack([line.lit.truth for line in lines], axis=-1)
     board = lines[0].factors.manifest.board_reflectance or 1.0
     return _judge(point, [line.wavelength_nm for line in lines], images * board, truth * board)
 
 
-def _solve(line: LitLine, factors: Factors, patterns: str, seed: int) -> FloatArray:
-    """(n, n) image of a line, as a user's own frames are exposed and reconstructed."""
+def _solve(line: lit_lines.LitLine, factors: Factors, patterns: str, seed: int) -> FloatArray:
     return reconstruct(expose(line.lit.light, patterns, seed=line.seed(seed)), factors).image
 
 
 def _under_daylight(
-    lines: Sequence[LitLine], light: tuple[FloatArray, float], part: float, patterns: str, seed: int
+    lines: Sequence[lit_lines.LitLine], light: tuple[FloatArray, float], part: float, patterns: str, seed: int
 ) -> FloatArray:
     """(n, n, lines) images of frames beside a ``part`` of a lamp's ``light`` (irradiance and wavelength), less it."""
     images = []
     for line in lines:
-        lit = DaylitLine.of(line, light, patterns, seed)
+        lit = lit_lines.DaylitLine.of(line, light, patterns, seed)
         shots = 0 if lit.family.signed else ambient_shots(lit.family)
         images += lit.images([(part, seed)], [lit.model], shots)[0]
     return np.stack(images, axis=-1)
@@ -157,7 +345,7 @@ def _claims(results: Results) -> Sequence[Claim]:
     *others, joint = found.values()
     return [
         told(OWN),
-        *(by_lux.claim_of(beside, patterns) for patterns in beside.distinct("patterns")),
+        *(ladder_claim(beside, patterns) for patterns in beside.distinct("patterns")),
         Claim(
             "Each line needs a calibration of its own (49 dots)", "", "",
             f"one for all: {loss} dB less, mean Delta E {more:+}", verdict(within(loss, low=0)),
@@ -179,12 +367,11 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     rows = table.where(way=OWN, patterns=_SHOWN).rows
     drawn["chart.png"] = _patches(rows[: len(chart().names)])
     drawn["images.png"] = _images(results)
-    drawn["daylight.png"] = by_lux.figure(table.where(way=BY_LUX))
+    drawn["daylight.png"] = ladder_figure(table.where(way=BY_LUX))
     return drawn
 
 
 def _by_patch(table: Table) -> Figure:
-    """Delta E of each patch: the floor, and what each family of patterns comes to."""
     names = [str(name) for name in table.distinct("patch")]
     found = {
         label(family): [table.mean("delta_e", patch=name, patterns=family).value for name in names]
@@ -194,26 +381,15 @@ def _by_patch(table: Table) -> Figure:
 
 
 def _by_way(table: Table) -> Figure:
-    """Mean Delta E of each way to see colour, under 49 dots."""
+    """Mean Delta E of each way to see colour, under 49 dots, above the floor."""
     rows = table.where(patterns=_SHOWN)
-    ways = [way for way in rows.distinct("way") if way != BY_LUX]
-    figure, axes = figure_of(0.42 * len(ways) + 1.0)
-    means = [rows.mean("delta_e", way=way).value for way in ways]
-    bars = axes.barh(ways, means, color=BLUE)
-    axes.bar_label(
-        bars,
-        [f"{mean:.2f}, {rows.mean('psnr_db', way=way).value:.1f} dB" for mean, way in zip(means, ways, strict=True)],
-        padding=3,
-        fontsize=FONT - 1,
-    )
-    floor = rows.mean("floor").value
-    axes.axvline(floor, color=VERMILION, lw=1.5)
-    axes.text(floor, -0.75, f"floor {floor:.2f}", color=VERMILION, fontsize=FONT - 1, ha="center", va="bottom")
-    axes.invert_yaxis()
-    axes.margins(x=0.25)
-    axes.tick_params(labelsize=FONT - 1)
-    label_axes(axes, f"mean Delta E 2000 of 24 patches, {label(_SHOWN)}", "", grid="x")
-    return figure
+    means = {
+        f"{way}, {rows.mean('psnr_db', way=way).value:.1f} dB": rows.mean("delta_e", way=way)._replace(error=0.0)
+        for way in rows.distinct("way")
+        if way != BY_LUX
+    }
+    floor = {"floor, no camera": rows.mean("floor")._replace(error=0.0)}
+    return bars({"found": means, "floor": floor}, f"mean Delta E 2000 of 24 patches, {label(_SHOWN)}")
 
 
 def _patches(rows: Sequence[Mapping[str, Any]]) -> Figure:
@@ -226,17 +402,13 @@ def _patches(rows: Sequence[Mapping[str, Any]]) -> Figure:
 
 def _images(results: Results) -> Figure:
     """What each family of patterns recovers, in colour."""
-    figure, (places,) = panels_of(1, len(FAMILIES), 3.2)
-    for axes, family in zip(places, FAMILIES, strict=True):
-        row = results.table.where(way=OWN, patterns=family).rows[0]
-        image = results.array(row, _IMAGE)
-        if image is not None:
-            axes.imshow(lightness(linear_srgb(image)), interpolation="none")
-        axes.set(xticks=[], yticks=[])
-        mean = results.table.mean("delta_e", way=OWN, patterns=family).value
-        axes.set_title(label(family), fontsize=FONT)
-        axes.set_xlabel(f"{row['psnr_db']:.1f} dB, mean Delta E {mean:.2f}", fontsize=FONT - 1)
-    return figure
+    cells = []
+    for family in FAMILIES:
+        rows = results.table.where(way=OWN, patterns=family)
+        image = results.array(rows.rows[0], _IMAGE)
+        caption = f"{rows.rows[0]['psnr_db']:.1f} dB, mean Delta E {rows.mean('delta_e').value:.2f}"
+        cells += [(linear_srgb(image), caption)] if image is not None else []
+    return image_grid({OWN: cells}, [label(family) for family in FAMILIES])
 
 
 def _tables(results: Results) -> Sequence[PageTable]:
@@ -264,7 +436,7 @@ def _tables(results: Results) -> Sequence[PageTable]:
                 if way != BY_LUX
             ),
         ),
-        *by_lux.tables(table.where(way=BY_LUX)),
+        *ladder_tables(table.where(way=BY_LUX)),
         PageTable(
             f"Delta E 2000 of each patch to its spectrum in D65, {OWN}: the floor (no camera), the truth (no noise), "
             "and what is reconstructed",

@@ -37,12 +37,22 @@ from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import prepare
 from mitsim.report import CONVENTIONS, EQUAL_FRAME, EQUAL_PEAK
 from mitsim.report.lit_scene import IdealCamera
-from mitsim.report.plots import curves, image_grid
+from mitsim.report.plots import curves
 from mitsim.report.table import Mean, Table, Value
 from mitsim.sensor.chain import dn_to_electrons, electrons_from_irradiance, expose, exposure_for_peak
-from mitsim.studies.framework.claims import Holds, every, image_array, near, sample_mean, verdict, verdict_at, within
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
-from mitsim.studies.framework.setup import QUICK_IMAGES, SIDE, Point, picture
+from mitsim.studies.framework import claims
+from mitsim.studies.framework.claims import Holds
+from mitsim.studies.framework.experiment import (
+    QUICK_IMAGES,
+    SIDE,
+    Claim,
+    Experiment,
+    Found,
+    Point,
+    Results,
+    Scope,
+    picture,
+)
 from mitsim.studies.framework.studio import Studio
 
 MEASURED, TRACED = "measured", "rendered"
@@ -87,7 +97,6 @@ def _points(scope: Scope) -> Sequence[Point]:
 
 @cache
 def _psf(file: str | None, variant: str) -> FloatArray:
-    """Of a picture, or of a rendered diffuser."""
     return rendered_psf(_SHAPE, _PITCH_MM, variant) if file is None else load_psf(file, _REDUCE)
 
 
@@ -120,7 +129,7 @@ def _measure(studio: Studio, point: Point) -> Found:
             solution, psnr_db = best_image(Classes(whole, k), shots, truth)
             rows.append(point.row(exposure=exposure, psnr_db=psnr_db, exposure_s=shots.exposure_s))
             if point.setup.picture in (*QUICK_IMAGES, None) and exposure == EQUAL_FRAME:
-                arrays = image_array(solution.image)
+                arrays = claims.image_array(solution.image)
     return Found(tuple(rows), arrays)
 
 
@@ -138,7 +147,7 @@ def _claims(results: Results) -> Sequence[Claim]:
             ends = dict.fromkeys(f"{float(f'{each:.2g}'):g}" for each in (found.min(), found.max()))
             # Seconds vary by factors; numbers of patterns stand for repeats.
             ratio = Mean.of_numbers(list(np.log(found)), f"{column} over {over}")
-            return f"{' to '.join(ends)} times as long", within(ratio, low=float(np.log(least)))
+            return f"{' to '.join(ends)} times as long", claims.within(ratio, low=float(np.log(least)))
 
         return judge
 
@@ -167,12 +176,12 @@ def _claims(results: Results) -> Sequence[Claim]:
 def _psnr_claim(rows: Table, name: str, band: tuple[float, float]) -> Claim:
     """A claim of PSNR within a ``band`` [dB] of what is called ``name``, at each way of exposing."""
     means = {
-        (psf, exposure): sample_mean(rows.where(psf=psf, exposure=exposure), "psnr_db")
+        (psf, exposure): claims.sample_mean(rows.where(psf=psf, exposure=exposure), "psnr_db")
         for psf in rows.distinct("psf")
         for exposure in EXPOSURES
     }
     at = {
-        exposure: every(*(near(mean, band) for (_, each), mean in means.items() if each == exposure))
+        exposure: claims.every(*(claims.near(mean, band) for (_, each), mean in means.items() if each == exposure))
         for exposure in EXPOSURES
     }
 
@@ -180,24 +189,14 @@ def _psnr_claim(rows: Table, name: str, band: tuple[float, float]) -> Claim:
         return "; ".join(f"{exposure}: {means[psf, exposure]} dB" for exposure in EXPOSURES), None
 
     claim = _judge(rows, f"{name}: {band[0]:g} to {band[1]:g} dB", f"{band[0]:g} to {band[1]:g} dB", said)
-    return replace(claim, verdict=verdict_at(at))
+    return replace(claim, verdict=claims.verdict_at(at))
 
 
 def _judge(rows: Table, claim: str, paper: str, judge: Judge) -> Claim:
-    """A claim judged with each point spread function that was measured with; the measured one stands under "idealised".
-
-    Parameters
-    ----------
-    rows
-        what was measured.
-    claim, paper
-        what the paper says.
-    judge
-        from a point spread function to what is said of it, and whether the claim holds for it.
-    """
+    """A claim judged with each point spread function in ``rows``; that of the measured one stands under "idealised"."""
     said = {psf: judge(psf) for psf in rows.distinct("psf")}
     texts = {psf: f"{psf} PSF: {text}" for psf, (text, _) in said.items()}
-    holds = verdict(every(*(each for _, each in said.values())))
+    holds = claims.verdict(claims.every(*(each for _, each in said.values())))
     return Claim(claim, paper, texts.get(MEASURED, ""), texts[TRACED], holds)
 
 
@@ -219,18 +218,14 @@ def _figures(results: Results) -> Mapping[str, Figure]:
         )
     drawn["seconds.png"] = _seconds(speed, psfs)
     few = [each for each in quality.distinct("patterns") if each in (1, 9, 49)]
-    grid = {}
-    for psf in psfs:
-        for name in (*QUICK_IMAGES, None):
-            rows = quality.where(psf=psf, picture=name, exposure=EQUAL_FRAME)
-            cells = [(results.array(row), row) for each in few for row in rows.where(patterns=each).rows[:1]]
-            kept = [(image, f"{row['psnr_db']:.1f} dB") for image, row in cells if image is not None]
-            if len(kept) == len(few):
-                grid[f"{name or 'scene'}, {psf}"] = kept
-    if grid:
-        columns = [f"{count} frame{'s' if count > 1 else ''}" for count in few]
-        drawn["images.png"] = image_grid(grid, columns, f"Images, exposure {EQUAL_FRAME}, best lambda")
-    return drawn
+    by_scene = {
+        f"{name or 'scene'}, {psf}": quality.where(psf=psf, picture=name, exposure=EQUAL_FRAME)
+        for psf in psfs
+        for name in (*QUICK_IMAGES, None)
+    }
+    title = f"Images, exposure {EQUAL_FRAME}, best lambda"
+    columns = [f"{count} frame{'s' if count > 1 else ''}" for count in few]
+    return drawn | claims.images("images.png", results, by_scene, "patterns", few, title, columns)
 
 
 def _seconds(speed: Table, psfs: Sequence[str]) -> Figure:
@@ -373,8 +368,8 @@ def best_by_psnr(solve: Callable[[float], Solution], truth: FloatArray, largest:
         if found > reached:
             best, reached = solution, found
     for step in _FINER:
-        near = [solve(best.lam * 10**move) for move in (-step, step)]
-        best = max([best, *near], key=lambda solution: psnr(solution.image, truth))
+        beside = [solve(best.lam * 10**move) for move in (-step, step)]
+        best = max([best, *beside], key=lambda solution: psnr(solution.image, truth))
     return best, psnr(best.image, truth)
 
 
@@ -468,7 +463,6 @@ def race(classes: Classes, whole: Classes, truth: FloatArray, sensor: SensorMode
 
 
 def _time(factorised: FactorisedClasses, frames: FloatArray, tolerance: float) -> tuple[Solution, float]:
-    """Solution of frames, and its CPU seconds."""
     start = time.process_time()
     solution = factorised.solve(factorised.classes.projected(frames), tolerance)
     return solution, time.process_time() - start

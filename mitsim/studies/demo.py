@@ -115,7 +115,6 @@ def _fitting(bench: Bench, request: Request) -> tuple[str, ...]:
 
 
 def _run(bench: Bench, folder: Path, request: Request, names: tuple[str, ...], job: Job) -> DemoResult:
-    """The demo in a folder of its own."""
     with job.clock.stage("plan"):
         plan = bench.plan(**request.model_dump())
     light = trace_request(bench, plan, job)
@@ -337,7 +336,6 @@ class Comparison:
         return LitScene(self.light)
 
     def _recover(self, shots: Capture) -> Recovery:
-        """As a user's own frames are reconstructed."""
         image = reconstruct(shots, self.factors)
         quality = self._lit.quality(image.image)
         # What the capture and the calibration are flagged for is in the report's notes, once for all families.

@@ -19,18 +19,8 @@ from mitsim.report import EQUAL_PEAK, IDEALISED, RENDERED, label
 from mitsim.report.lit_scene import Plane
 from mitsim.report.plots import curves
 from mitsim.report.table import Mean, Table, Value
-from mitsim.studies.framework.claims import (
-    by_patterns,
-    difference,
-    every,
-    finding,
-    images,
-    sample_mean,
-    verdict,
-    within,
-)
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope, group_by_setup
-from mitsim.studies.framework.setup import Point
+from mitsim.studies.framework import claims
+from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope, group_by_setup
 from mitsim.studies.framework.studio import Image, Studio
 
 CALIBRATED_MM = 400.0
@@ -102,7 +92,7 @@ def _measure(studio: Studio, point: Point) -> Found:
         focus = point["focus"] if point["focus"] in (AUTO, MAP) else None
         # Frames of the sheet elsewhere, factors of the rig as it was aligned.
         image = studio.image(setup, RENDERED, patterns, seed, focus=focus)
-    return finding(point, image.image, scene=setup.scene, **image.row())
+    return claims.finding(point, image.image, scene=setup.scene, **image.row())
 
 
 def _claims(results: Results) -> Sequence[Claim]:
@@ -114,39 +104,40 @@ def _claims(results: Results) -> Sequence[Claim]:
         """At the worse of both depths."""
         there = rows.where(depth=CALIBRATED_MM)
         beside = [depth for depth in rows.distinct("depth") if abs(depth - CALIBRATED_MM) == small]
-        losses = (difference(there, rows.where(depth=depth), "psnr_db") for depth in beside)
+        losses = (claims.difference(there, rows.where(depth=depth), "psnr_db") for depth in beside)
         return max(losses, key=lambda loss: loss.value)
 
     ideal = table.where(model=IDEALISED, patterns="dots:7", along="columns")
     losses = {baseline: lost(ideal.where(baseline=baseline)) for baseline in ideal.distinct("baseline")}
     rendered = lost(table.where(model=RENDERED, patterns="dots:7", focus=NONE))
-    holds = {baseline: within(loss, high=_ROBUST_DB) for baseline, loss in losses.items()}
+    holds = {baseline: claims.within(loss, high=_ROBUST_DB) for baseline, loss in losses.items()}
     robust = [baseline for baseline, each in holds.items() if each]
     by_baseline = ", ".join(f"{loss} dB at {baseline:g} mm" for baseline, loss in losses.items())
-    everywhere = every(within(rendered, high=_ROBUST_DB), *holds.values())
+    everywhere = claims.every(claims.within(rendered, high=_ROBUST_DB), *holds.values())
     apart = f"at most {max(robust):g} mm apart" if any(robust) else "co-located"
     only = f"confirmed only if camera and projector are {apart}"
-    claims = [
+    found = [
         Claim(
             f"Robust to small variations in depth: 49 dots, {small:g} mm beside the calibrated distance", "robust",
             f"lost by baseline: {by_baseline}", f"lost at 60 mm: {rendered} dB",
-            only if everywhere is False and robust else verdict(everywhere),
+            only if everywhere is False and robust else claims.verdict(everywhere),
         )
     ]  # fmt: skip
     own, auto = (table.where(focus=focus, patterns="dots:7") for focus in (OWN, AUTO))
     gains = {
-        depth: difference(auto.where(depth=depth), own.where(depth=depth), "psnr_db") for depth in own.distinct("depth")
+        depth: claims.difference(auto.where(depth=depth), own.where(depth=depth), "psnr_db")
+        for depth in own.distinct("depth")
     }
     worst = min(gains.values(), key=lambda gain: gain.value)
     which = f"worst of {len(gains)} depths" if len(gains) > 1 else f"{min(gains):g} mm"
-    claims.append(
+    found.append(
         Claim(
             "A plane whose depth is found (--focus auto) is within 3 dB of a calibration at its depth",
             "", "", f"{worst:+} dB at {which}",
-            verdict(every(*(within(gain, low=-_ROBUST_DB) for gain in gains.values()))),
+            claims.verdict(claims.every(*(claims.within(gain, low=-_ROBUST_DB) for gain in gains.values()))),
         )
     )  # fmt: skip
-    return [*claims, *(_map_claim(table.where(scene=scene), scene) for scene in DEEP if len(table.where(scene=scene)))]
+    return [*found, *(_map_claim(table.where(scene=scene), scene) for scene in DEEP if len(table.where(scene=scene)))]
 
 
 def _map_claim(rows: Table, scene: str) -> Claim:
@@ -154,16 +145,16 @@ def _map_claim(rows: Table, scene: str) -> Claim:
     by_case = {
         (family, focus): rows.where(patterns=family, focus=focus) for family in (short, long) for focus in (NONE, MAP)
     }
-    means = {case: sample_mean(each, "psnr_db") for case, each in by_case.items()}
+    means = {case: claims.sample_mean(each, "psnr_db") for case, each in by_case.items()}
     flagged = all(row["flagged"] for row in rows.where(patterns=short, focus=MAP).rows)
     gains = "; ".join(
         f"{label(name)} {means[name, NONE]} dB, with depths {means[name, MAP]} dB" for name in (short, long)
     )
-    gain = difference(by_case[long, MAP], by_case[long, NONE], "psnr_db")
-    better = every(within(gain, low=_ROBUST_DB), flagged)
+    gain = claims.difference(by_case[long, MAP], by_case[long, NONE], "psnr_db")
+    better = claims.every(claims.within(gain, low=_ROBUST_DB), flagged)
     return Claim(
         f"A depth for each pixel (--focus map) mends {scene}, and is flagged where dots are too near to each other",
-        "", "", gains, verdict(better),
+        "", "", gains, claims.verdict(better),
     )  # fmt: skip
 
 
@@ -179,7 +170,7 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     drawn = {"baseline.png": curves({"": by_baseline}, axis, title=title)}
     own = {
         name: rows.where(along="columns", baseline=60.0).means("psnr_db", "depth")
-        for name, rows in by_patterns(ideal).items()
+        for name, rows in claims.by_patterns(ideal).items()
     }
     title = "Idealised plane, projector 60 mm beside the camera, by patterns"
     drawn["patterns.png"] = curves({"": own}, axis, title=title)
@@ -197,7 +188,7 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     }
     shown: list[Value] = [NONE, MAP]
     titles = ["one depth", "a depth for each pixel"]
-    return drawn | images("images.png", results, lines, "focus", shown, "Rendered scenes of many depths", titles)
+    return drawn | claims.images("images.png", results, lines, "focus", shown, "Rendered scenes of many depths", titles)
 
 
 EXPERIMENT = Experiment(

@@ -10,9 +10,6 @@ The last is asked of idealised frames (an evenly lit plane without falloff, :mod
 only diffraction differs from the model, and once of rendered ones: the scene's own mask, the projector's lines, a
 rendered calibration session. Every family is exposed at equal peak, with the camera's noise. Light of the scene and of
 the session's board is traced once, and formed with either shadow.
-
-The slanted edge is ISO 12233's: the edge's place is fitted row by row, all pixels are put in order of their distance
-from it, four bins a pixel, and the spectrum of the derivative is the modulation transfer function.
 """
 
 from __future__ import annotations
@@ -33,7 +30,6 @@ from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.calibrate import estimate
 from mitsim.calibrate.lit_session import LitSession
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.mask import CameraMask
@@ -57,6 +53,7 @@ from mitsim.report.lit_scene import (
     point_profiles,
     shadow_row,
 )
+from mitsim.report.table import Mean
 from mitsim.studies.ablation import reform
 from mitsim.studies.framework.run import Findings
 
@@ -144,11 +141,6 @@ class DiffractionFindings(Findings):
 
     def figures(self) -> dict[str, Figure]:
         """Image quality by the solver's factors, and shadows of a point."""
-        quality = [
-            (f"{row.frames}, {row.mask},\n{row.light}", row.factors, row.psnr_db)
-            for row in self.quality
-            if row.patterns == self.patterns
-        ]
         profiles = point_profiles(self.bench)
         # It lies on the projector's lines, to the width of a plotted line.
         del profiles[LINE]
@@ -156,7 +148,9 @@ class DiffractionFindings(Findings):
         message = f"A point's shadow in the projector's light is {100 * off.point_source:.0f} % off the geometric one"
         position = self.bench.geometry.centres(0)
         return {
-            "quality.png": quality_by_factors(quality, self.verdict),
+            "quality.png": quality_by_factors(
+                [row for row in self.quality if row.patterns == self.patterns], self.verdict
+            ),
             "shadow.png": shadow_profiles(position, profiles, _PROFILE_MM, message),
         }
 
@@ -266,26 +260,21 @@ _TITLE_LETTERS = 100
 """Of a line above a figure of the page's width."""
 
 
-def quality_by_factors(rows: Sequence[tuple[str, str, float]], message: str) -> Figure:
-    """PSNR [dB] of each system by the factors that its solver used, ``rows`` (system, factors, PSNR), first on top;
-    ``message`` above."""
-    systems = list(dict.fromkeys(system for system, _, _ in rows))[::-1]
-    factors = list(dict.fromkeys(name for _, name, _ in rows))
-    figure, axes = plots.figure_of(1.3 + 0.46 * len(systems))
-    for place, system in enumerate(systems):
-        values = [value for name, _, value in rows if name == system]
-        axes.plot([min(values), max(values)], [place, place], color=plots.LINK, lw=2, zorder=1)
-    for index, name in enumerate(factors):
-        points = [(value, systems.index(system)) for system, kind, value in rows if kind == name]
-        style = {
-            "color": (plots.VERMILION, plots.BLUE, plots.GREEN)[index % 3],
-            "marker": plots.MARKERS[index % len(plots.MARKERS)],
+def quality_by_factors(rows: Sequence[QualityRow], message: str) -> Figure:
+    """PSNR [dB] of each system in ``rows``, with geometric factors and with those that fit it; ``message`` above."""
+    assumed, fitting = (
+        {
+            f"{row.frames}, {row.mask}, {row.light}": Mean(row.psnr_db, np.nan, 1)
+            for row in rows
+            if (row.factors == ASSUMED) == geometric
         }
-        axes.plot(*zip(*points, strict=True), ls="", ms=8, label=name, zorder=3, **style)
-    axes.set_yticks(range(len(systems)), systems, fontsize=plots.FONT - 2)
-    plots.label_axes(axes, "PSNR of the image [dB]", "", grid="x")
+        for geometric in (True, False)
+    )
+    # Of light that does not diffract the geometric factors are the true ones, and no others are tried.
+    untried = Mean(np.nan, np.nan, 0)
+    pairs = {system: (mean, fitting.get(system, untried)) for system, mean in assumed.items()}
+    figure = plots.pair_chart(pairs, (ASSUMED, f"{SEPARABLE}, or {CALIBRATED}"), "PSNR of the image [dB]")
     figure.suptitle(fill(message, _TITLE_LETTERS), fontsize=plots.FONT)
-    plots.legend_below(figure, len(factors), *axes.get_legend_handles_labels())
     return figure
 
 
@@ -310,81 +299,3 @@ def shadow_profiles(
     plots.label_axes(axes, "position on the sensor [mm]", "irradiance, open sensor = 1 [1]")
     axes.legend(fontsize=plots.FONT - 1, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
     return figure
-
-
-# -------- Images of bars and of a slanted edge in, how much contrast is left by spatial frequency out
-
-_BINS = 4
-"""Bins a pixel along the edge's normal, as the standard has them."""
-_LEAST_STEP = 0.05
-"""Least step of reflectance that an edge is looked for at."""
-
-
-def contrast(image: FloatArray, axis: int) -> float:
-    """(I_max - I_min) / (I_max + I_min) of an ``image`` of bars, averaged along them, which lie along ``axis``.
-
-    The paper's definition; above 1 where the least is negative.
-    """
-    profile = image.mean(axis=axis)
-    high, low = float(profile.max()), float(profile.min())
-    return (high - low) / (high + low)
-
-
-def modulation(image: FloatArray, axis: int, frequency: float) -> float:
-    """Contrast of an image of bars at their own frequency, which noise of others does not feign.
-
-    Amplitude over mean of the fundamental of the profile across the bars; a square wave of contrast c has 4 c / pi.
-
-    Parameters
-    ----------
-    image, axis
-        as for :func:`contrast`.
-    frequency
-        cycles a pixel.
-    """
-    profile = image.mean(axis=axis)
-    phase = 2 * np.pi * frequency * np.arange(len(profile))
-    waves = np.stack([np.cos(phase), np.sin(phase), np.ones(len(profile))], axis=1)
-    cosine, sine, mean = np.linalg.lstsq(waves, profile, rcond=None)[0]
-    return float(np.hypot(cosine, sine) / mean * np.pi / 4)
-
-
-def slanted_edge(image: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Modulation transfer function of an ``image`` (rows, columns) of one edge, a few degrees off its columns.
-
-    Returns frequencies [cycles a pixel], up to half a cycle, and the transfer, 1 at zero; without that of the bins and
-    of the difference that stands for the derivative.
-
-    Raises
-    ------
-    MitsimError
-        for an image without an edge from left to right.
-    """
-    rows, columns = image.shape
-    centres: FloatArray = np.arange(columns, dtype=np.float64) + 0.5
-    between: FloatArray = centres[:-1] + 0.5
-    if abs(float(image[:, -columns // 4 :].mean() - image[:, : columns // 4].mean())) < _LEAST_STEP:
-        raise MitsimError("slanted edge: the image has no step from left to right")
-    slopes = np.diff(image, axis=1)
-    line = np.polyfit(np.arange(rows), [_centroid(slope, between) for slope in slopes], 1)
-    # Once more about the first line, so that noise far from the edge does not move it.
-    near = np.exp(-np.square((between - np.polyval(line, np.arange(rows))[:, None]) / 8))
-    places = [_centroid(np.asarray(slope), between) for slope in slopes * near]
-    line = np.polyfit(np.arange(rows), places, 1)
-    distance = (centres - np.polyval(line, np.arange(rows))[:, None]) / np.hypot(1, line[0])
-    bins = np.floor(distance * _BINS).astype(int).ravel()
-    half = _BINS * (columns // 4)
-    inside = (bins >= -half) & (bins < half)
-    count = np.bincount(bins[inside] + half, minlength=2 * half)
-    edge = np.bincount(bins[inside] + half, image.ravel()[inside], 2 * half) / np.maximum(count, 1)
-    spread = np.diff(edge) * np.hanning(2 * half - 1)
-    spectrum = np.abs(np.fft.rfft(spread))
-    frequency = np.fft.rfftfreq(len(spread)) * _BINS
-    own = np.sinc(frequency / _BINS) ** 2
-    kept = frequency <= 0.5
-    return np.asarray(frequency[kept], dtype=np.float64), np.asarray(spectrum[kept] / spectrum[0] / own[kept])
-
-
-def _centroid(weights: FloatArray, places: FloatArray) -> float:
-    squares = np.square(weights)
-    return float((squares * places).sum() / squares.sum())

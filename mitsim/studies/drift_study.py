@@ -1,35 +1,475 @@
-"""What drifts between a calibration and a capture, each kind alone: the decibels that it costs, measured and predicted.
+"""A scene in its light, a calibrated camera and a drift in; what the drift costs out, measured and predicted [dB].
 
-Amounts are those of a recipe's table [drift] (``--recipe``, by default calibration/drift.toml), or those of ``--over``,
-of which the first is shown beside the other kinds. The paper has no such figure.
+*Measured*: frames of the traced light through the camera as it is after the drift, exposed with noise, and solved with
+the factors from before it, with the lambda that the solver chose without the drift, and with its own.
+
+*Predicted*: :mod:`mitsim.studies.perturbation`, from the same factors and the closed-form shadow of the paper's
+model before and after the drift. No frame of the simulation, no draw of noise and nothing solved is in it: only the
+truth, the mean noise of a datum and, for lamps, the frame of their light.
+
+The study takes amounts of a recipe's table [drift] (``--recipe``, by default calibration/drift.toml), or those of
+``--over``, of which the first is shown beside the other kinds. The paper has no such figure.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from mitsim.acquire.capture import trace_request
-from mitsim.acquire.exposure import drift_projector
+from mitsim.acquire.exposure import (
+    DriftedExposer,
+    ambient_shots,
+    drift_mask,
+    drift_projector,
+    levels,
+    takes_ambient_frame,
+    warmer,
+)
+from mitsim.bench.apparatus import Apparatus
+from mitsim.calibrate.board_session import Session
+from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import DEFAULT_CAMERA, locate, shipped
 from mitsim.core.errors import MitsimError
-from mitsim.devices.patterns import read_name
+from mitsim.devices.patterns import PatternFamily, read_name, stripe_signs
+from mitsim.devices.projector import Spectrum
 from mitsim.devices.sensor import load_sensor
-from mitsim.devices.session import DRIFT_UNITS, DRIFT_WORDS, Drift, SessionRecipe, amount_in_words, load_recipe
+from mitsim.devices.session import (
+    DRIFT_UNITS,
+    DRIFT_WORDS,
+    SIDES,
+    Drift,
+    SessionRecipe,
+    amount_in_words,
+    load_recipe,
+)
+from mitsim.light.light import SampledLight
+from mitsim.metrics import psnr
+from mitsim.optics.frames import ExpectedFrames
+from mitsim.optics.shadow import SeparableTerms, ShadowGeometry
 from mitsim.reconstruct.factors import Factors
-from mitsim.report.lit_scene import LitScene
+from mitsim.reconstruct.solution import Solution
+from mitsim.reconstruct.solver import Prepared
+from mitsim.report import EQUAL_PEAK, RENDERED
+from mitsim.report.lit_scene import NONUNIFORMITY, IdealCamera, LitScene, Unexposed, accumulate
 from mitsim.report.plots import curves, pair_chart
 from mitsim.report.table import Mean, Table
-from mitsim.studies.drift_loss import DriftStand
+from mitsim.sensor.chain import electrons_from_irradiance, ripple_response
+from mitsim.sensor.specimen import specimen
 from mitsim.studies.framework.claims import difference, verdict, within
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope, group_by_setup, number_of
-from mitsim.studies.framework.setup import TEST_IMAGES, Point, Setup
+from mitsim.studies.framework.experiment import (
+    TEST_IMAGES,
+    Claim,
+    Experiment,
+    Found,
+    Point,
+    Results,
+    Scope,
+    Setup,
+    group_by_setup,
+    number_of,
+)
 from mitsim.studies.framework.studio import Studio
+from mitsim.studies.perturbation import Changed, Expected, Gains, LinearImage, Noise
+
+AMBIENT, SESSION = "ambient frame", "session"
+"""Sources of noise beside those of frames."""
+OFFSETS = "offset nonuniformity"
+"""Of pixels: what they read without light, their dark currents' too."""
+_SPLITS = 4
+"""Rounds in which what all pixels of a row, and of a column, respond alike is found. Each leaves (s2 / s1)^2 of what is
+left, s1 and s2 the map's largest singular values: 2e-3 for 24 x 24 pixels that differ by a tenth, less for more."""
+_STEP_MM = 5e-4
+"""Shift over which a shadow's slope is taken either way: half a micrometre, a twentieth of a pixel."""
+_HERMITE = ((-(3**0.5), 1 / 6), (0.0, 2 / 3), (3**0.5, 1 / 6))
+"""Places [deviations] and weights of the Gauss-Hermite rule that is exact for a normal law up to the fifth power."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a drift is predicted to cost.
+
+    Attributes
+    ----------
+    before_db
+        PSNR [dB] without the drift, measured.
+    predicted_before_db, predicted_db
+        without the drift, and with it and the same lambda, as predicted.
+    """
+
+    before_db: float
+    predicted_before_db: float
+    predicted_db: float
+
+    @property
+    def predicted_lost_db(self) -> float:
+        """The squared error that the drift adds, beside that of the image without it."""
+        added = squared_error(self.predicted_db) - squared_error(self.predicted_before_db)
+        return 10 * math.log10(1 + added / squared_error(self.before_db))
+
+    @property
+    def predicted_error_db(self) -> float:
+        """How sure that is: what changes if the image without the drift is as predicted as well.
+
+        What the model leaves out of it, such as detail inside projector pixels, may have any share in the error that
+        the drift adds.
+        """
+        return abs(self.predicted_before_db - self.predicted_db - self.predicted_lost_db)
+
+
+@dataclass(frozen=True)
+class Outcome(Prediction):
+    """Images with and without a drift.
+
+    Attributes
+    ----------
+    after_db, auto_db
+        PSNR [dB] with the drift, by the lambda from before it and by one of its own.
+    """
+
+    after_db: float
+    auto_db: float
+
+    @property
+    def lost_db(self) -> float:
+        """What the drift costs, measured."""
+        return self.before_db - self.after_db
+
+    @property
+    def lost_auto_db(self) -> float:
+        """The same where the solver chooses lambda again."""
+        return self.before_db - self.auto_db
+
+
+@dataclass(frozen=True, eq=False)
+class DriftStand:
+    """A scene, a camera that was calibrated before any drift, and patterns.
+
+    Attributes
+    ----------
+    lit
+        the scene in its light.
+    factors, recipe
+        what the session found, and how it was run.
+    family, seed
+        the patterns, and seed of the noise and of what drifts at random.
+    """
+
+    lit: LitScene
+    factors: Factors
+    recipe: SessionRecipe
+    family: PatternFamily
+    seed: int
+
+    def outcome(self, drift: Drift, session: Factors | None = None, lit: LitScene | None = None) -> Outcome:
+        """What a drift does.
+
+        MitsimError for one that the bench cannot have.
+
+        Parameters
+        ----------
+        drift
+            what moves.
+        session
+            factors of a session that drifted by it; None: those from before the drift.
+        lit
+            the scene in light of the projector that moved; None: its light as it was.
+        """
+        after, auto = self.measured(drift, session, lit)
+        return Outcome(**vars(self.predict(drift)), after_db=after, auto_db=auto)
+
+    def predict(self, drift: Drift) -> Prediction:
+        """What a ``drift`` is predicted to do; MitsimError for one that the bench cannot have."""
+        return Prediction(
+            self.before_db, *(self.expected_image(each).psnr_db(self.lit.truth) for each in (Drift(), drift))
+        )
+
+    @property
+    def before_db(self) -> float:
+        """PSNR [dB] without a drift."""
+        return psnr(self._before.image, self.lit.truth)
+
+    def measured(
+        self, drift: Drift, session: Factors | None = None, lit: LitScene | None = None
+    ) -> tuple[float, float]:
+        """PSNR [dB] after a drift, with the lambda from before it and with the solver's own.
+
+        Parameters
+        ----------
+        drift, session, lit
+            as for :meth:`outcome`.
+        """
+        scene, model = lit or self.lit, self._model
+        if session is not None:
+            model = scene.rendered(session, self.family, self.seed).prepared()
+        solutions = self._solve(drift, scene, model)
+        same, own = (psnr(solution.image, scene.truth) for solution in solutions)
+        return same, own
+
+    def _solve(self, drift: Drift, scene: LitScene, model: Prepared) -> tuple[Solution, Solution]:
+        bench = scene.bench
+        moved = any(drift.mask_mm) or drift.motion is not None or drift.tilt_mrad is not None
+        expected = scene.expected(RENDERED, self.family, bench=drift_mask(bench, drift) if moved else None)
+        base = self._frames.exposer(self.exposure_s)
+        ambient = expected.projector_off.irradiance if expected.has_ambient else 0.0
+        exposer = DriftedExposer(bench.rig, base.exposure_s, base.seed, base.speckle, drift, self.family, ambient)
+        (sums,) = accumulate(exposer, self.family, expected, [model])
+        return model.solve(sums, self._before.lam), model.solve(sums, "auto")
+
+    @cached_property
+    def _frames(self) -> Unexposed:
+        return self.lit.rendered(self.factors, self.family, self.seed)
+
+    @cached_property
+    def exposure_s(self) -> float:
+        """Exposure time of each frame [s]."""
+        return self._frames.seconds(EQUAL_PEAK)
+
+    @cached_property
+    def _model(self) -> Prepared:
+        return self._frames.prepared()
+
+    @cached_property
+    def _before(self) -> Solution:
+        (sums,) = accumulate(self._frames.exposer(self.exposure_s), self.family, self._expected, [self._model])
+        return self._model.solve(sums, "auto")
+
+    @property
+    def _expected(self) -> ExpectedFrames:
+        return self._frames.expected
+
+    @property
+    def electrons(self) -> float:
+        """Expected photoelectrons of all frames without a drift, on the whole sensor."""
+        exposer = self._frames.exposer(self.exposure_s)
+        return float(sum(exposer.electrons(frame).sum() for frame in self._expected))
+
+    def session_mixes(self, drift: Drift) -> tuple[FloatArray, FloatArray]:
+        """(n, n) that each factor of a session is multiplied by, on the right, as its power drifts by a ``drift``.
+
+        The response to stripes h_i is a difference of shots of powers a and b, so that it is one to
+        ``h_i (a + b) / 2 + (a - b) / 2``: the factor is Phi C with ``C = (H diag((a + b) / 2) + 1 ((a - b) / 2)^T)
+        H^T / N``. The responses to uniform light scale the vector that all responses of a side share, hence the root of
+        their mean power.
+        """
+        signs = stripe_signs(self.family.n).astype(np.float64)
+        powers = Session(self.lit.bench, self.recipe.model_copy(update={"drift": drift}), self.seed).powers
+        found, first = [], []
+        for side in SIDES:
+            shots = np.array([powers[side, number].mean() for number in range(len(powers) // 2)])
+            if self.recipe.signed_capture == "pair":
+                even, odd = (shots[::2] + shots[1::2]) / 2, (shots[::2] - shots[1::2]) / 2
+            else:
+                even, odd = shots[1:], shots[1:] - shots[0]
+            found.append((signs * even + odd) @ signs.T / signs.shape[1])
+            first.append(even[0] + odd[0])
+        scale = float(np.mean(first)) ** -0.5
+        return scale * found[0], scale * found[1]
+
+    # ---- the prediction ----------------------------------------------------------------------------------------------
+
+    def expected_image(self, drift: Drift) -> Expected:
+        """What the image is expected to be after a ``drift``, as the model has it; MitsimError as :meth:`predict`."""
+        image, changed = self.linear, self._frame_changes(drift)
+        if drift.session_ramp or drift.session_flicker:
+            left, right = self.session_mixes(drift)
+            image = replace(image, left=self.factors.left @ left, right=self.factors.right @ right)
+            others = [(self.factors.left, self.factors.right), (-image.left, image.right)]
+            changed = replace(changed, terms=[*changed.terms, *others])
+        return image.expected(self.lit.truth, changed, self._noise)
+
+    @cached_property
+    def fixed(self) -> Mapping[str, FloatArray]:
+        """(n, n) what each difference of the sensor's pixels adds to the image."""
+        still = self.linear.expected(self.lit.truth).image
+        alone = {NONUNIFORMITY: Changed(response=self._response), OFFSETS: Changed(added=self._fixed_frame)}
+        return {name: self.linear.expected(self.lit.truth, each).image - still for name, each in alone.items()}
+
+    def clear(self, factors: Factors, light: SampledLight) -> FloatArray:
+        """(n, n) image of frames without noise, with the lambda of the image without a drift.
+
+        Parameters
+        ----------
+        factors
+            that it is made with.
+        light
+            of the scene.
+        """
+        return LitScene(light).rendered(factors, self.family, self.seed).clear(self.linear.lam)
+
+    @cached_property
+    def linear(self) -> LinearImage:
+        """The solver, its lambda that of the image without a drift."""
+        factors = self.factors
+        return LinearImage(factors.left, factors.right, self.family, self._before.lam, factors.manifest.centre)
+
+    @property
+    def _noise(self) -> Noise:
+        return sum(self.noises.values(), Noise())
+
+    @cached_property
+    def noises(self) -> Mapping[str, Noise]:
+        """The same by source: those of the frames by name, ``ambient frame`` and ``session``."""
+        frames = self._frames.noises(self.exposure_s)
+        found = {name: Noise(datum=variance) for name, variance in frames.items() if name != NONUNIFORMITY}
+        if self._takes_ambient:
+            exposer = self._frames.exposer(self.exposure_s)
+            off = exposer.electrons(self._expected.projector_off)
+            variance = (exposer.sensor_noise(off) / self.exposure_s) ** 2 / ambient_shots(self.family)
+            found[AMBIENT] = Noise(ambient=variance)
+        if known := self.factors.manifest.noise:
+            found[SESSION] = Noise(left=known.left**2, right=known.right**2)
+        return found
+
+    @property
+    def _takes_ambient(self) -> bool:
+        return takes_ambient_frame("auto", self.family, self._expected)
+
+    def _frame_changes(self, drift: Drift) -> Changed:
+        """What a ``drift`` changes in the frames, to first order where several things drift at once."""
+        count = self.family.left.shape[1], self.family.right.shape[1]
+        ramp = levels(self.seed, "power", len(self.family.shots), drift.power_ramp).reshape(*count, -1)
+        gain = (1 + drift.exposure) * (1 + drift.power) * ramp
+        changed = Changed(
+            terms=self._terms(drift),
+            leak=self._leak,
+            gain=gain.mean(axis=2),
+            gain_apart=(gain[:, :, 0] - gain[:, :, -1]) / 2,
+            flicker=self._gains(drift, "power", drift.power_flicker),
+            response=self._response,
+        )
+        if self._expected.has_ambient:  # and with it black level, dark current and offsets, or as parts of a difference
+            exposer = self._frames.exposer(1.0)
+            lamps = exposer.electrons(self._expected.projector_off)
+            each = self._gains(drift, "lamp", drift.lamp_flicker)
+            common = [rms / ambient_shots(self.family) ** 0.5 for rms in each]
+            return replace(changed, added=lamps, added_gain=drift.lamp, added_flicker=each, added_common=common)
+        frame = np.full(self.lit.bench.geometry.frame_shape, self._offset(drift))
+        return replace(changed, added=frame if self._fixed_frame is None else frame + self._fixed_frame)
+
+    @cached_property
+    def _response(self) -> FloatArray | None:
+        """(m, m') what pixels' responses differ by from what factors know: these were measured behind the same pixels,
+        and hold what all pixels of a row, and of a column, have alike."""
+        response = specimen(self.lit.bench.sensor, self.lit.bench.geometry.frame_shape).response
+        if response is None:
+            return None
+        left, right = (np.square(side.sum(axis=1)) for side in (self.factors.left, self.factors.right))
+        columns = np.ones(response.shape[1])
+        for _ in range(_SPLITS):
+            rows = response @ (right * columns) / (right * np.square(columns)).sum()
+            columns = response.T @ (left * rows) / (left * np.square(rows)).sum()
+        return np.asarray(response / np.outer(rows, columns) - 1)
+
+    @cached_property
+    def _fixed_frame(self) -> FloatArray | None:
+        """(m, m') what pixels read beyond what a user takes off without an ambient frame [electrons/s]."""
+        sensor, shape = self.lit.bench.sensor, self.lit.bench.geometry.frame_shape
+        own = specimen(sensor, shape)
+        if (own.offset_e is None and own.dark_e_per_s is None) or self._expected.has_ambient:
+            return None
+        frame = np.zeros(shape) if own.offset_e is None else own.offset_e.astype(np.float64) / self.exposure_s
+        return frame if own.dark_e_per_s is None else frame + own.dark_e_per_s - sensor.superpixel_dark_current_e_per_s
+
+    def _gains(self, drift: Drift, source: str, rms: float) -> Gains:
+        """Gains of a ``source`` from frame to frame: a flicker of ``rms``, and the cosine and sine of its ripple."""
+        found: list[float | FloatArray] = [rms] if rms else []
+        if source in drift.ripples:
+            amplitude, hertz = drift.ripples[source]
+            seconds, (rows, _) = self.exposure_s * (1 + drift.exposure), self.lit.bench.geometry.frame_shape
+            wave = amplitude / 2**0.5 * ripple_response(self.lit.bench.sensor, seconds, hertz, rows)
+            found += [wave.real, wave.imag]
+        return found
+
+    @property
+    def _leak(self) -> float:
+        """What black pixels leak, as a part of the light that a session sees: white pixels lose it there."""
+        black = self.lit.light.simulation.physics.black_level
+        return black / (1 - black)
+
+    def _offset(self, drift: Drift) -> float:
+        """What every datum reads beyond its light [electrons/s]."""
+        sensor = self.lit.bench.sensor
+        black = drift.black_level_dn * sensor.codes / sensor.gain_dn_per_e / self.exposure_s
+        dark = warmer(sensor, drift.temperature_k).superpixel_dark_current_e_per_s * (1 + drift.exposure)
+        return black + dark - sensor.superpixel_dark_current_e_per_s
+
+    def scatter(self, drift: Drift, error: FloatArray) -> float:
+        """Variance that the draw of a random ``drift`` brings into the mean squared error, beside an ``error`` (n, n')
+        of the image without it."""
+        return self.linear.scatter(self.lit.truth, self._frame_changes(drift), error) / error.size**2
+
+    def _terms(self, drift: Drift) -> SeparableTerms:
+        """What a ``drift`` of mask or projector adds to the camera's operator, in the unit of its factors."""
+        bench = self.lit.bench
+        best = IdealCamera(bench, bench.geometry.mask, self._spectrum).factors
+        at_rest = drift.model_copy(update={"mask_rotation_mrad": 0.0, "vibration_um": 0.0})
+        found = self._shadow(drift_projector(drift_mask(bench, at_rest), drift)) + _minus([best])
+        if drift.vibration_um:
+            parts = [(self._shift(place * drift.vibration_um / 1e3), weight) for place, weight in _HERMITE]
+            found += _weigh(parts) + _minus(self._shadow(bench))
+        if drift.mask_rotation_mrad:
+            found += self._turn(drift.mask_rotation_mrad / 1e3)
+        rate = electrons_from_irradiance(
+            self.lit.board_flux, 1.0, bench.sensor, bench.projector.effective_wavelength_nm
+        )
+        return [(float(rate) * left, right) for left, right in found]
+
+    def _turn(self, angle: float) -> SeparableTerms:
+        """Change of the shadow to first order in the ``angle``: theta (s_col d/d s_row - s_row d/d s_col)."""
+        camera = IdealCamera(self.lit.bench, self.lit.bench.geometry.mask)
+        shadow = ShadowGeometry.of(camera.bench.geometry, camera.bench.geometry.scene_distance)
+        row, column = (
+            shadow.along(axis).crossings(directions) - camera.bench.geometry.mask_offset[axis]
+            for axis, directions in enumerate(camera.directions)
+        )
+        still, ahead, behind = (self._shift(shift) for shift in (0.0, _STEP_MM, -_STEP_MM))
+        found: SeparableTerms = []
+        for (left, right), (left_ahead, right_ahead), (left_behind, right_behind) in zip(
+            still, ahead, behind, strict=True
+        ):
+            slopes = (left_ahead - left_behind) / (2 * _STEP_MM), (right_ahead - right_behind) / (2 * _STEP_MM)
+            found += [(angle * slopes[0], column * right), (-angle * row * left, slopes[1])]
+        return found
+
+    def _shift(self, by_mm: float) -> SeparableTerms:
+        """The shadow with every profile shifted ahead: of the mask moved back."""
+        back = Drift(mask_rows_um=-1e3 * by_mm, mask_columns_um=-1e3 * by_mm)
+        return self._shadow(drift_mask(self.lit.bench, back))
+
+    def _shadow(self, bench: Apparatus) -> SeparableTerms:
+        return IdealCamera(bench, bench.geometry.mask, self._spectrum).terms
+
+    @property
+    def _spectrum(self) -> Spectrum | None:
+        return self.lit.light.simulation.physics.spectrum
+
+
+def squared_error(db: float) -> float:
+    """Mean squared error of a PSNR ``db``, peak 1."""
+    return float(10 ** (-db / 10))
+
+
+def _minus(terms: SeparableTerms) -> SeparableTerms:
+    return [(-left, right) for left, right in terms]
+
+
+def _weigh(parts: list[tuple[SeparableTerms, float]]) -> SeparableTerms:
+    """Means of terms whose two factors vary on their own, factor by factor."""
+    found: SeparableTerms = []
+    for index in range(len(parts[0][0])):
+        left, right = (sum(weight * terms[index][side] for terms, weight in parts) for side in (0, 1))
+        found.append((np.asarray(left), np.asarray(right)))
+    return found
+
+
+# -------- Each kind of drift alone: the decibels that it costs
 
 _SEEDS = 4
 """Of noise and of what drifts at random: the fewest whose standard error is worth the name, known to 40 %."""
@@ -101,17 +541,13 @@ def _measure(studio: Studio, point: Point) -> Found:
     if kind.startswith("projector"):
         moved = studio.once("moved projector", 6, (setup, drift), lambda: _move_projector(lit, drift))
     found = known.outcome(drift, session, moved)
-    row = point.row(
-        before_db=found.before_db,
-        after_db=found.after_db,
-        lost_db=found.lost_db,
-        lost_auto_db=found.lost_auto_db,
-        predicted_before_db=found.predicted_before_db,
-        predicted_db=found.predicted_db,
-        predicted_lost_db=found.predicted_lost_db,
-        predicted_error_db=found.predicted_error_db,
-    )
-    return Found((row,))
+    measured = {
+        "before_db": found.before_db, "after_db": found.after_db,
+        "lost_db": found.lost_db, "lost_auto_db": found.lost_auto_db,
+        "predicted_before_db": found.predicted_before_db, "predicted_db": found.predicted_db,
+        "predicted_lost_db": found.predicted_lost_db, "predicted_error_db": found.predicted_error_db,
+    }  # fmt: skip
+    return Found((point.row(**measured),))
 
 
 def _session(studio: Studio, point: Point, recipe: SessionRecipe, drift: Drift) -> Factors:

@@ -30,7 +30,7 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.report.lit_scene import SPECKLE
 from mitsim.studies import ablation
 from mitsim.studies.ablation import Ablation
-from mitsim.studies.drift_loss import AMBIENT, SESSION, DriftStand, Prediction, squared_error
+from mitsim.studies.drift_study import AMBIENT, SESSION, DriftStand, Prediction, squared_error
 from mitsim.studies.perturbation import Noise, Scatter
 
 CAPTURE, SCENE, DRIFT, SOLVER, UNEXPLAINED = "capture", "scene", "drift", "solver", "unexplained"
@@ -205,14 +205,8 @@ def _clear_images(stand: DriftStand, clear: Factors) -> Iterator[tuple[str, Floa
 def _of_scene(scatter: Scatter, seen: Mapping[str, FloatArray], sampled: Noise) -> dict[tuple[str, str], _Part]:
     """What the light of a scene has beside that of a white board, by cause, and what lambda takes away.
 
-    Parameters
-    ----------
-    scatter
-        of images by factors without noise.
-    seen
-        images of the scene's light with its causes, and without one after another.
-    sampled
-        noise of the light's rendering, which all of these have alike.
+    ``seen`` are images of the light with its causes, then without one after another; ``sampled`` is the noise of its
+    rendering, which all of these have alike.
     """
     exact, scene, found = scatter.solver, scatter.scene, {(SCENE, ERROR_SOURCES[ablation.DETAIL]): _Part(0.0)}
     (_, last), *others = seen.items()

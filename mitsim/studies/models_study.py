@@ -27,8 +27,7 @@ from mitsim.report import EQUAL_PEAK
 from mitsim.report.lit_scene import LitScene
 from mitsim.report.plots import curves
 from mitsim.studies.framework.claims import difference, finding, sample_mean, verdict, within
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
-from mitsim.studies.framework.setup import Point, Setup
+from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope, Setup
 from mitsim.studies.framework.studio import Image, Studio
 
 OFF_MM = {"mask_distance": 0.05, "mask_offset_row": 0.037, "mask_offset_column": -0.021}

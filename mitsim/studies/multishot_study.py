@@ -48,8 +48,7 @@ from mitsim.report.lit_scene import IdealCamera, LitScene, Pair, Unexposed
 from mitsim.report.table import Table
 from mitsim.studies.framework import claims
 from mitsim.studies.framework.claims import Lines, image_array, images
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
-from mitsim.studies.framework.setup import QUICK_IMAGES, Point
+from mitsim.studies.framework.experiment import QUICK_IMAGES, Claim, Experiment, Found, Point, Results, Scope
 from mitsim.studies.framework.studio import Image, Studio, reason_of
 
 REACH = 15.0
@@ -87,7 +86,6 @@ def _measure(studio: Studio, point: Point) -> Found:
 
 
 def _still(studio: Studio, point: Point, lit: LitScene) -> dict[str, Image]:
-    """Images of as many uniform frames, or dots, as a point has, by exposure."""
     model, seed, n = point["model"], int(point["seed"]), lit.bench.n
     if point["patterns"] == DOTS:
         family = lit.bench.family(f"dots:{round(point['frames'] ** 0.5)}")
@@ -99,7 +97,6 @@ def _still(studio: Studio, point: Point, lit: LitScene) -> dict[str, Image]:
 
 
 def _moving(studio: Studio, point: Point, lit: LitScene) -> dict[str, Image]:
-    """Images through the moved mask, by exposure."""
     model, feature = point["model"], lit.bench.geometry.mask_feature
     columns: tuple[float, ...]
     if point["patterns"] == LINE:
@@ -130,7 +127,6 @@ def _factors(studio: Studio, point: Point, lit: LitScene) -> Places:
 
 
 def _spread(count: int, feature_mm: float) -> tuple[float, ...]:
-    """So many places [mm], evenly from one end to the other."""
     return tuple(float(place) for place in np.linspace(-REACH, REACH, count) * feature_mm)
 
 

@@ -375,21 +375,11 @@ class LinearImage:
 
 
 def _by_row(rms: float | FloatArray) -> FloatArray:
-    """(m, 1) by row, or (1, 1) for all rows."""
     return np.reshape(np.asarray(rms, dtype=np.float64), (-1, 1))
 
 
 def _together(seen: Terms, row: int, column: int, scene: FloatArray) -> FloatArray:
-    """(r, r') part of W that one frame of a scene (n, n') has, whose cameras' terms of G are ``seen``, (K, r, n) and
-    (K', r', n').
-
-    Parameters
-    ----------
-    seen, scene
-        as above.
-    row, column
-        of the frame's pattern.
-    """
+    """(r, r') part of W of one frame of a scene (n, n'); ``seen`` are terms of G, (K, r, n) and (K', r', n')."""
     return np.asarray(sum(first[row] @ scene @ second[column].T for first, second in seen))
 
 

@@ -20,8 +20,7 @@ from mitsim.report.plots import quality_bars
 from mitsim.report.table import Table
 from mitsim.studies.framework import claims
 from mitsim.studies.framework.claims import Holds
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
-from mitsim.studies.framework.setup import Point
+from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope
 from mitsim.studies.framework.studio import Studio
 
 FAMILIES = ("uniform", "dots:4", "dots:7")
@@ -100,13 +99,8 @@ def _figures(results: Results) -> Mapping[str, Figure]:
         drawn[f"psnr_{which}.png"] = quality_bars(
             claims.bars(lines, column), f"PSNR by the regularisation, {which} weight, exposure {EQUAL_FRAME}"
         )
-    for family in _SHOWN:
-        shown = claims.by_print(table.where(patterns=family))
-        title = f"{label(family)}, exposure {EQUAL_FRAME}, automatic weight"
-        drawn |= claims.images(
-            f"images_{family.replace(':', '')}.png", results, shown, "method", METHODS, title, _NAMES
-        )
-    return drawn
+    title = f"{{}}, exposure {EQUAL_FRAME}, automatic weight"
+    return drawn | claims.family_images(results, table, _SHOWN, "method", METHODS, title, _NAMES)
 
 
 EXPERIMENT = Experiment(

@@ -29,9 +29,7 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from mitsim.bench.request import Request
 from mitsim.core.arrays import FloatArray
@@ -329,40 +327,11 @@ def _double(values: Any, bits: int) -> FloatArray:
     return np.array([value / unit for value in values.ravel().tolist()], dtype=np.float64).reshape(values.shape)
 
 
-# -------- Error against seconds as a figure
-
-_BEST = "best for its time"
-
-
 def solver_costs(rows: Sequence[SolverRow]) -> Figure:
-    """Error of the image against seconds of the solver in ``rows``, a panel for each lambda, the best ringed."""
-    lambdas = sorted({row.lambda_rel for row in rows}, reverse=True)
-    figure, (panels,) = plots.panels_of(1, len(lambdas), 0.55 * plots.WIDTH, sharex=True, sharey=True)
-    colours = (plots.BLUE, plots.ORANGE, plots.VERMILION, plots.GREEN)
-    precisions = list(dict.fromkeys(row.precision for row in rows))
-    forms = list(dict.fromkeys((row.method, row.layout) for row in rows))
-    for axes, lam in zip(panels, lambdas, strict=True):
-        panel = [row for row in rows if row.lambda_rel == lam]
-        for row in panel:
-            colour = colours[precisions.index(row.precision)]
-            marker = plots.MARKERS[forms.index((row.method, row.layout))]
-            axes.plot([row.seconds], [row.error], marker, color=colour, ms=8, mec="white", mew=0.6, zorder=3)
-        _draw_front(axes, [(row.seconds, row.error) for row in panel])
-        axes.set(xscale="log", yscale="log")
-        plots.log_ticks(axes)
-        axes.set_title(typeset(f"relative \N{GREEK SMALL LETTER LAMDA} {lam:.0e}"), fontsize=plots.FONT)
-        plots.label_axes(axes, "wall time [s]", "")
-    panels[0].set_ylabel("relative error of the image [1]", fontsize=plots.FONT)
-    grey: dict[str, Any] = {"ls": "", "ms": 8, "color": "#9ca3af"}
-    entries = [(Line2D([], [], ls="", ms=8, color=colours[i], marker="o"), name) for i, name in enumerate(precisions)]
-    entries.append((panels[0].lines[-1], _BEST))
-    entries += [(Line2D([], [], **grey, marker=plots.MARKERS[i]), ", ".join(form)) for i, form in enumerate(forms)]
-    plots.legend_below(figure, 4, *zip(*entries, strict=True))
-    return figure
-
-
-def _draw_front(axes: Axes, points: Sequence[plots.Point]) -> None:
-    """Rings around the points that nothing beats, and the staircase that joins them."""
-    seconds, error = zip(*plots.pareto_front(points), strict=True)
-    style: dict[str, Any] = {"color": plots.GREY, "lw": 1.0, "ls": ":", "drawstyle": "steps-post", "zorder": 2}
-    axes.plot(seconds, error, "o", ms=13, mfc="none", mec=plots.GREY, mew=1.3, label=_BEST, **style)
+    """Error of the image against seconds of the solver in ``rows``, a panel for each lambda."""
+    panels: dict[str, list[plots.Cost]] = {}
+    for row in sorted(rows, key=lambda row: -row.lambda_rel):
+        seconds = row.seconds, row.seconds, max(row.most_s, row.seconds)
+        cost = plots.Cost(f"{row.method}, {row.layout}, {row.precision}", row.error, seconds)
+        panels.setdefault(typeset(f"relative \N{GREEK SMALL LETTER LAMDA} {row.lambda_rel:.0e}"), []).append(cost)
+    return plots.costs(panels, "relative error of the image [1]")

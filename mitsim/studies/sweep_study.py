@@ -20,13 +20,14 @@ from mitsim.studies.framework.experiment import (
     OTHERS,
     Experiment,
     PageTable,
+    Point,
     Results,
     Scope,
+    Setup,
     check_sweep,
     group_by_setup,
     number_of,
 )
-from mitsim.studies.framework.setup import Point, Setup
 
 
 def _points(scope: Scope) -> Sequence[Point]:
@@ -45,7 +46,6 @@ def _points(scope: Scope) -> Sequence[Point]:
 
 
 def _setup(setup: Setup, setting: Mapping[str, str]) -> Setup:
-    """The ``setup`` with what a ``setting`` says of the scene and of the light."""
     parameters = {name: value for name, value in setting.items() if name not in NO_SCENE}
     changed = setup.changed(**parameters)
     return replace(changed, accuracy=number_of("accuracy", setting["accuracy"])) if "accuracy" in setting else changed
@@ -85,7 +85,6 @@ def _tables(results: Results) -> Sequence[PageTable]:
 
 
 def _mean_text(rows: Table, column: str) -> str:
-    """Mean of a ``column``; a dash where it has no number."""
     if not rows.numbers(column):
         return DASH
     return str(rows.mean(column)) if column == MEASURES["psnr"][0] else scientific(rows.mean(column).value)

@@ -47,13 +47,12 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solution import Status, Verdict
 from mitsim.report.lit_scene import IdealCamera, LitScene
-from mitsim.report.plots import BLUE, FONT, GREEN, GREY, PALE, ROW, VERMILION, beside, image_grid, label_axes, panels_of
+from mitsim.report.plots import BLUE, FONT, GREEN, GREY, PALE, ROW, VERMILION, image_grid, label_axes, panels_of
 from mitsim.report.table import Mean, Table
 from mitsim.studies import ablation
 from mitsim.studies.ablation import Ablation
 from mitsim.studies.framework.claims import TOLERANCE_DB, difference, single_precision, verdict, within
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
-from mitsim.studies.framework.setup import QUICK_IMAGES, Point
+from mitsim.studies.framework.experiment import QUICK_IMAGES, Claim, Experiment, Found, Point, Results, Scope
 from mitsim.studies.framework.studio import Studio
 
 # -------- A scene, its camera and names of effects in
@@ -136,7 +135,6 @@ class Sessions:
         )
 
     def _estimate(self, off: frozenset[str]) -> Estimate:
-        """Factors of expected frames."""
         own = off & self._effects
         if own not in self._kept:
             self._kept[own] = self._by_lines(own)
@@ -278,15 +276,8 @@ def _measure(studio: Studio, point: Point) -> Found:
         )
         for model in MODELS
     ]
-    return Found(tuple(rows), _end_images(way, effect, without, having))
-
-
-def _end_images(
-    way: str, effect: str, without: Mapping[str, FloatArray], having: Mapping[str, FloatArray]
-) -> dict[str, FloatArray]:
-    """Images of the two ends, by model, as findings keep them."""
     ends_of = {EFFECTS[0]: without, EFFECTS[-1]: having} if way == IN_ORDER else {}
-    return single_precision(ends_of.get(effect, {}))
+    return Found(tuple(rows), single_precision(ends_of.get(effect, {})))
 
 
 def ends(way: str, effect: str) -> tuple[frozenset[str], frozenset[str]]:
@@ -364,8 +355,8 @@ def _images(results: Results) -> dict[str, list[tuple[FloatArray, str]]]:
 
 # -------- Levels and steps as a figure
 
-_COLUMNS = (14.0, 92.0)
-"""Points from a waterfall to the numbers beside it: "-23.1 ± 0.2" has 60."""
+_MARGIN = 0.12
+"""Of the scale, below the lowest level; twice that beside the highest one is room for a number."""
 _LETTERS = 122
 """Of a line below a figure, small ones."""
 
@@ -418,18 +409,16 @@ def waterfall(panels: Mapping[str, Fall], seen: float) -> Figure:
     change = {name: max(fall.step(name).largest for fall in panels.values()) for name in names}
     large = {name for name in names if change[name] >= seen}
     figure, places = panels_of(len(panels), 1, len(panels) * (ROW * (len(large) + 3) + 0.6) + 0.9, sharex=True)
-    places = places[:, 0]
     levels = np.concatenate([fall.levels for fall in panels.values()])
-    low, high = levels.min(), levels.max()
-    room = max(high - low, 1.0)
-    places[0].set_xlim(low - 0.12 * room, high + 0.22 * room)
-    for axes, (title, fall) in zip(places, panels.items(), strict=True):
+    low, room = levels.min(), max(np.ptp(levels), 1.0)
+    places[0, 0].set_xlim(low - _MARGIN * room, levels.max() + 2 * _MARGIN * room)
+    for axes, (title, fall) in zip(places[:, 0], panels.items(), strict=True):
         axes.set_title(title, fontsize=FONT, loc="left", fontweight="bold")
         _draw_fall(axes, fall, large)
-        label_axes(axes, "PSNR [dB]" if axes is places[-1] else "", "", grid="x")
+        label_axes(axes, "PSNR [dB]" if axes is places[-1, 0] else "", "", grid="x")
     small = ", ".join(name for name in names if 0 < change[name] < seen)
     none = ", ".join(name for name in names if change[name] == 0)
-    sentences = ["Changes of PSNR [dB] by each effect: bars in order, beside them alone and on the whole without it."]
+    sentences = ["Changes of PSNR [dB] by each effect: bars in order, beside names alone and to the whole."]
     sentences += [f"Less than {seen:g} dB each, in the bar called others: {small}."] if small else []
     sentences += [f"Nothing at all, as the scene does not call for them: {none}."] if none else []
     lines = [line for sentence in sentences for line in wrap(sentence, _LETTERS)]
@@ -438,40 +427,29 @@ def waterfall(panels: Mapping[str, Fall], seen: float) -> Figure:
 
 
 def _draw_fall(axes: Any, fall: Fall, large: Collection[str]) -> None:
-    """Bars of the steps that are ``large``, and one of all others."""
+    """Bars of the steps that are ``large``, and one of all others, between those of both ends."""
     others = sum(step.in_order.value for step in fall.steps if step.name not in large)
     steps = [step for step in fall.steps if step.name in large]
     steps += [Step("others", Mean(others, np.nan, 1))] if others else []
-    last, level, text = len(steps) + 1, fall.first.value, {"fontsize": FONT - 2, "va": "center"}
-    for row, step in enumerate(steps, start=1):
-        change = step.in_order.value
-        axes.plot([level, level], [row - 1, row], color=GREY, lw=0.8, zorder=1)
-        axes.barh(row, change, 0.66, left=level, color=VERMILION if change < 0 else GREEN, zorder=3)
-        level += change
-        place = max(level, level - change), row
-        axes.annotate(_sign(step.in_order), place, (5, 0), textcoords="offset points", **text)
-        for points, mean in zip(_COLUMNS, (step.alone, step.left_out), strict=True):
-            if mean:
-                beside(axes, row, points, _sign(mean), fontsize=FONT - 2, color=GREY)
-    axes.plot([level, level], [last - 1, last], color=GREY, lw=0.8, zorder=1)
-    for row, end, colour in ((0, fall.first, PALE), (last, fall.last, BLUE)):
-        left = axes.get_xlim()[0]
-        axes.barh(row, end.value - left, 0.66, left=left, color=colour, zorder=3)
-        axes.annotate(f"{end} dB", (end.value, row), (5, 0), textcoords="offset points", fontweight="bold", **text)
-    for points, heading in zip(_COLUMNS, ("alone", "left out"), strict=True):
-        if any(getattr(step, heading.replace(" ", "_")) for step in steps):
-            beside(axes, 0, points, heading, fontsize=FONT - 2, color=GREY)
-    axes.set_yticks(range(last + 1), ["idealised", *(step.name for step in steps), "rendered"])
-    axes.set_ylim(last + 0.5, -0.5)
-    axes.tick_params(axis="y", length=0)
-    axes.spines["left"].set_visible(False)
+    low, changes = axes.get_xlim()[0], [step.in_order.value for step in steps]
+    levels = fall.first.value + np.cumsum([0.0, *changes])
+    colours = [PALE, *(VERMILION if change < 0 else GREEN for change in changes), BLUE]
+    starts, ends = [low, *levels[:-1], low], [fall.first.value, *levels[1:], fall.last.value]
+    axes.barh(range(len(starts)), np.subtract(ends, starts), left=starts, color=colours)
+    texts = [f"{fall.first} dB", *(_with_sign(step.in_order) for step in steps), f"{fall.last} dB"]
+    for row, (end, text) in enumerate(zip(np.maximum(starts, ends), texts, strict=True)):
+        axes.annotate(text, (end, row), (5, 0), textcoords="offset points", fontsize=FONT - 2, va="center")
+    axes.set_yticks(range(len(starts)), ["idealised", *map(_step_name, steps), "rendered"])
+    axes.invert_yaxis()
 
 
-def _sign(mean: Mean) -> str:
-    """A change with its sign, and with its standard error."""
-    text = f"{mean.value:+.1f}" if round(mean.value, 1) else "0.0"
-    text = text.replace("-", "\N{MINUS SIGN}")
-    return text if np.isnan(mean.error) else f"{text} \N{PLUS-MINUS SIGN} {mean.error:.1f}"
+def _step_name(step: Step) -> str:
+    ways = {"alone": step.alone, "left out": step.left_out}
+    return ", ".join([step.name, *(f"{way} {_with_sign(mean)}" for way, mean in ways.items() if mean)])
+
+
+def _with_sign(mean: Mean) -> str:
+    return f"{mean:+}".replace("-", "\N{MINUS SIGN}")
 
 
 EXPERIMENT = Experiment(

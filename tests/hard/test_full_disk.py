@@ -15,9 +15,8 @@ from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.exchange.formats import export_run, import_file
 from mitsim.exchange.png_files import draw_family
 from mitsim.report.table import Table
-from mitsim.studies.framework.experiment import Found
+from mitsim.studies.framework.experiment import Found, Point, Setup
 from mitsim.studies.framework.run import Store
-from mitsim.studies.framework.setup import Point, Setup
 from tests.exchanged import Made, made
 from tests.unit.core.test_hdf5file import room
 

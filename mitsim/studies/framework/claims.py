@@ -19,8 +19,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.report import EQUAL_PEAK, IDEALISED, MODELS, RENDERED, label
 from mitsim.report.plots import Curve, curves, image_grid
 from mitsim.report.table import Mean, Table, Value
-from mitsim.studies.framework.experiment import IMAGE, Claim, Found, Results
-from mitsim.studies.framework.setup import QUICK_IMAGES, Point
+from mitsim.studies.framework.experiment import IMAGE, QUICK_IMAGES, Claim, Found, Point, Results
 from mitsim.studies.framework.studio import Studio
 
 CONFIRMED, NOT_CONFIRMED, UNDECIDED = "confirmed", "not confirmed", "not decided at this size"
@@ -271,6 +270,33 @@ def images(
     """
     grid = image_rows(results, lines, across, columns)
     return {file: image_grid(grid, names or [str(value) for value in columns], title)} if grid else {}
+
+
+def family_images(
+    results: Results,
+    table: Table,
+    families: Sequence[str],
+    across: str,
+    columns: Sequence[Value],
+    title: str,
+    names: Sequence[str] | None = None,
+) -> dict[str, Figure]:
+    """A grid of the images of each shown print in both models for each pattern family, by file name.
+
+    Parameters
+    ----------
+    results, across, columns, names
+        as for :func:`images`.
+    table, families
+        rows of the results, and which of their families have a grid.
+    title
+        of a grid; braces are its family.
+    """
+    drawn: dict[str, Figure] = {}
+    for family in families:
+        file, lines = f"images_{family.replace(':', '')}.png", by_print(table.where(patterns=family))
+        drawn |= images(file, results, lines, across, columns, title.format(label(family)), names)
+    return drawn
 
 
 def by_exposure(

@@ -7,16 +7,18 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import wrap
 
 from matplotlib.figure import Figure
 
 from mitsim.core.environment import versions
 from mitsim.report.html import page_figure, render_page, write_html
-from mitsim.studies.framework.experiment import KNOBS, Claim, Experiment, PageTable, Results, Scope
-from mitsim.studies.framework.setup import TEST_IMAGES, Setup
+from mitsim.studies.framework.experiment import KNOBS, TEST_IMAGES, Claim, Experiment, PageTable, Results, Scope, Setup
 
 _NUMBER = re.compile(r"[+-]?\d|nothing$")
 """How a cell of a column of numbers begins."""
+_LETTERS = 100
+"""Of a line of text, as wide as most terminals."""
 
 
 @dataclass(frozen=True)
@@ -90,8 +92,25 @@ class Part:
     @property
     def numeric(self) -> tuple[bool, ...]:
         """Of which columns all cells begin with a number: these stand to the right."""
-        columns = zip(*self.rows, strict=True)
-        return tuple(any(cells) and all(not cell or _NUMBER.match(cell) for cell in cells) for cells in columns)
+        return _numeric(self.rows)
+
+    def lines(self) -> list[str]:
+        """As text: the title, what leads to the table, and the table."""
+        return [f"{self.title}:", *wrap(self.lead, _LETTERS), *text_table(self.head, self.rows)]
+
+
+def text_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table of ``rows`` under their ``head``, its columns as wide as they need be; none without rows."""
+    table = [head, *rows] if rows else []
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    sides = [str.rjust if right else str.ljust for right in _numeric(rows)]
+    lines = [[side(*cell) for side, cell in zip(sides, zip(row, widths, strict=True), strict=True)] for row in table]
+    return ["  ".join(cells).rstrip() for cells in lines]
+
+
+def _numeric(rows: Sequence[Sequence[str]]) -> tuple[bool, ...]:
+    columns = zip(*rows, strict=True)
+    return tuple(any(cells) and all(not cell or _NUMBER.match(cell) for cell in cells) for cells in columns)
 
 
 def flag_warnings(name: str, results: Results) -> tuple[str, ...]:

@@ -21,8 +21,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.files import check_output, check_plain, output_folder, read_json, sweep, whole_file, write_json
 from mitsim.core.job import Job
 from mitsim.studies import ALL, EXPERIMENTS, PAPER, STUDIES
-from mitsim.studies.framework.experiment import Found, Results
-from mitsim.studies.framework.setup import Point
+from mitsim.studies.framework.experiment import Found, Point, Results
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -54,8 +53,8 @@ class Findings:
         raise NotImplementedError
 
     def lines(self) -> list[str]:
-        """For people."""
-        raise NotImplementedError
+        """For people: the page's parts, where the study says nothing shorter."""
+        return [line for part in self.parts() for line in part.lines()]
 
     def figures(self) -> Mapping[str, Figure]:
         """By file name."""

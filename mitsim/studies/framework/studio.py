@@ -28,7 +28,7 @@ from mitsim.reconstruct.solution import Status
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import LitScene, Unexposed
 from mitsim.report.table import Value
-from mitsim.studies.framework.setup import Point, Setup, picture
+from mitsim.studies.framework.experiment import Point, Setup, picture
 
 Kept = TypeVar("Kept")
 _PRINT = "reflectance.png"

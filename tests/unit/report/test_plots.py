@@ -12,6 +12,7 @@ from mitsim.report import demo_page, plots
 from mitsim.report.html import typeset
 from mitsim.report.table import Mean
 from mitsim.studies import diffraction_study, solver_study
+from mitsim.studies.diffraction_study import ASSUMED, SEPARABLE, QualityRow
 from mitsim.studies.solver_study import LAMBDAS, LAYOUTS, METHODS, PRECISIONS, SolverRow
 
 SOLVER_ROWS = [
@@ -110,11 +111,14 @@ def test_legends_cover_no_point_and_lie_inside_the_figure() -> None:
 
 
 def test_solver_costs_shows_every_row_in_the_panel_of_its_lambda() -> None:
+    """And rings around what nothing beats."""
     figure = solver_study.solver_costs(SOLVER_ROWS)
     for axes, lam in zip(figure.axes, LAMBDAS, strict=True):
         assert axes.get_title().endswith(typeset(f"{lam:.0e}"))
         shown = [(line.get_xdata()[0], line.get_ydata()[0]) for line in axes.lines[:-1]]
         assert sorted(shown) == sorted((row.seconds, row.error) for row in SOLVER_ROWS if row.lambda_rel == lam)
+        front = plots.pareto_front(shown)
+        assert list(zip(*axes.lines[-1].get_data(), strict=True)) == front
     looks = {(line.get_color(), line.get_marker()) for line in figure.axes[0].lines[:-1]}
     assert len(looks) == len(METHODS) * len(LAYOUTS) * len(PRECISIONS)
 
@@ -138,12 +142,17 @@ def test_no_pyplot_is_loaded() -> None:
 
 
 def test_quality_by_factors_shows_every_value_on_the_line_of_its_system() -> None:
-    rows = [("ray", "assumed", 40.0), ("wave", "assumed", 20.0), ("wave", "found", 41.0)]
+    def row(light: str, factors: str, psnr_db: float) -> QualityRow:
+        return QualityRow("idealised", "separable", light, "dots:7", factors, 49, psnr_db, 0.0, None, 0.0, 0.0, "")
+
+    rows = [row("ray", ASSUMED, 40.0), row("wave", ASSUMED, 20.0), row("wave", SEPARABLE, 41.0)]
     figure = diffraction_study.quality_by_factors(rows, "a message")
     axes = figure.axes[0]
-    assert [text.get_text() for text in axes.get_yticklabels()] == ["wave", "ray"], "the first stands on top"
-    marks = {line.get_label(): line.get_xydata().tolist() for line in axes.lines if line.get_marker() != "None"}
-    assert marks == {"assumed": [[40.0, 1.0], [20.0, 0.0]], "found": [[41.0, 0.0]]}
+    names = [text.get_text() for text in axes.get_yticklabels()]
+    assert names == ["idealised, separable, wave", "idealised, separable, ray"]
+    assert [bar.get_width() for bar in axes.patches] == [20.0, 40.0]
+    (fitting,) = (line.get_xdata() for line in axes.lines if line.get_marker() == "D")
+    assert fitting[0] == 41.0 and np.isnan(fitting[1]), "of rays no others are tried"
     assert "dB" in axes.get_xlabel() and figure.get_suptitle() == "a message"
 
 

@@ -135,7 +135,7 @@ def test_a_judge_takes_a_plans_own_numbers_where_its_time_does_not_buy_finer_one
     plan = stand.plan(3e-2)
     finest = stand.finest(plan).settings
     formed = SimpleNamespace(frames=lambda *_: [SimpleNamespace(irradiance=np.ones((2, 2)), variance=0.0)])
-    monkeypatch.setattr(Stand, "trace", lambda _, trial, seed: traced.append((trial.plan, seed)) or formed)
+    monkeypatch.setattr(Stand, "trace", lambda _, plan, seed: traced.append((plan, seed)) or formed)
     _, dear = accuracy_parts._within(stand, stand.finest(plan), 0.0)
     for seconds, taken in ((math.inf, finest), (dear, finest), (0.99 * dear, plan.settings), (0.0, plan.settings)):
         answer = Judge.trace(stand, plan, seconds)
@@ -177,11 +177,12 @@ def test_what_is_written(result: StudyResult, study: AccuracyFindings, folder: P
 
 def test_extrapolated_points_are_hollow(study: AccuracyFindings) -> None:
     runs, reference = study.figures()["accuracy.png"].axes
-    faces = [
-        [line.get_markerfacecolor() for line in axes.lines if line.get_marker() in "os"] for axes in (runs, reference)
-    ]
-    assert len(faces[0]) == len([row for row in study.rows if not row.extrapolated]) and "white" not in faces[0]
-    assert len(faces[1]) == 3 + 1 and set(faces[1]) == {"white"}, "three points and the legend's"
+    count = len([row for row in study.rows if not row.extrapolated])
+    faces = [[line.get_markerfacecolor() for line in axes.lines] for axes in (runs, reference)]
+    assert len(faces[0]) == count + 1 + 2 and "white" not in faces[0], "points, rings, judge and sensor noise"
+    assert faces[1] == ["white"] * 3 + ["none"], "points and rings"
+    said = {row.setting.removeprefix("accuracy ") for row in study.rows if not row.extrapolated}
+    assert said and said <= {text.get_text() for text in runs.texts}
 
 
 def test_what_does_not_fit_is_left_out_and_named(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -49,16 +49,14 @@ def test_each_surface_keeps_the_albedo_of_the_light(shared_scene: Callable[..., 
 
 
 def test_rows_of_one_part_stand_by_their_names_in_the_chart() -> None:
-    """And a bound is drawn beside each error."""
-    took = Spread.of([1.0, 1.1, 1.2])
-    rows = [PartCost("fog", 0.1, 0.2, took, took, True), PartCost("2 surfaces", 0.05, 0.06, took, None, True, of="fog")]
-    errors, _ = accuracy_findings.parts(rows, 1e-3).axes
-    assert [label.get_text() for label in errors.get_yticklabels()] == ["fog", "fog: 2 surfaces"]
-    assert [0.1, 0.2] in [list(line.get_xdata()) for line in errors.lines]
-
-
-def test_a_chart_of_parts_that_were_not_timed_has_no_empty_panel() -> None:
-    """(Planted: both panels always.)"""
-    (errors,) = accuracy_findings.parts([PartCost("fog", 0.1, 0.1, None, None, True)], 1e-3).axes
-    assert errors.figure.get_suptitle() == "What each part of the light buys"
-    assert not errors.figure.legends, "no bound and nothing left out"
+    """With what they take, and a bound is drawn beside each error. (Planted: bounds in the order of the rows.)"""
+    took, more = Spread.of([1.0, 1.1, 1.2]), Spread.of([3.0, 3.1, 3.2])
+    rows = [
+        PartCost("fog", 0.1, 0.2, more, took, True),
+        PartCost("2 surfaces", 0.05, 0.06, took, None, False, of="fog"),
+    ]
+    (errors,) = accuracy_findings.part_chart(rows, 1e-3).axes
+    names = [label.get_text() for label in errors.get_yticklabels()]
+    assert names == ["fog: 2 surfaces, not timed, not planned", "fog, 2 s (1.8 to 2.2)"]
+    ends = [path.vertices[:, 0].tolist() for path in errors.collections[-1].get_paths()]
+    assert ends == [[0.05, 0.06], [0.1, 0.2]]

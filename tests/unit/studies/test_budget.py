@@ -15,7 +15,7 @@ from mitsim.devices.patterns import parse_patterns, stripe_signs
 from mitsim.devices.session import Drift
 from mitsim.report.lit_scene import SPECKLE
 from mitsim.studies import ablation, error_budget
-from mitsim.studies.drift_loss import AMBIENT, SESSION
+from mitsim.studies.drift_study import AMBIENT, SESSION
 from mitsim.studies.error_budget import ERROR_SOURCES, LAMBDA, RENDERING, REST, LossRow
 from mitsim.studies.perturbation import Expected, LinearImage, Noise
 

@@ -19,10 +19,9 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.studies.framework import campaign
 from mitsim.studies.framework.campaign import CampaignResult, Where, merge, run_experiment
-from mitsim.studies.framework.experiment import Scope
+from mitsim.studies.framework.experiment import Scope, Setup
 from mitsim.studies.framework.page import build_page
 from mitsim.studies.framework.run import Shard
-from mitsim.studies.framework.setup import Setup
 
 pytestmark = pytest.mark.usefixtures("draft_figures")
 

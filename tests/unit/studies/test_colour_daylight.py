@@ -13,11 +13,11 @@ from mitsim.devices.chart import ChartPlace
 from mitsim.devices.patterns import parse_patterns
 from mitsim.devices.sensor import SensorModel
 from mitsim.report.table import Mean, Table
-from mitsim.studies import daylight as by_lux
-from mitsim.studies.daylight import BY_LUX, LEAST, METHODS, DaylitLine, claim_of, expected_delta_e, kept_lx, most
+from mitsim.studies import colour_study
+from mitsim.studies.colour_study import BY_LUX, LEAST, METHODS, kept_lx, ladder_claim
 from mitsim.studies.framework.claims import UNDECIDED
-from mitsim.studies.framework.experiment import Scope
-from mitsim.studies.framework.setup import Setup
+from mitsim.studies.framework.experiment import Scope, Setup
+from mitsim.studies.lit_lines import DaylitLine, expected_delta_e, most
 
 N, PIXELS = 8, 15
 BOXES = ((0, 2, 1, 4), (3, 8, 5, 7), *[(0, 1, 0, 1)] * 22)
@@ -116,33 +116,33 @@ def rows_of(measured: float, kept: float | None) -> Table:
 
 def test_claims_say_up_to_which_illuminance_they_hold() -> None:
     """1 more at 600 lx: 0.5 at 60 lx is just kept. 2 more: 0.5 of 1 on the way to 60 lx."""
-    claim = claim_of(rows_of(1.0, 30.0), "dots:7")
+    claim = ladder_claim(rows_of(1.0, 30.0), "dots:7")
     assert claim.verdict == "confirmed only if D65 has at most 60 lx" and "up to 30 lx" in claim.rendered
-    assert claim_of(rows_of(2.0, 30.0), "dots:7").verdict == "confirmed only if D65 has at most 30 lx"
-    assert claim_of(rows_of(0.1, 900.0), "hadamard:8").verdict == "confirmed"
+    assert ladder_claim(rows_of(2.0, 30.0), "dots:7").verdict == "confirmed only if D65 has at most 30 lx"
+    assert ladder_claim(rows_of(0.1, 900.0), "hadamard:8").verdict == "confirmed"
     dim = Table(tuple({**row, "goal_delta_e": 3.0} for row in rows_of(1.0, None).rows))
-    assert claim_of(dim, "dots:7").verdict == "not confirmed"
+    assert ladder_claim(dim, "dots:7").verdict == "not confirmed"
     # 0.01 of two exposures are an interval of 0.13 either way.
-    assert claim_of(rows_of(0.4, 900.0), "dots:7").verdict == UNDECIDED
+    assert ladder_claim(rows_of(0.4, 900.0), "dots:7").verdict == UNDECIDED
 
 
 def test_tables_have_every_illuminance_and_what_it_takes() -> None:
-    ladder, needed = by_lux.tables(rows_of(2.0, 30.0))
+    ladder, needed = colour_study.ladder_tables(rows_of(2.0, 30.0))
     assert [row[0] for row in ladder.rows] == ["0", "60", "600"] and len(ladder.headings) == 7
     assert ladder.rows[2][1:4] == ("6.00 \N{PLUS-MINUS SIGN} 0.01", "6.00 \N{PLUS-MINUS SIGN} 0.01", "5.00")
     assert "of 2 exposures" in ladder.title
     assert needed.rows[0] == ("49 dots", "30", "30", "3; 2", "3; 20")
-    assert by_lux.tables(rows_of(2.0, None))[1].rows[1][3:] == ("never", "never")
+    assert colour_study.ladder_tables(rows_of(2.0, None))[1].rows[1][3:] == ("never", "never")
 
 
 def test_the_figure_has_all_methods_and_the_goal() -> None:
-    figure = by_lux.figure(rows_of(1.0, 30.0))
+    figure = colour_study.ladder_figure(rows_of(1.0, 30.0))
     assert [text.get_text() for text in figure.legends[0].get_texts()] == [*METHODS, "floor + 0.5"]
     assert [axes.get_title() for axes in figure.axes] == ["49 dots", "64 Hadamard"]
 
 
 def test_a_quick_look_has_few_points() -> None:
     setup = Setup("colour_checker")
-    whole, quick = (by_lux.points_of(Scope(setup, (None,), quick=quick), setup) for quick in (False, True))
+    whole, quick = (colour_study.ladder_points(Scope(setup, (None,), quick=quick), setup) for quick in (False, True))
     assert [point["patterns"] for point in whole] == ["dots:7", "hadamard:8"] and len(quick) == 1
     assert quick[0]["ladder"] == "0 60" and quick[0]["draws"] < whole[0]["draws"]

@@ -16,9 +16,8 @@ from mitsim.devices.chart import load_chart
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e
 from mitsim.report.table import Table
 from mitsim.studies import colour_study
-from mitsim.studies.framework.experiment import Results, Scope, find_experiment
+from mitsim.studies.framework.experiment import Point, Results, Scope, Setup, find_experiment
 from mitsim.studies.framework.run import batches
-from mitsim.studies.framework.setup import Point, Setup
 from tests.unit.studies.test_colour_daylight import rows_of
 
 LINES = (638.0, 520.0, 445.0)

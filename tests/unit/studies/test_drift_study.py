@@ -20,10 +20,8 @@ from mitsim.devices.session import DRIFT_UNITS, Drift, load_recipe
 from mitsim.report import RENDERED
 from mitsim.report.lit_scene import LitScene
 from mitsim.report.table import Table
-from mitsim.studies.drift_loss import SESSION, DriftStand, Outcome
-from mitsim.studies.drift_study import _move_projector
-from mitsim.studies.framework.experiment import Results, Scope, find_experiment
-from mitsim.studies.framework.setup import Setup
+from mitsim.studies.drift_study import SESSION, DriftStand, Outcome, _move_projector
+from mitsim.studies.framework.experiment import Results, Scope, Setup, find_experiment
 from mitsim.studies.framework.studio import Studio
 
 pytestmark = pytest.mark.usefixtures("kept_plans")

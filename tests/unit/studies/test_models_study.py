@@ -11,8 +11,7 @@ import pytest
 from mitsim.devices.camera import CameraGeometry
 from mitsim.report.table import Table, Value
 from mitsim.studies import models_study
-from mitsim.studies.framework.experiment import Results, Scope, find_experiment
-from mitsim.studies.framework.setup import Setup
+from mitsim.studies.framework.experiment import Results, Scope, Setup, find_experiment
 
 EXPERIMENT = find_experiment("models")
 

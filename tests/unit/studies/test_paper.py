@@ -13,10 +13,18 @@ from mitsim.report.table import Table
 from mitsim.studies import EXPERIMENTS, PAPER
 from mitsim.studies.framework.campaign import Where, run_experiment
 from mitsim.studies.framework.claims import UNDECIDED, image_rows, judge_claim, psnr_claim
-from mitsim.studies.framework.experiment import IMAGE, Results, Scope, find_experiment, measures_of, values_of
+from mitsim.studies.framework.experiment import (
+    IMAGE,
+    Point,
+    Results,
+    Scope,
+    Setup,
+    find_experiment,
+    measures_of,
+    values_of,
+)
 from mitsim.studies.framework.page import Section, build_page, flag_warnings
 from mitsim.studies.framework.run import batches
-from mitsim.studies.framework.setup import Point, Setup
 
 TIMES = "\N{MULTIPLICATION SIGN}"
 WHOLE = Scope(Setup(), ("coins", "page"))

@@ -13,7 +13,7 @@ from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, RENDERED
 from mitsim.report.lit_scene import DIM, DIM_E, Plane, bin_frame
-from mitsim.studies.framework.setup import SIDE, TEST_IMAGES, Setup, picture
+from mitsim.studies.framework.experiment import SIDE, TEST_IMAGES, Setup, picture
 from mitsim.studies.framework.studio import Image, Studio
 
 pytestmark = pytest.mark.usefixtures("kept_plans")

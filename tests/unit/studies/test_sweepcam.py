@@ -20,8 +20,7 @@ from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODEL
 from mitsim.report.lit_scene import IdealCamera, LitScene
 from mitsim.report.table import Table
 from mitsim.sensor.chain import electrons_from_irradiance
-from mitsim.studies.framework.experiment import Results, find_experiment
-from mitsim.studies.framework.setup import Setup
+from mitsim.studies.framework.experiment import Results, Setup, find_experiment
 from mitsim.studies.framework.studio import Studio
 from mitsim.studies.multishot_study import MovedMask, _consistent, calibrated_places, ideal_places, move_mask
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.special import erf
 
 from mitsim.core.errors import MitsimError
-from mitsim.studies.diffraction_study import contrast, modulation, slanted_edge
+from mitsim.studies.camera_studies import contrast, modulation, slanted_edge
 
 ROWS = COLUMNS = 96
 

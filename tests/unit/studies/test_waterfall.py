@@ -18,8 +18,7 @@ from mitsim.report.lit_scene import LitScene
 from mitsim.report.table import Mean, Table
 from mitsim.studies.ablation import BLACK_LEVEL, DEPTH, FALLOFF, Ablation
 from mitsim.studies.framework.claims import UNDECIDED
-from mitsim.studies.framework.experiment import Results, Scope
-from mitsim.studies.framework.setup import Setup
+from mitsim.studies.framework.experiment import Results, Scope, Setup
 from mitsim.studies.framework.studio import Studio
 from mitsim.studies.waterfall_study import (
     ALONE,
@@ -222,12 +221,13 @@ def test_the_figure_has_a_bar_for_each_effect_that_shows() -> None:
     drawn = waterfall({"a": Fall(mean(40), tuple(steps), mean(38.55))}, seen=0.2)
     (axes,) = drawn.axes
     labels = [label.get_text() for label in axes.get_yticklabels()]
-    assert labels == ["idealised", "one", "two", "others", "rendered"]
+    one = "one, alone \N{MINUS SIGN}4.0 ± 0.1, left out \N{MINUS SIGN}2.0 ± 0.1"
+    assert labels == ["idealised", one, "two", "others", "rendered"]
     bars = [(bar.get_x(), bar.get_width()) for bar in axes.patches]
-    assert bars[0] == pytest.approx((40, -3)) and bars[1] == pytest.approx((37, 1.5))
-    assert bars[2] == pytest.approx((38.5, 0.05))
+    assert bars[1] == pytest.approx((40, -3)) and bars[2] == pytest.approx((37, 1.5))
+    assert bars[3] == pytest.approx((38.5, 0.05))
     texts = {text.get_text() for text in axes.texts}
-    assert {"\N{MINUS SIGN}3.0 ± 0.1", "\N{MINUS SIGN}4.0 ± 0.1", "\N{MINUS SIGN}2.0 ± 0.1", "40.0 ± 0.1 dB"} <= texts
+    assert {"\N{MINUS SIGN}3.0 ± 0.1", "+1.5 ± 0.1", "40.0 ± 0.1 dB"} <= texts
     assert "quiet" in drawn.get_supxlabel()
 
 

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mitsim.core.errors import MitsimError
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
-from mitsim.studies.framework.setup import Point
+from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope
 
 
 def points(scope: Scope) -> Sequence[Point]:
