@@ -27,9 +27,8 @@ from mitsim.acquire.exposure import (
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Request, Task
-from mitsim.core.arguments import checked
 from mitsim.core.environment import deciding_versions, versions
-from mitsim.core.errors import ArgumentError, cut
+from mitsim.core.errors import ArgumentError, checked, cut
 from mitsim.core.exr import Channel
 from mitsim.core.files import FRAMES, output_folder
 from mitsim.core.job import Job

@@ -7,8 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from mitsim.core.arguments import checked
-from mitsim.core.errors import ArgumentError
+from mitsim.core.errors import ArgumentError, checked
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -178,7 +178,7 @@ def demo(
 @verb
 def plan(scene: Scene, sampling: OfPatterns, devices: Coloured, common: Common) -> int:
     """What will be simulated, why, and what it costs, before any long work."""
-    from mitsim.core.resources import running_seconds
+    from mitsim.core.job import running_seconds
 
     request = request_of(sampling)
     devices.check_colour(common.variant, sampling.seconds)
@@ -215,8 +215,8 @@ def capture(
     limited: Limited,
 ) -> int:
     """Render, expose and write one frame for each pattern; in colour, for each pattern and line of the projector."""
+    from mitsim.core.job import memory_from_here, memory_since
     from mitsim.core.manifests import MANIFEST
-    from mitsim.core.resources import memory_from_here, memory_since
 
     if capturing.exposure != "auto":
         refuse_unused(context, ["exposure_fraction"], "on an --exposure in seconds")

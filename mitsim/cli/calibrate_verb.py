@@ -137,7 +137,7 @@ def calibrate(
 def _calibrate(scene: str, session: Session, planned: Planned, devices: Coloured, limited: Limited) -> int:
     from mitsim.bench.request import Exposure
     from mitsim.core.files import check_output
-    from mitsim.core.resources import memory_from_here, memory_since
+    from mitsim.core.job import memory_from_here, memory_since
     from mitsim.devices.session import load_recipe
 
     request, recipe, colour = session.request, load_recipe(session.recipe), devices.colour
@@ -216,7 +216,7 @@ def _finite(payload: Mapping[str, Any], *names: str) -> list[float]:
 
 
 def _calibrate_frames(folder: Path, output: Path, camera: str | None, limited: Limited) -> int:
-    from mitsim.core.resources import memory_from_here, memory_since
+    from mitsim.core.job import memory_from_here, memory_since
     from mitsim.devices.framelist import load_frames
 
     session = load_frames(folder)  # refused before the estimator is imported

@@ -21,7 +21,7 @@ import mitsim
 from mitsim.cli.screen import showing_progress
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.resources import Limits, running_seconds
+from mitsim.core.job import Limits, running_seconds
 from mitsim.devices.patterns import pattern_names
 
 if TYPE_CHECKING:

@@ -1,9 +1,34 @@
-"""Types of arrays that several rooms exchange."""
+"""Arrays that several rooms exchange, and files of them: NPY and NPZ in, HDF5 out.
 
-from dataclasses import fields
+NumPy maps an NPY file into memory, where a file that is cut short meanwhile ends the process, and allocates what the
+header of one in an NPZ claims. Here what a header claims is held against the file first, and numbers are copied.
+
+HDF5's own writer cannot close a file on a disk that is full: it says so many times on stderr, and once more when the
+program ends, or ends it. Here it writes through Python, which keeps the error until the file is closed.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from io import FileIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
+
+from mitsim.core.errors import reason_of
+from mitsim.core.files import whole_file
+from mitsim.core.job import Cost, Limits
+
+if TYPE_CHECKING:
+    import h5py
 
 FloatArray = npt.NDArray[np.float64]
 """Real numbers in double precision."""
@@ -48,3 +73,155 @@ class ByValue:
         for name, array in arrays.items():
             array.flags.writeable = False
             object.__setattr__(self, name, array)
+
+
+# -------- NumPy's files
+
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+"""Readers by version; later versions are of names of fields alone, which no array of numbers has."""
+_PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""What NumPy writes."""
+_MOST_ARRAYS = 10_000
+"""In an NPZ; a point of a study has some ten."""
+_AGAIN = 2
+"""Bytes of memory that a byte of an NPZ takes: as it is unpacked, and as an array."""
+
+
+@dataclass(frozen=True)
+class Npy:
+    """What an NPY file's header says: shape and type of its array, whether columns come first, and where it begins."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    fortran: bool
+    start: int
+
+    @classmethod
+    def of(cls, file: BinaryIO, size: int) -> Npy:
+        """The header at the beginning of ``file``, of ``size`` bytes. ValueError where it is none, of Python objects,
+        or claims other than the file has."""
+        read = _HEADERS.get(np.lib.format.read_magic(file))
+        if read is None:
+            raise ValueError("it is no array of numbers")
+        try:
+            shape, fortran, dtype = read(file)
+        except ValueError:
+            raise
+        except Exception:  # of a damaged header NumPy raises whatever Python does on reading it as a literal
+            raise ValueError("its header is damaged") from None
+        found = cls(shape, dtype, fortran, file.tell())
+        if dtype.hasobject:
+            raise ValueError("it holds objects of Python, which are code")
+        if found.bytes != size - found.start:
+            raise ValueError(f"its header claims {found.bytes} bytes of numbers, and {size - found.start} follow it")
+        return found
+
+    @property
+    def bytes(self) -> int:
+        """Of its numbers."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+    def part(self, file: BinaryIO, index: int | None = None) -> npt.NDArray[Any]:
+        """The numbers in ``file``, or those of one ``index`` of the first axis. ValueError where it ends before."""
+        several = index is not None and not self.fortran
+        shape = self.shape[1:] if several else self.shape
+        count = math.prod(shape)
+        file.seek(self.start + (count * self.dtype.itemsize * index if several and index else 0))
+        data = bytearray(count * self.dtype.itemsize)
+        if file.readinto(data) != len(data):  # type: ignore[attr-defined]
+            raise ValueError("it ended while it was read")
+        values = np.frombuffer(data, self.dtype).reshape(shape, order="F" if self.fortran else "C")
+        return np.array(values[index]) if index is not None and self.fortran else values
+
+
+def read_npz(file: BinaryIO, name: Path | str) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of an NPZ ``file``.
+
+    Parameters
+    ----------
+    file
+        open for reading.
+    name
+        of it, for messages.
+
+    Raises
+    ------
+    ValueError
+        for a file that is damaged, or holds anything but arrays of numbers and texts.
+    MitsimError
+        where unpacking it would take more memory than is free.
+    """
+    try:
+        with zipfile.ZipFile(file) as packed:
+            parts = packed.infolist()
+            if len(parts) > _MOST_ARRAYS or any(part.compress_type not in _PACKINGS for part in parts):
+                raise ValueError(f"it holds more than {_MOST_ARRAYS} arrays, or such as NumPy does not write")
+            Cost(memory_bytes=_AGAIN * sum(part.file_size for part in parts)).check(f"file {name}", Limits())
+            arrays = {}
+            for part in parts:
+                data = io.BytesIO(packed.read(part))
+                arrays[part.filename.removesuffix(".npy")] = Npy.of(data, part.file_size).part(data)
+            return arrays
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OverflowError) as error:
+        raise ValueError(reason_of(error)) from error
+
+
+# -------- HDF5 files
+
+
+@contextmanager
+def whole_hdf5(path: Path | str) -> Iterator[h5py.File]:
+    """An HDF5 file that takes the place of ``path`` on leaving; after an error nothing of it is left.
+
+    MitsimError when it cannot be written, as on a full disk.
+    """
+    import h5py  # here: it takes 50 ms to import, and most work writes none
+
+    with whole_file(path) as part, open(part, "w+b", buffering=0) as disk:
+        kept = _FirstErrorFile(disk)
+        try:
+            with h5py.File(kept, "w", track_order=True) as file:
+                yield file
+        except Exception as error:  # of what it could not read again, where it could not write
+            raise kept.error or error from None
+        if kept.error is not None:
+            raise kept.error
+
+
+class _FirstErrorFile:
+    """A file whose first error in writing is kept as ``error``: what follows is dropped, as if it were written."""
+
+    def __init__(self, disk: FileIO) -> None:
+        self._disk = disk
+        self.error: OSError | None = None
+        self.tell, self.seek, self.read = disk.tell, disk.seek, disk.read  # by which h5py knows an open file
+
+    def write(self, data: Any) -> int:
+        """Write ``data``; returns its length."""
+        return self._try(self._whole, memoryview(data).cast("B"), memoryview(data).nbytes)
+
+    def truncate(self, size: int) -> int:
+        """Make the file ``size`` bytes long; returns that."""
+        return self._try(self._disk.truncate, size, size)
+
+    def flush(self) -> None:
+        """Nothing waits: it is not buffered here."""
+
+    def readinto(self, buffer: Any) -> int:
+        """Fill a ``buffer``, with zeros where nothing was written; returns its length."""
+        view = memoryview(buffer).cast("B")
+        found = self._disk.readinto(view) or 0
+        view[found:] = bytes(len(view) - found)
+        return len(view)
+
+    def _whole(self, view: memoryview) -> None:
+        while view:
+            view = view[self._disk.write(view) :]
+
+    def _try(self, work: Any, argument: Any, result: int) -> int:
+        try:
+            if self.error is None:
+                work(argument)
+        except OSError as error:
+            self.error = error
+        return result

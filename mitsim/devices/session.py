@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 from pydantic import AfterValidator, Field, model_validator
 
-from mitsim.core.arguments import checked, checked_fields
 from mitsim.core.configuration import Configuration, load_model, shipped
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError, checked, checked_fields
 from mitsim.devices.drift import Drift
 from mitsim.devices.sensor import ExposureFraction
 

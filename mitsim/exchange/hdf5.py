@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitsim.core.arrayfile import whole_hdf5
+from mitsim.core.arrays import whole_hdf5
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.exr import Channels, Metadata, Value
 from mitsim.core.files import FRAME_LIMITS, MOST_BYTES, MOST_PIXELS, check_plain, fits_a_frame, parse_json
+from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import CalibrationManifest, RunManifest
-from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import TRUTH, Capture
 from mitsim.core.spectral_manifests import CALIBRATION, MOSAIC, RUN, ColourManifest
 from mitsim.exchange.packed import (

@@ -22,8 +22,8 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.exr import Channel, Channels, Metadata
 from mitsim.core.files import check_plain, whole_file
+from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import SIDES, CalibrationManifest, Digital, RunManifest, ShotFile
-from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import TRUTH
 from mitsim.core.spectral_manifests import CALIBRATION, RUN
 from mitsim.exchange.packed import (

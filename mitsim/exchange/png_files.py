@@ -14,8 +14,8 @@ import numpy.typing as npt
 from mitsim.core.configuration import load_model, locate, validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import whole_file, whole_folder, write_json, write_text
+from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import Patterns, RunManifest
-from mitsim.core.resources import Cost, Limits
 from mitsim.core.spectral_manifests import COLOUR
 from mitsim.devices.framelist import FrameList
 from mitsim.devices.patterns import parse_patterns, stripe_signs

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import sparse
 
-from mitsim.core.arrayfile import whole_hdf5
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, whole_hdf5
 from mitsim.core.errors import MitsimError
 from mitsim.light.grids import GRIDS, Grid
 from mitsim.light.light import SampledLight

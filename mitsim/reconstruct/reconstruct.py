@@ -10,10 +10,10 @@ from typing import Literal
 
 import numpy as np
 
-from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import checked
+from mitsim.core.job import Cost, Limits
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import Capture, Measurement
 from mitsim.reconstruct.causes import Cause, Evidence
 from mitsim.reconstruct.cost import BYTES_A_NUMBER, keeps_frames, predict_cost, slab_numbers

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
-from mitsim.core.display import card, png, scaled, span
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError, checked
 from mitsim.core.exr import write_frame
 from mitsim.core.files import output_folder, plain, read_json, whole_file, write_json
+from mitsim.core.images import card, png, scaled, span
 from mitsim.reconstruct.cost import ImageCost
 from mitsim.reconstruct.depth import Depth
 from mitsim.reconstruct.depth_map import DepthMap

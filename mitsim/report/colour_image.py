@@ -12,11 +12,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.display import card, data_uri, grey_png, lightness, png
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.files import whole_file
+from mitsim.core.images import card, data_uri, grey_png, lightness, png
 from mitsim.core.manifests import CalibrationManifest, read_manifest
 from mitsim.core.spectral_manifests import ColourManifest
 from mitsim.devices.chart import ChartPlace

@@ -18,8 +18,8 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.display import data_uri, grey_png, lightness
 from mitsim.core.errors import MitsimError
+from mitsim.core.images import data_uri, grey_png, lightness
 from mitsim.light.plan import PlanRow
 from mitsim.metrics import Quality
 from mitsim.reconstruct.misfit import chi_square_text

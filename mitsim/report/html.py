@@ -12,8 +12,8 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
-from mitsim.core.display import data_uri
 from mitsim.core.files import whole_file
+from mitsim.core.images import data_uri
 
 _DPI, _SHOWN_DPI = 220, 110
 """Figures are 8.6 inches wide at most: 946 pixels of the page, in two dots each."""

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from mitsim.core import spectral_manifests
-from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import MitsimError, checked
 from mitsim.core.files import output_folder
 from mitsim.core.runs import load_run
 from mitsim.core.spectral_manifests import ColourManifest

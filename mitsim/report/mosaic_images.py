@@ -23,9 +23,9 @@ import numpy as np
 
 from mitsim.core import spectral_manifests
 from mitsim.core.arrays import FloatArray
-from mitsim.core.display import png
 from mitsim.core.exr import write_frame
 from mitsim.core.files import output_folder, read_json, whole_file
+from mitsim.core.images import png
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import MosaicCapture, load_mosaic
 from mitsim.core.spectral_manifests import JOINT, ColourManifest, check_way

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.display import lightness
+from mitsim.core.images import lightness
 from mitsim.report.html import scientific, typeset
 from mitsim.report.table import Mean
 

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from mitsim.acquire.capture import expose
 from mitsim.acquire.exposure import ambient_shots
 from mitsim.core.arrays import FloatArray
-from mitsim.core.display import lightness
+from mitsim.core.images import lightness
 from mitsim.devices.chart import ChartPlace, load_chart
 from mitsim.metrics import psnr
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb

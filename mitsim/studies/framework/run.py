@@ -196,7 +196,7 @@ class Store:
 
     def load(self, point: Point) -> Found:
         """What was found at a ``point``; MitsimError when the file is damaged."""
-        from mitsim.core.arrayfile import read_npz
+        from mitsim.core.arrays import read_npz
 
         path = self._file(point)
         try:

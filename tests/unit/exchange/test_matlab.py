@@ -310,6 +310,6 @@ def test_a_packed_bomb_is_refused_by_what_it_claims(tmp_path: Path, monkeypatch:
     sides = {f"{stem}b": np.zeros((1 << 10, 1 << 10)) for stem in ("P1", "Q1")}
     savemat(tmp_path / "a.mat", sides, do_compression=True)
     assert (tmp_path / "a.mat").stat().st_size < 1 << 15
-    monkeypatch.setattr("mitsim.core.resources.free_memory", lambda: 2**25)
+    monkeypatch.setattr("mitsim.core.job.free_memory", lambda: 2**25)
     with pytest.raises(MitsimError, match=r"a\.mat: would take about 48 MiB of memory; allowed are 28.8 MiB"):
         import_file(tmp_path / "a.mat", None, tmp_path / "cal", "b")
