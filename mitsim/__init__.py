@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.factors import load_calibration as load_calibration
     from mitsim.reconstruct.reconstruct import reconstruct as reconstruct
     from mitsim.reconstruct.result import Reconstruction as Reconstruction
-    from mitsim.report.line_images import reconstruct_colours as reconstruct_colours
+    from mitsim.report.quality import reconstruct_colours as reconstruct_colours
 
 _HOMES = {
     name: home
@@ -68,7 +68,7 @@ _HOMES = {
         "reconstruct.factors": "Factors load_calibration",
         "reconstruct.reconstruct": "reconstruct",
         "reconstruct.result": "Reconstruction",
-        "report.line_images": "reconstruct_colours",
+        "report.quality": "reconstruct_colours",
     }.items()
     for name in names.split()
 }

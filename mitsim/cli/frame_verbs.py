@@ -186,7 +186,7 @@ def _reconstruct_colours(
     # What it holds is looked into later: an image of the same inputs may be replaced.
     check_output(output, overwrite=is_coloured(output))
     from mitsim.core.job import memory_from_here, memory_since
-    from mitsim.report.line_images import reconstruct_colours
+    from mitsim.report.quality import reconstruct_colours
 
     held = memory_from_here()
     found = reconstruct_colours(run, calibration, output, place, **options)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,12 +18,12 @@ from mitsim.core.exr import write_frame
 from mitsim.core.files import whole_file
 from mitsim.core.images import card, data_uri, grey_png, lightness, png
 from mitsim.core.manifests import CalibrationManifest, read_manifest
-from mitsim.core.spectral_manifests import ColourManifest
+from mitsim.core.spectral_manifests import ColourManifest, write_colours
 from mitsim.devices.chart import ChartPlace
-from mitsim.metrics import Quality, psnr
+from mitsim.metrics import Quality, psnr, summary_of
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
 from mitsim.reconstruct.request import IMAGE_FILE
-from mitsim.report.html import page_figure, render_page, write_html
+from mitsim.report.pages import page_figure, render_page, write_html
 from mitsim.report.plots import BLUE, FONT, GREEN, VERMILION, WIDTH, figure_of, label_axes
 
 
@@ -206,6 +206,111 @@ def mean_of(values: Iterable[float]) -> float | None:
     """Mean of ``values``; None where there are none."""
     known = list(values)
     return float(np.mean(known)) if known else None
+
+
+# -------- An image in colour with what is known of it, and its files
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedColours:
+    """An image in colour, and how good it and the images of its lines are.
+
+    Attributes
+    ----------
+    colours
+        the image in colour.
+    qualities
+        of each line's image by its name; None without a truth.
+    described
+        sentences on how the images were found.
+    facts
+        the same by name, for the page.
+    warnings
+        what is wrong with the images.
+    seconds
+        by stage.
+    output
+        the folder that holds all.
+    solution
+        numbers of one solve for all lines, by the keys of the command line's JSON; none where each has its own.
+    of_lines
+        numbers of the solve of each line, by its name, where each has its own.
+    """
+
+    colours: ColourImage
+    qualities: Mapping[str, Quality | None]
+    described: Sequence[str]
+    facts: Mapping[str, str]
+    warnings: tuple[str, ...]
+    seconds: Mapping[str, float]
+    output: str
+    solution: Mapping[str, Any] = field(default_factory=dict)
+    of_lines: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    @property
+    def model(self) -> ColourModel:
+        """From reflectances at the lines to colours."""
+        return self.colours.model
+
+    @property
+    def reflectances(self) -> FloatArray:
+        """(n, n', lines) reflectance at each line, 1 = a perfect reflector."""
+        return self.colours.reflectances
+
+    @property
+    def xyz(self) -> FloatArray:
+        """(n, n', 3) CIE XYZ under D65; a perfect reflector has Y = 1."""
+        return self.colours.xyz
+
+    @property
+    def ok(self) -> bool:
+        """Whether the images of all lines can be used as they are."""
+        return not self.warnings
+
+    @property
+    def psnr_db(self) -> float | None:
+        """Of all lines' images together: of the mean of their squared errors; None without a truth."""
+        return self.colours.psnr_db
+
+    @property
+    def sentences(self) -> list[str]:
+        """What the command line says of it."""
+        return [*self.described, *self.colours.sentences]
+
+    def summary(self) -> dict[str, Any]:
+        """All but the pictures, by the keys of the command line's JSON."""
+        known = [found.ssim for found in self.qualities.values() if found and found.ssim]
+        return {
+            **self.solution,
+            "channels": [
+                {**line.model_dump(), **summary_of(self.qualities[line.name]), **self.of_lines.get(line.name, {})}
+                for line in self.colours.lines.channels
+            ],
+            "ssim": mean_of(known),
+            **self.colours.summary(),
+            "status": " ".join(self.warnings) or "Solved: every line's image can be used as it is.",
+            "seconds": dict(self.seconds),
+            "output": self.output,
+        }
+
+    def write(self, folder: Path, **inputs: Any) -> None:
+        """Write the image in colour, its page, and colour.json last, to a ``folder``.
+
+        Parameters
+        ----------
+        folder
+            that holds all.
+        **inputs
+            further entries of colour.json.
+        """
+        self.colours.write(folder)
+        write_page(folder / PAGE, self.colours, self.qualities, self.facts, self.warnings)
+        parts = {key: value for key, value in self.summary().items() if key != "channels"}
+        lines = ColourManifest(kind="colour-image", channels=self.colours.lines.channels)
+        write_colours(folder, lines, **inputs, **parts)
+
+    def _repr_html_(self) -> str:
+        return self.colours._repr_html_()
 
 
 # -------- An image in colour in, one self-contained HTML page out

@@ -17,7 +17,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from mitsim.core.files import output_folder, read_json, whole_file
 from mitsim.core.images import png
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import MosaicCapture, load_mosaic
-from mitsim.core.spectral_manifests import JOINT, ColourManifest, check_way
+from mitsim.core.spectral_manifests import JOINT, check_way
 from mitsim.devices.chart import ChartPlace
 from mitsim.metrics import Quality
 from mitsim.optics.separable import BestTerm, best_term
@@ -39,100 +39,7 @@ from mitsim.reconstruct.regularisation import automatic_lambda
 from mitsim.reconstruct.request import IMAGE_FILE, check_joint
 from mitsim.reconstruct.result import check_same_inputs
 from mitsim.reconstruct.solver import prepare
-from mitsim.report.colour_image import PAGE, ColourImage, board_of, write_page
-
-# ---- Images of all lines, and what is said of them ----
-
-
-@dataclass(frozen=True, eq=False)
-class JudgedMosaic:
-    """Images of all lines from frames behind colour filters.
-
-    Attributes
-    ----------
-    colours
-        the image in colour.
-    solved
-        images of the lines, and lambda.
-    way
-        one of :data:`mitsim.core.spectral_manifests.WAYS`.
-    qualities
-        of each line's image by its name; None without a truth.
-    unexplained
-        rms part of the measurements that neither noise nor the factors' noise explains.
-    warnings
-        what is wrong with the images.
-    seconds
-        by stage.
-    output
-        the folder that holds all.
-    """
-
-    colours: ColourImage
-    solved: LineImages
-    way: str
-    qualities: Mapping[str, Quality | None]
-    unexplained: float
-    warnings: tuple[str, ...]
-    seconds: Mapping[str, float]
-    output: str
-
-    @property
-    def ok(self) -> bool:
-        """Whether the images can be used as they are."""
-        return not self.warnings
-
-    def summary(self) -> dict[str, Any]:
-        """All but the pictures, by the keys of the command line's JSON."""
-        known = [found.ssim for found in self.qualities.values() if found and found.ssim]
-        joint = self.solved.joint
-        return {
-            "mosaic": self.way,
-            "channels": [
-                {
-                    **line.model_dump(),
-                    "psnr": (found := self.qualities[line.name]) and found.psnr_db,
-                    "ssim": found and found.ssim,
-                    "truth_error": found and found.truth_error,
-                }
-                for line in self.colours.lines.channels
-            ],
-            "ssim": float(np.mean(known)) if known else None,
-            **self.colours.summary(),
-            "lambda": self.solved.lam,
-            "steps": None if joint is None else joint.steps,
-            "residual": self.solved.residual,
-            "unexplained": self.unexplained,
-            "status": " ".join(self.warnings) or "Solved: every line's image can be used as it is.",
-            "seconds": dict(self.seconds),
-            "output": self.output,
-        }
-
-    @property
-    def sentences(self) -> list[str]:
-        """What the command line says of it."""
-        each = [f"{name}: {found or 'no truth to compare with'}" for name, found in self.qualities.items()]
-        steps = "" if self.solved.joint is None else f", {self.solved.joint.steps} steps"
-        summary = (
-            f"{self.way}: lambda {self.solved.lam:.3g}{steps}, residual {self.solved.residual:.1e}, "
-            f"{self.unexplained:.1e} unexplained"
-        )
-        return [*each, summary, *self.colours.sentences]
-
-    @property
-    def facts(self) -> dict[str, str]:
-        """How the images were made, by name."""
-        steps = "" if self.solved.joint is None else f", {self.solved.joint.steps} steps"
-        return {
-            "frames": "all lines at once, behind colour filters",
-            "solved": f"{self.way}{steps}",
-            "lambda": f"{self.solved.lam:.3g}",
-            "residual of the frames": f"{self.solved.residual:.1e}, of which {self.unexplained:.1e} is unexplained",
-        }
-
-    def _repr_html_(self) -> str:
-        return self.colours._repr_html_()
-
+from mitsim.report.colour_image import ColourImage, JudgedColours, board_of
 
 # ---- From a run to its images ----
 
@@ -146,7 +53,7 @@ def reconstruct_mosaic(
     overwrite: bool = False,
     way: str = JOINT,
     lam: Lambda = "auto",
-) -> JudgedMosaic:
+) -> JudgedColours:
     """Recover the image of every line of a run behind colour filters, and bring them together.
 
     Writes image.exr and image.png in colour and of each line, colour.json and report.html.
@@ -156,7 +63,7 @@ def reconstruct_mosaic(
     run, calibration
         folders of `mitsim capture --colour mosaic` and `mitsim calibrate --colour mosaic`.
     output, chart, overwrite
-        as :func:`mitsim.report.line_images.reconstruct_colours`.
+        as :func:`mitsim.report.quality.reconstruct_colours`.
     way
         one of :data:`mitsim.core.spectral_manifests.WAYS`.
     lam
@@ -167,7 +74,7 @@ def reconstruct_mosaic(
     ------
     MitsimError
         for folders that do not fit each other, a way that there is not, and as
-        :func:`mitsim.report.line_images.reconstruct_colours`.
+        :func:`mitsim.report.quality.reconstruct_colours`.
     """
     started = time.perf_counter()
     check_way(way)
@@ -193,14 +100,23 @@ def reconstruct_mosaic(
         board = board_of(calibration, shots.manifest)
         truth = shots.truth(board)
         images = np.moveaxis(solved.images, 0, -1)
-        lines = ColourManifest(kind="colour-image", channels=shots.manifest.channels)
+        qualities = _qualities(shots, images, truth, board)
         unexplained = sums.unexplained(solved.residual, list(factors.values()))
-        found = JudgedMosaic(
-            colours=ColourImage.of(lines, images, board, truth, chart),
-            solved=solved,
-            way=way,
-            qualities=_qualities(shots, images, truth, board),
-            unexplained=unexplained,
+        steps = "" if solved.joint is None else f", {solved.joint.steps} steps"
+        left = f"residual {solved.residual:.1e}, {unexplained:.1e} unexplained"
+        found = JudgedColours(
+            colours=ColourImage.of(shots.manifest, images, board, truth, chart),
+            qualities=qualities,
+            described=[
+                *(f"{name}: {each or 'no truth to compare with'}" for name, each in qualities.items()),
+                f"{way}: lambda {solved.lam:.3g}{steps}, {left}",
+            ],
+            facts={
+                "frames": "all lines at once, behind colour filters",
+                "solved": f"{way}{steps}",
+                "lambda": f"{solved.lam:.3g}",
+                "residual of the frames": f"{solved.residual:.1e}, of which {unexplained:.1e} is unexplained",
+            },
             warnings=_warnings(shots, factors, solved, unexplained),
             seconds={
                 "read": read - started,
@@ -209,8 +125,20 @@ def reconstruct_mosaic(
                 "total": time.perf_counter() - started,
             },
             output=str(folder),
+            solution={
+                "mosaic": way,
+                "lambda": solved.lam,
+                "steps": solved.joint and solved.joint.steps,
+                "residual": solved.residual,
+                "unexplained": unexplained,
+            },
         )
-        _write(found, folder, options)
+        for name, image in zip(shots.manifest.names, solved.images, strict=True):
+            with output_folder(folder / name, overwrite=True) as place:
+                write_frame(place / IMAGE_FILE, {"reflectance": image.astype(np.float32)}, {"lambda": solved.lam})
+                with whole_file(place / "image.png") as part:
+                    part.write_bytes(png(image))
+        found.write(folder, inputs=options)
     return found
 
 
@@ -296,9 +224,6 @@ def _warnings(
     return tuple(warnings)
 
 
-# ---- Files of an image ----
-
-
 def _may_replace(folder: Path, options: Mapping[str, str | float], overwrite: bool) -> bool:
     """Whether a ``folder`` holds an image that may be replaced: ``overwrite``, or of the same inputs ``asked`` for.
 
@@ -309,20 +234,6 @@ def _may_replace(folder: Path, options: Mapping[str, str | float], overwrite: bo
     if not overwrite:
         check_same_inputs(folder, read_json(folder / spectral_manifests.COLOUR), options)
     return True
-
-
-def _write(found: JudgedMosaic, folder: Path, options: Mapping[str, str | float]) -> None:
-    """All files of an image, colour.json last."""
-    for number, name in enumerate(found.colours.lines.names):
-        place, image = folder / name, found.solved.images[number]
-        with output_folder(place, overwrite=True):
-            write_frame(place / IMAGE_FILE, {"reflectance": image.astype(np.float32)}, {"lambda": found.solved.lam})
-            with whole_file(place / "image.png") as part:
-                part.write_bytes(png(image))
-    found.colours.write(folder)
-    write_page(folder / PAGE, found.colours, found.qualities, found.facts, found.warnings)
-    parts = {key: value for key, value in found.summary().items() if key != "channels"}
-    spectral_manifests.write_colours(folder, found.colours.lines, inputs=dict(options), **parts)
 
 
 # ---- A camera under a mosaic of colour filters ----

@@ -19,8 +19,7 @@ from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocat
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.images import lightness
-from mitsim.report.html import scientific, typeset
-from mitsim.report.table import Mean
+from mitsim.report.pages import Mean, scientific, typeset
 
 BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 SKY, PURPLE, BLACK = "#56B4E9", "#CC79A7", "#1b1f24"

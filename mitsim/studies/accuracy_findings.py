@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mitsim.report.html import scientific
+from mitsim.report.pages import scientific
 from mitsim.report.plots import BLUE, FONT, GREY, LINK, VERMILION, WIDTH, label_axes, log_ticks, panels_of
 from mitsim.studies.framework.run import Findings
 

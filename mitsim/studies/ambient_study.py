@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 
 from mitsim.report import EQUAL_PEAK, RENDERED, in_text
 from mitsim.report.lit_scene import Unexposed
+from mitsim.report.pages import Mean, Table, Value
 from mitsim.report.plots import curves
-from mitsim.report.table import Mean, Table, Value
 from mitsim.studies.framework.claims import by_patterns, difference, finding, images, verdict, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import Point

@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from matplotlib.figure import Figure
 
 from mitsim.report import EQUAL_PEAK, MODELS, label
+from mitsim.report.pages import Value
 from mitsim.report.plots import curves
-from mitsim.report.table import Value
 from mitsim.studies.framework import claims
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import Point

@@ -35,10 +35,9 @@ from mitsim.light.light import SampledLight
 from mitsim.reconstruct.estimate_factors import Estimate, decibels
 from mitsim.reconstruct.factors import Factors
 from mitsim.report import plots
-from mitsim.report.html import with_error
 from mitsim.report.lit_scene import LitScene
+from mitsim.report.pages import Mean, Table, with_error
 from mitsim.report.plots import bars
-from mitsim.report.table import Mean, Table
 from mitsim.studies.ablation import ablations, reform
 from mitsim.studies.drift_loss import SESSION, DriftStand, squared_error
 from mitsim.studies.error_budget import (

@@ -22,7 +22,7 @@ from mitsim.core.environment import versions
 from mitsim.core.files import write_json
 from mitsim.core.job import Job
 from mitsim.devices.sensor import SensorModel
-from mitsim.report.html import round_to_error, typeset
+from mitsim.report.pages import round_to_error, typeset
 from mitsim.report.plots import BLACK, BLUE, FONT, GREY, ORANGE, VERMILION, WIDTH, figure_of, label_axes
 from mitsim.sensor.emva import LEAST_DARK, QUANTISATION, SPLIT, Session, figures
 from mitsim.sensor.specimen import mean_dark_current

@@ -27,8 +27,8 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.report import label
 from mitsim.report.colour_image import by_patch, halves
+from mitsim.report.pages import Table, Value
 from mitsim.report.plots import BLUE, FONT, VERMILION, figure_of, label_axes, panels_of
-from mitsim.report.table import Table, Value
 from mitsim.studies import daylight as by_lux
 from mitsim.studies.daylight import BY_LUX, GOAL, DaylitLine
 from mitsim.studies.framework.claims import difference, every, sample_mean, verdict, within

@@ -38,8 +38,8 @@ from mitsim.reconstruct.factorisation import Side
 from mitsim.reconstruct.request import MARKOV, TIKHONOV
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.report import RENDERED, label
+from mitsim.report.pages import Mean, Table
 from mitsim.report.plots import curves
-from mitsim.report.table import Mean, Table
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.studies.framework.claims import verdict, within
 from mitsim.studies.framework.experiment import Claim, Found, PageTable, Scope

@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 
 from mitsim.report import EQUAL_PEAK, IDEALISED, RENDERED, label
 from mitsim.report.lit_scene import Plane
+from mitsim.report.pages import Mean, Table, Value
 from mitsim.report.plots import curves
-from mitsim.report.table import Mean, Table, Value
 from mitsim.studies.framework.claims import (
     by_patterns,
     difference,

@@ -24,8 +24,8 @@ from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import SessionRecipe, load_recipe
 from mitsim.reconstruct.factors import Factors
 from mitsim.report.lit_scene import LitScene
+from mitsim.report.pages import Mean, Table
 from mitsim.report.plots import curves, pair_chart
-from mitsim.report.table import Mean, Table
 from mitsim.studies.drift_loss import DriftStand
 from mitsim.studies.framework.claims import difference, verdict, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope, group_by_setup, number_of

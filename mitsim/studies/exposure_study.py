@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from mitsim.devices.patterns import PatternFamily
 from mitsim.report import EQUAL_FRAME, IDEALISED, MODELS
 from mitsim.report.lit_scene import Unexposed
+from mitsim.report.pages import Mean
 from mitsim.report.plots import quality_bars
-from mitsim.report.table import Mean
 from mitsim.studies.framework import claims
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope
 from mitsim.studies.framework.setup import Point

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 from mitsim.report import CONVENTIONS, EQUAL_FRAME, MODELS, RENDERED, label
 from mitsim.report.lit_scene import DIM
+from mitsim.report.pages import Table
 from mitsim.report.plots import singular_values
-from mitsim.report.table import Table
 from mitsim.studies.framework import claims
 from mitsim.studies.framework.claims import Lines
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope

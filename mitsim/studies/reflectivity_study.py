@@ -37,8 +37,8 @@ from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import Prepared
 from mitsim.report import EQUAL_PEAK, RENDERED, label
 from mitsim.report.lit_scene import LitScene, Unexposed, peak_time
+from mitsim.report.pages import Mean, Table, Value
 from mitsim.report.plots import curves, image_grid
-from mitsim.report.table import Mean, Table, Value
 from mitsim.sensor.moments import frame_moments
 from mitsim.studies.framework.claims import Holds, difference, every, sample_mean, single_precision, verdict_at, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Results, Scope

@@ -18,8 +18,8 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.report import EQUAL_FRAME, MODELS
 from mitsim.report.lit_scene import LitScene
+from mitsim.report.pages import Table
 from mitsim.report.plots import curves, image_grid
-from mitsim.report.table import Table
 from mitsim.studies.diffraction_study import contrast, modulation, slanted_edge
 from mitsim.studies.framework import claims
 from mitsim.studies.framework.claims import Holds, image_array

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from mitsim.core.arrays import FloatArray
-    from mitsim.report.table import Table, Value
+    from mitsim.report.pages import Table, Value
     from mitsim.studies.framework.studio import Studio
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from mitsim.core.environment import versions
-from mitsim.report.html import page_figure, render_page, write_html
+from mitsim.report.pages import page_figure, render_page, write_html
 from mitsim.studies.framework.experiment import KNOBS, Claim, Experiment, PageTable, Results, Scope
 from mitsim.studies.framework.setup import TEST_IMAGES, Setup
 

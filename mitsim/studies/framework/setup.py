@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from mitsim.core.arrays import FloatArray
-    from mitsim.report.table import Value
+    from mitsim.report.pages import Value
 
 _KEY_DIGITS = 16
 """Of a point's name: two of 10^4 points have the same with a chance of 10^-11."""

@@ -12,7 +12,7 @@ from mitsim.core.configuration import load_model, locate
 from mitsim.devices.chart import ChartPlace
 from mitsim.devices.patterns import parse_patterns
 from mitsim.devices.sensor import SensorModel
-from mitsim.report.table import Mean, Table
+from mitsim.report.pages import Mean, Table
 from mitsim.studies import daylight as by_lux
 from mitsim.studies.daylight import BY_LUX, LEAST, METHODS, DaylitLine, claim_of, expected_delta_e, kept_lx, most
 from mitsim.studies.framework.claims import UNDECIDED

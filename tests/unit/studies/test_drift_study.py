@@ -20,7 +20,7 @@ from mitsim.devices.drift import UNITS, Drift
 from mitsim.devices.session import load_recipe
 from mitsim.report import RENDERED
 from mitsim.report.lit_scene import LitScene
-from mitsim.report.table import Table
+from mitsim.report.pages import Table
 from mitsim.studies.drift_loss import SESSION, DriftStand, Outcome
 from mitsim.studies.drift_study import _move_projector
 from mitsim.studies.framework.experiment import Results, Scope, find_experiment
