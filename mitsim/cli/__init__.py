@@ -9,31 +9,23 @@ from __future__ import annotations
 import errno
 import signal
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 import mitsim
 from mitsim.cli.calibrate_verb import calibrate
-from mitsim.cli.colour_option import (
-    AUTO,
-    MOSAIC,
-    NO,
-    Coloured,
-    ambient_of,
-    by_line,
-    in_colour,
-    of_capture,
-    of_mosaic,
-    plan_of,
-    weighed,
-)
 from mitsim.cli.exchange_verbs import export, import_, patterns, transport
 from mitsim.cli.frame_verbs import characterise, reconstruct, sense
 from mitsim.cli.options import (
+    AUTO,
+    MOSAIC,
+    NO,
     Accuracy,
+    Coloured,
     Common,
     Devices,
     Effects,
@@ -46,7 +38,9 @@ from mitsim.cli.options import (
     Sampling,
     Scene,
     Seed,
+    by_line,
     check_work,
+    in_colour,
     is_given,
     message_of,
     number_of,
@@ -55,11 +49,17 @@ from mitsim.cli.options import (
     request_of,
     verb,
 )
-from mitsim.cli.screen import finish, print_plan
+from mitsim.cli.screen import finish, payload_of_lines, print_plan, total_of_lines
 from mitsim.cli.study_verb import study
 from mitsim.core.errors import MitsimError, printable
-from mitsim.core.spectral_manifests import LINES
+from mitsim.core.spectral_manifests import LINES, RUN
+from mitsim.core.spectral_manifests import MOSAIC as MOSAIC_RUN
 from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped, end_uncaught, stopped
+
+if TYPE_CHECKING:
+    from mitsim.api.bench import Bench
+    from mitsim.core.runs import Capture, MosaicCapture
+    from mitsim.light.plan import Plan
 
 app = typer.Typer(
     name="mitsim",
@@ -185,10 +185,29 @@ def plan(scene: Scene, sampling: OfPatterns, devices: Coloured, common: Common) 
     devices.check(scene, sampling.patterns)
     bench = devices.open(scene, devices.traced_in(common.variant))
     starting = running_seconds()
-    found = plan_of(bench, devices.colour, request).taking(start=starting)
+    found = _plan_of(bench, devices.colour, request).taking(start=starting)
     if not common.as_json:
         print_plan(found)
     return finish(common.as_json, found.payload(), [], found.warnings)
+
+
+def _plan_of(bench: Bench, colour: str, request: dict[str, Any]) -> Plan:
+    """The plan that a command line asks for.
+
+    Parameters
+    ----------
+    bench, colour, request
+        what it names; of the request, its fields.
+    """
+    if colour == AUTO:
+        return bench.choose_colour(**request).plan
+    if colour == NO:
+        return bench.plan(**request)
+    from mitsim.acquire.spectral import SpectralBench
+    from mitsim.bench.request import Request
+
+    kind = MOSAIC_RUN if colour == MOSAIC else RUN
+    return SpectralBench.of(in_colour(bench, colour), kind).plan(Request.of(**request))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,7 +257,7 @@ def capture(
         what, options = request.pop("patterns"), request
         if colour == MOSAIC:
             seen = bench.capture_mosaic(what, output, resume, job, **options)
-            payload, lines = of_mosaic(seen)
+            payload, lines = _of_mosaic(seen)
             payload["memory_bytes"] = memory_since(held)
             return finish(limited.as_json, payload, lines, seen.warnings)
         if colour == AUTO:
@@ -247,7 +266,7 @@ def capture(
             bench, what, options, colour = chosen.bench, chosen.plan, {}, NO if chosen.mono else LINES
         if by_line(colour):
             runs = in_colour(bench, colour).capture_lines(what, output, resume, job, **options)
-            payload, lines = of_capture(runs, output)
+            payload, lines = _of_capture(runs, output)
             payload["memory_bytes"] = memory_since(held)
             return finish(limited.as_json, payload, lines, payload["warnings"])
         shots = bench.capture(what, output, resume, job, **options)
@@ -261,14 +280,60 @@ def capture(
         f"exposure {payload['exposure_s']:.3g} s a frame; memory {payload['memory_bytes'] / 2**30:.2g} GiB "
         f"of at most {payload['predicted_memory_bytes'] / 2**30:.2g} predicted",
     ]
-    lines += weighed(payload)
+    lines += _colour_lines(payload)
     if capturing.seconds is not None:
         lines.append(
             f"Asked for {capturing.seconds:g} s, predicted {payload['predicted_seconds']:.1f}, taken "
             f"{taken['total']:.1f}: accuracy {payload['accuracy']:g}, total error up to "
             f"{payload['total_error_bound']:.1e}"
         )
-    return finish(limited.as_json, payload, [*lines, *ambient_of(payload)], shots.warnings)
+    return finish(limited.as_json, payload, [*lines, *_ambient_lines(payload)], shots.warnings)
+
+
+def _of_capture(runs: Mapping[str, Capture], output: Path) -> tuple[dict[str, Any], list[str]]:
+    """JSON and lines of text of a coloured capture: its ``runs`` by line, in the folder ``output``."""
+    payload = payload_of_lines(RUN, {name: run.summary() for name, run in runs.items()}, output)
+    lines = [
+        f"{part['name']}: {part['frames']} frames of {part['shape'][0]}x{part['shape'][1]}, Monte Carlo error "
+        f"{part['mc_error']:.1e}, total error up to {part['total_error_bound']:.1e}, exposure {part['exposure_s']:.3g} "
+        "s a frame"
+        for part in payload["channels"]
+    ]
+    return payload, [*lines, total_of_lines(payload), *_colour_lines(payload)]
+
+
+def _colour_lines(payload: Mapping[str, Any]) -> list[str]:
+    """The line that a capture's ``payload`` says of what was weighed for colour; none where that was not asked for."""
+    choice = payload["colour"]
+    if choice is None or len(choice["candidates"]) < 2:
+        return []
+    errors = ", ".join(f"{each['name']} {each['error']:.1e}" for each in choice["candidates"])
+    return [f"Colour: {choice['chosen']} (error that each leaves: {errors})"]
+
+
+def _of_mosaic(shots: MosaicCapture) -> tuple[dict[str, Any], list[str]]:
+    """JSON and lines of text of ``shots`` behind colour filters, in their folder."""
+    payload = shots.summary()
+    lines = [
+        f"{payload['frames']} frames of {payload['shape'][0]}x{payload['shape'][1]} behind {payload['mosaic']} "
+        f"filters, {len(payload['channels'])} lines at once, in {payload['seconds']['total']:.1f} s: "
+        f"{payload['output']}",
+        f"Monte Carlo error at most {payload['mc_error']:.1e}, total error up to {payload['total_error_bound']:.1e}, "
+        f"exposure {payload['exposure_s']:.3g} s a frame",
+    ]
+    return payload, [*lines, *_ambient_lines(payload)]
+
+
+def _ambient_lines(payload: Mapping[str, Any]) -> list[str]:
+    """The line that a capture's ``payload`` says of its ambient frame; none where none was taken."""
+    ambient = payload["ambient_frame"]
+    if not ambient:
+        return []
+    return [
+        f"Ambient frame: the mean of {ambient['shots']} shots with the projector off, to be taken off; "
+        f"{ambient['part']:.1%} of the frames' light is ambient, noise {ambient['noise']:.2g} of the projector's, "
+        f"total error up to {payload['total_error_of_projector']:.1e} of it"
+    ]
 
 
 @dataclass(frozen=True)
