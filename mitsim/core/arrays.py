@@ -291,8 +291,7 @@ def read_variables(path: Path) -> dict[str, Any]:
     except NotImplementedError:
         raise MitsimError(f"{path}: is HDF5 (version 7.3); save it in MATLAB with -v7, or name an export .h5") from None
     except Exception as error:  # SciPy's reader raises of all kinds
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise MitsimError(f"{path}: damaged, or no MATLAB file ({reason}); write or copy it again") from error
+        raise MitsimError(f"{path}: damaged, or no MATLAB file ({reason_of(error)}); write or copy it again") from error
 
 
 def _arrays_in(file: BinaryIO) -> dict[str, int]:

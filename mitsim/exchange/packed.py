@@ -36,7 +36,6 @@ from mitsim.core.spectral_manifests import (
     ColourManifest,
     MosaicManifest,
     checked_colours,
-    checked_mosaic,
     is_coloured,
     is_mosaic,
     read_colours,
@@ -329,7 +328,7 @@ def unpack_colours(text: str, kind: str, place: Path, files: Sequence[str] = ())
         data = parse_json(text)
     except ValueError as error:
         raise MitsimError(f"{place}: its {COLOUR} is not valid JSON ({error}); export it again") from error
-    colours = checked_mosaic(data, place) if kind == MOSAIC else checked_colours(data, kind, place)
+    colours = checked_colours(data, kind, place)
     for name in {COLOUR, LOCK, *((MANIFEST, *files) if kind == MOSAIC else ())}.intersection(colours.names):
         raise MitsimError(f"{place}: a line is called {name}; give it a name of its own")
     return colours

@@ -14,7 +14,7 @@ same scene, and nearly the same noise, which lambda weighs against each other.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Protocol
@@ -93,7 +93,7 @@ def reconstruct_mosaic(
             [(each.left, each.right) for each in factors.values()], shots.weights, shots.manifest.mosaic
         )
         solver = solver_of(way, camera, shots.shots.patterns)
-        sums = _add_frames(solver, shots, (len(camera.lefts[0]), len(camera.rights[0])))
+        noise = _add_frames(solver, shots, (len(camera.lefts[0]), len(camera.rights[0])))
         added = time.perf_counter()
         solved = solver.images(lam)
         ended = time.perf_counter()
@@ -101,7 +101,7 @@ def reconstruct_mosaic(
         truth = shots.truth(board)
         images = np.moveaxis(solved.images, 0, -1)
         qualities = _qualities(shots, images, truth, board)
-        unexplained = sums.unexplained(solved.residual, list(factors.values()))
+        unexplained = _unexplained(solved.residual, noise, factors.values())
         steps = "" if solved.joint is None else f", {solved.joint.steps} steps"
         left = f"residual {solved.residual:.1e}, {unexplained:.1e} unexplained"
         found = JudgedColours(
@@ -157,33 +157,24 @@ def fitting_factors(shots: MosaicCapture, calibration: Path) -> dict[str, Factor
 # ---- Unexplained energy, quality and warnings ----
 
 
-@dataclass(frozen=True)
-class _Energies:
-    """Sums over all data of a run: of their squares, and of their noise's variances."""
-
-    data: float
-    noise: float
-
-    def unexplained(self, residual: float, factors: list[Factors]) -> float:
-        """Part of the data, rms, that a ``residual`` has beyond noise and the noise of ``factors``, lines' own."""
-        own = [each.manifest.noise for each in factors]
-        explained = 0.0
-        for each, noise in zip(factors, own, strict=True):
-            if noise is not None:
-                sides = (noise.left, each.left), (noise.right, each.right)
-                explained = max(explained, sum(s**2 * side.size / float(np.square(side).sum()) for s, side in sides))
-        left = residual**2 - (self.noise / self.data if self.data else 0.0) - explained
-        return float(np.sqrt(max(left, 0.0)))
-
-
-def _add_frames(solver: Solver, shots: MosaicCapture, shape: tuple[int, int]) -> _Energies:
-    """Every frame of ``shots`` (``shape``) added to a ``solver``."""
+def _add_frames(solver: Solver, shots: MosaicCapture, shape: tuple[int, int]) -> float:
+    """Every frame of ``shots`` (``shape``) added to a ``solver``; returns the part of their squares that is noise."""
     data = noise = 0.0
     for each in shots.shots.measured(shape):
         solver.add(each.frame, each.row, each.column)
         data += float(np.square(each.frame).sum())
         noise += float(np.maximum(shots.shots.manifest.digital.variance(each.light, each.shots), 0.0).sum())
-    return _Energies(data, noise)
+    return noise / data if data else 0.0
+
+
+def _unexplained(residual: float, noise: float, factors: Iterable[Factors]) -> float:
+    """Part of the data, rms, that a ``residual`` has beyond ``noise`` and the noise of ``factors``, lines' own."""
+    explained = 0.0
+    for each in factors:
+        if (own := each.manifest.noise) is not None:
+            sides = (own.left, each.left), (own.right, each.right)
+            explained = max(explained, sum(s**2 * side.size / float(np.square(side).sum()) for s, side in sides))
+    return float(np.sqrt(max(residual**2 - noise - explained, 0.0)))
 
 
 def _qualities(
