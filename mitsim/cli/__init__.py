@@ -58,7 +58,6 @@ from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped, end_unc
 
 if TYPE_CHECKING:
     from mitsim.api.bench import Bench
-    from mitsim.core.runs import Capture, MosaicCapture
     from mitsim.light.plan import Plan
 
 app = typer.Typer(
@@ -255,51 +254,56 @@ def capture(
         bench = devices.open(scene, variant, job)
         held = memory_from_here()
         what, options = request.pop("patterns"), request
-        if colour == MOSAIC:
-            seen = bench.capture_mosaic(what, output, resume, job, **options)
-            payload, lines = _of_mosaic(seen)
-            payload["memory_bytes"] = memory_since(held)
-            return finish(limited.as_json, payload, lines, seen.warnings)
         if colour == AUTO:
             with job.planning(what):
                 chosen = bench.choose_colour(patterns=what, **options)
             bench, what, options, colour = chosen.bench, chosen.plan, {}, NO if chosen.mono else LINES
         if by_line(colour):
             runs = in_colour(bench, colour).capture_lines(what, output, resume, job, **options)
-            payload, lines = _of_capture(runs, output)
-            payload["memory_bytes"] = memory_since(held)
-            return finish(limited.as_json, payload, lines, payload["warnings"])
-        shots = bench.capture(what, output, resume, job, **options)
-    payload = {**shots.summary(), "memory_bytes": memory_since(held)}
+            payload = payload_of_lines(RUN, {name: run.summary() for name, run in runs.items()}, output)
+        else:
+            take = bench.capture_mosaic if colour == MOSAIC else bench.capture
+            payload = take(what, output, resume, job, **options).summary()
+    payload["memory_bytes"] = memory_since(held)
+    return finish(limited.as_json, payload, _capture_lines(payload), payload["warnings"])
+
+
+def _capture_lines(payload: Mapping[str, Any]) -> list[str]:
+    """What is said of a capture by its ``payload``: of one that tells no lines apart, a coloured one, or of frames
+    behind colour filters."""
     taken = payload["seconds"]
+    if payload.get("kind") == RUN:
+        each = [
+            f"{part['name']}: {part['frames']} frames of {part['shape'][0]}x{part['shape'][1]}, Monte Carlo error "
+            f"{part['mc_error']:.1e}, total error up to {part['total_error_bound']:.1e}, exposure "
+            f"{part['exposure_s']:.3g} s a frame"
+            for part in payload["channels"]
+        ]
+        return [*each, total_of_lines(payload), *_colour_lines(payload)]
+    frames = f"{payload['frames']} frames of {payload['shape'][0]}x{payload['shape'][1]}"
+    if "mosaic" in payload:
+        return [
+            f"{frames} behind {payload['mosaic']} filters, {len(payload['channels'])} lines at once, in "
+            f"{taken['total']:.1f} s: {payload['output']}",
+            f"Monte Carlo error at most {payload['mc_error']:.1e}, total error up to "
+            f"{payload['total_error_bound']:.1e}, exposure {payload['exposure_s']:.3g} s a frame",
+            *_ambient_lines(payload),
+        ]
     lines = [
-        f"{payload['frames']} frames of {payload['shape'][0]}x{payload['shape'][1]} in {taken['total']:.1f} s "
-        f"(transport {taken['transport']:.2f}, optics {taken['optics']:.2f}, sensor {taken['sensor']:.2f}, "
-        f"write {taken['write']:.2f}): {payload['output']}",
+        f"{frames} in {taken['total']:.1f} s (transport {taken['transport']:.2f}, optics {taken['optics']:.2f}, "
+        f"sensor {taken['sensor']:.2f}, write {taken['write']:.2f}): {payload['output']}",
         f"Monte Carlo error {payload['mc_error']:.1e}, {payload['mc_to_sensor_noise']:.0%} of the sensor's noise; "
         f"exposure {payload['exposure_s']:.3g} s a frame; memory {payload['memory_bytes'] / 2**30:.2g} GiB "
         f"of at most {payload['predicted_memory_bytes'] / 2**30:.2g} predicted",
+        *_colour_lines(payload),
     ]
-    lines += _colour_lines(payload)
-    if capturing.seconds is not None:
+    if payload["asked_seconds"] is not None:
         lines.append(
-            f"Asked for {capturing.seconds:g} s, predicted {payload['predicted_seconds']:.1f}, taken "
+            f"Asked for {payload['asked_seconds']:g} s, predicted {payload['predicted_seconds']:.1f}, taken "
             f"{taken['total']:.1f}: accuracy {payload['accuracy']:g}, total error up to "
             f"{payload['total_error_bound']:.1e}"
         )
-    return finish(limited.as_json, payload, [*lines, *_ambient_lines(payload)], shots.warnings)
-
-
-def _of_capture(runs: Mapping[str, Capture], output: Path) -> tuple[dict[str, Any], list[str]]:
-    """JSON and lines of text of a coloured capture: its ``runs`` by line, in the folder ``output``."""
-    payload = payload_of_lines(RUN, {name: run.summary() for name, run in runs.items()}, output)
-    lines = [
-        f"{part['name']}: {part['frames']} frames of {part['shape'][0]}x{part['shape'][1]}, Monte Carlo error "
-        f"{part['mc_error']:.1e}, total error up to {part['total_error_bound']:.1e}, exposure {part['exposure_s']:.3g} "
-        "s a frame"
-        for part in payload["channels"]
-    ]
-    return payload, [*lines, total_of_lines(payload), *_colour_lines(payload)]
+    return [*lines, *_ambient_lines(payload)]
 
 
 def _colour_lines(payload: Mapping[str, Any]) -> list[str]:
@@ -309,19 +313,6 @@ def _colour_lines(payload: Mapping[str, Any]) -> list[str]:
         return []
     errors = ", ".join(f"{each['name']} {each['error']:.1e}" for each in choice["candidates"])
     return [f"Colour: {choice['chosen']} (error that each leaves: {errors})"]
-
-
-def _of_mosaic(shots: MosaicCapture) -> tuple[dict[str, Any], list[str]]:
-    """JSON and lines of text of ``shots`` behind colour filters, in their folder."""
-    payload = shots.summary()
-    lines = [
-        f"{payload['frames']} frames of {payload['shape'][0]}x{payload['shape'][1]} behind {payload['mosaic']} "
-        f"filters, {len(payload['channels'])} lines at once, in {payload['seconds']['total']:.1f} s: "
-        f"{payload['output']}",
-        f"Monte Carlo error at most {payload['mc_error']:.1e}, total error up to {payload['total_error_bound']:.1e}, "
-        f"exposure {payload['exposure_s']:.3g} s a frame",
-    ]
-    return payload, [*lines, *_ambient_lines(payload)]
 
 
 def _ambient_lines(payload: Mapping[str, Any]) -> list[str]:
