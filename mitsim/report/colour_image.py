@@ -149,14 +149,21 @@ class ColourImage:
             for number, name in enumerate(known.names)
         )
 
+    @property
+    def patch_means(self) -> list[float | None]:
+        """Means over the patches of Delta E: found, floor, and the truth's; None where there are none."""
+        known = ((getattr(patch, name) for patch in self.patches) for name in ("delta_e", "floor", "truth"))
+        return [mean_of(value for value in values if value is not None) for values in known]
+
     def summary(self) -> dict[str, Any]:
         """For colour.json and the command line's JSON."""
+        found, floor, _ = self.patch_means
         return {
             **self.model.summary(),
             "psnr": self.psnr_db,
             "delta_e": None if self.delta_e is None else float(self.delta_e.mean()),
-            "delta_e_chart": mean_of(patch.delta_e for patch in self.patches),
-            "delta_e_floor": mean_of(patch.floor for patch in self.patches),
+            "delta_e_chart": found,
+            "delta_e_floor": floor,
             "patches": [vars(patch) for patch in self.patches] or None,
         }
 
@@ -167,7 +174,7 @@ class ColourImage:
         if self.delta_e is not None:
             sentences.append(f"Delta E 2000 of a pixel to the truth {self.delta_e.mean():.2f} in the mean")
         if self.patches:
-            mean, floor = (mean_of(getattr(patch, name) for patch in self.patches) for name in ("delta_e", "floor"))
+            mean, floor, _ = self.patch_means
             sentences.append(f"of {len(self.patches)} patches to their spectra {mean:.2f}, floor {floor:.2f}")
         return sentences
 
@@ -349,14 +356,15 @@ def write_page(
     MitsimError
         when it cannot be written.
     """
+    seen = {"image": image.xyz} | ({} if image.truth_xyz is None else {"truth": image.truth_xyz})
     text = render_page(
         "colour.html",
         verdict=_verdict(image),
-        pictures=_pictures(image),
+        pictures={name: data_uri(png(linear_srgb(xyz), smallest=_SMALLEST)) for name, xyz in seen.items()},
         lines=[_line(image, number, qualities[name]) for number, name in enumerate(image.lines.names)],
         figures=_figures(image),
         patches=image.patches,
-        means=_means(image.patches),
+        means=image.patch_means,
         matrix=[(axis, [f"{value:.4f}" for value in row]) for axis, row in zip("XYZ", image.model.matrix, strict=True)],
         names=[f"{line.wavelength_nm:g} nm" for line in image.lines.channels],
         model=image.model.summary(),
@@ -373,7 +381,7 @@ def _verdict(image: ColourImage) -> tuple[str, str]:
     """Headline and detail."""
     quality = "" if image.psnr_db is None else f"PSNR of the {len(image.lines.names)} lines: {image.psnr_db:.1f} dB. "
     if image.patches:
-        mean, floor = _means(image.patches)[:2]
+        mean, floor, _ = image.patch_means
         return (
             f"Mean Delta E 2000 of {len(image.patches)} patches: {mean:.2f}",
             f"{quality}The floor is {floor:.2f}: these spectral lines alone, without a camera.",
@@ -381,12 +389,6 @@ def _verdict(image: ColourImage) -> tuple[str, str]:
     if image.delta_e is not None:
         return f"Mean Delta E 2000 to the truth: {image.delta_e.mean():.2f}", f"{quality}Mean over all pixels."
     return f"An image from {len(image.lines.names)} spectral lines", "No truth to compare it with."
-
-
-def _pictures(image: ColourImage) -> dict[str, str]:
-    """Image and truth, as data URIs."""
-    seen = {"image": image.xyz} | ({} if image.truth_xyz is None else {"truth": image.truth_xyz})
-    return {name: data_uri(png(linear_srgb(xyz), smallest=_SMALLEST)) for name, xyz in seen.items()}
 
 
 def _line(image: ColourImage, number: int, quality: Quality | None) -> dict[str, Any]:
@@ -417,13 +419,6 @@ def _figures(image: ColourImage) -> dict[str, tuple[str, int]]:
         title = "Left half: the patch's spectrum in D65. Right half: this image. Number: Delta E 2000"
         drawn["halves"] = halves(names, found, chart().xyz, image.chart.means(image.xyz), title)
     return {name: page_figure(figure) for name, figure in drawn.items()}
-
-
-def _means(patches: Sequence[Patch]) -> tuple[float, float, float | None]:
-    """Means over the patches: found, floor, truth (None without one)."""
-    truths = [patch.truth for patch in patches if patch.truth is not None]
-    found, floor = (np.mean([getattr(patch, name) for patch in patches] or [0.0]) for name in ("delta_e", "floor"))
-    return float(found), float(floor), mean_of(truths)
 
 
 # -------- Colours of a chart's patches in, matplotlib Figures out
