@@ -115,7 +115,17 @@ def finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequence
 
 
 def payload_of_lines(kind: str, results: Mapping[str, Mapping[str, Any]], output: Path) -> dict[str, Any]:
-    """JSON of the ``results`` of each line, by its name, in a coloured folder ``output`` of a ``kind``."""
+    """JSON of a coloured run or calibration.
+
+    Parameters
+    ----------
+    kind
+        of its folder, one of :data:`mitsim.core.spectral_manifests.KINDS`.
+    results
+        JSON of each line, by its name.
+    output
+        the folder.
+    """
     colours = read_colours(output, kind)
     return {
         "kind": colours.kind,
@@ -128,7 +138,7 @@ def payload_of_lines(kind: str, results: Mapping[str, Mapping[str, Any]], output
 
 
 def total_of_lines(payload: Mapping[str, Any]) -> str:
-    """The last line of text of a :func:`payload_of_lines`."""
+    """The last line of text of a ``payload`` as of :func:`payload_of_lines`."""
     return f"{len(payload['channels'])} lines in {payload['seconds']['total']:.1f} s: {payload['output']}"
 
 
