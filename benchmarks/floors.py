@@ -32,7 +32,7 @@ import drjit as dr
 import mitsim as ms
 from mitsim.capture import exposer
 from mitsim.core import framefile, recorders
-from mitsim.core.resources import workers
+from mitsim.core.worker import workers
 from mitsim.optics.image_formation import _Terms
 
 spent, lock = dict.fromkeys(("products", "noise", "files"), 0.0), threading.Lock()

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from mitsim.core.errors import MitsimError as MitsimError
     from mitsim.core.job import Clock as Clock
     from mitsim.core.job import Job as Job
-    from mitsim.core.resources import Limits as Limits
+    from mitsim.core.job import Limits as Limits
     from mitsim.core.runs import Capture as Capture
     from mitsim.core.runs import MosaicCapture as MosaicCapture
     from mitsim.core.runs import load_mosaic as load_mosaic
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.factors import load_calibration as load_calibration
     from mitsim.reconstruct.reconstruct import Reconstruction as Reconstruction
     from mitsim.reconstruct.reconstruct import reconstruct as reconstruct
-    from mitsim.report.line_images import reconstruct_colours as reconstruct_colours
+    from mitsim.report.quality import reconstruct_colours as reconstruct_colours
 
 _HOMES = {
     name: home
@@ -59,8 +59,7 @@ _HOMES = {
         "calibrate.model": "calibrate_model",
         "calibrate.session_plan": "CalibrationPlan plan_calibration",
         "core.errors": "ArgumentError MitsimError",
-        "core.job": "Clock Job",
-        "core.resources": "Limits",
+        "core.job": "Clock Job Limits",
         "core.runs": "Capture MosaicCapture load_mosaic load_run",
         "devices.session": "Modelling load_recipe",
         "light.plan": "Plan",
@@ -68,7 +67,7 @@ _HOMES = {
         "reconstruct.captured_session": "calibrate_frames",
         "reconstruct.factors": "Factors load_calibration",
         "reconstruct.reconstruct": "Reconstruction reconstruct",
-        "report.line_images": "reconstruct_colours",
+        "report.quality": "reconstruct_colours",
     }.items()
     for name in names.split()
 }

@@ -85,6 +85,12 @@ class Quality:
         return cls(psnr(image, truth), similar, truth_error)
 
 
+def summary_of(quality: Quality | None) -> dict[str, float | None]:
+    """A ``quality`` by the keys of the command line's JSON; None of each without one."""
+    keys = {"psnr": "psnr_db", "ssim": "ssim", "truth_error": "truth_error"}
+    return {key: None if quality is None else getattr(quality, name) for key, name in keys.items()}
+
+
 def psnr(image: Image, truth: Image) -> float:
     """Peak signal-to-noise ratio in dB, peak 1: -10 log10(mean((image - truth)^2)); inf when they are equal.
 

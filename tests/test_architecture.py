@@ -63,7 +63,7 @@ CHECKS_A_REQUEST = (
     "mitsim.devices.session",
     "mitsim.devices.framelist",
     "mitsim.exchange.formats",
-    "mitsim.exchange.real_capture",
+    "mitsim.exchange.formats",
 )
 """What looks at words, manifests and lists before work begins."""
 

@@ -17,8 +17,8 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from mitsim.core.display import lightness
 from mitsim.core.exr import read_frame
+from mitsim.core.images import lightness
 
 COMMANDS = {
     "run": ("capture", "photograph", "--patterns", "dots:7"),

@@ -29,11 +29,9 @@ from mitsim.acquire.exposure import (
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Request, Task
-from mitsim.core.arguments import checked
-from mitsim.core.arrayfile import whole_hdf5
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, whole_hdf5
 from mitsim.core.environment import deciding_versions, versions
-from mitsim.core.errors import ArgumentError, MitsimError, cut
+from mitsim.core.errors import ArgumentError, MitsimError, checked, cut
 from mitsim.core.exr import Channel
 from mitsim.core.files import FRAMES, output_folder
 from mitsim.core.job import Job

@@ -14,13 +14,11 @@ import numpy as np
 
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import FEWEST_PASSES, REFERENCE, check_accuracy, check_samples
-from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import DEFAULT_VARIANT, load_variant, versions
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import MitsimError, checked
 from mitsim.core.exr import write_frame
-from mitsim.core.job import Job
-from mitsim.core.resources import Cost
+from mitsim.core.job import Cost, Job
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.light.cost_model import frames_cost
@@ -88,7 +86,7 @@ class Rendered:
         return f"Rendered({rows} x {columns}: {self.facts['estimator']}, relative noise {self.mc_error:.1e})"
 
     def _repr_html_(self) -> str:
-        from mitsim.core.display import card, scaled, span
+        from mitsim.core.images import card, scaled, span
 
         grey = self.mean.mean(axis=2)
         facts = f"mean {grey.mean():.3g} W/m^2, relative noise {self.mc_error:.1e}"

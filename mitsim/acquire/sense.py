@@ -15,13 +15,12 @@ from typing import Any
 import numpy as np
 
 from mitsim.bench.request import Exposure, check_ending, check_f_number, check_image, check_wavelength
-from mitsim.core.arrayfile import Npy
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, Npy
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import Channel, finite_channel, read_frame, write_frame
 from mitsim.core.files import FRAME_LIMITS, fits_a_frame, whole_file
-from mitsim.core.resources import Cost, Limits
+from mitsim.core.job import Cost, Limits
 from mitsim.core.seeds import stream
 from mitsim.devices.sensor import EXPOSURE_S, SensorModel
 from mitsim.sensor.chain import Digital, electrons_from_irradiance, expose, exposure_for_peak

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from mitsim.bench.apparatus import Apparatus, open_apparatus, reopened
 from mitsim.bench.request import Request, SessionRequest, Task
-from mitsim.core.arguments import checked
 from mitsim.core.environment import DEFAULT_VARIANT
+from mitsim.core.errors import checked
 from mitsim.core.job import Job
 
 # What needs numpy, or the renderer, is imported where it is used: what opens a bench refuses a misspelt name first.

@@ -20,10 +20,9 @@ from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import SessionRequest
 from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.lit_session import LitSession
-from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import versions
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import MitsimError, checked
 from mitsim.core.files import output_folder
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, Digital, FactorNoise, FittedNumber, ModelledFactors

@@ -30,9 +30,8 @@ from mitsim.bench.request import Exposure, Request, check_psnr
 from mitsim.calibrate.board_session import Session, session_seconds
 from mitsim.calibrate.calibrate import NOISE_FREE, session_sums
 from mitsim.calibrate.lit_session import LitSession
-from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import MitsimError, checked
 from mitsim.core.job import Clock, Job
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.core.parallel import single_threaded_blas

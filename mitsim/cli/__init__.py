@@ -9,31 +9,23 @@ from __future__ import annotations
 import errno
 import signal
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 import mitsim
 from mitsim.cli.calibrate_verb import calibrate
-from mitsim.cli.colour_option import (
-    AUTO,
-    MOSAIC,
-    NO,
-    Coloured,
-    ambient_of,
-    by_line,
-    in_colour,
-    of_capture,
-    of_mosaic,
-    plan_of,
-    weighed,
-)
 from mitsim.cli.exchange_verbs import export, import_, patterns, transport
 from mitsim.cli.frame_verbs import characterise, reconstruct, sense
 from mitsim.cli.options import (
+    AUTO,
+    MOSAIC,
+    NO,
     Accuracy,
+    Coloured,
     Common,
     Devices,
     Effects,
@@ -46,7 +38,9 @@ from mitsim.cli.options import (
     Sampling,
     Scene,
     Seed,
+    by_line,
     check_work,
+    in_colour,
     is_given,
     message_of,
     number_of,
@@ -55,11 +49,16 @@ from mitsim.cli.options import (
     request_of,
     verb,
 )
-from mitsim.cli.screen import finish, print_plan
+from mitsim.cli.screen import finish, payload_of_lines, print_plan, total_of_lines
 from mitsim.cli.study_verb import study
 from mitsim.core.errors import MitsimError, printable
-from mitsim.core.spectral_manifests import LINES
+from mitsim.core.spectral_manifests import LINES, RUN
+from mitsim.core.spectral_manifests import MOSAIC as MOSAIC_RUN
 from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped, end_uncaught, stopped
+
+if TYPE_CHECKING:
+    from mitsim.api.bench import Bench
+    from mitsim.light.plan import Plan
 
 app = typer.Typer(
     name="mitsim",
@@ -178,17 +177,36 @@ def demo(
 @verb
 def plan(scene: Scene, sampling: OfPatterns, devices: Coloured, common: Common) -> int:
     """What will be simulated, why, and what it costs, before any long work."""
-    from mitsim.core.resources import running_seconds
+    from mitsim.core.job import running_seconds
 
     request = request_of(sampling)
     devices.check_colour(common.variant, sampling.seconds)
     devices.check(scene, sampling.patterns)
     bench = devices.open(scene, devices.traced_in(common.variant))
     starting = running_seconds()
-    found = plan_of(bench, devices.colour, request).taking(start=starting)
+    found = _plan_of(bench, devices.colour, request).taking(start=starting)
     if not common.as_json:
         print_plan(found)
     return finish(common.as_json, found.payload(), [], found.warnings)
+
+
+def _plan_of(bench: Bench, colour: str, request: dict[str, Any]) -> Plan:
+    """The plan that a command line asks for.
+
+    Parameters
+    ----------
+    bench, colour, request
+        what it names; of the request, its fields.
+    """
+    if colour == AUTO:
+        return bench.choose_colour(**request).plan
+    if colour == NO:
+        return bench.plan(**request)
+    from mitsim.acquire.spectral import SpectralBench
+    from mitsim.bench.request import Request
+
+    kind = MOSAIC_RUN if colour == MOSAIC else RUN
+    return SpectralBench.of(in_colour(bench, colour), kind).plan(Request.of(**request))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,8 +233,8 @@ def capture(
     limited: Limited,
 ) -> int:
     """Render, expose and write one frame for each pattern; in colour, for each pattern and line of the projector."""
+    from mitsim.core.job import memory_from_here, memory_since
     from mitsim.core.manifests import MANIFEST
-    from mitsim.core.resources import memory_from_here, memory_since
 
     if capturing.exposure != "auto":
         refuse_unused(context, ["exposure_fraction"], "on an --exposure in seconds")
@@ -236,39 +254,77 @@ def capture(
         bench = devices.open(scene, variant, job)
         held = memory_from_here()
         what, options = request.pop("patterns"), request
-        if colour == MOSAIC:
-            seen = bench.capture_mosaic(what, output, resume, job, **options)
-            payload, lines = of_mosaic(seen)
-            payload["memory_bytes"] = memory_since(held)
-            return finish(limited.as_json, payload, lines, seen.warnings)
         if colour == AUTO:
             with job.planning(what):
                 chosen = bench.choose_colour(patterns=what, **options)
             bench, what, options, colour = chosen.bench, chosen.plan, {}, NO if chosen.mono else LINES
         if by_line(colour):
             runs = in_colour(bench, colour).capture_lines(what, output, resume, job, **options)
-            payload, lines = of_capture(runs, output)
-            payload["memory_bytes"] = memory_since(held)
-            return finish(limited.as_json, payload, lines, payload["warnings"])
-        shots = bench.capture(what, output, resume, job, **options)
-    payload = {**shots.summary(), "memory_bytes": memory_since(held)}
+            payload = payload_of_lines(RUN, {name: run.summary() for name, run in runs.items()}, output)
+        else:
+            take = bench.capture_mosaic if colour == MOSAIC else bench.capture
+            payload = take(what, output, resume, job, **options).summary()
+    payload["memory_bytes"] = memory_since(held)
+    return finish(limited.as_json, payload, _capture_lines(payload), payload["warnings"])
+
+
+def _capture_lines(payload: Mapping[str, Any]) -> list[str]:
+    """What is said of a capture by its ``payload``: of one that tells no lines apart, a coloured one, or of frames
+    behind colour filters."""
     taken = payload["seconds"]
+    if payload.get("kind") == RUN:
+        each = [
+            f"{part['name']}: {part['frames']} frames of {part['shape'][0]}x{part['shape'][1]}, Monte Carlo error "
+            f"{part['mc_error']:.1e}, total error up to {part['total_error_bound']:.1e}, exposure "
+            f"{part['exposure_s']:.3g} s a frame"
+            for part in payload["channels"]
+        ]
+        return [*each, total_of_lines(payload), *_colour_lines(payload)]
+    frames = f"{payload['frames']} frames of {payload['shape'][0]}x{payload['shape'][1]}"
+    if "mosaic" in payload:
+        return [
+            f"{frames} behind {payload['mosaic']} filters, {len(payload['channels'])} lines at once, in "
+            f"{taken['total']:.1f} s: {payload['output']}",
+            f"Monte Carlo error at most {payload['mc_error']:.1e}, total error up to "
+            f"{payload['total_error_bound']:.1e}, exposure {payload['exposure_s']:.3g} s a frame",
+            *_ambient_lines(payload),
+        ]
     lines = [
-        f"{payload['frames']} frames of {payload['shape'][0]}x{payload['shape'][1]} in {taken['total']:.1f} s "
-        f"(transport {taken['transport']:.2f}, optics {taken['optics']:.2f}, sensor {taken['sensor']:.2f}, "
-        f"write {taken['write']:.2f}): {payload['output']}",
+        f"{frames} in {taken['total']:.1f} s (transport {taken['transport']:.2f}, optics {taken['optics']:.2f}, "
+        f"sensor {taken['sensor']:.2f}, write {taken['write']:.2f}): {payload['output']}",
         f"Monte Carlo error {payload['mc_error']:.1e}, {payload['mc_to_sensor_noise']:.0%} of the sensor's noise; "
         f"exposure {payload['exposure_s']:.3g} s a frame; memory {payload['memory_bytes'] / 2**30:.2g} GiB "
         f"of at most {payload['predicted_memory_bytes'] / 2**30:.2g} predicted",
+        *_colour_lines(payload),
     ]
-    lines += weighed(payload)
-    if capturing.seconds is not None:
+    if payload["asked_seconds"] is not None:
         lines.append(
-            f"Asked for {capturing.seconds:g} s, predicted {payload['predicted_seconds']:.1f}, taken "
+            f"Asked for {payload['asked_seconds']:g} s, predicted {payload['predicted_seconds']:.1f}, taken "
             f"{taken['total']:.1f}: accuracy {payload['accuracy']:g}, total error up to "
             f"{payload['total_error_bound']:.1e}"
         )
-    return finish(limited.as_json, payload, [*lines, *ambient_of(payload)], shots.warnings)
+    return [*lines, *_ambient_lines(payload)]
+
+
+def _colour_lines(payload: Mapping[str, Any]) -> list[str]:
+    """The line that a capture's ``payload`` says of what was weighed for colour; none where that was not asked for."""
+    choice = payload["colour"]
+    if choice is None or len(choice["candidates"]) < 2:
+        return []
+    errors = ", ".join(f"{each['name']} {each['error']:.1e}" for each in choice["candidates"])
+    return [f"Colour: {choice['chosen']} (error that each leaves: {errors})"]
+
+
+def _ambient_lines(payload: Mapping[str, Any]) -> list[str]:
+    """The line that a capture's ``payload`` says of its ambient frame; none where none was taken."""
+    ambient = payload["ambient_frame"]
+    if not ambient:
+        return []
+    return [
+        f"Ambient frame: the mean of {ambient['shots']} shots with the projector off, to be taken off; "
+        f"{ambient['part']:.1%} of the frames' light is ambient, noise {ambient['noise']:.2g} of the projector's, "
+        f"total error up to {payload['total_error_of_projector']:.1e} of it"
+    ]
 
 
 @dataclass(frozen=True)

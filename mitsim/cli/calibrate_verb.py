@@ -14,25 +14,30 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mitsim.cli.colour_option import MOSAIC, NO, Coloured, in_colour, of_calibration
 from mitsim.cli.options import (
+    MOSAIC,
+    NO,
     Accuracy,
+    Coloured,
     Limited,
     Resume,
     Seed,
     check_work,
+    in_colour,
     is_given,
     option,
     request_of,
     spelled,
     verb,
 )
-from mitsim.cli.screen import finish
+from mitsim.cli.screen import finish, payload_of_lines, total_of_lines
 from mitsim.core.errors import MitsimError
+from mitsim.core.spectral_manifests import CALIBRATION
 from mitsim.core.worker import RESUME, advise
 
 if TYPE_CHECKING:
     from mitsim.devices.session import Modelling
+    from mitsim.reconstruct.factors import Factors
 
 _OF_FRAMES = {"frames", "camera", "output", "as_json", "quiet"}
 """Options of `mitsim calibrate` that go with --frames."""
@@ -137,7 +142,7 @@ def calibrate(
 def _calibrate(scene: str, session: Session, planned: Planned, devices: Coloured, limited: Limited) -> int:
     from mitsim.bench.request import Exposure
     from mitsim.core.files import check_output
-    from mitsim.core.resources import memory_from_here, memory_since
+    from mitsim.core.job import memory_from_here, memory_since
     from mitsim.devices.session import load_recipe
 
     request, recipe, colour = session.request, load_recipe(session.recipe), devices.colour
@@ -168,7 +173,7 @@ def _calibrate(scene: str, session: Session, planned: Planned, devices: Coloured
             seen = in_colour(bench, colour)
             by_line = seen.calibrate_mosaic if colour == MOSAIC else seen.calibrate_lines
             shown = None if session.recipe is None else recipe
-            payload, lines = of_calibration(by_line(**whole, recipe=shown, resume=session.resume), folder)
+            payload, lines = _of_lines(by_line(**whole, recipe=shown, resume=session.resume), folder)
             payload["memory_bytes"] = memory_since(held)
             return finish(limited.as_json, payload, lines, payload["warnings"])
         if session.write_frames is not None:
@@ -207,6 +212,25 @@ def _session_lines(payload: dict[str, Any]) -> list[str]:
     ]
 
 
+def _of_lines(factors: Mapping[str, Factors], output: Path) -> tuple[dict[str, Any], list[str]]:
+    """JSON and lines of text of a coloured calibration: its ``factors`` by line, in the folder ``output``."""
+    results = {
+        name: {**each.manifest.result, "warnings": each.warnings, "output": str(output / name)}
+        for name, each in factors.items()
+    }
+    payload = payload_of_lines(CALIBRATION, results, output)
+    lines = [
+        f"{part['name']}: {part['frames']} frames of {part['n']} stripes, separability residual "
+        f"{_percent(part['separability_residual'])}, factor error {part['phi_error']:.1e}"
+        for part in payload["channels"]
+    ]
+    return payload, [*lines, total_of_lines(payload)]
+
+
+def _percent(part: float | None) -> str:
+    return "unknown" if part is None else f"{part:.2%}"
+
+
 def _finite(payload: Mapping[str, Any], *names: str) -> list[float]:
     """Numbers of a ``payload``; JSON has none beyond the finite ones."""
     return [math.inf if payload[name] is None else payload[name] for name in names]
@@ -216,7 +240,7 @@ def _finite(payload: Mapping[str, Any], *names: str) -> list[float]:
 
 
 def _calibrate_frames(folder: Path, output: Path, camera: str | None, limited: Limited) -> int:
-    from mitsim.core.resources import memory_from_here, memory_since
+    from mitsim.core.job import memory_from_here, memory_since
     from mitsim.devices.framelist import load_frames
 
     session = load_frames(folder)  # refused before the estimator is imported

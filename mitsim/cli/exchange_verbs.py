@@ -125,7 +125,7 @@ def import_(
 
 def _import_frames(context: typer.Context, source: Path, output: Path, frames: Frames) -> dict[str, Any]:
     from mitsim.core.imagelist import BARE, Raw
-    from mitsim.exchange.real_capture import RealCapture
+    from mitsim.exchange.formats import RealCapture
 
     if frames.patterns is None or frames.camera is None or frames.exposure is None:
         missing = next(name for name in ("patterns", "camera", "exposure") if getattr(frames, name) is None)

@@ -130,7 +130,7 @@ def reconstruct(
     if solving.focus is not None or solving.margin:
         check_parallax(manifest.parallax, str(calibration))
     check_output(output, overwrite=(output / IMAGE_FILE).is_file())
-    from mitsim.core.resources import memory_from_here, memory_since
+    from mitsim.core.job import memory_from_here, memory_since
     from mitsim.report.quality import reconstruct as reconstruct_folder
 
     held = memory_from_here()
@@ -185,8 +185,8 @@ def _reconstruct_colours(
     place = None if chart is None else load_chart(chart)
     # What it holds is looked into later: an image of the same inputs may be replaced.
     check_output(output, overwrite=is_coloured(output))
-    from mitsim.core.resources import memory_from_here, memory_since
-    from mitsim.report.line_images import reconstruct_colours
+    from mitsim.core.job import memory_from_here, memory_since
+    from mitsim.report.quality import reconstruct_colours
 
     held = memory_from_here()
     found = reconstruct_colours(run, calibration, output, place, **options)

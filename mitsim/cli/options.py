@@ -21,7 +21,8 @@ import mitsim
 from mitsim.cli.screen import showing_progress
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.resources import Limits, running_seconds
+from mitsim.core.job import Limits, running_seconds
+from mitsim.core.spectral_manifests import BANDS, LINES, bands_of, check_undecided, spectral_of
 from mitsim.devices.patterns import pattern_names
 
 if TYPE_CHECKING:
@@ -39,6 +40,9 @@ _SPELLED = {
 }
 """Options that are not called like their parameter."""
 _BENCH_ARGUMENTS = ("scene", "variant", "camera", "projector", "allow_outside_files", "for_render")
+
+NO, MOSAIC, AUTO = "no", "mosaic", "auto"
+"""Words of --colour beside `lines` and `bands:K`."""
 
 Scene = Annotated[str, typer.Argument(help="scene XML, or the name of a shipped scene", metavar="SCENE")]
 Patterns = Annotated[str, typer.Option(help=pattern_names())]
@@ -236,6 +240,98 @@ class Devices(LitScene):
 
         path, _ = check_devices(self.camera, None)
         exposure.check(load_sensor(path), path)
+
+
+def _choice(context: typer.Context, name: str) -> str:
+    words = [NO, LINES, f"{BANDS}:K", MOSAIC, AUTO]
+    if context.info_name == "calibrate":
+        words.remove(AUTO)
+    if name.startswith(f"{BANDS}:"):
+        bands_of(name)
+    elif name not in words:
+        raise MitsimError(f"--colour {name!r}: use {', '.join(words[:-1])} or {words[-1]}")
+    return name
+
+
+@dataclass(frozen=True)
+class Coloured(Devices):
+    """What opens a bench, and which of its projector's light is told apart."""
+
+    colour: str = option(
+        NO,
+        "lines: sequential colour, each line of the projector in a folder of its own; bands:K: the same of K "
+        "bands of its lines; mosaic: all lines at once, by a camera under colour filters; auto: no, bands or "
+        "lines, as the accuracy needs (not calibrate); no: light that is not told apart",
+        metavar="no|lines|bands:K|mosaic|auto",
+        callback=_choice,
+    )
+
+    def traced_in(self, variant: str) -> str:
+        """The variant that light is traced in: told apart, by the backend of ``variant`` that knows wavelengths.
+
+        MitsimError for colour that the camera cannot have.
+        """
+        if self.colour == NO:
+            return variant
+        from mitsim.bench.apparatus import check_devices
+        from mitsim.devices.sensor import load_sensor
+
+        path, _ = check_devices(self.camera, None)
+        mosaic = load_sensor(path).mosaic
+        if self.colour == MOSAIC and mosaic is None:
+            raise MitsimError(
+                f"--colour mosaic: camera {path} has no mosaic of colour filters; give one that has, such as "
+                "--camera imx249_rggb, or use --colour lines"
+            )
+        if self.colour != MOSAIC and mosaic is not None:
+            raise MitsimError(
+                f"--colour {self.colour}: camera {path} has a mosaic {mosaic}, whose frames show all lines at once; "
+                "use --colour mosaic"
+            )
+        return variant if self.colour == AUTO else spectral_of(variant)
+
+    def check_colour(self, variant: str, seconds: float | None = None) -> None:
+        """Refuse colour that a bench would refuse, before the renderer is imported.
+
+        Parameters
+        ----------
+        variant
+            as asked for.
+        seconds
+            that a capture is to take; None: not said.
+
+        Raises
+        ------
+        MitsimError
+            for seconds, a variant that colours cannot be weighed from, and lines or bands that the projector does not
+            have.
+        """
+        if self.colour == NO:
+            return
+        from mitsim.bench.apparatus import check_devices
+        from mitsim.bench.request import check_untimed
+        from mitsim.core.configuration import load_model
+
+        check_untimed(seconds)
+        _, path = check_devices(None, self.projector)
+        if self.colour == AUTO:
+            check_undecided(variant)
+            return
+        from mitsim.devices.projector import ProjectorModel
+
+        model = load_model(path, ProjectorModel)
+        lit = model.in_bands(bands_of(self.colour)) if self.colour.startswith(BANDS) else model
+        lit.traced_lines  # noqa: B018 - checks itself
+
+
+def by_line(colour: str) -> bool:
+    """Whether ``colour`` is of lines, or bands of them, one after the other."""
+    return colour.partition(":")[0] in (LINES, BANDS)
+
+
+def in_colour(bench: Bench, colour: str) -> Bench:
+    """The ``bench`` with the lines that ``colour`` names; MitsimError for more bands than its projector has lines."""
+    return bench.in_bands(bands_of(colour)) if colour.startswith(BANDS) else bench
 
 
 # ---- what words say --------------------------------------------------------------------------------------------------

@@ -7,11 +7,13 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mitsim.core.errors import MitsimError, printable
+from mitsim.core.spectral_manifests import RUN, read_colours
 
 if TYPE_CHECKING:
     from mitsim.core.job import Progress
@@ -110,6 +112,34 @@ def finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequence
     for warning in warnings:
         print(f"mitsim: warning: {printable(warning)}", file=sys.stderr)
     return 1 if warnings else 0
+
+
+def payload_of_lines(kind: str, results: Mapping[str, Mapping[str, Any]], output: Path) -> dict[str, Any]:
+    """JSON of a coloured run or calibration.
+
+    Parameters
+    ----------
+    kind
+        of its folder, one of :data:`mitsim.core.spectral_manifests.KINDS`.
+    results
+        JSON of each line, by its name.
+    output
+        the folder.
+    """
+    colours = read_colours(output, kind)
+    return {
+        "kind": colours.kind,
+        "channels": [{**line.model_dump(), **results[line.name]} for line in colours.channels],
+        "seconds": results[colours.names[-1]]["seconds"],
+        **{name: results[colours.names[0]].get(name) for name in ("colour",) if kind == RUN},
+        "warnings": tuple(f"{name}: {text}" for name, result in results.items() for text in result["warnings"]),
+        "output": str(output),
+    }
+
+
+def total_of_lines(payload: Mapping[str, Any]) -> str:
+    """The last line of text of a ``payload`` as of :func:`payload_of_lines`."""
+    return f"{len(payload['channels'])} lines in {payload['seconds']['total']:.1f} s: {payload['output']}"
 
 
 @contextmanager

@@ -1,9 +1,36 @@
-"""Types of arrays that several rooms exchange."""
+"""Arrays that several rooms exchange, and files of them: NPY, NPZ and MATLAB files in, HDF5 and MATLAB files out.
 
-from dataclasses import fields
+NumPy maps an NPY file into memory, where a file that is cut short meanwhile ends the process, and allocates what the
+header of one in an NPZ claims. Here what a header claims is held against the file first, and numbers are copied.
+
+HDF5's own writer cannot close a file on a disk that is full: it says so many times on stderr, and once more when the
+program ends, or ends it. Here it writes through Python, which keeps the error until the file is closed.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from io import FileIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
+
+from mitsim.core.errors import MitsimError, reason_of
+from mitsim.core.files import check_plain, whole_file
+from mitsim.core.job import Cost, Limits
+
+if TYPE_CHECKING:
+    import h5py
 
 FloatArray = npt.NDArray[np.float64]
 """Real numbers in double precision."""
@@ -48,3 +75,294 @@ class ByValue:
         for name, array in arrays.items():
             array.flags.writeable = False
             object.__setattr__(self, name, array)
+
+
+# -------- NumPy's files
+
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+"""Readers by version; later versions are of names of fields alone, which no array of numbers has."""
+_PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""What NumPy writes."""
+_MOST_ARRAYS = 10_000
+"""In an NPZ; a point of a study has some ten."""
+_AGAIN = 2
+"""Bytes of memory that a byte of an NPZ takes: as it is unpacked, and as an array."""
+
+
+@dataclass(frozen=True)
+class Npy:
+    """What an NPY file's header says: shape and type of its array, whether columns come first, and where it begins."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    fortran: bool
+    start: int
+
+    @classmethod
+    def of(cls, file: BinaryIO, size: int) -> Npy:
+        """The header at the beginning of ``file``, of ``size`` bytes. ValueError where it is none, of Python objects,
+        or claims other than the file has."""
+        read = _HEADERS.get(np.lib.format.read_magic(file))
+        if read is None:
+            raise ValueError("it is no array of numbers")
+        try:
+            shape, fortran, dtype = read(file)
+        except ValueError:
+            raise
+        except Exception:  # of a damaged header NumPy raises whatever Python does on reading it as a literal
+            raise ValueError("its header is damaged") from None
+        found = cls(shape, dtype, fortran, file.tell())
+        if dtype.hasobject:
+            raise ValueError("it holds objects of Python, which are code")
+        if found.bytes != size - found.start:
+            raise ValueError(f"its header claims {found.bytes} bytes of numbers, and {size - found.start} follow it")
+        return found
+
+    @property
+    def bytes(self) -> int:
+        """Of its numbers."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+    def part(self, file: BinaryIO, index: int | None = None) -> npt.NDArray[Any]:
+        """The numbers in ``file``, or those of one ``index`` of the first axis. ValueError where it ends before."""
+        several = index is not None and not self.fortran
+        shape = self.shape[1:] if several else self.shape
+        count = math.prod(shape)
+        file.seek(self.start + (count * self.dtype.itemsize * index if several and index else 0))
+        data = bytearray(count * self.dtype.itemsize)
+        if file.readinto(data) != len(data):  # type: ignore[attr-defined]
+            raise ValueError("it ended while it was read")
+        values = np.frombuffer(data, self.dtype).reshape(shape, order="F" if self.fortran else "C")
+        return np.array(values[index]) if index is not None and self.fortran else values
+
+
+def read_npz(file: BinaryIO, name: Path | str) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of an NPZ ``file``.
+
+    Parameters
+    ----------
+    file
+        open for reading.
+    name
+        of it, for messages.
+
+    Raises
+    ------
+    ValueError
+        for a file that is damaged, or holds anything but arrays of numbers and texts.
+    MitsimError
+        where unpacking it would take more memory than is free.
+    """
+    try:
+        with zipfile.ZipFile(file) as packed:
+            parts = packed.infolist()
+            if len(parts) > _MOST_ARRAYS or any(part.compress_type not in _PACKINGS for part in parts):
+                raise ValueError(f"it holds more than {_MOST_ARRAYS} arrays, or such as NumPy does not write")
+            Cost(memory_bytes=_AGAIN * sum(part.file_size for part in parts)).check(f"file {name}", Limits())
+            arrays = {}
+            for part in parts:
+                data = io.BytesIO(packed.read(part))
+                arrays[part.filename.removesuffix(".npy")] = Npy.of(data, part.file_size).part(data)
+            return arrays
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OverflowError) as error:
+        raise ValueError(reason_of(error)) from error
+
+
+# -------- HDF5 files
+
+
+@contextmanager
+def whole_hdf5(path: Path | str) -> Iterator[h5py.File]:
+    """An HDF5 file that takes the place of ``path`` on leaving; after an error nothing of it is left.
+
+    MitsimError when it cannot be written, as on a full disk.
+    """
+    import h5py  # here: it takes 50 ms to import, and most work writes none
+
+    with whole_file(path) as part, open(part, "w+b", buffering=0) as disk:
+        kept = _FirstErrorFile(disk)
+        try:
+            with h5py.File(kept, "w", track_order=True) as file:
+                yield file
+        except Exception as error:  # of what it could not read again, where it could not write
+            raise kept.error or error from None
+        if kept.error is not None:
+            raise kept.error
+
+
+class _FirstErrorFile:
+    """A file whose first error in writing is kept as ``error``: what follows is dropped, as if it were written."""
+
+    def __init__(self, disk: FileIO) -> None:
+        self._disk = disk
+        self.error: OSError | None = None
+        self.tell, self.seek, self.read = disk.tell, disk.seek, disk.read  # by which h5py knows an open file
+
+    def write(self, data: Any) -> int:
+        """Write ``data``; returns its length."""
+        return self._try(self._whole, memoryview(data).cast("B"), memoryview(data).nbytes)
+
+    def truncate(self, size: int) -> int:
+        """Make the file ``size`` bytes long; returns that."""
+        return self._try(self._disk.truncate, size, size)
+
+    def flush(self) -> None:
+        """Nothing waits: it is not buffered here."""
+
+    def readinto(self, buffer: Any) -> int:
+        """Fill a ``buffer``, with zeros where nothing was written; returns its length."""
+        view = memoryview(buffer).cast("B")
+        found = self._disk.readinto(view) or 0
+        view[found:] = bytes(len(view) - found)
+        return len(view)
+
+    def _whole(self, view: memoryview) -> None:
+        while view:
+            view = view[self._disk.write(view) :]
+
+    def _try(self, work: Any, argument: Any, result: int) -> int:
+        try:
+            if self.error is None:
+                work(argument)
+        except OSError as error:
+            self.error = error
+        return result
+
+
+# -------- MATLAB files of version 5
+
+LARGEST_VARIABLE = (1 << 31) - 1
+"""Bytes of an array in a file of version 5."""
+_HEAD = 128
+"""Bytes before the first variable: a text, the version and the order of bytes."""
+_HDF5, _HDF5_MARK = 2, b"\x89HDF\r\n\x1a\n"
+"""Version of a file that is an HDF5 file behind its head."""
+_MATRIX, _COMPRESSED = 14, 15
+"""Kinds of elements: an array, and one that is packed."""
+_COMPLEX = 0x08
+"""Bit of an array's flags: its numbers are complex."""
+_BYTES_OF = {4: 4, 6: 8, 7: 4, 8: 1, 9: 1, 10: 2, 11: 2, 12: 4, 13: 4, 14: 8, 15: 8}
+"""Bytes of a number that SciPy reads, by class: letters, double, single, whole numbers of 8 to 64 bits."""
+_BEGINNING = 4096
+"""Bytes of a variable that its flags, shape and name lie in; a name has 63 letters at most."""
+_PADDING = 16
+"""Bytes after a variable's shape and name that are no numbers: a tag, and what fills up to 8."""
+_MOST_VARIABLES = 10_000
+"""Of a file; a run in 16 colours has 200."""
+_COPIES = 3
+"""Arrays of a variable's size that are held at once: as stored, of its class, and as a run's."""
+
+
+def write_variables(path: Path, variables: Mapping[str, Any]) -> None:
+    """Write ``variables`` to a MATLAB file at ``path``, whole or not at all.
+
+    MitsimError for an array that is larger than such files hold.
+    """
+    from scipy.io import savemat
+
+    for name, values in variables.items():
+        if getattr(values, "nbytes", 0) > LARGEST_VARIABLE:
+            raise MitsimError(
+                f"{path}: {name} takes {values.nbytes / 2**30:.3g} GiB, and MATLAB files of version 5 hold 2; "
+                "use the format hdf5"
+            )
+    # A descriptor: given a name, savemat puts .mat behind it.
+    with whole_file(path) as part, part.open("wb") as file:
+        savemat(file, dict(variables), do_compression=True, long_field_names=True)
+
+
+def read_variables(path: Path) -> dict[str, Any]:
+    """The arrays of real numbers and the texts of the MATLAB file ``path``, by name; cells, structures and objects,
+    which files of `mitsim export` and FlatCam have none of, are not looked into.
+
+    MitsimError for a file that is missing, damaged, of version 7.3 or 4, or that takes more memory than is free.
+    """
+    from scipy.io import loadmat
+
+    check_plain(path)
+    try:
+        with open(path, "rb") as file:
+            arrays = _arrays_in(file)
+            Cost(memory_bytes=_COPIES * sum(arrays.values())).check(f"{path}", Limits())
+            file.seek(0)
+            return dict(loadmat(file, variable_names=[*arrays]))
+    except MitsimError:
+        raise
+    except NotImplementedError:
+        raise MitsimError(f"{path}: is HDF5 (version 7.3); save it in MATLAB with -v7, or name an export .h5") from None
+    except Exception as error:  # SciPy's reader raises of all kinds
+        raise MitsimError(f"{path}: damaged, or no MATLAB file ({reason_of(error)}); write or copy it again") from error
+
+
+def _arrays_in(file: BinaryIO) -> dict[str, int]:
+    """Bytes that each array of real numbers and each text of an open MATLAB ``file`` takes, by name.
+
+    SciPy's readers allocate what a file claims, and call themselves for each cell within a cell until the process
+    ends. Here no more than the beginning of each variable is unpacked, after "MAT-File Format" (MathWorks).
+    """
+    head = file.read(_HEAD)
+    mark = head[_HEAD - 2 :]
+    if head.startswith(_HDF5_MARK):
+        raise NotImplementedError
+    if len(head) < _HEAD or mark not in (b"IM", b"MI"):
+        raise ValueError("it does not begin as one of version 5")
+    order = "<" if mark == b"IM" else ">"
+    if struct.unpack(f"{order}H", head[_HEAD - 4 : _HEAD - 2])[0] >> 8 == _HDF5:
+        raise NotImplementedError
+    two, found = f"{order}2I", dict[str, int]()
+    end = file.seek(0, os.SEEK_END)
+    place = _HEAD
+    while place + 8 <= end:
+        file.seek(place)
+        kind, length = struct.unpack(two, file.read(8))
+        place += 8 + length
+        if place > end:
+            raise ValueError("it ends within a variable")
+        beginning = file.read(min(length, _BEGINNING))
+        if kind == _COMPRESSED:
+            beginning = zlib.decompressobj().decompress(beginning, _BEGINNING)
+            kind, length = struct.unpack_from(two, beginning)
+            beginning = beginning[8:]
+        if kind != _MATRIX:
+            raise ValueError(f"it holds an element of the kind {kind}")
+        named = _array(beginning, length, order)
+        if named is not None:
+            if named[0] in found or len(found) == _MOST_VARIABLES:
+                raise ValueError(f"it holds {named[0]!r} twice, or over {_MOST_VARIABLES} variables")
+            found[named[0]] = named[1]
+    return found
+
+
+def _array(beginning: bytes, length: int, order: str) -> tuple[str, int] | None:
+    """Name and bytes of an array of real numbers or a text that begins so, of ``length`` bytes in the file; None of
+    another. ValueError where it claims other bytes than its shape has."""
+    flags, place = _element(beginning, 0, order)
+    (flag,) = struct.unpack_from(f"{order}I", flags)
+    size = _BYTES_OF.get(flag & 0xFF)
+    if size is None or flag >> 8 & _COMPLEX:
+        return None
+    dimensions, place = _element(beginning, place, order)
+    name, place = _element(beginning, place, order)
+    sides = struct.unpack(f"{order}{len(dimensions) // 4}i", dimensions)
+    count = math.prod(sides)
+    if len(sides) < 2 or min(sides) < 0 or count * size > LARGEST_VARIABLE:
+        raise ValueError(f"its variable {name[:80]!r} claims a shape of {sides[:8]}")
+    # Numbers are stored as the smallest type that holds them, and never as a larger one than they are of.
+    stored, _ = _tag(beginning, place, order)
+    if stored > count * size or length > place + count * size + _PADDING:
+        raise ValueError(f"its variable {name[:80]!r} claims more bytes than its shape has")
+    return name.decode("ascii"), count * size
+
+
+def _tag(data: bytes, place: int, order: str) -> tuple[int, int]:
+    """Bytes of an element's content at a ``place``, and where it begins."""
+    kind, length = struct.unpack_from(f"{order}2I", data, place)
+    return (kind >> 16, place + 4) if kind >> 16 else (length, place + 8)
+
+
+def _element(data: bytes, place: int, order: str) -> tuple[bytes, int]:
+    """Content of an element at a ``place``, and where the next one begins."""
+    length, start = _tag(data, place, order)
+    if start + length > len(data):
+        raise ValueError(f"a name or shape in it takes {length} bytes")
+    return data[start : start + length], place + 8 if start == place + 4 else start + -(-length // 8) * 8

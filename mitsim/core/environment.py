@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import importlib.metadata
 import json
 import os
 import platform
@@ -433,6 +432,8 @@ def deciding_versions() -> dict[str, str]:
 @cache
 def _read_versions() -> tuple[tuple[str, str], ...]:
     """Read once: it takes 8 ms, and a coloured run states them nine times."""
+    import importlib.metadata
+
     by_name = {"mitsim": __version__, "python": platform.python_version()}
     for name in _PACKAGES:
         try:

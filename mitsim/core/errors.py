@@ -1,9 +1,16 @@
-"""The one exception for what a user can cause and mend."""
+"""The one exception for what a user can cause and mend; arguments of public functions that are of another kind than
+their annotation says, which are refused by it in a line."""
 
 from __future__ import annotations
 
+import ast
 import difflib
-from collections.abc import Iterable
+import functools
+import inspect
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from numbers import Integral, Real
+from typing import Any, ParamSpec, TypeVar
 
 _LONGEST = 1500
 """Characters of a message: a screen of 80 x 20."""
@@ -52,3 +59,109 @@ def near_name(text: str, known: Iterable[str]) -> str:
     """ "did you mean NAME? " for the ``known`` name that a mistyped ``text`` is nearest to; empty without one."""
     near = difflib.get_close_matches(text, [*known], 1)
     return f"did you mean {near[0]}? " if near else ""
+
+
+# -------- Arguments of public functions
+# Annotations are read as they are written, so that no type of another room is imported for it: a class is known by its
+# name. What a value may be within its kind, such as a range, each function checks itself.
+
+P = ParamSpec("P")
+R = TypeVar("R")
+C = TypeVar("C", bound=type)
+_ANY = "object", "Any"
+_LONGEST_PATH, _LONGEST_NAME = 4095, 255
+"""Bytes of a path, and of a name in it, that Linux takes."""
+Kind = tuple[str, Callable[[object], bool]]
+"""What an annotation allows, in words and as a test."""
+_KINDS: dict[str, Kind] = {
+    "None": ("None", lambda value: value is None),
+    "bool": ("True or False", lambda value: type(value).__name__ in ("bool", "bool_")),
+    "int": ("a whole number", lambda value: isinstance(value, Integral) and not isinstance(value, bool)),
+    "float": ("a number", lambda value: isinstance(value, Real) and not isinstance(value, bool)),
+    "str": ("text", lambda value: isinstance(value, str)),
+    "Path": ("a path", lambda value: isinstance(value, os.PathLike) or (isinstance(value, str) and _is_path(value))),
+    "Mapping": ("a mapping", lambda value: isinstance(value, Mapping)),
+    "tuple": ("a tuple", lambda value: isinstance(value, tuple)),
+    "Progress": ("a function", callable),
+}
+
+
+def checked(function: Callable[P, R]) -> Callable[P, R]:
+    """A public ``function`` that refuses arguments of another kind than it is annotated with: ArgumentError, a line
+    with the argument, the value and what is allowed."""
+    signature = inspect.signature(function)
+    annotated = {name: each.annotation for name, each in signature.parameters.items()}
+    kinds = {name: _kinds(text, function) if isinstance(text, str) else [] for name, text in annotated.items()}
+
+    rest = next((kinds[name] for name, each in signature.parameters.items() if each.kind == each.VAR_KEYWORD), [])
+
+    @functools.wraps(function)
+    def called(*arguments: P.args, **named: P.kwargs) -> R:
+        for name, value in _each(signature, signature.bind(*arguments, **named).arguments):
+            allowed = kinds.get(name, rest)
+            if allowed and not any(allows(value) for _, allows in allowed):
+                words = " or ".join(dict.fromkeys(words for words, _ in allowed))
+                raise ArgumentError(name, f"{cut(repr(value))}: give {words}")
+        return function(*arguments, **named)
+
+    return called
+
+
+def _each(signature: inspect.Signature, bound: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
+    """Name and value of every argument that is ``bound`` to a ``signature``, further ones one by one."""
+    for name, value in bound.items():
+        kind = signature.parameters[name].kind
+        if kind == inspect.Parameter.VAR_KEYWORD:
+            yield from value.items()
+        elif kind == inspect.Parameter.VAR_POSITIONAL:
+            yield from ((name, each) for each in value)
+        else:
+            yield name, value
+
+
+def checked_fields(made: C) -> C:
+    """The class ``made``, which refuses such arguments when it is called: see :func:`checked`."""
+    made.__init__ = checked(vars(made)["__init__"])  # type: ignore[misc]
+    return made
+
+
+def _kinds(annotation: str, function: Callable[..., object]) -> list[Kind]:
+    """What an ``annotation`` of a ``function`` allows, such as ``float | Literal["auto"] | None``; empty: anything."""
+    found: list[Kind] = []
+    terms = _terms(ast.parse(annotation, mode="eval").body)
+    for term in terms:
+        name = ast.unparse(term.value if isinstance(term, ast.Subscript) else term)
+        if name == "Literal" and isinstance(term, ast.Subscript):
+            values = term.slice.elts if isinstance(term.slice, ast.Tuple) else [term.slice]
+            found += [_literal(ast.literal_eval(value)) for value in values]
+        elif name in _KINDS:
+            found.append(_KINDS[name])
+        elif isinstance(getattr(function, "__globals__", {}).get(name, type), type) and name not in _ANY:
+            found.append(_of_class(name))
+        else:
+            return []  # another name for several types
+    # Text is a path there.
+    return [kind for kind in found if not (_KINDS["Path"] in found and kind == _KINDS["str"])]
+
+
+def _terms(node: ast.expr) -> list[ast.expr]:
+    """Alternatives of an annotation."""
+    if isinstance(node, ast.BinOp):
+        return [*_terms(node.left), *_terms(node.right)]
+    return [node]
+
+
+def _literal(allowed: object) -> Kind:
+    return repr(allowed), lambda value: isinstance(value, str) and value == allowed
+
+
+def _of_class(name: str) -> Kind:
+    return f"a {name}", lambda value: name in (each.__name__ for each in type(value).__mro__)
+
+
+def _is_path(text: str) -> bool:
+    """Whether a ``text`` can be a path: an empty one would be the working folder, and of a longer one the operating
+    system has an error of its own."""
+    data = os.fsencode(text)
+    short = len(data) <= _LONGEST_PATH and all(len(name) <= _LONGEST_NAME for name in data.split(os.sep.encode()))
+    return bool(data) and b"\0" not in data and short

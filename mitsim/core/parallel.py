@@ -16,7 +16,7 @@ from functools import cache
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from mitsim.core.resources import workers
+from mitsim.core.worker import workers
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController

@@ -16,10 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
-from mitsim.core.display import card, scaled, span
-from mitsim.core.errors import ArgumentError, MitsimError, cut
+from mitsim.core.errors import ArgumentError, MitsimError, checked, cut
 from mitsim.core.exr import (
     Channel,
     Channels,
@@ -32,6 +30,7 @@ from mitsim.core.exr import (
     write_frame,
 )
 from mitsim.core.files import output_folder, sweep
+from mitsim.core.images import card, scaled, span
 from mitsim.core.manifests import MANIFEST, Digital, RunHead, RunManifest, read_head, read_manifest, write_manifest
 from mitsim.core.spectral_manifests import MosaicManifest, read_mosaic, write_colours
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -140,12 +140,14 @@ def read_colours(folder: Path | str, kind: str) -> ColourManifest:
 
     MitsimError when it has no colour.json, or one of another kind or that breaks a rule.
     """
-    return checked_colours(_contents(Path(folder), kind), kind, Path(folder))
+    if not is_coloured(folder):
+        raise MitsimError(f"{folder}: holds no {COLOUR}; give a coloured folder, of `mitsim {_COMMANDS[kind]}`")
+    return checked_colours(read_json(Path(folder) / COLOUR), kind, Path(folder))
 
 
 def read_mosaic(folder: Path | str) -> MosaicManifest:
     """What colour.json says of a run behind colour filters in ``folder``. MitsimError as :func:`read_colours`."""
-    return checked_mosaic(_contents(Path(folder), MOSAIC), Path(folder))
+    return cast("MosaicManifest", read_colours(folder, MOSAIC))
 
 
 def check_lines(lines: ColourManifest, run: str, calibration: Path) -> None:
@@ -173,7 +175,7 @@ def check_lines(lines: ColourManifest, run: str, calibration: Path) -> None:
 
 
 def checked_colours(data: Any, kind: str, place: Path) -> ColourManifest:
-    """The lines of a coloured folder.
+    """The lines of a coloured folder, and filters where it is behind some.
 
     Parameters
     ----------
@@ -189,13 +191,9 @@ def checked_colours(data: Any, kind: str, place: Path) -> ColourManifest:
     MitsimError
         when it is of another kind or breaks a rule.
     """
-    return validate(ColourManifest, _of_kind(data, kind, place), f"{place}/{COLOUR}")
-
-
-def checked_mosaic(data: Any, place: Path) -> MosaicManifest:
-    """What the ``data`` of a colour.json, found in ``place``, say of a run behind colour filters. MitsimError as
-    :func:`checked_colours`."""
-    return validate(MosaicManifest, _of_kind(data, MOSAIC, place), f"{place}/{COLOUR}")
+    if _kind(data) != kind:
+        raise MitsimError(f"{place}: holds a {cut(_kind(data))}, not a {kind}; give the right folder")
+    return validate(MosaicManifest if kind == MOSAIC else ColourManifest, data, f"{place}/{COLOUR}")
 
 
 def same_lines(run: Path, calibration: Path) -> ColourManifest:
@@ -203,18 +201,6 @@ def same_lines(run: Path, calibration: Path) -> ColourManifest:
     lines = read_colours(run, RUN)
     check_lines(lines, str(run), calibration)
     return lines
-
-
-def _contents(folder: Path, kind: str) -> Any:
-    if not is_coloured(folder):
-        raise MitsimError(f"{folder}: holds no {COLOUR}; give a coloured folder, of `mitsim {_COMMANDS[kind]}`")
-    return read_json(folder / COLOUR)
-
-
-def _of_kind(data: Any, kind: str, place: Path) -> Any:
-    if _kind(data) != kind:
-        raise MitsimError(f"{place}: holds a {cut(_kind(data))}, not a {kind}; give the right folder")
-    return data
 
 
 def _kind(data: Any) -> str:

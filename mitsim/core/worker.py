@@ -19,8 +19,6 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
-from mitsim.core.resources import workers
-
 INTERRUPTED = 128 + signal.SIGINT
 """Exit status after Control-C, as in a shell."""
 RESUME = "finished work is kept, go on with --resume"
@@ -38,6 +36,12 @@ _LONGEST_FAULT = 300
 """Characters of an uncaught error's message: some have whole files in them."""
 _LONGEST_ADVICE = 256
 """Bytes; chosen so that any sentence fits."""
+
+
+def workers() -> int:
+    """Processors that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 class OutOfTime(BaseException):

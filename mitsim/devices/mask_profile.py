@@ -13,7 +13,7 @@ from mitsim.core.configuration import Configuration, read_toml, validate
 from mitsim.core.errors import MitsimError
 from mitsim.core.imagelist import Wanted
 from mitsim.core.images import image_size, read_image
-from mitsim.core.resources import Cost, Limits
+from mitsim.core.job import Cost, Limits
 from mitsim.core.seeds import stream
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import Dust, Flaws, MaskKind, etch, mls_mask

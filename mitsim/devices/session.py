@@ -13,9 +13,8 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import AfterValidator, Field, model_validator
 
-from mitsim.core.arguments import checked, checked_fields
 from mitsim.core.configuration import Configuration, load_model, shipped, validate
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError, checked, checked_fields
 from mitsim.devices.sensor import ExposureFraction
 
 # -------- The white board of a calibration session

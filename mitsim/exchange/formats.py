@@ -1,4 +1,5 @@
 """RUN and CAL folders in, a file or folder of a format that other programs read out; and such a file back to folders.
+What a person knows of a real camera's frames, checked before any is opened.
 
 Each format is a row of :data:`FORMATS`. Its module is imported when it is used: what a request says is checked before.
 """
@@ -10,11 +11,14 @@ from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+from mitsim.core.configuration import locate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import check_apart, check_plain, output_file, whole_folder
+from mitsim.core.imagelist import Raw, Wanted, image_files
 from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
+from mitsim.core.seeds import check_root
 from mitsim.core.spectral_manifests import (
     RUN,
     check_lines,
@@ -24,7 +28,11 @@ from mitsim.core.spectral_manifests import (
     read_mosaic,
     same_lines,
 )
-from mitsim.exchange.real_capture import check_channel
+from mitsim.devices.patterns import read_name
+from mitsim.devices.sensor import check_exposure, load_sensor
+
+if TYPE_CHECKING:
+    from mitsim.exchange.packed import Run
 
 
 @dataclass(frozen=True)
@@ -57,13 +65,13 @@ class Format:
 FORMATS: dict[str, Format] = {
     "hdf5": Format("one HDF5 file, all of RUN and CAL", "file", "optional", "hdf5.write_hdf5"),
     "mat": Format("the paper's variables, for MATLAB and Octave", "file", "optional", "matlab.write_matlab"),
-    "flatcam": Format("FlatCam's variables, for its scripts", "file", "needed", "flatcam.write_flatcam", False),
+    "flatcam": Format("FlatCam's variables, for its scripts", "file", "needed", "matlab.write_flatcam", False),
     "deepinv": Format("tensors of a deepinv physics", "file", "needed", "tensors.write_deepinv"),
     "torch": Format("tensors for torch.load", "file", "optional", "tensors.write_tensors"),
     "png": Format("pictures of frames, patterns for a real projector", "folder", "none", "png_files.write_pngs", False),
 }
 """Formats by the name that `--format` takes."""
-READERS = {".h5": "hdf5.load_hdf5", ".hdf5": "hdf5.load_hdf5", ".mat": "flatcam.load_mat"}
+READERS = {".h5": "hdf5.load_hdf5", ".hdf5": "hdf5.load_hdf5", ".mat": "matlab.load_mat"}
 """What opens a file that `mitsim import` takes, by the end of its name: from the place and a channel to a context of
 :class:`mitsim.exchange.packed.Loaded`."""
 _ENDINGS = {".h5": ("hdf5",), ".hdf5": ("hdf5",), ".mat": ("mat", "flatcam")}
@@ -139,14 +147,14 @@ def export_run(
             read_manifest(factors / line, CalibrationManifest)
     check_apart(place, [folder, *([factors] if factors else [])])
     with output_file(place, overwrite) if chosen.kind == "file" else nullcontext():
-        from mitsim.exchange.packed import any_calibration, any_run, run_parts
+        from mitsim.exchange.packed import calibration_content, run_content
 
-        shots, calibrated = any_run(folder), None if factors is None else any_calibration(factors)
+        shots, calibrated = run_content(folder), None if factors is None else calibration_content(factors)
         options = {"projector": projector} if chosen.calibration == "none" else {"calibration": calibrated}
         notes = _function(chosen.writer)(place, shots, **options)
     return {
         "format": format,
-        "frames": sum(len(part.manifest.patterns.captures) for part in run_parts(shots).values()),
+        "frames": _frames_of(shots),
         "calibration": None if calibration is None else str(calibration),
         "notes": list(notes),
         "output": str(place),
@@ -206,20 +214,109 @@ def import_file(
             folders = [(stack.enter_context(whole_folder(place)), held) for place, held in wanted.values() if place]
             for folder, held in folders:
                 held.fill(folder)
-    from mitsim.exchange.packed import parts_of, run_parts
-
-    runs = {} if loaded.run is None else run_parts(loaded.run)
-    calibrations = {} if loaded.calibration is None else parts_of(loaded.calibration)
+    run, calibration = loaded.run, loaded.calibration
+    parts = {} if calibration is None or calibration_output is None else calibration.parts
     return {
-        "frames": sum(len(part.manifest.patterns.captures) for part in runs.values()) if runs else None,
+        "frames": None if run is None else _frames_of(run),
         "output": None if output is None else str(output),
         "calibration_output": None if calibration_output is None else str(calibration_output),
-        "holds": [name for name, (_, held) in zip(("run", "calibration"), wanted.values(), strict=True) if held],
+        "holds": [_CALLED[argument] for argument, (_, held) in wanted.items() if held],
         "left_out": list(loaded.left_out),
         "warnings": [
-            f"{line}{text}"
-            for line, part in calibrations.items()
-            for text in part.manifest.warnings
-            if calibration_output is not None
+            f"{line}: {text}" if line else text for line, part in parts.items() for text in part.manifest.warnings
         ],
     }
+
+
+def _frames_of(run: Run) -> int:
+    return sum(len(part.manifest.patterns.captures) for part in run.parts.values())
+
+
+# -------- Frames of a real camera
+
+
+PLANES = {"r": (1, 1), "gb": (0, 1), "gr": (1, 0), "b": (0, 0)}
+"""First row and first column of each plane of a frame, as FlatCam names them."""
+
+
+def check_channel(name: str) -> str:
+    """The ``name``, where a plane is called so; MitsimError otherwise."""
+    if name not in PLANES:
+        raise ArgumentError("channel", f"{name!r}: use {', '.join(PLANES)}")
+    return name
+
+
+@dataclass(frozen=True)
+class RealCapture:
+    """What a person knows of a real capture.
+
+    Attributes
+    ----------
+    patterns
+        name of the family, or `patterns.json` of `mitsim export --format png`.
+    camera
+        electronics: name of a shipped file, or a TOML file.
+    exposure_s
+        of every frame [s].
+    calibration
+        CAL folder of the same camera, which tells its identity and the projector's pixels.
+    n
+        projector pixels a side, without a calibration.
+    black_level_dn
+        digital number of a (binned) pixel without charge, where it is another than the camera file's.
+    ambient
+        frame, or folder of frames, with the projector off.
+    ambient_shots
+        that the single frame is the mean of.
+    raw
+        how files without a header are read.
+    channel
+        plane of a colour sensor's frames that is taken, a key of :data:`PLANES`.
+    seed
+        of patterns of a `random` family.
+    """
+
+    patterns: str
+    camera: str
+    exposure_s: float
+    calibration: Path | None = None
+    n: int | None = None
+    black_level_dn: float | None = None
+    ambient: Path | None = None
+    ambient_shots: int | None = None
+    raw: Raw | None = None
+    channel: str | None = None
+    seed: int = 0
+
+    @property
+    def wanted(self) -> Wanted:
+        """How its files are read."""
+        return Wanted(raw=self.raw)
+
+    @property
+    def in_file(self) -> bool:
+        """Whether the patterns stand in a file."""
+        return Path(self.patterns).suffix == ".json"
+
+    def check(self, source: Path) -> None:
+        """MitsimError for values that cannot be, and a ``source`` without frames, before any frame is opened."""
+        check_exposure(self.exposure_s)
+        check_root(self.seed)
+        if self.n is not None and self.n < 1:
+            raise ArgumentError("projector_pixels", f"{self.n}: give 1 or more, those a side")
+        if self.channel is not None:
+            check_channel(self.channel)
+        if self.ambient_shots is not None and (self.ambient is None or self.ambient_shots < 1):
+            raise ArgumentError("ambient_shots", f"{self.ambient_shots}: give 1 or more, of an ambient frame")
+        load_sensor(locate(self.camera, "calibration", ".toml"))
+        if self.calibration is not None:
+            read_manifest(self.calibration, CalibrationManifest)
+        elif self.n is None:
+            raise ArgumentError(
+                "calibration", "is not given, and patterns need its projector; give it, or --projector-pixels"
+            )
+        if self.in_file:
+            check_plain(self.patterns)
+        else:
+            read_name(self.patterns, self.n)
+        image_files(source, self.wanted)

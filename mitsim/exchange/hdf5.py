@@ -15,30 +15,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitsim.core.arrayfile import whole_hdf5
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.arrays import whole_hdf5
+from mitsim.core.errors import ArgumentError, MitsimError, reason_of
 from mitsim.core.exr import Channels, Metadata, Value
 from mitsim.core.files import FRAME_LIMITS, MOST_BYTES, MOST_PIXELS, check_plain, fits_a_frame, parse_json
+from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import CalibrationManifest, RunManifest
-from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import TRUTH, Capture
-from mitsim.core.spectral_manifests import CALIBRATION, MOSAIC, RUN, ColourManifest
+from mitsim.core.spectral_manifests import CALIBRATION, MOSAIC, RUN
 from mitsim.exchange.packed import (
     FACTORS,
     Calibration,
-    Coloured,
-    Filtered,
+    Content,
     Loaded,
     Packed,
     Run,
     as_channel,
-    line_of,
-    manifest_text,
-    run_parts,
     shots_of,
     unpack,
     unpack_colours,
-    unpack_filters,
     unpack_run,
 )
 from mitsim.version import __version__
@@ -76,24 +71,23 @@ def write_hdf5(path: Path, run: Run, calibration: Calibration | None = None) -> 
     MitsimError
         for shots that differ in shape or channels, or a file that cannot be read or written.
     """
-    with _begin_file(path) as file:
-        if isinstance(run, Packed):
-            _write_run(file, run)
-            _write_calibration(file, line_of(calibration, ""))
-            return ()
-        _write_text(file, run.colours.kind, run.text)
-        if isinstance(calibration, Coloured):
-            _write_text(file, CALIBRATION, calibration.text)
-        if isinstance(run, Filtered):
-            _write_run(file, run.shots)
-        lines = file.create_group(_LINES, track_order=True)
-        for name in run.colours.names:
-            line = lines.create_group(name, track_order=True)
-            if not isinstance(run, Filtered):
-                _write_run(line, run.lines[name])
-            elif name in run.truths:
-                _write_frame(line.create_group("truth"), *run.truths[name])
-            _write_calibration(line, line_of(calibration, name))
+    with whole_hdf5(path) as file:
+        file.attrs["mitsim_exchange"] = LAYOUT
+        file.attrs["mitsim_version"] = __version__
+        for held in (run, calibration):
+            if held is not None and held.colours:
+                _write_text(file, held.colours.kind, held.text)
+        if "" in run.parts:
+            _write_run(file, run.parts[""])
+        lines = file.create_group(_LINES, track_order=True) if run.colours else None
+        for name in run.names:
+            place = file if lines is None else lines.create_group(name, track_order=True)
+            if name and name in run.parts:
+                _write_run(place, run.parts[name])
+            if name in run.truths:
+                _write_frame(place.create_group("truth"), *run.truths[name])
+            if calibration is not None:
+                _write_calibration(place, calibration.parts[name])
     return ()
 
 
@@ -136,16 +130,12 @@ def open_hdf5(path: Path | str, line: str | None = None) -> Iterator[ExchangeFil
     does not have.
     """
     with open_folders(path) as (run, calibration):
-        runs = {**run.lines} if isinstance(run, Coloured) else run_parts(run)
-        if isinstance(run, Filtered):
-            runs.update(dict.fromkeys(run.colours.names, run.shots))
-        factors = {**calibration.lines} if isinstance(calibration, Coloured) else {"": calibration}
         name = line or ""
-        if name not in runs:
-            lines = ", ".join(filter(None, runs))
+        if name not in {*run.parts, *run.names}:
+            lines = ", ".join(filter(None, run.names))
             known = f"{lines}; give one" if lines else "no lines; leave it out"
             raise ArgumentError("line", f"{line!r}: {path} has {known}")
-        yield ExchangeFile(runs[name], factors.get(name))
+        yield ExchangeFile(run.of_line(name), calibration.parts.get(name) if calibration else None)
 
 
 @contextmanager
@@ -164,10 +154,8 @@ def open_folders(path: Path | str) -> Iterator[tuple[Run, Calibration | None]]:
                 raise MitsimError(
                     f"{path}: is no HDF5 file of `mitsim export` (mitsim_exchange is {layout}, 1 to {LAYOUT} are read)"
                 )
-            if _LINES in file:
-                run, calibration = _of_lines(file, path)
-            else:
-                run, calibration = _run(file, path), _calibration(file, path) if "calibration" in file else None
+            run = _run_in(file, path)
+            calibration = _calibration_in(file, run, path)
         yield run, calibration
 
 
@@ -199,15 +187,6 @@ class _Lazily(Mapping[str, tuple[Channels, Metadata]]):
         return len(dict.fromkeys(self._packed.names))
 
 
-@contextmanager
-def _begin_file(path: Path) -> Iterator[h5py.File]:
-    """A file of this layout that takes its place at ``path`` when all is written."""
-    with whole_hdf5(path) as file:
-        file.attrs["mitsim_exchange"] = LAYOUT
-        file.attrs["mitsim_version"] = __version__
-        yield file
-
-
 def _write_run(place: h5py.Group, run: Packed[RunManifest]) -> None:
     group = _begin(place, "run", run)
     _write_shots(group, run)
@@ -218,16 +197,15 @@ def _write_run(place: h5py.Group, run: Packed[RunManifest]) -> None:
             _write_frame(group.create_group(name), *run.read(source))
 
 
-def _write_calibration(place: h5py.Group, calibration: Packed[CalibrationManifest] | None) -> None:
-    if calibration is not None:
-        group = _begin(place, "calibration", calibration)
-        for name in FACTORS:
-            _write_frame(group.create_group(Path(name).stem), *calibration.read(name))
+def _write_calibration(place: h5py.Group, calibration: Packed[CalibrationManifest]) -> None:
+    group = _begin(place, "calibration", calibration)
+    for name in FACTORS:
+        _write_frame(group.create_group(Path(name).stem), *calibration.read(name))
 
 
 def _begin(place: h5py.Group, name: str, packed: Packed[Any]) -> h5py.Group:
     group = place.create_group(name, track_order=True)
-    _write_text(group, "manifest", manifest_text(packed.manifest, packed.text))
+    _write_text(group, "manifest", packed.text)
     return group
 
 
@@ -266,37 +244,35 @@ def _strings() -> Any:
     return h5py.string_dtype("utf-8")
 
 
-def _of_lines(file: h5py.File, path: Path) -> tuple[Run, Calibration | None]:
-    group, run = _group(file, _LINES, path), _coloured_run(file, path) if RUN in file else _filtered_run(file, path)
-    if CALIBRATION not in file:
-        return run, None
-    text = _text_in(file, CALIBRATION, path)
-    colours, calibrations = unpack_colours(text, CALIBRATION, path), {}
-    for name in colours.names:
-        if name not in run.colours.names or "calibration" not in group[name]:
-            raise MitsimError(f"{path}: has no calibration of {name}; export it again")
-        calibrations[name] = _calibration(_group(group, name, path), path)
-    return run, Coloured(colours, text, calibrations)
-
-
-def _coloured_run(file: h5py.File, path: Path) -> Coloured[RunManifest]:
-    text = _text_in(file, RUN, path)
-    colours = unpack_colours(text, RUN, path)
-    return Coloured(colours, text, {name: _run(line, path) for name, line in _lines_of(file, colours, path).items()})
-
-
-def _filtered_run(file: h5py.File, path: Path) -> Filtered:
-    text, shots = _text_in(file, MOSAIC, path), _run(file, path)
-    colours = unpack_filters(text, shots, path)
-    lines = _lines_of(file, colours, path)
-    truths = {name: _frame(_group(line, "truth", path), path) for name, line in lines.items() if "truth" in line}
-    return Filtered(colours, text, shots, truths)
-
-
-def _lines_of(file: h5py.File, colours: ColourManifest, path: Path) -> dict[str, h5py.Group]:
-    """The group of each line."""
+def _run_in(file: h5py.File, path: Path) -> Run:
+    """The run in a ``file``, of as many lines as it has."""
+    if _LINES not in file:
+        return Content({"": _run(file, path)})
+    kind = RUN if RUN in file else MOSAIC
+    text = _text_in(file, kind, path)
+    own = {"": _run(file, path)} if kind == MOSAIC else {}
+    colours = unpack_colours(text, kind, path, own[""].names if own else ())
     group = _group(file, _LINES, path)
-    return {name: _group(group, name, path) for name in colours.names}
+    lines = {name: _group(group, name, path) for name in colours.names}
+    if kind == RUN:
+        return Content({name: _run(line, path) for name, line in lines.items()}, colours, text)
+    truths = {name: _frame(_group(line, "truth", path), path) for name, line in lines.items() if "truth" in line}
+    return Content(own, colours, text, truths)
+
+
+def _calibration_in(file: h5py.File, run: Run, path: Path) -> Calibration | None:
+    """The calibration in a ``file`` of a ``run``, where it holds one."""
+    if not run.colours:
+        return Content({"": _calibration(file, path)}) if "calibration" in file else None
+    if CALIBRATION not in file:
+        return None
+    text, group, parts = _text_in(file, CALIBRATION, path), _group(file, _LINES, path), {}
+    colours = unpack_colours(text, CALIBRATION, path)
+    for name in colours.names:
+        if name not in run.names or "calibration" not in group[name]:
+            raise MitsimError(f"{path}: has no calibration of {name}; export it again")
+        parts[name] = _calibration(_group(group, name, path), path)
+    return Content(parts, colours, text)
 
 
 def _run(file: h5py.Group, path: Path) -> Packed[RunManifest]:
@@ -427,5 +403,4 @@ def _in_one_line(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
-        reason = " ".join(str(error).split())
-        raise MitsimError(f"{path}: damaged, or no HDF5 file ({reason}); write or copy it again") from error
+        raise MitsimError(f"{path}: damaged, or no HDF5 file ({reason_of(error)}); write or copy it again") from error

@@ -1,50 +1,154 @@
-"""A run in one MATLAB file with the variables of the paper's public script: folders in, the file out, and back.
+"""A run and its calibration in one MATLAB file: folders in, the file out, and back.
 
-`phi_left` (P o X) `phi_right`' = `data_coded` - `measBg` in digital numbers, for each pattern P = PL(:, i) PR(:, j)'
-(Zheng & Asif, arXiv 2111.12862, section III-B). Files are of version 5, which SciPy, GNU Octave and every MATLAB read.
+With the variables of the paper's public script `phi_left` (P o X) `phi_right`' = `data_coded` - `measBg` in digital
+numbers, for each pattern P = PL(:, i) PR(:, j)' (Zheng & Asif, arXiv 2111.12862, section III-B).
+
+With FlatCam's: it (Asif et al. 2017, arXiv 1509.00116) has a colour sensor and calibrates each of its four planes: a
+plane of a frame, less the means of its rows and columns, is P1 X Q1^T. The loader of
+https://github.com/tanjasper/flatcam takes plane b from row 0 and column 0 on, every second one, gb from (0, 1), gr from
+(1, 0), r from (1, 1). A monochrome frame has the same four planes, whose factors are every second row of both. A
+coloured run has a whole frame of each line: it is a plane of a frame of twice the rows and columns, so that nothing is
+left out.
+
+Files are of version 5, which SciPy, GNU Octave and every MATLAB read.
 """
 
 from __future__ import annotations
 
 import math
-import os
 import re
-import struct
-import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, read_variables, write_variables
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.exr import Channel, Channels, Metadata
-from mitsim.core.files import check_plain, whole_file
 from mitsim.core.manifests import SIDES, CalibrationManifest, Digital, RunManifest, ShotFile
-from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import TRUTH
-from mitsim.core.spectral_manifests import CALIBRATION, RUN
+from mitsim.core.spectral_manifests import CALIBRATION, MOSAIC, RUN, ColourManifest
+from mitsim.exchange.formats import PLANES, check_channel
 from mitsim.exchange.packed import (
     FACTORS,
     Calibration,
-    Coloured,
-    Filtered,
+    Content,
+    Loaded,
     Packed,
     Run,
     as_channel,
-    line_of,
-    manifest_text,
     shots_of,
     unpack,
     unpack_colours,
-    unpack_filters,
     unpack_run,
 )
 
 ELECTRONS = "expected electrons of the frames"
 """What such a file does not hold of a simulated run."""
+Variables = dict[str, Any]
+"""Arrays and texts by name."""
+
+# -------- The variables of a file
+
+
+@dataclass(frozen=True, eq=False)
+class MatFile:
+    """What a MATLAB file holds, or what it holds of one line; checked as it is asked for.
+
+    Attributes
+    ----------
+    path
+        of the file, for messages.
+    values
+        arrays and texts by name.
+    """
+
+    path: Path
+    values: Mapping[str, Any]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.values
+
+    def text(self, name: str) -> str:
+        """The text called ``name``; MitsimError where there is none."""
+        value = np.asarray(self.values.get(name))
+        if value.dtype.kind != "U" or value.size != 1:
+            raise MitsimError(
+                f"{self.path}: has no text {name}, so it is not of `mitsim export`; it holds "
+                f"{', '.join(key for key in self.values if not key.startswith('__'))}"
+            )
+        return str(value.item())
+
+    def array(self, name: str, shape: tuple[int, ...]) -> npt.NDArray[Any]:
+        """The array called ``name``, in a ``shape`` of which MATLAB drops axes of length 1 at the end.
+
+        MitsimError where it is missing, or not of so many real numbers.
+        """
+        array = np.asarray(self.values.get(name))
+        if array.dtype.kind not in "uif" or array.size != math.prod(shape):
+            reported = f"is {array.dtype} of shape {array.shape}" if name in self else "is missing"
+            raise MitsimError(f"{self.path}: {name} {reported}; numbers of shape {shape} are needed")
+        return array.reshape(shape, order="F")
+
+    def matrix(self, name: str) -> FloatArray:
+        """The matrix called ``name``, of any size; MitsimError where it is missing, or none of real numbers."""
+        matrix = np.asarray(self.values.get(name))
+        if matrix.ndim != 2 or matrix.dtype.kind not in "uif":
+            reported = "no matrix of numbers" if name in self else "missing"
+            raise MitsimError(f"{self.path}: {name} is {reported}; write it again")
+        return matrix.astype(np.float64)
+
+    def image(self, name: str, scale: float = 1.0) -> Channel:
+        """The matrix called ``name``, over a ``scale``, as a channel: (rows, columns) float32."""
+        # Rounding in double precision is far below half of the last digit in single: the number is the one written.
+        return as_channel((self.matrix(name) / scale).astype(np.float32), name, self.path)
+
+    def by_line(self, names: Sequence[str]) -> dict[str, MatFile]:
+        """What it holds of each of the lines ``names``, by the variables' names without their ending."""
+        return {
+            name: MatFile(
+                self.path, {key.removesuffix(end): each for key, each in self.values.items() if key.endswith(end)}
+            )
+            for name, end in endings(names, self.path).items()
+        }
+
+
+COLOURED, FILTERED, _CALIBRATED = "colour_run", "mosaic_run", "colour_calibration"
+"""Variables that hold the colour.json of a coloured run, of one behind colour filters, and of a calibration."""
+_LONGEST_LINE = 31
+"""Letters of a line's name: a variable of MATLAB has 63 at most, truth_board_reflectance_ half of them."""
+
+
+def endings(names: Sequence[str], path: Path) -> dict[str, str]:
+    """What variables of each line end in, by the line's name: of letters, digits and _, as MATLAB wants it.
+
+    Parameters
+    ----------
+    names
+        of the lines; "" of a run that tells none apart.
+    path
+        of the file, for messages.
+
+    Raises
+    ------
+    MitsimError
+        for a name that no variable can end in, or two that are the same to MATLAB.
+    """
+    ends = {name: name and "_" + re.sub(r"[^0-9A-Za-z_]", "_", name) for name in names}
+    for name in filter(None, names):
+        # Beginning with a digit, they are no end of another variable: truth_standard_error is not of a line `error`.
+        if not (name[0].isdigit() and len(name) <= _LONGEST_LINE) or [*ends.values()].count(ends[name]) > 1:
+            raise MitsimError(
+                f"{path}: a line is called {cut(name)}, which no variable of MATLAB can end in; use the format hdf5"
+            )
+    return ends
+
+
+# -------- Folders in, the paper's variables out
 
 
 def write_matlab(path: Path, run: Run, calibration: Calibration | None) -> tuple[str, ...]:
@@ -69,56 +173,26 @@ def write_matlab(path: Path, run: Run, calibration: Calibration | None) -> tuple
         for a run that mixes whole shots and pairs, or is larger than such a file may be, and for lines whose names
         cannot end one of a variable.
     """
-    if isinstance(run, Packed):
-        variables = _variables(run, line_of(calibration, ""))
-    else:
-        ends, variables = endings(run.colours.names, path), colours_in(run, calibration)
-        if isinstance(run, Filtered):
-            variables.update({**_variables(run.shots, None), "weights": np.array(run.colours.weights)})
-        for name, end in ends.items():
-            if isinstance(run, Filtered):
-                held = truth_variables(*run.truths[name]) if name in run.truths else {}
-                held.update(calibration_variables(line_of(calibration, name), run.shots.manifest.digital))
-            else:
-                held = _variables(run.lines[name], line_of(calibration, name))
-            variables.update({f"{key}{end}": values for key, values in held.items()})
+    ends, variables = endings(run.names, path), _colour_variables(run, calibration)
+    if run.filters:
+        shots = run.parts[""]
+        variables.update(
+            {**_coded_frames(shots), **_folder_variables(shots, None), "weights": np.array(run.filters.weights)}
+        )
+    for name, end in ends.items():
+        factors = calibration.parts[name] if calibration else None
+        if name in run.parts:
+            own = {**_coded_frames(run.parts[name]), **_folder_variables(run.parts[name], factors)}
+        else:
+            own = _truth_variables(*run.truths[name]) if name in run.truths else {}
+            own.update(_calibration_variables(factors, run.of_line(name).manifest.digital))
+        variables.update({f"{key}{end}": values for key, values in own.items()})
     write_variables(path, variables)
     without = () if calibration else ("phi_left and phi_right are left out: no calibration was given",)
     return (*without, f"Left out: {ELECTRONS}")
 
 
-def folders_of(variables: Variables, path: Path) -> tuple[Run, Calibration | None]:
-    """Run and calibration in the ``variables`` of the file ``path`` of :func:`write_matlab`.
-
-    MitsimError for a file that is none, or is damaged.
-    """
-    if FILTERED in variables:
-        return _filtered_in(variables, path)
-    if COLOURED in variables:
-        return lines_in(variables, lambda name, own: _folders_in(own, path), path)
-    return _folders_in(variables, path)
-
-
-def _filtered_in(variables: Variables, path: Path) -> tuple[Filtered, Coloured[CalibrationManifest] | None]:
-    text, (shots, _) = text_in(variables, FILTERED, path), _folders_in(variables, path)
-    colours = unpack_filters(text, shots, path)
-    lines = by_line(variables, colours.names, path)
-    truths = {name: truth_in(own, path) for name, own in lines.items() if "truth" in own}
-    digital = shots.manifest.digital
-    calibrations = {name: calibration_in(own, digital, path) for name, own in lines.items()}
-    return Filtered(colours, text, shots, truths), calibrations_in(variables, calibrations, path)
-
-
-def _variables(run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None) -> dict[str, Any]:
-    return {**_frames(run), **of_folders(run, calibration)}
-
-
-def _folders_in(variables: Variables, path: Path) -> tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]:
-    manifest = unpack_run(text_in(variables, "run_manifest", path), path)
-    return _run(variables, manifest, path), calibration_in(variables, manifest.digital, path)
-
-
-def _frames(run: Packed[RunManifest]) -> dict[str, Any]:
+def _coded_frames(run: Packed[RunManifest]) -> Variables:
     """`data_coded`, `measBg` and, of signed pairs, `data_negative`: (rows, columns, K, K') each, or (rows, columns)."""
     manifest = run.manifest
     signs = {abs(shot.sign) for shot in manifest.patterns.captures}
@@ -148,523 +222,254 @@ def _background(run: Packed[RunManifest], shape: tuple[int, ...]) -> FloatArray:
     ambient, digital = run.manifest.ambient_frame, run.manifest.digital
     if ambient is not None:
         return run.read(ambient.file)[0]["DN"].astype(np.float64)
-    return np.full(shape, digital.black_level_dn + digital.dark_current_e_per_s * dn_per_rate(digital))
+    return np.full(shape, digital.black_level_dn + digital.dark_current_e_per_s * _dn_per_rate(digital))
 
 
-def _run(variables: Variables, manifest: RunManifest, path: Path) -> Packed[RunManifest]:
-    """The run whose frames are `data_coded`."""
-    left, right = manifest.patterns.matrices
-    found = np.asarray(variables.get("data_coded"))
-    if found.ndim < 2:
-        raise MitsimError(f"{path}: data_coded is missing; export it again")
-    shape = *found.shape[:2], left.shape[1], right.shape[1]
-    data = array_in(variables, "data_coded", shape, path)
-    if any(shot.sign for shot in manifest.patterns.captures):
-        negative = array_in(variables, "data_negative", shape, path)
-        stacks = {1: data + negative, -1: negative}
-    else:
-        stacks = {0: data}
-
-    def frame(shot: ShotFile) -> npt.NDArray[Any]:
-        """The frame of a ``shot``, (rows, columns)."""
-        return np.asarray(stacks[shot.sign][:, :, shot.row, shot.column])
-
-    return run_in(variables, manifest, frame, path)
-
-
-# -------- Arrays and texts by name in
-
-Variables = Mapping[str, Any]
-LARGEST_VARIABLE = (1 << 31) - 1
-"""Bytes of an array in a file of version 5."""
-_HEAD = 128
-"""Bytes before the first variable: a text, the version and the order of bytes."""
-_HDF5, _HDF5_MARK = 2, b"\x89HDF\r\n\x1a\n"
-"""Version of a file that is an HDF5 file behind its head."""
-_MATRIX, _COMPRESSED = 14, 15
-"""Kinds of elements: an array, and one that is packed."""
-_COMPLEX = 0x08
-"""Bit of an array's flags: its numbers are complex."""
-_BYTES_OF = {4: 4, 6: 8, 7: 4, 8: 1, 9: 1, 10: 2, 11: 2, 12: 4, 13: 4, 14: 8, 15: 8}
-"""Bytes of a number that SciPy reads, by class: letters, double, single, whole numbers of 8 to 64 bits."""
-_BEGINNING = 4096
-"""Bytes of a variable that its flags, shape and name lie in; a name has 63 letters at most."""
-_PADDING = 16
-"""Bytes after a variable's shape and name that are no numbers: a tag, and what fills up to 8."""
-_MOST_VARIABLES = 10_000
-"""Of a file; a run in 16 colours has 200."""
-_COPIES = 3
-"""Arrays of a variable's size that are held at once: as stored, of its class, and as a run's."""
-
-
-def write_variables(path: Path, variables: Variables) -> None:
-    """Write ``variables`` to a MATLAB file at ``path``, whole or not at all.
-
-    MitsimError for an array that is larger than such files hold.
-    """
-    from scipy.io import savemat
-
-    for name, values in variables.items():
-        if getattr(values, "nbytes", 0) > LARGEST_VARIABLE:
-            raise MitsimError(
-                f"{path}: {name} takes {values.nbytes / 2**30:.3g} GiB, and MATLAB files of version 5 hold 2; "
-                "use the format hdf5"
-            )
-    # A descriptor: given a name, savemat puts .mat behind it.
-    with whole_file(path) as part, part.open("wb") as file:
-        savemat(file, dict(variables), do_compression=True, long_field_names=True)
-
-
-def read_variables(path: Path) -> dict[str, Any]:
-    """The arrays of real numbers and the texts of the MATLAB file ``path``, by name; cells, structures and objects,
-    which files of `mitsim export` and FlatCam have none of, are not looked into.
-
-    MitsimError for a file that is missing, damaged, of version 7.3 or 4, or that takes more memory than is free.
-    """
-    from scipy.io import loadmat
-
-    check_plain(path)
-    try:
-        with open(path, "rb") as file:
-            arrays = _arrays_in(file)
-            Cost(memory_bytes=_COPIES * sum(arrays.values())).check(f"{path}", Limits())
-            file.seek(0)
-            return dict(loadmat(file, variable_names=[*arrays]))
-    except MitsimError:
-        raise
-    except NotImplementedError:
-        raise MitsimError(f"{path}: is HDF5 (version 7.3); save it in MATLAB with -v7, or name an export .h5") from None
-    except Exception as error:  # SciPy's reader raises of all kinds
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise MitsimError(f"{path}: damaged, or no MATLAB file ({reason}); write or copy it again") from error
-
-
-def _arrays_in(file: BinaryIO) -> dict[str, int]:
-    """Bytes that each array of real numbers and each text of an open MATLAB ``file`` takes, by name.
-
-    SciPy's readers allocate what a file claims, and call themselves for each cell within a cell until the process
-    ends. Here no more than the beginning of each variable is unpacked, after "MAT-File Format" (MathWorks).
-    """
-    head = file.read(_HEAD)
-    mark = head[_HEAD - 2 :]
-    if head.startswith(_HDF5_MARK):
-        raise NotImplementedError
-    if len(head) < _HEAD or mark not in (b"IM", b"MI"):
-        raise ValueError("it does not begin as one of version 5")
-    order = "<" if mark == b"IM" else ">"
-    if struct.unpack(f"{order}H", head[_HEAD - 4 : _HEAD - 2])[0] >> 8 == _HDF5:
-        raise NotImplementedError
-    two, found = f"{order}2I", dict[str, int]()
-    end = file.seek(0, os.SEEK_END)
-    place = _HEAD
-    while place + 8 <= end:
-        file.seek(place)
-        kind, length = struct.unpack(two, file.read(8))
-        place += 8 + length
-        if place > end:
-            raise ValueError("it ends within a variable")
-        beginning = file.read(min(length, _BEGINNING))
-        if kind == _COMPRESSED:
-            beginning = zlib.decompressobj().decompress(beginning, _BEGINNING)
-            kind, length = struct.unpack_from(two, beginning)
-            beginning = beginning[8:]
-        if kind != _MATRIX:
-            raise ValueError(f"it holds an element of the kind {kind}")
-        named = _array(beginning, length, order)
-        if named is not None:
-            if named[0] in found or len(found) == _MOST_VARIABLES:
-                raise ValueError(f"it holds {named[0]!r} twice, or over {_MOST_VARIABLES} variables")
-            found[named[0]] = named[1]
-    return found
-
-
-def _array(beginning: bytes, length: int, order: str) -> tuple[str, int] | None:
-    """Name and bytes of an array of real numbers or a text that begins so, of ``length`` bytes in the file; None of
-    another. ValueError where it claims other bytes than its shape has."""
-    flags, place = _element(beginning, 0, order)
-    (flag,) = struct.unpack_from(f"{order}I", flags)
-    size = _BYTES_OF.get(flag & 0xFF)
-    if size is None or flag >> 8 & _COMPLEX:
-        return None
-    dimensions, place = _element(beginning, place, order)
-    name, place = _element(beginning, place, order)
-    sides = struct.unpack(f"{order}{len(dimensions) // 4}i", dimensions)
-    count = math.prod(sides)
-    if len(sides) < 2 or min(sides) < 0 or count * size > LARGEST_VARIABLE:
-        raise ValueError(f"its variable {name[:80]!r} claims a shape of {sides[:8]}")
-    # Numbers are stored as the smallest type that holds them, and never as a larger one than they are of.
-    stored, _ = _tag(beginning, place, order)
-    if stored > count * size or length > place + count * size + _PADDING:
-        raise ValueError(f"its variable {name[:80]!r} claims more bytes than its shape has")
-    return name.decode("ascii"), count * size
-
-
-def _tag(data: bytes, place: int, order: str) -> tuple[int, int]:
-    """Bytes of an element's content at a ``place``, and where it begins."""
-    kind, length = struct.unpack_from(f"{order}2I", data, place)
-    return (kind >> 16, place + 4) if kind >> 16 else (length, place + 8)
-
-
-def _element(data: bytes, place: int, order: str) -> tuple[bytes, int]:
-    """Content of an element at a ``place``, and where the next one begins."""
-    length, start = _tag(data, place, order)
-    if start + length > len(data):
-        raise ValueError(f"a name or shape in it takes {length} bytes")
-    return data[start : start + length], place + 8 if start == place + 4 else start + -(-length // 8) * 8
-
-
-def text_in(variables: Variables, name: str, path: Path) -> str:
-    """A text of a file.
-
-    Parameters
-    ----------
-    variables
-        of the file.
-    name
-        of the one that is wanted.
-    path
-        of the file, for messages.
-
-    Raises
-    ------
-    MitsimError
-        where there is none.
-    """
-    value = np.asarray(variables.get(name))
-    if value.dtype.kind != "U" or value.size != 1:
-        raise MitsimError(
-            f"{path}: has no text {name}, so it is not of `mitsim export`; it holds "
-            f"{', '.join(key for key in variables if not key.startswith('__'))}"
-        )
-    return str(value.item())
-
-
-def array_in(variables: Variables, name: str, shape: tuple[int, ...], path: Path) -> npt.NDArray[Any]:
-    """An array of a file.
-
-    Parameters
-    ----------
-    variables
-        of the file.
-    name, shape
-        of the one that is wanted; MATLAB drops axes of length 1 at the end.
-    path
-        of the file, for messages.
-
-    Raises
-    ------
-    MitsimError
-        where it is missing, or not of real numbers in that shape.
-    """
-    array = np.asarray(variables.get(name))
-    if array.dtype.kind not in "uif" or array.size != math.prod(shape):
-        reported = f"is {array.dtype} of shape {array.shape}" if name in variables else "is missing"
-        raise MitsimError(f"{path}: {name} {reported}; numbers of shape {shape} are needed")
-    return array.reshape(shape, order="F")
-
-
-def matrix_in(variables: Variables, name: str, path: Path) -> FloatArray:
-    """A matrix of a file, of any size.
-
-    Parameters
-    ----------
-    variables
-        of the file.
-    name
-        of the one that is wanted.
-    path
-        of the file, for messages.
-
-    Raises
-    ------
-    MitsimError
-        where it is missing, or no matrix of real numbers.
-    """
-    matrix = np.asarray(variables.get(name))
-    if matrix.ndim != 2 or matrix.dtype.kind not in "uif":
-        raise MitsimError(
-            f"{path}: {name} is {'no matrix of numbers' if name in variables else 'missing'}; write it again"
-        )
-    return matrix.astype(np.float64)
-
-
-# -------- A run and a calibration of several lines in
-
-COLOURED, FILTERED, _CALIBRATED = "colour_run", "mosaic_run", "colour_calibration"
-"""Variables that hold the colour.json of a coloured run, of one behind colour filters, and of a calibration."""
-_LONGEST_LINE = 31
-"""Letters of a line's name: a variable of MATLAB has 63 at most, truth_board_reflectance_ half of them."""
-
-
-def lines_in(
-    variables: Variables,
-    folders_in: Callable[[str, Variables], tuple[Packed[RunManifest], Packed[CalibrationManifest] | None]],
-    path: Path,
-) -> tuple[Coloured[RunManifest], Coloured[CalibrationManifest] | None]:
-    """Coloured run and calibration in a file.
-
-    Parameters
-    ----------
-    variables
-        of the file.
-    folders_in
-        from a line's name and the variables that end in it, without that ending, to its run and calibration.
-    path
-        of the file, for messages.
-
-    Raises
-    ------
-    MitsimError
-        for a line that is missing, and as ``folders_in``.
-    """
-    text = text_in(variables, COLOURED, path)
-    colours = unpack_colours(text, RUN, path)
-    held = {name: folders_in(name, own) for name, own in by_line(variables, colours.names, path).items()}
-    run = Coloured(colours, text, {name: shots for name, (shots, _) in held.items()})
-    return run, calibrations_in(variables, {name: calibration for name, (_, calibration) in held.items()}, path)
-
-
-def calibrations_in(
-    variables: Variables, held: Mapping[str, Packed[CalibrationManifest] | None], path: Path
-) -> Coloured[CalibrationManifest] | None:
-    """The coloured calibration in a file; None where it holds none.
-
-    Parameters
-    ----------
-    variables
-        of the file.
-    held
-        the calibration of each line, where there is one, by its name.
-    path
-        of the file, for messages.
-
-    Raises
-    ------
-    MitsimError
-        where some line has none.
-    """
-    if _CALIBRATED not in variables:
-        return None
-    text = text_in(variables, _CALIBRATED, path)
-    colours = unpack_colours(text, CALIBRATION, path)
-    lines = {name: calibration for name, calibration in held.items() if calibration is not None}
-    if {*lines} != {*colours.names}:
-        raise MitsimError(f"{path}: has calibrations of {', '.join(lines)}, not of {', '.join(colours.names)}")
-    return Coloured(colours, text, lines)
-
-
-def by_line(variables: Variables, names: Sequence[str], path: Path) -> dict[str, dict[str, Any]]:
-    """Variables of each line by its name, without their ending.
-
-    Parameters
-    ----------
-    variables
-        of the file.
-    names
-        of the lines.
-    path
-        of the file, for messages.
-
-    Raises
-    ------
-    MitsimError
-        as :func:`endings`.
-    """
-    return {
-        name: {key.removesuffix(end): values for key, values in variables.items() if key.endswith(end)}
-        for name, end in endings(names, path).items()
-    }
-
-
-def colours_in(run: Coloured[RunManifest] | Filtered, calibration: Calibration | None) -> dict[str, Any]:
+def _colour_variables(run: Run, calibration: Calibration | None) -> Variables:
     """Variables that say of which lines a file is: the colour.json of ``run`` and ``calibration``."""
-    variables = {FILTERED if isinstance(run, Filtered) else COLOURED: run.text}
-    return {**variables, _CALIBRATED: calibration.text} if isinstance(calibration, Coloured) else variables
+    variables = {FILTERED if run.filters else COLOURED: run.text} if run.colours else {}
+    return {**variables, _CALIBRATED: calibration.text} if calibration and calibration.colours else variables
 
 
-def endings(names: Sequence[str], path: Path) -> dict[str, str]:
-    """What variables of each line end in, by the line's name: of letters, digits and _, as MATLAB wants it.
-
-    Parameters
-    ----------
-    names
-        of the lines.
-    path
-        of the file, for messages.
-
-    Raises
-    ------
-    MitsimError
-        for a name that no variable can end in, or two that are the same to MATLAB.
-    """
-    ends = {name: "_" + re.sub(r"[^0-9A-Za-z_]", "_", name) for name in names}
-    for name in names:
-        # Beginning with a digit, they are no end of another variable: truth_standard_error is not of a line `error`.
-        if not (name[0].isdigit() and len(name) <= _LONGEST_LINE) or [*ends.values()].count(ends[name]) > 1:
-            raise MitsimError(
-                f"{path}: a line is called {cut(name)}, which no variable of MATLAB can end in; use the format hdf5"
-            )
-    return ends
-
-
-# -------- A run and its calibration in
-
-
-def of_folders(run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None) -> dict[str, Any]:
-    """Variables of every MATLAB file: manifests, patterns, factors, truth and ambient frame.
-
-    Parameters
-    ----------
-    run, calibration
-        that are exported.
-    """
-    variables: dict[str, Any] = {"run_manifest": manifest_text(run.manifest, run.text)}
+def _folder_variables(run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None) -> Variables:
+    """Variables of every MATLAB file: manifests, patterns, factors, truth and ambient frame."""
+    variables: Variables = {"run_manifest": run.text}
     variables["PL"], variables["PR"] = run.manifest.patterns.matrices
-    variables.update(calibration_variables(calibration, run.manifest.digital))
+    variables.update(_calibration_variables(calibration, run.manifest.digital))
     ambient = run.manifest.ambient_frame
     if ambient is not None:
         variables["ambient"] = run.read(ambient.file)[0]["DN"]
-    return {**variables, **truth_variables(*run.read(TRUTH))} if TRUTH in run.names else variables
+    return {**variables, **_truth_variables(*run.read(TRUTH))} if TRUTH in run.names else variables
 
 
-def calibration_variables(calibration: Packed[CalibrationManifest] | None, digital: Digital) -> dict[str, Any]:
+def _calibration_variables(calibration: Packed[CalibrationManifest] | None, digital: Digital) -> Variables:
     """Factors (pixels, n) [sqrt(DN)] and manifest of a ``calibration``, for frames that are read as ``digital`` says;
     none without one."""
     if calibration is None:
         return {}
-    factors = factors_in_dn(calibration, dn_per_rate(digital))
-    variables: dict[str, Any] = {f"phi_{side}": factor for side, factor in factors.items()}
-    return {**variables, "calibration_manifest": manifest_text(calibration.manifest, calibration.text)}
+    named = {f"phi_{side}": factor for side, factor in zip(SIDES, _factors_in_dn(calibration, digital), strict=True)}
+    return {**named, "calibration_manifest": calibration.text}
 
 
-def truth_variables(channels: Channels, metadata: Metadata) -> dict[str, Any]:
+def _truth_variables(channels: Channels, metadata: Metadata) -> Variables:
     """A truth, of the ``channels`` (n, n') and ``metadata`` of its file."""
-    variables: dict[str, Any] = {"truth": channels["reflectance"]}
+    variables: Variables = {"truth": channels["reflectance"]}
     variables["truth_board_reflectance"] = float(metadata.get("board_reflectance", math.nan))
     if "standard_error" in channels:
         variables["truth_standard_error"] = channels["standard_error"]
     return variables
 
 
-def truth_in(variables: Variables, path: Path) -> tuple[Channels, Metadata]:
-    """Channels (n, n') and metadata of the truth in a file.
-
-    Parameters
-    ----------
-    variables
-        of the file, a truth among them.
-    path
-        of the file, for messages.
-
-    Raises
-    ------
-    MitsimError
-        where it is no image.
-    """
-    channels = {"reflectance": _image_in(variables, "truth", path)}
-    if "truth_standard_error" in variables:
-        array_in(variables, "truth_standard_error", channels["reflectance"].shape, path)
-        channels["standard_error"] = _image_in(variables, "truth_standard_error", path)
-    board = math.nan
-    if "truth_board_reflectance" in variables:
-        board = float(array_in(variables, "truth_board_reflectance", (1,), path)[0])
-    return channels, {} if math.isnan(board) else {"board_reflectance": board}
-
-
-def _image_in(variables: Variables, name: str, path: Path) -> Channel:
-    """The image called ``name``, (rows, columns) float32."""
-    return as_channel(matrix_in(variables, name, path).astype(np.float32), name, path)
-
-
-def dn_per_rate(digital: Digital) -> float:
+def _dn_per_rate(digital: Digital) -> float:
     """Digital numbers of a photoelectron a second, in frames that are read as ``digital`` says."""
     return digital.gain_dn_per_e * digital.exposure_s
 
 
-def factors_in_dn(calibration: Packed[CalibrationManifest], scale: float) -> dict[str, FloatArray]:
-    """Both factors [sqrt(DN)] by side, (pixels, n).
+def _factors_in_dn(calibration: Packed[CalibrationManifest], digital: Digital) -> tuple[FloatArray, ...]:
+    """Left and right factor (pixels, n) of a ``calibration`` [sqrt(electrons / s)] in sqrt(DN)."""
+    root = math.sqrt(_dn_per_rate(digital))
+    return tuple(calibration.read(name)[0]["factor"].astype(np.float64) * root for name in FACTORS)
+
+
+# -------- Folders in, FlatCam's variables out
+
+_COLOURS = (("r",), ("gr", "gb"), ("b",))
+"""Planes of each colour, the longest wavelength first. Either green plane has the whole frame."""
+
+
+def write_flatcam(path: Path, run: Run, calibration: Calibration) -> tuple[str, ...]:
+    """Write a run with FlatCam's variables, whole or not at all; returns a sentence on what is left out.
 
     Parameters
     ----------
-    calibration
-        with factors [sqrt(electrons / s)].
-    scale
-        as of :func:`dn_per_rate`.
-    """
-    return {
-        side: calibration.read(name)[0]["factor"].astype(np.float64) * math.sqrt(scale)
-        for side, name in zip(SIDES, FACTORS, strict=True)
-    }
-
-
-def calibration_in(variables: Variables, digital: Digital, path: Path) -> Packed[CalibrationManifest] | None:
-    """The calibration in a file; None where it holds none.
-
-    Parameters
-    ----------
-    variables
-        of the file.
-    digital
-        of the run in the file, whose unit `phi_left` and `phi_right` have.
     path
-        of the file, for messages.
+        of the file.
+    run
+        with frames of an even number of rows and columns; or of three lines, of which the longest is taken for red and
+        the shortest for blue, and each plane is the whole frame of a line.
+    calibration
+        that goes with it, of the same lines.
 
     Raises
     ------
     MitsimError
-        for factors that are none.
+        for other frames or lines, lines that differ in the number or size of their frames, and more frames than such a
+        file holds.
     """
-    if "calibration_manifest" not in variables:
-        return None
-    text = text_in(variables, "calibration_manifest", path)
-    manifest = unpack(text, CalibrationManifest, path)
-    metadata: Metadata = {"unit": "sqrt(e-/s)"}
-    if manifest.board_reflectance is not None:
-        metadata = {**metadata, "reflectance": manifest.board_reflectance}
-
-    def read(name: str) -> tuple[Channels, Metadata]:
-        variable = f"phi_{Path(name).stem}"
-        factor = matrix_in(variables, variable, path) / math.sqrt(dn_per_rate(digital))
-        # Rounding in double precision is far below half of the last digit in single: the number is the first one.
-        return {"factor": as_channel(factor.astype(np.float32), variable, path)}, metadata
-
-    return Packed(manifest, text, FACTORS, read, path)
+    if run.colours:
+        variables = _of_lines(path, run, run.colours, calibration)
+    else:
+        variables = _of_one(run.parts[""], calibration.parts[""])
+    write_variables(path, variables)
+    return (f"Left out: {ELECTRONS}",)
 
 
-def run_in(variables: Variables, manifest: RunManifest, frame: Any, path: Path) -> Packed[RunManifest]:
-    """A run in a MATLAB file.
+def _of_one(run: Packed[RunManifest], calibration: Packed[CalibrationManifest]) -> Variables:
+    left, right = _factors_in_dn(calibration, run.manifest.digital)
+    if len(left) % 2 or len(right) % 2:
+        size = f"{len(left)}x{len(right)}"
+        raise MitsimError(f"{run.place}: frames are {size}; FlatCam's four planes need even sides, use mat")
+    meas = np.empty((len(left), len(right), len(run.manifest.patterns.captures)), order="F")
+    kind = _fill(meas, run)
+    factors = {name: (left[row::2], right[column::2]) for name, (row, column) in PLANES.items()}
+    return {"meas": meas, "dn_class": kind, **_plane_variables(factors), **_folder_variables(run, calibration)}
+
+
+def _of_lines(path: Path, run: Run, colours: ColourManifest, calibration: Calibration) -> Variables:
+    ends, planes = endings(colours.names, path), _lines_of_planes(colours, path)
+    counts = {name: len(run.parts[name].manifest.patterns.captures) for name in colours.names}
+    if len({*counts.values()}) > 1:
+        reported = ", ".join(f"{count} of {name}" for name, count in counts.items())
+        raise MitsimError(f"{path}: frames are {reported}, but FlatCam's planes are of one frame; use mat")
+    sides = {name: _factors_in_dn(calibration.parts[name], shots.manifest.digital) for name, shots in run.parts.items()}
+    rows, columns = (len(side) for side in sides[planes["r"]])
+    meas, variables = (
+        np.empty((2 * rows, 2 * columns, counts[planes["r"]]), order="F"),
+        _colour_variables(run, calibration),
+    )
+    for plane, name in planes.items():
+        row, column = PLANES[plane]
+        kind = _fill(meas[row::2, column::2], run.parts[name])
+        own = {"dn_class": kind, **_folder_variables(run.parts[name], calibration.parts[name])}
+        variables.update({f"{key}{ends[name]}": values for key, values in own.items()})
+    return {**variables, "meas": meas, **_plane_variables({plane: sides[planes[plane]] for plane in PLANES})}
+
+
+def _lines_of_planes(colours: ColourManifest, path: Path) -> dict[str, str]:
+    """Name of the line that each plane is of."""
+    if len(colours.names) != len(_COLOURS):
+        raise MitsimError(
+            f"{path}: lines are {', '.join(colours.names)}; FlatCam has red, green and blue, so use mat, or export the "
+            "folder of a line"
+        )
+    by_length = sorted(colours.channels, key=lambda line: -line.wavelength_nm)
+    return {plane: line.name for line, planes in zip(by_length, _COLOURS, strict=True) for plane in planes}
+
+
+def _fill(meas: npt.NDArray[Any], run: Packed[RunManifest]) -> str:
+    """Put a run's frames into ``meas`` (rows, columns, shots); returns the type of their numbers."""
+    for index, (shot, channels, _) in enumerate(shots_of(run)):
+        if channels["DN"].shape != meas.shape[:2]:
+            rows, columns = meas.shape[:2]
+            raise MitsimError(f"{run.place / shot.file}: is not {rows}x{columns}, as the calibration; calibrate again")
+        meas[:, :, index] = channels["DN"]
+    return channels["DN"].dtype.name
+
+
+def _plane_variables(factors: Mapping[str, tuple[FloatArray, ...]]) -> Variables:
+    """FlatCam's variables of the left and right ``factors`` of each plane, which lose the means of their columns as
+    frames do."""
+    variables: Variables = {"angle": 0.0}
+    for plane, (left, right) in factors.items():
+        variables["cSize"] = np.array([[len(left), len(right)]], float)
+        variables.update({f"P1{plane}": left - left.mean(axis=0), f"Q1{plane}": right - right.mean(axis=0)})
+    return variables
+
+
+# -------- A file in, folders out
+
+
+@contextmanager
+def load_mat(path: Path, channel: str | None) -> Iterator[Loaded]:
+    """Run and calibration in a MATLAB file of `mitsim export`, with the paper's variables or FlatCam's.
 
     Parameters
     ----------
-    variables
-        of the file.
-    manifest
-        of the run.
-    frame
-        from a shot to its digital numbers, (rows, columns).
     path
-        of the file, for messages.
+        of the file.
+    channel
+        the file is the calibration of a real FlatCam, of which this plane is taken.
+
+    Raises
+    ------
+    MitsimError
+        for a file that is none of these, or is damaged.
     """
+    if channel is not None:
+        yield Loaded(None, Content({"": flatcam_calibration(path, channel)}))
+        return
+    file = MatFile(path, read_variables(path))
+    run, lines = _run_in(file)
+    held = {name: _calibration_part(own, run.of_line(name).manifest.digital) for name, own in lines.items()}
+    yield Loaded(run, _calibration_in(file, held, run), (ELECTRONS,))
+
+
+def _run_in(file: MatFile) -> tuple[Run, dict[str, MatFile]]:
+    """The run in a ``file``, and what the file holds of each line."""
+    meas = _frames_in(file, "meas") if "meas" in file else None
+    if COLOURED not in file:
+        shots = _run_part(file, meas)
+        if FILTERED not in file:
+            return Content({"": shots}), {"": file}
+        text = file.text(FILTERED)
+        colours = unpack_colours(text, MOSAIC, file.path, shots.names)
+        lines = file.by_line(colours.names)
+        truths = {name: _truth_in(own) for name, own in lines.items() if "truth" in own}
+        return Content({"": shots}, colours, text, truths), lines
+    text = file.text(COLOURED)
+    colours = unpack_colours(text, RUN, file.path)
+    frames = (
+        {}
+        if meas is None
+        else {
+            name: meas[PLANES[plane][0] :: 2, PLANES[plane][1] :: 2]
+            for plane, name in _lines_of_planes(colours, file.path).items()
+        }
+    )
+    lines = file.by_line(colours.names)
+    return Content({name: _run_part(own, frames.get(name)) for name, own in lines.items()}, colours, text), lines
+
+
+def _frames_in(file: MatFile, name: str) -> npt.NDArray[Any]:
+    """The frames called ``name``, (rows, columns) and further axes."""
+    frames = np.asarray(file.values.get(name))
+    if frames.ndim < 2:
+        raise MitsimError(f"{file.path}: {name} is missing, or no frames; export it again")
+    return frames
+
+
+def _run_part(own: MatFile, meas: npt.NDArray[Any] | None) -> Packed[RunManifest]:
+    """The run of the variables ``own``, its frames in ``meas`` (rows, columns, shots), or, without it, `data_coded`."""
+    text = own.text("run_manifest")
+    manifest = unpack_run(text, own.path)
     captures, ambient = manifest.patterns.captures, manifest.ambient_frame
+    frame = _frames_of_patterns(own, manifest) if meas is None else _frames_of_shots(own, meas, manifest)
     shots = {shot.file: shot for shot in captures}
-    kind = np.float32 if text_in(variables, "dn_class", path) == "float32" else np.uint32
+    kind = np.float32 if own.text("dn_class") == "float32" else np.uint32
 
     def read(name: str) -> tuple[Channels, Metadata]:
+        known: Metadata = {"exposure_s": manifest.digital.exposure_s}
         if name in shots:
             shot = shots[name]
-            return {"DN": _digital(frame(shot), kind, name, path)}, {
-                "row": shot.row,
-                "column": shot.column,
-                "sign": shot.sign,
-                "exposure_s": manifest.digital.exposure_s,
-            }
+            place: Metadata = {"row": shot.row, "column": shot.column, "sign": shot.sign}
+            return {"DN": _digital(frame(shot), kind, name, own.path)}, {**place, **known}
         if ambient is not None and name == ambient.file:
-            known: Metadata = {"shots": ambient.shots, "exposure_s": manifest.digital.exposure_s}
-            return {"DN": _image_in(variables, "ambient", path)}, known
-        return truth_in(variables, path)
+            return {"DN": own.image("ambient")}, {"shots": ambient.shots, **known}
+        return _truth_in(own)
 
-    names = (*shots, *([ambient.file] if ambient else ()), *((TRUTH,) if "truth" in variables else ()))
-    return Packed(manifest, text_in(variables, "run_manifest", path), names, read, path)
+    names = (*shots, *([ambient.file] if ambient else ()), *((TRUTH,) if "truth" in own else ()))
+    return Packed(manifest, text, names, read, own.path)
+
+
+def _frames_of_patterns(own: MatFile, manifest: RunManifest) -> Callable[[ShotFile], npt.NDArray[Any]]:
+    """The frame of a shot in `data_coded`, (rows, columns, K, K')."""
+    left, right = manifest.patterns.matrices
+    shape = *_frames_in(own, "data_coded").shape[:2], left.shape[1], right.shape[1]
+    data = own.array("data_coded", shape)
+    stacks = {0: data}
+    if any(shot.sign for shot in manifest.patterns.captures):
+        negative = own.array("data_negative", shape)
+        stacks = {1: data + negative, -1: negative}
+    return lambda shot: stacks[shot.sign][:, :, shot.row, shot.column]
+
+
+def _frames_of_shots(
+    own: MatFile, meas: npt.NDArray[Any], manifest: RunManifest
+) -> Callable[[ShotFile], npt.NDArray[Any]]:
+    """The frame of a shot in ``meas``, (rows, columns, shots)."""
+    index = {shot.file: number for number, shot in enumerate(manifest.patterns.captures)}
+    frames = MatFile(own.path, {"meas": meas}).array("meas", (*meas.shape[:2], len(manifest.patterns.captures)))
+    return lambda shot: frames[:, :, index[shot.file]]
 
 
 def _digital(values: npt.NDArray[Any], kind: Any, name: str, path: Path) -> Channel:
@@ -674,3 +479,83 @@ def _digital(values: npt.NDArray[Any], kind: Any, name: str, path: Path) -> Chan
     if not np.array_equal(digital.astype(np.float64), values):
         raise MitsimError(f"{path}: {name} has numbers that are no {np.dtype(kind).name}; export it again")
     return as_channel(digital, name, path)
+
+
+def _truth_in(own: MatFile) -> tuple[Channels, Metadata]:
+    """Channels (n, n') and metadata of the truth; MitsimError where it is no image."""
+    channels = {"reflectance": own.image("truth")}
+    if "truth_standard_error" in own:
+        own.array("truth_standard_error", channels["reflectance"].shape)
+        channels["standard_error"] = own.image("truth_standard_error")
+    board = math.nan
+    if "truth_board_reflectance" in own:
+        board = float(own.array("truth_board_reflectance", (1,))[0])
+    return channels, {} if math.isnan(board) else {"board_reflectance": board}
+
+
+def _calibration_in(
+    file: MatFile, held: Mapping[str, Packed[CalibrationManifest] | None], run: Run
+) -> Calibration | None:
+    """The calibration in a ``file`` of a ``run``, whose lines' are ``held``; None where it holds none."""
+    parts = {name: part for name, part in held.items() if part is not None}
+    if not run.colours:
+        return Content(parts) if parts else None
+    if _CALIBRATED not in file:
+        return None
+    text = file.text(_CALIBRATED)
+    colours = unpack_colours(text, CALIBRATION, file.path)
+    if {*parts} != {*colours.names}:
+        raise MitsimError(f"{file.path}: has calibrations of {', '.join(parts)}, not of {', '.join(colours.names)}")
+    return Content(parts, colours, text)
+
+
+def _calibration_part(own: MatFile, digital: Digital) -> Packed[CalibrationManifest] | None:
+    """The calibration of the variables ``own``, where there is one, of a run whose frames are read as ``digital`` says,
+    and whose unit `phi_left` and `phi_right` have."""
+    if "calibration_manifest" not in own:
+        return None
+    text = own.text("calibration_manifest")
+    manifest = unpack(text, CalibrationManifest, own.path)
+    metadata: Metadata = {"unit": "sqrt(e-/s)"}
+    if manifest.board_reflectance is not None:
+        metadata = {**metadata, "reflectance": manifest.board_reflectance}
+    root = math.sqrt(_dn_per_rate(digital))
+
+    def read(name: str) -> tuple[Channels, Metadata]:
+        return {"factor": own.image(f"phi_{Path(name).stem}", root)}, metadata
+
+    return Packed(manifest, text, FACTORS, read, own.path)
+
+
+def flatcam_calibration(path: Path, channel: str) -> Packed[CalibrationManifest]:
+    """The factors of one plane of a real FlatCam, from its calibration file.
+
+    Parameters
+    ----------
+    path
+        of the file, with `P1*` and `Q1*`.
+    channel
+        a key of :data:`mitsim.exchange.formats.PLANES`.
+
+    Returns
+    -------
+    Packed
+        a calibration for frames of that plane; flagged where the frames must be turned first.
+
+    Raises
+    ------
+    MitsimError
+        for a file without that plane.
+    """
+    check_channel(channel)
+    file = MatFile(path, {"angle": [[0.0]], **read_variables(path)})
+    sides = {name: file.image(f"{stem}{channel}") for name, stem in zip(FACTORS, ("P1", "Q1"), strict=True)}
+    angle = float(file.matrix("angle")[0, 0])
+    turned = f"its frames were turned by {angle:g} degrees, and import turns none: turn them before, or shifts remain"
+    camera = {"name": path.stem, "channel": channel}
+    manifest = CalibrationManifest(camera=camera, centre=True, warnings=(turned,) if angle else ())
+
+    def read(name: str) -> tuple[Channels, Metadata]:
+        return {"factor": sides[name]}, {}
+
+    return Packed(manifest, "", FACTORS, read, path)

@@ -1,20 +1,22 @@
-"""A RUN or CAL folder in, its manifest and files by name out; or the other way, from wherever they were kept.
+"""A RUN or CAL folder in, its manifests and files by name out; or the other way, from wherever they were kept.
 
-A run behind colour filters is one RUN folder of all lines; of each there is what a perfect image would show.
+Whatever lines a folder tells apart, its content is one :class:`Content`: of a mono folder it has one part, of a
+coloured one a part for each line. A run behind colour filters is one RUN folder of all lines; of each there is what a
+perfect image would show.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.exr import Channel, Channels, Metadata, checksum, read_frame, verify, write_frame
-from mitsim.core.files import LOCK, MOST_BYTES, fits_a_frame, json_text, parse_json, read_text, whole_folder, write_text
+from mitsim.core.files import LOCK, MOST_BYTES, fits_a_frame, parse_json, read_text, whole_folder, write_text
 from mitsim.core.manifests import (
     MANIFEST,
     SIDES,
@@ -29,11 +31,11 @@ from mitsim.core.runs import TRUTH, load_run
 from mitsim.core.spectral_manifests import (
     CALIBRATION,
     COLOUR,
+    MOSAIC,
     RUN,
     ColourManifest,
     MosaicManifest,
     checked_colours,
-    checked_mosaic,
     is_coloured,
     is_mosaic,
     read_colours,
@@ -58,7 +60,7 @@ class Packed(Generic[Manifest]):
     manifest
         of the folder.
     text
-        of its `manifest.json`, letter by letter; empty where only the model is known.
+        of its `manifest.json`, letter by letter; empty where only the model is known, as of what is not exported.
     names
         of its files.
     read
@@ -176,11 +178,6 @@ def unpack_run(text: str, place: Path) -> RunManifest:
     return manifest
 
 
-def manifest_text(manifest: RunManifest | CalibrationManifest, text: str) -> str:
-    """The ``text`` of a manifest's file, or, where there is none, that of the ``manifest``."""
-    return text or json_text(manifest)
-
-
 def as_channel(values: object, name: str, place: Path) -> Channel:
     """An array of an exchanged file as a channel of a frame.
 
@@ -206,75 +203,66 @@ def as_channel(values: object, name: str, place: Path) -> Channel:
     return np.ascontiguousarray(array)
 
 
-def _text_of(folder: Path) -> str:
-    return read_text(folder / MANIFEST, MOST_BYTES)
+def _text_of(folder: Path, name: str = MANIFEST) -> str:
+    return read_text(folder / name, MOST_BYTES)
 
 
 def _kinds_text(kinds: Mapping[str, tuple[object, ...]]) -> str:
     return ", ".join(f"{name} ({' '.join(map(str, kind))})" for name, kind in kinds.items())
 
 
-# -------- A coloured RUN or CAL folder in, the content of its lines' folders out
+# -------- The content of a whole folder, whatever lines it tells apart
 
 
 @dataclass(frozen=True, eq=False)
-class Coloured(Generic[Manifest]):
-    """A coloured folder's content.
+class Content(Generic[Manifest]):
+    """What a RUN or CAL folder holds.
 
     Attributes
     ----------
+    parts
+        content of each line's folder, by the line's name; that of the folder itself by "".
     colours
-        its lines.
+        lines, and filters where there are some; None of a folder that tells no lines apart.
     text
         of its `colour.json`, letter by letter.
-    lines
-        content of each line's folder, by its name.
-    """
-
-    colours: ColourManifest
-    text: str
-    lines: Mapping[str, Packed[Manifest]]
-
-    def fill(self, folder: Path) -> None:
-        """Write all folders into a ``folder`` that this process holds, and colour.json last."""
-        for name, held in self.lines.items():
-            (folder / name).mkdir()
-            held.fill(folder / name)
-        write_text(folder / COLOUR, self.text)
-
-
-@dataclass(frozen=True, eq=False)
-class Filtered:
-    """Content of the folder of a run behind colour filters.
-
-    Attributes
-    ----------
-    colours
-        its lines and filters.
-    text
-        of its `colour.json`, letter by letter.
-    shots
-        frames of all lines at once.
     truths
-        channels and metadata of each line's `truth.exr`, by the line's name; none of a real camera.
+        of a run behind filters: channels and metadata of each line's `truth.exr`, by its name; none of a real camera.
     """
 
-    colours: MosaicManifest
-    text: str
-    shots: Packed[RunManifest]
-    truths: Mapping[str, tuple[Channels, Metadata]]
+    parts: Mapping[str, Packed[Manifest]]
+    colours: ColourManifest | None = None
+    text: str = ""
+    truths: Mapping[str, tuple[Channels, Metadata]] = field(default_factory=dict)
+
+    @property
+    def filters(self) -> MosaicManifest | None:
+        """The filters that its frames were seen through."""
+        return self.colours if isinstance(self.colours, MosaicManifest) else None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of its lines; "" alone where it tells none apart."""
+        return self.colours.names if self.colours else ("",)
+
+    def of_line(self, name: str) -> Packed[Manifest]:
+        """The folder that a line called ``name`` is in: its own, or that of all lines."""
+        return self.parts.get(name) or self.parts[""]
 
     def fill(self, folder: Path) -> None:
-        """Write all files into a ``folder`` that this process holds, and colour.json last."""
-        self.shots.fill(folder)
+        """Write all files into a ``folder`` that this process holds, colour.json last."""
+        for name, part in self.parts.items():
+            (folder / name).mkdir(exist_ok=True)
+            part.fill(folder / name)
         for name, truth in self.truths.items():
             (folder / name).mkdir()
             write_frame(folder / name / TRUTH, *truth)
-        write_text(folder / COLOUR, self.text)
+        if self.colours:
+            write_text(folder / COLOUR, self.text)
 
 
-Run = Packed[RunManifest] | Coloured[RunManifest] | Filtered
-Calibration = Packed[CalibrationManifest] | Coloured[CalibrationManifest]
+Run = Content[RunManifest]
+Calibration = Content[CalibrationManifest]
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,31 +282,31 @@ class Loaded:
     left_out: tuple[str, ...] = ()
 
 
-def any_run(folder: Path) -> Run:
+def run_content(folder: Path) -> Run:
     """The RUN ``folder``, coloured, behind colour filters, or neither. MitsimError when it, or a line's folder, is not
     a complete one."""
-    if is_mosaic(folder):
-        filters = read_mosaic(folder)
-        files = {name: folder / name / TRUTH for name in filters.names}
-        truths = {name: read_frame(path) for name, path in files.items() if path.is_file()}
-        return Filtered(filters, _colour_text_of(folder), pack_run(folder), truths)
-    if not is_coloured(folder):
-        return pack_run(folder)
-    colours = read_colours(folder, RUN)
-    return Coloured(colours, _colour_text_of(folder), {name: pack_run(folder / name) for name in colours.names})
+    if not is_mosaic(folder):
+        return _content(folder, RUN, pack_run)
+    filters = read_mosaic(folder)
+    files = {name: folder / name / TRUTH for name in filters.names}
+    truths = {name: read_frame(path) for name, path in files.items() if path.is_file()}
+    return Content({"": pack_run(folder)}, filters, _text_of(folder, COLOUR), truths)
 
 
-def any_calibration(folder: Path) -> Calibration:
+def calibration_content(folder: Path) -> Calibration:
     """The CAL ``folder``, coloured or not. MitsimError when it, or a line's folder, is not a complete one."""
+    return _content(folder, CALIBRATION, pack_calibration)
+
+
+def _content(folder: Path, kind: str, pack: Callable[[Path], Packed[Manifest]]) -> Content[Manifest]:
     if not is_coloured(folder):
-        return pack_calibration(folder)
-    colours = read_colours(folder, CALIBRATION)
-    lines = {name: pack_calibration(folder / name) for name in colours.names}
-    return Coloured(colours, _colour_text_of(folder), lines)
+        return Content({"": pack(folder)})
+    colours = read_colours(folder, kind)
+    return Content({name: pack(folder / name) for name in colours.names}, colours, _text_of(folder, COLOUR))
 
 
-def unpack_colours(text: str, kind: str, place: Path) -> ColourManifest:
-    """The lines that an exchanged file has.
+def unpack_colours(text: str, kind: str, place: Path, files: Sequence[str] = ()) -> ColourManifest:
+    """The lines, and filters, that an exchanged file has.
 
     Parameters
     ----------
@@ -328,67 +316,19 @@ def unpack_colours(text: str, kind: str, place: Path) -> ColourManifest:
         of folder that this is to be of, one of :data:`mitsim.core.spectral_manifests.KINDS`.
     place
         the file, for messages.
+    files
+        names of what lies beside the lines' folders.
 
     Raises
     ------
     MitsimError
         when the text is not JSON, breaks a rule of its format, or names a folder that cannot be.
     """
-    colours = checked_colours(_parse(text, place), kind, place)
-    _check_names(colours, place, (COLOUR, LOCK))
-    return colours
-
-
-def unpack_filters(text: str, shots: Packed[RunManifest], place: Path) -> MosaicManifest:
-    """The lines and filters that an exchanged file has.
-
-    Parameters
-    ----------
-    text
-        of the colour.json that it holds.
-    shots
-        of the run, which lie beside the lines' folders.
-    place
-        the file, for messages.
-
-    Raises
-    ------
-    MitsimError
-        as :func:`unpack_colours`.
-    """
-    colours = checked_mosaic(_parse(text, place), place)
-    _check_names(colours, place, (COLOUR, LOCK, MANIFEST, *shots.names))
-    return colours
-
-
-def _parse(text: str, place: Path) -> Any:
     try:
-        return parse_json(text)
+        data = parse_json(text)
     except ValueError as error:
         raise MitsimError(f"{place}: its {COLOUR} is not valid JSON ({error}); export it again") from error
-
-
-def _check_names(colours: ColourManifest, place: Path, others: Sequence[str]) -> None:
-    for name in {*others}.intersection(colours.names):
+    colours = checked_colours(data, kind, place)
+    for name in {COLOUR, LOCK, *((MANIFEST, *files) if kind == MOSAIC else ())}.intersection(colours.names):
         raise MitsimError(f"{place}: a line is called {name}; give it a name of its own")
-
-
-def line_of(held: Packed[Manifest] | Coloured[Manifest] | None, name: str) -> Packed[Manifest] | None:
-    """The folder of the line ``name`` of ``held``, which is that folder itself where it tells no lines apart."""
-    return held.lines[name] if isinstance(held, Coloured) else held
-
-
-def run_parts(run: Run) -> dict[str, Packed[RunManifest]]:
-    """The shots that a ``run`` is of, as :func:`parts_of`."""
-    return {"": run.shots} if isinstance(run, Filtered) else parts_of(run)
-
-
-def parts_of(held: Packed[Manifest] | Coloured[Manifest]) -> dict[str, Packed[Manifest]]:
-    """The folders that ``held`` is of, by the beginning of a message about each: of its line, or nothing."""
-    if isinstance(held, Packed):
-        return {"": held}
-    return {f"{name}: ": part for name, part in held.lines.items()}
-
-
-def _colour_text_of(folder: Path) -> str:
-    return read_text(folder / COLOUR, MOST_BYTES)
+    return colours

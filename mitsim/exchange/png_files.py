@@ -14,15 +14,15 @@ import numpy.typing as npt
 from mitsim.core.configuration import load_model, locate, validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import whole_file, whole_folder, write_json, write_text
+from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import Patterns, RunManifest
-from mitsim.core.resources import Cost, Limits
 from mitsim.core.spectral_manifests import COLOUR
 from mitsim.devices.framelist import FrameList
 from mitsim.devices.patterns import parse_patterns, stripe_signs
 from mitsim.devices.projector import ProjectorModel
 from mitsim.devices.sensor import check_exposure, digital_of, load_sensor
 from mitsim.devices.session import UNIFORM, taken
-from mitsim.exchange.packed import Coloured, Packed, shots_of
+from mitsim.exchange.packed import Packed, Run, shots_of
 
 PATTERNS = "patterns.json"
 """Which picture shows what, and where the grid lies in it."""
@@ -391,9 +391,7 @@ _LARGEST = 2**16 - 1
 """Of a PNG's numbers."""
 
 
-def write_pngs(
-    folder: Path, run: Packed[RunManifest] | Coloured[RunManifest], projector: str | None = None
-) -> tuple[str, ...]:
+def write_pngs(folder: Path, run: Run, projector: str | None = None) -> tuple[str, ...]:
     """Write the frames of a run, and its patterns as a projector shows them, to a new folder, whole or not at all.
 
     Parameters
@@ -417,18 +415,16 @@ def write_pngs(
         for numbers that PNG cannot hold, patterns that are not of 0, 1 and -1, or a projector of unknown or too few
         pixels.
     """
-    if isinstance(run, Packed):
-        raster = _raster(run, projector)
-        with whole_folder(folder) as place:
-            where = _fill(place, run, raster)
-        return _read_again(folder, "RUN", "CAL", run.manifest), f"Patterns in cells of {describe_cells(where)}"
+    rasters = {name: _raster(shots, projector) for name, shots in run.parts.items()}
     with whole_folder(folder) as place:
-        for name, shots in run.lines.items():
-            (place / name).mkdir()
-            where = _fill(place / name, shots, _raster(shots, projector))
-        write_text(place / COLOUR, run.text)
-    again = (_read_again(folder / name, f"RUN/{name}", f"CAL/{name}", run.lines[name].manifest) for name in run.lines)
-    return f"Begin with: mkdir RUN; cp {folder / COLOUR} RUN", *again, f"Patterns in cells of {describe_cells(where)}"
+        for name, shots in run.parts.items():
+            (place / name).mkdir(exist_ok=True)
+            where = _fill(place / name, shots, rasters[name])
+        if run.colours:
+            write_text(place / COLOUR, run.text)
+    begin = (f"Begin with: mkdir RUN; cp {folder / COLOUR} RUN",) if run.colours else ()
+    again = (_read_again(folder / name, name, shots.manifest) for name, shots in run.parts.items())
+    return *begin, *again, f"Patterns in cells of {describe_cells(where)}"
 
 
 def _fill(place: Path, run: Packed[RunManifest], raster: Raster) -> dict[str, Any]:
@@ -455,12 +451,12 @@ def _fill(place: Path, run: Packed[RunManifest], raster: Raster) -> dict[str, An
     return where
 
 
-def _read_again(folder: Path, run: str, calibration: str, manifest: RunManifest) -> str:
-    """How the frames in a ``folder`` become the RUN folder ``run`` again."""
+def _read_again(folder: Path, line: str, manifest: RunManifest) -> str:
+    """How the frames in a ``folder`` become a RUN folder, or that of a ``line``, again."""
     again = f"--patterns {folder / PATTERNS} --exposure {manifest.digital.exposure_s!r}"
     if manifest.ambient_frame is not None:
         again += f" --ambient-frame {folder / 'ambient.npy'} --ambient-shots {manifest.ambient_frame.shots}"
-    frames = folder / "frames"
+    frames, run, calibration = folder / "frames", Path("RUN", line), Path("CAL", line)
     return f"Read again by: mitsim import {frames} {again} --camera NAME --calibration {calibration} -o {run}"
 
 

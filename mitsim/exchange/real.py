@@ -22,13 +22,13 @@ from mitsim.core.exr import Channel, Channels, Metadata, checksum
 from mitsim.core.files import read_json
 from mitsim.core.imagelist import image_files
 from mitsim.core.images import Numbers, image_pages, read_images
+from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import AmbientFile, CalibrationManifest, Digital, Patterns, RunHead, RunManifest
-from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import AMBIENT, frame_name
 from mitsim.devices.patterns import PatternFamily, parse_patterns
 from mitsim.devices.sensor import SensorModel, digital_of, load_sensor
+from mitsim.exchange.formats import PLANES, RealCapture
 from mitsim.exchange.packed import FACTORS, Packed, pack_calibration
-from mitsim.exchange.real_capture import PLANES, RealCapture
 
 _SECONDS_PER_PIXEL = 1e-7
 """Of an import, which reads every frame twice and writes it once: some 30 s for 256 megapixels on a slow disk."""

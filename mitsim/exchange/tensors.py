@@ -15,9 +15,9 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import whole_file
-from mitsim.core.manifests import SIDES, CalibrationManifest, RunManifest
+from mitsim.core.manifests import SIDES, RunManifest
 from mitsim.core.runs import TRUTH, Capture, load_run
-from mitsim.exchange.packed import FACTORS, Calibration, Coloured, Filtered, Packed, Run, line_of
+from mitsim.exchange.packed import FACTORS, Calibration, Packed, Run
 from mitsim.reconstruct.colour import behind
 
 if TYPE_CHECKING:
@@ -59,12 +59,10 @@ def write_tensors(path: Path, run: Run, calibration: Calibration | None) -> tupl
         tensor.
     """
     torch = extra("torch")
-    if isinstance(run, Packed):
-        arrays = _arrays(run, line_of(calibration, ""))
+    if run.colours is None:
+        arrays = {**_frames(run.parts[""]), **_line(run, calibration, "")}
     else:
-        arrays = (
-            _arrays_behind_filters(run, calibration) if isinstance(run, Filtered) else _join(path, run, calibration)
-        )
+        arrays = _join_lines(path, run, calibration)
         arrays["wavelengths_nm"] = np.array(run.colours.wavelengths_nm)
     with whole_file(path) as part:
         torch.save({name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in arrays.items()}, part)
@@ -84,44 +82,39 @@ def write_deepinv(path: Path, run: Run, calibration: Calibration | None) -> tupl
     return (f"Read it by mitsim.exchange.tensors.load_physics({str(path)!r})",)
 
 
-def _join(path: Path, run: Coloured[RunManifest], calibration: Calibration | None) -> dict[str, FloatArray]:
-    lines = {name: _arrays(run.lines[name], line_of(calibration, name)) for name in run.colours.names}
+def _join_lines(path: Path, run: Run, calibration: Calibration | None) -> dict[str, FloatArray]:
+    """Tensors of all lines: those of frames behind filters, which are of all at once, have no axis of them."""
+    frames = {name: _frames(part) for name, part in run.parts.items()}
+    lines = {name: {**frames.get(name, {}), **_line(run, calibration, name)} for name in run.names}
     first, *others = lines.values()
     for arrays in others:
         if arrays.keys() != first.keys() or any(arrays[key].shape != first[key].shape for key in first):
             raise MitsimError(f"{path}: lines differ in shape; use the format hdf5")
-        if not all(np.array_equal(arrays[key], first[key]) for key in _PATTERNS):
+        if not all(np.array_equal(arrays[key], first[key]) for key in first.keys() & {*_PATTERNS}):
             raise MitsimError(f"{path}: lines differ in their patterns; use the format hdf5")
-    joined = {key: first[key] for key in _PATTERNS}
-    for key in first.keys() - joined.keys():
+    shared = {**frames[""], "weights": np.array(run.filters.weights)} if run.filters else {}
+    for key, values in first.items():
         # The truth has an axis of one channel, which the lines take.
-        joined[key] = (np.concatenate if key == "x" else np.stack)([arrays[key] for arrays in lines.values()])
-    return joined
+        join = np.concatenate if key == "x" else np.stack
+        shared[key] = values if key in _PATTERNS else join([arrays[key] for arrays in lines.values()])
+    return shared
 
 
-def _arrays(run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None) -> dict[str, FloatArray]:
+def _frames(run: Packed[RunManifest]) -> dict[str, FloatArray]:
     shots = Capture(run.manifest, None, {name: run.read(name) for name in dict.fromkeys(run.names)})
-    arrays = {"y": measurements(shots), **dict(zip(_PATTERNS, shots.patterns, strict=True))}
-    if shots.truth is not None:
-        arrays["x"] = shots.truth[None]
-    return arrays if calibration is None else {**arrays, **_sides(calibration)}
+    return {"y": measurements(shots), **dict(zip(_PATTERNS, shots.patterns, strict=True))}
 
 
-def _sides(calibration: Packed[CalibrationManifest]) -> dict[str, FloatArray]:
-    factors = {side: calibration.read(name)[0]["factor"] for side, name in zip(SIDES, FACTORS, strict=True)}
-    return {side: np.asarray(factor, np.float64) for side, factor in factors.items()}
-
-
-def _arrays_behind_filters(run: Filtered, calibration: Calibration | None) -> dict[str, FloatArray]:
-    names = run.colours.names
-    # The truth of the frames is a mixture of the lines', which are given themselves.
-    arrays = {key: values for key, values in _arrays(run.shots, None).items() if key != "x"}
-    arrays["weights"] = np.array(run.colours.weights)
-    if run.truths.keys() >= {*names}:
-        arrays["x"] = np.stack([run.truths[name][0]["reflectance"] for name in names]).astype(np.float64)
-    if isinstance(calibration, Coloured):
-        sides = [_sides(calibration.lines[name]) for name in names]
-        arrays.update({side: np.stack([each[side] for each in sides]) for side in SIDES})
+def _line(run: Run, calibration: Calibration | None, name: str) -> dict[str, FloatArray]:
+    """Truth and factors of a line; truths behind filters where those of all lines are known."""
+    arrays = {}
+    if name in run.parts and TRUTH in run.parts[name].names:
+        arrays["x"] = run.parts[name].read(TRUTH)[0]["reflectance"][None].astype(np.float64)
+    elif run.truths.keys() >= {*run.names}:
+        arrays["x"] = run.truths[name][0]["reflectance"][None].astype(np.float64)
+    if calibration is not None:
+        factors = (calibration.parts[name].read(file)[0]["factor"] for file in FACTORS)
+        arrays.update({side: np.asarray(factor, np.float64) for side, factor in zip(SIDES, factors, strict=True)})
     return arrays
 
 

@@ -17,7 +17,8 @@ import numpy as np
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.effects import names
 from mitsim.core.arrays import FloatArray
-from mitsim.core.resources import Cost, workers
+from mitsim.core.job import Cost
+from mitsim.core.worker import workers
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.plate import FEW, Plate

@@ -13,8 +13,8 @@ import numpy as np
 
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.board import before_board
-from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray, Labels
+from mitsim.core.errors import checked
 from mitsim.core.job import Progress, silent
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer

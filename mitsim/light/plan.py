@@ -8,14 +8,13 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from mitsim.bench.request import Request
-from mitsim.core.arguments import checked
-from mitsim.core.display import table
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import MitsimError, checked
+from mitsim.core.images import table
 from mitsim.core.spectral_manifests import MONO
 from mitsim.light.settings import Estimate, Settings
 
 if TYPE_CHECKING:
-    from mitsim.core.resources import Cost
+    from mitsim.core.job import Cost
 
 State = Literal["exact", "approximate", "off"]
 _REPORTED = (

@@ -21,8 +21,8 @@ from typing import Any, Literal
 import numpy as np
 
 from mitsim.core.arrays import FloatArray, SeparableTerm
+from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import Digital, FactorNoise, RunManifest
-from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import Capture, Measurement
 from mitsim.reconstruct.factorisation import Side
 from mitsim.reconstruct.factors import Factors

@@ -21,18 +21,17 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import locate
 from mitsim.core.environment import versions
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import MitsimError, checked
 from mitsim.core.exr import checksum, verify
 from mitsim.core.files import output_folder
 from mitsim.core.images import image_size, own_end, read_image
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, Digital
 from mitsim.core.parallel import in_threads, single_threaded_blas
-from mitsim.core.resources import workers
+from mitsim.core.worker import workers
 from mitsim.devices.framelist import DarkFile, SessionFrames, StripeFile, load_frames
 from mitsim.devices.patterns import stripe_signs
 from mitsim.devices.sensor import digital_of, load_sensor

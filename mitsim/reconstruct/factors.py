@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray, SeparableTerm
-from mitsim.core.display import card, scaled, span
-from mitsim.core.errors import MitsimError, cut
+from mitsim.core.errors import MitsimError, checked, cut
 from mitsim.core.exr import Channels, Metadata, checksum, finite_channel, read_frame, verify, write_frame
 from mitsim.core.files import output_folder
+from mitsim.core.images import card, scaled, span
 from mitsim.core.manifests import SIDES, CalibrationManifest, FactorNoise, read_manifest, write_manifest
 from mitsim.core.runs import Capture
 from mitsim.devices.patterns import PatternFamily, parse_patterns

@@ -12,15 +12,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from mitsim.core.arguments import checked
 from mitsim.core.arrays import FloatArray
-from mitsim.core.display import card, png, scaled, span
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError, checked
 from mitsim.core.exr import write_frame
 from mitsim.core.files import output_folder, plain, read_json, whole_file, write_json
-from mitsim.core.job import Clock
+from mitsim.core.images import card, png, scaled, span
+from mitsim.core.job import Clock, Cost, Limits
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.core.resources import Cost, Limits
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulation import Accumulation, accumulate, check_factorising
 from mitsim.reconstruct.background import Margin

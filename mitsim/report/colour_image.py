@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,18 +12,18 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.display import card, data_uri, grey_png, lightness, png
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.files import whole_file
+from mitsim.core.images import card, data_uri, grey_png, lightness, png
 from mitsim.core.manifests import CalibrationManifest, read_manifest
-from mitsim.core.spectral_manifests import ColourManifest
+from mitsim.core.spectral_manifests import ColourManifest, write_colours
 from mitsim.devices.chart import ChartPlace
-from mitsim.metrics import Quality, psnr
+from mitsim.metrics import Quality, psnr, summary_of
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
 from mitsim.reconstruct.request import IMAGE_FILE
-from mitsim.report.html import page_figure, render_page, write_html
+from mitsim.report.pages import page_figure, render_page, write_html
 from mitsim.report.plots import BLUE, FONT, GREEN, VERMILION, WIDTH, figure_of, label_axes
 
 
@@ -149,14 +149,21 @@ class ColourImage:
             for number, name in enumerate(known.names)
         )
 
+    @property
+    def patch_means(self) -> list[float | None]:
+        """Means over the patches of Delta E: found, floor, and the truth's; None where there are none."""
+        known = ((getattr(patch, name) for patch in self.patches) for name in ("delta_e", "floor", "truth"))
+        return [mean_of(value for value in values if value is not None) for values in known]
+
     def summary(self) -> dict[str, Any]:
         """For colour.json and the command line's JSON."""
+        found, floor, _ = self.patch_means
         return {
             **self.model.summary(),
             "psnr": self.psnr_db,
             "delta_e": None if self.delta_e is None else float(self.delta_e.mean()),
-            "delta_e_chart": mean_of(patch.delta_e for patch in self.patches),
-            "delta_e_floor": mean_of(patch.floor for patch in self.patches),
+            "delta_e_chart": found,
+            "delta_e_floor": floor,
             "patches": [vars(patch) for patch in self.patches] or None,
         }
 
@@ -167,7 +174,7 @@ class ColourImage:
         if self.delta_e is not None:
             sentences.append(f"Delta E 2000 of a pixel to the truth {self.delta_e.mean():.2f} in the mean")
         if self.patches:
-            mean, floor = (mean_of(getattr(patch, name) for patch in self.patches) for name in ("delta_e", "floor"))
+            mean, floor, _ = self.patch_means
             sentences.append(f"of {len(self.patches)} patches to their spectra {mean:.2f}, floor {floor:.2f}")
         return sentences
 
@@ -208,6 +215,111 @@ def mean_of(values: Iterable[float]) -> float | None:
     return float(np.mean(known)) if known else None
 
 
+# -------- An image in colour with what is known of it, and its files
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedColours:
+    """An image in colour, and how good it and the images of its lines are.
+
+    Attributes
+    ----------
+    colours
+        the image in colour.
+    qualities
+        of each line's image by its name; None without a truth.
+    described
+        sentences on how the images were found.
+    facts
+        the same by name, for the page.
+    warnings
+        what is wrong with the images.
+    seconds
+        by stage.
+    output
+        the folder that holds all.
+    solution
+        numbers of one solve for all lines, by the keys of the command line's JSON; none where each has its own.
+    of_lines
+        numbers of the solve of each line, by its name, where each has its own.
+    """
+
+    colours: ColourImage
+    qualities: Mapping[str, Quality | None]
+    described: Sequence[str]
+    facts: Mapping[str, str]
+    warnings: tuple[str, ...]
+    seconds: Mapping[str, float]
+    output: str
+    solution: Mapping[str, Any] = field(default_factory=dict)
+    of_lines: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    @property
+    def model(self) -> ColourModel:
+        """From reflectances at the lines to colours."""
+        return self.colours.model
+
+    @property
+    def reflectances(self) -> FloatArray:
+        """(n, n', lines) reflectance at each line, 1 = a perfect reflector."""
+        return self.colours.reflectances
+
+    @property
+    def xyz(self) -> FloatArray:
+        """(n, n', 3) CIE XYZ under D65; a perfect reflector has Y = 1."""
+        return self.colours.xyz
+
+    @property
+    def ok(self) -> bool:
+        """Whether the images of all lines can be used as they are."""
+        return not self.warnings
+
+    @property
+    def psnr_db(self) -> float | None:
+        """Of all lines' images together: of the mean of their squared errors; None without a truth."""
+        return self.colours.psnr_db
+
+    @property
+    def sentences(self) -> list[str]:
+        """What the command line says of it."""
+        return [*self.described, *self.colours.sentences]
+
+    def summary(self) -> dict[str, Any]:
+        """All but the pictures, by the keys of the command line's JSON."""
+        known = [found.ssim for found in self.qualities.values() if found and found.ssim]
+        return {
+            **self.solution,
+            "channels": [
+                {**line.model_dump(), **summary_of(self.qualities[line.name]), **self.of_lines.get(line.name, {})}
+                for line in self.colours.lines.channels
+            ],
+            "ssim": mean_of(known),
+            **self.colours.summary(),
+            "status": " ".join(self.warnings) or "Solved: every line's image can be used as it is.",
+            "seconds": dict(self.seconds),
+            "output": self.output,
+        }
+
+    def write(self, folder: Path, **inputs: Any) -> None:
+        """Write the image in colour, its page, and colour.json last, to a ``folder``.
+
+        Parameters
+        ----------
+        folder
+            that holds all.
+        **inputs
+            further entries of colour.json.
+        """
+        self.colours.write(folder)
+        write_page(folder / PAGE, self.colours, self.qualities, self.facts, self.warnings)
+        parts = {key: value for key, value in self.summary().items() if key != "channels"}
+        lines = ColourManifest(kind="colour-image", channels=self.colours.lines.channels)
+        write_colours(folder, lines, **inputs, **parts)
+
+    def _repr_html_(self) -> str:
+        return self.colours._repr_html_()
+
+
 # -------- An image in colour in, one self-contained HTML page out
 
 PAGE = "report.html"
@@ -244,14 +356,15 @@ def write_page(
     MitsimError
         when it cannot be written.
     """
+    seen = {"image": image.xyz} | ({} if image.truth_xyz is None else {"truth": image.truth_xyz})
     text = render_page(
         "colour.html",
         verdict=_verdict(image),
-        pictures=_pictures(image),
+        pictures={name: data_uri(png(linear_srgb(xyz), smallest=_SMALLEST)) for name, xyz in seen.items()},
         lines=[_line(image, number, qualities[name]) for number, name in enumerate(image.lines.names)],
         figures=_figures(image),
         patches=image.patches,
-        means=_means(image.patches),
+        means=image.patch_means,
         matrix=[(axis, [f"{value:.4f}" for value in row]) for axis, row in zip("XYZ", image.model.matrix, strict=True)],
         names=[f"{line.wavelength_nm:g} nm" for line in image.lines.channels],
         model=image.model.summary(),
@@ -268,7 +381,7 @@ def _verdict(image: ColourImage) -> tuple[str, str]:
     """Headline and detail."""
     quality = "" if image.psnr_db is None else f"PSNR of the {len(image.lines.names)} lines: {image.psnr_db:.1f} dB. "
     if image.patches:
-        mean, floor = _means(image.patches)[:2]
+        mean, floor, _ = image.patch_means
         return (
             f"Mean Delta E 2000 of {len(image.patches)} patches: {mean:.2f}",
             f"{quality}The floor is {floor:.2f}: these spectral lines alone, without a camera.",
@@ -276,12 +389,6 @@ def _verdict(image: ColourImage) -> tuple[str, str]:
     if image.delta_e is not None:
         return f"Mean Delta E 2000 to the truth: {image.delta_e.mean():.2f}", f"{quality}Mean over all pixels."
     return f"An image from {len(image.lines.names)} spectral lines", "No truth to compare it with."
-
-
-def _pictures(image: ColourImage) -> dict[str, str]:
-    """Image and truth, as data URIs."""
-    seen = {"image": image.xyz} | ({} if image.truth_xyz is None else {"truth": image.truth_xyz})
-    return {name: data_uri(png(linear_srgb(xyz), smallest=_SMALLEST)) for name, xyz in seen.items()}
 
 
 def _line(image: ColourImage, number: int, quality: Quality | None) -> dict[str, Any]:
@@ -312,13 +419,6 @@ def _figures(image: ColourImage) -> dict[str, tuple[str, int]]:
         title = "Left half: the patch's spectrum in D65. Right half: this image. Number: Delta E 2000"
         drawn["halves"] = halves(names, found, chart().xyz, image.chart.means(image.xyz), title)
     return {name: page_figure(figure) for name, figure in drawn.items()}
-
-
-def _means(patches: Sequence[Patch]) -> tuple[float, float, float | None]:
-    """Means over the patches: found, floor, truth (None without one)."""
-    truths = [patch.truth for patch in patches if patch.truth is not None]
-    found, floor = (np.mean([getattr(patch, name) for patch in patches] or [0.0]) for name in ("delta_e", "floor"))
-    return float(found), float(floor), mean_of(truths)
 
 
 # -------- Colours of a chart's patches in, matplotlib Figures out

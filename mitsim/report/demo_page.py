@@ -18,16 +18,15 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.display import data_uri, grey_png, lightness
 from mitsim.core.errors import MitsimError
+from mitsim.core.images import data_uri, grey_png, lightness
 from mitsim.light.plan import PlanRow
 from mitsim.metrics import Quality
 from mitsim.reconstruct.misfit import chi_square_text
 from mitsim.reconstruct.reconstruct import Reconstruction
 from mitsim.report import plots
-from mitsim.report.html import DASH, figure_uri, reflectance, render_page, sentence, write_html
+from mitsim.report.pages import DASH, Mean, figure_uri, reflectance, render_page, sentence, write_html
 from mitsim.report.plots import FONT, WIDTH, figure_of, panels_of
-from mitsim.report.table import Mean
 
 _PATTERN_CORNER = 40
 """Projector pixels a side that are shown of a pattern, so that single ones can be told apart."""

@@ -14,21 +14,21 @@ same scene, and nearly the same noise, which lambda weighs against each other.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
 from mitsim.core import spectral_manifests
 from mitsim.core.arrays import FloatArray
-from mitsim.core.display import png
 from mitsim.core.exr import write_frame
 from mitsim.core.files import output_folder, read_json, whole_file
+from mitsim.core.images import png
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import MosaicCapture, load_mosaic
-from mitsim.core.spectral_manifests import JOINT, ColourManifest, check_way
+from mitsim.core.spectral_manifests import JOINT, check_way
 from mitsim.devices.chart import ChartPlace
 from mitsim.metrics import Quality
 from mitsim.optics.terms import BestTerm, best_term
@@ -40,100 +40,7 @@ from mitsim.reconstruct.regularisation import automatic_lambda
 from mitsim.reconstruct.request import IMAGE_FILE, check_joint
 from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import prepare
-from mitsim.report.colour_image import PAGE, ColourImage, board_of, write_page
-
-# ---- Images of all lines, and what is said of them ----
-
-
-@dataclass(frozen=True, eq=False)
-class JudgedMosaic:
-    """Images of all lines from frames behind colour filters.
-
-    Attributes
-    ----------
-    colours
-        the image in colour.
-    solved
-        images of the lines, and lambda.
-    way
-        one of :data:`mitsim.core.spectral_manifests.WAYS`.
-    qualities
-        of each line's image by its name; None without a truth.
-    unexplained
-        rms part of the measurements that neither noise nor the factors' noise explains.
-    warnings
-        what is wrong with the images.
-    seconds
-        by stage.
-    output
-        the folder that holds all.
-    """
-
-    colours: ColourImage
-    solved: LineImages
-    way: str
-    qualities: Mapping[str, Quality | None]
-    unexplained: float
-    warnings: tuple[str, ...]
-    seconds: Mapping[str, float]
-    output: str
-
-    @property
-    def ok(self) -> bool:
-        """Whether the images can be used as they are."""
-        return not self.warnings
-
-    def summary(self) -> dict[str, Any]:
-        """All but the pictures, by the keys of the command line's JSON."""
-        known = [found.ssim for found in self.qualities.values() if found and found.ssim]
-        joint = self.solved.joint
-        return {
-            "mosaic": self.way,
-            "channels": [
-                {
-                    **line.model_dump(),
-                    "psnr": (found := self.qualities[line.name]) and found.psnr_db,
-                    "ssim": found and found.ssim,
-                    "truth_error": found and found.truth_error,
-                }
-                for line in self.colours.lines.channels
-            ],
-            "ssim": float(np.mean(known)) if known else None,
-            **self.colours.summary(),
-            "lambda": self.solved.lam,
-            "steps": None if joint is None else joint.iterations,
-            "residual": self.solved.residual,
-            "unexplained": self.unexplained,
-            "status": " ".join(self.warnings) or "Solved: every line's image can be used as it is.",
-            "seconds": dict(self.seconds),
-            "output": self.output,
-        }
-
-    @property
-    def sentences(self) -> list[str]:
-        """What the command line says of it."""
-        each = [f"{name}: {found or 'no truth to compare with'}" for name, found in self.qualities.items()]
-        steps = "" if self.solved.joint is None else f", {self.solved.joint.iterations} steps"
-        summary = (
-            f"{self.way}: lambda {self.solved.lam:.3g}{steps}, residual {self.solved.residual:.1e}, "
-            f"{self.unexplained:.1e} unexplained"
-        )
-        return [*each, summary, *self.colours.sentences]
-
-    @property
-    def facts(self) -> dict[str, str]:
-        """How the images were made, by name."""
-        steps = "" if self.solved.joint is None else f", {self.solved.joint.iterations} steps"
-        return {
-            "frames": "all lines at once, behind colour filters",
-            "solved": f"{self.way}{steps}",
-            "lambda": f"{self.solved.lam:.3g}",
-            "residual of the frames": f"{self.solved.residual:.1e}, of which {self.unexplained:.1e} is unexplained",
-        }
-
-    def _repr_html_(self) -> str:
-        return self.colours._repr_html_()
-
+from mitsim.report.colour_image import ColourImage, JudgedColours, board_of
 
 # ---- From a run to its images ----
 
@@ -147,7 +54,7 @@ def reconstruct_mosaic(
     overwrite: bool = False,
     way: str = JOINT,
     lam: Lambda = "auto",
-) -> JudgedMosaic:
+) -> JudgedColours:
     """Recover the image of every line of a run behind colour filters, and bring them together.
 
     Writes image.exr and image.png in colour and of each line, colour.json and report.html.
@@ -157,7 +64,7 @@ def reconstruct_mosaic(
     run, calibration
         folders of `mitsim capture --colour mosaic` and `mitsim calibrate --colour mosaic`.
     output, chart, overwrite
-        as :func:`mitsim.report.line_images.reconstruct_colours`.
+        as :func:`mitsim.report.quality.reconstruct_colours`.
     way
         one of :data:`mitsim.core.spectral_manifests.WAYS`.
     lam
@@ -168,7 +75,7 @@ def reconstruct_mosaic(
     ------
     MitsimError
         for folders that do not fit each other, a way that there is not, and as
-        :func:`mitsim.report.line_images.reconstruct_colours`.
+        :func:`mitsim.report.quality.reconstruct_colours`.
     """
     started = time.perf_counter()
     check_way(way)
@@ -187,21 +94,30 @@ def reconstruct_mosaic(
             [(each.left, each.right) for each in factors.values()], shots.weights, shots.manifest.mosaic
         )
         solver = solver_of(way, camera, shots.shots.patterns)
-        sums = _add_frames(solver, shots, (len(camera.lefts[0]), len(camera.rights[0])))
+        noise = _add_frames(solver, shots, (len(camera.lefts[0]), len(camera.rights[0])))
         added = time.perf_counter()
         solved = solver.images(lam)
         ended = time.perf_counter()
         board = board_of(calibration, shots.manifest)
         truth = shots.truth(board)
         images = np.moveaxis(solved.images, 0, -1)
-        lines = ColourManifest(kind="colour-image", channels=shots.manifest.channels)
-        unexplained = sums.unexplained(solved.residual, list(factors.values()))
-        found = JudgedMosaic(
-            colours=ColourImage.of(lines, images, board, truth, chart),
-            solved=solved,
-            way=way,
-            qualities=_qualities(shots, images, truth, board),
-            unexplained=unexplained,
+        qualities = _qualities(shots, images, truth, board)
+        unexplained = _unexplained(solved.residual, noise, factors.values())
+        steps = "" if solved.joint is None else f", {solved.joint.iterations} steps"
+        left = f"residual {solved.residual:.1e}, {unexplained:.1e} unexplained"
+        found = JudgedColours(
+            colours=ColourImage.of(shots.manifest, images, board, truth, chart),
+            qualities=qualities,
+            described=[
+                *(f"{name}: {each or 'no truth to compare with'}" for name, each in qualities.items()),
+                f"{way}: lambda {solved.lam:.3g}{steps}, {left}",
+            ],
+            facts={
+                "frames": "all lines at once, behind colour filters",
+                "solved": f"{way}{steps}",
+                "lambda": f"{solved.lam:.3g}",
+                "residual of the frames": f"{solved.residual:.1e}, of which {unexplained:.1e} is unexplained",
+            },
             warnings=_warnings(shots, factors, solved, unexplained),
             seconds={
                 "read": read - started,
@@ -210,8 +126,20 @@ def reconstruct_mosaic(
                 "total": time.perf_counter() - started,
             },
             output=str(folder),
+            solution={
+                "mosaic": way,
+                "lambda": solved.lam,
+                "steps": solved.joint and solved.joint.iterations,
+                "residual": solved.residual,
+                "unexplained": unexplained,
+            },
         )
-        _write(found, folder, options)
+        for name, image in zip(shots.manifest.names, solved.images, strict=True):
+            with output_folder(folder / name, overwrite=True) as place:
+                write_frame(place / IMAGE_FILE, {"reflectance": image.astype(np.float32)}, {"lambda": solved.lam})
+                with whole_file(place / "image.png") as part:
+                    part.write_bytes(png(image))
+        found.write(folder, inputs=options)
     return found
 
 
@@ -230,33 +158,24 @@ def fitting_factors(shots: MosaicCapture, calibration: Path) -> dict[str, Factor
 # ---- Unexplained energy, quality and warnings ----
 
 
-@dataclass(frozen=True)
-class _Energies:
-    """Sums over all data of a run: of their squares, and of their noise's variances."""
-
-    data: float
-    noise: float
-
-    def unexplained(self, residual: float, factors: list[Factors]) -> float:
-        """Part of the data, rms, that a ``residual`` has beyond noise and the noise of ``factors``, lines' own."""
-        own = [each.manifest.noise for each in factors]
-        explained = 0.0
-        for each, noise in zip(factors, own, strict=True):
-            if noise is not None:
-                sides = (noise.left, each.left), (noise.right, each.right)
-                explained = max(explained, sum(s**2 * side.size / float(np.square(side).sum()) for s, side in sides))
-        left = residual**2 - (self.noise / self.data if self.data else 0.0) - explained
-        return float(np.sqrt(max(left, 0.0)))
-
-
-def _add_frames(solver: Solver, shots: MosaicCapture, shape: tuple[int, int]) -> _Energies:
-    """Every frame of ``shots`` (``shape``) added to a ``solver``."""
+def _add_frames(solver: Solver, shots: MosaicCapture, shape: tuple[int, int]) -> float:
+    """Every frame of ``shots`` (``shape``) added to a ``solver``; returns the part of their squares that is noise."""
     data = noise = 0.0
     for each in shots.shots.measured(shape):
         solver.add(each.frame, each.row, each.column)
         data += float(np.square(each.frame).sum())
         noise += float(np.maximum(shots.shots.manifest.digital.variance(each.light, each.shots), 0.0).sum())
-    return _Energies(data, noise)
+    return noise / data if data else 0.0
+
+
+def _unexplained(residual: float, noise: float, factors: Iterable[Factors]) -> float:
+    """Part of the data, rms, that a ``residual`` has beyond ``noise`` and the noise of ``factors``, lines' own."""
+    explained = 0.0
+    for each in factors:
+        if (own := each.manifest.noise) is not None:
+            sides = (own.left, each.left), (own.right, each.right)
+            explained = max(explained, sum(s**2 * side.size / float(np.square(side).sum()) for s, side in sides))
+    return float(np.sqrt(max(residual**2 - noise - explained, 0.0)))
 
 
 def _qualities(
@@ -297,9 +216,6 @@ def _warnings(
     return tuple(warnings)
 
 
-# ---- Files of an image ----
-
-
 def _may_replace(folder: Path, options: Mapping[str, str | float], overwrite: bool) -> bool:
     """Whether a ``folder`` holds an image that may be replaced: ``overwrite``, or of the same inputs ``asked`` for.
 
@@ -310,20 +226,6 @@ def _may_replace(folder: Path, options: Mapping[str, str | float], overwrite: bo
     if not overwrite:
         check_same_inputs(folder, read_json(folder / spectral_manifests.COLOUR), options)
     return True
-
-
-def _write(found: JudgedMosaic, folder: Path, options: Mapping[str, str | float]) -> None:
-    """All files of an image, colour.json last."""
-    for number, name in enumerate(found.colours.lines.names):
-        place, image = folder / name, found.solved.images[number]
-        with output_folder(place, overwrite=True):
-            write_frame(place / IMAGE_FILE, {"reflectance": image.astype(np.float32)}, {"lambda": found.solved.lam})
-            with whole_file(place / "image.png") as part:
-                part.write_bytes(png(image))
-    found.colours.write(folder)
-    write_page(folder / PAGE, found.colours, found.qualities, found.facts, found.warnings)
-    parts = {key: value for key, value in found.summary().items() if key != "channels"}
-    spectral_manifests.write_colours(folder, found.colours.lines, inputs=dict(options), **parts)
 
 
 # ---- A camera under a mosaic of colour filters ----

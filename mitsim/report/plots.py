@@ -19,9 +19,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.display import lightness
-from mitsim.report.html import scientific, typeset
-from mitsim.report.table import Mean
+from mitsim.core.images import lightness
+from mitsim.report.pages import Mean, scientific, typeset
 
 BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 SKY, PURPLE, BLACK = "#56B4E9", "#CC79A7", "#1b1f24"

@@ -1,4 +1,5 @@
-"""`mitsim reconstruct`: a RUN and a CAL folder in, the image written, and compared with the truth if there is one.
+"""`mitsim reconstruct`: a RUN and a CAL folder in, the image written, and compared with the truth if there is one; of
+coloured folders an image of each line, and one in colour.
 
 It stands alone so that an image starts without what pages and figures load.
 """
@@ -8,15 +9,23 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+
+from mitsim.core.errors import MitsimError, checked
 from mitsim.core.files import output_folder
 from mitsim.core.runs import load_run
-from mitsim.metrics import Quality, truth_error_for, truth_for
+from mitsim.core.spectral_manifests import IMAGE, is_coloured, is_mosaic, read_colours, same_lines
+from mitsim.devices.chart import ChartPlace
+from mitsim.metrics import Quality, summary_of, truth_error_for, truth_for
 from mitsim.reconstruct.factors import load_calibration
 from mitsim.reconstruct.reconstruct import Reconstruction, may_replace
 from mitsim.reconstruct.reconstruct import reconstruct as solve
 from mitsim.reconstruct.request import ImageRequest
+
+if TYPE_CHECKING:
+    from mitsim.report.colour_image import JudgedColours
 
 
 @dataclass(frozen=True)
@@ -29,9 +38,7 @@ class Judged:
 
     def summary(self) -> dict[str, Any]:
         """All but the image, by the keys of the command line's JSON."""
-        measured = {"psnr": self.quality and self.quality.psnr_db, "ssim": self.quality and self.quality.ssim}
-        error = self.quality and self.quality.truth_error
-        return {**measured, "truth_error": error, **self.reconstruction.summary(), "output": self.output}
+        return {**summary_of(self.quality), **self.reconstruction.summary(), "output": self.output}
 
 
 def reconstruct(
@@ -75,3 +82,82 @@ def reconstruct(
         )
         judged.reconstruction.write(folder, judged.summary())
     return judged
+
+
+@checked
+def reconstruct_colours(
+    run: Path | str,
+    calibration: Path | str,
+    output: Path | str,
+    chart: ChartPlace | None = None,
+    overwrite: bool = False,
+    **options: Any,
+) -> JudgedColours:
+    """Recover the image of every line of a coloured run, and bring them together.
+
+    Writes the folder of each line's image, image.exr (linear sRGB and XYZ), image.png, report.html and colour.json.
+
+    Parameters
+    ----------
+    run, calibration
+        coloured folders of the same lines.
+    output
+        a folder: new or empty, or with an earlier coloured image of the same inputs.
+    chart
+        where the image shows the chart; the colour matrix is then fitted on it. None: a fixed matrix, fitted on the
+        chart's spectra at the lines.
+    overwrite
+        whether an earlier image of other inputs may be replaced.
+    **options
+        of :func:`reconstruct`, for every line; of a run behind colour filters, ``way`` and
+        ``lam`` as for :func:`mitsim.report.mosaic_images.reconstruct_mosaic`.
+
+    Raises
+    ------
+    MitsimError
+        for folders of different lines, and as :func:`reconstruct`.
+    """
+    from mitsim.report.colour_image import ColourImage, JudgedColours, board_of
+    from mitsim.report.mosaic_images import reconstruct_mosaic
+
+    run, calibration, output = Path(run), Path(calibration), Path(output)
+    if is_mosaic(run):
+        return reconstruct_mosaic(run, calibration, output, chart, overwrite, **options)
+    lines = same_lines(run, calibration)
+    held = is_coloured(output)
+    earlier = held and read_colours(output, IMAGE).names == lines.names
+    with output_folder(output, overwrite=earlier or (overwrite and held)) as folder:
+        images = {
+            name: reconstruct(run / name, calibration / name, folder / name, overwrite=overwrite, **options)
+            for name in lines.names
+        }
+        solved = {name: judged.reconstruction for name, judged in images.items()}
+        shapes = {each.image.shape for each in solved.values()}
+        if len(shapes) > 1:
+            raise MitsimError(f"colour: the lines' images have {sorted(shapes)} pixels; capture all lines in one grid")
+        board, stack = board_of(calibration, lines), np.stack([each.image for each in solved.values()], axis=-1)
+        truths = [truth_for(load_run(run / name), board) for name in lines.names]
+        known = [truth for truth in truths if truth is not None]
+        truth = np.stack(known, axis=-1) if len(known) == len(truths) else None
+        summaries = {name: judged.summary() for name, judged in images.items()}
+        found = JudgedColours(
+            colours=ColourImage.of(lines, stack, board, truth, chart),
+            qualities={name: judged.quality for name, judged in images.items()},
+            described=[
+                f"{name}: {judged.quality or 'no truth to compare with'}, lambda {solved[name].lam:.3g}, residual "
+                f"{solved[name].residual:.1e}"
+                for name, judged in images.items()
+            ],
+            facts={
+                "frames": "one line at a time, a run for each",
+                "solved": "each line by itself",
+                "lambda": ", ".join(f"{name} {each.lam:.3g}" for name, each in solved.items()),
+                "residual of the frames": ", ".join(f"{name} {each.residual:.1e}" for name, each in solved.items()),
+            },
+            warnings=tuple(f"{name}: {each.status}" for name, each in solved.items() if not each.ok),
+            seconds={"total": sum(each["seconds"]["total"] for each in summaries.values())},
+            output=str(folder),
+            of_lines=summaries,
+        )
+        found.write(folder)
+    return found

@@ -10,7 +10,12 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from mitsim.report.plots import FONT, Cost, costs, error_bars
+from mitsim.report.plots import (
+    FONT,
+    Cost,
+    costs,
+    error_bars,
+)
 from mitsim.studies.framework.run import Findings
 
 SOLVER = "mitsim study solver"

@@ -34,10 +34,9 @@ from mitsim.light.light import SampledLight
 from mitsim.reconstruct.estimate_factors import Estimate, decibels
 from mitsim.reconstruct.factors import Factors
 from mitsim.report import plots
-from mitsim.report.html import with_error
 from mitsim.report.lit_scene import LitScene
+from mitsim.report.pages import Mean, Table, with_error
 from mitsim.report.plots import bars
-from mitsim.report.table import Mean, Table
 from mitsim.studies import error_budget
 from mitsim.studies.ablation import ablations, reform
 from mitsim.studies.drift_study import SESSION, DriftStand, squared_error

@@ -29,8 +29,8 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, MODELS
 from mitsim.report.lit_scene import LitScene
+from mitsim.report.pages import Table, Value
 from mitsim.report.plots import curves, image_grid
-from mitsim.report.table import Table, Value
 from mitsim.studies.framework import claims
 from mitsim.studies.framework.claims import Holds, image_array, measure_image
 from mitsim.studies.framework.experiment import PRINT_MM, Claim, Experiment, Found, Point, Results, Scope

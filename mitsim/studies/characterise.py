@@ -25,7 +25,7 @@ from mitsim.core.job import Job
 from mitsim.core.parallel import in_threads
 from mitsim.core.seeds import stream
 from mitsim.devices.sensor import EXPOSURE_S, SensorModel
-from mitsim.report.html import round_to_error, typeset
+from mitsim.report.pages import round_to_error, typeset
 from mitsim.report.plots import BLACK, BLUE, FONT, GREY, ORANGE, VERMILION, WIDTH, figure_of, label_axes
 from mitsim.sensor import emva
 from mitsim.sensor.chain import expose

@@ -32,8 +32,8 @@ from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.request import MARKOV, TIKHONOV
 from mitsim.report import label
 from mitsim.report.colour_image import by_patch, halves
+from mitsim.report.pages import Mean, Table, Value
 from mitsim.report.plots import bars, curves, image_grid
-from mitsim.report.table import Mean, Table, Value
 from mitsim.studies import lit_lines
 from mitsim.studies.framework.claims import difference, every, sample_mean, verdict, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, PageTable, Point, Results, Scope, Setup

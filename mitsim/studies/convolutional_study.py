@@ -37,8 +37,8 @@ from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import prepare
 from mitsim.report import CONVENTIONS, EQUAL_FRAME, EQUAL_PEAK
 from mitsim.report.lit_scene import IdealCamera
+from mitsim.report.pages import Mean, Table, Value
 from mitsim.report.plots import curves
-from mitsim.report.table import Mean, Table, Value
 from mitsim.sensor.chain import dn_to_electrons, electrons_from_irradiance, expose, exposure_for_peak
 from mitsim.studies.framework import claims
 from mitsim.studies.framework.claims import Holds

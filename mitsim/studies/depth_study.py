@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 
 from mitsim.report import EQUAL_PEAK, IDEALISED, RENDERED, label
 from mitsim.report.lit_scene import Plane
+from mitsim.report.pages import Mean, Table, Value
 from mitsim.report.plots import curves
-from mitsim.report.table import Mean, Table, Value
 from mitsim.studies.framework import claims
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope, group_by_setup
 from mitsim.studies.framework.studio import Image, Studio

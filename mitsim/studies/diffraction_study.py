@@ -53,7 +53,7 @@ from mitsim.report.lit_scene import (
     point_profiles,
     shadow_row,
 )
-from mitsim.report.table import Mean
+from mitsim.report.pages import Mean
 from mitsim.studies.ablation import reform
 from mitsim.studies.framework.run import Findings
 

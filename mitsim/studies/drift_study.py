@@ -58,8 +58,8 @@ from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import Prepared
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import NONUNIFORMITY, IdealCamera, LitScene, Unexposed, accumulate
+from mitsim.report.pages import Mean, Table
 from mitsim.report.plots import curves, pair_chart
-from mitsim.report.table import Mean, Table
 from mitsim.sensor.chain import electrons_from_irradiance, ripple_response
 from mitsim.sensor.specimen import specimen
 from mitsim.studies.framework.claims import difference, verdict, within

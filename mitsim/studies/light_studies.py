@@ -23,8 +23,8 @@ from matplotlib.figure import Figure
 from mitsim.devices.patterns import PatternFamily
 from mitsim.report import CONVENTIONS, EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED, in_text, label
 from mitsim.report.lit_scene import DIM, Unexposed
+from mitsim.report.pages import Mean, Table, Value
 from mitsim.report.plots import curves, quality_bars, singular_values
-from mitsim.report.table import Mean, Table, Value
 from mitsim.studies.framework import claims
 from mitsim.studies.framework.claims import Lines, by_patterns, difference, finding, images, verdict, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope

@@ -45,7 +45,7 @@ from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import centre_columns, centre_frame, prepare
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODELS, RENDERED
 from mitsim.report.lit_scene import IdealCamera, LitScene, Pair, Unexposed
-from mitsim.report.table import Table
+from mitsim.report.pages import Table
 from mitsim.studies.framework import claims
 from mitsim.studies.framework.claims import Lines, image_array, images
 from mitsim.studies.framework.experiment import QUICK_IMAGES, Claim, Experiment, Found, Point, Results, Scope

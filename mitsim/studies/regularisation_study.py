@@ -16,8 +16,8 @@ from mitsim.metrics import psnr
 from mitsim.reconstruct.solvers import solve_tv
 from mitsim.report import EQUAL_FRAME, MODELS, in_text, label
 from mitsim.report.lit_scene import LAMBDAS
+from mitsim.report.pages import Table
 from mitsim.report.plots import quality_bars
-from mitsim.report.table import Table
 from mitsim.studies.framework import claims
 from mitsim.studies.framework.claims import Holds
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope

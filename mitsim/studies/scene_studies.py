@@ -47,8 +47,8 @@ from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.report import EQUAL_PEAK, RENDERED, label
 from mitsim.report.lit_scene import LitScene, Unexposed, peak_time
+from mitsim.report.pages import Mean, Table, Value
 from mitsim.report.plots import curves, image_grid
-from mitsim.report.table import Mean, Table, Value
 from mitsim.sensor.moments import frame_moments
 from mitsim.studies.framework import claims
 from mitsim.studies.framework.claims import Holds

@@ -43,7 +43,7 @@ from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.factorisation import Method, Structure
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.report import plots
-from mitsim.report.html import typeset
+from mitsim.report.pages import typeset
 from mitsim.studies.framework.run import Findings
 
 

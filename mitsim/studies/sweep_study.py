@@ -9,9 +9,8 @@ from itertools import product
 from matplotlib.figure import Figure
 
 from mitsim.report import EQUAL_PEAK, RENDERED
-from mitsim.report.html import DASH, scientific
+from mitsim.report.pages import DASH, Table, Value, scientific
 from mitsim.report.plots import curves
-from mitsim.report.table import Table, Value
 from mitsim.studies.framework.claims import measure_image
 from mitsim.studies.framework.experiment import (
     KNOBS,

@@ -47,8 +47,8 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solution import Status, Verdict
 from mitsim.report.lit_scene import IdealCamera, LitScene
+from mitsim.report.pages import Mean, Table
 from mitsim.report.plots import BLUE, FONT, GREEN, GREY, PALE, ROW, VERMILION, image_grid, label_axes, panels_of
-from mitsim.report.table import Mean, Table
 from mitsim.studies import ablation
 from mitsim.studies.ablation import Ablation
 from mitsim.studies.framework.claims import TOLERANCE_DB, difference, single_precision, verdict, within

@@ -14,7 +14,7 @@ from mitsim.core.files import write_json, write_text
 from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.exchange.formats import export_run, import_file
 from mitsim.exchange.png_files import draw_family
-from mitsim.report.table import Table
+from mitsim.report.pages import Table
 from mitsim.studies.framework.experiment import Found, Point, Setup
 from mitsim.studies.framework.run import Store
 from tests.exchanged import Made, made

@@ -287,7 +287,7 @@ def test_factors_that_do_not_fit_the_memory_are_refused(
     bench: Callable[..., tuple[Path, Path]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folders = bench()
-    monkeypatch.setattr("mitsim.core.resources.free_memory", lambda: 1e4)
+    monkeypatch.setattr("mitsim.core.job.free_memory", lambda: 1e4)
     with pytest.raises(MitsimError, match=r"factorising its patterns: would take about 0\.0625 MiB of memory"):
         image_of(*folders)
     assert not (folders[0] / "image").exists()

@@ -26,7 +26,7 @@ from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.files import read_json, sweep, write_json
 from mitsim.core.job import Job
-from mitsim.core.resources import workers
+from mitsim.core.worker import workers
 from mitsim.studies import ALL, EXPERIMENTS, PAPER
 from mitsim.studies.framework.experiment import HEADS, Claim, Experiment, Found, Point, Scope, find_experiment
 from mitsim.studies.framework.run import POINTS, Shard, Store, batches, check_study_folder, study_folder, write_figures

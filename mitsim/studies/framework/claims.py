@@ -17,8 +17,8 @@ from scipy.special import stdtrit
 
 from mitsim.core.arrays import FloatArray
 from mitsim.report import EQUAL_PEAK, IDEALISED, MODELS, RENDERED, label
+from mitsim.report.pages import Mean, Table, Value
 from mitsim.report.plots import Curve, curves, image_grid
-from mitsim.report.table import Mean, Table, Value
 from mitsim.studies.framework.experiment import IMAGE, QUICK_IMAGES, Claim, Found, Point, Results
 from mitsim.studies.framework.studio import Studio
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from mitsim.core.arrays import FloatArray
-    from mitsim.report.table import Table, Value
+    from mitsim.report.pages import Table, Value
 
 # -------- Where a study measures: setups, whose points share light and calibration, and points
 

@@ -12,7 +12,7 @@ from textwrap import wrap
 from matplotlib.figure import Figure
 
 from mitsim.core.environment import versions
-from mitsim.report.html import page_figure, render_page, write_html
+from mitsim.report.pages import page_figure, render_page, write_html
 from mitsim.studies.framework.experiment import KNOBS, TEST_IMAGES, Claim, Experiment, PageTable, Results, Scope, Setup
 
 _NUMBER = re.compile(r"[+-]?\d|nothing$")

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from mitsim.api.bench import Bench
-    from mitsim.report.table import Table
+    from mitsim.report.pages import Table
     from mitsim.studies.framework.page import Part
 
 
@@ -195,7 +195,7 @@ class Store:
 
     def load(self, point: Point) -> Found:
         """What was found at a ``point``; MitsimError when the file is damaged."""
-        from mitsim.core.arrayfile import read_npz
+        from mitsim.core.arrays import read_npz
 
         path = self._file(point)
         try:
@@ -222,7 +222,7 @@ class Store:
 
     def results(self, points: Iterable[Point]) -> Results:
         """Everything found at ``points``, in their order."""
-        from mitsim.report.table import Table
+        from mitsim.report.pages import Table
 
         found = {point.key: self.load(point) for point in points}
         rows = tuple({**row, "point": key} for key, each in found.items() for row in each.rows)

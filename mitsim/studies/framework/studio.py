@@ -27,7 +27,7 @@ from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solution import Status
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import LitScene, Unexposed
-from mitsim.report.table import Value
+from mitsim.report.pages import Value
 from mitsim.studies.framework.experiment import Point, Setup, picture
 
 Kept = TypeVar("Kept")

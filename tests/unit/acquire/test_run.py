@@ -18,8 +18,7 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.request import Exposure, Request
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.exr import checksum, read_frame
-from mitsim.core.job import Job
-from mitsim.core.resources import Limits
+from mitsim.core.job import Job, Limits
 from mitsim.core.runs import Capture
 from mitsim.devices.patterns import parse_patterns
 from mitsim.devices.session import load_recipe
@@ -496,7 +495,7 @@ def test_a_resumed_run_needs_room_for_its_missing_frames_only(
     captured: Capture, bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nine frames take 0.3 MB; with all of them there, 0.06 MB are enough."""
-    monkeypatch.setattr("mitsim.core.resources.free_disk", lambda _: 6e4)
+    monkeypatch.setattr("mitsim.core.job.free_disk", lambda _: 6e4)
     with pytest.raises(MitsimError, match="would write about"):
         bench.capture("dots:3", tmp_path / "new", accuracy=ACCURACY, seed=5)
     folder = Path(shutil.copytree(captured.folder, tmp_path / "run"))

@@ -10,8 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from mitsim.core.arguments import checked, checked_fields
-from mitsim.core.errors import ArgumentError
+from mitsim.core.errors import ArgumentError, checked, checked_fields
 
 Alias = Literal["a", "b"] | int
 

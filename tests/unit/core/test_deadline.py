@@ -10,8 +10,7 @@ from collections.abc import Callable
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.job import Job, within
-from mitsim.core.resources import Limits
+from mitsim.core.job import Job, Limits, within
 from mitsim.core.worker import OutOfTime
 
 LIMIT, LATE, END = 0.1, 5.0, 10.0

@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 import pytest
 
-from mitsim.core.arrayfile import whole_hdf5
+from mitsim.core.arrays import whole_hdf5
 from mitsim.core.errors import MitsimError
 
 NOISE = np.random.default_rng(3).integers(0, 256, 40_000, np.uint8)

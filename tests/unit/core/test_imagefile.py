@@ -341,6 +341,6 @@ def test_no_picture_is_mapped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 def test_a_picture_beyond_free_memory_is_refused_by_its_header(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Sparse files cost nothing on disk."""
     np.lib.format.open_memmap(tmp_path / "a.npy", "w+", np.float64, (8000, 8000)).flush()
-    monkeypatch.setattr("mitsim.core.resources.free_memory", lambda: 2**30)
+    monkeypatch.setattr("mitsim.core.job.free_memory", lambda: 2**30)
     with pytest.raises(MitsimError, match=r"a\.npy: would take about .* GiB of memory; allowed are 922 MiB"):
         read_image(tmp_path / "a.npy")

@@ -5,7 +5,7 @@ import io
 import numpy as np
 from PIL import Image
 
-from mitsim.core.display import card, png, scaled, span, table
+from mitsim.core.images import card, png, scaled, span, table
 
 
 def opened(data: bytes) -> np.ndarray:

@@ -11,9 +11,9 @@ from types import SimpleNamespace
 import psutil
 import pytest
 
-from mitsim.core import resources
+from mitsim.core import job
 from mitsim.core.errors import MitsimError
-from mitsim.core.resources import Cost, Limits, free_disk, free_memory
+from mitsim.core.job import Cost, Limits, free_disk, free_memory
 
 
 def refusal(cost: Cost, limits: Limits, output: Path | None = None) -> str:
@@ -38,7 +38,7 @@ def test_an_estimate_that_is_no_number_is_too_much() -> None:
 
 
 def test_free_memory_is_a_limit_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resources, "free_memory", lambda: 1e9)
+    monkeypatch.setattr(job, "free_memory", lambda: 1e9)
     Cost(memory_bytes=0.89e9).check("dots:7", Limits(memory_bytes=1e15))
     refusal(Cost(memory_bytes=0.91e9), Limits(memory_bytes=1e15))
 
@@ -51,7 +51,7 @@ def test_a_control_group_counts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
     (tmp_path / "memory.max").write_text(f"{2 * 2**30}\n")
     (tmp_path / "memory.current").write_text(f"{2**29 + 2**28}\n")
     (tmp_path / "memory.stat").write_text(f"anon {2**29}\ninactive_file {2**28}\n")
-    monkeypatch.setattr(resources, "_CGROUPS", ((tmp_path, *resources._CGROUPS[0][1:]),))
+    monkeypatch.setattr(job, "_CGROUPS", ((tmp_path, *job._CGROUPS[0][1:]),))
     monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=10 * 2**30))
     assert free_memory() == 1.5 * 2**30
     (tmp_path / "memory.max").write_text("max\n")
@@ -59,7 +59,7 @@ def test_a_control_group_counts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
 
 
 def test_the_limit_of_the_process_counts() -> None:
-    program = "from mitsim.core.resources import free_memory; print(free_memory())"
+    program = "from mitsim.core.job import free_memory; print(free_memory())"
 
     def bound() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (2**30, 2**30))
@@ -86,4 +86,4 @@ def test_the_disk_of_a_place_that_is_not_there_yet(tmp_path: Path, monkeypatch: 
 def test_the_seconds_since_the_start_are_those_of_psutil_to_its_whole_second() -> None:
     """psutil adds the time of boot, of which Linux tells whole seconds: up to one more than it was."""
     by_psutil = time.time() - psutil.Process().create_time()
-    assert -0.1 < by_psutil - resources.running_seconds() < 1.1  # 0.1: a tick, and the time between both
+    assert -0.1 < by_psutil - job.running_seconds() < 1.1  # 0.1: a tick, and the time between both

@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from mitsim.core import worker
-from mitsim.core.resources import workers
+from mitsim.core.worker import workers
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="one process where there is no fork")
 

@@ -16,10 +16,9 @@ from scipy.io import loadmat, savemat
 import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.exchange import tensors
-from mitsim.exchange.formats import export_run, import_file
+from mitsim.exchange.formats import RealCapture, export_run, import_file
 from mitsim.exchange.hdf5 import open_hdf5
 from mitsim.exchange.real import import_frames
-from mitsim.exchange.real_capture import RealCapture
 from tests.exchanged import COLUMNS, ROWS, SCENE, Made, bytes_of, made
 from tests.unit.exchange.test_real import known
 

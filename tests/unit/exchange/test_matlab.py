@@ -14,10 +14,10 @@ import pytest
 from scipy.io import loadmat, savemat, whosmat
 
 import mitsim as ms
+from mitsim.core import arrays
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame
 from mitsim.exchange import matlab
-from mitsim.exchange import matlab as matlab_file
 from mitsim.exchange.formats import export_run, import_file
 from tests.exchanged import COLUMNS, DIGITAL, ROWS, SCENE, Made, bytes_of, made
 
@@ -174,7 +174,7 @@ def test_files_that_are_none_are_refused_and_no_folder_is_left(tmp_path: Path) -
 
 
 def test_a_run_larger_than_such_a_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(matlab_file, "LARGEST_VARIABLE", 1000)
+    monkeypatch.setattr(arrays, "LARGEST_VARIABLE", 1000)
     with pytest.raises(MitsimError, match=r"data_coded takes .* hdf5"):
         export_run(made(tmp_path).run, "mat", tmp_path / "all.mat")
     assert not (tmp_path / "all.mat").exists()
@@ -253,14 +253,14 @@ def test_what_is_no_array_is_not_looked_into(tmp_path: Path, packed: bool) -> No
         matrix(b"scarce", 5, (1, 1), NUMBER),
     )
     (tmp_path / "a.mat").write_bytes(mat(*others, matrix(b"P1b", 6, (1, 1), NUMBER), packed=packed))
-    assert {
-        name: value for name, value in matlab_file.read_variables(tmp_path / "a.mat").items() if name[0] != "_"
-    } == {"P1b": [[2.5]]}
+    assert {name: value for name, value in arrays.read_variables(tmp_path / "a.mat").items() if name[0] != "_"} == {
+        "P1b": [[2.5]]
+    }
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_arrays_are_listed_as_scipy_lists_them(tmp_path: Path, order: str) -> None:
-    arrays = {
+    known = {
         "a": np.arange(6.0).reshape(2, 3),
         "text": "one \u00b5m",
         "small": np.int8([[3]]),
@@ -269,15 +269,13 @@ def test_arrays_are_listed_as_scipy_lists_them(tmp_path: Path, order: str) -> No
         "none": np.zeros((0, 4)),
     }
     for packed in (False, True):
-        savemat(tmp_path / "a.mat", arrays, do_compression=packed, long_field_names=True)
-        found = matlab_file.read_variables(tmp_path / "a.mat")
+        savemat(tmp_path / "a.mat", known, do_compression=packed, long_field_names=True)
+        found = arrays.read_variables(tmp_path / "a.mat")
         assert {name for name in found if name[:2] != "__"} == {name for name, *_ in whosmat(tmp_path / "a.mat")}
-        assert all(
-            np.array_equal(found[name], np.atleast_2d(value)) or name == "text" for name, value in arrays.items()
-        )
+        assert all(np.array_equal(found[name], np.atleast_2d(value)) or name == "text" for name, value in known.items())
     number = element(9, struct.pack(f"{order}d", 2.5), order)
     (tmp_path / "b.mat").write_bytes(mat(matrix(b"P1b", 6, (1, 1), number, order=order), order=order))
-    assert matlab_file.read_variables(tmp_path / "b.mat")["P1b"] == [[2.5]]
+    assert arrays.read_variables(tmp_path / "b.mat")["P1b"] == [[2.5]]
 
 
 @pytest.mark.parametrize("packed", [False, True])
@@ -310,6 +308,6 @@ def test_a_packed_bomb_is_refused_by_what_it_claims(tmp_path: Path, monkeypatch:
     sides = {f"{stem}b": np.zeros((1 << 10, 1 << 10)) for stem in ("P1", "Q1")}
     savemat(tmp_path / "a.mat", sides, do_compression=True)
     assert (tmp_path / "a.mat").stat().st_size < 1 << 15
-    monkeypatch.setattr("mitsim.core.resources.free_memory", lambda: 2**25)
+    monkeypatch.setattr("mitsim.core.job.free_memory", lambda: 2**25)
     with pytest.raises(MitsimError, match=r"a\.mat: would take about 48 MiB of memory; allowed are 28.8 MiB"):
         import_file(tmp_path / "a.mat", None, tmp_path / "cal", "b")

@@ -21,9 +21,8 @@ from mitsim.core.exr import write_frame
 from mitsim.core.imagelist import Raw, Wanted
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.exchange import real
-from mitsim.exchange.formats import export_run
+from mitsim.exchange.formats import RealCapture, export_run
 from mitsim.exchange.real import LEFT_OUT, import_frames
-from mitsim.exchange.real_capture import RealCapture
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solution import Status, Verdict
 from tests.exchanged import COLUMNS, DIGITAL, ROWS, SCENE, Made, made

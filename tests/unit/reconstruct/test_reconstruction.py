@@ -13,8 +13,8 @@ import pytest
 import mitsim.reconstruct
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame
+from mitsim.core.job import Cost
 from mitsim.core.manifests import CalibrationManifest, Digital, Patterns, RunHead, RunManifest
-from mitsim.core.resources import Cost
 from mitsim.core.runs import Capture, Recorder, frame_name, load_run
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct import request

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from mitsim.report.pages import Mean
 from mitsim.report.plots import bars, curves, image_grid, pair_chart
-from mitsim.report.table import Mean
 
 
 def test_curves_are_in_the_order_of_their_numbers() -> None:

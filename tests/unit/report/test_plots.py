@@ -9,8 +9,7 @@ from itertools import product
 import numpy as np
 
 from mitsim.report import demo_page, plots
-from mitsim.report.html import typeset
-from mitsim.report.table import Mean
+from mitsim.report.pages import Mean, typeset
 from mitsim.studies import diffraction_study, solver_study
 from mitsim.studies.diffraction_study import ASSUMED, SEPARABLE, QualityRow
 from mitsim.studies.solver_study import LAMBDAS, LAYOUTS, METHODS, PRECISIONS, SolverRow

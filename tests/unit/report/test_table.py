@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.report.table import Mean, Table
+from mitsim.report.pages import Mean, Table
 
 ROWS = tuple(
     {"model": model, "patterns": patterns, "psnr_db": value, "seed": seed}

@@ -2,7 +2,7 @@
 
 import pytest
 
-from mitsim.report.html import round_to_error, scientific, sentence, typeset, with_error
+from mitsim.report.pages import round_to_error, scientific, sentence, typeset, with_error
 
 TIMES, MICRO = "\N{MULTIPLICATION SIGN}", "\N{GREEK SMALL LETTER MU}"
 

@@ -246,7 +246,7 @@ def test_a_zip_bomb_is_refused_before_it_is_unpacked(
     file = sorted((tmp_path / "out" / "points").iterdir())[0]
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
         packed.writestr("rows.npy", npy_header((1 << 25,), "|u1") + bytes(1 << 25))
-    monkeypatch.setattr("mitsim.core.resources.free_memory", lambda: 2**26)
+    monkeypatch.setattr("mitsim.core.job.free_memory", lambda: 2**26)
     with pytest.raises(MitsimError, match=f"{file.name}: would take about 64 MiB of memory"):
         run()
 

@@ -15,9 +15,8 @@ from mitsim.core.exr import read_frame
 from mitsim.core.runs import load_run
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
 from mitsim.reconstruct.factors import load_calibration
-from mitsim.report.line_images import reconstruct_colours
 from mitsim.report.lit_scene import LitScene
-from mitsim.report.quality import reconstruct
+from mitsim.report.quality import reconstruct, reconstruct_colours
 from mitsim.studies.lit_lines import LitLine, serving
 from tests.coloured import LINES, PLACE, folders
 
@@ -43,12 +42,11 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def test_each_line_is_solved_as_it_is_alone(pair: tuple[Path, Path], tmp_path: Path) -> None:
     run, calibration = pair
     found = reconstruct_colours(run, calibration, tmp_path / "image", lam=1e3)
-    for index, (name, judged) in enumerate(found.images.items()):
+    for index, name in enumerate(found.qualities):
         alone = reconstruct(run / name, calibration / name, tmp_path / name, 1e3).reconstruction
-        assert np.array_equal(judged.reconstruction.image, alone.image) and alone.lam == 1e3, "options are passed on"
-        assert np.array_equal(found.reflectances[..., index], alone.image)
+        assert np.array_equal(found.reflectances[..., index], alone.image) and alone.lam == 1e3, "options are passed on"
         assert (tmp_path / "image" / name / "result.json").is_file()
-    errors = [10 ** (-judged.quality.psnr_db / 10) for judged in found.images.values() if judged.quality]
+    errors = [10 ** (-quality.psnr_db / 10) for quality in found.qualities.values() if quality]
     assert found.psnr_db == pytest.approx(-10 * np.log10(np.mean(errors)))
 
 
@@ -151,7 +149,7 @@ def test_the_board_counts_with_its_reflectance(pair: tuple[Path, Path], tmp_path
     run, calibration = pair
     plain = reconstruct_colours(run, calibration, tmp_path / "plain")
     shutil.copytree(calibration, tmp_path / "cal")
-    for name in plain.images:
+    for name in plain.qualities:
         path = tmp_path / "cal" / name / "manifest.json"
         path.write_text(json.dumps({**json.loads(path.read_text()), "board_reflectance": 0.8}))
     found = reconstruct_colours(run, tmp_path / "cal", tmp_path / "image")

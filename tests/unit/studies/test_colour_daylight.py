@@ -12,7 +12,7 @@ from mitsim.core.configuration import load_model, locate
 from mitsim.devices.chart import ChartPlace
 from mitsim.devices.patterns import parse_patterns
 from mitsim.devices.sensor import SensorModel
-from mitsim.report.table import Mean, Table
+from mitsim.report.pages import Mean, Table
 from mitsim.studies import colour_study
 from mitsim.studies.colour_study import BY_LUX, LEAST, METHODS, kept_lx, ladder_claim
 from mitsim.studies.framework.claims import UNDECIDED

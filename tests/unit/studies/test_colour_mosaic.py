@@ -13,8 +13,8 @@ from mitsim.core.runs import load_mosaic
 from mitsim.core.spectral_manifests import HALF, JOINT, WAYS, check_way
 from mitsim.metrics import psnr
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e
-from mitsim.report.line_images import reconstruct_colours
-from mitsim.report.mosaic_images import JudgedMosaic
+from mitsim.report.colour_image import JudgedColours
+from mitsim.report.quality import reconstruct_colours
 from tests.coloured import LINES, PLACE, WEIGHTS, mosaic_folders, scenes
 from tests.unit.studies.test_colour_by_line import main
 
@@ -26,10 +26,8 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return mosaic_folders(tmp_path_factory.mktemp("mosaic"))
 
 
-def solved(pair: tuple[Path, Path], output: Path, **options: object) -> JudgedMosaic:
-    found = reconstruct_colours(*pair, output, **options)  # type: ignore[arg-type]
-    assert isinstance(found, JudgedMosaic)
-    return found
+def solved(pair: tuple[Path, Path], output: Path, **options: object) -> JudgedColours:
+    return reconstruct_colours(*pair, output, **options)  # type: ignore[arg-type]
 
 
 def test_the_folder_holds_what_was_saved(pair: tuple[Path, Path]) -> None:
@@ -43,9 +41,9 @@ def test_the_folder_holds_what_was_saved(pair: tuple[Path, Path]) -> None:
 def test_lines_come_apart_and_have_their_colours(pair: tuple[Path, Path], tmp_path: Path) -> None:
     found = solved(pair, tmp_path / "image", chart=PLACE)
     for number, (name, truth) in enumerate(scenes().items()):
-        assert psnr(found.solved.images[number], truth) > 30
+        assert psnr(found.colours.images[..., number], truth) > 30
         kept = read_frame(tmp_path / "image" / name / "image.exr")[0]["reflectance"]
-        assert np.allclose(kept, found.solved.images[number], atol=1e-6)
+        assert np.allclose(kept, found.colours.images[..., number], atol=1e-6)
     floor = delta_e(ColourModel.of_lines(LINES).xyz(chart().at(LINES)), chart().xyz)
     told = json.loads((tmp_path / "image" / "colour.json").read_text())
     assert told["kind"] == "colour-image" and told["mosaic"] == "joint" and told["psnr"] == found.colours.psnr_db
@@ -69,7 +67,7 @@ def test_the_joint_solve_is_best_where_each_line_has_a_camera_of_its_own(
         quality[way] = found.colours.psnr_db
         assert quality[way] is not None
         ladder = [
-            solved(pair, tmp_path / way, way=way, lam=found.solved.lam * step, overwrite=True).colours.psnr_db
+            solved(pair, tmp_path / way, way=way, lam=found.solution["lambda"] * step, overwrite=True).colours.psnr_db
             for step in (0.1, 0.3, 3.0, 10.0)
         ]
         assert quality[way] > max(ladder) - 0.5, (way, quality, ladder)
@@ -83,7 +81,7 @@ def test_an_image_of_other_inputs_is_kept(pair: tuple[Path, Path], tmp_path: Pat
     with pytest.raises(MitsimError, match=r"other inputs \(mosaic differ\)"):
         solved(pair, tmp_path / "image", way=HALF)
     assert json.loads(before)["inputs"] == json.loads((tmp_path / "image" / "colour.json").read_text())["inputs"]
-    assert solved(pair, tmp_path / "image", way=HALF, overwrite=True).way == HALF
+    assert solved(pair, tmp_path / "image", way=HALF, overwrite=True).solution["mosaic"] == HALF
 
 
 def test_a_real_camera_has_no_truth(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from mitsim.devices.chart import load_chart
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e
-from mitsim.report.table import Table
+from mitsim.report.pages import Table
 from mitsim.studies import colour_study
 from mitsim.studies.framework.experiment import Point, Results, Scope, Setup, find_experiment
 from mitsim.studies.framework.run import batches

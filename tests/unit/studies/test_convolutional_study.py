@@ -6,7 +6,7 @@ import pytest
 
 from mitsim.acquire.reference import rendered_psf
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK
-from mitsim.report.table import Table
+from mitsim.report.pages import Table
 from mitsim.studies.framework.experiment import Results, Scope, Setup, find_experiment
 
 EXPERIMENT = find_experiment("convolutional")

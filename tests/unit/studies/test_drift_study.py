@@ -19,7 +19,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.session import DRIFT_UNITS, Drift, load_recipe
 from mitsim.report import RENDERED
 from mitsim.report.lit_scene import LitScene
-from mitsim.report.table import Table
+from mitsim.report.pages import Table
 from mitsim.studies.drift_study import SESSION, DriftStand, Outcome, _move_projector
 from mitsim.studies.framework.experiment import Results, Scope, Setup, find_experiment
 from mitsim.studies.framework.studio import Studio

@@ -9,7 +9,7 @@ from typing import Any, cast
 import pytest
 
 from mitsim.devices.camera import CameraGeometry
-from mitsim.report.table import Table, Value
+from mitsim.report.pages import Table, Value
 from mitsim.studies import models_study
 from mitsim.studies.framework.experiment import Results, Scope, Setup, find_experiment
 

@@ -9,7 +9,7 @@ import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.report import MODELS
-from mitsim.report.table import Table
+from mitsim.report.pages import Table
 from mitsim.studies import EXPERIMENTS, PAPER
 from mitsim.studies.framework.campaign import Where, run_experiment
 from mitsim.studies.framework.claims import UNDECIDED, image_rows, judge_claim, psnr_claim

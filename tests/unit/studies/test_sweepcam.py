@@ -18,7 +18,7 @@ from mitsim.devices.session import load_recipe
 from mitsim.optics.frames import Frame
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODELS
 from mitsim.report.lit_scene import IdealCamera, LitScene
-from mitsim.report.table import Table
+from mitsim.report.pages import Table
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.studies.framework.experiment import Results, Setup, find_experiment
 from mitsim.studies.framework.studio import Studio

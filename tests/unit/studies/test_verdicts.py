@@ -10,7 +10,7 @@ import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED
-from mitsim.report.table import Mean, Table, Value
+from mitsim.report.pages import Mean, Table, Value
 from mitsim.studies import drift_study
 from mitsim.studies.framework.claims import (
     CONFIRMED,

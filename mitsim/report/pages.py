@@ -1,19 +1,30 @@
-"""What every page is made by: a template and what it shows in, one self-contained HTML file out."""
+"""What people read: rows of a study in, means with standard errors and a tidy CSV file out; numbers as text; a template
+and what it shows in, one self-contained HTML page out.
+
+Processes that measure points load this and neither templates nor figures.
+"""
 
 from __future__ import annotations
 
+import csv
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from matplotlib.figure import Figure
+import numpy as np
 
-from mitsim.core.display import data_uri
+from mitsim.core.errors import MitsimError
 from mitsim.core.files import whole_file
+from mitsim.core.images import data_uri
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# -------- Pages
 
 _DPI, _SHOWN_DPI = 220, 110
 """Figures are 8.6 inches wide at most: 946 pixels of the page, in two dots each."""
@@ -31,6 +42,8 @@ def render_page(template: str, filters: Mapping[str, Callable[..., str]] | None 
     **shown
         what it shows, by the names that it has there; one that is missing is an error.
     """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
     loader = PackageLoader("mitsim.report")
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -171,3 +184,86 @@ def _power(found: re.Match[str]) -> str:
         return f"{float(found[0]):.{max(len(mantissa.partition('.')[2]) - exponent, 0)}f}"
     power = f"10{str(exponent).translate(_SUPERSCRIPT)}"
     return power if float(mantissa) == 1 and "." not in mantissa else f"{mantissa}{_TIMES}{power}"
+
+
+# -------- Rows of a study in, their means out
+
+Value = str | int | float | bool | None
+_SEEN = 0.05
+"""Error from which one place shows it: less would be 0.0, which is no error."""
+
+
+class Mean(NamedTuple):
+    """A mean, its standard error (NaN of a single value), and how many values it is of."""
+
+    value: float
+    error: float
+    of: int
+
+    def __str__(self) -> str:
+        return format(self)
+
+    def __format__(self, sign: str) -> str:
+        """With its error; ``sign`` is "+" for a number that always shows its own."""
+        if math.isnan(self.error):
+            return f"{self.value:{sign}.1f}"
+        places = 1 if self.error >= _SEEN else 2
+        return f"{self.value:{sign}.{places}f} \N{PLUS-MINUS SIGN} {self.error:.{places}f}"
+
+    @classmethod
+    def of_numbers(cls, numbers: Sequence[float], what: str) -> Mean:
+        """Of independent ``numbers``; MitsimError that nothing was measured of ``what`` where there are none."""
+        if not numbers:
+            raise MitsimError(f"study: nothing was measured of {what}")
+        array = np.array(numbers)
+        error = float(array.std(ddof=1) / math.sqrt(len(array))) if len(array) > 1 else math.nan
+        return cls(float(array.mean()), error, len(array))
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of named values, one for each thing measured; a value that a row does not have is None."""
+
+    rows: tuple[Mapping[str, Value], ...]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of all values, in the order of first use."""
+        return tuple(dict.fromkeys(name for row in self.rows for name in row))
+
+    def where(self, **values: Value) -> Table:
+        """Rows that have these ``values``."""
+        return Table(tuple(row for row in self.rows if all(row.get(name) == value for name, value in values.items())))
+
+    def distinct(self, name: str) -> list[Any]:
+        """Different values of the column ``name``, in the order of first use."""
+        return list(dict.fromkeys(row[name] for row in self.rows if row.get(name) is not None))
+
+    def mean(self, name: str, **values: Value) -> Mean:
+        """Mean of the column ``name`` over rows with these ``values``.
+
+        MitsimError where there is none.
+        """
+        wanted = ", ".join(f"{key} = {value}" for key, value in values.items())
+        return Mean.of_numbers(self.numbers(name, **values), f"{name} with {wanted}" if wanted else name)
+
+    def numbers(self, name: str, **values: Value) -> list[float]:
+        """Column ``name`` of the rows with these ``values``, where it has a number."""
+        chosen = self.where(**values).rows
+        return [float(value) for row in chosen if isinstance(value := row.get(name), (int, float))]
+
+    def means(self, name: str, by: str) -> dict[Any, Mean]:
+        """:meth:`mean` of the column ``name`` for each value of the column ``by`` that it has numbers at."""
+        return {
+            value: self.mean(name, **{by: value}) for value in self.distinct(by) if self.numbers(name, **{by: value})
+        }
+
+    def write(self, path: Path) -> None:
+        """To the CSV file ``path``, a header line first, all or nothing; MitsimError when it cannot be written."""
+        with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, self.columns)
+            writer.writeheader()
+            writer.writerows(self.rows)
