@@ -74,10 +74,10 @@ class Outcome:
 
 
 BEFOREHAND = (
-    *("capture.sense", "exchange.hdf5", "exchange.matlab", "exchange.real", "exchange.load", "exchange.pngs"),
-    *("study.campaign", "study.page", "study.quality", "study.characterise", "study.paper.patterns", "core.worker"),
-    *("scene.check", "capture.opening", "reconstruct.reconstruction", "rig.recipe", "capture.request"),
-    *("reconstruct.measured", "rig.framelist", "rig.profile", "rig.projector", "rig.chart"),
+    *("acquire.sense", "exchange.hdf5", "exchange.matlab", "exchange.real", "exchange.formats", "exchange.png_files"),
+    *("studies.framework.campaign", "studies.framework.page", "report.quality", "studies.characterise", "core.worker"),
+    *("scene.check", "bench.open", "reconstruct.reconstruct", "devices.session", "bench.request"),
+    *("reconstruct.captured_session", "devices.framelist", "devices.mask_profile", "devices.projector"),
 )
 """Modules that commands import where they use them: here before all, so that an input takes less than a second."""
 KINDS: dict[str, tuple[int, list[Callable[[Good], Make]]]] = {
@@ -118,7 +118,9 @@ def unloaded(*_: object, **__: object) -> None:
 def serve(kind: str, command: Sequence[str], stdout: Path, stderr: Path) -> None:
     """Run a command as the worker does, in this process, and end it."""
     if kind in CHECKED:
-        vars(sys.modules["mitsim.bench.open"])["_loaded"] = unloaded
+        opening = vars(sys.modules["mitsim.bench.open"])
+        assert "_load" in opening, "what loads a scene has another name"
+        opening["_load"] = unloaded
     for number, path in ((1, stdout), (2, stderr)):
         os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT), number)
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
