@@ -18,6 +18,7 @@ import hashlib
 import importlib
 import json
 import os
+import pkgutil
 import random
 import signal
 import sys
@@ -73,13 +74,8 @@ class Outcome:
     said: str = ""
 
 
-BEFOREHAND = (
-    *("capture.sense", "exchange.hdf5", "exchange.matlab", "exchange.real", "exchange.load", "exchange.pngs"),
-    *("study.campaign", "study.page", "study.quality", "study.characterise", "study.paper.patterns", "core.worker"),
-    *("scene.check", "capture.opening", "reconstruct.reconstruction", "rig.recipe", "capture.request"),
-    *("reconstruct.measured", "rig.framelist", "rig.profile", "rig.projector", "rig.chart"),
-)
-"""Modules that commands import where they use them: here before all, so that an input takes less than a second."""
+BEFOREHAND = "core", "devices", "sensor", "scene", "bench", "acquire", "reconstruct", "report", "studies", "exchange"
+"""Rooms whose modules commands import where they use them: all before the first input, which then takes no second."""
 KINDS: dict[str, tuple[int, list[Callable[[Good], Make]]]] = {
     "pictures": (11, [pictures]),
     "pictures, bytes": (8, [changed(name) for name in ("a.png", "a.tif", "b.tif", "a.npy", "a.exr")]),
@@ -118,7 +114,9 @@ def unloaded(*_: object, **__: object) -> None:
 def serve(kind: str, command: Sequence[str], stdout: Path, stderr: Path) -> None:
     """Run a command as the worker does, in this process, and end it."""
     if kind in CHECKED:
-        vars(sys.modules["mitsim.bench.apparatus"])["_loaded"] = unloaded
+        bench = [vars(module) for name, module in sys.modules.items() if name.startswith("mitsim.bench.")]
+        (opening,) = [names for names in bench if "_load" in names]
+        opening["_load"] = unloaded
     for number, path in ((1, stdout), (2, stderr)):
         os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT), number)
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
@@ -262,8 +260,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--kind", nargs="*", choices=KINDS, default=[*KINDS])
     asked = parser.parse_args(arguments)
     whole = sum(KINDS[kind][0] for kind in asked.kind)
-    for module in BEFOREHAND:
-        importlib.import_module(f"mitsim.{module}")
+    for room in BEFOREHAND:
+        package = importlib.import_module(f"mitsim.{room}")
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            importlib.import_module(module.name)
     results = Results(asked.json, asked.seed)
     done = {(each.kind, each.seed) for each in results.outcomes}
     with tempfile.TemporaryDirectory(prefix="mitsim-good-") as folder:

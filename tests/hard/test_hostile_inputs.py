@@ -35,3 +35,10 @@ def test_a_hundred_inputs(measured: Recorder, tmp_path: Path) -> None:
     told = json.loads((tmp_path / "a.json").read_text())
     measured(told["inputs"], at_least=100, what="inputs")
     assert {"0", "2"} <= {status for row in told["kinds"] for status in row["status"]}, "some are good"
+
+
+def test_one_function_of_the_bench_loads_a_scene() -> None:
+    """By the name that benchmarks/hostile.py has for it: what passes all checks is refused in its place."""
+    texts = [path.read_text(encoding="utf-8") for path in (ROOT / "mitsim" / "bench").rglob("*.py")]
+    assert sum("\ndef _load(" in text for text in texts) == 1
+    assert 'opening["_load"] = unloaded' in (ROOT / "benchmarks" / "hostile.py").read_text(encoding="utf-8")
