@@ -122,7 +122,7 @@ def judged(scene: str, accuracy: float, halves: Frames, tree: Path | None, seed:
     """One capture, held against the answer."""
     run = captured(scene, accuracy, tree, seed)
     bench = ms.open_bench(scene)
-    unit = float(Exposer(bench.rig, run["exposure_s"], 0).electrons(_Unit()))
+    unit = float(Exposer(bench.devices, run["exposure_s"], 0).electrons(_Unit()))
     of_shots = shares(run["frames"] / unit, halves)
     manifest = run["manifest"]
     plan = manifest["plan"]
@@ -261,9 +261,9 @@ def main() -> None:
                 if key in rows or (name == "old" and tree is None):
                     continue
                 rows[key] = row = judged(scene, accuracy, np.load(kept), tree)
-                said = f"error {row['error']:.2e} [{row['low']:.1e}, {row['high']:.1e}]"
+                reported = f"error {row['error']:.2e} [{row['low']:.1e}, {row['high']:.1e}]"
                 print(
-                    f"{scene} {key}: {said}, {row['seconds']:.1f} s, predicted {row['predicted_seconds']:.1f}",
+                    f"{scene} {key}: {reported}, {row['seconds']:.1f} s, predicted {row['predicted_seconds']:.1f}",
                     flush=True,
                 )
                 options.json.write_text(json.dumps(found, indent=1))

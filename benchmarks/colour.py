@@ -51,10 +51,10 @@ def measured(options: Sequence[str], output: Path) -> dict[str, Any]:
     wall, after = time.perf_counter() - started, os.times()
     if done.returncode not in (0, 1):
         raise SystemExit(done.stderr)
-    told = json.loads(done.stdout)
-    stages = told["seconds"]
+    reported = json.loads(done.stdout)
+    stages = reported["seconds"]
     processor = sum(getattr(after, name) - getattr(before, name) for name in ("children_user", "children_system"))
-    errors = [run["total_error_bound"] for run in told.get("channels", [told])]
+    errors = [run["total_error_bound"] for run in reported.get("channels", [reported])]
     traced = sum(stages[name] for name in TRACED)
     return {"wall": wall, "processor": processor, "traced": traced, "error_bounds": errors, "stages": stages}
 
@@ -101,8 +101,8 @@ def main() -> None:
         cases[scene] = {**compared(turns[1:], count), "turns": turns[1:]}
         for other in ("mono", "one line"):
             ratios = cases[scene][other]
-            told = ", ".join(f"{kind} {ratio['median']:.2f}" for kind, ratio in ratios.items())
-            print(f"{scene}: {count} lines over {other}: {told} (goal {GOAL})", flush=True)
+            reported = ", ".join(f"{kind} {ratio['median']:.2f}" for kind, ratio in ratios.items())
+            print(f"{scene}: {count} lines over {other}: {reported} (goal {GOAL})", flush=True)
         options.json.write_text(json.dumps({**facts, "cases": cases}, indent=1) + "\n")
 
 

@@ -93,8 +93,8 @@ def main() -> None:
     cases = {}
     for scene in options.scene or SCENES:
         cases[scene] = row = measured(scene, options.patterns, options.accuracy)
-        told = ", ".join(f"{name} {seconds:.2f}" for name, seconds in row.items() if name != "stages")
-        print(f"{scene}: {told} s", flush=True)
+        reported = ", ".join(f"{name} {seconds:.2f}" for name, seconds in row.items() if name != "stages")
+        print(f"{scene}: {reported} s", flush=True)
     facts = {"patterns": options.patterns, "accuracy": options.accuracy, "processors": os.cpu_count()}
     options.json.write_text(json.dumps({**facts, "cases": cases}, indent=1))
 

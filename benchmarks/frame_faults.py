@@ -258,19 +258,23 @@ def verdict(shots: Capture, factors: Factors, true: np.ndarray) -> dict[str, Any
     }
 
 
-def is_named(fault: str, numbers: set[int], said: dict[str, Any]) -> bool:
-    """Whether what is ``said`` is this ``fault`` of the shots of these ``numbers``."""
-    if "refused" in said:
+def is_named(fault: str, numbers: set[int], reported: dict[str, Any]) -> bool:
+    """Whether what is ``reported`` is this ``fault`` of the shots of these ``numbers``."""
+    if "refused" in reported:
         return fault == "black"
     if fault in CAUSES:
-        return bool(said["cause"] == CAUSES[fault].name)
+        return bool(reported["cause"] == CAUSES[fault].name)
     if fault == "rig":
-        return bool(said["cause"] == Cause.RIG.name)
+        return bool(reported["cause"] == Cause.RIG.name)
     if fault == "repeated":  # of two frames that are one, it need not be clear which is the other
-        return len(said["faults"]) == 1 and said["faults"][0][0] == fault and numbers <= set(said["faults"][0][1])
+        return (
+            len(reported["faults"]) == 1
+            and reported["faults"][0][0] == fault
+            and numbers <= set(reported["faults"][0][1])
+        )
     if fault == "dead":
-        return len(said["defects"]) == 1 and set(said["defects"][0]) == numbers
-    return bool(said["faults"] == [[fault, sorted(numbers)]])
+        return len(reported["defects"]) == 1 and set(reported["defects"][0]) == numbers
+    return bool(reported["faults"] == [[fault, sorted(numbers)]])
 
 
 def faulty(
@@ -288,14 +292,14 @@ def faulty(
     if fault == "rig":
         factors = replace(camera(mask, n, other=True)).calibrated(seed)
     true = scene(name, n, seed)
-    said = verdict(changed(shots, laid, CODES * 16 if fault == "scale" else CODES), factors, true)
-    right: bool | None = is_named(fault, numbers, said)
-    if fault == "dead" and right and not said["ok"]:  # left out, it is no reason for a flag
+    reported = verdict(changed(shots, laid, CODES * 16 if fault == "scale" else CODES), factors, true)
+    right: bool | None = is_named(fault, numbers, reported)
+    if fault == "dead" and right and not reported["ok"]:  # left out, it is no reason for a flag
         right = not verdict(shots, factors, true)["ok"]
-    if not right and said.get("ok"):
-        said["harm"] = said["error"] / verdict(shots, factors, true)["error"]
-        right = None if said["harm"] < HARMLESS else False
-    return right, {**said, "laid": sorted(numbers)}
+    if not right and reported.get("ok"):
+        reported["harm"] = reported["error"] / verdict(shots, factors, true)["error"]
+        right = None if reported["harm"] < HARMLESS else False
+    return right, {**reported, "laid": sorted(numbers)}
 
 
 def _alike(one: np.ndarray, other: np.ndarray) -> bool:
@@ -344,8 +348,8 @@ def main() -> None:
             plain[number % len(plain)],
             options.seed + 100 * turn + number % 97,
         )
-        right, said = faulty(fault, mask, name, family, n, peak, seed)
-        if said:
+        right, reported = faulty(fault, mask, name, family, n, peak, seed)
+        if reported:
             counts["harmless"][0] += right is None
             counts["harmless"][1] += 1
         if right is None:
@@ -354,7 +358,7 @@ def main() -> None:
             counts[key][0] += right
             counts[key][1] += 1
         if not right:
-            wrong.append({"fault": fault, "case": [mask, name, family, n, peak, seed], **said})
+            wrong.append({"fault": fault, "case": [mask, name, family, n, peak, seed], **reported})
             print(json.dumps(wrong[-1]), flush=True)
     alarms = 0
     for number in range(options.fitting):
@@ -362,13 +366,13 @@ def main() -> None:
         seed = options.seed + 5000 + number
         mask, n = MASKS[number // 5 % len(MASKS)], options.sizes[number // 7 % len(options.sizes)]
         peak = options.peaks[number // 3 % len(options.peaks)]
-        said = verdict(*run_of(mask, name, family, n, peak, seed), scene(name, n, seed))
+        reported = verdict(*run_of(mask, name, family, n, peak, seed), scene(name, n, seed))
         blamed = {Cause.FRAMES, *CAUSES.values(), Cause.RIG}
-        alarm = bool(said["faults"] or said["defects"] or said["cause"] in {cause.name for cause in blamed})
-        alarm |= bool(said["cause"]) and name not in GLOSSY
+        alarm = bool(reported["faults"] or reported["defects"] or reported["cause"] in {cause.name for cause in blamed})
+        alarm |= bool(reported["cause"]) and name not in GLOSSY
         alarms += alarm
         if alarm:
-            wrong.append({"fault": None, "case": [mask, name, family, n, peak, seed], **said})
+            wrong.append({"fault": None, "case": [mask, name, family, n, peak, seed], **reported})
             print(json.dumps(wrong[-1]), flush=True)
     rates: dict[str, dict[str, Any]] = {
         key: {"named": right, "of": of, "rate": interval(right, of)} for key, (right, of) in counts.items()

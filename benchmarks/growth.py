@@ -67,10 +67,10 @@ def measured(case: Case, limit: float) -> dict[str, Any]:
         inside = Path(folder)
         scene, camera = drawn(inside, ROOT / "scenes", case.sensor, case.projector)
         run, calibration = str(inside / "run"), str(inside / "cal")
-        rig = [str(scene), "--camera", str(camera)]
+        arguments = [str(scene), "--camera", str(camera)]
         words = {
-            "capture": ["capture", *rig, "--patterns", case.patterns, "-o", run],
-            "calibrate": ["calibrate", *rig, "-o", calibration],
+            "capture": ["capture", *arguments, "--patterns", case.patterns, "-o", run],
+            "calibrate": ["calibrate", *arguments, "-o", calibration],
             "reconstruct": ["reconstruct", run, "--calibration", calibration, "-o", str(inside / "image")],
         }
         found: dict[str, Any] = {}
@@ -86,10 +86,10 @@ def measured(case: Case, limit: float) -> dict[str, Any]:
 
 def _counted(words: list[str], inside: Path, limit: float) -> dict[str, Any]:
     """What ``mitsim`` with these ``words`` took in a process of its own, killed after ``limit`` seconds."""
-    printed, said = inside / "stdout", inside / "stderr"
+    printed, message = inside / "stdout", inside / "stderr"
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     started = time.perf_counter()
-    with printed.open("wb") as out, said.open("wb") as err:
+    with printed.open("wb") as out, message.open("wb") as err:
         process = subprocess.Popen(
             [sys.executable, "-m", "mitsim", *words],
             stdout=out,
@@ -111,10 +111,10 @@ def _counted(words: list[str], inside: Path, limit: float) -> dict[str, Any]:
     if found["seconds"] >= limit:
         return {**found, "killed": True}
     if process.returncode not in (0, 1):
-        raise SystemExit(f"mitsim ended with {process.returncode}: {' '.join(words)}\n{said.read_text()}")
+        raise SystemExit(f"mitsim ended with {process.returncode}: {' '.join(words)}\n{message.read_text()}")
     payload = json.loads(printed.read_text())
-    told = "mc_error", "total_error_bound", "predicted", "memory_bytes", "predicted_memory_bytes", "warnings"
-    return {**found, **{key: payload.get(key) for key in told}, "stages": payload["seconds"]}
+    reported = "mc_error", "total_error_bound", "predicted", "memory_bytes", "predicted_memory_bytes", "warnings"
+    return {**found, **{key: payload.get(key) for key in reported}, "stages": payload["seconds"]}
 
 
 def table(results: Mapping[str, Any], verb: str) -> str:

@@ -157,18 +157,21 @@ def tried(kind: str, seed: int, make: Make) -> Outcome:
             round(usage.ru_utime + usage.ru_stime, 3),
             max(usage.ru_maxrss * 1024 - held, 0),
         )
-        said = (folder / "stderr").read_bytes().decode(errors="backslashreplace")
-        judge(outcome, said, before, listed(work))
+        message = (folder / "stderr").read_bytes().decode(errors="backslashreplace")
+        judge(outcome, message, before, listed(work))
         return outcome
 
 
-def judge(outcome: Outcome, said: str, before: dict[str, tuple[int, ...]], after: dict[str, tuple[int, ...]]) -> None:
-    """Add to an ``outcome`` what it broke, by what it ``said`` on stderr and what its folder held before and after."""
-    lines = [line for line in said.split("\n") if line]
+def judge(
+    outcome: Outcome, message: str, before: dict[str, tuple[int, ...]], after: dict[str, tuple[int, ...]]
+) -> None:
+    """Add to an ``outcome`` what it broke, by what it ``message`` on stderr and what its folder held before and
+    after."""
+    lines = [line for line in message.split("\n") if line]
     status, broken, outcome.lines = outcome.status, outcome.broken, len(lines)
     if status not in (0, 1, 2):
         broken.append(f"status {status}")
-    if "Traceback" in said or "a fault of mitsim's own" in said:
+    if "Traceback" in message or "a fault of mitsim's own" in message:
         broken.append("traceback")
     if status == 2 and len(lines) != 1:
         broken.append(f"{len(lines)} lines of a refusal")
@@ -180,7 +183,7 @@ def judge(outcome: Outcome, said: str, before: dict[str, tuple[int, ...]], after
         broken.append(f"{outcome.processor_seconds:.1f} s")
     if outcome.memory_bytes > MEMORY:
         broken.append(f"{outcome.memory_bytes / 2**30:.2f} GiB")
-    outcome.said = said[-1500:] if broken else said[:200]
+    outcome.said = message[-1500:] if broken else message[:200]
 
 
 def listed(folder: Path) -> dict[str, tuple[int, ...]]:
@@ -228,8 +231,8 @@ class Results:
     def add(self, outcome: Outcome) -> None:
         self.outcomes.append(outcome)
         if outcome.broken:
-            told = f"{outcome.kind} {outcome.seed}: {'; '.join(outcome.broken)}: {outcome.said.strip()[-300:]!r}"
-            sys.stdout.write(f"{told}\n  {outcome.command}\n")
+            reported = f"{outcome.kind} {outcome.seed}: {'; '.join(outcome.broken)}: {outcome.said.strip()[-300:]!r}"
+            sys.stdout.write(f"{reported}\n  {outcome.command}\n")
             sys.stdout.flush()
         if len(self.outcomes) % 20 == 0:
             self.write()
@@ -237,9 +240,9 @@ class Results:
     def write(self) -> None:
         if self.path is None:
             return
-        told = {**self.about, "inputs": len(self.outcomes), "kinds": table(self.outcomes)}
+        reported = {**self.about, "inputs": len(self.outcomes), "kinds": table(self.outcomes)}
         part = self.path.with_suffix(".part")
-        part.write_text(json.dumps({**told, "outcomes": [asdict(each) for each in self.outcomes]}, indent=1) + "\n")
+        part.write_text(json.dumps({**reported, "outcomes": [asdict(each) for each in self.outcomes]}, indent=1) + "\n")
         part.replace(self.path)
 
 

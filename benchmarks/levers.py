@@ -3,9 +3,10 @@
     python benchmarks/levers.py --json FILE [--scene NAME ...] [--groups 8] [--samples 64] [--repeat 3]
 
 For each scene its plan at 1e-3 says which cells, layers and anchors there are. Then its indirect and its direct light
-are traced and filed with each lever on, alone and together, in eight independent groups of the same seeds, in turn;
-variance is that of the frames of that light, by groups (good to some 10 % here), seconds the sum over the groups, the
-least of ``--repeat`` rounds. Both, and their product, are over those without levers: below 1 is a gain, at equal error.
+are traced and accumulated with each lever on, alone and together, in eight independent groups of the same seeds, in
+turn; variance is that of the frames of that light, by groups (good to some 10 % here), seconds the sum over the groups,
+the least of ``--repeat`` rounds. Both, and their product, are over those without levers: below 1 is a gain, at equal
+error.
 
 - device: light is added up where it is traced, not on the host;
 - repeats: blocks of pixels whose light is noisy are followed more often;

@@ -161,8 +161,8 @@ def main() -> None:
                 row = {name: float(np.mean([run[name] for run in runs])) for name in runs[0]}
                 spread = float(np.std([run["window"] for run in runs], ddof=1)) if len(runs) > 1 else 0.0
                 rows.append({"patterns": patterns, "light": kind, "b": bright, "spread": spread, **row})
-                told = ", ".join(f"{name} {value:.1f}" for name, value in row.items())
-                print(f"{patterns:>8} {kind:>8} b {bright:g}: {told} dB (one run +-{spread:.2f})", flush=True)
+                reported = ", ".join(f"{name} {value:.1f}" for name, value in row.items())
+                print(f"{patterns:>8} {kind:>8} b {bright:g}: {reported} dB (one run +-{spread:.2f})", flush=True)
     report(rows, options.json)
 
 

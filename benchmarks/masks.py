@@ -49,7 +49,7 @@ def light(subdivision: int, period: int) -> tuple[Directions, np.ndarray, np.nda
     return cells, places, np.random.default_rng(0).random(len(places))
 
 
-def told(**row: object) -> None:
+def reported(**row: object) -> None:
     rounded = {name: float(f"{value:.2g}") if isinstance(value, float) else value for name, value in row.items()}
     print(json.dumps(rounded), flush=True)
 
@@ -75,14 +75,14 @@ def costs() -> None:
         for subdivision in (1, 4):
             for fft in (False, True) if terms > 2 else (False,):
                 geometry = of_rank(terms).model_copy(update={"mask_fft": fft})
-                told(terms=terms, fft=fft, cells=subdivision**2, **formed(geometry, None, subdivision))
+                reported(terms=terms, fft=fft, cells=subdivision**2, **formed(geometry, None, subdivision))
     drawn: dict[str, tuple[CameraGeometry, Spectrum | None]] = {
         "turned 0.3 degrees": (camera(kind="separable", rotation_deg=0.3), None),
         "random, waves of three lines": (camera(kind="random", features=511), LINES),
     }
     for name, (geometry, spectrum) in drawn.items():
         for subdivision in (1, 4):
-            told(mask=name, fft=True, cells=subdivision**2, **formed(geometry, spectrum, subdivision))
+            reported(mask=name, fft=True, cells=subdivision**2, **formed(geometry, spectrum, subdivision))
 
 
 def errors() -> None:
@@ -100,7 +100,9 @@ def errors() -> None:
             for count in (6, 8, 12):
                 finer = geometry.model_copy(update={"mask_cells": count})
                 error, known = raster_error(finer, cells, cells, DEPTH_MM, None, shown)
-                told(mask=name, patterns=patterns, cells=count, left=error, by="sums" if known else "half the cells")
+                reported(
+                    mask=name, patterns=patterns, cells=count, left=error, by="sums" if known else "half the cells"
+                )
 
 
 def mounted() -> None:
@@ -111,7 +113,7 @@ def mounted() -> None:
             geometry = camera(kind="separable", **{name: value})
             terms = shadow_terms(geometry, cells, cells, DEPTH_MM, places=range(0, 512, 8))
             residual = best_term(terms).residual
-            told(flaw=name, value=value, residual=residual, below_dB=round(-20 * float(np.log10(residual)), 1))
+            reported(flaw=name, value=value, residual=residual, below_dB=round(-20 * float(np.log10(residual)), 1))
 
 
 def nodes() -> None:
@@ -136,7 +138,7 @@ def nodes() -> None:
 
         fine = frame(48)
         left = float(np.linalg.norm(frame(own[1]) - fine) / np.linalg.norm(fine))
-        told(tilt_mrad=tilt, nodes=own[1], left=left)
+        reported(tilt_mrad=tilt, nodes=own[1], left=left)
 
 
 if __name__ == "__main__":

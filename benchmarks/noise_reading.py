@@ -161,10 +161,10 @@ def main() -> None:
                     **nearest(cases, convention, rule),
                 }
                 rows.append(row)
-                told = ", ".join(f"{name} {psnr:.1f}" for name, psnr in row["psnr_db"].items())
+                reported = ", ".join(f"{name} {psnr:.1f}" for name, psnr in row["psnr_db"].items())
                 print(
                     f"{brightness:12} {convention:12} {rule:26} {row['outside_db']:.1f} dB outside at "
-                    f"{row['electrons']:.3g} e, read noise {row['read_noise_e']:.3g} e: {told}",
+                    f"{row['electrons']:.3g} e, read noise {row['read_noise_e']:.3g} e: {reported}",
                     flush=True,
                 )
     if options.json:

@@ -55,9 +55,9 @@ def new_process(scene: str, capture: str, repeat: int) -> dict[str, Any]:
             done = subprocess.run([*command, "-o", f"{folder}/{number}"], check=True, capture_output=True)
             wall, after = time.perf_counter() - started, os.times()
             processor = after.children_user + after.children_system - before.children_user - before.children_system
-            told = json.loads(done.stdout)
-            facts = {name: told[name] for name in ("frames", "phi_error", "predicted_seconds")}
-            stages = {name: seconds for name, seconds in told["seconds"].items() if name != "total"}
+            reported = json.loads(done.stdout)
+            facts = {name: reported[name] for name in ("frames", "phi_error", "predicted_seconds")}
+            stages = {name: seconds for name, seconds in reported["seconds"].items() if name != "total"}
             found.append({"wall": wall, "processor": processor, **facts, "stages": stages})
     return min(found[1:], key=lambda row: row["wall"])
 

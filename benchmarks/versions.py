@@ -155,10 +155,10 @@ def measured(version: Version, case: Case, scenes: Path) -> dict[str, Any]:
             scene, camera = drawn(inside, scenes, case.pixels, case.window)
             words = [str(scene) if "/drawn/" in word else word for word in (*words, "--camera", str(camera))]
         words = [word.replace("SCENES", str(scenes)) for word in words]
-        printed, said = inside / "stdout", inside / "stderr"
+        printed, reported = inside / "stdout", inside / "stderr"
         environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONDONTWRITEBYTECODE")}
         started = time.perf_counter()
-        with printed.open("wb") as out, said.open("wb") as err:
+        with printed.open("wb") as out, reported.open("wb") as err:
             process = subprocess.Popen(
                 version.command(words), stdout=out, stderr=err, cwd=folder, env=environment, start_new_session=True
             )
@@ -176,7 +176,9 @@ def measured(version: Version, case: Case, scenes: Path) -> dict[str, Any]:
         if process.returncode in (-signal.SIGKILL, 137) and seconds >= LIMIT:
             return {**found, "killed": True}
         if process.returncode not in case.status:
-            raise SystemExit(f"{version.name} ended with {process.returncode}: {' '.join(words)}\n{said.read_text()}")
+            raise SystemExit(
+                f"{version.name} ended with {process.returncode}: {' '.join(words)}\n{reported.read_text()}"
+            )
         try:
             payload = json.loads(printed.read_text())
         except ValueError:

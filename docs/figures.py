@@ -116,7 +116,7 @@ def closed() -> dict[str, float]:
     import numpy as np
 
     from mitsim.core.configuration import load_model, shipped
-    from mitsim.devices.camera import CameraGeometry, Rig
+    from mitsim.devices.camera import CameraGeometry, Devices
     from mitsim.devices.projector import Coherence, ProjectorModel, Spectrum
     from mitsim.devices.sensor import load_sensor
     from mitsim.optics.shadow import Directions
@@ -140,7 +140,7 @@ def closed() -> dict[str, float]:
         return float(np.linalg.norm(wave - rays) / np.linalg.norm(rays))
 
     def contrast(lit: Any, **coherence: float) -> float:
-        devices = Rig(
+        devices = Devices(
             camera,
             load_sensor(shipped("calibration", "imx249.toml")),
             projector.model_copy(update={"speckle": Coherence(**coherence)}),

@@ -34,7 +34,7 @@ SMALL_SCENE = """<scene version="3.0.0">
     <default name="albedo" value="0.5"/>
     <integrator type="{integrator}">{integrator_options}</integrator>
     <sensor type="mitsim_lensless">
-        <transform name="to_world"><matrix value="{rig}"/></transform>
+        <transform name="to_world"><matrix value="{pose}"/></transform>
         <float name="pixel_pitch" value="{pitch}"/>
         <string name="mask" value="{mask}"/>
         <integer name="mask_order" value="{mask_order}"/>
@@ -51,7 +51,7 @@ SMALL_SCENE = """<scene version="3.0.0">
     </sensor>
     <emitter type="projector">
         <transform name="to_world">
-            {projector_turn} <translate x="60"/> <matrix value="{rig}"/>
+            {projector_turn} <translate x="60"/> <matrix value="{pose}"/>
         </transform>
         <string name="fov_axis" value="x"/> <float name="fov" value="33.398488"/>
         <float name="scale" value="111000"/>
@@ -62,7 +62,7 @@ SMALL_SCENE = """<scene version="3.0.0">
     </emitter>
     <shape type="rectangle">
         <transform name="to_world">
-            <rotate z="1" angle="180"/> <scale x="64" y="64"/> <translate z="{sheet_z}"/> <matrix value="{rig}"/>
+            <rotate z="1" angle="180"/> <scale x="64" y="64"/> <translate z="{sheet_z}"/> <matrix value="{pose}"/>
         </transform>
         <boolean name="flip_normals" value="true"/>
         <bsdf type="diffuse">{reflectance}</bsdf>
@@ -87,7 +87,7 @@ NUMBERS = {
     "integrator": "path",
     "integrator_options": '<integer name="max_depth" value="2"/>',
     "projector_turn": "",
-    "rig": IDENTITY,
+    "pose": IDENTITY,
     "extra": "",
 }
 

@@ -73,9 +73,16 @@ def sections() -> dict[str, Section]:
         title, _, body = text.partition("\n")
         section = Section(title)
         for match in _STEP.finditer(body):
-            said = {name: value or "" for name, value in match.groupdict().items()}
-            file, how = said["new"] or said["file"], "new" if said["new"] else said["how"] or "at the end"
-            step = Step(command=said["command"]) if said["command"] else Step(file, how, said["line"], said["code"])
+            reported = {name: value or "" for name, value in match.groupdict().items()}
+            file, how = (
+                reported["new"] or reported["file"],
+                "new" if reported["new"] else reported["how"] or "at the end",
+            )
+            step = (
+                Step(command=reported["command"])
+                if reported["command"]
+                else Step(file, how, reported["line"], reported["code"])
+            )
             section.steps.append(step)
         assert len(re.findall("^```", body, flags=re.M)) == 2 * len(section.files), f"{title}: a block of no file"
         if section.steps:

@@ -20,12 +20,12 @@ _kept: dict[str, Any] = {}
 
 
 def question(bench: Any, lighting: Any, accuracy: float, seed: int, switches: Mapping[str, bool], lines: int) -> str:
-    """A digest of all that decides a plan: what is seen, by which rig, in which light, and how well."""
+    """A digest of all that decides a plan: what is seen, by which devices, in which light, and how well."""
     from mitsim.core.exr import checksum
 
     files = sorted(checksum(path) for path in bench.loaded.files)
     light = lighting.labels.tobytes(), lighting.weights.tobytes(), lighting.weights.shape
-    seen = str(bench.loaded.scene), files, bench.variant, repr(bench.rig)
+    seen = str(bench.loaded.scene), files, bench.variant, repr(bench.devices)
     return hashlib.sha256(repr((seen, light, accuracy, seed, sorted(switches.items()), lines)).encode()).hexdigest()
 
 

@@ -47,7 +47,7 @@ class RealBench:
         return 0.8 / self._filled(float(frame.irradiance.max()))
 
     def _filled(self, irradiance: float) -> float:
-        sensor, wavelength = self.bench.sensor, self.bench.rig.projector.effective_wavelength_nm
+        sensor, wavelength = self.bench.sensor, self.bench.devices.projector.effective_wavelength_nm
         return float(electrons_from_irradiance(irradiance, 1.0, sensor, wavelength)) / sensor.superpixel_full_well_e
 
     def take(self, light: SampledLight, pictures: list[Path], exposure_s: float, names: list[Path]) -> None:
@@ -59,7 +59,7 @@ class RealBench:
         where = json.loads((pictures[0].parents[1] / "patterns.json").read_text())["projector"]
         shown = np.stack([self._shown(path, where) for path in pictures])
         lighting = Lighting(np.arange(self.bench.n**2), shown)
-        exposer = Exposer(self.bench.rig, exposure_s, 5)
+        exposer = Exposer(self.bench.devices, exposure_s, 5)
         for name, frame in zip(names, light.frames(lighting, 0), strict=True):
             numbers = exposer.digital(exposer.electrons(frame), str(name))
             name.parent.mkdir(exist_ok=True)

@@ -459,7 +459,7 @@ def test_no_module_but_core_knows_a_backend() -> None:
     assert not names_a_backend("mitsim.transport.direct", '"""Runs on LLVM."""\nimport mitsuba as mi')
 
 
-def test_lanes_are_not_added_up_in_32_bits() -> None:
+def test_samples_are_not_added_up_in_32_bits() -> None:
     """Light is added up on the device in whole numbers or floats of 64 bits, or on the host in double precision."""
     assert not [name for name, path in modules() if sums_lanes(name, path.read_text(encoding="utf-8"))]
     assert sums_lanes("mitsim.transport.direct", "total = dr.sum(light)") == ["sum"]
@@ -485,6 +485,8 @@ PARTICIPLE = re.compile(
 MOST_PARTICIPLES = 154
 """Functions that are named by a participle alone: what was done is no name of what a function does or gives. A change
 takes some away, and adds none."""
+REPLACED = {"anatomy", "deposits", "filed", "foreseen", "foretold", "glint", "lamplight", "ledger", "rig", "tray"}
+"""Words that docs/glossary.md replaces, and that are part of no name here."""
 TOKENS_WITHOUT_CODE = {
     *(tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER)
 }
@@ -546,3 +548,16 @@ def test_no_more_functions_are_named_by_participles() -> None:
     assert len(found) <= MOST_PARTICIPLES, len(found)
     planted = "def _told(): ...\ndef weighed(): ...\ndef tell(): ...\ndef feed(): ...\ndef kept_plans(): ..."
     assert participles(planted) == ["_told", "weighed"]
+
+
+def names_with(words: set[str], source: str) -> set[str]:
+    """Names in a text of which a part is one of some ``words``; an enumeration's own in capitals may be a key."""
+    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
+    names = {token.string for token in tokens if token.type == tokenize.NAME and token.string.upper() != token.string}
+    return {name for name in names if words & {part.lower() for part in re.findall("[A-Z]?[a-z]+", name)}}
+
+
+def test_names_have_the_words_of_the_glossary() -> None:
+    found = {name: names_with(REPLACED, text) for name, (text, _) in sources().items()}
+    assert not {name: words for name, words in found.items() if words}
+    assert names_with({"rig"}, "class ToyRig: ...\nRIG = right = 1\nx.rig_of()") == {"ToyRig", "rig_of"}

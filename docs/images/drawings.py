@@ -1,4 +1,4 @@
-"""The drawings of docs/physics.md and docs/architecture.md: the shipped rig's numbers in, six PNG files out.
+"""The drawings of docs/physics.md and docs/architecture.md: the shipped devices' numbers in, six PNG files out.
 
     python docs/images/drawings.py [FOLDER]
 
@@ -30,7 +30,7 @@ DPI = 110
 """Drawings are 1000 pixels wide or so, of some 40 KiB."""
 
 
-def rig() -> Figure:
+def devices() -> Figure:
     """Where the devices stand."""
     figure, axes = _sheet(10, 4.6)
     half = WINDOW_MM / 2
@@ -385,7 +385,7 @@ def _measure(
         )
 
 
-DRAWINGS = (rig, axes, shadow, anchors, parallax, passes)
+DRAWINGS = (devices, axes, shadow, anchors, parallax, passes)
 
 
 def main() -> None:

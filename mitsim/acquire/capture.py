@@ -267,8 +267,8 @@ def _run(
         expected = light.frames(family.lighting, request.seed)
         # Forming the frames once finds the brightest pixel; a family with few classes keeps them for later.
         totals = Totals.of(expected)
-    exposure_s = request.timing.choose(bench.rig, totals.peak)
-    exposer = Exposer(bench.rig, exposure_s, request.seed, light.speckle(family))
+    exposure_s = request.timing.choose(bench.devices, totals.peak)
+    exposer = Exposer(bench.devices, exposure_s, request.seed, light.speckle(family))
     with job.clock.stage("write"):
         recorder.begin()
         recorder.write_truth(truth.reflectance, load_recipe().board_reflectance, truth.standard_error)
@@ -373,10 +373,10 @@ def capture_mosaic(bench: Apparatus, request: Request, task: Task) -> MosaicCapt
 
 def _warnings(light: SampledLight, totals: Totals, shooting: Shooting, request: Request) -> Iterator[str]:
     accuracy, total = light.plan.accuracy, light.plan.total(totals.noise)
-    foretold = set(light.plan.warnings) - set(known_losses(light.bench.loaded, request.effects))
+    predicted_warnings = set(light.plan.warnings) - set(known_losses(light.bench.loaded, request.effects))
     if not light.reached:
         yield from light.unreached
-    elif total.bound > accuracy and not foretold and request.noise_fraction is None:
+    elif total.bound > accuracy and not predicted_warnings and request.noise_fraction is None:
         reason = _foreign(light, totals, request)
         yield (
             f"the total error is up to {total.bound:.1e} (95 %); the accuracy {accuracy:g} was not reached"
@@ -472,7 +472,7 @@ def write_light(path: Path, light: SampledLight) -> None:
     count = light.bench.n**2
     if not np.array_equal(light.labels, np.arange(count)):
         raise MitsimError(f"file {path}: the light was traced for one family alone; trace it by pixel, by bench.light")
-    glint = _glint(path, light)
+    specular = _specular(path, light)
     with whole_hdf5(path) as file:
         file.attrs.update(_facts(light))
         grids = file.create_group("light", track_order=True)
@@ -484,15 +484,15 @@ def write_light(path: Path, light: SampledLight) -> None:
                 _write_shadow(place, light.simulation.grids[name])
         if light.simulation.physics.lamps:
             file.create_dataset("ambient", data=_ambient(light).astype(np.float32), **_PACKED)
-        if glint is not None:
-            _write_matrix(file.create_group("glint", track_order=True), glint)
+        if specular is not None:
+            _write_matrix(file.create_group("glint", track_order=True), specular)
 
 
 def _facts(light: SampledLight) -> dict[str, Any]:
     """Attributes of the file."""
-    bench, plan, rig = light.bench, light.plan, light.bench.rig
+    bench, plan, devices = light.bench, light.plan, light.bench.devices
     rows, columns = bench.geometry.frame_shape
-    joule = electrons_from_irradiance(1.0, 1.0, rig.sensor, rig.projector.effective_wavelength_nm)
+    joule = electrons_from_irradiance(1.0, 1.0, devices.sensor, devices.projector.effective_wavelength_nm)
     return {
         "mitsim_transport": LAYOUT if bench.geometry.axes_alike else LAYOUT_OF_TWO_SIDES,
         "mitsim_version": __version__,
@@ -544,19 +544,19 @@ def _write_shadow(group: h5py.Group, grid: Grid) -> None:
 def _ambient(light: SampledLight) -> FloatArray:
     """(groups, m, m') irradiance of lamps by each group of a ``light``."""
     frames = np.zeros((len(light.groups), *light.bench.geometry.frame_shape))
-    for filed in light.simulation.with_optics(light.groups, light.bench.n**2)[1]:
-        for frame, group in zip(frames, filed.groups, strict=True):
+    for accumulated in light.simulation.with_optics(light.groups, light.bench.n**2)[1]:
+        for frame, group in zip(frames, accumulated.groups, strict=True):
             group.sort_indices()
-            frame += filed.optics.frame(group.indices, group.data)
+            frame += accumulated.optics.frame(group.indices, group.data)
     return frames
 
 
-def _glint(path: Path, light: SampledLight) -> sparse.csr_array | None:
+def _specular(path: Path, light: SampledLight) -> sparse.csr_array | None:
     """(n^2, m m') irradiance of each projector pixel over mirrors alone; None without such light."""
     if not light.simulation.physics.mirrors:
         return None
     (rows, columns), count = light.bench.geometry.frame_shape, light.bench.n**2
-    shining = len(np.unique(light.bench.glint.beams.pixel))
+    shining = len(np.unique(light.bench.specular.beams.pixel))
     if shining * rows * columns * 8 > _SPECULAR_BYTES:
         raise MitsimError(
             f"file {path}: {shining} projector pixels shine over mirrors, and their frames of {rows}x{columns} take "

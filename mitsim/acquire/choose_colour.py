@@ -88,8 +88,8 @@ def choose_colour(bench: Opened, request: Request) -> Coloured[Opened]:
     if _in_greys(bench):
         errors, spectral = {name: 0.0 for name in runs if name in (MONO, LINES)}, None
     else:
-        look = _Look(bench, request)
-        errors, spectral = look.errors(runs), look.spectral
+        pilot = _ColourPilot(bench, request)
+        errors, spectral = pilot.errors(runs), pilot.spectral
     most = _PART * request.accuracy
     chosen = next((name for name in errors if errors[name] <= most), min(errors, key=lambda name: errors[name]))
     looked = time.perf_counter() - started
@@ -172,7 +172,7 @@ def _with_choice(plan: Plan, choice: ColourChoice, request: Request) -> Plan:
     return replace(plan, colour=choice, effects=rows, warnings=warnings)
 
 
-class _Look(Generic[Opened]):
+class _ColourPilot(Generic[Opened]):
     """Frames of few rays by candidate, in electrons but for a factor that all share."""
 
     def __init__(self, bench: Opened, request: Request) -> None:
@@ -226,9 +226,9 @@ class _Look(Generic[Opened]):
     def _electrons(self, bench: Apparatus, path_samples: PathSamples) -> FloatArray:
         """(shots, rows, columns) of the light in ``path_samples``, by the photons and the efficiency of a ``bench``."""
         simulation, lighting = Simulation(bench, self._settings), self._lighting
-        filed = simulation.accumulate("direct", path_samples, lighting.labels, _RAYS_OF_BANDS)
+        accumulated = simulation.accumulate("direct", path_samples, lighting.labels, _RAYS_OF_BANDS)
         rows = np.arange(lighting.weights.shape[1])
-        frames = expected_of([(simulation, [filed])], rows, lighting, self._seed, leaking=False)
+        frames = expected_of([(simulation, [accumulated])], rows, lighting, self._seed, leaking=False)
         wavelength = bench.projector.effective_wavelength_nm
         each = bench.sensor.efficiency(wavelength) * wavelength
         return np.stack([frame.irradiance for frame in frames]) * each

@@ -22,7 +22,7 @@ from mitsim.core.manifests import MOST_SHOTS, AmbientFile
 from mitsim.core.parallel import Behind, in_threads
 from mitsim.core.runs import AMBIENT, Recorder
 from mitsim.core.seeds import stream
-from mitsim.devices.camera import Rig
+from mitsim.devices.camera import Devices
 from mitsim.devices.patterns import PatternFamily, Shot
 from mitsim.devices.sensor import SensorModel
 from mitsim.devices.session import Drift
@@ -51,7 +51,7 @@ class Exposer:
     """A camera at one exposure time, whose frames have speckle of a contrast (0: none); every frame's noise has streams
     of its own, found by its names."""
 
-    rig: Rig
+    devices: Devices
     exposure_s: float
     seed: int
     speckle: float = 0.0
@@ -59,7 +59,7 @@ class Exposer:
     def electrons(self, frame: Frame) -> FloatArray:
         """Expected photoelectrons (m, m') of ``frame``, without dark current."""
         return electrons_from_irradiance(
-            frame.irradiance, self.exposure_s, self.rig.sensor, self.rig.projector.effective_wavelength_nm
+            frame.irradiance, self.exposure_s, self.devices.sensor, self.devices.projector.effective_wavelength_nm
         )
 
     def lit(self, frame: Frame, *names: str | int) -> FloatArray:
@@ -69,28 +69,28 @@ class Exposer:
     def digital(self, electrons: FloatArray, *names: str | int) -> Digital:
         """Noisy digital numbers of expected ``electrons``; ``names`` find the frame's own noise."""
         shot, read = (stream(self.seed, noise, *names) for noise in ("shot", "read"))
-        return expose(electrons, self.exposure_s, self.rig.sensor, shot, read)
+        return expose(electrons, self.exposure_s, self.devices.sensor, shot, read)
 
     def rate(self, digital: Digital) -> FloatArray:
         """What a user of frames computes of ``digital`` numbers: photoelectrons a second, dark current taken off."""
-        sensor = self.rig.sensor
+        sensor = self.devices.sensor
         return dn_to_electrons(digital, sensor) / self.exposure_s - sensor.superpixel_dark_current_e_per_s
 
     def rendering_noise(self, frame: Frame) -> float:
         """Root mean square Monte Carlo error of ``frame`` [electrons]."""
         unit = electrons_from_irradiance(
-            1.0, self.exposure_s, self.rig.sensor, self.rig.projector.effective_wavelength_nm
+            1.0, self.exposure_s, self.devices.sensor, self.devices.projector.effective_wavelength_nm
         )
         return float(np.sqrt(frame.variance) * unit)
 
     def sensor_noise(self, electrons: FloatArray) -> float:
         """Root mean square noise of the sensor on expected ``electrons``, from its closed form [electrons]."""
-        variance = mean_variance(electrons, self.exposure_s, self.rig.sensor)
-        return math.sqrt(variance) / self.rig.sensor.gain_dn_per_e
+        variance = mean_variance(electrons, self.exposure_s, self.devices.sensor)
+        return math.sqrt(variance) / self.devices.sensor.gain_dn_per_e
 
     def saturated(self, digital: Digital, electrons: FloatArray) -> bool:
         """Whether a pixel of a ``digital`` frame, of expected ``electrons``, reached the full well or the ADC's end."""
-        return saturated_pixels(digital, electrons, self.exposure_s, self.rig.sensor) > 0
+        return saturated_pixels(digital, electrons, self.exposure_s, self.devices.sensor) > 0
 
     def measurements(self, family: PatternFamily, expected: ExpectedFrames) -> Iterator[tuple[FloatArray, int, int]]:
         """Noisy measurement [electrons / s] of every pattern (i, j) of ``family``, from its ``expected`` frames: of a
@@ -123,13 +123,13 @@ class NoiseTarget:
 
     Attributes
     ----------
-    rig, exposure
+    devices, exposure
         the devices, and how its exposure time is found.
     fraction
         part of the noise.
     """
 
-    rig: Rig
+    devices: Devices
     exposure: Exposure
     fraction: float
 
@@ -138,7 +138,7 @@ class NoiseTarget:
         peak = peak_irradiance(expected)
         if peak <= 0:
             return np.inf
-        exposer = Exposer(self.rig, self.exposure.choose(self.rig, peak), 0)
+        exposer = Exposer(self.devices, self.exposure.choose(self.devices, peak), 0)
         noise = energy = 0.0
         for frame in expected:
             electrons = exposer.electrons(frame)
@@ -535,7 +535,7 @@ def drift_mask(bench: Apparatus, drift: Drift) -> Apparatus:
             f"drift: {kinds} would tilt the mask until its shadow takes more terms than are formed; give less, or one "
             "of the two alone"
         )
-    return replace(bench, rig=replace(bench.rig, camera=moved))
+    return replace(bench, devices=replace(bench.devices, camera=moved))
 
 
 def drift_projector(bench: Apparatus, drift: Drift) -> Apparatus:
@@ -605,17 +605,17 @@ class DriftedExposer(Exposer):
         if source not in self.drift.ripples:
             return 1.0
         amplitude, hertz = self.drift.ripples[source]
-        response = ripple_response(self.rig.sensor, self._open.exposure_s, hertz, rows)
+        response = ripple_response(self.devices.sensor, self._open.exposure_s, hertz, rows)
         phase = stream(self.seed, "drift", f"{source} ripple", *names).uniform(0, 2 * np.pi)
         return ripple_level(response, amplitude, phase)
 
     @cached_property
     def _open(self) -> Exposer:
         """The camera as it is."""
-        sensor, drift = warmer(self.rig.sensor, self.drift.temperature_k), self.drift
+        sensor, drift = warmer(self.devices.sensor, self.drift.temperature_k), self.drift
         black = {"black_level_dn": sensor.black_level_dn + drift.black_level_dn}
-        rig = replace(self.rig, sensor=sensor.model_copy(update=black))
-        return Exposer(rig, self.exposure_s * (1 + drift.exposure), self.seed, self.speckle)
+        devices = replace(self.devices, sensor=sensor.model_copy(update=black))
+        return Exposer(devices, self.exposure_s * (1 + drift.exposure), self.seed, self.speckle)
 
     @cached_property
     def levels(self) -> dict[tuple[str | int, ...], tuple[float, float]]:

@@ -84,11 +84,11 @@ class SpectralBench:
             Line(name=f"{wavelength:g}nm", wavelength_nm=wavelength, radiant_share=share)
             for wavelength, share in zip(lines.wavelengths_nm, lines.shares, strict=True)
         )
-        said: dict[str, Any] = {"kind": kind, "channels": named}
+        message: dict[str, Any] = {"kind": kind, "channels": named}
         if kind == MOSAIC:
-            said |= {"mosaic": bench.counting.mosaic, "weights": bench.counting.planes(lines.wavelengths_nm)}
+            message |= {"mosaic": bench.counting.mosaic, "weights": bench.counting.planes(lines.wavelengths_nm)}
         model = MosaicManifest if kind == MOSAIC else ColourManifest
-        return cls(replace(bench, lines=lines), model.model_validate(said))
+        return cls(replace(bench, lines=lines), model.model_validate(message))
 
     @cached_property
     def benches(self) -> tuple[Apparatus, ...]:
@@ -116,12 +116,12 @@ class SpectralBench:
     def sampling(self, request: Request) -> Sampling:
         """How light is sampled for one family's frames by a ``request``."""
         fraction = request.noise_fraction
-        target = NoiseTarget(self.whole.rig, request.timing, fraction) if fraction else None
+        target = NoiseTarget(self.whole.devices, request.timing, fraction) if fraction else None
         return Sampling(by_pixel=False, target=target, excess=excess_behind_filters if self.whole.filters else None)
 
     def check(self, request: Request) -> None:
         """MitsimError for what of a ``request`` the camera cannot have, or is not simulated in colour."""
-        request.timing.check(self.whole.sensor, self.whole.rig.camera_file)
+        request.timing.check(self.whole.sensor, self.whole.devices.camera_file)
         if self.manifest is None:
             return
         check_untimed(request.seconds)
@@ -208,8 +208,8 @@ class SpectralBench:
 
 def line_alone(bench: Apparatus, line: Lines) -> Apparatus:
     """The ``bench`` whose projector shows a ``line`` alone."""
-    rig = replace(bench.rig, projector=bench.projector.at(line.wavelengths_nm[0]))
-    return replace(bench, rig=rig, lines=line)
+    devices = replace(bench.devices, projector=bench.projector.at(line.wavelengths_nm[0]))
+    return replace(bench, devices=devices, lines=line)
 
 
 def plan_request(bench: Apparatus, request: Request, lines: int = 1) -> Plan:
@@ -249,17 +249,17 @@ def without_filters(bench: Opened) -> Opened:
     sensor = bench.sensor
     if sensor.mosaic is None:
         raise MitsimError(
-            f"camera {bench.rig.camera_file}: has no mosaic of colour filters, and colour mosaic was asked for; "
+            f"camera {bench.devices.camera_file}: has no mosaic of colour filters, and colour mosaic was asked for; "
             "use a camera that has one, such as imx249_rggb, or colour lines"
         )
     (rows, columns), first = bench.geometry.frame_shape, (bench.geometry.roi or (0, 0))[:2]
     if rows % 2 or columns % 2 or any(at % 2 for at in first):
         raise MitsimError(
-            f"camera {bench.rig.camera_file}: frames of {rows} x {columns} pixels from row {first[0]} and column "
+            f"camera {bench.devices.camera_file}: frames of {rows} x {columns} pixels from row {first[0]} and column "
             f"{first[1]} do not hold whole filters of 2 x 2; give the scene's film even numbers"
         )
     bare = sensor.model_copy(update={"mosaic": None, "mosaic_curves": None, "quantum_efficiency": 1.0})
-    return replace(bench, rig=replace(bench.rig, sensor=bare), filters=sensor)
+    return replace(bench, devices=replace(bench.devices, sensor=bare), filters=sensor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,7 +332,7 @@ class MosaicLight(SampledLight):
         frames, counted = list[Frame](), np.zeros((len(PLANES), len(counted_lamps.responses)))
         for number, response in enumerate(counted_lamps.responses):
             frames += _lamps_alone(light, counted_lamps.rows(number), seed)
-            # Filed is the mean over all pixels, of which the response's have it all.
+            # Accumulated is the mean over all pixels, of which the response's have it all.
             scale = response.part * unit * self.bench.projector.effective_wavelength_nm
             counted[list(response.planes), number] = 1 / scale
         shape = self.bench.geometry.frame_shape
@@ -351,8 +351,8 @@ def _lamps_alone(light: SampledLight, bands: slice, seed: int) -> ExpectedFrames
     """One frame of lamps of a ``light``, of some ``bands`` of theirs; a ``seed`` of its probes."""
     counted_lamps = light.bench.counted_lamps
     assert counted_lamps is not None, "asked before"
-    filed = light.simulation.of_lamps(light.groups, light.groups[0].rows - len(counted_lamps.bands), bands)
-    return ExpectedFrames(filed, Lighting(np.zeros(1, np.int64), np.ones((1, 1))), seed)
+    accumulated = light.simulation.of_lamps(light.groups, light.groups[0].rows - len(counted_lamps.bands), bands)
+    return ExpectedFrames(accumulated, Lighting(np.zeros(1, np.int64), np.ones((1, 1))), seed)
 
 
 def excess_behind_filters(lights: Sequence[SampledLight]) -> float:

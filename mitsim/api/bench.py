@@ -78,8 +78,8 @@ class Bench(Apparatus):
 
     def __repr__(self) -> str:
         path, (rows, columns) = self.loaded.path, self.geometry.frame_shape
-        rig = f"{self.sensor.name} with {rows} x {columns} pixels, {self.projector.name}"
-        return f"Bench({path.parent.name}/{path.name}: {rig})"
+        devices = f"{self.sensor.name} with {rows} x {columns} pixels, {self.projector.name}"
+        return f"Bench({path.parent.name}/{path.name}: {devices})"
 
     # ---- The plan, and light of the scene ----
 

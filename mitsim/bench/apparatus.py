@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from mitsim.core.manifests import Parallax
-    from mitsim.devices.camera import CameraGeometry, Rig
+    from mitsim.devices.camera import CameraGeometry, Devices
     from mitsim.devices.lamps import CountedLamps
     from mitsim.devices.mask_profile import MaskProfile
     from mitsim.devices.patterns import PatternFamily
     from mitsim.devices.projector import Lines, ProjectorModel, Spectrum
     from mitsim.devices.sensor import SensorModel
-    from mitsim.optics.mirror_frames import Glint
+    from mitsim.optics.mirror_frames import SpecularLight
     from mitsim.scene.load import LoadedScene
     from mitsim.transport.connect import OpticalSetup
     from mitsim.transport.projector import ProjectorOptics
@@ -54,7 +54,7 @@ class Apparatus:
     ----------
     loaded
         the scene.
-    rig
+    devices
         camera, sensor and projector, as pure data.
     variant
         of Mitsuba.
@@ -65,12 +65,12 @@ class Apparatus:
     counted_lamps
         how the camera counts lamps' light of all wavelengths; None: as light of the projector's effective wavelength.
     filters
-        the camera with its colour filters, which are put over frames; the sensor in ``rig`` then has none, and
+        the camera with its colour filters, which are put over frames; the sensor in ``devices`` then has none, and
         makes one electron of a photon. None: frames are as the sensor has them.
     """
 
     loaded: LoadedScene
-    rig: Rig
+    devices: Devices
     variant: str
     defines: dict[str, str]
     lines: Lines | None = None
@@ -80,12 +80,12 @@ class Apparatus:
     @property
     def geometry(self) -> CameraGeometry:
         """The camera's geometry, as the scene states it."""
-        return self.rig.camera
+        return self.devices.camera
 
     @property
     def sensor(self) -> SensorModel:
         """The camera's electronics."""
-        return self.rig.sensor
+        return self.devices.sensor
 
     @property
     def counting(self) -> SensorModel:
@@ -95,7 +95,7 @@ class Apparatus:
     @property
     def projector(self) -> ProjectorModel:
         """The projector's light and lens."""
-        return self.rig.projector
+        return self.devices.projector
 
     @property
     def n(self) -> int:
@@ -144,12 +144,12 @@ class Apparatus:
         return None if narrow or not self.geometry.diffracts else self.spectrum
 
     @cached_property
-    def glint(self) -> Glint:
+    def specular(self) -> SpecularLight:
         """Light of the projector that mirrors alone bring to the sensor."""
-        from mitsim.optics.mirror_frames import Glint
+        from mitsim.optics.mirror_frames import SpecularLight
         from mitsim.transport.specular import trace_specular_chains
 
-        return Glint(trace_specular_chains(self.loaded.scene, self.loaded.camera, self.projector_optics))
+        return SpecularLight(trace_specular_chains(self.loaded.scene, self.loaded.camera, self.projector_optics))
 
     @property
     def windows(self) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -247,7 +247,7 @@ class Apparatus:
             rows, columns = ((far - near) * self.geometry.scene_distance / self.n for near, far in self.windows)
             shots = () if family is None else family.shots[:: -(-len(family.shots) // _SPECKLED_SHOTS)]
             lit = [family.light(shot) for shot in shots] if family else [np.ones((self.n, self.n))]
-            each = [contrast_of(self.rig, (rows, columns), light) for light in lit if light.any()]
+            each = [contrast_of(self.devices, (rows, columns), light) for light in lit if light.any()]
             self._contrasts[key] = float(np.sqrt(np.mean(np.square(each))))
         return self._contrasts[key]
 
@@ -300,7 +300,7 @@ class Apparatus:
     def in_bands(self, count: int) -> Self:
         """The same bench whose projector has ``count`` bands of its lines as lines; MitsimError as
         :meth:`mitsim.devices.projector.ProjectorModel.in_bands`."""
-        return replace(self, rig=replace(self.rig, projector=self.projector.in_bands(count)))
+        return replace(self, devices=replace(self.devices, projector=self.projector.in_bands(count)))
 
 
 # -------- Opening a scene, a camera and a projector
@@ -371,7 +371,7 @@ def open_apparatus(
 
     sensor = load_sensor(sensor_path)
     # What imports numpy comes after what does not.
-    from mitsim.devices.camera import Rig
+    from mitsim.devices.camera import Devices
     from mitsim.devices.mask_profile import load_mask
     from mitsim.devices.projector import ProjectorModel
 
@@ -401,8 +401,8 @@ def open_apparatus(
             )
     _wear(loaded, mask, sensor_path)
     _tune(loaded, light)
-    rig = Rig(loaded.camera.geometry, sensor, light, str(sensor_path))
-    return Apparatus(loaded, rig, variant, defines)
+    devices = Devices(loaded.camera.geometry, sensor, light, str(sensor_path))
+    return Apparatus(loaded, devices, variant, defines)
 
 
 def reopened(bench: Opened, variant: str) -> Opened:
@@ -410,7 +410,7 @@ def reopened(bench: Opened, variant: str) -> Opened:
     :func:`mitsim.api.bench.open_bench`."""
     from mitsim.devices.mask_profile import load_mask
 
-    camera = Path(bench.rig.camera_file)
+    camera = Path(bench.devices.camera_file)
     loaded = _load(variant, bench.loaded.path, bench.defines, outside=True)
     _wear(loaded, load_mask(camera), camera)
     _tune(loaded, bench.projector)

@@ -104,7 +104,7 @@ class Effect:
         light (:data:`DIRECT`, :data:`FOLLOWED`) that must be traced anew to see the frames without it.
     kind
         kind of traced light that is left out to the same end; None: nothing is.
-    first_look
+    first_pilot_run
         whether it shapes direct light so much that the pilot has it on while it looks for anchors, layers and cells.
     followed
         whether its light is followed over several surfaces or from the camera, which takes time.
@@ -124,7 +124,7 @@ class Effect:
     note: Callable[[Apparatus], str] = field(default=lambda bench: "")
     retraced: Callable[[Physics], frozenset[str]] = field(default=lambda physics: frozenset())
     kind: Literal["indirect", "ambient"] | None = None
-    first_look: bool = False
+    first_pilot_run: bool = False
     followed: bool = False
     in_shadow: bool = False
     in_frames: bool = True
@@ -208,7 +208,7 @@ EFFECTS: Mapping[str, Effect] = _registry(
         {"mirrors": False},
         absent="no surface reflects or transmits light in single directions",
         retraced=_always(FOLLOWED),
-        first_look=True,
+        first_pilot_run=True,
         followed=True,
         in_reference=True,
     ),
@@ -226,7 +226,7 @@ EFFECTS: Mapping[str, Effect] = _registry(
         {"spectrum": None},
         absent="the mask's shadow is geometric, or a picture that has it",
         note=_diffraction,
-        first_look=True,
+        first_pilot_run=True,
         in_shadow=True,
     ),
     Effect("mask-thickness", {"geometry.mask_thickness": 0.0}, absent="the mask is thin", in_reference=True),
@@ -244,7 +244,7 @@ EFFECTS: Mapping[str, Effect] = _registry(
         absent="the projector is a pinhole: sharp at all distances",
         note=_lens,
         retraced=_always(DIRECT, FOLLOWED),
-        first_look=True,
+        first_pilot_run=True,
         in_truth=True,
     ),
     Effect(
@@ -252,7 +252,7 @@ EFFECTS: Mapping[str, Effect] = _registry(
         {"projector.blur": 0.0},
         absent="the projector's pixels are sharp",
         retraced=_always(DIRECT, FOLLOWED),
-        first_look=True,
+        first_pilot_run=True,
         in_truth=True,
     ),
     Effect(

@@ -25,7 +25,7 @@ from mitsim.devices.patterns import pattern_names, read_name
 from mitsim.devices.sensor import EXPOSURE_FRACTION, EXPOSURE_S, SensorModel
 
 if TYPE_CHECKING:
-    from mitsim.devices.camera import Rig
+    from mitsim.devices.camera import Devices
     from mitsim.devices.session import SessionRecipe
 
 LOWEST_ACCURACY, HIGHEST_ACCURACY = 1e-6, 0.3
@@ -126,15 +126,15 @@ class Exposure:
                 "give a finite one, or an exposure in seconds"
             )
 
-    def choose(self, rig: Rig, peak_irradiance: float) -> float:
-        """Exposure time [s] of a ``rig`` for frames whose brightest expected pixel has ``peak_irradiance``
+    def choose(self, devices: Devices, peak_irradiance: float) -> float:
+        """Exposure time [s] of ``devices`` for frames whose brightest expected pixel has ``peak_irradiance``
         [W m^-2]."""
         if self.seconds is not None:
             return self.seconds
         from mitsim.sensor.chain import exposure_for_peak  # here: it needs numpy, and checking a request does not
 
-        wavelength = rig.projector.effective_wavelength_nm
-        return exposure_for_peak(peak_irradiance, self.fraction, rig.sensor, wavelength)
+        wavelength = devices.projector.effective_wavelength_nm
+        return exposure_for_peak(peak_irradiance, self.fraction, devices.sensor, wavelength)
 
 
 def _check_range(name: str, value: float, least: float, most: float, rule: str) -> float:

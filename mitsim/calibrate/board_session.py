@@ -237,7 +237,7 @@ def _lines(n: int) -> Lighting:
 # -------- What a calibration session takes
 # The reason of each figure is how :class:`mitsim.calibrate.session.LitSession` works.
 
-_PACES = replace(FIXED, product=1.1e-11)
+_UNIT_COSTS = replace(FIXED, product=1.1e-11)
 """A multiplication of products as large as those of stripes: half of what it takes in small ones (2048 pixels a side,
 two processors)."""
 _MIXED_S, _FORMED_S = 3e-8, 1e-8
@@ -280,8 +280,8 @@ def session_seconds(board: Apparatus, count: int, shots: int, settings: Settings
         correlated=(board.geometry.drawn(waves=False), board.geometry.drawn(board.geometry.diffracts)),
     )
     numbers = replace(Numbers.of(settings), mixed=0.0)  # what black pixels leak is added to frames
-    seconds = 2 * float(forming_seconds(forming, numbers, n if mixed else count, _PACES))
-    each = n * _PACES.product + _MIXED_S if mixed else _FORMED_S
+    seconds = 2 * float(forming_seconds(forming, numbers, n if mixed else count, _UNIT_COSTS))
+    each = n * _UNIT_COSTS.product + _MIXED_S if mixed else _FORMED_S
     return {"optics": seconds + 2 * count * pixels**2 * each, "sensor": frame_seconds(board, shots)["sensor"]}
 
 

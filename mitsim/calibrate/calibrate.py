@@ -167,7 +167,7 @@ def _by_line(bench: SpectralBench, request: SessionRequest, task: Task) -> dict[
         if (dark := np.argwhere(weights == 0)).size:
             plane, line = dark[0]
             raise MitsimError(
-                f"camera {bench.whole.rig.camera_file}: its {str(filters.mosaic)[plane]} filters "
+                f"camera {bench.whole.devices.camera_file}: its {str(filters.mosaic)[plane]} filters "
                 f"pass nothing of {names[line]}, so a calibration in this line alone does not see all "
                 "pixels; use a projector whose lines all filters pass"
             )
@@ -206,7 +206,7 @@ def _run_sessions(
     lights: list[SampledLight] = []
     for number, (session, place) in enumerate(zip(lines, places, strict=True)):
         bench, recipe = session.bench, session.recipe
-        Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.rig.camera_file)
+        Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.devices.camera_file)
         configuration = {
             **bench.provenance(),
             **bench.identity(),

@@ -85,7 +85,7 @@ class LitSession:
             n, signs = session.bench.n, session.signs
             white = next(iter(light.frames(Lighting.uniform(n), session.seed)))
             exposure = Exposure(None, session.recipe.exposure_fraction)
-            exposure_s = exposure.choose(session.bench.rig, float(session.filtered(white.irradiance).max()))
+            exposure_s = exposure.choose(session.bench.devices, float(session.filtered(white.irradiance).max()))
         stripes = PatternFamily("stripes", signs[:, 1:2].astype(np.int8), np.ones((n, 1), np.int8))
         return cls(session, light, white, exposure_s, light.speckle(stripes))
 
@@ -232,7 +232,7 @@ class LitSession:
     @property
     def _second(self) -> Exposer:
         """An exposure of one second, whose electrons are rates."""
-        return Exposer(self.session.bench.rig, 1.0, self.session.seed)
+        return Exposer(self.session.bench.devices, 1.0, self.session.seed)
 
     @cached_property
     def exposures_s(self) -> tuple[float, ...]:
@@ -242,7 +242,7 @@ class LitSession:
     @cached_property
     def _exposers(self) -> tuple[Exposer, ...]:
         bench = self.session.bench
-        return tuple(Exposer(bench.rig, time, self.session.seed, self.speckle) for time in self.exposures_s)
+        return tuple(Exposer(bench.devices, time, self.session.seed, self.speckle) for time in self.exposures_s)
 
     @cached_property
     def ladders(self) -> Mapping[str, Ladder]:

@@ -174,7 +174,7 @@ def _of_frames(bench: Apparatus, session: SessionFrames, modelling: Modelling) -
     if listed.n != bench.n:
         raise MitsimError(
             f"frames {session.folder}: n is {listed.n}, but the scene's projector has {bench.n} pixels a side; give "
-            "the scene of this rig"
+            "the scene of these devices"
         )
     signs = stripe_signs(listed.n).astype(np.float64)
     chosen = modelling.chosen(_changes(signs), pairs, listed.repeats)
@@ -184,7 +184,7 @@ def _of_frames(bench: Apparatus, session: SessionFrames, modelling: Modelling) -
         if rate.shape != (rows, columns):
             raise MitsimError(
                 f"frames {session.folder}: are {rate.shape[0]} x {rate.shape[1]} pixels, but the scene's camera has "
-                f"{rows} x {columns}; give the scene of this rig"
+                f"{rows} x {columns}; give the scene of these devices"
             )
         shown.append(_response(signs[:, index], side, rate, noise, listed.centre))
     return shown, listed.digital, frames_of(chosen, pairs, listed.repeats) * len(listed.exposure_ladder)

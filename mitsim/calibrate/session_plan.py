@@ -120,16 +120,16 @@ class CalibrationPlan:
             return self.flags
         most = f", most of its error is {self.ceiling.largest}" if self.ceiling.largest else ""
         if self.ceiling.psnr_db < self.psnr_asked:
-            said = (
+            sentence = (
                 f"PSNR {self.psnr_asked:g} dB cannot be reached under {self.patterns}: with a calibration without "
                 f"noise the image has {self.ceiling.psnr_db:.1f} dB{most}; improve the capture, not the calibration"
             )
         else:
-            said = (
+            sentence = (
                 f"PSNR {self.psnr_asked:g} dB is not reached by {self.recipe.repeats} repeats: "
                 f"{self.trial.psnr_db:.1f} dB; the ceiling is {self.ceiling.psnr_db:.1f} dB{most}"
             )
-        return (said, *self.flags)
+        return (sentence, *self.flags)
 
     def payload(self) -> dict[str, Any]:
         """The JSON of the command line."""
@@ -217,7 +217,7 @@ def plan_calibration(
             f"recipe: has {len(recipe.exposure_ladder)} exposures of a frame and {recipe.dark_frames} dark frames; a "
             "plan knows sessions of one exposure without dark frames, so leave exposure_ladder and dark_frames out"
         )
-    Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.rig.camera_file)
+    Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.devices.camera_file)
     job.progress("capture", 0.0)
     with job.clock.stage("capture"):
         request = Request.of(patterns=patterns, seed=seed, accuracy=accuracy)
@@ -238,7 +238,7 @@ def plan_calibration(
     if contrast:
         unknown = [f"speckle of contrast {contrast:g}: it is in every frame, and not in the plan's calibration"]
     # Half of the projector's pixels are lit in every frame but the uniform ones.
-    electrons = float(Exposer(bench.rig, lit.exposure_s, seed).electrons(lit.white).mean()) / 2
+    electrons = float(Exposer(bench.devices, lit.exposure_s, seed).electrons(lit.white).mean()) / 2
     return CalibrationPlan(
         psnr_asked=psnr,
         patterns=patterns,
@@ -377,7 +377,7 @@ class PredictedSession:
         """The session with the exposure and the repeats of a ``recipe``, whose other fields are those it was lit by."""
         lit = self.lit
         exposure = Exposure(None, recipe.exposure_fraction).choose(
-            lit.session.bench.rig, float(lit.white.irradiance.max())
+            lit.session.bench.devices, float(lit.white.irradiance.max())
         )
         return replace(lit, session=replace(lit.session, recipe=recipe), exposure_s=exposure)
 
@@ -438,7 +438,7 @@ def _variances(lit: LitSession) -> tuple[FloatArray, FloatArray | None]:
     Shots of a pattern are taken for half as bright as uniform light: over all patterns, and over a pair, that is exact.
     """
     bench, time, recipe = lit.session.bench, lit.exposure_s, lit.session.recipe
-    white = Exposer(bench.rig, time, lit.session.seed).electrons(lit.white)
+    white = Exposer(bench.devices, time, lit.session.seed).electrons(lit.white)
     unit = recipe.repeats * (bench.sensor.gain_dn_per_e * time) ** 2
     half = frame_moments(white / 2, time, bench.sensor)[1] / unit
     if lit.session.pairs:

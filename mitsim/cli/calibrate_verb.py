@@ -86,7 +86,7 @@ class Modelled:
     """What --model is asked for."""
 
     model: str | None = option(
-        None, "model the factors, its rig fitted to a few frames; of --frames with SCENE", metavar="geometric|wave"
+        None, "model the factors, its devices fitted to a few frames; of --frames with SCENE", metavar="geometric|wave"
     )
     frames_used: int | None = option(None, "frames that --model is fitted to, at most", show_default="16", metavar="K")
     fit: str | None = option(None, "what --model fits", show_default="mask, magnification, gain", metavar="NAME,...")

@@ -276,8 +276,8 @@ def _npy(path: Path, wanted: Wanted) -> _Header:
         array = Npy.of(file, path.stat().st_size)
     kinds, sides = "buif" if 1 in wanted.bits else "uif", array.shape[-2:]
     if len(array.shape) not in (2, 3) or array.dtype.kind not in kinds:
-        told = f"{array.dtype} of shape {array.shape}"
-        raise wanted.refusal(path, f"holds {told}; rows x columns of numbers are needed, or pages of them")
+        payload = f"{array.dtype} of shape {array.shape}"
+        raise wanted.refusal(path, f"holds {payload}; rows x columns of numbers are needed, or pages of them")
     pages = array.shape[0] if len(array.shape) == 3 else 1
     # Columns first, a page is scattered over the whole file.
     at_once = array.bytes / max(math.prod(sides), 1) if array.fortran else float(array.dtype.itemsize)

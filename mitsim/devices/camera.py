@@ -80,7 +80,7 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
 
     As the distance: no mask is wider."""
     scene_distance: float = Field(default=400.0, ge=1e-6, le=1e10)
-    """Sensor to the plane that the rig is aligned to [mm].
+    """Sensor to the plane that the bench is aligned to [mm].
 
     A nanometre, for masks in contact, to 10 000 km."""
     fov: float = Field(default=20.0, ge=1e-3, lt=180)
@@ -379,7 +379,7 @@ def centred_edges(count: int, pitch: float) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Rig:
+class Devices:
     """Camera and projector.
 
     Attributes

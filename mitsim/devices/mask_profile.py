@@ -148,8 +148,8 @@ class MaskProfile(Configuration):
             values, turn = np.rot90(values, quarters), 0.0
             dust = dust and dust.turned(quarters)
         flaws = Flaws(self.edge_blur_um * 1e-3, turn, (self.tilt_row_mrad, self.tilt_column_mrad), dust)
-        told = [f"{name} {getattr(self, name):g}" for name in type(self).model_fields if name in self._stated]
-        return Plate(feature, values, ", ".join([drawn.words, *told]), lines, flaws)
+        stated = [f"{name} {getattr(self, name):g}" for name in type(self).model_fields if name in self._stated]
+        return Plate(feature, values, ", ".join([drawn.words, *stated]), lines, flaws)
 
     def pictured(self, folder: Path, mask_distance_mm: float) -> Plate:
         """The light behind a phase mask as a plate: how much brighter each place is than without a mask.

@@ -38,7 +38,7 @@ MOST_CHECKED = 64
 """Shots that are looked at where light is followed over several surfaces, as heavy paths strike single ones (cookie_bag
 at 1e-3 met its target in eight of 49, and not in all); and classes whose frames tell of all shots, which are formed of
 them: what a look finds of them is used again."""
-_LOOK = 0.4
+_CHECK = 0.4
 """Time of a look at a frame's error in that of forming the frame: 0.36 in corner, 0.44 in cookie_bag, 0.40 in
 gift_card."""
 MIXING = "black-level"
@@ -111,7 +111,7 @@ layer: 0.08 to 0.13 processor seconds of 512 x 512 pixels and 36 phases, where s
 (benchmarks/masks.py)."""
 _MANY_ENTRIES = 1.2
 """An entry of a geometric shadow of many terms over one of a wave-optical one (benchmarks/masks.py)."""
-_FILED = 0.2
+_FURTHER_LINE = 0.2
 """What tracing takes more for each further line: 0.15 of a mono capture's seconds, 0.3 of one line's (three lines of
 photograph, benchmarks/colour.py)."""
 _PASSED = 0.4
@@ -340,9 +340,9 @@ def checking_seconds(forming: Forming, numbers: Numbers, costs: UnitCosts) -> Nu
     rounds = ROUNDS + numbers.indirect
     if tells_all(forming.classes, forming.shots, forming.pixels):
         # The last look takes its part of forming the frames over.
-        return forming_seconds(forming, numbers, _LOOK * (rounds - 1) * forming.classes, costs)
+        return forming_seconds(forming, numbers, _CHECK * (rounds - 1) * forming.classes, costs)
     few, many = (min(shots, forming.shots) for shots in (CHECKED_SHOTS, MOST_CHECKED))
-    return forming_seconds(forming, numbers, _LOOK * rounds * (few + numbers.indirect * (many - few)), costs)
+    return forming_seconds(forming, numbers, _CHECK * rounds * (few + numbers.indirect * (many - few)), costs)
 
 
 def tells_all(classes: int, shots: int, pixels: float) -> bool:
@@ -385,7 +385,7 @@ def tracing_seconds(pilot_result: PilotResult, settings: Settings, costs: UnitCo
 def traced_for(lines: int, parted: bool = False) -> float:
     """Times what one line takes that tracing and accumulating take for so many ``lines`` on the same paths, or on paths
     of their own where glass has ``parted`` them."""
-    return lines if parted else 1 + _FILED * (lines - 1)
+    return lines if parted else 1 + _FURTHER_LINE * (lines - 1)
 
 
 def predicted_rays(pixels: int, samples: float, rate: float) -> float:

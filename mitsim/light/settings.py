@@ -378,7 +378,7 @@ class PilotResult:
         takes is then of that.
     left_out
         light that no tracer finds, over that and what is found (:mod:`mitsim.transport.missed`).
-    glint
+    unresolved_specular
         light over mirrors alone whose place on the sensor is not known, over all light.
     mirror
         place, among the scene's shapes, of what most of that comes over.
@@ -399,7 +399,7 @@ class PilotResult:
     apart: Mapping[str, float] = field(default_factory=dict)
     unresolved: float = 0.0
     left_out: float = 0.0
-    glint: float = 0.0
+    unresolved_specular: float = 0.0
     mirror: int | None = None
     shared: bool = False
     repeats: tuple[int, ...] = ()

@@ -21,7 +21,7 @@ from mitsim.devices.patterns import Lighting
 from mitsim.light.grids import GRIDS, LightEstimate
 from mitsim.light.passes import PASSES, Pass, PassTracer, Tracers
 from mitsim.light.settings import PATHS_AT_ONCE
-from mitsim.optics.forming import Filed
+from mitsim.optics.forming import AccumulatedLight
 from mitsim.optics.frames import ClassFrames, ExpectedFrames
 from mitsim.transport.accumulator import DeviceAccumulator, DeviceSums
 from mitsim.transport.direct import DirectTracer
@@ -194,7 +194,9 @@ class Simulation(Tracers):
 
     # ---- Frames
 
-    def with_optics(self, groups: Sequence[LightEstimate], first: int) -> tuple[list[Filed], list[Filed]]:
+    def with_optics(
+        self, groups: Sequence[LightEstimate], first: int
+    ) -> tuple[list[AccumulatedLight], list[AccumulatedLight]]:
         """Light of the projector and ambient light, with the optics that form their frames.
 
         Parameters
@@ -203,13 +205,15 @@ class Simulation(Tracers):
             independent estimates of the light, and the first row of ambient light in them.
         """
         lights = [
-            Filed(self.grids[row.name].optics, tuple(_rows(group[row.name], 0, first) for group in groups))
+            AccumulatedLight(self.grids[row.name].optics, tuple(_rows(group[row.name], 0, first) for group in groups))
             for row in GRIDS.values()
             if row.formed(self.settings, self.physics)
         ]
         return lights, self.of_lamps(groups, first) if self.physics.lamps else []
 
-    def of_lamps(self, groups: Sequence[LightEstimate], first: int, bands: slice = slice(None)) -> list[Filed]:
+    def of_lamps(
+        self, groups: Sequence[LightEstimate], first: int, bands: slice = slice(None)
+    ) -> list[AccumulatedLight]:
         """Lamps' light with the optics that form its frames.
 
         Parameters
@@ -220,20 +224,20 @@ class Simulation(Tracers):
             of which it is, where not of all.
         """
         return [
-            Filed(grid.optics, tuple(_rows(group[name], row, row + 1) for group in groups))
+            AccumulatedLight(grid.optics, tuple(_rows(group[name], row, row + 1) for group in groups))
             for row, grids in list(enumerate(self.by_band, first))[bands]
             for name, grid in grids.items()
             if GRIDS[name].formed(self.settings, self.physics)
         ]
 
     def specular_frames(self, labels: Labels) -> ClassFrames | None:
-        """Frames of the projector's glint by class in ``labels`` (n^2,); None without such light.
+        """Frames of the projector's specular chains by class in ``labels`` (n^2,); None without such light.
 
         It is a pinhole's light, whatever the projector's lens.
         """
         if not self.physics.mirrors:
             return None
-        found = self.bench.glint.frames(labels, self.physics.geometry, self.physics.spectrum)
+        found = self.bench.specular.frames(labels, self.physics.geometry, self.physics.spectrum)
         if found is None or self.places is None:
             return found
         return replace(found, irradiance=found.irradiance[:, self.places[0]][:, :, self.places[1]])
@@ -275,8 +279,8 @@ def expected_of(
     light = emitted(parts[0][0].physics, lighting, leaking)
     formed = [simulation.with_optics(groups, len(rows)) for simulation, groups in parts]
     lights, ambient = ([each for part in formed for each in part[kind]] for kind in (0, 1))
-    glint = parts[-1][0].specular_frames(lighting.labels)
-    return ExpectedFrames(lights, Lighting(rows, light), seed, ambient, glint, probed)
+    specular = parts[-1][0].specular_frames(lighting.labels)
+    return ExpectedFrames(lights, Lighting(rows, light), seed, ambient, specular, probed)
 
 
 def emitted(physics: Physics, lighting: Lighting, leaking: bool = True) -> FloatArray:

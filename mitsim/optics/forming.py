@@ -34,7 +34,7 @@ _MOST_COLUMNS = 2**22
 
 
 @dataclass(frozen=True, eq=False)
-class Filed:
+class AccumulatedLight:
     """Light and the optics that forms it.
 
     Attributes
@@ -50,7 +50,7 @@ class Filed:
 
 
 def form_frames(
-    lights: Sequence[Filed], basis: sparse.csr_array, probes: FloatArray | None
+    lights: Sequence[AccumulatedLight], basis: sparse.csr_array, probes: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
     """Frames of mixtures of light, and its replicates times probes.
 
@@ -83,7 +83,9 @@ def form_frames(
     return frames, probed
 
 
-def probe_frames(lights: Sequence[Filed], basis: sparse.csr_array, probes: FloatArray) -> tuple[FloatArray, FloatArray]:
+def probe_frames(
+    lights: Sequence[AccumulatedLight], basis: sparse.csr_array, probes: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Replicates of mixtures of light, without the frames themselves.
 
     Parameters
@@ -112,7 +114,9 @@ def probe_frames(lights: Sequence[Filed], basis: sparse.csr_array, probes: Float
     return probed, noise
 
 
-def _mix_lights(lights: Sequence[Filed], basis: sparse.csr_array) -> list[tuple[FrameOptics, list[sparse.csr_array]]]:
+def _mix_lights(
+    lights: Sequence[AccumulatedLight], basis: sparse.csr_array
+) -> list[tuple[FrameOptics, list[sparse.csr_array]]]:
     """Mixtures ``basis`` (b, rows) of each group of each light, with the light's optics."""
     mixed = [(light.optics, [_product(basis, group) for group in light.groups]) for light in lights]
     for _, parts in mixed:

@@ -18,7 +18,7 @@ from mitsim.core.parallel import in_threads
 from mitsim.devices.camera import side_of
 from mitsim.devices.patterns import Lighting
 from mitsim.optics.forming import (
-    Filed,
+    AccumulatedLight,
     Mixture,
     bound_of,
     form_frames,
@@ -151,7 +151,7 @@ class ExpectedFrames:
         of the random signs.
     ambient
         light (1, cells) of every shot, its groups paired with those of ``lights``.
-    glint
+    specular
         frames to be added to those of some classes.
     probed
         :attr:`probed` of other shots of the same lights, classes and seed.
@@ -159,14 +159,14 @@ class ExpectedFrames:
 
     def __init__(
         self,
-        lights: Sequence[Filed],
+        lights: Sequence[AccumulatedLight],
         lighting: Lighting,
         seed: int,
-        ambient: Sequence[Filed] = (),
-        glint: ClassFrames | None = None,
+        ambient: Sequence[AccumulatedLight] = (),
+        specular: ClassFrames | None = None,
         probed: FloatArray | None = None,
     ) -> None:
-        self._lights, self._ambient, self._glint = tuple(lights), tuple(ambient), glint
+        self._lights, self._ambient, self._specular = tuple(lights), tuple(ambient), specular
         self._seed, self._weights = seed, lighting.weights
         (shots, classes), rows = lighting.weights.shape, lighting.labels.size
         indicator = sparse.csr_array((np.ones(rows), (lighting.labels, np.arange(rows))), shape=(classes, rows))
@@ -278,9 +278,9 @@ class ExpectedFrames:
             noise = of_shots.sum(axis=0)
             if self._leaked_light is not None:
                 probed += self._leaked_light[1][0]
-        if self._glint is not None:  # in every group
-            brought = np.repeat((self._glint.irradiance @ self._probes)[:, :, None], self._groups, axis=2)
-            probed += weights[:, self._glint.classes] @ brought.reshape(len(brought), -1)
+        if self._specular is not None:  # in every group
+            brought = np.repeat((self._specular.irradiance @ self._probes)[:, :, None], self._groups, axis=2)
+            probed += weights[:, self._specular.classes] @ brought.reshape(len(brought), -1)
         if self._ambient:
             seen, of_one = probe_frames(self._ambient, _ALL, self._probes)
             probed += seen
@@ -316,8 +316,8 @@ class ExpectedFrames:
     def _form(self, start: int, stop: int) -> tuple[FloatArray, FloatArray]:
         """(b, m, m') frames of basis lights, (b, m * groups * probes) those of groups as signs see them.
 
-        Glint is exact: it is in the frames alone, as no difference between groups has any. Classes that were probed
-        before are not probed again.
+        Light of specular chains is exact: it is in the frames alone, as no difference between groups has any. Classes
+        that were probed before are not probed again.
         """
         basis = self._basis[start:stop]
         if self._probed is None:
@@ -327,14 +327,16 @@ class ExpectedFrames:
         if not self._mixed and self._leaked_light is not None:
             frames += self._leaked_light[0]
             probed += self._leaked_light[1]
-        if self._glint is not None:
-            shares = self._shares[start:stop][:, self._glint.classes]
+        if self._specular is not None:
+            shares = self._shares[start:stop][:, self._specular.classes]
             for frame, share in zip(frames, shares, strict=True):
                 for index in np.flatnonzero(share):
-                    frame += share[index] * self._glint.irradiance[index]
+                    frame += share[index] * self._specular.irradiance[index]
         return frames, probed
 
-    def _form_with_probes(self, lights: Sequence[Filed], basis: sparse.csr_array) -> tuple[FloatArray, FloatArray]:
+    def _form_with_probes(
+        self, lights: Sequence[AccumulatedLight], basis: sparse.csr_array
+    ) -> tuple[FloatArray, FloatArray]:
         """As :func:`form_frames`; a single group's frames differ from no others."""
         return form_frames(lights, basis, self._probes if self._groups > 1 else None)
 

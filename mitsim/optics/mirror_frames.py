@@ -141,7 +141,7 @@ def specular_frames(
     for cut in _cuts(beams, reached, min(geometry.pitches) / boxes_per_pixel):
         boxes = _boxes(beams, cut, geometry)
         pixels = beams.pixel[boxes.beam]
-        total += _deposit(frames, np.searchsorted(classes, labels[pixels]), boxes, geometry, terms, active_part)
+        total += _accumulate(frames, np.searchsorted(classes, labels[pixels]), boxes, geometry, terms, active_part)
         lit[pixels] = True
     used = np.isin(classes, labels[lit])
     area = math.prod(geometry.active_sides)
@@ -236,7 +236,7 @@ def _boxes(beams: Beams, cut: _Cut, geometry: CameraGeometry) -> _Boxes:
     return _Boxes(cut.beams[owner], flux * response, place, extent, tangent, magnification[owner])
 
 
-def _deposit(
+def _accumulate(
     frames: FloatArray,
     slot: IntArray,
     boxes: _Boxes,
@@ -330,7 +330,7 @@ _KEPT = 4
 """Frames of so many lightings and cameras: what the pilot switches between."""
 
 
-class Glint:
+class SpecularLight:
     """Frames made from ``beams``; the last few are kept, because forming them takes as long as tracing does.
 
     Attributes

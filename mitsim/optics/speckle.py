@@ -30,7 +30,7 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.devices.camera import CameraGeometry, Rig
+from mitsim.devices.camera import CameraGeometry, Devices
 from mitsim.devices.projector import Coherence
 
 _NODES = 16
@@ -64,12 +64,12 @@ def add_speckle(irradiance: FloatArray, contrast: float, rng: np.random.Generato
     return np.asarray(irradiance * rng.gamma(contrast**-2, contrast**2, size=irradiance.shape))
 
 
-def contrast_of(rig: Rig, pixels_mm: tuple[float, float], lit: FloatArray) -> float:
+def contrast_of(devices: Devices, pixels_mm: tuple[float, float], lit: FloatArray) -> float:
     """The contrast of speckle in one sensor pixel, by the formula above, mean over the sensor.
 
     Parameters
     ----------
-    rig
+    devices
         camera and projector, whose table ``speckle`` says how coherent its light is; its defaults where there is none.
     pixels_mm
         height and width of a projector pixel on the aligned plane [mm].
@@ -83,12 +83,12 @@ def contrast_of(rig: Rig, pixels_mm: tuple[float, float], lit: FloatArray) -> fl
     """
     if not lit.any():
         raise MitsimError("speckle contrast: no projector pixel is lit; light makes it")
-    coherence, spectrum = rig.projector.speckle or Coherence(), rig.projector.spectrum
+    coherence, spectrum = devices.projector.speckle or Coherence(), devices.projector.spectrum
     inverse = 1 / spectrum.wavelengths_nm
     pairs = _coherences(spectrum.wavelengths_nm, coherence.roughness_um, coherence.linewidth_nm)
     pairs *= np.outer(spectrum.weights, spectrum.weights)
     spaces = {
-        wavelength: _space(rig, pixels_mm, lit, wavelength * 1e-6)
+        wavelength: _space(devices, pixels_mm, lit, wavelength * 1e-6)
         for wavelength in np.unique(2 / (inverse[:, None] + inverse)[pairs > 0])
     }
     # Of two lines, grains at their mean wave number; where lines are coherent at all they are close to it.
@@ -118,13 +118,13 @@ def _coherences(wavelengths_nm: FloatArray, roughness_um: float | None, linewidt
     return np.asarray(found)
 
 
-def _space(rig: Rig, pixels_mm: tuple[float, float], lit: FloatArray, wavelength_mm: float) -> float:
+def _space(devices: Devices, pixels_mm: tuple[float, float], lit: FloatArray, wavelength_mm: float) -> float:
     """The mean over pairs of points, for one wavelength [mm]; other parameters as for :func:`contrast_of`.
 
     Of speckle's variance over all pixels, relative to the sum of their light's squares: the mask's shadow has pixels of
     more light and of less.
     """
-    camera, radius = rig.camera, (rig.projector.speckle or Coherence()).beam_radius_mm
+    camera, radius = devices.camera, (devices.projector.speckle or Coherence()).beam_radius_mm
 
     def grains(distance: FloatArray, width: float) -> FloatArray:
         kernel = np.square(np.sinc(width * distance / (wavelength_mm * camera.scene_distance)))

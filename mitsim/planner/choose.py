@@ -299,7 +299,7 @@ class _Table:
         lacking = {
             "light over sharp lobes": pilot_result.unresolved,
             "light over mirrors or curved glass both ways, or once and a sharp lobe (left out)": pilot_result.left_out,
-            "light over small mirrors alone (not resolved)": pilot_result.glint,
+            "light over small mirrors alone (not resolved)": pilot_result.unresolved_specular,
         }
         missing = min(sum(lacking.values()), 1.0)
         # Errors of the light that is there count for its part of all.

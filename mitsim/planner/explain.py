@@ -202,19 +202,19 @@ class _Words:
         chosen, accuracy, missing = self.chosen, self.accuracy, self.pilot_result.unresolved
         if chosen.total.bound <= accuracy:
             return ()
-        said, parts = [], self._bounds_by_part()
+        sentences, parts = [], self._bounds_by_part()
         if missing > accuracy:
-            said.append(
+            sentences.append(
                 f"{missing:.0%} of the direct light comes over lobes too sharp to sample, and the frames lack "
                 "most of it; give those surfaces more roughness, or make them perfect mirrors (conductor)"
             )
         largest = max(parts, key=lambda name: parts[name])
         shapes, mirror = self.facts.shapes, self.pilot_result.mirror
         if mirror is not None and shapes and self.pilot_result.left_out >= min(accuracy, parts[largest]):
-            said.append(self._left_out(shapes[mirror]))
-        if self.facts.mirrors and self.pilot_result.glint >= min(accuracy, parts[largest]):
-            said.append(self._unresolved_specular(self.facts.mirrors))
-        return tuple(said) or (
+            sentences.append(self._left_out(shapes[mirror]))
+        if self.facts.mirrors and self.pilot_result.unresolved_specular >= min(accuracy, parts[largest]):
+            sentences.append(self._unresolved_specular(self.facts.mirrors))
+        return tuple(sentences) or (
             f"the predicted total error, up to {chosen.total.bound:.1e}, exceeds the requested {accuracy:g}; "
             f"largest: {largest}, {parts[largest]:.1e}",
         )
@@ -224,9 +224,9 @@ class _Words:
         kinds = Counter(str(mirror.attributes.get("type", "shape")) for mirror in mirrors)
         among = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
         rule = (
-            f"{self.pilot_result.glint:.2g} of the light comes over the scene's mirrors and curved glass alone "
-            f"({among}; this is the first), in beams too fine to be placed on the sensor: it is left out, or in the "
-            "wrong pixels; use fewer or larger ones, move them apart, or make them rough"
+            f"{self.pilot_result.unresolved_specular:.2g} of the light comes over the scene's mirrors and curved glass "
+            f"alone ({among}; this is the first), in beams too fine to be placed on the sensor: it is left out, or in "
+            "the wrong pixels; use fewer or larger ones, move them apart, or make them rough"
         )
         return str(mirrors[0].refusal("shape", repr(mirrors[0].attributes.get("type", "")), rule))
 
@@ -370,14 +370,14 @@ class _Words:
         error = self.pilot_result.effects.get(name)
         if error is None:
             return PlanRow(name, state, effect.absent or "nothing in the scene calls for it", 0.0, 0.0)
-        said = [self.facts.notes.get(name, ""), "switched by the user" if name in self.switches else ""]
-        said.append(f"left out, the frames change by {_error_words(error)}")
+        sentences = [self.facts.notes.get(name, ""), "switched by the user" if name in self.switches else ""]
+        sentences.append(f"left out, the frames change by {_error_words(error)}")
         takes_time = name in costly_effects()
         if on and name not in self.switches:
             less = replace(settings, effects=settings.effects - {name})
-            said.append(self._without(less) if takes_time else "it takes no time")
+            sentences.append(self._without(less) if takes_time else "it takes no time")
         seconds = self._seconds(effects=settings.effects - {name}) if on and takes_time else 0.0
-        return PlanRow(name, state, "; ".join(filter(None, said)), error.value, seconds)
+        return PlanRow(name, state, "; ".join(filter(None, sentences)), error.value, seconds)
 
 
 def _error_words(error: Estimate) -> str:

@@ -80,7 +80,7 @@ _MORE = 4
 _LOOSELY = 0.3
 """Part of the light of highlights that the search for lobes may lack where it has found them: some 30 hits tell it to a
 fifth."""
-_FEWEST_IN_LOOK = 8.0
+_FEWEST_IN_RUN = 8.0
 """Hits that a look at a small target must count on: the looks then tell its light to a fifth."""
 _ALIGNED = 1e-6
 """Relative distance from the aligned plane that is rounding: the plane keeps its exact cells."""
@@ -114,17 +114,17 @@ class PilotRuns:
     def __init__(self, bench: Apparatus, lighting: Lighting, accuracy: float, seed: int, lines: int = 1) -> None:
         self.bench, self.lighting, self.accuracy, self.seed, self._lines = bench, lighting, accuracy, seed, lines
         self.present = effects.present(bench)
-        first_look = frozenset(self.present) & effects.names(lambda effect: effect.first_look)
-        first = Simulation(bench, Settings(depth=bench.geometry.scene_distance, effects=first_look))
+        first_pilot_run = frozenset(self.present) & effects.names(lambda effect: effect.first_pilot_run)
+        first = Simulation(bench, Settings(depth=bench.geometry.scene_distance, effects=first_pilot_run))
         self._sharp = _sharp(first, seed)
         depth, centre, hits = _first_light(first, seed, self._sharp)
         # A connection that meets a sharp lobe by chance may be all that the centre sees.
         self._light = self._sharp.rest if self._sharp.irradiance else centre
-        self._seen = seen = Simulation(bench, Settings(depth=depth, effects=first_look))
+        self._seen = seen = Simulation(bench, Settings(depth=depth, effects=first_pilot_run))
         reach = light_reach(seen, integer(seed, "pilot", "reach"))
         own = integer(seed, "pilot", "sharp")
         apart = sharp_pixels(seen, self._sharp, self._light, accuracy, own)
-        self._base = Settings(depth=depth, effects=first_look, reach=reach, sharp=apart)
+        self._base = Settings(depth=depth, effects=first_pilot_run, reach=reach, sharp=apart)
         sample, self._hits = Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors), math.inf
         if not bench.loaded.mirrors and not self._sharp.irradiance:
             sample = _enough(sample, hits, bench)
@@ -270,7 +270,7 @@ class PilotRuns:
         """
         if not self.bench.loaded.mirrors:
             return 0.0
-        found, unsure = self.bench.glint.irradiance(self.bench.geometry)
+        found, unsure = self.bench.specular.irradiance(self.bench.geometry)
         return unsure / (other + found + unsure) if unsure else 0.0
 
     # ---- The pilot's result ----
@@ -311,7 +311,7 @@ class PilotRuns:
             apart=switched.apart,
             unresolved=unresolved / (self._light + sharp.irradiance + unmet) if unresolved else 0.0,
             left_out=left_out / (left_out + found) if left_out else 0.0,
-            glint=self._unsure_specular(found),
+            unresolved_specular=self._unsure_specular(found),
             mirror=mirror,
             reach=self._base.reach,
             sharp=apart,
@@ -337,9 +337,9 @@ def _enough(sample: Sample, hits: float, bench: Apparatus) -> Sample:
 
     MitsimError where that takes more than a look may trace.
     """
-    times = math.ceil(_FEWEST_IN_LOOK / (hits * sample.direct)) if hits else 1
+    times = math.ceil(_FEWEST_IN_RUN / (hits * sample.direct)) if hits else 1
     more = replace(sample, times=times * sample.times)
-    if times > 1 and hits * more.direct < _FEWEST_IN_LOOK:
+    if times > 1 and hits * more.direct < _FEWEST_IN_RUN:
         n, side = bench.n, math.sqrt(hits)
         raise MitsimError(
             f"what the camera sees is too small for the projector's light: all that it lights fills {hits:.1e} of a "

@@ -32,7 +32,7 @@ from mitsim.light.settings import (
 )
 from mitsim.light.simulation import Simulation, emitted
 from mitsim.optics.fft_shadow import cells_per_pixel
-from mitsim.optics.forming import Filed
+from mitsim.optics.forming import AccumulatedLight
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.image_formation import raster_error
 from mitsim.planner.pilot_samples import EVEN_CELLS, GOOD_ENOUGH, Sample, ladder, noise, norm
@@ -173,9 +173,9 @@ class DirectRuns:
         rows, weights = self.sample.rows, self.sample.lighting.weights
         fine = simulation.grids["fine"]
         light = fine.bundle.accumulate(self._path_samples[0], self.sample.lighting.labels, self.sample.fine)
-        filed, timed = Filed(fine.optics, (light[: len(rows)],) * GROUPS), weights[: workers()]
+        accumulated, timed = AccumulatedLight(fine.optics, (light[: len(rows)],) * GROUPS), weights[: workers()]
         started = time.perf_counter()
-        list(ExpectedFrames([filed], Lighting(rows, timed), 0))
+        list(ExpectedFrames([accumulated], Lighting(rows, timed), 0))
         seconds = (time.perf_counter() - started) / len(timed)
         cells = max(fine.bundle.cells)
         geometry = self.bench.geometry
@@ -374,9 +374,9 @@ _SEEN = 0.5
 lobe's light varies over the sensor: they meet it thirty times."""
 _TRIAL, _LARGEST_TRIAL = 16, 2**21
 """Samples that tell how noisy the light is, and connections of them, some 0.5 s."""
-_AFFORDABLE = 2.0**29
+_MOST_CONNECTIONS = 2.0**29
 """Connections, some 100 s, beyond which sharp lobes are left unresolved, and said to be."""
-_LOOKS = 64
+_RAYS_OF_WINDOW = 64
 """Rays of each pixel that tell which directions its light comes from; what they overlook is counted when it is
 accumulated."""
 
@@ -425,20 +425,20 @@ def sharp_pixels(
         pixels = np.sort(order[:count])
     left = math.exp(-anchors * rate) * sharp.irradiance / whole
     chosen = SharpPixels(tuple(pixels.tolist()), anchors, _window(simulation, pixels, seed), left)
-    return chosen if _connections(simulation, chosen, accuracy, seed) <= _AFFORDABLE else None
+    return chosen if _connections(simulation, chosen, accuracy, seed) <= _MOST_CONNECTIONS else None
 
 
 def _unseen(sharp: SharpLight, order: Labels, negligible: float) -> int:
     """Pixels, the first in ``order``, without which the others' light is ``negligible`` or seen by ordinary
     replicates."""
     held, moments = (np.cumsum(values[order][::-1])[::-1] for values in (sharp.by_pixel, sharp.moments))
-    told = (held <= negligible) | (np.square(held) >= _SEEN * moments)
-    return int(np.argmax(told)) if told.any() else len(order)
+    settled = (held <= negligible) | (np.square(held) >= _SEEN * moments)
+    return int(np.argmax(settled)) if settled.any() else len(order)
 
 
 def _connections(simulation: Simulation, chosen: SharpPixels, accuracy: float, seed: int) -> float:
     """Connections that light of ``chosen`` pixels takes to be known to the ``accuracy``, by a short trial."""
-    if len(chosen.pixels) * chosen.anchors**2 > _AFFORDABLE:
+    if len(chosen.pixels) * chosen.anchors**2 > _MOST_CONNECTIONS:
         return math.inf
     tracer = Simulation(simulation.bench, replace(simulation.settings, sharp=chosen)).sharp
     assert tracer is not None
@@ -466,7 +466,7 @@ def _paths(moments: FloatArray, even: float, pixels: int, anchors: int) -> Float
 
 def _window(simulation: Simulation, pixels: Labels, seed: int) -> tuple[float, float, float, float]:
     """First and last tan-angle, along rows and along columns, of the surfaces that ``pixels`` light."""
-    seen = DirectTracer(simulation.setup, 2, pixels=pixels).trace(seed, 0, _LOOKS)
+    seen = DirectTracer(simulation.setup, 2, pixels=pixels).trace(seed, 0, _RAYS_OF_WINDOW)
     if not seen.value.size:
         return (0.0, 0.0, 0.0, 0.0)
     return float(seen.row.min()), float(seen.row.max()), float(seen.column.min()), float(seen.column.max())

@@ -288,8 +288,8 @@ class EffectRuns:
         lamps = followed.get("ambient", ())
         if physics.lamps and lamps:
             frames += sample.lamps(simulation.ambient["fine"], lamps, few, known)
-        glint = simulation.specular_frames(sample.lighting.labels)
-        return frames if glint is None else frames + np.tensordot(light[:, glint.classes], glint.irradiance, 1)
+        specular = simulation.specular_frames(sample.lighting.labels)
+        return frames if specular is None else frames + np.tensordot(light[:, specular.classes], specular.irradiance, 1)
 
 
 def _indirect_of(replicates: Sequence[PathSamples]) -> list[PathSamples]:

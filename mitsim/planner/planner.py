@@ -165,7 +165,7 @@ def _decide(runs: pilot.PilotRuns, accuracy: float, switches: Mapping[str, bool]
     plan = replace(plan, predicted_range=_range(timed, plan))
     if simulation.physics.mirrors:
         # The pilot formed the frames of other shots, or of fewer effects, from the same beams.
-        plan = plan.taking(optics=plan.predicted["optics"] + bench.glint.seconds)
+        plan = plan.taking(optics=plan.predicted["optics"] + bench.specular.seconds)
     return plan
 
 

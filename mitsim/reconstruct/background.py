@@ -127,7 +127,7 @@ def _wider(parallax: Parallax, sizes: tuple[int, int], cells: int) -> Parallax:
 # ---- Global light, the same in all frames ----------------------------------------------------------------------------
 
 
-_LEAST_TOLD = 1e-3
+_LEAST_EIGENVALUE = 1e-3
 """Part of a mode that must remain: noise in it is magnified by the root of one over that, thirtyfold, which the mean
 over all frames makes up for."""
 
@@ -188,17 +188,17 @@ def separate(
     measured = (model.sigma > 0).astype(np.float64)
     target = bases[0].T @ total @ bases[1] - lit[0].T @ (measured * weights) @ lit[1]
     unexplained: FloatArray = np.eye(target.size) - _explained_matrix(lit, measured) / count
-    told, modes = np.linalg.eigh(unexplained)
-    if told[-1] < _LEAST_TOLD:
+    reported, modes = np.linalg.eigh(unexplained)
+    if reported[-1] < _LEAST_EIGENVALUE:
         raise MitsimError("separation: these patterns light all pixels in each frame; use dots:K with K of 2 or more")
-    inverse = np.divide(1.0, count * told, out=np.zeros_like(told), where=told > _LEAST_TOLD)
+    inverse = np.divide(1.0, count * reported, out=np.zeros_like(reported), where=reported > _LEAST_EIGENVALUE)
     found = (modes @ (inverse * (modes.T @ target.ravel()))).reshape(shape)
     left, right = (
         _inside(hats, len(side)) @ np.linalg.inv(triangle)
         for hats, side, triangle in zip(nodes, patterns, triangles, strict=True)
     )
     part = float(np.prod([side.mean() for side in patterns]))
-    return Separation(bases[0] @ found @ bases[1].T, left @ found @ right.T / part, told)
+    return Separation(bases[0] @ found @ bases[1].T, left @ found @ right.T / part, reported)
 
 
 def _inside(hats: FloatArray, pixels: int) -> FloatArray:

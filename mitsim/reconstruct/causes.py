@@ -3,7 +3,7 @@
 Each cause leaves its own mark. Where a surface is not at the calibrated distance, parallax moves its light along the
 baseline: a few measurements of single groups of lit pixels are then explained by light of *any* pixel of the same rows
 (or the same columns). Ambient light is the same in every shot, and comes from all pixels. Gloss comes from the lit
-pixels, but changes over the sensor: the factors times a polynomial of the place explain it. Another rig explains
+pixels, but changes over the sensor: the factors times a polynomial of the place explain it. Other devices explain
 nothing.
 
 *Other readings.* Each other reading is added up anew by the same factorised model: frames turned or mirrored, shots in
@@ -51,7 +51,7 @@ residual. Light that changes from shot to shot has 1 / shots."""
 _EVERYWHERE = 0.75
 """The same of what light of all scene pixels explains: a lamp's own colours leave 0.06 to 0.2 of theirs."""
 _ALL = 0.3
-"""Unexplained part of the measurements above which neither depth nor ambient light is the cause, but another rig."""
+"""Unexplained part of the measurements above which neither depth nor ambient light is the cause, but other devices."""
 STEPS = (
     "one step late: each shot shows the pattern of the shot before",
     "one step early: each shot shows the pattern of the next",
@@ -88,7 +88,7 @@ class Cause(Enum):
         "turn the highlight away from the sensor, or take it as an image of the matt parts alone",
     )
     RIG = (
-        "another rig, mask or pattern than was calibrated, or light over mirrors",
+        "other devices, another mask or pattern than was calibrated, or light over mirrors",
         "calibrate this camera with this projector",
     )
     MASK = (
@@ -210,8 +210,8 @@ class Evidence:
             left += [each.beyond(*pair) for pair in ranges]
         rows, columns, everywhere, gloss = 1 - left[1:] / left[0] if left[0] > 0 else np.full(4, np.nan)
         mask = self.predicted / unexplained if self.predicted is not None and unexplained > 0 else np.nan
-        told = rows, columns, everywhere, gloss, common, saturated, mask, self.print_part()
-        return Signatures(*(float(value) for value in told))
+        payload = rows, columns, everywhere, gloss, common, saturated, mask, self.print_part()
+        return Signatures(*(float(value) for value in payload))
 
     def print_part(self) -> float:
         """Part of what the lit pixels leave of their frames that is print finer than a pixel; NaN where pixels of

@@ -84,9 +84,9 @@ class Defects:
             for (row, column), value in values.items():
                 left, right = prepared.slabs((row, column))
                 own, other = left.matrix[self.rows], right.matrix[self.columns]
-                told = (own @ weights[left.columns][:, right.columns] * other).sum(axis=1)
+                predicted = (own @ weights[left.columns][:, right.columns] * other).sum(axis=1)
                 leverage = np.square(own).sum(axis=1) * np.square(other).sum(axis=1)
-                step = (told - value) / np.maximum(1 - leverage / gain, 0.5)
+                step = (predicted - value) / np.maximum(1 - leverage / gain, 0.5)
                 value += step
                 step /= gain
                 change[prepared.places((row, column))] += own.T @ (step[:, None] * other)

@@ -51,7 +51,7 @@ _SURE = 25.0
 _RIVAL, _ASTRAY = 2.0, 0.05
 """Starts that leave less than twice as much as the best one must not place more than this part of the told pixels half
 a period beside it: two cards under dots too near to each other come out either way, and 1.8 times as much is left."""
-_TOLD = 0.5
+_RELIABLE = 0.5
 """Confidence from which a pixel's depth counts as told: twice as much light arrives there as anywhere else."""
 _SPARE = 2.0
 """Projector pixels of the period that told depths must leave free, or they may be another's by a whole period: as many
@@ -102,9 +102,9 @@ class DepthMap:
     def __str__(self) -> str:
         if self.doubt:
             return "focus: no depths are told; the image is that of the calibrated one"
-        said = self.summary()
-        depths = f"{said['least_mm']:.4g} to {said['most_mm']:.4g} mm, median {said['median_mm']:.4g}"
-        return f"focus: depths of {depths}, told for {said['told_part']:.0%} of pixels"
+        message = self.summary()
+        depths = f"{message['least_mm']:.4g} to {message['most_mm']:.4g} mm, median {message['median_mm']:.4g}"
+        return f"focus: depths of {depths}, told for {message['told_part']:.0%} of pixels"
 
     @property
     def solution(self) -> Solution:
@@ -114,9 +114,9 @@ class DepthMap:
         return Solution(self.image, self.lam, residual, status)
 
     @property
-    def told(self) -> np.ndarray:
-        """(n, n') whether each depth is told."""
-        return np.asarray(self.confidence >= _TOLD)
+    def reliable(self) -> np.ndarray:
+        """(n, n') whether each depth is reliable."""
+        return np.asarray(self.confidence >= _RELIABLE)
 
     def misfit(self, noise: FrameNoise, factor_energy: float | None, print_energy: float) -> Misfit:
         """What of the measurements fits no image at these depths, over the sensor as a whole.
@@ -144,9 +144,9 @@ class DepthMap:
 
     def summary(self) -> dict[str, float]:
         """What result.json and the command line's JSON say of it."""
-        told = self.mm[self.told] if self.told.any() else self.mm
-        low, middle, high = (float(value) for value in np.percentile(told, (1, 50, 99)))
-        return {"least_mm": low, "median_mm": middle, "most_mm": high, "told_part": float(self.told.mean())}
+        reliable = self.mm[self.reliable] if self.reliable.any() else self.mm
+        low, middle, high = (float(value) for value in np.percentile(reliable, (1, 50, 99)))
+        return {"least_mm": low, "median_mm": middle, "most_mm": high, "told_part": float(self.reliable.mean())}
 
 
 @single_threaded_blas()
@@ -172,7 +172,7 @@ def depth_map(
     Raises
     ------
     MitsimError
-        for other patterns than dots, a rig without parallax, a calibration that does not state it, or a frame that
+        for other patterns than dots, devices without parallax, a calibration that does not state it, or a frame that
         cannot be read.
     """
     return _Search(shots, factors, depth_range).found(lam)
@@ -227,16 +227,17 @@ class _Search:
     def _doubt(self, shift: FloatArray, confidence: FloatArray, rivals: Sequence[tuple[float, float]]) -> str:
         """Why depths are not to be trusted, or nothing; ``rivals`` are starts (look, offset) that explain nearly as
         much as that of these."""
-        told = confidence >= _TOLD
+        reliable = confidence >= _RELIABLE
         found = self._pixels.solve(shift)
         variance, unknowns = self._pixels.variance(found), 2 * shift.size
         less = found.left_over - self._left_over(np.zeros(shift.shape))
         # Of a sheet at the calibrated depth either may leave more.
-        if not told.any() or less > chance_difference(less, variance, unknowns):
+        if not reliable.any() or less > chance_difference(less, variance, unknowns):
             return "Depths by pixel explain no more of the measurements than the calibrated one, which the image is of."
-        span = float(np.ptp(np.percentile(shift[told], (1, 99))))
+        span = float(np.ptp(np.percentile(shift[reliable], (1, 99))))
         astray = max(
-            float((np.abs(self._arrivals.most(*rival)[0] - shift)[told] > self.width / 2).mean()) for rival in rivals
+            float((np.abs(self._arrivals.most(*rival)[0] - shift)[reliable] > self.width / 2).mean())
+            for rival in rivals
         )
         spared = not self._arrivals.limited or self.width - span >= _SPARE * self.pixel
         if not spared or astray > _ASTRAY:
@@ -457,7 +458,7 @@ class Arrivals:
     Parameters
     ----------
     shots, factors
-        under shifting dots, and of the same camera; MitsimError for other patterns, and for a rig without parallax.
+        under shifting dots, and of the same camera; MitsimError for other patterns, and for devices without parallax.
     ends
         least and largest change of 1/z [1/mm] of the depths that are looked for.
     beside

@@ -310,8 +310,10 @@ class Explanations:
         check = self._check
         if not check.exclusive:
             return
-        told = self._weights[self._model.places(one.pattern)]
-        ratio = float(np.vdot(self._model.weights(one.frame, one.pattern), told)) / max(sum_of_squares(told), 1e-300)
+        payload = self._weights[self._model.places(one.pattern)]
+        ratio = float(np.vdot(self._model.weights(one.frame, one.pattern), payload)) / max(
+            sum_of_squares(payload), 1e-300
+        )
         fault = Fault.DIM if ratio < 1 else Fault.BRIGHT
         words = f"holds {ratio:.2f} of the light that its neighbours' pixels tell"
         yield _Named(-np.inf, fault, one.numbers, words)

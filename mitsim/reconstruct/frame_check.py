@@ -304,20 +304,23 @@ def odd_brightness(check: LeaveOneOut, weights: FloatArray, good: BoolArray) -> 
     image, lit = check.image(weights), check.lit(good)
     near = check.neighbours(image, lit)
     least = max(_LEAST, _FEW / good.size)
-    middles = {pattern: _median(seen / told) for pattern, seen, told in _beside(check, image, near, good)}
+    middles = {pattern: _median(seen / payload) for pattern, seen, payload in _beside(check, image, near, good)}
     if len(middles) < 3:
         return None
     first = max(middles, key=lambda pattern: abs(_away(middles[pattern], middles)))
     if abs(_away(middles[first], middles)) < least / 2:
         return None
-    (own,) = ((seen, told) for pattern, seen, told in _beside(check, image, near, good) if pattern == first)
+    (own,) = ((seen, payload) for pattern, seen, payload in _beside(check, image, near, good) if pattern == first)
     # Its neighbours are off by what it is off.
     lit[np.ix_(*(side[:, index] != 0 for side, index in zip(check.patterns, first, strict=True)))] = False
     near = check.neighbours(image, lit)
     middles, wholes = dict[Pattern, float](), dict[Pattern, float]()
-    for pattern, seen, told in _beside(check, image, near, good):
+    for pattern, seen, payload in _beside(check, image, near, good):
         if pattern != first:
-            middles[pattern], wholes[pattern] = _median(seen / told), float(np.vdot(seen, told)) / sum_of_squares(told)
+            middles[pattern], wholes[pattern] = (
+                _median(seen / payload),
+                float(np.vdot(seen, payload)) / sum_of_squares(payload),
+            )
     if len(middles) < 3:
         return None
     ratios = own[0] / own[1]

@@ -378,15 +378,15 @@ class Pairs:
         corrected = power / float(self.power[self.good].mean()) if lamp.corrected else 1.0
         own.change(index, -sign * (2 * sound - both) / corrected)
         own.extras[index] += own.noise
-        repair = "it is left out, and foretold by the other frame of its pair"
+        repair = "it is left out, and predicted by the other frame of its pair"
         own.add(index, fault.kind, fault.detail, repair, fault.other, sign)
 
     def _fault(self, frame: _Frame) -> _Fault:
         """The fault that leaves least of a frame unexplained, of those that explain it."""
         shown, expected = self._measured_parts(frame), self._predicted_parts(frame)
-        seen, told = np.concatenate(shown), np.concatenate(expected)
-        size = float(np.dot(told, told))
-        part = float(np.dot(seen, told)) / size if size else 0.0
+        seen, reported = np.concatenate(shown), np.concatenate(expected)
+        size = float(np.dot(reported, reported))
+        part = float(np.dot(seen, reported)) / size if size else 0.0
         flux = float(shown[0].sum() / expected[0].sum()) if expected[0].sum() else 0.0
         if frame.pattern == 0 and frame.sign < 0 and self.dark < DARK:
             flux = part = 1.0  # a dark frame of a dark room
@@ -395,10 +395,10 @@ class Pairs:
         even = (np.ptp(own) < DARK * 2 * np.ptp(other) + 12 for own, other in zip(shown, expected, strict=True))
         if flux < DARK and all(even):
             return _Fault(1.0, "black", "is black")
-        tried = [_Fault(float(np.square(seen - part * told).mean()), *name_by_light(part))]
+        tried = [_Fault(float(np.square(seen - part * reported).mean()), *name_by_light(part))]
         tried += [*_losses(shown, expected), *self._repeats(frame, shown), *_shifts(frame.number, shown, expected)]
         best = min(tried, key=lambda fault: fault.rest)
-        if best.rest > max(_FITS, _EXPLAINED * float(np.square(seen - told).mean())):
+        if best.rest > max(_FITS, _EXPLAINED * float(np.square(seen - reported).mean())):
             return _Fault(best.rest, "wrong", "is not what the other frame of its pair foretells")
         return best
 

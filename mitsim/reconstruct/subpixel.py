@@ -33,7 +33,7 @@ PRINT = (1 + EDGES) / 2
 _ALIKE = 0.5
 """Correlation with the moved neighbour from which responses count as one moving shadow: 0.9 behind a mask of features
 wider than a sensor pixel, 0.3 by chance of 64 pixels."""
-_LEAST_TOLD = 0.01
+_LEAST_EIGENVALUE = 0.01
 """Least energy that halves disagree on over that of the image's error, as noise is magnified by its inverse: a ninth to
 a half under patterns, nothing under uniform light where neighbours in the scene tell the slope."""
 _SIGNIFICANT = 3.0
@@ -282,16 +282,16 @@ def disagreement(model: Model, gain: FloatArray, halves: Halves, known: tuple[Fl
         weights, light = np.square(gain.T if axis else gain), np.square(other.response).sum(axis=0)
         whole = response.sum(axis=0)
         parts = whole, response[0] - whole @ own.first_half
-        struck, told = (float(np.square(part).sum(axis=0) @ weights @ light) for part in parts)
+        struck, expected = (float(np.square(part).sum(axis=0) @ weights @ light) for part in parts)
         # White noise of variance v has the energy v sum G^2 in the image and v sum (spread G^2) in the difference.
         spread = half_spread(own.first_half)[:, None] * weights
         level = float(variance.sum() / weights.sum())
         difference = gain * halves.differences[axis]
         beyond = float(np.square(difference).sum()) - level * float(spread.sum())
         chance = level * float(np.sqrt(2 * np.square(spread).sum()))
-        if told > _LEAST_TOLD * struck and beyond > _SIGNIFICANT * chance:
+        if expected > _LEAST_EIGENVALUE * struck and beyond > _SIGNIFICANT * chance:
             excess = np.square(model.prepared.image(difference)) - variance * float(spread.sum() / weights.sum())
-            total += struck / told * gaussian_filter(excess, _NEAR, mode="nearest")
+            total += struck / expected * gaussian_filter(excess, _NEAR, mode="nearest")
     return np.maximum(total, 0.0)
 
 

@@ -36,7 +36,7 @@ from mitsim.devices.patterns import PatternFamily
 from mitsim.devices.projector import Spectrum
 from mitsim.light.light import SampledLight
 from mitsim.metrics import Quality, psnr, relative_error
-from mitsim.optics.forming import Filed
+from mitsim.optics.forming import AccumulatedLight
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions, SeparableTerms
@@ -243,7 +243,7 @@ class Unexposed:
     def exposer(self, seconds: float) -> Exposer:
         """The camera, at an exposure time of so many ``seconds``."""
         speckle = self.lit.light.speckle(self.family) if self.model == RENDERED else 0.0
-        return Exposer(self.lit.bench.rig, seconds, self.seed, speckle)
+        return Exposer(self.lit.bench.devices, seconds, self.seed, speckle)
 
     def noise(self, seconds: float) -> float:
         """Standard deviation of a datum [electrons/s], rms over all frames, of exposures of so many ``seconds``."""
@@ -271,7 +271,7 @@ class Unexposed:
 def peak_time(bench: Apparatus, expected: ExpectedFrames) -> float:
     """Exposure time [s] on ``bench`` at equal peak: the brightest pixel of the ``expected`` frames fills the default
     part of the full well."""
-    return Exposure().choose(bench.rig, peak_irradiance(expected))
+    return Exposure().choose(bench.devices, peak_irradiance(expected))
 
 
 def bin_frame(frame: FloatArray, binning: int) -> FloatArray:
@@ -374,7 +374,7 @@ class IdealCamera:
         """
         light = sparse.csr_array(sparse.diags_array(flux.ravel()))
         optics = self._optics if plane is None else self._optics_at(plane)
-        return ExpectedFrames([Filed(optics, (light,))], family.lighting, seed=0)
+        return ExpectedFrames([AccumulatedLight(optics, (light,))], family.lighting, seed=0)
 
     def _optics_at(self, plane: Plane) -> FrameOptics:
         shift = 1 / plane.depth_mm - 1 / self.bench.geometry.scene_distance

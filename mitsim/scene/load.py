@@ -361,7 +361,7 @@ def _where_scene_lies(loaded: LoadedScene, to_world: mi.Transform4f, within: boo
     if np.abs([low, high]).max() < _SMALL * distance:
         return f"{where}: this looks like metres, and 1 unit is 1 mm; scale it by 1000"
     if low[2] > _FAR * distance:
-        return f"{where}: too far, for the rig is aligned to {distance:g} mm; move it nearer or set scene_distance"
+        return f"{where}: too far, for the bench is aligned to {distance:g} mm; move it nearer or set scene_distance"
     if high[2] <= 0:
         return f"{where}: behind the camera, which looks along +z; move the scene or turn the camera"
     if within:

@@ -205,7 +205,7 @@ rounding moves corners by 2 % of an edge at 1e-5 of the distance."""
 _POLISHED = ("conductor", "dielectric", "mitsim_glass", "thindielectric")
 """Materials whose light comes by single directions alone, which are followed on the cylinder itself."""
 _MIXED = ("plastic", "pplastic")
-"""Materials that need the cylinder for their glint, which holds no matt light."""
+"""Materials that need the cylinder for their specular chains, which holds no matt light."""
 Mesh = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 """Corners (k, 3), normals (k, 3) and uv (k, 2), and triangles (m, 3)."""
 

@@ -169,7 +169,9 @@ class Ablation:
             if DEPTH in off:
                 settings = replace(settings, depth=bench.geometry.scene_distance, layers=())
             settings = replace(settings, effects=settings.effects - absent)
-            self._kept[direct, off] = traced_again(self.light, _Filing(bench, settings, direct, own), self._purpose)
+            self._kept[direct, off] = traced_again(
+                self.light, _AblationSimulation(bench, settings, direct, own), self._purpose
+            )
         return self._kept[direct, off]
 
 
@@ -198,7 +200,7 @@ class AblatedLight(SampledLight):
         return self.whole.apparent
 
 
-class _Filing(Simulation):
+class _AblationSimulation(Simulation):
     """Direct light with its glare, or all other, accumulated where it would be seen without the effects ``off``."""
 
     def __init__(self, bench: Apparatus, settings: Settings, direct: bool, off: frozenset[str]) -> None:

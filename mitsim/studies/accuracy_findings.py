@@ -59,10 +59,10 @@ class Row:
     def reaching(self, error: float) -> Row:
         """The row of the same estimator at the samples that would leave another ``error``."""
         more = (self.error / error) ** 2
-        said = f"error falls with 1/sqrt(samples) from {self.setting}"
+        text = f"error falls with 1/sqrt(samples) from {self.setting}"
         setting = f"{float(self.setting.split()[0]) * more:.0e} spp"
         spread, noise = self.spread * more, self.mc_error / more**0.5
-        return replace(self, setting=setting, spread=spread, error=error, mc_error=noise, extrapolated=said)
+        return replace(self, setting=setting, spread=spread, error=error, mc_error=noise, extrapolated=text)
 
     def payload(self) -> dict[str, Any]:
         """As JSON."""
@@ -130,12 +130,12 @@ class PartCost:
     def payload(self) -> dict[str, Any]:
         """As JSON; ``seconds`` is None where noise hides it or nobody timed it."""
         extra = self.extra
-        told = extra is not None and not extra.within_noise
+        measured = extra is not None and not extra.within_noise
         return {
             "name": self.name,
             "error_if_off": self.error_if_off,
             "error_bound": self.error_bound,
-            "seconds": extra.median if extra is not None and told else None,
+            "seconds": extra.median if extra is not None and measured else None,
             "least_s": max(extra.least, 0.0) if extra else None,
             "most_s": max(extra.most, 0.0) if extra else None,
             "within_noise": None if extra is None else extra.within_noise,

@@ -279,7 +279,7 @@ class Judge:
         """Relative noise of the sensor at equal peak; None for a camera without a full well."""
         if not np.isfinite(self.stand.bench.sensor.full_well_e):
             return None
-        return NoiseTarget(self.stand.bench.rig, Exposure(), 1.0)(self.expected)
+        return NoiseTarget(self.stand.bench.devices, Exposure(), 1.0)(self.expected)
 
 
 def _within(stand: Stand, plan: Plan, seconds: float) -> tuple[Plan, float]:
@@ -380,12 +380,14 @@ class Orders:
         return traced_again(again, simulation, "orders")
 
     def _looks(self, fewest: int, most: int) -> FloatArray:
-        """(LOOKS, shots, pixels, pixels) frames of some shots by light of some orders alone."""
+        """(REPLICATES, shots, pixels, pixels) frames of some shots by light of some orders alone."""
         fewer = {name: max(1, samples // _FEWER) for name, samples in self._samples.items()}
         light = self._light(OfOrders(self._stand.bench, self._settings, fewest, most), fewer)
-        looks = [reduce(add, light.groups[look::REPLICATES]) / (GROUPS // REPLICATES) for look in range(REPLICATES)]
+        replicates = [
+            reduce(add, light.groups[look::REPLICATES]) / (GROUPS // REPLICATES) for look in range(REPLICATES)
+        ]
         shots = self._stand.family.lighting.shots(self._stand.few_shots)
-        formed = [replace(light, groups=(look,)).frames(shots, self._stand.seed) for look in looks]
+        formed = [replace(light, groups=(look,)).frames(shots, self._stand.seed) for look in replicates]
         return np.array([[frame.irradiance for frame in frames] for frames in formed])
 
     def _following(self, last: int) -> Callable[[], float]:
@@ -431,7 +433,7 @@ def one_line(bench: Apparatus) -> Apparatus:
     """``bench`` with a projector of its effective wavelength alone."""
     model = bench.projector
     changes = {"wavelengths_nm": (model.effective_wavelength_nm,), "radiant_shares": (1.0,)}
-    return replace(bench, rig=replace(bench.rig, projector=model.model_copy(update=changes)))
+    return replace(bench, devices=replace(bench.devices, projector=model.model_copy(update=changes)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -445,14 +447,14 @@ class Stand:
     accuracy: float
 
     @cached_property
-    def look(self) -> pilot.PilotRuns:
+    def pilot_runs(self) -> pilot.PilotRuns:
         """The pilot's."""
         return pilot.PilotRuns(self.bench, self.family.lighting, self.accuracy, self.seed)
 
     @cached_property
     def pilot_result(self) -> PilotResult:
         """Of the pilot."""
-        return self.look.pilot_result
+        return self.pilot_runs.pilot_result
 
     @cached_property
     def few_shots(self) -> Labels:

@@ -49,7 +49,7 @@ BUDGET_S = 100.0
 """Seconds of the whole study on a quiet machine: with starting, opening and figures below two minutes."""
 _JUDGE_PART, _FRONT_PART, _PARTS_PART, _ORDERS_PART = 0.12, 0.6, 0.6, 0.4
 """Of what is left, what the judge, one whole run, one look at all parts, and one at light by surfaces may take."""
-_SHORTEST_LOOK_S = 1.0
+_SHORTEST_PILOT_S = 1.0
 """Shorter looks tell more of kernels than of the machine's pace."""
 
 
@@ -69,8 +69,8 @@ def measure(bench: Apparatus, request: Request, job: Job) -> AccuracyFindings:
     stand = Stand(bench, bench.family(request.patterns, request.seed), request.seed, job, QUOTED)
     job.progress("judge", 0.1)
     started = time.perf_counter()
-    looked = stand.look.seconds
-    budget.saw(time.perf_counter() - started, max(looked, _SHORTEST_LOOK_S))
+    looked = stand.pilot_runs.seconds
+    budget.saw(time.perf_counter() - started, max(looked, _SHORTEST_PILOT_S))
     judge = Judge.trace(stand, stand.plan(QUOTED), _JUDGE_PART * budget.left / budget.slower)
     runs, parts = Runs(stand, request, judge, sum(opening.values())), Parts(stand, judge)
     job.progress("whole runs", 0.3)
@@ -200,7 +200,7 @@ class Runs:
             settings = replace(plan.settings, samples=taken)
             groups.setdefault(settings, []).append(accuracy)
             lit[settings] = plan.predicted_seconds
-        around = self._stand.look.seconds + sum(
+        around = self._stand.pilot_runs.seconds + sum(
             frame_seconds(self._stand.bench, len(self._stand.family.shots)).values()
         )
         for settings, group in groups.items():
@@ -229,8 +229,10 @@ class Runs:
 
     def _irradiance(self, shots: Capture) -> FloatArray:
         """(shots, pixels, pixels) expected irradiance that a capture was exposed to [W m^-2]."""
-        rig = self._stand.bench.rig
-        unit = electrons_from_irradiance(1.0, shots.exposure_s, rig.sensor, rig.projector.effective_wavelength_nm)
+        devices = self._stand.bench.devices
+        unit = electrons_from_irradiance(
+            1.0, shots.exposure_s, devices.sensor, devices.projector.effective_wavelength_nm
+        )
         return np.asarray(shots.electrons, dtype=np.float64) / unit
 
 

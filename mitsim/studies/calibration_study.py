@@ -77,7 +77,7 @@ def measure(bench: Bench, request: Request, job: Job, recipe: SessionRecipe | No
             "depths out, and move the board's plane by -D or the scene's scene_distance"
         )
     family = bench.family(request.patterns, request.seed)
-    Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.rig.camera_file)
+    Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.devices.camera_file)
     session = Session(bench, recipe.model_copy(update={"drift": Drift()}), request.seed)
     plan = session.plan(request.accuracy, job)
     lit = LitSession.of(session, session.trace(plan, job), job)

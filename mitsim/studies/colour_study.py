@@ -329,7 +329,7 @@ def _place(scene: str) -> ChartPlace:
 def _claims(results: Results) -> Sequence[Claim]:
     table = results.table
 
-    def told(way: str) -> Claim:
+    def reported(way: str) -> Claim:
         rows = table.where(way=way, patterns=_SHOWN)
         floor, mean = rows.mean("floor").value, sample_mean(rows, "delta_e")
         return Claim(
@@ -344,7 +344,7 @@ def _claims(results: Results) -> Sequence[Claim]:
     found = {way: table.where(way=way, patterns=_SHOWN) for way in mosaics}
     *others, joint = found.values()
     return [
-        told(OWN),
+        reported(OWN),
         *(ladder_claim(beside, patterns) for patterns in beside.distinct("patterns")),
         Claim(
             "Each line needs a calibration of its own (49 dots)", "", "",

@@ -185,18 +185,18 @@ def _psnr_claim(rows: Table, name: str, band: tuple[float, float]) -> Claim:
         for exposure in EXPOSURES
     }
 
-    def said(psf: str) -> tuple[str, Holds]:
+    def judgements(psf: str) -> tuple[str, Holds]:
         return "; ".join(f"{exposure}: {means[psf, exposure]} dB" for exposure in EXPOSURES), None
 
-    claim = _judge(rows, f"{name}: {band[0]:g} to {band[1]:g} dB", f"{band[0]:g} to {band[1]:g} dB", said)
+    claim = _judge(rows, f"{name}: {band[0]:g} to {band[1]:g} dB", f"{band[0]:g} to {band[1]:g} dB", judgements)
     return replace(claim, verdict=claims.verdict_at(at))
 
 
 def _judge(rows: Table, claim: str, paper: str, judge: Judge) -> Claim:
     """A claim judged with each point spread function in ``rows``; that of the measured one stands under "idealised"."""
-    said = {psf: judge(psf) for psf in rows.distinct("psf")}
-    texts = {psf: f"{psf} PSF: {text}" for psf, (text, _) in said.items()}
-    holds = claims.verdict(claims.every(*(each for _, each in said.values())))
+    judgements = {psf: judge(psf) for psf in rows.distinct("psf")}
+    texts = {psf: f"{psf} PSF: {text}" for psf, (text, _) in judgements.items()}
+    holds = claims.verdict(claims.every(*(each for _, each in judgements.values())))
     return Claim(claim, paper, texts.get(MEASURED, ""), texts[TRACED], holds)
 
 

@@ -89,7 +89,7 @@ def demo(bench: Bench, output: Path | str, request: Request | None = None, job: 
         the main family, its accuracy and seed; it is compared with those of the paper that fit the projector.
     """
     request, job = request or Request.of(), job or Job()
-    Exposure().check(bench.sensor, bench.rig.camera_file)
+    Exposure().check(bench.sensor, bench.devices.camera_file)
     names = _fitting(bench, request)
     # Only now, with nothing left to refuse, is an earlier demo taken away.
     with study_folder(output, "demo") as folder:

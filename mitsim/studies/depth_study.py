@@ -3,9 +3,9 @@
 Paper, section V-A and its limitations: "our method is robust to small variations in depth", camera and projector being
 co-located. Parallax moves each projector pixel's light by B (1/z - 1/z_0), B being the distance between them.
 
-Idealised: a plane beside the calibrated distance, any baseline. Rendered: the shipped rig, 60 mm, its sheet moved; the
-depth given by nothing, found for the sheet, or of a calibration at the sheet's own distance; and scenes of many depths,
-whose depth is found for each projector pixel.
+Idealised: a plane beside the calibrated distance, any baseline. Rendered: the shipped devices, 60 mm, its sheet moved;
+the depth given by nothing, found for the sheet, or of a calibration at the sheet's own distance; and scenes of many
+depths, whose depth is found for each projector pixel.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ BASELINES_MM = (0.0, 15.0, 60.0, 150.0, 300.0)
 """From co-located, over a pico projector that touches the camera, to one on the other side of a bench."""
 FAMILIES = ("uniform", "dots:4", "dots:7")
 ALONG = {"columns": (0.0, -1.0), "rows": (-1.0, 0.0), "both": (-(0.5**0.5), -(0.5**0.5))}
-"""Unit vectors of the baseline; the shipped rig's is along the columns."""
+"""Unit vectors of the baseline; that of the shipped devices is along the columns."""
 DEEP = {"cards": ("dots:7", "dots:7x14"), "cookie_bag": ("dots:7", "dots:7x16")}
 """Scenes of many depths, and patterns whose period is too short for them, and long enough."""
 NONE, AUTO, MAP, OWN = ("none", "auto", "map", "own calibration")
@@ -65,7 +65,7 @@ def _points(scope: Scope) -> Sequence[Point]:
         for setup in setups
         for depth in depths
         for focus in (NONE, AUTO, OWN)
-        if not (focus == OWN and depth == CALIBRATED_MM)  # that is the rig as it is
+        if not (focus == OWN and depth == CALIBRATED_MM)  # that is the bench as it is
     ]  # fmt: skip
     deep = [
         Point.of(replace(scope.setup, scene=scene), model=RENDERED, patterns=family, seed=each, focus=focus)
@@ -90,7 +90,7 @@ def _measure(studio: Studio, point: Point) -> Found:
         image = Image.of(frames, frames.seconds(EQUAL_PEAK))
     else:
         focus = point["focus"] if point["focus"] in (AUTO, MAP) else None
-        # Frames of the sheet elsewhere, factors of the rig as it was aligned.
+        # Frames of the sheet elsewhere, factors of the bench as it was aligned.
         image = studio.image(setup, RENDERED, patterns, seed, focus=focus)
     return claims.finding(point, image.image, scene=setup.scene, **image.row())
 

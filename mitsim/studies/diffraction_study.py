@@ -165,7 +165,7 @@ def measure(bench: Bench, request: Request, job: Job) -> DiffractionFindings:
     bench, request, job
         the scene, patterns, seed and accuracy (diffraction is on, whatever it is worth), progress and limits.
     """
-    Exposure().check(bench.sensor, bench.rig.camera_file)
+    Exposure().check(bench.sensor, bench.devices.camera_file)
     request = request.changed(effects={**request.effects, "diffraction": True})
     families = [bench.family(name, request.seed) for name in dict.fromkeys((request.patterns, "uniform"))]
     light = bench.light(job=job, **request.model_dump())
@@ -198,7 +198,7 @@ class _Trials:
                 known[SEPARABLE] = camera.calibrated(self.flux)
             for family in self.families:
                 expected = camera.frames(family, self.truth * self.flux)
-                exposer = Exposer(camera.bench.rig, peak_time(camera.bench, expected), self.seed)
+                exposer = Exposer(camera.bench.devices, peak_time(camera.bench, expected), self.seed)
                 yield from self._rows(("idealised", camera.mask, name), exposer, family, expected, known)
 
     def rendered(self, light: SampledLight, accuracy: float, job: Job) -> Iterator[QualityRow]:
@@ -218,7 +218,7 @@ class _Trials:
             for family in self.families:
                 expected = scene.frames(family.lighting, self.seed)
                 speckle = scene.speckle(family)
-                exposer = Exposer(bench.rig, peak_time(bench, expected), self.seed, speckle)
+                exposer = Exposer(bench.devices, peak_time(bench, expected), self.seed, speckle)
                 yield from self._rows(("rendered", mask, name), exposer, family, expected, known)
 
     def _rows(

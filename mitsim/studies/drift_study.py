@@ -218,7 +218,7 @@ class DriftStand:
         expected = scene.expected(RENDERED, self.family, bench=drift_mask(bench, drift) if moved else None)
         base = self._frames.exposer(self.exposure_s)
         ambient = expected.projector_off.irradiance if expected.has_ambient else 0.0
-        exposer = DriftedExposer(bench.rig, base.exposure_s, base.seed, base.speckle, drift, self.family, ambient)
+        exposer = DriftedExposer(bench.devices, base.exposure_s, base.seed, base.speckle, drift, self.family, ambient)
         (sums,) = accumulate(exposer, self.family, expected, [model])
         return model.solve(sums, self._before.lam), model.solve(sums, "auto")
 

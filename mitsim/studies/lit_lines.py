@@ -157,7 +157,7 @@ def daylight_frame(setup: Setup, folder: Path) -> tuple[FloatArray, float]:
     wavelengths = np.arange(380.0, 781.0, 5.0)
     mean = float((daylight(wavelengths) * wavelengths).sum() / daylight(wavelengths).sum())
     bench = _open(setup, scene)
-    bench = replace(bench, rig=replace(bench.rig, projector=bench.projector.at(mean)))
+    bench = replace(bench, devices=replace(bench.devices, projector=bench.projector.at(mean)))
     light = bench.light("uniform", accuracy=setup.accuracy)
     return light.merged().frames(bench.family("uniform").lighting, light.seed).projector_off.irradiance, mean
 
@@ -303,16 +303,16 @@ def mosaic_shots(lines: Lines, patterns: str, seed: int) -> MosaicShots:
         for a line that the filters' curves do not hold.
     """
     first, family = lines[0].lit, lines[0].lit.bench.family(patterns, seed)
-    rig, weights = first.bench.rig, filter_weights(lines)
+    devices, weights = first.bench.devices, filter_weights(lines)
     # Light, and what is noise of a shot, is of electrons: any time and wavelength between them.
-    one_second = [Exposer(line.lit.bench.rig, 1.0, 0) for line in lines]
+    one_second = [Exposer(line.lit.bench.devices, 1.0, 0) for line in lines]
     expected = [line.lit.expected("rendered", family) for line in lines]
-    passed = behind(weights, rig.camera.frame_shape)
+    passed = behind(weights, devices.camera.frame_shape)
     rates = [
         np.einsum("lij,lij->ij", passed, [unit.electrons(frame) for unit, frame in zip(one_second, shot, strict=True)])
         for shot in zip(*expected, strict=True)
     ]
-    frames = expose_rates(Exposer(rig, peak_seconds(rig.sensor, rates), integer(seed, "mosaic")), family, rates)
+    frames = expose_rates(Exposer(devices, peak_seconds(devices.sensor, rates), integer(seed, "mosaic")), family, rates)
     return MosaicShots(lines, family, tuple(frames))
 
 
@@ -411,7 +411,7 @@ class DaylitLine:
 
     def rates(self) -> list[FloatArray]:
         """(m, m') electrons a second of every shot in the dark."""
-        unit = Exposer(self.line.lit.bench.rig, 1.0, 0)
+        unit = Exposer(self.line.lit.bench.devices, 1.0, 0)
         return [unit.electrons(frame) for frame in self.line.lit.expected(RENDERED, self.family)]
 
     @cached_property
@@ -458,7 +458,7 @@ class DaylitLine:
         self, rates: Sequence[FloatArray], exposure: tuple[float, int], models: Sequence[Prepared], shots: int
     ) -> list[FloatArray]:
         lamp, sums = exposure[0] * self.lamp, [model.accumulator() for model in models]
-        exposer = Exposer(self.line.lit.bench.rig, self.seconds(exposure[0]), self.line.seed(exposure[1]))
+        exposer = Exposer(self.line.lit.bench.devices, self.seconds(exposure[0]), self.line.seed(exposure[1]))
         off: FloatArray | float = 0.0
         for shot in range(shots):
             off = off + exposer.rate(exposer.digital(lamp * exposer.exposure_s, "ambient", shot)) / shots
@@ -478,7 +478,7 @@ class DaylitLine:
             of the patches.
         """
         bench, seconds, lamp = self.line.lit.bench, self.seconds(part), part * self.lamp
-        exposer, read = Exposer(bench.rig, seconds, 0), 2 if self.family.signed else 1
+        exposer, read = Exposer(bench.devices, seconds, 0), 2 if self.family.signed else 1
         frames, off = ((exposer.sensor_noise((light + lamp) * seconds) / seconds) ** 2 for light in (self.levels[1], 0))
         own, common = self._noise_gain(place)
         return read * frames * own + (off / self.shots * common if self.shots else 0.0)

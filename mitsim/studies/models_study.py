@@ -66,7 +66,7 @@ def as_built(bench: Bench) -> Bench:
     """The ``bench`` with its mask off its place by :data:`OFF_MM`."""
     camera = bench.geometry
     changed = camera.model_copy(update={name: getattr(camera, name) + off for name, off in OFF_MM.items()})
-    return replace(bench, rig=replace(bench.rig, camera=changed))
+    return replace(bench, devices=replace(bench.devices, camera=changed))
 
 
 def _recipe(point: Point) -> SessionRecipe:
@@ -84,13 +84,13 @@ def _measure(studio: Studio, point: Point) -> Found:
     lit = studio.once(
         "as built", 1, point.setup, lambda: LitScene(studio.lit(point.setup).light.behind(as_built(bench)))
     )
-    foreseen = _session(studio, point.setup, recipe)
+    predicted = _session(studio, point.setup, recipe)
     reported: dict[str, Any] = {}
     if point["factors"] == MEASURED:
-        factors = foreseen.factors(recipe, seed)
-        frames = foreseen.by(recipe).session.shots
+        factors = predicted.factors(recipe, seed)
+        frames = predicted.by(recipe).session.shots
     else:
-        session = foreseen.by(recipe)
+        session = predicted.by(recipe)
         factors = _model_factors(bench, replace(session, session=replace(session.session, seed=seed)), point)
         frames = int(factors.manifest.result["frames"])
         numbers = factors.manifest.result["parameters"]

@@ -194,7 +194,7 @@ def move_mask(bench: Apparatus, row_mm: float, column_mm: float) -> Apparatus:
         the mask's centre off the axis.
     """
     offset = {"mask_offset_row": row_mm, "mask_offset_column": column_mm}
-    return replace(bench, rig=replace(bench.rig, camera=bench.geometry.model_copy(update=offset)))
+    return replace(bench, devices=replace(bench.devices, camera=bench.geometry.model_copy(update=offset)))
 
 
 def ideal_places(bench: Apparatus, places_mm: Iterable[float], board_flux: float) -> Places:
@@ -256,14 +256,14 @@ def _consistent(factors: Places, bench: Apparatus, white: Callable[[float, float
     Parameters
     ----------
     factors, bench
-        as the sessions of each place left them, and the rig.
+        as the sessions of each place left them, and the devices.
     white
         the board in uniform light through the mask at a row and a column [mm].
     """
     first, found = next(iter(factors)), {}
     for place, (left, right) in factors.items():
         modelled = np.outer(left.sum(axis=1), factors[first][1].sum(axis=1))
-        measured = Exposer(bench.rig, 1.0, 0).electrons(white(place, first))
+        measured = Exposer(bench.devices, 1.0, 0).electrons(white(place, first))
         if bench.geometry.centred:
             modelled, measured = centre_frame(modelled), centre_frame(measured)
         share = float(np.vdot(modelled, measured) / np.vdot(measured, measured))
@@ -332,7 +332,7 @@ class MovedMask:
         places = list(product(rows_mm, columns_mm))
         if exposure == EQUAL_PEAK:
             brightest = max(peak_irradiance(self.expected(*place)) for place in places)
-            return Exposure().choose(self.lit.bench.rig, brightest)
+            return Exposure().choose(self.lit.bench.devices, brightest)
         return self.lit.uniform_s(self.model) / (len(places) if exposure == EQUAL_TOTAL else 1)
 
     def solve(self, rows_mm: Sequence[float], columns_mm: Sequence[float], seconds: float) -> Solution:
@@ -368,7 +368,7 @@ class MovedMask:
         """Noisy electrons a second at one place, of ambient light what a user takes off."""
         bench, expected = self.lit.bench, self.expected(row_mm, column_mm)
         speckle = self.lit.light.simulation.physics.speckle if self.model == RENDERED else 0.0
-        exposer = Exposer(bench.rig, seconds, integer(self.seed, "mask", f"{row_mm:g}", f"{column_mm:g}"), speckle)
+        exposer = Exposer(bench.devices, seconds, integer(self.seed, "mask", f"{row_mm:g}", f"{column_mm:g}"), speckle)
         family = bench.family("uniform")
         ((frame, _, _),) = exposer.measurements(family, expected)
         frame = frame - taken_off(exposer, family, expected)

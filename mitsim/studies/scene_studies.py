@@ -172,7 +172,7 @@ AS_MATT = "as the matt scene"
 EXPOSURES = (EQUAL_PEAK, AS_MATT)
 _ACCURACY = 3e-3
 """Of the light: a tenth of the artefacts that matter, and of global light, in a third of the time of 1e-3."""
-_VARIED = ("finish", "roughness", "shape", "z")  # of a scene, but not of its rig
+_VARIED = ("finish", "roughness", "shape", "z")  # of a scene, but not of its devices
 _TRUTHS = ("matt paint", "apparent")
 _GREY = 0.5  # of no error
 _ROUNDING = 1e-12
@@ -234,7 +234,7 @@ def _reflectivity_measure(studio: Studio, point: Point) -> Found:
 
 
 def _factors(studio: Studio, setup: Setup, seed: int) -> Factors:
-    """A calibration before a board, which does not see what is varied; the shipped three share a rig."""
+    """A calibration before a board, which does not see what is varied; the shipped three share their devices."""
     parameters = tuple(each for each in setup.parameters if each[0] not in _VARIED)
     scene = CARD if setup.scene in SHIPPED and not parameters else setup.scene
     return studio.factors(replace(setup, scene=scene, parameters=parameters), seed)

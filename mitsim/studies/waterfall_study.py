@@ -63,7 +63,7 @@ EFFECTS = (
     ablation.INTERREFLECTION, ablation.MIRRORS, ablation.GLOSS, ablation.AMBIENT, ablation.BLACK_LEVEL,
     ablation.DEFOCUS, ablation.SPECKLE, SATURATION, CALIBRATION_NOISE, QUANTISATION, ablation.RENDER_NOISE,
 )  # fmt: skip
-"""In the order in which they are added: of the rig, of the scene, of light, of the camera, of the simulation."""
+"""In the order in which they are added: of the devices, of the scene, of light, of the camera, of the simulation."""
 ASSUMED, CALIBRATED = MODELS = ("assumed", "calibrated")
 _OF_SESSIONS = frozenset({ablation.FALLOFF, ablation.DIFFRACTION, ablation.KEYSTONE, ablation.DEFOCUS})
 """Effects that change what a session's frames are expected to be, but for the black level, a factor for all of them."""
@@ -147,7 +147,7 @@ class Sessions:
     def _by_lines(self, off: frozenset[str]) -> Estimate:
         """From lines of the projector, each alone: what +-1 stripes come to without noise."""
         light, n = self._ablation.without(off), self._session.bench.n
-        second = Exposer(self._session.bench.rig, 1.0, self._session.seed)
+        second = Exposer(self._session.bench.devices, 1.0, self._session.seed)
 
         def rates(lighting: Lighting) -> Iterator[FloatArray]:
             return (second.electrons(frame) for frame in light.frames(lighting, 0, leaking=False))
@@ -193,7 +193,7 @@ class Levels:
         off, light = frozenset(self.effects) - on, self.lit.light
         sensor, fraction = sensor_without(light.bench.sensor, off), Exposure().fraction
         fraction = fraction / _ROOM if SATURATION in off else fraction
-        bench = replace(light.bench, rig=replace(light.bench.rig, sensor=sensor))
+        bench = replace(light.bench, devices=replace(light.bench.devices, sensor=sensor))
         request = light.plan.request
         assert request is not None
         options = request.changed(patterns=self._patterns, seed=self._seed, exposure_fraction=fraction)

@@ -33,7 +33,8 @@ from mitsim.transport.transmission import Passage, refracted_way
 
 @dataclass(frozen=True)
 class SensorPoints:
-    """Where on the sensor light is followed to: its centre, several anchors, or random points that are filed as one.
+    """Where on the sensor light is followed to: its centre, several anchors, or random points that are accumulated as
+    one.
 
     Attributes
     ----------
@@ -171,7 +172,7 @@ class OpticalSetup:
 
     @cached_property
     def board(self) -> float:
-        """Irradiance [W m^-2] by the light of a projector pixel, from a white board at the rig's distance."""
+        """Irradiance [W m^-2] by the light of a projector pixel, from a white board at the aligned distance."""
         pixel = dr.arange(mi.UInt32, self.projector.n**2)
         wavelengths, spectral = sample_wavelengths(self.camera, generator(mi.UInt32(0), pixel), self.projector.lines)
         flux = np.array(panchromatic(self.rays.flux(pixel, wavelengths) * spectral))

@@ -42,7 +42,7 @@ class DirectTracer(Tracer):
         anchors
             sensor points a side that light is connected to.
         spread
-            connect to random points of the sensor instead, all filed as one anchor: the mean over the sensor.
+            connect to random points of the sensor instead, all accumulated as one anchor: the mean over the sensor.
         pixels
             (m,) of the projector that are traced; None: all.
         """

@@ -13,9 +13,9 @@ Most of the projector's light is followed from its own side (:mod:`mitsim.transp
 comes what that side cannot find: light whose last surface before the sensor is a mirror, and of indirect light the part
 over sharp turns (:func:`mitsim.transport.integrator.camera_part`).
 
-A path's light is filed under the direction and depth of its first vertex that is no mirror: through plane mirrors, of
-that vertex's image, which is where the camera sees it. Paths end at random (Russian roulette) with a probability that
-keeps the estimate unbiased; there is no last bounce.
+A path's light is accumulated under the direction and depth of its first vertex that is no mirror: through plane
+mirrors, of that vertex's image, which is where the camera sees it. Paths end at random (Russian roulette) with a
+probability that keeps the estimate unbiased; there is no last bounce.
 """
 
 from __future__ import annotations
@@ -336,7 +336,7 @@ class CameraPaths(PathIntegrator[State]):
             self._keep(paths, "indirect", active & (order > 1), light * paths.part, pixel)
 
     def _keep(self, paths: State, kind: str, active: mi.Bool, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32) -> None:
-        # Filed as the sensor's centre sees it.
+        # Accumulated as the sensor's centre sees it.
         row, column = (t + s * paths.inverse_depth for t, s in zip((self.row, self.column), self.origin, strict=True))
         lit = dr.select(active, light, 0)
         self._join(paths, kind, Sightings.of(lit, self.by_line, pixel, row, column, paths.inverse_depth))

@@ -38,7 +38,7 @@ _SHARP = 1.0
 Three times a matt surface's 0.32, so that none of its light is, and low enough for connections to hold the rest.
 """
 _MIRRORS = 16
-"""Mirrors that a path meets without the risk to end there: as many as the depth of glints."""
+"""Mirrors that a path meets without the risk to end there: as many as specular chains may have."""
 _LONGEST = 0.999
 """Largest chance to go on: paths end even where nothing is absorbed.
 

@@ -120,8 +120,8 @@ def _equal_hits(light: FloatArray, moments: FloatArray) -> tuple[FloatArray, Flo
 
 
 class _MissedTracer(FromCameraTracer):
-    """Light that a lens would bring, filed under shapes: that which no connection finds as indirect light, that over a
-    mirror and a lobe as direct light, with what a connection brings in the row's stead."""
+    """Light that a lens would bring, accumulated by shape: that which no connection finds as indirect light, that over
+    a mirror and a lobe as direct light, with what a connection brings in the row's stead."""
 
     def _paths(self, flight: InFlight) -> _MissedPaths:
         return _MissedPaths(self, flight)

@@ -422,7 +422,7 @@ def aligned_grid(
 ) -> CellGrid:
     """Cells that divide the projector's pixels, and more of them to cover the field stop.
 
-    Light that a plane at the rig's distance reflects then never shares a cell with a neighbouring projector pixel.
+    Light that a plane at the aligned distance reflects then never shares a cell with a neighbouring projector pixel.
     The margin on each side is a multiple of ``subdivision`` cells, so that grids of different subdivisions nest.
 
     Parameters

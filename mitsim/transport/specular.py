@@ -1,4 +1,5 @@
-"""Glint: from a scene and a pinhole projector to beams of rays that reach the sensor over perfect mirrors alone.
+"""Specular chains: from a scene and a pinhole projector to beams of rays that reach the sensor over perfect mirrors
+alone.
 
 A path projector - mirror - sensor has a delta at both ends, so no path from the camera finds it: it is traced from the
 projector instead (:mod:`mitsim.transport.specular_rays`). Rays go through a grid of points of each projector pixel.
@@ -90,7 +91,7 @@ def trace_specular_chains(scene: mi.Scene, camera: mi.Sensor, projector: Project
         for a depth below 1.
     """
     if max_depth < 1:
-        raise MitsimError(f"max_depth of glints is {max_depth}; give at least 1")
+        raise MitsimError(f"max_depth of specular chains is {max_depth}; give at least 1")
     if not has_mirrors(scene):
         return _join([], np.zeros(2))
     parts, left = [], np.zeros(2)

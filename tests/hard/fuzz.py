@@ -315,17 +315,17 @@ def main() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (_ROOM, resource.RLIM_INFINITY))
     signal.signal(signal.SIGALRM, _hangs)
 
-    def said(line: str) -> None:
+    def reported(line: str) -> None:
         sys.stdout.write(line + "\n")
         sys.stdout.flush()
 
     def tell(seed: int) -> None:
         signal.alarm(int(LONGEST * 4))
-        said(f"seed {seed}")
+        reported(f"seed {seed}")
 
     with tempfile.TemporaryDirectory() as folder:
         taken, refused = run(getattr(Fuzz(Path(folder)), kind), first, count, seconds, tell)
-    said(f"{kind}: {taken} taken, {refused} refused")
+    reported(f"{kind}: {taken} taken, {refused} refused")
 
 
 if __name__ == "__main__":

@@ -46,7 +46,7 @@ def mean(totals: np.ndarray) -> tuple[float, float]:
 
 
 MIRROR_Z, HALF = 395.0, 30.0
-GLINT = np.pi * SCALE / (2 * MIRROR_Z) ** 2
+SPECULAR = np.pi * SCALE / (2 * MIRROR_Z) ** 2
 """Irradiance at the sensor's centre by a perfect mirror there: the mirrored projector faces it at twice that."""
 
 

@@ -15,7 +15,7 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.patterns import Lighting
 from mitsim.light.settings import GROUPS, Settings
-from mitsim.optics.forming import Filed
+from mitsim.optics.forming import AccumulatedLight
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions
@@ -33,8 +33,10 @@ def heavy_frames(weight: float, seed: int = 0) -> tuple[ExpectedFrames, np.ndarr
     rng = np.random.default_rng(seed)
     groups = rng.normal(1, 0.05, (GROUPS, 1, 64))
     groups[3, 0, 20] += weight * 64
-    filed = Filed(FrameOptics(geometry, axis, axis, (Z,), 1), tuple(sparse.csr_array(group) for group in groups))
-    return ExpectedFrames([filed], Lighting.uniform(1), 0), groups
+    accumulated = AccumulatedLight(
+        FrameOptics(geometry, axis, axis, (Z,), 1), tuple(sparse.csr_array(group) for group in groups)
+    )
+    return ExpectedFrames([accumulated], Lighting.uniform(1), 0), groups
 
 
 @settings(max_examples=50, deadline=None, derandomize=True)

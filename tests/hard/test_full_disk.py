@@ -76,9 +76,9 @@ def test_a_full_disk(
     """(Planted: a writer that leaves what it began; numpy's own sentence, which names neither file nor cause.)"""
     # Python keeps byte code that was cut short, and fails on it ever after.
     monkeypatch.setattr("sys.dont_write_bytecode", True)
-    with room(ROOM), pytest.raises(MitsimError, match="cannot be written") as told:
+    with room(ROOM), pytest.raises(MitsimError, match="cannot be written") as reported:
         WRITERS[name](bench, tmp_path)
-    message = str(told.value)
+    message = str(reported.value)
     assert str(tmp_path) in message and "room" in message and message.isprintable()
     assert not [*tmp_path.iterdir()]
     assert capfd.readouterr().err == ""

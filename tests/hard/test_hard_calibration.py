@@ -359,7 +359,7 @@ def test_a_saturated_session_is_flagged(
     )
     bench = open_bench(small_scene(n=8), variant, camera=camera)
     found = bench.calibrate(accuracy=2e-2, output=tmp_path / "cal")
-    [told] = [warning for warning in found.warnings if "full well or the ADC's end" in warning]
-    assert told.startswith("saturation: 30 of 32 frames") and not found.ok
+    [reported] = [warning for warning in found.warnings if "full well or the ADC's end" in warning]
+    assert reported.startswith("saturation: 30 of 32 frames") and not found.ok
     manifest = json.loads((tmp_path / "cal" / "manifest.json").read_text())
     assert tuple(manifest["warnings"]) == found.warnings and manifest["estimate"] == str(found.status)

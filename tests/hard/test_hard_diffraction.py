@@ -189,7 +189,8 @@ def test_a_plan_with_openings_below_half_a_wavelength_goes_without_diffraction(
     with pytest.raises(MitsimError, match="half a wavelength"):
         bench.plan("uniform", accuracy=0.1)
     assert any(
-        "shadow is a guess" in said for said in bench.plan("uniform", accuracy=0.1, effects="-diffraction").warnings
+        "shadow is a guess" in reported
+        for reported in bench.plan("uniform", accuracy=0.1, effects="-diffraction").warnings
     )
 
 

@@ -84,7 +84,7 @@ def test_metres_and_micrometres_are_refused(small_scene: Callable[..., Path], sc
 
 
 def furnace(write: Callable[..., Path], albedo: float) -> IndirectTracer:
-    """The rig inside a closed matt sphere."""
+    """The devices inside a closed matt sphere."""
     sphere = (
         '<shape type="sphere"><point name="center" x="0" y="0" z="180"/><float name="radius" value="220"/>'
         f'<boolean name="flip_normals" value="true"/>{matt(albedo)}</shape>'

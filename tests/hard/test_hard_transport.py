@@ -10,7 +10,7 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.devices.patterns import Lighting
 from mitsim.planner.planner import make_plan
 from mitsim.transport.missed import SharpLight, sharp_light
-from tests.hard.hard_light import GLINT, SEVEN, SIGMAS, SLOW, N, glossy, lobe, mean, seen_alone
+from tests.hard.hard_light import SEVEN, SIGMAS, SLOW, SPECULAR, N, glossy, lobe, mean, seen_alone
 from tests.robustness import Recorder
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.robustness("Light")]
@@ -22,8 +22,8 @@ def sharp(bench: Bench, seed: int) -> SharpLight:
 
 def test_the_lobe_becomes_the_mirror() -> None:
     """The judge alone: from 1e-4 of roughness on it is the mirror's closed form, and it falls to the matt end."""
-    assert lobe(1e-4) == pytest.approx(GLINT, rel=1e-3) and lobe(1e-3) == pytest.approx(GLINT, rel=1e-3)
-    assert lobe(0.1) < 0.6 * GLINT and lobe(1.0) < 0.05 * GLINT
+    assert lobe(1e-4) == pytest.approx(SPECULAR, rel=1e-3) and lobe(1e-3) == pytest.approx(SPECULAR, rel=1e-3)
+    assert lobe(0.1) < 0.6 * SPECULAR and lobe(1.0) < 0.05 * SPECULAR
 
 
 @pytest.mark.parametrize("alpha", [1.0, 0.3, 0.1, 0.03, 0.01])
@@ -58,22 +58,22 @@ def test_a_lobe_that_would_be_missed_flags_the_plan(
 ) -> None:
     """Too much to trace at 1e-3 and below, 95 % of the light would lack, and no group tell: the plan says so."""
     bench = open_bench(small_scene(**glossy(alpha)))
-    monkeypatch.setattr("mitsim.planner.pilot_direct._AFFORDABLE", 0.0)
+    monkeypatch.setattr("mitsim.planner.pilot_direct._MOST_CONNECTIONS", 0.0)
     plan = make_plan(bench, Lighting.uniform(N), 2e-2, 1, {"diffraction": False})
-    said = [warning for warning in plan.warnings if "too sharp" in warning]
-    assert bool(said) is not seen
+    reported = [warning for warning in plan.warnings if "too sharp" in warning]
+    assert bool(reported) is not seen
     if not seen:
         # Of all light: 95 %. Ten of 2^20 rays fall on this sensor, and a connection may meet the lobe by chance.
-        missed = int(said[0].partition("%")[0]) / 100
+        missed = int(reported[0].partition("%")[0]) / 100
         measured(missed, at_least=0.6, at_most=1, what="of the light is told as missed")
 
 
 def test_a_perfect_mirror_is_exact(measured: Recorder, small_scene: Callable[..., Path]) -> None:
     """The limit: beams give the closed form of the mirrored projector, without noise (tests/physics/test_mirror.py)."""
     bench = open_bench(small_scene(mask="open", **glossy(None)))
-    frames = bench.glint.frames(np.zeros(N * N, np.int64), bench.geometry, None)
+    frames = bench.specular.frames(np.zeros(N * N, np.int64), bench.geometry, None)
     # The sensor's corner lies 0.53 mm off: obliquity and distance change by 1e-6.
-    measured(np.abs(frames.irradiance.sum(axis=0) / GLINT - 1).max(), at_most=1e-4)
+    measured(np.abs(frames.irradiance.sum(axis=0) / SPECULAR - 1).max(), at_most=1e-4)
 
 
 @pytest.mark.slow
@@ -86,6 +86,6 @@ def test_light_over_sharp_lobes_alone_flags_the_plan(
     """
     bench = open_bench(small_scene(**glossy(1e-4, sheet=False)))
     assert not any("too sharp" in warning for warning in make_plan(bench, Lighting.uniform(N), 2e-2, 1).warnings)
-    monkeypatch.setattr("mitsim.planner.pilot_direct._AFFORDABLE", 0.0)
+    monkeypatch.setattr("mitsim.planner.pilot_direct._MOST_CONNECTIONS", 0.0)
     plan = make_plan(bench, Lighting.uniform(N), 1e-2, 1)
     assert plan.systematic_error > 0.9 and any("100% of the direct light" in warning for warning in plan.warnings)

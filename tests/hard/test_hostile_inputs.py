@@ -32,9 +32,9 @@ def test_a_hundred_inputs(measured: Recorder, tmp_path: Path) -> None:
     ]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
-    told = json.loads((tmp_path / "a.json").read_text())
-    measured(told["inputs"], at_least=100, what="inputs")
-    assert {"0", "2"} <= {status for row in told["kinds"] for status in row["status"]}, "some are good"
+    reported = json.loads((tmp_path / "a.json").read_text())
+    measured(reported["inputs"], at_least=100, what="inputs")
+    assert {"0", "2"} <= {status for row in reported["kinds"] for status in row["status"]}, "some are good"
 
 
 def test_one_function_of_the_bench_loads_a_scene() -> None:

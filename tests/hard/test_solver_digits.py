@@ -284,7 +284,7 @@ def test_full_size_against_exact_integers(measured: Recorder, distance: float) -
 # ---- frames and columns that are hard --------------------------------------------------------------------------------
 
 
-def test_a_bright_glint_in_single_precision(measured: Recorder) -> None:
+def test_a_bright_highlight_in_single_precision(measured: Recorder) -> None:
     """float32 frames of whole DN up to 65535, one scene pixel 5000 times the rest: digits as with double precision.
 
     Rounding to DN leaves a misfit, so the bound is the one under noise. Products in single precision lose the image.

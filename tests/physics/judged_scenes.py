@@ -1,6 +1,6 @@
 """Scenes of the third judge's shapes: drawn by a seeded generator or by hand, written as XML, and held against mitsim.
 
-:func:`scenes` gives 30 of them by name. Each lies in the camera's frame; ``moved`` puts the whole rig elsewhere in its
+:func:`scenes` gives 30 of them by name. Each lies in the camera's frame; ``moved`` puts all devices elsewhere in its
 file. mitsim renders without ``interreflection``, diffraction and black level, which the judge does not have.
 """
 
@@ -46,7 +46,8 @@ LEFT_OUT = {"interreflection": False, "diffraction": False, "black-level": False
 
 @dataclass(frozen=True)
 class Judged:
-    """A scene, rays a side that settle it (see :func:`tests.physics.third_judge.answer`), and where its rig stands."""
+    """A scene, rays a side that settle it (see :func:`tests.physics.third_judge.answer`), and where its devices
+    stand."""
 
     scene: Scene
     k: int = 4
@@ -274,7 +275,7 @@ def _by_hand() -> dict[str, Judged]:
             sheet(430, print_), card(vector(5, 3, 380), 40, tilted(10), 0.4, leaf),
             card(vector(-10, -5, 300), 30, tilted(-20, 15), 0.8, leaf), k=6, fine=20,
         ),
-        "rig 300 m away": of(
+        "devices 300 m away": of(
             sheet(440, print_), Sphere(vector(15, 5, 375), 20.0, 0.6), camera=CODED, fine=16, moved=(3e5, -3e5, 3e5)
         ),
         "wires 1 km away": of(*wires(7, 25, 0.15, 90, 420), fine=24, moved=(-1e6, 2e5, 1e6)),

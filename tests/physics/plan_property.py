@@ -30,7 +30,7 @@ STUDENT = 2.02
 
 
 @dataclass(frozen=True)
-class Effort:
+class SampleWork:
     """Samples of one group, a projector pixel of direct light, a pixel or a cell of other light; numbers a side."""
 
     direct: int
@@ -50,20 +50,20 @@ class Error:
     high: float
 
 
-def answer(bench: Bench, shots: Lighting, depth: float, seed: int, effort: Effort) -> np.ndarray:
+def answer(bench: Bench, shots: Lighting, depth: float, seed: int, sample_work: SampleWork) -> np.ndarray:
     """(groups, shots, pixels, pixels) frames with all that ``bench`` has, all ``depth`` [mm] of the light in layers."""
     names = frozenset(effects.present(bench)) - {"speckle"}
-    base = Settings(depth, subdivision=effort.cells, effects=names, coarse_cells=2, coarse_layers=True)
-    base = replace(base, followed_anchors=effort.followed_anchors)
-    settings = replace(base, anchors=effort.anchors, layers=_layers(bench, base, seed, effort.layers))
+    base = Settings(depth, subdivision=sample_work.cells, effects=names, coarse_cells=2, coarse_layers=True)
+    base = replace(base, followed_anchors=sample_work.followed_anchors)
+    settings = replace(base, anchors=sample_work.anchors, layers=_layers(bench, base, seed, sample_work.layers))
     simulation = Simulation(bench, settings)
-    counts = {"direct": effort.direct, "anchor_residual": max(1, effort.direct // 4)}
+    counts = {"direct": sample_work.direct, "anchor_residual": max(1, sample_work.direct // 4)}
     groups = []
     for group in range(GROUPS):
         parts = [
             simulation.accumulate(name, each.tracer.trace(integer(seed, name, group), 0, count), shots.labels, count)
             for name, each in simulation.passes.items()
-            for count in [counts.get(name, effort.other)]
+            for count in [counts.get(name, sample_work.other)]
         ]
         groups.append(sum(parts[1:], parts[0]))
     rows = np.arange(shots.weights.shape[1])

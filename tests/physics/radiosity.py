@@ -228,7 +228,7 @@ class Corner:
 
 @dataclass(frozen=True)
 class Furnace:
-    """Inside of a sphere of radius ``radius`` about (0, 0, ``centre``), reflectance ``rho``, around the whole rig.
+    """Inside of a sphere of radius ``radius`` about (0, 0, ``centre``), reflectance ``rho``, around all devices.
 
     Between points of a sphere the kernel cos cos / (pi r^2) is 1 / area, whatever the points. So light that was
     reflected once is spread evenly, and so is every later reflection: beside its own light, flux Phi of the projector

@@ -47,8 +47,8 @@ MIRROR = """<shape type="rectangle"><transform name="to_world"><scale x="40" y="
     <bsdf type="conductor"><string name="material" value="none"/></bsdf></shape>"""
 LAMP = """<shape type="rectangle"><transform name="to_world"><scale x="15" y="15"/><translate z="320" x="-40"/>
     </transform><emitter type="area"><spectrum name="radiance" value="0.5"/></emitter></shape>"""
-SCENES = {"slab": SLAB, "ball": BALL, "glint": MIRROR + SLAB, "lamp": SLAB + LAMP}
-QUICK = ("slab", "glint")
+SCENES = {"slab": SLAB, "ball": BALL, "specular chain": MIRROR + SLAB, "lamp": SLAB + LAMP}
+QUICK = ("slab", "specular chain")
 ROUNDING = 2e-6
 """Of sums of a few thousand paths in float32."""
 
@@ -79,8 +79,8 @@ def followed(bench: Bench) -> dict[str, PathSamples]:
     return {name: tracer.trace(3, 0, SAMPLES) for name, tracer in tracers.items()}
 
 
-def filed(bench: Bench) -> list[list[float]]:
-    """(lines, kinds and classes) indirect and direct light that is filed on the device."""
+def accumulated(bench: Bench) -> list[list[float]]:
+    """(lines, kinds and classes) indirect and direct light that is accumulated on the device."""
     lines = bench.lines
     assert lines is not None
     labels = np.arange(N**2) % 5
@@ -102,7 +102,7 @@ def flux(bench: Bench) -> list[list[float]]:
     return [[float(line.sum()), float(line[: N**2 // 2].sum())] for line in sums]
 
 
-def glint(bench: Bench) -> list[float]:
+def specular(bench: Bench) -> list[float]:
     """Of beams that reach the sensor: power, and by place."""
     beams = trace_specular_chains(bench.loaded.scene, bench.loaded.camera, bench.projector_optics)
     light = beams.flux * beams.throughput.mean(axis=(1, 2))
@@ -129,15 +129,15 @@ def both(name: str, opened: Callable[[str, str], Bench]) -> dict[str, Any]:
     alone = [line_alone(opened(name, PLAIN.format(index(nm))), line) for nm, line in pairs]
     if name == "lamp":
         return {"lamps": [lamps(whole), [lamps(bench)[line] for line, bench in enumerate(alone)]]}
-    if name == "glint":
-        each = np.array([glint(bench) for bench in alone])
-        return {"glint": [[glint(whole)], [each.sum(axis=0).tolist()]], "line by line": [each.tolist()] * 2}
+    if name == "specular chain":
+        each = np.array([specular(bench) for bench in alone])
+        return {"specular chain": [[specular(whole)], [each.sum(axis=0).tolist()]], "line by line": [each.tolist()] * 2}
     together, apart = followed(whole), [followed(bench) for bench in alone]
     found = {
         way: [[seen(line) for line in light.by_line(3)], [seen(one[way]) for one in apart]]
         for way, light in together.items()
     }
-    for way, sums in {"filed": filed, "flux": flux}.items():
+    for way, sums in {"accumulated": accumulated, "flux": flux}.items():
         found[way] = [sums(whole), [sums(bench)[0] for bench in alone]]
     return found
 
@@ -210,6 +210,6 @@ def test_each_line_is_bent_by_its_own_index(light: Callable[[str], dict[str, Any
 
 def test_drawn_wavelengths_are_refused(light: Callable[[str], dict[str, Any]]) -> None:
     """By either estimator: paths of four wavelengths would all be bent as the first is."""
-    said = light(QUICK[0])["refusals"]
-    assert said["factored"].startswith("variant llvm_ad_spectral: ") and "colour lines" in said["factored"]
-    assert "got 'mitsim_glass' in <bsdf" in said["reference"] and "use a mono variant" in said["reference"]
+    reported = light(QUICK[0])["refusals"]
+    assert reported["factored"].startswith("variant llvm_ad_spectral: ") and "colour lines" in reported["factored"]
+    assert "got 'mitsim_glass' in <bsdf" in reported["reference"] and "use a mono variant" in reported["reference"]

@@ -169,7 +169,7 @@ def glossy(shared_scene: SmallScene, name: str, alpha: float) -> Path:
 
 def with_lens(bench: Bench, radius: float, focus: float | None = None) -> Bench:
     lens = {"aperture_radius_mm": radius, "focus_mm": focus}
-    return replace(bench, rig=replace(bench.rig, projector=bench.projector.model_copy(update=lens)))
+    return replace(bench, devices=replace(bench.devices, projector=bench.projector.model_copy(update=lens)))
 
 
 def reference_with_lens(bench: Bench, shown: np.ndarray, spp: int) -> tuple[np.ndarray, np.ndarray]:
@@ -234,10 +234,10 @@ def test_a_small_lens_is_a_pinhole(shared_scene: SmallScene) -> None:
 
 
 def test_black_pixels_shine_by_one_over_the_contrast(shipped_bench: Callable[..., Bench]) -> None:
-    """Contrast 100: every frame is 1 % of the uniform one and 99 % of its own, glints included."""
+    """Contrast 100: every frame is 1 % of the uniform one and 99 % of its own, specular chains included."""
     sharp = shipped_bench("mirror")
     grey = sharp.projector.model_copy(update={"contrast_ratio": 100.0})
-    bench = replace(sharp, rig=replace(sharp.rig, projector=grey))
+    bench = replace(sharp, devices=replace(sharp.devices, projector=grey))
     dots = bench.family("dots:3").lighting
     lighting = Lighting(dots.labels, np.concatenate([dots.weights, np.ones((1, 9)), np.zeros((1, 9))]))
     frames = {}

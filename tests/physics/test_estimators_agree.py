@@ -320,7 +320,7 @@ def one_layer_shifted(pair: Pair) -> np.ndarray:
     """The nearest layer's light, and that alone, one cell to the right."""
 
     def change(light: np.ndarray) -> np.ndarray:
-        if len(light) < len(pair.plan.settings.depths):  # light that is filed in one layer for all depths
+        if len(light) < len(pair.plan.settings.depths):  # light that is accumulated in one layer for all depths
             return light
         return np.concatenate([light[:-1], np.roll(light[-1:], 1, axis=4)])
 

@@ -76,7 +76,7 @@ def path(scene: Path, spp: int, seed: int) -> Measured:
 
 
 def factored(scene: Path, spp: int, seed: int) -> Measured:
-    """The factored estimator: light filed and made into frames as a capture does, in GROUPS independent parts.
+    """The factored estimator: light accumulated and made into frames as a capture does, in GROUPS independent parts.
 
     Light of one reflection is traced apart from light of more.
     """

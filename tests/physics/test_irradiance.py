@@ -111,10 +111,10 @@ def test_masked_mean_is_that_of_the_closed_form_shadow(small_scene: Callable[...
     assert abs(mean - expected) < SIGMAS * error
 
 
-def test_a_rig_that_moves_as_one_sees_the_same(small_scene: Callable[..., Path]) -> None:
+def test_devices_that_move_as_one_see_the_same(small_scene: Callable[..., Path]) -> None:
     plain = render(small_scene("plain"), spp=64)
     # A third of a turn about the diagonal (1, 1, 1), which permutes the axes, then a shift.
-    moved = render(small_scene("moved", rig="0 0 1 30 1 0 0 -25 0 1 0 70 0 0 0 1"), spp=64)
+    moved = render(small_scene("moved", pose="0 0 1 30 1 0 0 -25 0 1 0 70 0 0 0 1"), spp=64)
     # The same paths; float32 lets a few of 262 144 change a feature of the mask or miss the window's edge.
     assert np.abs(moved - plain).max() < 0.5 * plain.mean()
     assert np.linalg.norm(moved - plain) < 0.01 * np.linalg.norm(plain)

@@ -83,7 +83,7 @@ def mean_over(terms: list[SampledTerm], s: np.ndarray, width: float) -> np.ndarr
     return sum(weight * np.outer(*axis) for (weight, *_), axis in zip(terms, axes, strict=True))
 
 
-def test_glint_sees_the_same_flaws() -> None:
+def test_specular_chains_see_the_same_flaws() -> None:
     """Samplers at points and over 12 um, of an etched and blurred mask off the axis, and of a turned one, whose raster
     has edges a cell wide. (Planted: the mask's offset left out.)"""
     s = np.linspace(-0.5, 0.5, 41)

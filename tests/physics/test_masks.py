@@ -191,12 +191,12 @@ def test_a_tilt_that_is_left_out_is_told_with_what_it_moves(
     assert not SceneFacts.of(bench).warnings
     path.write_text(path.read_text() + "rotation_deg = 0.5\n")
     turned_too = open_bench(small_scene(), variant, path)
-    said = "tilt is left out: it moves shadows by up to 1.3 um"
-    assert any(said in told for told in SceneFacts.of(turned_too).warnings)
+    message = "tilt is left out: it moves shadows by up to 1.3 um"
+    assert any(message in reported for reported in SceneFacts.of(turned_too).warnings)
     path = camera_file(tmp_path, "random", np.random.default_rng(3).integers(0, 2, (15, 15)))
     path.write_text(path.read_text() + "tilt_row_mrad = -0.5\n")
     random = open_bench(small_scene(), variant, path)
-    assert any("tilt is left out" in told for told in SceneFacts.of(random).warnings)
+    assert any("tilt is left out" in reported for reported in SceneFacts.of(random).warnings)
     assert not SceneFacts.of(random, {"diffraction": False}).warnings
 
 
@@ -296,8 +296,8 @@ def test_waves_behind_flatcam_are_told_to_be_not_separable(small_scene: Callable
 
 
 @pytest.mark.slow
-def test_a_sessions_factors_foretell_the_misfit_behind_flatcam(small_scene: Callable[..., Path], variant: str) -> None:
-    """An even sheet, so that no print is in the misfit: foretold to 5 %, of the session's noise and what terms leave
+def test_a_sessions_factors_predict_the_misfit_behind_flatcam(small_scene: Callable[..., Path], variant: str) -> None:
+    """An even sheet, so that no print is in the misfit: predicted to 5 %, of the session's noise and what terms leave
     out, and named; 95 % of the image within its uncertainty, less one in twenty by chance of 256 pixels."""
     bench = open_bench(small_scene(mask="flatcam", pixels=96), variant)
     factors = bench.calibrate(accuracy=5e-4)

@@ -46,7 +46,7 @@ def mirror(centre: Vector, normal: np.ndarray, half: float = 80.0) -> dict:
     return {"type": "rectangle", "to_world": facing(centre, normal, half), "bsdf": bsdf}
 
 
-class Rig:
+class MirrorBench:
     """Projector at ``place`` turned by degrees about y; its window is the right or whole part of the canvas."""
 
     def __init__(self, place: Vector, turn: float = 0.0, shifted: bool = True) -> None:
@@ -91,9 +91,9 @@ class Rig:
         beams = trace_specular_chains(scene, camera, projector)
         return specular_frames(beams, camera.geometry, geometric_samplers(camera.geometry), labels)
 
-    def mirrored(self, *mirrors: tuple[Vector, np.ndarray]) -> "Rig":
+    def mirrored(self, *mirrors: tuple[Vector, np.ndarray]) -> "MirrorBench":
         """The virtual projector behind plane mirrors (point, unit normal), met in this order."""
-        image = Rig(tuple(self.place), 0.0, self.shifted)
+        image = MirrorBench(tuple(self.place), 0.0, self.shifted)
         image.axes = self.axes
         for point, normal in mirrors:
             image.place = image.place - 2 * ((image.place - np.array(point)) @ normal) * normal
@@ -155,9 +155,9 @@ def tilted(x: float, y: float) -> np.ndarray:
 )
 def test_a_plane_mirror_shows_a_second_projector(turn: float, normal: np.ndarray) -> None:
     """Uniform light, all 512 x 512 pixels, through the mask."""
-    rig, place = Rig((60, 0, 0), turn), (30.0, 0.0, 400.0)
-    found = rig.frames(rig.scene(mirror=mirror(place, normal)), UNIFORM)
-    image = rig.mirrored((place, normal))
+    devices, place = MirrorBench((60, 0, 0), turn), (30.0, 0.0, 400.0)
+    found = devices.frames(devices.scene(mirror=mirror(place, normal)), UNIFORM)
+    image = devices.mirrored((place, normal))
     u = centres()
     light, row, column = image.irradiance(u[:, None], u)
     assert ((row > 0) & (row < N) & (column > 0) & (column < N)).all(), "the window covers the sensor"
@@ -173,9 +173,9 @@ def test_a_plane_mirror_shows_a_second_projector(turn: float, normal: np.ndarray
 def test_dots_by_a_mirror(variant: str) -> None:
     """Every class of dots:7 that reaches the sensor; pixels of the projector have edges inside sensor pixels."""
     labels = parse_patterns("dots:7", N).lighting.labels
-    rig, place = Rig((60, 0, 0)), (30.0, 0.0, 400.0)
-    found = rig.frames(rig.scene(mirror=mirror(place, BACK)), labels)
-    image = rig.mirrored((place, BACK))
+    devices, place = MirrorBench((60, 0, 0)), (30.0, 0.0, 400.0)
+    found = devices.frames(devices.scene(mirror=mirror(place, BACK)), labels)
+    image = devices.mirrored((place, BACK))
     fine = 1024
     u = ((np.arange(512 * fine) + 0.5) / fine - 256) * PITCH
     light, row, _ = image.irradiance(u, 0.0)
@@ -202,9 +202,9 @@ def test_dots_by_a_mirror_that_casts_a_keystone(variant: str) -> None:
     pixels, pitch, fine = 48, 0.125, 64
     labels = parse_patterns("dots:7", N).lighting.labels
     normal = tilted(2.0, -1.5)
-    rig, place = Rig((60, 0, 0), 10.0), (30.0, 0.0, 400.0)
-    found = rig.frames(rig.scene(pixels=pixels, pitch=pitch, mirror=mirror(place, normal)), labels)
-    image = rig.mirrored((place, normal))
+    devices, place = MirrorBench((60, 0, 0), 10.0), (30.0, 0.0, 400.0)
+    found = devices.frames(devices.scene(pixels=pixels, pitch=pitch, mirror=mirror(place, normal)), labels)
+    image = devices.mirrored((place, normal))
     u = ((np.arange(pixels * fine) + 0.5) / fine - pixels / 2) * pitch
     light, row, column = image.irradiance(u[:, None], u)
     half = pitch / fine / 2
@@ -221,12 +221,12 @@ def test_dots_by_a_mirror_that_casts_a_keystone(variant: str) -> None:
 
 
 def test_two_mirrors_make_a_periscope(variant: str) -> None:
-    rig = Rig((60, 0, 0), shifted=False)
+    devices = MirrorBench((60, 0, 0), shifted=False)
     first, second = np.array([-1.0, 0.0, -1.0]) / np.sqrt(2), np.array([1.0, 0.0, -1.0]) / np.sqrt(2)
     places = (60.0, 0.0, 300.0), (0.0, 0.0, 300.0)
-    scene = rig.scene(first=mirror(places[0], first, 60), second=mirror(places[1], second, 20))
-    found = rig.frames(scene, UNIFORM)
-    image = rig.mirrored((places[0], first), (places[1], second))
+    scene = devices.scene(first=mirror(places[0], first, 60), second=mirror(places[1], second, 20))
+    found = devices.frames(scene, UNIFORM)
+    image = devices.mirrored((places[0], first), (places[1], second))
     assert image.place == pytest.approx([0, 0, 660])
     u = centres()
     light, _, _ = image.irradiance(u[:, None], u)
@@ -237,9 +237,9 @@ def test_two_mirrors_make_a_periscope(variant: str) -> None:
 
 def test_a_mirror_that_shows_the_projector_to_part_of_the_sensor(variant: str) -> None:
     """A rim across the sensor: the mirror ends at x = 30, halfway between projector and sensor's centre."""
-    rig, place = Rig((60, 0, 0)), (70.0, 0.0, 400.0)
-    found = rig.frames(rig.scene(mask="open", mirror=mirror(place, BACK, 40.0)), UNIFORM)
-    image = rig.mirrored((place, BACK))
+    devices, place = MirrorBench((60, 0, 0)), (70.0, 0.0, 400.0)
+    found = devices.frames(devices.scene(mask="open", mirror=mirror(place, BACK, 40.0)), UNIFORM)
+    image = devices.mirrored((place, BACK))
     u = centres()
     light, _, _ = image.irradiance(u[:, None], u)
     # Sensor x meets the mirror at (60 + x) / 2: dark where x < 0, columns of s > 0.
@@ -250,31 +250,31 @@ def test_a_mirror_that_shows_the_projector_to_part_of_the_sensor(variant: str) -
 
 
 def test_a_mirror_out_of_view_gives_nothing(variant: str) -> None:
-    rig = Rig((60, 0, 0))
-    away = rig.scene(mirror=mirror((30.0, 0.0, 400.0), tilted(-8.0, 0.0)))
-    assert rig.frames(away, UNIFORM).irradiance.shape == (0, 512, 512)
+    devices = MirrorBench((60, 0, 0))
+    away = devices.scene(mirror=mirror((30.0, 0.0, 400.0), tilted(-8.0, 0.0)))
+    assert devices.frames(away, UNIFORM).irradiance.shape == (0, 512, 512)
     # Lit, but outside the field stop: the source's image stands at x = 60, 4.3 degrees from the axis.
-    stopped = rig.scene(mirror=mirror((30.0, 0.0, 400.0), BACK), fov=8.0)
-    assert rig.frames(stopped, UNIFORM).flux == 0
+    stopped = devices.scene(mirror=mirror((30.0, 0.0, 400.0), BACK), fov=8.0)
+    assert devices.frames(stopped, UNIFORM).flux == 0
 
 
 @pytest.mark.parametrize(("x", "passes"), [(45.0, False), (15.0, False), (30.0, True)], ids=["out", "back", "between"])
 def test_paper_in_the_way(x: float, passes: bool) -> None:
     """Halfway to the mirror the light passes x = 45 on its way out and 15 on its way back."""
-    rig = Rig((60, 0, 0))
+    devices = MirrorBench((60, 0, 0))
     paper = {"type": "rectangle", "to_world": facing((x, 0, 200), BACK, 6), "bsdf": {"type": "diffuse"}}
-    found = rig.frames(rig.scene(mask="open", mirror=mirror((30.0, 0.0, 400.0), BACK), paper=paper), UNIFORM)
+    found = devices.frames(devices.scene(mask="open", mirror=mirror((30.0, 0.0, 400.0), BACK), paper=paper), UNIFORM)
     full = np.pi * SCALE * REFLECTANCE / 800**2 * (512 * PITCH) ** 2
     assert found.flux == (pytest.approx(full, rel=1e-5) if passes else 0)
 
 
 def test_no_camera_side_path_finds_this_light(variant: str) -> None:
     """The reason for tracing it from the projector: the reference renders black, exactly."""
-    rig = Rig((60, 0, 0))
-    scene = rig.scene(mask="open", pixels=32, pitch=0.1875, mirror=mirror((30.0, 0.0, 400.0), BACK))
+    devices = MirrorBench((60, 0, 0))
+    scene = devices.scene(mask="open", pixels=32, pitch=0.1875, mirror=mirror((30.0, 0.0, 400.0), BACK))
     assert not np.array(mi.render(scene, spp=64, seed=0)).any()
-    light, _, _ = rig.mirrored(((30.0, 0.0, 400.0), BACK)).irradiance(np.zeros(1), np.zeros(1))
-    assert rig.frames(scene, UNIFORM).irradiance.mean() == pytest.approx(REFLECTANCE * light[0], rel=1e-4)
+    light, _, _ = devices.mirrored(((30.0, 0.0, 400.0), BACK)).irradiance(np.zeros(1), np.zeros(1))
+    assert devices.frames(scene, UNIFORM).irradiance.mean() == pytest.approx(REFLECTANCE * light[0], rel=1e-4)
 
 
 def ball(tangent: np.ndarray, source: np.ndarray, centre: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
@@ -290,11 +290,13 @@ def ball(tangent: np.ndarray, source: np.ndarray, centre: np.ndarray, radius: fl
     return -x[..., 1::-1], -(d / d[..., 2:])[..., 1::-1]
 
 
-def by_ball(rig: "Rig", centre: np.ndarray, radius: float, pixels: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def by_ball(
+    devices: "MirrorBench", centre: np.ndarray, radius: float, pixels: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Irradiance without mask, and tan-angles and places of the light (pixels, pixels, 2), by the exact map."""
     u = np.stack(np.meshgrid(centres(pixels), centres(pixels), indexing="ij"), axis=-1)
-    reach = lambda tangent: ball(tangent, rig.place, centre, radius)  # noqa: E731
-    start = centre - rig.place
+    reach = lambda tangent: ball(tangent, devices.place, centre, radius)  # noqa: E731
+    start = centre - devices.place
     # First the point that halves the angle between projector and sensor.
     towards = start / np.linalg.norm(start) + centre / np.linalg.norm(centre)
     start = start - radius * towards / np.linalg.norm(towards)
@@ -313,10 +315,10 @@ def by_ball(rig: "Rig", centre: np.ndarray, radius: float, pixels: int) -> tuple
 def test_a_ball_of_steel(variant: str) -> None:
     """A convex mirror spreads the light: flux over the area on which it lands, by the derivative of the exact map."""
     pixels = 128
-    rig, centre, radius = Rig((60, 0, 0)), np.array([12.0, 5.0, 420.0]), 20.0
+    devices, centre, radius = MirrorBench((60, 0, 0)), np.array([12.0, 5.0, 420.0]), 20.0
     shape = {"type": "sphere", "center": centre.tolist(), "radius": radius, "bsdf": mirror((0, 0, 1), BACK)["bsdf"]}
-    found = rig.frames(rig.scene(pixels=pixels, ball=shape), UNIFORM)
-    light, seen, u = by_ball(rig, centre, radius, pixels)
+    found = devices.frames(devices.scene(pixels=pixels, ball=shape), UNIFORM)
+    light, seen, u = by_ball(devices, centre, radius, pixels)
     s = u + D * seen
     slope = 1 + D * np.gradient(seen[:, 0, 0], PITCH).mean()
     masks = [code_mean(s[..., i] - slope * PITCH / 2, s[..., i] + slope * PITCH / 2) for i in (0, 1)]
@@ -330,24 +332,24 @@ def test_small_balls(variant: str, radius: float) -> None:
 
     (Planted: no squares divided for them, and all of their light is missing; hits in float32, 3e-4 to 5e-2 off.)
     """
-    pixels, rig = 64, Rig((60, 0, 0))
+    pixels, devices = 64, MirrorBench((60, 0, 0))
     places = np.array([[12.3, 5.1, 371.0], [-31.7, 20.9, 388.3], [2.6, -33.2, 362.9]], np.float32).astype(float)
     bsdf, held = mirror((0, 0, 1), BACK)["bsdf"], float(np.float32(radius))
     shapes = {
         f"ball{i}": {"type": "sphere", "center": c.tolist(), "radius": held, "bsdf": bsdf} for i, c in enumerate(places)
     }
-    found = rig.frames(rig.scene("open", pixels, **shapes), UNIFORM)
-    light = sum(by_ball(rig, centre, held, pixels)[0] for centre in places)
+    found = devices.frames(devices.scene("open", pixels, **shapes), UNIFORM)
+    light = sum(by_ball(devices, centre, held, pixels)[0] for centre in places)
     assert relative(found.irradiance[0], light) < 2e-4
     assert found.unresolved < 1e-6 * found.flux
-    from_projector = places - rig.place
+    from_projector = places - devices.place
     cosine = from_projector[:, 2] / np.linalg.norm(from_projector, axis=1)
     intensity = np.pi * SCALE / from_projector[:, 2] ** 2 / cosine * REFLECTANCE * held**2 / 4
     far = np.linalg.norm(places, axis=1)
     assert found.irradiance.mean() == pytest.approx((intensity * places[:, 2] / far**3).sum(), rel=1e-3 + radius / 100)
 
 
-def by_bead(rig: Rig, centre: np.ndarray, radius: float, at: np.ndarray, index: float = 1.5) -> np.ndarray:
+def by_bead(devices: MirrorBench, centre: np.ndarray, radius: float, at: np.ndarray, index: float = 1.5) -> np.ndarray:
     """Irradiance at points of the sensor (k, 3) by a ball of glass, reflected by it or once inside of it.
 
     A ray that leaves P at an angle a to the centre meets the ball at i, sin i = D sin a / r, is bent to t, and arrives
@@ -355,7 +357,7 @@ def by_bead(rig: Rig, centre: np.ndarray, radius: float, at: np.ndarray, index: 
     at the distance d. In each plane through P and the centre this is solved for i on every monotone piece, and E = pi
     scale / cos^3 sin a da / (d^2 sin T dT cos b), on a sensor that is not seen squarely times its cosine.
     """
-    to = centre - rig.place
+    to = centre - devices.place
     distance, seen = np.linalg.norm(to), at - centre
     away = np.linalg.norm(seen, axis=1)
     ahead = to / distance
@@ -400,14 +402,14 @@ def by_bead(rig: Rig, centre: np.ndarray, radius: float, at: np.ndarray, index: 
 def test_beads_of_glass(variant: str, radius: float, pixels: int) -> None:
     """Two thirds of what a bead sends back comes from its last thirtieth; what comes from its last 64th is counted, and
     not found. (Planted: no arcs looked for, 0.37 of the light; what is too close not counted.)"""
-    pitch, rig = 6 / pixels, Rig((60, 0, 0))
+    pitch, devices = 6 / pixels, MirrorBench((60, 0, 0))
     centre, held = np.array([12.3, 5.1, 371.0], np.float32).astype(float), float(np.float32(radius))
     bead = {"type": "sphere", "center": centre.tolist(), "radius": held, "bsdf": {"type": "dielectric", "int_ior": 1.5}}
     bead["bsdf"]["ext_ior"] = 1.0
-    found = rig.frames(rig.scene("open", pixels, pitch, bead=bead), UNIFORM)
+    found = devices.frames(devices.scene("open", pixels, pitch, bead=bead), UNIFORM)
     u = centres(4 * pixels, pitch / 4)
     row, column = (axis.ravel() for axis in np.meshgrid(u, u, indexing="ij"))
-    light = by_bead(rig, centre, held, np.stack([-column, -row, 0 * row], axis=1))
+    light = by_bead(devices, centre, held, np.stack([-column, -row, 0 * row], axis=1))
     light = light.reshape(pixels, 4, pixels, 4).mean(axis=(1, 3))
     area = (pixels * pitch) ** 2
     missing = (light.mean() - found.irradiance[0].mean()) * area
@@ -418,8 +420,8 @@ def test_beads_of_glass(variant: str, radius: float, pixels: int) -> None:
 @pytest.mark.parametrize("side", [0.3, 0.05])
 def test_a_small_facet(variant: str, side: float) -> None:
     """A plane mirror between the rays of the first grid: pi scale R / z^2 times its area, on a patch twice as large."""
-    rig, place = Rig((60, 0, 0)), (30.12, 0.07, 400.0)
-    found = rig.frames(rig.scene("open", 128, 0.05, facet=mirror(place, BACK, side / 2)), UNIFORM)
+    devices, place = MirrorBench((60, 0, 0)), (30.12, 0.07, 400.0)
+    found = devices.frames(devices.scene("open", 128, 0.05, facet=mirror(place, BACK, side / 2)), UNIFORM)
     assert found.flux == pytest.approx(np.pi * SCALE * REFLECTANCE / 400**2 * side**2, rel=2e-2)
     lit = np.argwhere(found.irradiance[0] > 0.2 * found.irradiance[0].max())
     assert np.abs((lit - 63.5) * 0.05 - [-0.14, -0.24]).max() < side + 0.05
@@ -427,18 +429,18 @@ def test_a_small_facet(variant: str, side: float) -> None:
 
 def test_rays_are_better_than_float32(variant: str) -> None:
     """Mitsuba's own rays land some 1e-4 mm off by a plane mirror, more by this ball; polished ones do not."""
-    rig, centre, radius = Rig((60, 0, 0)), np.array([12.0, 5.0, 420.0]), 20.0
+    devices, centre, radius = MirrorBench((60, 0, 0)), np.array([12.0, 5.0, 420.0]), 20.0
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (500, 2)) + [58.7, 51.2]
     ball_shape = {"type": "sphere", "center": centre.tolist(), "radius": radius, "bsdf": {"type": "conductor"}}
     for shape, off in ((mirror((0, 0, 400), BACK, 120), 1e-6), (ball_shape, 1e-6)):
-        scene = rig.scene(shape=shape)
+        scene = devices.scene(shape=shape)
         tracer = SpecularRays(scene, scene.sensors()[0], ProjectorOptics(scene.emitters()[0], N, 0, N, (N, 2 * N)), 1)
         found = tracer.follow(points)
         assert found.ray.tolist() == list(range(500))
         direction = tracer.rays.directions(points)
         tangent = direction[:, :2] / direction[:, 2:]
-        flat = -(rig.place[:2] + 800 * tangent)[:, ::-1]
-        exact = flat if shape is not ball_shape else ball(tangent, rig.place, centre, radius)[0]
+        flat = -(devices.place[:2] + 800 * tangent)[:, ::-1]
+        exact = flat if shape is not ball_shape else ball(tangent, devices.place, centre, radius)[0]
         assert np.abs(found.sensor - exact).max() < off
 
 
@@ -449,8 +451,8 @@ SHIPPED, ANGLE = 0.9, np.radians(4.2654)
 """Reflectance and turn of the mirror in scenes/mirror, which stands at (0, 0, 400)."""
 
 
-def shipped_image() -> "Rig":
-    return Rig((60, 0, 0)).mirrored(((0.0, 0.0, 400.0), np.array([np.sin(ANGLE), 0.0, -np.cos(ANGLE)])))
+def shipped_image() -> "MirrorBench":
+    return MirrorBench((60, 0, 0)).mirrored(((0.0, 0.0, 400.0), np.array([np.sin(ANGLE), 0.0, -np.cos(ANGLE)])))
 
 
 def pipeline_light(bench, diffraction: bool):
@@ -471,7 +473,8 @@ def mirror_part(light) -> np.ndarray:
 
 @pytest.mark.slow
 def test_the_shipped_mirror_through_the_pipeline(shipped_bench, variant: str) -> None:
-    """Ray optics. What is left of the frame without the analytic glint is what the reference sees: the board alone."""
+    """Ray optics. What is left of the frame without the analytic specular chain is what the reference sees: the board
+    alone."""
     bench = shipped_bench("mirror")
     plan, light = pipeline_light(bench, diffraction=False)
     assert "mirrors" in plan.settings.effects
@@ -479,8 +482,8 @@ def test_the_shipped_mirror_through_the_pipeline(shipped_bench, variant: str) ->
     irradiance, row, column = image.irradiance(u[:, None], u)
     assert ((row > 0) & (row < N) & (column > 0) & (column < N)).all()
     masks = [code_mean(image.shadow(u - PITCH / 2, axis), image.shadow(u + PITCH / 2, axis)) for axis in (0, 1)]
-    glint = SHIPPED * irradiance * np.outer(*masks)
-    assert relative(mirror_part(light), glint) < 2e-3
+    specular = SHIPPED * irradiance * np.outer(*masks)
+    assert relative(mirror_part(light), specular) < 2e-3
 
     whole = next(iter(light.frames(LIT, 0))).irradiance
     board = np.zeros_like(whole)
@@ -490,8 +493,8 @@ def test_the_shipped_mirror_through_the_pipeline(shipped_bench, variant: str) ->
         one = np.array(mi.render(bench.loaded.scene, spp=4, seed=50 + seed), np.float64)[..., 0]
         board, squares = board + one / passes, squares + one**2 / passes
     error = np.sqrt(((squares - board**2) / (passes - 1)).sum())
-    assert glint.sum() > 50 * error, "the reference is sharp enough to tell the glint from nothing"
-    assert abs((whole - glint).sum() - board.sum()) < 5 * error + 2e-3 * board.sum()
+    assert specular.sum() > 50 * error, "the reference is sharp enough to tell the specular chain from nothing"
+    assert abs((whole - specular).sum() - board.sum()) < 5 * error + 2e-3 * board.sum()
     assert abs(whole.sum() - board.sum()) > 50 * error
 
 
@@ -509,11 +512,11 @@ def test_the_shipped_mirror_in_wave_optics(shipped_bench, variant: str) -> None:
     for nm, share in lines:
         shadow += share * np.outer(*(by_point_source(geometry, tau, depth, nm=nm) for tau in taus))
         photons += share
-    glint = SHIPPED * irradiance * shadow / photons
+    specular = SHIPPED * irradiance * shadow / photons
     found = mirror_part(light)
-    assert relative(found, glint) < 3e-3
+    assert relative(found, specular) < 3e-3
     geometric = [code_mean(image.shadow(u - PITCH / 2, axis), image.shadow(u + PITCH / 2, axis)) for axis in (0, 1)]
-    assert relative(SHIPPED * irradiance * np.outer(*geometric), glint) > 0.1
+    assert relative(SHIPPED * irradiance * np.outer(*geometric), specular) > 0.1
 
 
 # ---- a projector of finite aperture
@@ -527,8 +530,8 @@ def test_a_perfect_mirror_with_an_aperture_in_the_reference(variant: str) -> Non
     """
     plugins.register()
     place, radius = (30.0, 0.0, 400.0), 20.0
-    rig = Rig((60, 0, 0))
-    pinhole = rig.scene(mask="open", pixels=64, pitch=0.09375, mirror=mirror(place, BACK))
+    devices = MirrorBench((60, 0, 0))
+    pinhole = devices.scene(mask="open", pixels=64, pitch=0.09375, mirror=mirror(place, BACK))
     parts = aperture_scene_parts(pinhole.emitters()[0], radius, 400.0)
     scene = mi.load_dict(
         {
@@ -542,8 +545,8 @@ def test_a_perfect_mirror_with_an_aperture_in_the_reference(variant: str) -> Non
     passes = [float(np.array(mi.render(scene, spp=256, seed=seed)).mean()) for seed in range(16)]
     mean, error = np.mean(passes), np.std(passes, ddof=1) / 4
     u = centres(64, 0.09375)
-    analytic = REFLECTANCE * rig.mirrored((place, BACK)).irradiance(u[:, None], u)[0].mean()
-    beams = rig.frames(pinhole, UNIFORM).irradiance.mean()
+    analytic = REFLECTANCE * devices.mirrored((place, BACK)).irradiance(u[:, None], u)[0].mean()
+    beams = devices.frames(pinhole, UNIFORM).irradiance.mean()
     assert beams == pytest.approx(analytic, rel=1e-4)
     assert 5 * error < 0.03 * analytic
     assert abs(mean - analytic) < 5 * error + 1e-3 * analytic

@@ -151,7 +151,7 @@ def test_light_through_a_hole_is_direct_light(scene: Callable[..., Bench]) -> No
 
 @pytest.mark.slow
 def test_a_hole_before_a_mirror_is_no_hole(scene: Callable[..., Bench]) -> None:
-    """What mirrors add (glint, caustics, things seen in them) is the same behind a card of opacity 0."""
+    """What mirrors add (specular chains, caustics, things seen in them) is the same behind a card of opacity 0."""
     mirror = plate(395, MIRROR, 30, 30)
     alone, behind = scene(mirror), scene(mirror + plate(250, card(0), 14, 12))
     light = [
@@ -160,6 +160,6 @@ def test_a_hole_before_a_mirror_is_no_hole(scene: Callable[..., Bench]) -> None:
     (found, error), (expected, spread) = (mean(values) for values in light)
     gate = SIGMAS * np.hypot(error, spread)
     assert gate < 0.02 * expected and abs(found - expected) < gate
-    frames = [bench.glint.frames(np.zeros(bench.n**2, np.int64), bench.geometry, None) for bench in (alone, behind)]
+    frames = [bench.specular.frames(np.zeros(bench.n**2, np.int64), bench.geometry, None) for bench in (alone, behind)]
     assert frames[0].irradiance.sum() > 0
     assert frames[1].irradiance.sum() == pytest.approx(frames[0].irradiance.sum(), rel=1e-5)

@@ -15,7 +15,7 @@ import pytest
 from mitsim.api.bench import Bench, open_bench
 from mitsim.devices.patterns import Lighting
 from mitsim.planner.planner import make_plan
-from tests.physics.plan_property import Effort, answer, planned, total_error
+from tests.physics.plan_property import SampleWork, answer, planned, total_error
 
 pytestmark = pytest.mark.usefixtures("variant")
 PLANNED, ANSWERED = 0, 4711
@@ -48,11 +48,11 @@ def check(bench: Bench, patterns: str, accuracy: float, groups: np.ndarray) -> N
     plan = make_plan(bench, family, accuracy, PLANNED)
     frames, noise = planned(bench, plan, judged(bench, family), PLANNED)
     error, stated = total_error(frames, groups), plan.total(noise)
-    said = f"{error} against {stated}, settings {plan.settings}"
+    reported = f"{error} against {stated}, settings {plan.settings}"
     assert not plan.warnings, plan.warnings
-    assert stated.bound <= accuracy, said
-    assert error.low <= accuracy, said
-    assert error.high <= 1.5 * accuracy, f"too few samples to tell: {said}"
+    assert stated.bound <= accuracy, reported
+    assert error.low <= accuracy, reported
+    assert error.high <= 1.5 * accuracy, f"too few samples to tell: {reported}"
 
 
 @pytest.fixture(scope="module")
@@ -65,19 +65,19 @@ def small(shared_scene: Callable[..., Path], variant: str) -> Bench:
     )
 
 
-def of_small(bench: Bench, effort: Effort) -> np.ndarray:
+def of_small(bench: Bench, sample_work: SampleWork) -> np.ndarray:
     """The answer that the small scene's frames are held against."""
-    return answer(bench, judged(bench, bench.family("dots:4").lighting), 370.0, ANSWERED, effort)
+    return answer(bench, judged(bench, bench.family("dots:4").lighting), 370.0, ANSWERED, sample_work)
 
 
 @pytest.fixture(scope="module")
 def small_answer(small: Bench) -> np.ndarray:
-    return of_small(small, Effort(256, 512, cells=8))
+    return of_small(small, SampleWork(256, 512, cells=8))
 
 
 def test_a_small_scene_keeps_a_loose_accuracy(small: Bench) -> None:
     """A ball before a print and a wall beside it, near a sensor of 8 mm: all discretisations count."""
-    check(small, "dots:4", 5e-2, of_small(small, Effort(64, 128)))
+    check(small, "dots:4", 5e-2, of_small(small, SampleWork(64, 128)))
 
 
 @pytest.mark.slow
@@ -107,7 +107,7 @@ def answers(shipped_bench: Callable[..., Bench]) -> Callable[[str], np.ndarray]:
         bench = shipped_bench(scene)
         family = bench.family("dots:7").lighting
         depth = make_plan(bench, family, 0.1, PLANNED).settings.depth
-        return answer(bench, judged(bench, family), depth, ANSWERED, Effort(direct=32, other=32, layers=12))
+        return answer(bench, judged(bench, family), depth, ANSWERED, SampleWork(direct=32, other=32, layers=12))
 
     return measure
 

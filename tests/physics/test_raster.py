@@ -224,7 +224,7 @@ def judged(camera: CameraGeometry, at: Directions, light: np.ndarray) -> tuple[f
         pytest.param({"kind": "separable", "order": 6, "rotation_deg": 0.3}, marks=pytest.mark.slow),
     ],
 )
-def test_what_a_raster_leaves_is_told_before(mask: dict[str, object]) -> None:
+def test_what_a_raster_leaves_is_predicted(mask: dict[str, object]) -> None:
     """Of dots, from 64 x 64 of 96 x 96 pixels; sums and FFT agree to it. (Planted: not sharpened; etched lines
     taken for even ones.)"""
     camera = MaskProfile.model_validate({"feature_mm": 0.06, **mask}).worn(CameraGeometry(pixels=96), Path())

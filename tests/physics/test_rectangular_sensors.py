@@ -115,8 +115,8 @@ def test_what_is_chosen_behind_a_mask_follows_the_sensors_shape() -> None:
     assert random.may_be_drawn(waves=False) and not tall.may_be_drawn(waves=False)
     at, light = Directions.cells(np.linspace(-0.15, 0.15, 21)), np.random.default_rng(0).random((20, 20))
     corner = random.model_copy(update={"roi": (70, 70, 26, 26)})
-    told = [raster_error(each, at, at, 400.0, None, light)[0] for each in (random, corner)]
-    assert told[0] == told[1] > 0
+    reported = [raster_error(each, at, at, 400.0, None, light)[0] for each in (random, corner)]
+    assert reported[0] == reported[1] > 0
     tilted = MaskProfile(kind="separable", feature_mm=0.06, order=6, tilt_row_mrad=20.0).worn(CameraGeometry(), Path())
     fine = tilted.model_copy(update={"row_pitch": tilted.pixel_pitch / 2})
     assert max(fine.tilt_nodes(waves=False) or ()) > 1.5 * max(tilted.tilt_nodes(waves=False) or ())
@@ -139,7 +139,7 @@ def test_a_camera_file_states_pixels_that_are_not_square(small_scene: Write) -> 
     square = open_bench(small_scene(reflectance=PRINT))
     assert tall.sensor.superpixel_area_m2 == pytest.approx(2 * square.sensor.superpixel_area_m2, rel=1e-12)
     with pytest.raises(MitsimError, match=r"binned row pitch is 23\.44 um, .* 11\.72 um"):
-        open_bench(square.loaded.path, camera=tall.rig.camera_file)
+        open_bench(square.loaded.path, camera=tall.devices.camera_file)
 
 
 @pytest.mark.slow

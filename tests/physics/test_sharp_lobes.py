@@ -17,7 +17,7 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.devices.patterns import Lighting
 from mitsim.light.light import SampledLight, Sampling, trace_light
 from mitsim.planner.planner import make_plan
-from tests.hard.hard_light import GLINT, PLACE, SCALE, gauss, glossy, lobe
+from tests.hard.hard_light import PLACE, SCALE, SPECULAR, gauss, glossy, lobe
 
 N, PIXELS, SIGMAS = 32, 64, 5.0
 ALONE = {"interreflection": False, "diffraction": False}
@@ -66,7 +66,7 @@ def test_a_plate_of_any_roughness(traced: Callable[..., SampledLight], alpha: fl
     assert error < SIGMAS * predicted(light) < 0.15
     if alpha <= 1e-3:
         # Energy against the limit: the mirror's, but for the lobe's tails beyond the plate and the window.
-        assert found[4:-4, 4:-4].mean() == pytest.approx(GLINT, rel=SIGMAS * predicted(light))
+        assert found[4:-4, 4:-4].mean() == pytest.approx(SPECULAR, rel=SIGMAS * predicted(light))
         assert light.plan.settings.sharp is not None
 
 
@@ -342,7 +342,7 @@ def test_a_sharp_lobe_behind_panes(traced: Callable[..., SampledLight], monkeypa
     light = traced(1e-2, **plate)
     index, place = points(light.bench, 6)
     expected = np.array([[behind_panes(1e-3, row, column) for column in place] for row in place])
-    assert expected.mean() == pytest.approx(0.96**4 * GLINT * (790 / 786) ** 2, rel=5e-3)
+    assert expected.mean() == pytest.approx(0.96**4 * SPECULAR * (790 / 786) ** 2, rel=5e-3)
     error = float(np.linalg.norm(frame(light)[np.ix_(index, index)] - expected) / np.linalg.norm(expected))
     assert light.reached and light.plan.settings.sharp is not None
     assert error < SIGMAS * predicted(light) < 0.15

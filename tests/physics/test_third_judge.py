@@ -41,7 +41,7 @@ def test_a_mirror_ball(radius: float) -> None:
     """I = E R r^2 / 4 in all directions; parallax over the ball changes it by r / d."""
     place = vector(5, -11, 380)
     ball = Sphere(place, radius, mirror=0.85)
-    ((_, light, _),) = judge.glint(Scene(PROJECTOR, CAMERA, [ball]), CAMERA.point(10, 30)[None])
+    ((_, light, _),) = judge.specular(Scene(PROJECTOR, CAMERA, [ball]), CAMERA.point(10, 30)[None])
     away = place - PROJECTOR.place
     lit = np.pi * 1000.0 / away[2] ** 2 * (np.linalg.norm(away) / away[2])  # across the light, from pi scale / z^2
     seen = place - CAMERA.point(10, 30)
@@ -53,7 +53,7 @@ def test_a_long_mirror_cylinder() -> None:
     """E = I R r / 2 cos(g / 2) / (d_1 d_2 (d_1 + d_2)) across its axis, g the angle between the two ways."""
     projector = Projector(vector(0, 60, 0), 16, 1000.0, -0.15, 0.15, -0.3, 0.0)
     rod = Cylinder(vector(-300, 0, 400), vector(300, 0, 400), 0.1, mirror=1.0)
-    ((_, light, _),) = judge.glint(Scene(projector, CAMERA, [rod]), vector(0, 0, 0)[None])
+    ((_, light, _),) = judge.specular(Scene(projector, CAMERA, [rod]), vector(0, 0, 0)[None])
     near, far = 400.0, np.hypot(60, 400)
     half = np.arctan(60 / 400) / 2
     intensity = np.pi * 1000.0 * (far / 400) ** 3  # W/sr of the pinhole towards the rod
@@ -94,7 +94,7 @@ def test_a_slab_at_60_degrees() -> None:
 def test_a_pane_mirrors_by_its_two_faces() -> None:
     """R / (2 z)^2-like light of the front, and (1 - R)^2 R of the back at t / n behind it, on the axis between."""
     slab = Slab(vector(0, 0, 398), vector(0, 0, 1), 4.0, 1.5)
-    found = judge.glint(Scene(PROJECTOR, CAMERA, [BLACK], slab), vector(0, 0, 0)[None])
+    found = judge.specular(Scene(PROJECTOR, CAMERA, [BLACK], slab), vector(0, 0, 0)[None])
     light = [one[1][0] for one in found]
     assert light[0] == pytest.approx(np.pi * 1000 * 0.04 / 792.0**2, rel=1e-3)  # 4.3 degrees
     assert light[1] == pytest.approx(np.pi * 1000 * 0.04 * 0.96**2 / (792 + 8 / 1.5) ** 2, rel=1e-3)

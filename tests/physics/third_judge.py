@@ -533,7 +533,7 @@ def mirrored(scene: Scene, x: Array, k: int) -> tuple[Array, npt.NDArray[np.int6
 # ---- light over mirrors
 
 
-def glint(scene: Scene, x: Array) -> list[tuple[Array, Array, Array]]:
+def specular(scene: Scene, x: Array) -> list[tuple[Array, Array, Array]]:
     """Light over one mirror, or a pane's faces, that arrives at sensor points ``x`` (m, 3).
 
     A list over ways: tan-angles (m, 2) of the projector's ray, irradiance (m,) where it is seen, and tan-angles (m, 2)
@@ -706,7 +706,7 @@ def _quadrature(
     offsets = (np.arange(parts) + 0.5) / parts - 0.5
     x = np.array([[scene.camera.point(*point, (a, b)) for a in offsets for b in offsets] for point in points])
     flat = x.reshape(-1, 3)
-    for p, light, t in glint(scene, flat):
+    for p, light, t in specular(scene, flat):
         masked = light / parts**2
         if scene.camera.code is not None:
             depth = np.full(len(t), np.inf)

@@ -163,7 +163,7 @@ class Laboratory:
     photograph: Callable[[int], np.ndarray]
 
     @property
-    def rig(self) -> tuple[object, ...]:
+    def arguments(self) -> tuple[object, ...]:
         """Arguments that name scene, camera, projector and accuracy."""
         return self.scene, *self.electronics
 
@@ -195,10 +195,10 @@ def lab(variant: str, shared_scene: Callable[..., Path], tmp_path_factory: pytes
         return shared_scene(name, **{"reflectance": photograph(), **numbers})
 
     scene = write_scene("laboratory")
-    rig = scene, "--camera", camera, "--projector", projector, "--accuracy", ACCURACY
+    arguments = scene, "--camera", camera, "--projector", projector, "--accuracy", ACCURACY
     with plans_kept():
-        captured = call("capture", *rig, "-o", folder / "run", "--patterns", "dots:4", "--json")
-        calibrated = call("calibrate", *rig, "-o", folder / "calibration", "--json")
+        captured = call("capture", *arguments, "-o", folder / "run", "--patterns", "dots:4", "--json")
+        calibrated = call("calibrate", *arguments, "-o", folder / "calibration", "--json")
     assert captured.code == 0, captured.err
     assert calibrated.code == 0, calibrated.err
     return Laboratory(
@@ -236,5 +236,5 @@ def whole(lab: Laboratory, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of many frames that nothing disturbed."""
     run: Path = tmp_path_factory.mktemp("whole") / "run"
     with plans_kept():
-        assert call("capture", *lab.rig, "-o", run, "--patterns", PATTERNS).code == 0
+        assert call("capture", *lab.arguments, "-o", run, "--patterns", PATTERNS).code == 0
     return run

@@ -262,8 +262,8 @@ def test_a_damaged_factor(refused: Refused, lab: Any, calibration: Path, damage:
     harm(calibration / "left.exr")
     if not checked:
         edit(calibration, drop("checksums"))
-    said = ["calibration's are 32x64"] if damage == "smaller" and not checked else [FACTOR]
-    mentions(refused("reconstruct", lab.run, "--calibration", "calibration"), *said)
+    reported = ["calibration's are 32x64"] if damage == "smaller" and not checked else [FACTOR]
+    mentions(refused("reconstruct", lab.run, "--calibration", "calibration"), *reported)
 
 
 def test_numbers_that_are_not_finite(refused: Refused, lab: Any, run: Path, calibration: Path) -> None:
@@ -295,8 +295,8 @@ def test_a_damaged_truth(refused: Refused, lab: Any, run: Path, damage: str, che
         (run / "truth.exr").write_bytes(data)
     else:
         harm(run / "truth.exr")
-    said = ["truth 8 x 16"] if damage == "smaller" else ["run/truth.exr"]
-    mentions(refused("reconstruct", "run", "--calibration", lab.calibration), *said)
+    reported = ["truth 8 x 16"] if damage == "smaller" else ["run/truth.exr"]
+    mentions(refused("reconstruct", "run", "--calibration", lab.calibration), *reported)
 
 
 def test_a_refusal_keeps_an_earlier_image(refused: Refused, call: Callable[..., Any], lab: Any, run: Path) -> None:

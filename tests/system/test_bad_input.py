@@ -56,7 +56,7 @@ from tests.system.refusals import NEW, Refused, mentions
 )
 def test_capture_refuses(refused: Refused, lab: Any, options: list[str], fragments: list[str]) -> None:
     patterns = () if "--patterns" in options else ("--patterns", "dots:4")
-    mentions(refused("capture", *lab.rig, *NEW, *patterns, *options), *fragments)
+    mentions(refused("capture", *lab.arguments, *NEW, *patterns, *options), *fragments)
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def test_capture_refuses(refused: Refused, lab: Any, options: list[str], fragmen
     ids=lambda value: " ".join(value) if value[0].startswith("--") else None,
 )
 def test_calibrate_refuses(refused: Refused, lab: Any, options: list[str], fragments: list[str]) -> None:
-    mentions(refused("calibrate", *lab.rig, *NEW, *options), *fragments)
+    mentions(refused("calibrate", *lab.arguments, *NEW, *options), *fragments)
 
 
 @pytest.mark.parametrize(
@@ -184,7 +184,7 @@ def test_a_camera_file_with_a_mistake(
     assert old in text
     (tmp_path / "mine.toml").write_text(text.replace(old, new))
     for verb in (("capture", "--patterns", "dots:4"), ("calibrate",)):
-        mentions(refused(*verb, *lab.rig, *NEW, "--camera", "mine.toml"), "mine.toml", *fragments)
+        mentions(refused(*verb, *lab.arguments, *NEW, "--camera", "mine.toml"), "mine.toml", *fragments)
 
 
 @pytest.mark.parametrize("value", ["nan", "-562.0", "0", "inf", "'green'"])
@@ -207,7 +207,7 @@ def test_a_recipe_with_a_mistake(refused: Refused, lab: Any, tmp_path: Path, lin
     recipe = {"board_reflectance": "0.99", "exposure_fraction": "0.8", "signed_capture": "'pair'", "source": "'me'"}
     name, value = line.split(" = ")
     (tmp_path / "mine.toml").write_text("".join(f"{k} = {v}\n" for k, v in {**recipe, name: value}.items()))
-    mentions(refused("calibrate", *lab.rig, *NEW, "--recipe", "mine.toml"), "mine.toml", name, value)
+    mentions(refused("calibrate", *lab.arguments, *NEW, "--recipe", "mine.toml"), "mine.toml", name, value)
 
 
 def test_binary_files_where_text_is_expected(refused: Refused, lab: Any, tmp_path: Path) -> None:

@@ -17,8 +17,8 @@ from tests.system.refusals import Refused, mentions
 def to(request: pytest.FixtureRequest, lab: Any) -> Callable[[str], tuple[object, ...]]:
     """Arguments of each verb that writes, with the output given."""
     verb = {
-        "capture": ("capture", *lab.rig, "--patterns", "dots:4"),
-        "calibrate": ("calibrate", *lab.rig),
+        "capture": ("capture", *lab.arguments, "--patterns", "dots:4"),
+        "calibrate": ("calibrate", *lab.arguments),
         "reconstruct": ("reconstruct", lab.run, "--calibration", lab.calibration),
         "render": ("render", lab.scene, "--spp", "4"),
         "study": ("study", "accuracy", lab.scene),
@@ -60,7 +60,7 @@ def test_no_input_is_replaced(refused: Refused, lab: Any, tmp_path: Path) -> Non
     link.symlink_to(frame)
     mentions(refused("sense", frame, "--camera", lab.camera, "--channel", "DN", "-o", link), str(link), "is read")
     for place in (lab.scene, lab.camera):
-        mentions(refused("transport", *lab.rig, "-o", place, "--overwrite"), str(place), "is read")
+        mentions(refused("transport", *lab.arguments, "-o", place, "--overwrite"), str(place), "is read")
     manifest = tmp_path / "run" / "manifest.json"
     mentions(refused("export", manifest.parent, "--format", "hdf5", "-o", manifest, "--overwrite"), "is read")
 
@@ -70,8 +70,8 @@ def test_a_folder_that_holds_something(refused: Refused, lab: Any, tmp_path: Pat
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("keep me")
     arguments = {
-        "capture": ("capture", *lab.rig, "--patterns", "dots:4"),
-        "calibrate": ("calibrate", *lab.rig),
+        "capture": ("capture", *lab.arguments, "--patterns", "dots:4"),
+        "calibrate": ("calibrate", *lab.arguments),
         "demo": ("demo", lab.scene),
         "reconstruct": ("reconstruct", lab.run, "--calibration", lab.calibration),
     }[verb]

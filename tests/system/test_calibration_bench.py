@@ -17,18 +17,18 @@ pytestmark = pytest.mark.usefixtures("kept_plans")
 
 def test_a_plan_prints_what_it_takes_and_writes_its_recipe(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
     options = "--plan", "--psnr", 20, "--patterns", "dots:4", "--json", "--quiet", "-o", tmp_path / "recipe.toml"
-    done = call("calibrate", *lab.rig, *options)
+    done = call("calibrate", *lab.arguments, *options)
     assert done.code == 0, done.err
-    said = done.payload
+    reported = done.payload
     recipe = load_recipe(tmp_path / "recipe.toml")
-    assert (recipe.exposure_fraction, recipe.repeats) == (said["exposure_fraction"], said["repeats"])
-    assert said["reached"] and 20 <= said["psnr"] <= 21 < said["psnr_ceiling"]
-    assert said["exposure_total_s"] == pytest.approx(said["frames"] * said["exposure_s"])
-    assert said["photons_a_pixel"] > said["electrons_a_pixel"] > 0 and said["simulation_s"] > 0
+    assert (recipe.exposure_fraction, recipe.repeats) == (reported["exposure_fraction"], reported["repeats"])
+    assert reported["reached"] and 20 <= reported["psnr"] <= 21 < reported["psnr_ceiling"]
+    assert reported["exposure_total_s"] == pytest.approx(reported["frames"] * reported["exposure_s"])
+    assert reported["photons_a_pixel"] > reported["electrons_a_pixel"] > 0 and reported["simulation_s"] > 0
 
 
 def test_a_ceiling_ends_with_status_one_and_a_line(call: Callable[..., Any], lab: Any) -> None:
-    done = call("calibrate", *lab.rig, "--plan", "--psnr", 90, "--patterns", "uniform", "--quiet")
+    done = call("calibrate", *lab.arguments, "--plan", "--psnr", 90, "--patterns", "uniform", "--quiet")
     assert done.code == 1
     (line,) = [line for line in done.err.splitlines() if "cannot be reached" in line]
     mentions(line, "90 dB cannot be reached under uniform", "without noise", "improve the capture")
@@ -38,10 +38,10 @@ def test_modelled_factors_are_a_calibration_that_says_so(call: Callable[..., Any
     """The small sensor sees no difference of distance and size, so one is held."""
     fit = "mask_distance,mask_shift_row,mask_shift_column"
     options = "--model", "wave", "--frames-used", 8, "--fit", fit, "-o", tmp_path / "cal", "--json", "--quiet"
-    done = call("calibrate", *lab.rig, *options)
+    done = call("calibrate", *lab.arguments, *options)
     assert done.code == 0, done.err
-    said, written = done.payload, json.loads((tmp_path / "cal" / "manifest.json").read_text())
-    assert said["frames"] == 8 and said["model"] == "wave"
+    reported, written = done.payload, json.loads((tmp_path / "cal" / "manifest.json").read_text())
+    assert reported["frames"] == 8 and reported["model"] == "wave"
     fitted, held = (
         written["modelled"]["parameters"]["mask_distance"],
         written["modelled"]["parameters"]["magnification"],
@@ -76,9 +76,9 @@ REFUSED = [
 def test_what_goes_together_with_nothing_is_refused(
     refused: Refused, lab: Any, options: tuple[object, ...], fragments: tuple[str, ...]
 ) -> None:
-    mentions(refused("calibrate", *lab.rig, "-o", "new.toml", *options), *fragments)
+    mentions(refused("calibrate", *lab.arguments, "-o", "new.toml", *options), *fragments)
 
 
 def test_a_calibration_without_a_folder_or_a_model_without_a_scene_is_refused(refused: Refused, lab: Any) -> None:
-    mentions(refused("calibrate", *lab.rig), "Missing option '-o' / '--output'")
+    mentions(refused("calibrate", *lab.arguments), "Missing option '-o' / '--output'")
     mentions(refused("calibrate", "--model", "wave", "-o", "new"), "--model: give the scene too")

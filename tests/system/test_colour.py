@@ -134,14 +134,14 @@ def test_a_grey_lamp_is_in_every_line_what_a_mono_capture_has(
     whole, middle = projector(tmp_path / "all.toml", LINES), projector(tmp_path / "middle.toml", {595: 1.0})
     common = "--patterns", "dots:2", "--accuracy", ACCURACY, "--exposure", 0.02, "-D", "albedo=0.5", "--json"
     scene, run = coloured("lamp"), tmp_path / "run"
-    told = shell("capture", scene, "-o", run, "--colour", "lines", "--projector", whole, *common).payload
+    reported = shell("capture", scene, "-o", run, "--colour", "lines", "--projector", whole, *common).payload
     mono = call("capture", scene, "-o", tmp_path / "mono", "--projector", middle, *common, "--seed", 1).payload
 
     def lamp(folder: Path) -> np.ndarray:
         return read_frame(folder / "ambient.exr")[0]["electrons"].astype(float).reshape(8, 8, 8, 8).mean(axis=(1, 3))
 
     expected, frames = lamp(tmp_path / "mono"), electrons(tmp_path / "mono").mean()
-    for channel in told["channels"]:
+    for channel in reported["channels"]:
         assert channel["ambient_frame"]["shots"] == 16 and 0.05 < channel["ambient_frame"]["part"] < 0.95
         error = np.hypot(channel["mc_error"], mono["mc_error"]) * max(frames, electrons(run / channel["name"]).mean())
         assert np.sqrt(np.square(lamp(run / channel["name"]) - expected).mean()) < 2 * error
@@ -228,7 +228,7 @@ def test_the_error_of_mono_and_of_bands_is_that_of_their_reflectances(
     bare.write_text(scene.read_text().replace('name="mask" value="separable"', 'name="mask" value="open"'))
     options = "--colour", "auto", "--projector", whole, "--patterns", "dots:2", "--accuracy", 0.05, "--json"
     choice = shell("plan", bare, *options).payload["colour"]
-    told = {each["name"]: each["error"] for each in choice["candidates"]}
+    reported = {each["name"]: each["error"] for each in choice["candidates"]}
     ends = min(SHEET) - 40, *sorted(SHEET), max(SHEET) + 40
 
     def sheet(nm: float) -> float:
@@ -247,9 +247,9 @@ def test_the_error_of_mono_and_of_bands_is_that_of_their_reflectances(
         "bands:2": abs(photons(520, 445, mean=True) / photons(520, 445) - 1),
         "lines": 0.0,
     }
-    assert [*told] == [*left]
+    assert [*reported] == [*left]
     for name, error in left.items():
-        assert 0.999 * error <= told[name] <= 1.1 * error, name  # rounded up to two digits
+        assert 0.999 * error <= reported[name] <= 1.1 * error, name  # rounded up to two digits
     assert choice["chosen"] == "bands:2" and max(left["mono"], left["bands:1"]) > 0.025 > left["bands:2"]
 
 

@@ -48,7 +48,7 @@ def assert_seconds(seconds: dict[str, object], *stages: str) -> None:
 
 def test_plan(call: Callable[..., Any], lab: Any) -> None:
     options = "--patterns", "dots:4", "--json", "--quiet", "--variant", "llvm_ad_mono"
-    plan = call("plan", *lab.rig, *options).payload
+    plan = call("plan", *lab.arguments, *options).payload
     assert {"effects", "accuracy", "predicted_seconds", "predicted_range"} <= plan.keys()
     assert plan["accuracy"] == 0.005 and number(plan["predicted_seconds"], 1e-6)
     assert len({effect["name"] for effect in plan["effects"]}) == len(plan["effects"]) >= 5
@@ -234,7 +234,7 @@ def test_characterise_and_sense(call: Callable[..., Any], tmp_path: Path) -> Non
 
 def test_a_flagged_result_exits_with_1_and_says_why(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
     for verb in (("plan",), ("capture", "-o", tmp_path / "run")):
-        outcome = call(*verb, *lab.rig, "--patterns", "dots:4", "--effects=-diffraction", "--json")
+        outcome = call(*verb, *lab.arguments, "--patterns", "dots:4", "--effects=-diffraction", "--json")
         assert outcome.code == 1
         assert outcome.payload["warnings"] and "diffraction (off)" in outcome.payload["warnings"][0]
         lines = outcome.err.splitlines()
@@ -243,7 +243,7 @@ def test_a_flagged_result_exits_with_1_and_says_why(call: Callable[..., Any], la
 
 
 def test_a_saturated_capture_is_flagged(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
-    outcome = call("capture", *lab.rig, "-o", tmp_path / "run", "--patterns", "dots:4", "--exposure", "1000")
+    outcome = call("capture", *lab.arguments, "-o", tmp_path / "run", "--patterns", "dots:4", "--exposure", "1000")
     assert outcome.code == 1 and "full well" in outcome.err
 
 
@@ -268,7 +268,7 @@ def test_a_fault_of_the_program_is_one_line_and_its_traceback_is_kept(
 
     monkeypatch.setattr("mitsim.acquire.spectral.make_plan", broken)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    line = call("plan", *lab.rig).refusal
+    line = call("plan", *lab.arguments).refusal
     assert line.startswith("a fault of mitsim's own, ZeroDivisionError: planted [31m and more; its traceback is in /")
     (log,) = tmp_path.glob("mitsim-*.log")
     assert str(log) in line and "in broken" in log.read_text() and "planted\x1b[31m" in log.read_text()
@@ -278,10 +278,10 @@ def test_a_fault_of_the_program_is_one_line_and_its_traceback_is_kept(
 
 
 def test_the_program(shell: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
-    good = shell("capture", *lab.rig, "-o", "run", "--patterns", "uniform", "--json", cwd=tmp_path)
+    good = shell("capture", *lab.arguments, "-o", "run", "--patterns", "uniform", "--json", cwd=tmp_path)
     assert good.code == 0 and good.err == ""
     assert good.payload["output"] == "run"
-    bad = shell("capture", *lab.rig, "-o", "run", "--patterns", "uniform", "--json", cwd=tmp_path)
+    bad = shell("capture", *lab.arguments, "-o", "run", "--patterns", "uniform", "--json", cwd=tmp_path)
     assert "run" in bad.refusal
 
 
@@ -371,8 +371,8 @@ def test_a_terminal_sees_a_bar_that_goes_away(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], lab: Any, tmp_path: Path, verb: str
 ) -> None:
     arguments = {
-        "capture": ("capture", *lab.rig, "--patterns", "dots:4", "-o"),
-        "calibrate": ("calibrate", *lab.rig, "-o"),
+        "capture": ("capture", *lab.arguments, "--patterns", "dots:4", "-o"),
+        "calibrate": ("calibrate", *lab.arguments, "-o"),
         "render": ("render", lab.scene, "--spp", 256, "-o"),
     }[verb]
     out, err = on_a_terminal(monkeypatch, capsys, *arguments, tmp_path / "loud.exr")
@@ -390,7 +390,16 @@ def test_a_refusal_on_a_terminal_leaves_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], lab: Any, tmp_path: Path
 ) -> None:
     out, err = on_a_terminal(
-        monkeypatch, capsys, "capture", *lab.rig, "-o", tmp_path / "run", "--patterns", "dots:4", "--accuracy", "0"
+        monkeypatch,
+        capsys,
+        "capture",
+        *lab.arguments,
+        "-o",
+        tmp_path / "run",
+        "--patterns",
+        "dots:4",
+        "--accuracy",
+        "0",
     )
     assert out == ""
     visible = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", err.rsplit("\x1b[2K", 1)[-1])
@@ -398,6 +407,6 @@ def test_a_refusal_on_a_terminal_leaves_one_line(
 
 
 def test_no_bar_where_stderr_is_no_terminal(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
-    outcome = call("capture", *lab.rig, "-o", tmp_path / "run", "--patterns", "dots:4")
+    outcome = call("capture", *lab.arguments, "-o", tmp_path / "run", "--patterns", "dots:4")
     assert outcome.code == 0 and outcome.err == ""
     assert len(outcome.out.splitlines()) == 2 and "\x1b" not in outcome.out

@@ -94,9 +94,9 @@ def test_a_second_demo_of_ones_own_devices_and_patterns_replaces_the_first(
     page = assert_self_contained(folder / "report.html")
     for words in ("test camera", "test projector", "albedo = 0.4", "4 dots", "exposure (4 dots)"):
         assert words in page, words
-    told = json.loads((folder / "demo.json").read_text())
-    assert tuple(told["psnr"]) == ("uniform", "dots:4", "dots:5", "dots:2", "hadamard:8")
-    assert told["verdict"].startswith("4 dots") and told["verdict"] in page
+    reported = json.loads((folder / "demo.json").read_text())
+    assert tuple(reported["psnr"]) == ("uniform", "dots:4", "dots:5", "dots:2", "hadamard:8")
+    assert reported["verdict"].startswith("4 dots") and reported["verdict"] in page
     assert (folder / "report.html").stat().st_mtime_ns > old
     first, now = ({path.relative_to(place) for path in place.rglob("*")} for place in (done[0], folder))
     gone = {Path("run", f"frame_{index:05d}.exr") for index in range(4, 49)}

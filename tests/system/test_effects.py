@@ -34,13 +34,13 @@ def test_effects_that_make_no_sense(refused: Callable[..., str], lab: Any, verb:
 
 @pytest.mark.parametrize("fraction", ["2", "0", "-1", "1e-300", "nan", "much"])
 def test_noise_fractions_that_make_no_sense(refused: Callable[..., str], lab: Any, fraction: str) -> None:
-    line = refused("capture", *lab.rig, "-o", "new", "--patterns", "dots:4", "--noise-fraction", fraction)
+    line = refused("capture", *lab.arguments, "-o", "new", "--patterns", "dots:4", "--noise-fraction", fraction)
     assert "--noise-fraction" in line and fraction in line
 
 
 def test_a_plan_as_json(call: Callable[..., Any], lab: Any) -> None:
     free, forced = (
-        call("plan", *lab.rig, "--patterns", "dots:4", "--json", *more).payload
+        call("plan", *lab.arguments, "--patterns", "dots:4", "--json", *more).payload
         for more in ((), ("--effects", "+anchors,-diffraction,+ambient"))
     )
     for block in (free, forced):
@@ -58,7 +58,7 @@ def test_a_capture_with_both(call: Callable[..., Any], lab: Any, tmp_path: Path)
     """A sampling error of a fiftieth of the sensor's noise, where the accuracy alone leaves 0.04 (seed 0)."""
     options = "--effects", "-diffraction,-interreflection", "--patterns", "uniform", "--json"
     free, done = (
-        call("capture", *lab.rig, "-o", tmp_path / name, *options, *more).payload
+        call("capture", *lab.arguments, "-o", tmp_path / name, *options, *more).payload
         for name, more in (("free", ()), ("run", ("--noise-fraction", "0.02")))
     )
     assert free["mc_error"] > 0.03 * done["sensor_noise"] and 0 < done["mc_error"] < 0.02 * done["sensor_noise"]

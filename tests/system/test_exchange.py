@@ -76,7 +76,7 @@ def test_light_in_a_file_makes_the_frames_of_a_capture(call: Callable[..., Any],
     shots = ms.load_run(lab.run)
     for seed in (0, 1):
         options = "--patterns", "dots:4", "-o", tmp_path / f"{seed}.h5", "--seed", seed, "--json"
-        done = call("transport", *lab.rig, *options)
+        done = call("transport", *lab.arguments, *options)
         assert done.code == 0, done.err
         payload = done.payload
         assert payload.keys() == {

@@ -132,7 +132,7 @@ def test_a_saved_capture_is_that_of_the_command_line(
     """The same files with the same pixels, and manifests that differ in seconds alone."""
     shots.save(tmp_path / "saved")
     options = "--patterns", "dots:3", "--accuracy", ACCURACY, "--seed", SEED, "-D", f"albedo={ALBEDO}"
-    told = call("capture", bench.loaded.path, *options, "-o", tmp_path / "told", "--json").payload
+    reported = call("capture", bench.loaded.path, *options, "-o", tmp_path / "told", "--json").payload
     bench.capture("dots:3", tmp_path / "direct", accuracy=ACCURACY, seed=SEED)
     names = sorted(path.name for path in (tmp_path / "told").iterdir())
     assert names == [*(f"frame_{index:05d}.exr" for index in range(9)), "manifest.json", "truth.exr"]
@@ -144,11 +144,11 @@ def test_a_saved_capture_is_that_of_the_command_line(
             if name.endswith(".exr"):
                 assert_equal_files(tmp_path / other / name, tmp_path / "told" / name)
     # What the process took is as little of the result as its seconds.
-    taken = told.pop("memory_bytes")
-    assert 0 <= taken < told["predicted_memory_bytes"]
-    summary = {**shots.summary(), "shape": [64, 64], "warnings": [], "output": told["output"]}
+    taken = reported.pop("memory_bytes")
+    assert 0 <= taken < reported["predicted_memory_bytes"]
+    summary = {**shots.summary(), "shape": [64, 64], "warnings": [], "output": reported["output"]}
     timed = {"seconds": 0, "predicted_seconds": 0, "colour": untimed(tmp_path / "told")["plan"]["colour"]}
-    assert {**summary, **timed} == {**told, **timed}
+    assert {**summary, **timed} == {**reported, **timed}
 
 
 def untimed(folder: Path) -> dict[str, Any]:
@@ -396,9 +396,9 @@ for arguments, _ in json.loads(sys.argv[1]):
     command = [sys.executable, "-c", program, json.dumps(TYPOS)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=120)
     for (arguments, fragment), line in zip(TYPOS, done.stdout.splitlines(), strict=True):
-        code, said, heavy = json.loads(line)
-        assert code == 2 and said.startswith("mitsim: ") and said.count("\n") == 1, (arguments, said)
-        assert fragment in said, (arguments, said)
+        code, message, heavy = json.loads(line)
+        assert code == 2 and message.startswith("mitsim: ") and message.count("\n") == 1, (arguments, message)
+        assert fragment in message, (arguments, message)
         assert heavy == [], f"{arguments} imported {heavy}"
     assert not list(tmp_path.iterdir())
 

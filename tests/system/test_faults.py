@@ -43,7 +43,7 @@ def finished(run: Path, whole: Path) -> dict[Path, int]:
 def assert_resumed(call: Callable[..., Any], lab: Any, run: Path, whole: Path) -> None:
     """``--resume`` ends in the frames of ``whole``, and writes none of the finished ones again."""
     kept = finished(run, whole) if run.exists() else {}
-    outcome = call("capture", *lab.rig, "-o", run, "--patterns", PATTERNS, "--resume")
+    outcome = call("capture", *lab.arguments, "-o", run, "--patterns", PATTERNS, "--resume")
     assert outcome.code == 0, outcome.err
     assert_equal_runs(run, whole)
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
@@ -55,12 +55,12 @@ def assert_resumed(call: Callable[..., Any], lab: Any, run: Path, whole: Path) -
 
 def stopped(call: Callable[..., Any], lab: Any, run: Path, whole: Path, how: signal.Signals, least: int) -> None:
     """One run ended by a signal after so many frames, and resumed."""
-    done = cut_short(how, least, "capture", *lab.rig, "-o", run, "--patterns", PATTERNS, "--json")
-    said = {signal.SIGINT: "mitsim: interrupted" + RESUME, signal.SIGTERM: "mitsim: ended by SIGTERM" + RESUME}
+    done = cut_short(how, least, "capture", *lab.arguments, "-o", run, "--patterns", PATTERNS, "--json")
+    reported = {signal.SIGINT: "mitsim: interrupted" + RESUME, signal.SIGTERM: "mitsim: ended by SIGTERM" + RESUME}
     status = -how if how == signal.SIGKILL else 128 + how
     # The last frames take milliseconds: the signal may find the result printed, but then all of it, or the run over.
     if least < 490 or done.returncode != 0:
-        words = said.get(how, "")
+        words = reported.get(how, "")
         # Between the folder and its manifest nothing is kept yet.
         assert done.returncode == status and done.stderr in (
             words,
@@ -108,7 +108,7 @@ def test_a_worker_that_dies_while_it_renders(
     """The kernel's out-of-memory killer, and an abort inside LLVM: the parent is left to say so."""
     run = tmp_path / "run"
     least = 30 if how == signal.SIGKILL else 0
-    process = running(least or "manifest.json", "capture", *lab.rig, "-o", run, "--patterns", PATTERNS)
+    process = running(least or "manifest.json", "capture", *lab.arguments, "-o", run, "--patterns", PATTERNS)
     (worker,) = psutil.Process(process.pid).children()
     worker.send_signal(how)
     done = ended(process)
@@ -138,7 +138,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 @pytest.mark.slow
 def test_a_disk_that_fills_up_during_a_run(call: Callable[..., Any], lab: Any, whole: Path, small_disk: Path) -> None:
     run = small_disk / "run"
-    process = running(20, "capture", *lab.rig, "-o", run, "--patterns", PATTERNS, "--json")
+    process = running(20, "capture", *lab.arguments, "-o", run, "--patterns", PATTERNS, "--json")
     with pytest.raises(OSError, match="No space left"), open(small_disk / "filler", "wb", buffering=0) as filler:
         while True:
             filler.write(bytes(1 << 20))
@@ -156,7 +156,7 @@ def test_a_disk_that_is_too_small_is_refused_before_work(
     refused: Callable[..., str], lab: Any, small_disk: Path
 ) -> None:
     (small_disk / "filler").write_bytes(bytes(12 << 20))
-    line = refused("capture", *lab.rig, "-o", small_disk / "run", "--patterns", PATTERNS)
+    line = refused("capture", *lab.arguments, "-o", small_disk / "run", "--patterns", PATTERNS)
     assert line.startswith(f"{PATTERNS}: would write about") and f"{small_disk / 'run'} has 12 MiB left" in line
     assert sorted(path.name for path in small_disk.iterdir()) == ["filler"]
 
@@ -164,7 +164,7 @@ def test_a_disk_that_is_too_small_is_refused_before_work(
 def test_a_read_only_disk_is_refused_before_work(refused: Callable[..., str], lab: Any, small_disk: Path) -> None:
     subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
     for verb in (("capture", "--patterns", "dots:4"), ("calibrate",)):
-        line = refused(*verb, *lab.rig, "-o", small_disk / "run")
+        line = refused(*verb, *lab.arguments, "-o", small_disk / "run")
         assert f"output {small_disk / 'run'}" in line and "Read-only file system" in line
     assert "Read-only file system" in refused("render", lab.scene, "-o", small_disk / "frame.exr")
 
@@ -176,11 +176,11 @@ def test_a_read_only_disk_is_refused_before_work(refused: Callable[..., str], la
 def test_two_runs_on_one_folder(call: Callable[..., Any], lab: Any, tmp_path: Path, whole: Path) -> None:
     """The second is refused while the first writes, whatever its options; the first does not notice."""
     run = tmp_path / "run"
-    process = running(20, "capture", *lab.rig, "-o", run, "--patterns", PATTERNS)
+    process = running(20, "capture", *lab.arguments, "-o", run, "--patterns", PATTERNS)
     worker = psutil.Process(process.pid).children()[0]
     worker.suspend()
     for options, words in ((), "the folder holds files already"), (("--resume",), "another mitsim is writing there"):
-        line = call("capture", *lab.rig, "-o", run, "--patterns", PATTERNS, *options).refusal
+        line = call("capture", *lab.arguments, "-o", run, "--patterns", PATTERNS, *options).refusal
         assert line.startswith(f"output {run}: {words}")
     worker.resume()
     assert ended(process).returncode == 0
@@ -220,7 +220,7 @@ def test_damaged_frames_of_an_interrupted_run_are_made_again(
     (interrupted / "frame_00014.exr").write_text("DN")
     (interrupted / "frame_00015.exr").unlink()
     kept = {path: path.stat().st_mtime_ns for path in interrupted.glob("frame_*.exr")}
-    assert call("capture", *lab.rig, "-o", interrupted, "--patterns", PATTERNS, "--resume").code == 0
+    assert call("capture", *lab.arguments, "-o", interrupted, "--patterns", PATTERNS, "--resume").code == 0
     assert_equal_runs(interrupted, whole)
     written = {path.name for path, time in kept.items() if path.stat().st_mtime_ns != time}
     assert written == {f"frame_{index:05d}.exr" for index in range(7, 15)}, "and no others"
@@ -236,14 +236,14 @@ def test_resume_with_another_version_is_refused(
 
     for package in ("mitsim", "mitsuba", "numpy"):
         monkeypatch.setattr("mitsim.core.environment.versions", lambda name=package: {**versions(), name: "99.0"})
-        line = refused("capture", *lab.rig, "-o", interrupted, "--patterns", PATTERNS, "--resume")
+        line = refused("capture", *lab.arguments, "-o", interrupted, "--patterns", PATTERNS, "--resume")
         assert "resume" in line and "another configuration (versions differ)" in line
 
 
 @pytest.mark.slow
 def test_resume_with_another_variant_is_refused(shell: Callable[..., Any], lab: Any, interrupted: Path) -> None:
     options = "--patterns", PATTERNS, "--resume", "--variant", "llvm_ad_rgb"
-    assert "(variant differ)" in shell("capture", *lab.rig, "-o", interrupted, *options).refusal
+    assert "(variant differ)" in shell("capture", *lab.arguments, "-o", interrupted, *options).refusal
 
 
 def test_resume_with_another_texture_is_refused(
@@ -279,5 +279,5 @@ def test_a_home_that_takes_no_kernels(
 
 @pytest.mark.parametrize("fraction", ["1e-300", "1e-323"])
 def test_a_part_of_the_noise_that_nothing_reaches(refused: Callable[..., str], lab: Any, fraction: str) -> None:
-    line = refused("capture", *lab.rig, "-o", "new", "--patterns", "dots:4", "--noise-fraction", fraction)
+    line = refused("capture", *lab.arguments, "-o", "new", "--patterns", "dots:4", "--noise-fraction", fraction)
     assert "noise-fraction" in line and fraction in line

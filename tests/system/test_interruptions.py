@@ -68,7 +68,7 @@ ENDS: dict[str, Callable[[subprocess.Popen[str]], None]] = {
 @pytest.mark.parametrize("how", ENDS)
 @pytest.mark.parametrize("frames", [1, 60, 300])
 def test_a_capture_goes_on_to_the_same_frames(lab: Any, whole: Path, tmp_path: Path, how: str, frames: int) -> None:
-    command = ("capture", *lab.rig, "-o", tmp_path / "run", "--patterns", PATTERNS, "--quiet")
+    command = ("capture", *lab.arguments, "-o", tmp_path / "run", "--patterns", PATTERNS, "--quiet")
     process = running(frames, *command, session=True)
     workers = psutil.Process(process.pid).children(recursive=True)
     ENDS[how](process)
@@ -76,8 +76,8 @@ def test_a_capture_goes_on_to_the_same_frames(lab: Any, whole: Path, tmp_path: P
     assert not psutil.wait_procs(workers, timeout=30)[1], "the worker goes on without its parent"
     assert "Traceback" not in finished.stderr and finished.stderr.count("\n") <= 1, finished.stderr
     assert finished.returncode not in (0, 1, 2)
-    code, said = done(*command, "--resume")
-    assert code == 0, said
+    code, reported = done(*command, "--resume")
+    assert code == 0, reported
     assert_equal_runs(tmp_path / "run", whole)
 
 
@@ -134,8 +134,8 @@ def contents(folder: Path) -> dict[str, object]:
 def test_what_is_killed_leaves_nothing_half_written(lab: Any, sources: Path, tmp_path: Path, name: str) -> None:
     """And the same command, where the place is free again, gives the same bits."""
     (tmp_path / "whole").mkdir()
-    code, said = done(*works(lab, sources, tmp_path / "whole")[name])
-    assert code in (0, 1), said
+    code, reported = done(*works(lab, sources, tmp_path / "whole")[name])
+    assert code in (0, 1), reported
     whole, killed = contents(tmp_path / "whole"), 0
     for number in range(TRIES):
         out = tmp_path / f"try{number}"
@@ -173,9 +173,9 @@ def test_of_two_at_once_one_writes(lab: Any, sources: Path, tmp_path: Path, name
         both = [begun(*works(lab, sources, out)[name]) for _ in range(2)]
         finished = [ended(each) for each in both]
         statuses = sorted(each.returncode for each in finished)
-        said = [each.stderr for each in finished if each.returncode == 2]
+        reported = [each.stderr for each in finished if each.returncode == 2]
         # `reconstruct` may write the same image again, once the first has ended.
-        assert statuses == [code, 2] or (name == "reconstruct" and statuses == [code, code]), said
-        for line in said:
+        assert statuses == [code, 2] or (name == "reconstruct" and statuses == [code, code]), reported
+        for line in reported:
             assert line.count("\n") == 1 and ("another mitsim is writing there" in line or "already" in line), line
         assert contents(out) == contents(tmp_path / "whole")

@@ -66,8 +66,8 @@ def test_a_pixel_sees_each_line_through_its_own_filter(
     """Against runs of each line by a monochrome camera, of the same paths: electrons by efficiencies' ratio."""
     run, lines = tmp_path / "run", tmp_path / "lines"
     common = *COMMON, "--exposure", "0.1"
-    told = shell("capture", scene, "-o", run, "--colour", "mosaic", *devices, *common).payload
-    assert told["kind"] == "mosaic-run" and told["mosaic"] == "GBRG" and told["warnings"] == []
+    reported = shell("capture", scene, "-o", run, "--colour", "mosaic", *devices, *common).payload
+    assert reported["kind"] == "mosaic-run" and reported["mosaic"] == "GBRG" and reported["warnings"] == []
     shell("capture", scene, "-o", lines, "--colour", "lines", *devices[2:], *common)
     seen, expected = electrons(run), np.zeros_like(electrons(run))
     for nm in LINES:
@@ -77,7 +77,7 @@ def test_a_pixel_sees_each_line_through_its_own_filter(
         truths = [read_frame(each / f"{nm}nm" / "truth.exr")[0]["reflectance"] for each in (run, lines)]
         assert np.array_equal(*truths)
     assert np.allclose(seen, expected, rtol=1e-5, atol=1e-5 * seen.max())
-    assert told["mc_error"] < 2e-2 and (run / "truth.exr").is_file()
+    assert reported["mc_error"] < 2e-2 and (run / "truth.exr").is_file()
 
 
 def counted(plane: str) -> float:
@@ -97,9 +97,9 @@ def test_a_run_behind_filters_goes_on_and_comes_apart(
     """
     run, cal = tmp_path / "run", tmp_path / "cal"
     command = "capture", lit, "-o", run, "--colour", "mosaic", *devices, *COMMON
-    told = shell(*command)
-    assert told.code == 0 and told.payload["ambient_frame"]["shots"] == 16
-    assert 0.1 < told.payload["ambient_frame"]["part"] < 0.9
+    reported = shell(*command)
+    assert reported.code == 0 and reported.payload["ambient_frame"]["shots"] == 16
+    assert 0.1 < reported.payload["ambient_frame"]["part"] < 0.9
     lamp = read_frame(run / "ambient.exr")[0]["electrons"].astype(float)
     planes = {name: lamp[a::2, b::2].mean() for name, (a, b) in zip("GBR", ((0, 0), (0, 1), (1, 0)), strict=True)}
     for name in "BR":
@@ -113,8 +113,8 @@ def test_a_run_behind_filters_goes_on_and_comes_apart(
     after = tree(run)
     changed = {Path(name).name for name in before if before[name] != after[name]}
     assert changed <= {"manifest.json"}, "whose seconds differ"
-    told = shell("calibrate", scene, "-o", cal, "--colour", "mosaic", *devices, *COMMON[2:]).payload
-    assert told["kind"] == "colour-calibration" and len(told["channels"]) == 3
+    reported = shell("calibrate", scene, "-o", cal, "--colour", "mosaic", *devices, *COMMON[2:]).payload
+    assert reported["kind"] == "colour-calibration" and len(reported["channels"]) == 3
     found = shell("reconstruct", run, "--calibration", cal, "-o", tmp_path / "image", "--json").payload
     assert all(line["psnr"] > 25 for line in found["channels"]) and found["delta_e"] < 5
     half = "reconstruct", run, "--calibration", cal, "-o", tmp_path / "half", "--mosaic", "half", "--json"

@@ -31,7 +31,7 @@ def runs(
     @cache
     def captured(patterns: str) -> tuple[Path, dict[str, Any]]:
         run = folder / patterns.replace(":", "")
-        return run, call("capture", *lab.rig, "-o", run, "--patterns", patterns, "--json").payload
+        return run, call("capture", *lab.arguments, "-o", run, "--patterns", patterns, "--json").payload
 
     return captured
 
@@ -66,8 +66,8 @@ def test_every_family_is_captured_and_recovered(
 
 def test_detail_finer_than_a_projector_pixel_costs(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
     """Three squares a pixel: uneven light in a pixel casts another shadow than the board's, and 66 dB become 49."""
-    rig = lab.write_scene("detail", reflectance=lab.photograph(48)), *lab.electronics
-    assert call("capture", *rig, "-o", tmp_path / "run", "--patterns", "dots:4").code == 0
+    devices = lab.write_scene("detail", reflectance=lab.photograph(48)), *lab.electronics
+    assert call("capture", *devices, "-o", tmp_path / "run", "--patterns", "dots:4").code == 0
     found = call("reconstruct", tmp_path / "run", "--calibration", lab.calibration, "--json").payload
     assert 46 < found["psnr"] < 56
 
@@ -97,7 +97,7 @@ def test_the_brightest_pixel_is_at_the_fraction_of_full_well(
     for run, fraction in ((runs("dots:4")[0], 0.8), (tmp_path / "dim", 0.25)):
         if not run.exists():
             options = "--patterns", "dots:4", "--exposure-fraction", fraction
-            assert call("capture", *lab.rig, "-o", run, *options).code == 0
+            assert call("capture", *lab.arguments, "-o", run, *options).code == 0
         peak = max(read_frame(path)[0]["electrons"].max() for path in run.glob("frame_*.exr"))
         # Dark current, 6 electrons a second, is the rest.
         assert peak == pytest.approx(fraction * full_well, rel=1e-4)
@@ -107,7 +107,7 @@ def test_exposure_by_hand(call: Callable[..., Any], lab: Any, tmp_path: Path) ->
     peaks = []
     for seconds in ("0.01", "0.02"):
         options = "--patterns", "uniform", "--exposure", seconds, "--json"
-        captured = call("capture", *lab.rig, "-o", tmp_path / seconds, *options).payload
+        captured = call("capture", *lab.arguments, "-o", tmp_path / seconds, *options).payload
         assert captured["exposure_s"] == float(seconds)
         peaks.append(read_frame(tmp_path / seconds / "frame_00000.exr")[0]["electrons"])
     assert np.allclose(peaks[1], 2 * peaks[0], rtol=1e-6)
@@ -181,7 +181,7 @@ def test_noise_is_drawn_afresh_for_every_frame_and_seed(call: Callable[..., Any]
     noise = []
     for seed in (5, 6):
         run = tmp_path / str(seed)
-        assert call("capture", *lab.rig, "-o", run, "--patterns", "dots:2", "--seed", seed).code == 0
+        assert call("capture", *lab.arguments, "-o", run, "--patterns", "dots:2", "--seed", seed).code == 0
         for index in range(3):
             channels = read_frame(run / f"frame_{index:05d}.exr")[0]
             electrons = channels["electrons"].astype(float)
@@ -194,9 +194,9 @@ def test_noise_is_drawn_afresh_for_every_frame_and_seed(call: Callable[..., Any]
 
 
 def test_a_flatcam_from_end_to_end(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
-    rig = lab.write_scene("flatcam", mask="flatcam"), *lab.electronics
-    assert call("capture", *rig, "-o", tmp_path / "run", "--patterns", "dots:4").code == 0
-    assert call("calibrate", *rig, "-o", tmp_path / "cal").code in (0, 1)
+    devices = lab.write_scene("flatcam", mask="flatcam"), *lab.electronics
+    assert call("capture", *devices, "-o", tmp_path / "run", "--patterns", "dots:4").code == 0
+    assert call("calibrate", *devices, "-o", tmp_path / "cal").code in (0, 1)
     assert json.loads((tmp_path / "cal" / "manifest.json").read_text())["centre"] is True
     found = call("reconstruct", tmp_path / "run", "--calibration", tmp_path / "cal", "--json").payload
     assert found["psnr"] > 30

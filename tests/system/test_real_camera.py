@@ -161,13 +161,13 @@ def test_frames_of_a_session_calibrate_as_the_session_did(
 
     with monkeypatch.context() as patch:
         patch.setattr(Exposer, "digital", kept)
-        assert call("calibrate", *lab.rig, "-o", tmp_path / "simulated").code == 0
-    told = json.loads((tmp_path / "simulated" / "manifest.json").read_text())
-    listed = {name: told[name] for name in ("camera", "digital", "board_reflectance")}
+        assert call("calibrate", *lab.arguments, "-o", tmp_path / "simulated").code == 0
+    reported = json.loads((tmp_path / "simulated" / "manifest.json").read_text())
+    listed = {name: reported[name] for name in ("camera", "digital", "board_reflectance")}
     (frames / "session.json").write_text(json.dumps({**listed, "n": 16, "signed_capture": "pair"}))
     found = call("calibrate", "--frames", frames, "-o", tmp_path / "measured", "--json").payload
     assert (found["frames"], found["n"], found["phi_error"]) == (64, 16, None)
-    assert found["predicted_phi_error"] == pytest.approx(told["result"]["phi_error"], rel=0.3)
+    assert found["predicted_phi_error"] == pytest.approx(reported["result"]["phi_error"], rel=0.3)
     for name in ("left", "right"):
         ours, theirs = (read_frame(tmp_path / cal / f"{name}.exr")[0]["factor"] for cal in ("measured", "simulated"))
         assert np.array_equal(ours, theirs), name

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.robustness("Faults")
 def killed(lab: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same run, its process killed while it wrote frames; not to be changed."""
     run: Path = tmp_path_factory.mktemp("killed") / "run"
-    done = cut_short(signal.SIGKILL, 100, "capture", *lab.rig, "-o", run, "--patterns", PATTERNS, "--quiet")
+    done = cut_short(signal.SIGKILL, 100, "capture", *lab.arguments, "-o", run, "--patterns", PATTERNS, "--quiet")
     assert done.returncode == -signal.SIGKILL and done.stdout == "" and done.stderr == ""
     return run
 
@@ -46,7 +46,7 @@ def test_a_killed_run_is_no_run(refused: Callable[..., str], lab: Any, interrupt
     line = refused("reconstruct", "run", "--calibration", lab.calibration)
     assert "run: the capture is incomplete" in line and "--resume" in line
     frames = len(list(interrupted.glob("frame_*.exr")))
-    line = refused("capture", *lab.rig, "-o", "run", "--patterns", PATTERNS)
+    line = refused("capture", *lab.arguments, "-o", "run", "--patterns", PATTERNS)
     assert "run: the folder holds files already" in line and f"{frames} finished frames" in line
     assert "go on with --resume" in line and "empty" not in line, "emptying it would throw the frames away"
 
@@ -55,7 +55,7 @@ def test_resume_finishes_it(call: Callable[..., Any], lab: Any, interrupted: Pat
     """And sweeps up what was half written."""
     kept = {path: path.stat().st_mtime_ns for path in interrupted.glob("frame_*.exr")}
     (interrupted / ".frame_00400.exr.4711-140703.part").write_bytes(b"\x76\x2f\x31\x01")
-    outcome = call("capture", *lab.rig, "-o", interrupted, "--patterns", PATTERNS, "--resume", "--json")
+    outcome = call("capture", *lab.arguments, "-o", interrupted, "--patterns", PATTERNS, "--resume", "--json")
     assert outcome.code == 0 and outcome.payload["frames"] == 512
     assert_equal_runs(interrupted, whole)
     assert {path: path.stat().st_mtime_ns for path in kept} == kept, "frames that were there are not written again"
@@ -65,12 +65,12 @@ def test_resume_finishes_it(call: Callable[..., Any], lab: Any, interrupted: Pat
 def test_resume_of_a_finished_run_changes_nothing(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
     run = lab.copy("run", tmp_path / "run")
     before = {path.name: path.read_bytes() for path in run.glob("*.exr")}
-    assert call("capture", *lab.rig, "-o", run, "--patterns", "dots:4", "--resume").code == 0
+    assert call("capture", *lab.arguments, "-o", run, "--patterns", "dots:4", "--resume").code == 0
     assert {path.name: path.read_bytes() for path in run.glob("*.exr")} == before
 
 
 def test_resume_starts_where_nothing_is(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
-    assert call("capture", *lab.rig, "-o", tmp_path / "run", "--patterns", "dots:4", "--resume").code == 0
+    assert call("capture", *lab.arguments, "-o", tmp_path / "run", "--patterns", "dots:4", "--resume").code == 0
     assert_equal_runs(tmp_path / "run", lab.run)
 
 
@@ -81,7 +81,7 @@ def test_resume_replaces_a_frame_that_was_changed(call: Callable[..., Any], lab:
     data[-2000] ^= 1
     (run / "frame_00005.exr").write_bytes(data)
     assert "resume" in call("reconstruct", run, "--calibration", lab.calibration).refusal
-    assert call("capture", *lab.rig, "-o", run, "--patterns", "dots:4", "--resume").code == 0
+    assert call("capture", *lab.arguments, "-o", run, "--patterns", "dots:4", "--resume").code == 0
     assert_equal_runs(run, lab.run)
 
 
@@ -101,7 +101,7 @@ def test_resume_refuses_another_configuration(
 ) -> None:
     (tmp_path / "other.toml").write_text(lab.camera.read_text().replace("6.7", "7.6"))
     lab.copy("run", tmp_path / "run")
-    line = refused("capture", *lab.rig, "-o", "run", "--resume", "--patterns", "dots:4", *options)
+    line = refused("capture", *lab.arguments, "-o", "run", "--resume", "--patterns", "dots:4", *options)
     assert "--resume: run holds a run of another configuration" in line and f"({fragment} differ)" in line
 
 
@@ -112,13 +112,13 @@ def test_resume_refuses_another_configuration(
 def test_resume_refuses_a_corrupted_manifest(refused: Callable[..., str], lab: Any, tmp_path: Path, text: str) -> None:
     run = lab.copy("run", tmp_path / "run")
     (run / "manifest.json").write_text(text)
-    assert "run/manifest.json" in refused("capture", *lab.rig, "-o", "run", "--resume", "--patterns", "dots:4")
+    assert "run/manifest.json" in refused("capture", *lab.arguments, "-o", "run", "--resume", "--patterns", "dots:4")
 
 
 def test_resume_refuses_a_foreign_folder(refused: Callable[..., str], lab: Any, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("keep me")
-    line = refused("capture", *lab.rig, "-o", "mine", "--resume", "--patterns", "dots:4")
+    line = refused("capture", *lab.arguments, "-o", "mine", "--resume", "--patterns", "dots:4")
     assert "mine: the folder holds files already" in line
 
 
@@ -127,13 +127,13 @@ def test_resume_refuses_a_foreign_folder(refused: Callable[..., str], lab: Any, 
 
 @pytest.fixture(scope="module")
 def wide(lab: Any) -> tuple[object, ...]:
-    """The laboratory's rig with a projector of 32 x 32 pixels, whose 128 shots take long enough to be hit."""
+    """The laboratory's devices with a projector of 32 x 32 pixels, whose 128 shots take long enough to be hit."""
     return lab.write_scene("wide", n=32), *lab.electronics[:-1], "0.02"
 
 
 @pytest.fixture(scope="module")
 def factors(call: Callable[..., Any], wide: tuple[object, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The calibration of that rig which nothing disturbed."""
+    """The calibration of those devices which nothing disturbed."""
     calibration: Path = tmp_path_factory.mktemp("factors") / "cal"
     assert call("calibrate", *wide, "-o", calibration).code in (0, 1)
     return calibration
@@ -160,8 +160,8 @@ def test_a_calibration_that_is_stopped_loses_no_finished_part(
     """While light is traced, after it, and between stripes; `reconstruct` does not take it for a calibration."""
     calibration = tmp_path / "cal"
     done = cut_short(how, part, "calibrate", *wide, "-o", calibration)
-    said = {signal.SIGINT: "mitsim: interrupted" + RESUME, signal.SIGTERM: "mitsim: ended by SIGTERM" + RESUME}
-    assert (done.returncode, done.stderr) == (-how if how == signal.SIGKILL else 128 + how, said.get(how, ""))
+    reported = {signal.SIGINT: "mitsim: interrupted" + RESUME, signal.SIGTERM: "mitsim: ended by SIGTERM" + RESUME}
+    assert (done.returncode, done.stderr) == (-how if how == signal.SIGKILL else 128 + how, reported.get(how, ""))
     assert (calibration / part).is_file()
     assert "the calibration is incomplete" in call("reconstruct", lab.run, "--calibration", calibration).refusal
     assert "(seed differ)" in call("calibrate", *wide, "-o", calibration, "--resume", "--seed", "1").refusal

@@ -54,7 +54,7 @@ def test_capture_in_every_variant(
     have the error asked for; seed 0 leaves 3.4e-3 of the frames and 1.6e-3 of the truth.
     """
     options = "-o", tmp_path / "run", "--patterns", "dots:4", "--json", "--variant", colour
-    outcome = shell("capture", *lab.rig, *options)
+    outcome = shell("capture", *lab.arguments, *options)
     assert outcome.err == "" and outcome.payload["variant"] == colour
     frames = [
         np.stack([read_frame(path)[0]["electrons"].astype(float) for path in sorted(run.glob("frame_*.exr"))])
@@ -72,7 +72,7 @@ def test_capture_in_every_variant(
 def test_sampled_wavelengths_leave_indirect_light(
     call: Callable[..., Any], shell: Callable[..., Any], shared_scene: Callable[..., Path], tmp_path: Path
 ) -> None:
-    """A corner of two walls, where light is filed on the device: frames of both variants keep the accuracy."""
+    """A corner of two walls, where light is accumulated on the device: frames of both variants keep the accuracy."""
     scene = shared_scene("spectral corner", extra=WALL.format(turn=90, x=-30, bsdf=MATT))
     options = scene, "--patterns", "uniform", "--accuracy", 0.05, "--json", "-o"
     assert call("capture", *options, tmp_path / "mono").code == 0
@@ -86,7 +86,7 @@ def test_sampled_wavelengths_leave_indirect_light(
 def test_a_variant_that_is_not_on_this_machine(shell: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
     """A GPU variant: one line where there is no GPU, the usual frames where there is one."""
     outcome = shell(
-        "capture", *lab.rig, "-o", "run", "--patterns", "uniform", "--variant", "cuda_ad_mono", cwd=tmp_path
+        "capture", *lab.arguments, "-o", "run", "--patterns", "uniform", "--variant", "cuda_ad_mono", cwd=tmp_path
     )
     if outcome.code:
         assert "cuda_ad_mono" in outcome.refusal and not (tmp_path / "run").exists()

@@ -76,7 +76,7 @@ _PAIRS = 4
 """Most terms of Sellmeier's formula: as many as any catalogue fits."""
 _VISIBLE = 360.0, 830.0
 """Wavelengths [nm] of Mitsuba's spectra, over which an index must be one."""
-_LOOKED_AT = 48
+_CHECKED_WAVELENGTHS = 48
 """Wavelengths at which that is looked at: 10 nm apart."""
 _MOST_INDEX = 5.0
 """Above germanium's 4: more is no glass."""
@@ -110,7 +110,7 @@ class GlassModel(BaseModel):
             raise MitsimError(
                 f"{PLUGIN}: sellmeier: got {len(model.sellmeier)} numbers; give pairs B_1, C_1, B_2, C_2, ..."
             )
-        for wavelength in np.linspace(*_VISIBLE, _LOOKED_AT):
+        for wavelength in np.linspace(*_VISIBLE, _CHECKED_WAVELENGTHS):
             squared = model.squared(float(wavelength))
             if not 1 <= squared <= _MOST_INDEX**2:
                 raise MitsimError(

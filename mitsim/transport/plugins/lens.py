@@ -129,13 +129,13 @@ def plugin_class() -> type:
             self.irradiance = props["irradiance"]
             width, height = self.irradiance.resolution()
             self.aspect = float(width) / float(height)
-            self.rig = mi.Transform4f(props.get("to_world", mi.ScalarAffineTransform4f()).matrix)
+            self.to_world = mi.Transform4f(props.get("to_world", mi.ScalarAffineTransform4f()).matrix)
 
         def _power(
             self, point: mi.Point3f, direction: mi.Vector3f, wavelengths: mi.Color0f, active: mi.Bool
         ) -> tuple[mi.Spectrum, mi.Float]:
             """pi scale texture of the ray that leaves the aperture, and its cosine to the axis."""
-            inverse = self.rig.inverse()
+            inverse = self.to_world.inverse()
             o, d = inverse @ point, inverse @ direction
             active &= d.z > 0
             sharp = o + d * ((self.focus - o.z) / d.z)
@@ -198,7 +198,7 @@ def plugin_class() -> type:
             """A point of the aperture and one of the picture, both even: the weight is pi scale texture x its area."""
             ps, _ = self.sample_position(time, sample2, active)
             near = mi.Vector3f((1 - 2 * sample3.x) * self.reach, (1 - 2 * sample3.y) * self.reach / self.aspect, 1)
-            direction = dr.normalize(self.rig @ mi.Point3f(near * self.focus) - ps.p)
+            direction = dr.normalize(self.to_world @ mi.Point3f(near * self.focus) - ps.p)
             si = mi.SurfaceInteraction3f(ps, dr.zeros(mi.Ray3f).wavelengths)
             si.uv = sample3
             wavelengths, weight = self.sample_wavelengths(si, sample1, active)

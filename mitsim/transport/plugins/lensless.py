@@ -34,7 +34,7 @@ parameter               unit      default     meaning
 ``mask_thickness``      mm        0           mask thickness; 0 is a thin mask
 ``mask_offset_row``     mm        0           the mask's centre off the axis, down the rows (toward -y)
 ``mask_offset_column``  mm        0           the same along the columns (toward -x)
-``scene_distance``      mm        400         plane to which the rig is aligned (calibration board, cell grid)
+``scene_distance``      mm        400         plane that the bench is aligned to (calibration board, cell grid)
 ``fov``                 degrees   20          full angle of the square field stop, a baffle: no light beyond it
 ``pixel_fill_factor``   -         1           active part of a pixel, a centred square
 ``angular_exponent``    -         0           a pixel responds as cos(theta) to this power; 0 is no angular response

@@ -17,7 +17,7 @@ def _numbers() -> list[Case]:
     def turned(inside: str, *says: str) -> Case:
         return Case(inside, ball(f'<transform name="to_world">{inside}</transform>'), says)
 
-    def rig(who: str, inside: str) -> Case:
+    def posed(who: str, inside: str) -> Case:
         old = {"camera": '<rotate y="1" angle="0"/>', "projector": '<translate x="60"/>'}[who]
         return Case(f"{who} {inside}", swap(old, inside), ("to_world: got", "moved and turned only"))
 
@@ -185,12 +185,12 @@ def _numbers() -> list[Case]:
         turned('<lookat origin="0 0 0" target="0 0 0"/>', "invalid lookat"),
         turned('<lookat origin="0 0 0" target="0 5 0" up="0 1 0"/>', "invalid lookat"),
         turned('<lookat origin="0 0" target="0 5 0"/>', "expected 3 values"),
-        rig("camera", '<scale value="2"/>'),
-        rig("camera", '<scale x="-1"/>'),
-        rig("camera", '<scale z="1000"/>'),
-        rig("camera", '<matrix value="1 0.1 0 0 0 1 0 0 0 0 1 0 0 0 0 1"/>'),
-        rig("projector", '<scale value="1000"/><translate x="60"/>'),
-        rig("projector", '<scale x="-1"/>'),
+        posed("camera", '<scale value="2"/>'),
+        posed("camera", '<scale x="-1"/>'),
+        posed("camera", '<scale z="1000"/>'),
+        posed("camera", '<matrix value="1 0.1 0 0 0 1 0 0 0 0 1 0 0 0 0 1"/>'),
+        posed("projector", '<scale value="1000"/><translate x="60"/>'),
+        posed("projector", '<scale x="-1"/>'),
     ]
     return cases
 

@@ -105,7 +105,7 @@ def test_it_holds_the_lamps_light_alone(captured: Capture, light: SampledLight) 
     shown = np.stack([frame.irradiance for frame in expected])
     off = expected.projector_off.irradiance
     assert off.min() > 0 and (shown - off).min() > -1e-9 * off.max()
-    exposer = Exposer(light.bench.rig, captured.exposure_s, 0)
+    exposer = Exposer(light.bench.devices, captured.exposure_s, 0)
     electrons = read_frame(captured.folder / "ambient.exr")[0]["electrons"]
     assert electrons == pytest.approx(exposer.electrons(expected.projector_off), rel=1e-6)
     # Light is linear: all dots together are uniform light, and 15 times what black pixels leak; ambient light once.
@@ -117,7 +117,9 @@ def test_it_holds_the_lamps_light_alone(captured: Capture, light: SampledLight) 
 def test_black_pixels_leak_into_frames_but_not_into_it(light: SampledLight) -> None:
     """At a contrast of 20 the frames are brighter, and the ambient frame is the same to the last bit."""
     bench = light.bench
-    grey = replace(bench, rig=replace(bench.rig, projector=bench.projector.model_copy(update={"contrast_ratio": 20.0})))
+    grey = replace(
+        bench, devices=replace(bench.devices, projector=bench.projector.model_copy(update={"contrast_ratio": 20.0}))
+    )
     settings = replace(light.plan.settings, effects=light.plan.settings.effects | {"black-level"})
     leaky = replace(light, simulation=Simulation(grey, settings))
     assert leaky.simulation.physics.black_level == pytest.approx(0.05)
@@ -367,11 +369,11 @@ def test_no_lamp_ruins_an_image_in_silence(scene: Path, variant: str, factors: F
     bench = open_bench(scene, variant, lamp=lamp)
     light = bench.light("dots:4", accuracy=1e-2, effects="-interreflection")
     shots = light.expose("dots:4", exposure_fraction=1e-3)
-    said = any("times the projector's light" in warning for warning in shots.warnings)
+    reported = any("times the projector's light" in warning for warning in shots.warnings)
     bound, _ = allowed(shots, factors, light)
     found = ms.psnr(reconstruct(shots, factors).image, light.truth)
-    assert found > bound - 1.5 or said
-    assert said == (shots.manifest.ambient_frame.noise > 1) and (said or lamp < 1500)
+    assert found > bound - 1.5 or reported
+    assert reported == (shots.manifest.ambient_frame.noise > 1) and (reported or lamp < 1500)
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from mitsim.core.spectral_manifests import RUN
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Lines
 from mitsim.light.plan import Plan
-from tests.unit.planner.invented_evidence import plan
+from tests.unit.planner.invented_pilot_result import plan
 
 LASERS = Lines((638.0, 520.0, 445.0), (0.5, 0.3, 0.2))
 STAGES = {"plan": 1.0, "transport": 2.0, "truth": 3.0, "optics": 4.0, "write": 5.0}
@@ -53,8 +53,8 @@ def chosen(monkeypatch: pytest.MonkeyPatch) -> Callable[..., bands.Coloured]:
         def looking(self: Any, whole: Bench, request: Request) -> None:
             self._bench = whole
 
-        monkeypatch.setattr(bands._Look, "__init__", looking)
-        monkeypatch.setattr(bands._Look, "errors", found)
+        monkeypatch.setattr(bands._ColourPilot, "__init__", looking)
+        monkeypatch.setattr(bands._ColourPilot, "errors", found)
         monkeypatch.setattr(bands, "reopened", lambda of, variant: of.reopened(variant))
         monkeypatch.setattr(bands, "plan_request", planned)
 
@@ -135,13 +135,13 @@ def test_what_has_no_answer_is_refused() -> None:
         bands.choose_colour(spectral, Request.of())  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("error", "said"), [(0.0, 0.0), (9e-7, 0.0), (0.0123, 0.013), (0.02, 0.02), (0.0991, 0.1)])
-def test_errors_are_rounded_up_to_two_digits(error: float, said: float) -> None:
+@pytest.mark.parametrize(("error", "reported"), [(0.0, 0.0), (9e-7, 0.0), (0.0123, 0.013), (0.02, 0.02), (0.0991, 0.1)])
+def test_errors_are_rounded_up_to_two_digits(error: float, reported: float) -> None:
     """A resumed run must find the same, whatever the order of its sums; rounding of single precision is none."""
     import numpy as np
 
     true = np.full((2, 3), 4.0)
-    assert bands._relative(true * (1 + error), true) == said
+    assert bands._relative(true * (1 + error), true) == reported
     assert bands._relative(np.zeros(3), np.zeros(3)) == 0.0
 
 
@@ -199,12 +199,12 @@ def test_a_look_finds_what_bands_leave_of_all_lines(
         assert of.alone == found
         return np.array([[[1.0], [3.0]]]) if found is None else light(found)
 
-    monkeypatch.setattr(bands._Look, "__init__", lambda self, whole: setattr(self, "_bench", whole))
-    monkeypatch.setattr(bands._Look, "_path_samples", path_samples)
-    monkeypatch.setattr(bands._Look, "_electrons", electrons)
+    monkeypatch.setattr(bands._ColourPilot, "__init__", lambda self, whole: setattr(self, "_bench", whole))
+    monkeypatch.setattr(bands._ColourPilot, "_path_samples", path_samples)
+    monkeypatch.setattr(bands._ColourPilot, "_electrons", electrons)
     monkeypatch.setattr(bands, "reopened", lambda of, variant: replace(of, variant=variant))
     monkeypatch.setattr(bands, "line_alone", lambda of, line: replace(of, alone=line))
-    look: Any = bands._Look
+    look: Any = bands._ColourPilot
     found = look(OfLines(own=lines)).errors(["lines", "bands:1", "bands:2", "mono"])
     assert asked == [("llvm_ad_mono", 0), *(("llvm_ad_spectral", count) for count in traced)]
 
@@ -239,8 +239,8 @@ def test_a_look_is_at_few_rays_of_four_shots(monkeypatch: pytest.MonkeyPatch) ->
             return SimpleNamespace(by_line=lambda count: ["light"] * count)
 
         def accumulate(name: str, found: Any, of_labels: Any, rays: int) -> Any:
-            asked.update(filed=(found, rays), labels=of_labels)
-            return "filed"
+            asked.update(accumulated=(found, rays), labels=of_labels)
+            return "accumulated"
 
         return SimpleNamespace(direct=SimpleNamespace(trace=trace), accumulate=accumulate)
 
@@ -257,7 +257,7 @@ def test_a_look_is_at_few_rays_of_four_shots(monkeypatch: pytest.MonkeyPatch) ->
         projector=SimpleNamespace(effective_wavelength_nm=500.0),
         sensor=SimpleNamespace(efficiency=lambda nm: nm / 1000),
     )
-    look = bands._Look(of, Request.of(patterns="dots:3", seed=3))
+    look = bands._ColourPilot(of, Request.of(patterns="dots:3", seed=3))
     assert np.array_equal(look._lighting.weights[:, look._lighting.labels], weights[[0, 2, 5, 8]][:, labels])
     assert look._lighting.weights.shape[1] == len({tuple(each) for each in weights[[0, 2, 5, 8]].T})
     assert look._settings.effects == {"diffraction"} and look._settings.depth == 400
@@ -267,14 +267,14 @@ def test_a_look_is_at_few_rays_of_four_shots(monkeypatch: pytest.MonkeyPatch) ->
     assert asked["traced"] == (integer(3, "colour"), 0, bands._RAYS_OF_BANDS) and asked["settings"] == look._settings
     found = look._electrons(of, "light")  # type: ignore[arg-type]
     assert found.shape == (2, 2, 2) and (found[1] == 250).all() and not found[0].any()
-    assert asked["filed"] == ("light", bands._RAYS_OF_BANDS) and asked["labels"] is look._lighting.labels
+    assert asked["accumulated"] == ("light", bands._RAYS_OF_BANDS) and asked["labels"] is look._lighting.labels
     assert asked["rows"] == list(range(look._lighting.weights.shape[1])) and not asked["leaking"]
     for diffracts, effects in ((False, {}), (True, {"diffraction": False})):
         of.geometry.diffracts = diffracts
-        assert not bands._Look(of, Request.of(effects=effects))._settings.effects
+        assert not bands._ColourPilot(of, Request.of(effects=effects))._settings.effects
     few = SimpleNamespace(lighting=family.lighting.shots([1, 4]))
     of.family = lambda patterns, seed: few
-    assert len(bands._Look(of, Request.of())._lighting.weights) == 2
+    assert len(bands._ColourPilot(of, Request.of())._lighting.weights) == 2
 
 
 def test_a_choice_falls_back_on_the_variant_that_was_set(chosen: Callable[..., bands.Coloured]) -> None:

@@ -16,7 +16,7 @@ from mitsim.calibrate.board_session import Session
 from mitsim.core.configuration import load_model, shipped
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
-from mitsim.devices.camera import CameraGeometry, Rig
+from mitsim.devices.camera import CameraGeometry, Devices
 from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.patterns import parse_patterns
 from mitsim.devices.projector import ProjectorModel
@@ -29,7 +29,7 @@ from mitsim.sensor.chain import ripple_level, ripple_response
 
 PIXELS, SECONDS, SEED = 12, 0.01, 5
 SENSOR = load_sensor(shipped("calibration", "imx249.toml"))
-RIG = Rig(
+DEVICES = Devices(
     CameraGeometry(pixels=PIXELS),
     SENSOR,
     load_model(shipped("calibration", "mp_cl1.toml"), ProjectorModel),
@@ -42,7 +42,7 @@ FRAMES = [Frame(AMBIENT + 0.02 * RNG.random((PIXELS, PIXELS)), 0.0, 0.0, 0.0) fo
 
 
 def exposer(**drift: float) -> DriftedExposer:
-    return DriftedExposer(RIG, SECONDS, SEED, 0.0, Drift(**drift), FAMILY, AMBIENT)
+    return DriftedExposer(DEVICES, SECONDS, SEED, 0.0, Drift(**drift), FAMILY, AMBIENT)
 
 
 def frames(camera: Exposer) -> np.ndarray:
@@ -51,7 +51,7 @@ def frames(camera: Exposer) -> np.ndarray:
 
 def test_without_drift_frames_are_the_same_bit_for_bit() -> None:
     """(Planted: the lamps' light added once more.)"""
-    still, drifting = Exposer(RIG, SECONDS, SEED), exposer()
+    still, drifting = Exposer(DEVICES, SECONDS, SEED), exposer()
     assert np.array_equal(frames(drifting), frames(still))
     for shot, frame in zip(FAMILY.shots, FRAMES, strict=True):
         assert np.array_equal(drifting.lit(frame, *shot.names), still.lit(frame, *shot.names))
@@ -62,7 +62,7 @@ def test_power_scales_the_projectors_light_and_lamps_that_of_lamps() -> None:
     for camera, power, lamp in ((exposer(power=0.1), 1.1, 1.0), (exposer(lamp=0.3), 1.0, 1.3)):
         for shot, frame in zip(FAMILY.shots, FRAMES, strict=True):
             expected = power * (frame.irradiance - AMBIENT) + lamp * AMBIENT
-            unit = Exposer(RIG, SECONDS, SEED).electrons(Frame(expected, 0.0, 0.0, 0.0))
+            unit = Exposer(DEVICES, SECONDS, SEED).electrons(Frame(expected, 0.0, 0.0, 0.0))
             assert np.allclose(camera.lit(frame, *shot.names), unit, rtol=1e-12)
 
 
@@ -96,8 +96,8 @@ def test_black_level_and_warmth_add_to_every_datum() -> None:
     law = {"dark_current_temperature_c": 25.0, "dark_doubling_c": 8.0, "dark_current_e_per_s": 1e5}
     stated = SENSOR.model_copy(update=law)
     assert warmer(stated, 8.0).superpixel_dark_current_e_per_s == pytest.approx(2 * 4e5)
-    hot = replace(exposer(temperature_k=8.0), rig=replace(RIG, sensor=stated))
-    cold = replace(exposer(), rig=replace(RIG, sensor=stated))
+    hot = replace(exposer(temperature_k=8.0), devices=replace(DEVICES, sensor=stated))
+    cold = replace(exposer(), devices=replace(DEVICES, sensor=stated))
     assert (frames(hot) - frames(cold)).mean() == pytest.approx(4e5, rel=0.01)
 
 
@@ -139,14 +139,14 @@ def test_a_sessions_power_drifts_in_the_order_of_its_frames(order: str, signed: 
 def bench(mirrors: bool = False, **geometry: Any) -> Bench:
     return Bench(
         cast(Any, SimpleNamespace(mirrors=mirrors, path=Path("scene.xml"))),
-        replace(RIG, camera=RIG.camera.model_copy(update=geometry)), "", {},
+        replace(DEVICES, camera=DEVICES.camera.model_copy(update=geometry)), "", {},
     )  # fmt: skip
 
 
 def test_a_mask_moved_by_a_pixel_casts_the_same_shadow_a_pixel_on() -> None:
     """Along the rows alone, and by the pixel as the mask sees it: the frame of a scene is shifted by a row. (Planted:
     the columns instead; the other sign.)"""
-    camera, cells = RIG.camera.model_copy(update={"pixels": 64}), Directions.cells(np.linspace(-0.05, 0.05, 9))
+    camera, cells = DEVICES.camera.model_copy(update={"pixels": 64}), Directions.cells(np.linspace(-0.05, 0.05, 9))
     by_um = 1e3 * camera.pixel_pitch * (1 - camera.mask_distance / 400.0)
     moved = drift_mask(bench(pixels=64), Drift(mask_rows_um=by_um)).geometry
     scene = np.random.default_rng(2).random((8, 8))
@@ -175,7 +175,7 @@ def test_a_mask_that_tilts_casts_the_shadow_of_one_that_was_made_so() -> None:
             "tilt_row_mrad": rows,
             "tilt_column_mrad": columns,
         }
-        return MaskProfile.model_validate(table).worn(RIG.camera.model_copy(update={"pixels": 48}), Path())
+        return MaskProfile.model_validate(table).worn(DEVICES.camera.model_copy(update={"pixels": 48}), Path())
 
     def frame(camera: CameraGeometry) -> np.ndarray:
         cells = Directions.cells(np.linspace(-0.15, 0.15, 4))
@@ -186,7 +186,7 @@ def test_a_mask_that_tilts_casts_the_shadow_of_one_that_was_made_so() -> None:
         (made(0.0, 0.0), Drift(mask_tilt_rows_mrad=6.0, mask_tilt_columns_mrad=-2.0)),
         (made(2.0, -2.0), Drift(mask_tilt_rows_mrad=4.0)),
     ):
-        moved = drift_mask(replace(bench(), rig=replace(RIG, camera=before)), drift).geometry
+        moved = drift_mask(replace(bench(), devices=replace(DEVICES, camera=before)), drift).geometry
         assert np.linalg.norm(frame(moved) - expected) < 1e-3 * np.linalg.norm(expected - even)
     assert Drift().tilt_mrad is None and drift_mask(bench(), Drift()).geometry.identity == bench().geometry.identity
     assert drift_mask(bench(), Drift(mask_tilt_rows_mrad=4.0)).geometry.identity != bench().geometry.identity
@@ -202,7 +202,7 @@ def test_what_cannot_be_formed_is_refused() -> None:
     with pytest.raises(MitsimError, match=r"^drift: [^\n]*mirrors$"):
         drift_mask(bench(mirrors=True), Drift(vibration_um=1.0))
     mask = MaskProfile.model_validate({"kind": "separable", "feature_mm": 0.06, "order": 5, "rotation_deg": 1.0})
-    turned = mask.worn(RIG.camera, Path())
+    turned = mask.worn(DEVICES.camera, Path())
     for drift in (Drift(vibration_um=1.0), Drift(mask_tilt_columns_mrad=1.0)):
         with pytest.raises(MitsimError, match=rf"^drift: {drift.kinds[0]} [^\n]*\[mask\]$"):
             drift_mask(bench(mask="plate", mask_plate=turned.mask_plate), drift)
@@ -217,31 +217,31 @@ def test_what_cannot_be_formed_is_refused() -> None:
         drift_mask(bench(mask_distance=0.5), Drift(mask_axis_um=-600.0))
 
 
-ROLLING = replace(RIG, sensor=SENSOR.model_copy(update={"shutter": "rolling", "line_time_us": 300.0}))
+ROLLING = replace(DEVICES, sensor=SENSOR.model_copy(update={"shutter": "rolling", "line_time_us": 300.0}))
 
 
-def rippled(rig: Rig, **drift: float) -> DriftedExposer:
-    return replace(exposer(**drift), rig=rig)
+def rippled(devices: Devices, **drift: float) -> DriftedExposer:
+    return replace(exposer(**drift), devices=devices)
 
 
 def test_a_ripple_is_a_level_of_each_row_by_a_phase_of_each_frame() -> None:
     """Of the projector's light or of the lamps' alone; a global shutter's rows have one level. Frames are the same in
     any order. (Planted: both sources rippled; one phase for all frames; columns for rows; the exposure that was asked
     for in place of the one that the camera has.)"""
-    for source, rig in (("power", ROLLING), ("lamp", ROLLING), ("power", RIG)):
-        camera = rippled(rig, **{f"{source}_ripple": 0.4, f"{source}_ripple_hz": 37.0, "exposure": 0.5})
+    for source, devices in (("power", ROLLING), ("lamp", ROLLING), ("power", DEVICES)):
+        camera = rippled(devices, **{f"{source}_ripple": 0.4, f"{source}_ripple_hz": 37.0, "exposure": 0.5})
         seen = []
         for shot, frame in reversed(list(zip(FAMILY.shots, FRAMES, strict=True))):
             open_s = 1.5 * SECONDS
             own = {"power": frame.irradiance - AMBIENT, "lamp": AMBIENT}
-            unit = Exposer(RIG, SECONDS, SEED).electrons(Frame(own[source], 0.0, 0.0, 0.0))
-            whole = Exposer(RIG, SECONDS, SEED).electrons(frame)
+            unit = Exposer(DEVICES, SECONDS, SEED).electrons(Frame(own[source], 0.0, 0.0, 0.0))
+            whole = Exposer(DEVICES, SECONDS, SEED).electrons(frame)
             level = 1 + (camera.lit(frame, *shot.names) / 1.5 - whole) / unit
             assert np.allclose(level, level[:, :1], rtol=1e-9)
             phase = stream(SEED, "drift", f"{source} ripple", *shot.names).uniform(0, 2 * np.pi)
-            response = ripple_response(rig.sensor, open_s, 37.0, PIXELS)
+            response = ripple_response(devices.sensor, open_s, 37.0, PIXELS)
             assert np.allclose(level, ripple_level(response, 0.4, phase), rtol=1e-9)
-            assert (np.ptp(level[:, 0]) < 1e-9) == (rig is RIG)
+            assert (np.ptp(level[:, 0]) < 1e-9) == (devices is DEVICES)
             seen.append(level[0, 0])
         assert len(set(np.round(seen, 6))) == len(FRAMES)
 
@@ -263,7 +263,7 @@ def test_shots_of_an_ambient_frame_ripple_as_well() -> None:
 
 
 def test_a_ripple_before_a_rolling_shutter_of_unknown_line_time_is_refused() -> None:
-    unknown = replace(RIG, sensor=SENSOR.model_copy(update={"shutter": "rolling"}))
+    unknown = replace(DEVICES, sensor=SENSOR.model_copy(update={"shutter": "rolling"}))
     assert np.array_equal(frames(rippled(unknown)), frames(exposer()))
     with pytest.raises(MitsimError, match=r"^sensor [^\n]*line_time_us[^\n]*$"):
         frames(rippled(unknown, power_ripple=0.1, power_ripple_hz=100.0))

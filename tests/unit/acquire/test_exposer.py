@@ -1,4 +1,4 @@
-"""Noise of frames and of their differences, on a rig of plain numbers: no scene is loaded and no light traced.
+"""Noise of frames and of their differences, on devices of plain numbers: no scene is loaded and no light traced.
 
 The sensor has no ADC and no full well, so a frame's numbers are its electrons, shot noise plus read noise.
 """
@@ -16,7 +16,7 @@ from mitsim.acquire import exposure as exposing
 from mitsim.acquire.exposure import Exposer, camera_warnings
 from mitsim.calibrate.board_session import Session
 from mitsim.core.arrays import FloatArray
-from mitsim.devices.camera import Rig
+from mitsim.devices.camera import Devices
 from mitsim.devices.patterns import parse_patterns
 from mitsim.devices.sensor import SensorModel
 from mitsim.devices.session import load_recipe
@@ -36,13 +36,13 @@ PIXELS = 8
 
 
 def exposer(**sensor: float) -> Exposer:
-    rig = Rig(
+    devices = Devices(
         camera=SimpleNamespace(),
         sensor=SENSOR.model_copy(update=sensor),
         projector=SimpleNamespace(effective_wavelength_nm=550.0),
         camera_file="none",
     )
-    return Exposer(rig, exposure_s=0.25, seed=5)
+    return Exposer(devices, exposure_s=0.25, seed=5)
 
 
 def frame(peak: float) -> Frame:

@@ -77,7 +77,7 @@ def some_light(bench: Bench) -> Light:
 def test_a_file_gives_the_frame_of_any_pattern(light: Light, tmp_path: Path) -> None:
     """To single precision, of light of every kind, and its standard error as the groups' frames have it. (Planted: rows
     for columns, one term of the mask left out, layers in the other order, no leak of black pixels, lamps of the first
-    group alone, glint of the next pixel.)"""
+    group alone, specular chain of the next pixel.)"""
     path = light.save(tmp_path / "light.h5")
     pattern = np.random.default_rng(12).random((N, N))
     frame, error = frame_of(path, pattern)
@@ -100,7 +100,7 @@ def test_a_file_gives_the_frame_of_any_pattern(light: Light, tmp_path: Path) -> 
 def test_a_file_gives_the_frame_of_a_region(bench: Bench, tmp_path: Path) -> None:
     """Whose columns do not lie as its rows do, as the layout's number tells. (Planted: rows' anchors for columns'.)"""
     camera = bench.geometry.model_copy(update={"rows": 40, "roi": (3, 9, 30, 50)})
-    light = some_light(replace(bench, rig=replace(bench.rig, camera=camera)))
+    light = some_light(replace(bench, devices=replace(bench.devices, camera=camera)))
     path, pattern = light.save(tmp_path / "light.h5"), np.random.default_rng(12).random((N, N))
     (exact,) = light.frames(Lighting(np.arange(N**2), pattern.reshape(1, -1)), 0)
     frame, _ = frame_of(path, pattern)

@@ -121,7 +121,7 @@ def coloured(bench: Bench) -> Bench:
     }
     change = {"mosaic": "RGGB", "mosaic_curves": MosaicCurves(**flat), "quantum_efficiency": None, "binning": 1}
     sensor = bench.sensor.model_copy(update=change)
-    return replace(bench, rig=replace(bench.rig, sensor=sensor))
+    return replace(bench, devices=replace(bench.devices, sensor=sensor))
 
 
 def test_a_session_behind_filters_tells_the_bare_camera(bench: Bench, kept_plans: None) -> None:
@@ -173,7 +173,7 @@ def test_lamps_are_seen_by_each_pixel_through_its_filter(shared_scene: Callable[
     parts = np.repeat([response.part for response in responses], 4)
     lights = []
     for nm, unit in units:
-        own = replace(seen, rig=replace(seen.rig, projector=seen.projector.at(nm)), counted_lamps=counted_lamps)
+        own = replace(seen, devices=replace(seen.devices, projector=seen.projector.at(nm)), counted_lamps=counted_lamps)
         simulation = Simulation(own, settings)
         lamps = PathSamples(
             n**2 + np.arange(12), none, none, place, place[::-1], place * 0 + 0.0025, counts * parts * unit,
@@ -183,11 +183,11 @@ def test_lamps_are_seen_by_each_pixel_through_its_filter(shared_scene: Callable[
             none[:1], none[:1], none[:1], place[3:4], place[5:6], place[:1] * 0 + 0.0025, np.array([unit]),
             np.full(1, DIRECT, np.int16),
         )  # fmt: skip
-        filed = simulation.accumulate("indirect", PathSamples.joined([lamps, spot]), none[:1].repeat(n**2), 1)
+        accumulated = simulation.accumulate("indirect", PathSamples.joined([lamps, spot]), none[:1].repeat(n**2), 1)
         plan: Any = SimpleNamespace(settings=settings)
         zeros = np.zeros(n**2)
         truth = Truth(np.zeros((n, n)), np.zeros((n, n)), np.ones(n**2), 1)
-        light = SampledLight((filed,), simulation, plan, 0, none[:1].repeat(n**2), zeros, zeros, 1, 0.0, True)
+        light = SampledLight((accumulated,), simulation, plan, 0, none[:1].repeat(n**2), zeros, zeros, 1, 0.0, True)
         lights.append(replace(light, known_truth=truth))
     whole = MosaicLight.of(replace(seen, counted_lamps=counted_lamps), lights, [nm for nm, _ in units])
     lighting = Lighting(none[:1].repeat(n**2), np.ones((1, 1)))
@@ -214,9 +214,9 @@ def test_lamps_are_seen_by_each_pixel_through_its_filter(shared_scene: Callable[
 def test_frames_that_cut_through_filters_are_refused(bench: Bench, part: dict[str, object]) -> None:
     """An odd side, and a region that begins at another filter. (Planted: where a region begins not looked at.)"""
     seen = coloured(bench)
-    rig = replace(seen.rig, camera=seen.rig.camera.model_copy(update=part))
+    devices = replace(seen.devices, camera=seen.devices.camera.model_copy(update=part))
     with pytest.raises(MitsimError, match=r"do not hold whole filters of 2 x 2; give the scene's film even numbers"):
-        without_filters(replace(seen, rig=rig))
+        without_filters(replace(seen, devices=devices))
 
 
 def test_a_bench_behind_filters_says_which_camera_it_has(bench: Bench) -> None:

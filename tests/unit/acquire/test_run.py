@@ -26,7 +26,7 @@ from mitsim.light.light import trace_light
 from mitsim.light.settings import GROUPS
 from mitsim.planner.planner import make_plan
 from mitsim.sensor.moments import frame_moments
-from tests.unit.planner.invented_evidence import plan as invented_plan
+from tests.unit.planner.invented_pilot_result import plan as invented_plan
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
 N, ACCURACY = 16, 1e-2
@@ -126,7 +126,7 @@ def test_the_monte_carlo_error_is_within_the_accuracy(captured: Capture, bench: 
     plan = make_plan(bench, lighting, ACCURACY, 5)
     assert json.loads(json.dumps(plan.block()["settings"])) == json.loads(json.dumps(captured.plan["settings"]))
     light = trace_light(bench, replace(plan, sampling_target=captured.manifest.mc_error / 3), lighting, seed=99)
-    exposer = Exposer(bench.rig, captured.exposure_s, 0)
+    exposer = Exposer(bench.devices, captured.exposure_s, 0)
     judge = np.stack([exposer.electrons(frame) for frame in light.frames(lighting, 0)])
     found = np.stack([read_frame(captured.folder / name)[0]["electrons"] for name in FILES])
     error = np.linalg.norm(found - judge) / np.linalg.norm(judge)
@@ -225,8 +225,8 @@ def test_too_few_seconds_flag_the_loosest_plan(bench: Bench) -> None:
     plan = bench.plan("dots:3", seconds=0.01, seed=5)
     assert plan.accuracy == 0.3 and any("0.01 seconds are too few" in line for line in plan.warnings)
     assert plan.payload()["asked_seconds"] == 0.01
-    for other, said in (({"seconds": 20.0}, "0.01; plan anew"), ({"accuracy": 1e-3}, "not both")):
-        with pytest.raises(MitsimError, match=said):
+    for other, reported in (({"seconds": 20.0}, "0.01; plan anew"), ({"accuracy": 1e-3}, "not both")):
+        with pytest.raises(MitsimError, match=reported):
             bench.capture(plan, **other)
 
 
@@ -364,7 +364,7 @@ def test_measurements_are_the_noisy_response_to_each_pattern(bench: Bench) -> No
     family = parse_patterns("hadamard:2", N)
     plan = make_plan(bench, family.lighting, 2e-2, 0)
     expected = trace_light(bench, plan, family.lighting, 0).frames(family.lighting, 0)
-    exposer = Exposer(bench.rig, 0.01, seed=3)
+    exposer = Exposer(bench.devices, 0.01, seed=3)
     measured = {(i, j): y for y, i, j in exposer.measurements(family, expected)}
     assert set(measured) == {(0, 0), (0, 1), (1, 0), (1, 1)}
     frames = dict(zip(((c.row, c.column, c.sign) for c in family.shots), expected, strict=True))
@@ -385,9 +385,9 @@ def test_measurements_are_the_noisy_response_to_each_pattern(bench: Bench) -> No
 def test_dark_current_is_taken_off(bench: Bench) -> None:
     """1e5 dark electrons a second in 0.1 s on a frame without light: 1e4 electrons, a rate of 0 +- 1000 a pixel."""
     noisy = replace(
-        bench, rig=replace(bench.rig, sensor=bench.sensor.model_copy(update={"dark_current_e_per_s": 25e3}))
+        bench, devices=replace(bench.devices, sensor=bench.sensor.model_copy(update={"dark_current_e_per_s": 25e3}))
     )
-    exposer = Exposer(noisy.rig, 0.1, seed=1)
+    exposer = Exposer(noisy.devices, 0.1, seed=1)
     rate = exposer.rate(exposer.digital(np.zeros((64, 64)), "dark"))
     assert abs(rate.mean()) < 5 * 1000 / 64
     assert rate.std() == pytest.approx(1000, rel=0.06)

@@ -1,4 +1,4 @@
-"""Shots that are exposed in chunks while files of the chunk before are written, on a rig of plain numbers."""
+"""Shots that are exposed in chunks while files of the chunk before are written, on devices of plain numbers."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def test_shots_are_the_same_however_many_are_exposed_at_a_time(together: int, mo
     for name, (channels, metadata) in one.files.items():
         assert metadata == other.files[name][1]
         assert all(np.array_equal(values, other.files[name][0][channel]) for channel, values in channels.items())
-    for told in ("sensor_noise", "saturated", "noise_ratio", "dilution", "ambient_part", "noise_to_signal"):
-        assert getattr(first, told) == getattr(second, told)
+    for reported in ("sensor_noise", "saturated", "noise_ratio", "dilution", "ambient_part", "noise_to_signal"):
+        assert getattr(first, reported) == getattr(second, reported)
     electrons = np.array([channels["electrons"] for channels, _ in one.files.values()], dtype=np.float64)
     assert first.sensor_noise**2 * np.square(electrons).sum() == pytest.approx((electrons + 9).sum(), rel=1e-6)
 

@@ -38,14 +38,14 @@ def test_identity_and_provenance(small_scene: Callable[..., Path]) -> None:
     # Its light is what the mask diffracts: that of one line is other light. (Planted: left out.)
     assert identity["projector"]["lines_nm"] == [638.0, 520.0, 445.0]
     assert identity["projector"]["radiant_shares"] == [0.4757, 0.3348, 0.1895]
-    red = replace(bench, rig=replace(bench.rig, projector=bench.projector.at(638.0))).identity()
+    red = replace(bench, devices=replace(bench.devices, projector=bench.projector.at(638.0))).identity()
     assert red["projector"] == {**identity["projector"], "lines_nm": [638.0], "radiant_shares": [1.0]}
 
 
-@pytest.mark.parametrize("rig", [None, "0 0 1 50 0 1 0 -20 -1 0 0 30 0 0 0 1"])
-def test_parallax_tells_the_window_at_any_depth(small_scene: Callable[..., Path], rig: str | None) -> None:
+@pytest.mark.parametrize("pose", [None, "0 0 1 50 0 1 0 -20 -1 0 0 30 0 0 0 1"])
+def test_parallax_tells_the_window_at_any_depth(small_scene: Callable[..., Path], pose: str | None) -> None:
     """60 mm beside the camera, square to it: the same for both edges, to Mitsuba's single precision."""
-    bench = open_bench(small_scene(**({"rig": rig} if rig else {})))
+    bench = open_bench(small_scene(**({"pose": pose} if pose else {})))
     parallax = bench.parallax
     assert parallax.row_mm == pytest.approx((0, 0), abs=1e-3)
     assert parallax.column_mm == pytest.approx((-60, -60), abs=1e-3)
@@ -59,7 +59,7 @@ def test_parallax_of_a_region_is_seen_from_its_middle(small_scene: Callable[...,
     """Which lies 7 rows above and 8 columns beyond the axis. (Planted: seen from the axis.)"""
     bench = open_bench(small_scene())
     camera = bench.geometry.model_copy(update={"roi": (10, 20, 30, 40)})
-    parallax = replace(bench, rig=replace(bench.rig, camera=camera)).parallax
+    parallax = replace(bench, devices=replace(bench.devices, camera=camera)).parallax
     shift = 1 / 330 - 1 / parallax.depth_mm
     seen = (parallax.row_tan, parallax.row_mm), (parallax.column_tan, parallax.column_mm)
     for (tangents, edges), pixels, window in zip(seen, (-7, 8), bench.windows_at(330.0), strict=True):
@@ -67,10 +67,10 @@ def test_parallax_of_a_region_is_seen_from_its_middle(small_scene: Callable[...,
         assert np.add(tangents, np.multiply(edges, shift)) == pytest.approx(expected, abs=1e-6)
 
 
-@pytest.mark.parametrize("rig", [None, "0 0 1 50 0 1 0 -20 -1 0 0 30 0 0 0 1"])
-def test_the_board_faces_the_camera_wherever_it_stands(small_scene: Callable[..., Path], rig: str | None) -> None:
+@pytest.mark.parametrize("pose", [None, "0 0 1 50 0 1 0 -20 -1 0 0 30 0 0 0 1"])
+def test_the_board_faces_the_camera_wherever_it_stands(small_scene: Callable[..., Path], pose: str | None) -> None:
     """Its light is that of a sheet of that reflectance on the aligned plane, even where the scene has none."""
-    place = {} if rig is None else {"rig": rig}
+    place = {} if pose is None else {"pose": pose}
     bench = open_bench(small_scene(sheet_z=330, **place))
     sheet = open_bench(small_scene("sheet", **place), albedo="0.9")
 

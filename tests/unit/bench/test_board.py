@@ -141,8 +141,8 @@ def test_a_board_that_is_too_small_flags_the_session(bench: Bench) -> None:
     recipe = load_recipe()
     assert not Session(bench, recipe).board_warnings
     small = recipe.model_copy(update={"board": BoardShape(size_mm=100.0)})
-    (said,) = Session(bench, small).warnings
-    assert said.startswith("board: 112 of 256 projector pixels") and "the window is 120 x 120 mm" in said
+    (reported,) = Session(bench, small).warnings
+    assert reported.startswith("board: 112 of 256 projector pixels") and "the window is 120 x 120 mm" in reported
     large = recipe.model_copy(update={"board": BoardShape(size_mm=140.0)})
     assert not Session(bench, large).warnings
 

@@ -183,13 +183,13 @@ def test_a_new_effect_is_an_entry_and_its_physics(small_scene: Callable[..., Pat
     dimmed, full = tmp_path / "dimmed.toml", tmp_path / "full.toml"
     dimmed.write_text('name = "dimmed"\neffective_wavelength_nm = 562.0\n')
     full.write_text('name = "full"\neffective_wavelength_nm = 562.0\n')
-    rig = [str(small_scene()), "--patterns", "uniform", "--accuracy", "0.02", "--json"]
+    devices = [str(small_scene()), "--patterns", "uniform", "--accuracy", "0.02", "--json"]
     shot = ["--exposure", "0.01", "-o"]
     off, changed = "--effects=-dimming", ["--projector", str(dimmed)]
     calls = [
-        ["plan", *rig, "--projector", str(full)],
-        ["capture", *rig, *changed, *shot, str(tmp_path / "on")],
-        ["capture", *rig, *changed, off, *shot, str(tmp_path / "off")],
+        ["plan", *devices, "--projector", str(full)],
+        ["capture", *devices, *changed, *shot, str(tmp_path / "on")],
+        ["capture", *devices, *changed, off, *shot, str(tmp_path / "off")],
     ]
     command = [sys.executable, "-c", PROGRAM, json.dumps(calls)]
     done = subprocess.run(command, cwd=copy, capture_output=True, text=True, timeout=300, check=False)

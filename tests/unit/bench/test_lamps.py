@@ -95,7 +95,7 @@ def test_a_spot_lamp_is_taken_off(bench: Callable[[str], Bench], tmp_path: Path)
     """
     light = bench("spot").light("dots:2", accuracy=1e-2, seed=1)
     captured = light.expose("dots:2", tmp_path / "run")
-    manifest, exposer = captured.manifest, Exposer(light.bench.rig, captured.exposure_s, 0)
+    manifest, exposer = captured.manifest, Exposer(light.bench.devices, captured.exposure_s, 0)
     unit = float(exposer.electrons(_Unit()))
     assert not captured.warnings and manifest.ambient_frame is not None and manifest.ambient_frame.shots == 16
     dark = read_frame(tmp_path / "run" / "ambient.exr")[0]["electrons"].astype(float).mean()
@@ -141,11 +141,11 @@ def test_a_small_lamp_in_view_flags_the_plan(
     """
     path = small_scene(n=N, extra=extra)
     loaded = open_bench(path, variant).loaded
-    said = list(known_losses(loaded, {}))
-    assert bool(said) is seen and not list(known_losses(loaded, {"ambient": False}))
+    reported = list(known_losses(loaded, {}))
+    assert bool(reported) is seen and not list(known_losses(loaded, {"ambient": False}))
     if seen:
         line = 1 + path.read_text(encoding="utf-8").split('<emitter type="point"')[0].count("\n")
-        assert said[0].startswith(
+        assert reported[0].startswith(
             f"{path}:{line}: light: got 'point' in <emitter type='point'>; it shines on the sensor"
         )
 
@@ -175,13 +175,13 @@ def test_a_speck_that_shines_into_the_camera_flags_the_run(
     ignored, nothing in the way, every lamp.)"""
     path = small_scene(n=N, extra=extra, integrator="volpath")
     bench = open_bench(path, variant)
-    said = list(known_losses(bench.loaded, {}))
-    assert bool(said) is seen and not list(known_losses(bench.loaded, {"ambient": False}))
+    reported = list(known_losses(bench.loaded, {}))
+    assert bool(reported) is seen and not list(known_losses(bench.loaded, {"ambient": False}))
     by_reference = bench.render("reference", spp=4).warnings
     assert bool(by_reference) is seen
     if seen:
         line = 1 + path.read_text(encoding="utf-8").split('<shape type="sphere"')[0].count("\n")
-        for sentence in (*said, *by_reference):
+        for sentence in (*reported, *by_reference):
             assert sentence.startswith(
                 f"{path}:{line}: lamp: got 2.6e-05 of the field of view in <shape type='sphere'>"
             )

@@ -94,10 +94,10 @@ def test_a_bench_is_what_its_files_say(loader: Loader, scene: Path) -> None:
     """Parameters as a scene spells them; no file outside unless allowed; a scene to render needs no projector."""
     bench = open_bench(scene, "llvm_ad_mono", albedo=0.25, mask=True)
     assert bench.variant == "llvm_ad_mono" and dict(bench.defines) == {"albedo": "0.25", "mask": "true"}
-    assert bench.rig.camera is bench.loaded.camera.geometry and "IMX249" in bench.sensor.name
+    assert bench.devices.camera is bench.loaded.camera.geometry and "IMX249" in bench.sensor.name
     assert (
         "MP-CL1" in bench.projector.name
-        and bench.rig.camera_file == str(opening.check_devices(None, None)[0])
+        and bench.devices.camera_file == str(opening.check_devices(None, None)[0])
         and not loader.worn
     )
     open_bench(scene, "llvm_ad_rgb", allow_outside_files=True, for_render=True)
@@ -113,7 +113,7 @@ def test_a_bench_is_what_its_files_say(loader: Loader, scene: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("pitches", "said"),
+    ("pitches", "reported"),
     [
         ((0.01172, 0.011733), "pixel pitch is 11.72 um, but .* has 11.733 um"),
         ((0.011707, 0.01172), "row pitch is 11.72 um, but .* has 11.707 um"),
@@ -121,14 +121,14 @@ def test_a_bench_is_what_its_files_say(loader: Loader, scene: Path) -> None:
     ],
 )
 def test_pitches_are_the_scenes_to_a_thousandth(
-    loader: Loader, scene: Path, pitches: tuple[float, float], said: str | None
+    loader: Loader, scene: Path, pitches: tuple[float, float], reported: str | None
 ) -> None:
     """Along columns and down the rows. (Planted: one for the other; a shorter pitch let pass.)"""
     loader.pitches = pitches
-    if said is None:
+    if reported is None:
         open_bench(scene)
         return
-    with pytest.raises(MitsimError, match=said):
+    with pytest.raises(MitsimError, match=reported):
         open_bench(scene)
     open_bench(scene, for_render=True)
 
@@ -177,6 +177,6 @@ def test_a_mask_of_the_camera_is_worn_and_is_the_only_one(loader: Loader, scene:
     with pytest.raises(MitsimError, match="was set to 'mura' as well; give one of the two"):
         open_bench(scene, mask="mura")
     other = opening.reopened(bench, "llvm_ad_rgb")
-    assert loader.worn == ["mask", "mask"] and other.variant == "llvm_ad_rgb" and other.rig is bench.rig
+    assert loader.worn == ["mask", "mask"] and other.variant == "llvm_ad_rgb" and other.devices is bench.devices
     assert loader.asked[-1] == ("llvm_ad_rgb", scene, {"albedo": "0.25"}, {"outside": True})
     assert other.loaded is not bench.loaded

@@ -44,12 +44,12 @@ def test_seconds_or_an_accuracy() -> None:
     assert Request.of(**request.deciding) == request and "accuracy" not in request.deciding
     assert "seconds" not in Request.of().deciding and Request.of().deciding["accuracy"] == 1e-3
     for seconds in (1e-6, 10.0, LONGEST_S):
-        for other, named, said in (
+        for other, named, reported in (
             ({"accuracy": 1e-3}, "seconds", "give seconds or an accuracy, not both"),
             ({"noise_fraction": 0.1}, "noise_fraction", "give one of both"),
         ):
             for ask in (Request.of, Request.of(seconds=seconds).changed):
-                with pytest.raises(ArgumentError, match=f"^{named} .*: .*{said}$") as caught:
+                with pytest.raises(ArgumentError, match=f"^{named} .*: .*{reported}$") as caught:
                     ask(seconds=seconds, **other)
                 assert caught.value.argument == named
 

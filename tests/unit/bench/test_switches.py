@@ -4,7 +4,7 @@ import pytest
 
 from mitsim.bench.effects import EFFECTS, SWITCHES, parse_switches
 from mitsim.core.errors import MitsimError
-from tests.unit.planner.invented_evidence import plan, rows
+from tests.unit.planner.invented_pilot_result import plan, rows
 
 
 @pytest.mark.parametrize(

@@ -118,12 +118,12 @@ def test_a_session_by_the_plan_has_the_images_that_it_promised(bench: Any, plan:
 
 def test_its_light_is_that_of_the_session(bench: Any, plan: ms.CalibrationPlan) -> None:
     """A quarter of the mask's shadow is open where both rows and columns are: the mean is less than the peak's half."""
-    said = plan.payload()
+    reported = plan.payload()
     peak = plan.recipe.exposure_fraction * bench.sensor.superpixel_full_well_e
     assert 0.05 * peak < plan.electrons < 0.5 * peak
     assert plan.photons == pytest.approx(plan.electrons / bench.sensor.quantum_efficiency)
-    assert said["exposure_total_s"] == pytest.approx(plan.frames * plan.exposure_s)
-    assert said["electrons_a_pixel_total"] == pytest.approx(plan.frames * plan.electrons)
+    assert reported["exposure_total_s"] == pytest.approx(plan.frames * plan.exposure_s)
+    assert reported["electrons_a_pixel_total"] == pytest.approx(plan.frames * plan.electrons)
     assert plan.simulation_s > 0 and "30 dB under dots:2" in plan.lines()[0]
 
 

@@ -162,12 +162,12 @@ def test_a_turned_mask_casts_the_shadow_that_rays_through_it_make() -> None:
 
     row, column = 3, 12
     change = frame(angle, row, column) - frame(0.0, row, column)
-    said = sum(angle * np.outer(left[:, row], right[:, column]) for left, right in model.turned(model.built))
-    assert np.linalg.norm(said) > 0.02 * np.linalg.norm(frame(0.0, row, column))
+    reported = sum(angle * np.outer(left[:, row], right[:, column]) for left, right in model.turned(model.built))
+    assert np.linalg.norm(reported) > 0.02 * np.linalg.norm(frame(0.0, row, column))
     falloff = np.prod([(1 + tau[points * each : points * (each + 1)].mean() ** 2) ** -2 for each in (row, column)])
-    said = said / falloff
-    assert np.vdot(said, change) / np.vdot(said, said) == pytest.approx(1, abs=0.1)
-    assert np.linalg.norm(said - change) < 0.7 * np.linalg.norm(change)
+    reported = reported / falloff
+    assert np.vdot(reported, change) / np.vdot(reported, reported) == pytest.approx(1, abs=0.1)
+    assert np.linalg.norm(reported - change) < 0.7 * np.linalg.norm(change)
 
 
 @pytest.mark.parametrize("spectrum", [None, LINE])
@@ -199,7 +199,7 @@ def test_frames_are_chosen_from_coarse_to_fine_and_counted() -> None:
 
 
 def test_words_are_checked() -> None:
-    for wrong, said in (
+    for wrong, reported in (
         (
             {"model": "wave", "fitted": ("projector_row", "mask_shift_row")},
             "fit mask_shift_row,projector_row: both move",
@@ -208,7 +208,7 @@ def test_words_are_checked() -> None:
         ({"model": "wave", "frames": 1}, "frames_used 1: give 2 or more"),
         ({"model": "wave", "fitted": ("tilt",)}, "fit 'tilt': use names of mask_distance"),
     ):
-        with pytest.raises(ArgumentError, match=said):
+        with pytest.raises(ArgumentError, match=reported):
             Modelling(**wrong)  # type: ignore[arg-type]
     assert Modelling("wave", fitted=("magnification",)).free == ("magnification", "gain")
     assert tuple(UNITS) == tuple(Placement.__dataclass_fields__)

@@ -23,7 +23,7 @@ from mitsim.calibrate.checkpoint import Checkpoint
 from mitsim.calibrate.lit_session import LitSession, _Shot
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
-from mitsim.devices.camera import Rig
+from mitsim.devices.camera import Devices
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.sensor import SensorModel, digital_of
 from mitsim.devices.session import SIDES, load_recipe
@@ -44,13 +44,13 @@ SENSOR = SensorModel(
 )
 PIXELS = 24
 EXPOSURE_S = 0.02
-RIG = Rig(
+DEVICES = Devices(
     camera=SimpleNamespace(mask="separable"),
     sensor=SENSOR,
     projector=SimpleNamespace(effective_wavelength_nm=550.0),
     camera_file="none",
 )
-CLIPPED = replace(RIG, sensor=SENSOR.model_copy(update={"full_well_e": 1.3e3, "bits": 12}))
+CLIPPED = replace(DEVICES, sensor=SENSOR.model_copy(update={"full_well_e": 1.3e3, "bits": 12}))
 """A camera whose full well the toy's uniform light fills by 0.3, dark electrons too, and overfills here and there at
 three times the exposure."""
 
@@ -62,7 +62,7 @@ class ToyLight:
         rng = np.random.default_rng(n)
         self.left, self.right = 30 * rng.random((PIXELS, n)), 20 * rng.random((PIXELS + 3, n))
         self.simulation = SimpleNamespace(physics=SimpleNamespace(black_level=leak))
-        self.unit = float(Exposer(RIG, 1.0, 0).electrons(Frame(np.ones(1), 0.0, 0.0, 0.0))[0])
+        self.unit = float(Exposer(DEVICES, 1.0, 0).electrons(Frame(np.ones(1), 0.0, 0.0, 0.0))[0])
 
     def frames(self, lighting: Lighting, _: int, leaking: bool = True) -> list[Frame]:
         n, leak = self.left.shape[1], self.simulation.physics.black_level if leaking else 0.0
@@ -72,13 +72,13 @@ class ToyLight:
 
 
 def lit_session(
-    n: int = 7, mode: str = "pair", mask: str = "separable", rig: Rig = RIG, **recipe_fields: object
+    n: int = 7, mode: str = "pair", mask: str = "separable", devices: Devices = DEVICES, **recipe_fields: object
 ) -> LitSession:
     recipe = load_recipe().model_copy(update={"signed_capture": mode, **recipe_fields})
     bench = SimpleNamespace(
         n=n,
-        rig=rig,
-        sensor=rig.sensor,
+        devices=devices,
+        sensor=devices.sensor,
         geometry=SimpleNamespace(centred=mask == "flatcam", frame_shape=(PIXELS, PIXELS + 3)),
     )
     light = ToyLight(n)
@@ -137,10 +137,10 @@ def test_a_flatcam_s_responses_are_centred() -> None:
 
 
 def test_progress_of_each_side_rises_to_the_whole() -> None:
-    told: list[tuple[str, float]] = []
-    estimate(lit_session(29), Job(progress=lambda stage, part: told.append((stage, part))))
+    reported: list[tuple[str, float]] = []
+    estimate(lit_session(29), Job(progress=lambda stage, part: reported.append((stage, part))))
     for side in SIDES:  # 16 patterns at once, of 32 less the first, which is the uniform one
-        assert [part for stage, part in told if stage == f"{side} stripes"] == [17 / 32, 1.0]
+        assert [part for stage, part in reported if stage == f"{side} stripes"] == [17 / 32, 1.0]
 
 
 # ---- shots -----------------------------------------------------------------------------------------------------------
@@ -386,7 +386,7 @@ def test_frames_of_a_session_in_a_folder_give_its_factors_bit_for_bit(
 ) -> None:
     """Shots are numbered in the order that a folder's names have. (Planted: the exposure divided before the gain, dark
     frames not merged, repeats and exposures in the other order.)"""
-    lit, shoot = lit_session(mode=mode, rig=CLIPPED, **more), Exposer.digital
+    lit, shoot = lit_session(mode=mode, devices=CLIPPED, **more), Exposer.digital
     dark = []
 
     def kept(self: Exposer, electrons: FloatArray, *names: str | int) -> Digital:
@@ -455,7 +455,7 @@ def test_responses_have_the_mean_and_the_noise_of_the_closed_form(mode: str, mor
     without weights, saturated ones too, the weights themselves in the variance, weights by
     a frame that they merge.)
     """
-    lit, seeds = lit_session(7, mode, rig=CLIPPED, **more), 12
+    lit, seeds = lit_session(7, mode, devices=CLIPPED, **more), 12
     total, squares, saturated = 0.0, 0.0, 0
     for seed in range(seeds):
         own = replace(lit, session=replace(lit.session, seed=seed))
@@ -468,4 +468,4 @@ def test_responses_have_the_mean_and_the_noise_of_the_closed_form(mode: str, mor
     assert float(np.mean(variance)) == pytest.approx(lit.response_noise**2, rel=0.03)
     assert np.abs(total / np.sqrt(seeds * variance.mean())).max() < 7  # of pixels up to twice as noisy as the mean
     if "exposure_ladder" in more:
-        assert lit.response_noise < 0.8 * lit_session(7, mode, rig=CLIPPED).response_noise
+        assert lit.response_noise < 0.8 * lit_session(7, mode, devices=CLIPPED).response_noise

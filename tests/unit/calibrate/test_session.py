@@ -276,7 +276,7 @@ def test_frames_that_are_written_give_the_same_factors_bit_for_bit(
     parallax in the list.)"""
     bench = open_bench(shared_scene("written16", n=16))
     if ending == ".npy":
-        bench = replace(bench, rig=replace(bench.rig, sensor=bench.sensor.model_copy(update={"bits": None})))
+        bench = replace(bench, devices=replace(bench.devices, sensor=bench.sensor.model_copy(update={"bits": None})))
     own = recipe("pair").model_copy(update=more)
     simulated = bench.write_session(tmp_path / "frames", tmp_path / "cal", 3, recipe=own)
     found = calibrate_frames(tmp_path / "frames")

@@ -24,9 +24,9 @@ def test_a_file_that_ends_too_early_is_no_interrupt(
     assert ended.value.code == 2 and "EOFError: no data left" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("by", "status", "said"), [(None, 2, "no variant"), (signal.SIGINT, 130, "interrupted")])
+@pytest.mark.parametrize(("by", "status", "reported"), [(None, 2, "no variant"), (signal.SIGINT, 130, "interrupted")])
 def test_an_error_that_an_interrupt_became_is_an_interrupt(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], by: int | None, status: int, said: str
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], by: int | None, status: int, reported: str
 ) -> None:
     """Control-C while an extension initialises is an ImportError of that. (Planted: told as that error.)"""
 
@@ -37,4 +37,4 @@ def test_an_error_that_an_interrupt_became_is_an_interrupt(
     monkeypatch.setattr(worker, "_stopped_by", by)
     with pytest.raises(SystemExit) as ended:
         cli.run()
-    assert ended.value.code == status and capsys.readouterr().err == f"mitsim: {said}\n"
+    assert ended.value.code == status and capsys.readouterr().err == f"mitsim: {reported}\n"

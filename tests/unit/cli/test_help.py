@@ -28,9 +28,9 @@ def described(command: Any) -> dict[str, Any]:
         name = " ".join(parameter.opts) if parameter.param_type_name == "option" else parameter.name
         default = parameter.default
         # These grow with their registries.
-        said = parameter.help.replace(pattern_names(), "PATTERNS").replace(method_names(), "METHODS")
+        reported = parameter.help.replace(pattern_names(), "PATTERNS").replace(method_names(), "METHODS")
         options[name] = {
-            "help": said,
+            "help": reported,
             "metavar": parameter.metavar,
             "default": default if isinstance(default, str | int | float | None) else str(default),
             "shown": parameter.show_default,

@@ -148,9 +148,9 @@ def cut_short(path: Path) -> None:
 def test_what_is_no_frame_is_refused(tmp_path: Path, name: str, write: Write, words: str) -> None:
     """(Planted: 4 bits read as Pillow gives them; white for black.)"""
     write(tmp_path / name)
-    with pytest.raises(MitsimError) as told:
+    with pytest.raises(MitsimError) as reported:
         read_image(tmp_path / name)
-    line = str(told.value)
+    line = str(reported.value)
     assert words in line and line.startswith(f"frame {tmp_path / name}: ") and "\n" not in line
 
 

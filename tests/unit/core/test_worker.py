@@ -69,10 +69,10 @@ sys.exit(3)
 def test_a_worker_ends_once_all_is_done_and_takes_nothing_apart() -> None:
     """(Planted: no flush; ended at once instead of at exit; a status of none that is noted.)"""
     process = start(LEAVING)
-    said = "unflushed\nthread\nexit function\n"
-    assert (*process.communicate(), process.returncode) == (said, "", 3)
+    reported = "unflushed\nthread\nexit function\n"
+    assert (*process.communicate(), process.returncode) == (reported, "", 3)
     process = start(LEAVING.replace("(3)", "('words')"))
-    assert (*process.communicate(), process.returncode) == (said + "taken apart", "words\n", 1)
+    assert (*process.communicate(), process.returncode) == (reported + "taken apart", "words\n", 1)
 
 
 @pytest.mark.parametrize(

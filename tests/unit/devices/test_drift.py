@@ -42,11 +42,11 @@ def test_a_ripple_has_a_frequency_and_keeps_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "amount", "said"),
+    ("kind", "amount", "reported"),
     [("speed", 1, "no such kind"), ("power", -2, "power"), ("mask_tilt_rows_mrad", 51, "50")],
 )
-def test_what_cannot_be_is_one_line(kind: str, amount: float, said: str) -> None:
-    with pytest.raises(MitsimError, match=rf"^drift[^\n]*{said}[^\n]*$"):
+def test_what_cannot_be_is_one_line(kind: str, amount: float, reported: str) -> None:
+    with pytest.raises(MitsimError, match=rf"^drift[^\n]*{reported}[^\n]*$"):
         Drift().alone(kind, amount)
 
 

@@ -34,7 +34,7 @@ def test_a_camera_captures_as_its_file_says_or_is_told_what_it_lacks(camera: Pat
     assert "characterise" in verbs and {*verbs} <= {"capture", "sense", "characterise"}
     assert ("sense" in verbs) == (sensor.states_efficiency and sensor.mosaic is None)
     if "capture" in verbs and sensor.mosaic is None:
-        assert open_bench("photograph", camera=camera).rig.sensor == sensor
+        assert open_bench("photograph", camera=camera).devices.sensor == sensor
         return
     with pytest.raises(MitsimError) as caught:
         open_bench("photograph", camera=camera)

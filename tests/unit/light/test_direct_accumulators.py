@@ -1,4 +1,4 @@
-"""Direct light that is filed on the device: what the host files of the same paths, place by place."""
+"""Direct light that is accumulated on the device: what the host accumulates of the same paths, place by place."""
 
 import math
 from collections.abc import Callable
@@ -53,8 +53,8 @@ def both(simulation: Simulation, name: str, labels: np.ndarray) -> tuple[LightEs
 @pytest.mark.parametrize("name", ["anchor_residual", "sharp"])
 def test_the_device_adds_up_what_the_host_does(bench: Bench, name: str) -> None:
     """Light between layers and between cells is split, not drawn. (Planted: rows and columns of anchors exchanged; the
-    nearer layer's part for the farther; the first cell of two alone; what lies outside filed as the first anchor's;
-    pixels' rows for classes'.)"""
+    nearer layer's part for the farther; the first cell of two alone; what lies outside accumulated as the first
+    anchor's; pixels' rows for classes'.)"""
     labels = np.random.default_rng(1).integers(0, 5, N * N)
     host, device = both(Simulation(bench, SETTINGS), name, labels)
     expected, found = (light[name].toarray() for light in (host, device))
@@ -92,5 +92,5 @@ def test_the_middle_of_the_sharpest_lobe_is_light(bench: Bench, variant: str) ->
     accumulator = simulation.accumulator("anchor_residual", np.zeros(N * N, dtype=np.int64), 1)
     for place, light in enumerate([10 * brightest * board, 1e-5 * board]):
         accumulator.add([mi.Float(light)], mi.UInt32(0), mi.UInt32(place))
-    filed, *_ = accumulator.fetch()[0].light()
-    np.testing.assert_allclose(filed.toarray()[0, :2] / board, [10 * brightest, 1e-5], rtol=0.02)
+    accumulated, *_ = accumulator.fetch()[0].light()
+    np.testing.assert_allclose(accumulated.toarray()[0, :2] / board, [10 * brightest, 1e-5], rtol=0.02)

@@ -29,7 +29,7 @@ from mitsim.planner import choose, planner
 from mitsim.planner.choose import Candidate
 from mitsim.planner.explain import SceneFacts
 from mitsim.planner.planner import make_plan
-from tests.unit.planner.invented_evidence import PILOT_RESULT
+from tests.unit.planner.invented_pilot_result import PILOT_RESULT
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
 N = 16
@@ -114,11 +114,11 @@ def test_shots_that_are_looked_at(
     may strike another; again after each round. (Planted: eight always.)"""
     target, asked = plan.sampling_target, []
 
-    def told(frames: ExpectedFrames) -> tuple[float, float]:
+    def reported(frames: ExpectedFrames) -> tuple[float, float]:
         asked.append(len(frames))
         return 0.5 * target, 2 * target if len(asked) == 1 else 0.5 * target
 
-    monkeypatch.setattr(ExpectedFrames, "sampling_error", told)
+    monkeypatch.setattr(ExpectedFrames, "sampling_error", reported)
     monkeypatch.setattr("mitsim.light.light.tells_all", lambda *_: classes_tell)
     monkeypatch.setattr("mitsim.light.light.CHECKED_SHOTS", 8)
     plan = replace(plan, settings=replace(plan.settings, effects=frozenset(effects)))
@@ -139,13 +139,13 @@ def test_the_next_round_is_for_the_error_where_few_paths_make_the_bound(
 ) -> None:
     """Where many tell it, for the bound; never more than that. (Planted: for the bound always, for the error always,
     no power of the bound.)"""
-    target, looks = plan.sampling_target, []
+    target, runs = plan.sampling_target, []
 
-    def told(frames: ExpectedFrames) -> tuple[float, float]:
-        looks.append(frames)
-        return (0.0, 0.0) if len(looks) > 1 else (error * target, bound * target)
+    def reported(frames: ExpectedFrames) -> tuple[float, float]:
+        runs.append(frames)
+        return (0.0, 0.0) if len(runs) > 1 else (error * target, bound * target)
 
-    monkeypatch.setattr(ExpectedFrames, "sampling_error", told)
+    monkeypatch.setattr(ExpectedFrames, "sampling_error", reported)
     monkeypatch.setattr(module, "tells_all", lambda *_: True)
     asked = []
 
@@ -161,13 +161,13 @@ def test_light_that_needs_less_than_a_sample_takes_one_and_every_round_grows(
     bench: Bench, plan: Plan, family: Lighting, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """(Planted: two samples for what needs less; rounds in which nothing grows.)"""
-    target, looks = plan.sampling_target, list[ExpectedFrames]()
+    target, runs = plan.sampling_target, list[ExpectedFrames]()
 
-    def told(frames: ExpectedFrames) -> tuple[float, float]:
-        looks.append(frames)
-        return (1.1 * target, 1.2 * target) if len(looks) < 3 else (0.0, 0.0)
+    def reported(frames: ExpectedFrames) -> tuple[float, float]:
+        runs.append(frames)
+        return (1.1 * target, 1.2 * target) if len(runs) < 3 else (0.0, 0.0)
 
-    monkeypatch.setattr(ExpectedFrames, "sampling_error", told)
+    monkeypatch.setattr(ExpectedFrames, "sampling_error", reported)
     samples = {"direct": 0.1, "indirect": 3.0, "indirect_residual": 0.5, "camera_residual": 0.02}
     samples = {**plan.settings.samples, **samples}
     settings = replace(plan.settings, effects=frozenset(FAR), followed_anchors=2, samples=samples)
@@ -307,9 +307,9 @@ def test_light_for_another_family_says_how_much_worse_its_frames_are(bench: Benc
     (found,) = light.expose("dots:8").warnings
     assert found.startswith("the total error is up to") and found.endswith("trace it for dots:8")
     lax = replace(light, plan=replace(light.plan, accuracy=0.1))
-    with pytest.warns(UserWarning, match=r"traced for uniform, .* trace it for dots:8$") as said:
+    with pytest.warns(UserWarning, match=r"traced for uniform, .* trace it for dots:8$") as message:
         shots = lax.expose("dots:8")
-    assert len(said) == 1 and not shots.warnings
+    assert len(message) == 1 and not shots.warnings
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert not lax.expose("uniform").warnings
@@ -349,7 +349,9 @@ def test_sampling_is_checked_without_what_black_pixels_leak(bench: Bench, plan: 
 
     (Planted: ``leaking`` not heeded.)
     """
-    grey = replace(bench, rig=replace(bench.rig, projector=bench.projector.model_copy(update={"contrast_ratio": 20.0})))
+    grey = replace(
+        bench, devices=replace(bench.devices, projector=bench.projector.model_copy(update={"contrast_ratio": 20.0}))
+    )
     with_black = replace(plan, settings=replace(plan.settings, effects=plan.settings.effects | {"black-level"}))
     light = trace_light(grey, with_black, family, 3)
     ours = stacked(light.frames(family, 3, leaking=False))
@@ -379,7 +381,7 @@ def test_a_heavy_path_in_a_shot_that_is_not_checked_is_seen() -> None:
     assert max(ratios(heavy, [0, 5, 14])) == 1.0, "what is checked is in the error already"
 
 
-def test_paces_are_measured_of_what_was_chosen_alone(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unit_costs_are_measured_of_what_was_chosen_alone(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """Direct light and its anchors, of a machine that takes 0.1 us a path; other kinds keep what they had. (Planted:
     seconds of a sample, not of a path.)"""
     monkeypatch.setattr(

@@ -11,7 +11,16 @@ from mitsim.bench.request import check_accuracy
 from mitsim.core.errors import MitsimError
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Approximation, Drawn, Estimate
-from tests.unit.planner.invented_evidence import ACCURACIES, FACTS, ONE_CLASS, PILOT_RESULT, SIZES, changes, plan, rows
+from tests.unit.planner.invented_pilot_result import (
+    ACCURACIES,
+    FACTS,
+    ONE_CLASS,
+    PILOT_RESULT,
+    SIZES,
+    changes,
+    plan,
+    rows,
+)
 
 
 def test_effects_that_the_scene_does_not_have_stay_off() -> None:
@@ -157,7 +166,7 @@ def test_what_a_masks_raster_leaves_is_in_the_budget() -> None:
     assert loose.systematic_bound >= 4e-3 and loose.systematic_error >= 3e-3
     assert "on a raster" in loose.row("mask-shadow").reason
     fine = plan(3.9e-3, drawn)
-    assert any("largest: the mask's raster, 4.0e-03" in told for told in fine.warnings)
+    assert any("largest: the mask's raster, 4.0e-03" in reported for reported in fine.warnings)
     assert not plan(3.9e-3, drawn, "-diffraction").settings.raster and not plan(3.9e-3).warnings
 
 

@@ -168,7 +168,7 @@ def test_the_next_round_lowers_the_variance_by_what_is_missing_and_a_twentieth()
     assert grown(1e200) == 6000
 
 
-def test_work_is_that_of_paths_at_fixed_paces() -> None:
+def test_work_is_that_of_paths_at_fixed_unit_costs() -> None:
     """Shared light counts for several, and light at anchors has a pace of its own: of two lights with the same variance
     the one of less work grows. (Planted: one pace for all, shared light counted once.)"""
     shared = PathReuseTracer.__new__(PathReuseTracer)

@@ -163,7 +163,7 @@ def test_indirect_light_goes_to_its_own_cells(bench: Bench) -> None:
 
 
 def test_anchors_file_only_what_differs_from_the_mean(bench: Bench) -> None:
-    """Weighed by the mean anchor weights, what is filed for single anchors adds up to nothing."""
+    """Weighed by the mean anchor weights, what is accumulated for single anchors adds up to nothing."""
     made = simulation(bench, anchors=2)
     seen = made.anchored.trace(2, 0, 4)
     light = made.accumulate("anchor_residual", seen, np.zeros(N * N, dtype=np.int64), 4)["anchor_residual"]

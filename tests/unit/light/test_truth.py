@@ -179,7 +179,7 @@ def test_it_is_refined_as_far_as_the_frames_need(bench: Bench, monkeypatch: pyte
 
 
 def test_samples_go_where_a_ray_takes_off_most() -> None:
-    """Numbers double; noisy pixels have more; what is foretold is left, or all samples are spent.
+    """Numbers double; noisy pixels have more; what is predicted is left, or all samples are spent.
 
     (Planted: the variance of one sample for that of those taken; the cheapest step last.)
     """
@@ -213,7 +213,7 @@ def test_pixels_without_light_have_no_truth_and_no_error(bench: Bench, small_sce
 
 def test_lens_and_pixels_of_the_plan_shape_it(bench: Bench) -> None:
     """A blurred spot blurs the truth, as long as the plan simulates it."""
-    rig = replace(bench.rig, projector=bench.projector.model_copy(update={"blur_pixels": 2.0}))
-    blurred = partial(trace_truth, replace(bench, rig=rig), seed=0, flux_error=np.full(N * N, np.inf))
+    devices = replace(bench.devices, projector=bench.projector.model_copy(update={"blur_pixels": 2.0}))
+    blurred = partial(trace_truth, replace(bench, devices=devices), seed=0, flux_error=np.full(N * N, np.inf))
     sharp, soft = (blurred(Settings(Z, effects=effects)).reflectance for effects in (frozenset(), frozenset({"blur"})))
     assert soft[4:12, 4:12].std() < 0.7 * sharp[4:12, 4:12].std(), "and noise"

@@ -9,7 +9,7 @@ from scipy import sparse
 
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.patterns import Lighting
-from mitsim.optics.forming import Filed
+from mitsim.optics.forming import AccumulatedLight
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions
@@ -47,8 +47,8 @@ LABELS = np.arange(PIXELS) % 4
 
 
 def expected_frames(optics, groups, labels, weights, seed, more=(), **others) -> ExpectedFrames:
-    """Frames of ``groups`` in the cells of ``optics``, and of light filed elsewhere."""
-    return ExpectedFrames([Filed(optics, tuple(groups)), *more], Lighting(labels, weights), seed, **others)
+    """Frames of ``groups`` in the cells of ``optics``, and of light accumulated elsewhere."""
+    return ExpectedFrames([AccumulatedLight(optics, tuple(groups)), *more], Lighting(labels, weights), seed, **others)
 
 
 FAMILIES = {

@@ -7,7 +7,7 @@ from scipy.linalg import hadamard
 
 from mitsim.optics import forming
 from mitsim.optics import frames as frames_module
-from mitsim.optics.forming import Filed, _product, pair_shots
+from mitsim.optics.forming import AccumulatedLight, _product, pair_shots
 from mitsim.optics.frames import ClassFrames, ExpectedFrames, Frame, at_once, formed_frames, frames_in_memory, mixes
 from mitsim.optics.image_formation import FrameOptics
 from tests.unit.optics.small_camera import (
@@ -123,7 +123,7 @@ def test_shots_of_a_class_each_are_formed_where_the_classes_lay(
     weights = black + most * np.eye(4)[[2, 0, 3, 1]]
     sides = np.where(np.arange(CELLS**2) % CELLS < CELLS // 2, -1.0, 1.5)
     light = [sparse.csr_array(group.toarray() * sides) for group in random_groups(3, 7, 0.2)]
-    ambient = [Filed(small_optics(), ambient_groups(3))] if lamps else []
+    ambient = [AccumulatedLight(small_optics(), ambient_groups(3))] if lamps else []
 
     def formed() -> list[list[Frame]]:
         expected = expected_frames(small_optics(), light, LABELS, weights, 5, ambient=ambient)
@@ -185,7 +185,7 @@ def test_ambient_light_is_in_every_capture_alike(family: str) -> None:
     weights[1] = 0
     optics, groups, lamps = small_optics(), random_groups(3, 7, 0.2), ambient_groups(3)
     plain = list(expected_frames(optics, groups, labels, weights, 5))
-    lit = expected_frames(optics, groups, labels, weights, 5, ambient=[Filed(optics, lamps)])
+    lit = expected_frames(optics, groups, labels, weights, 5, ambient=[AccumulatedLight(optics, lamps)])
     mean = np.asarray(sum(lamps[1:], lamps[0]).todense()).ravel() / 3
     expected = optics.frame(np.arange(CELLS**2), mean)
     for with_lamps, without in zip(lit, plain, strict=True):
@@ -203,9 +203,16 @@ def test_ambient_light_is_in_every_capture_alike(family: str) -> None:
 def test_ambient_light_of_two_kinds() -> None:
     """Fine and coarse cells: their frames add, and so do the deviations of paired groups, before they are squared."""
     optics, groups, lamps, others = small_optics(), random_groups(3, 7, 0.2), ambient_groups(3), ambient_groups(3, 32)
-    apart = expected_frames(optics, groups, LABELS, np.eye(4), 5, ambient=[Filed(optics, lamps), Filed(optics, others)])
+    apart = expected_frames(
+        optics,
+        groups,
+        LABELS,
+        np.eye(4),
+        5,
+        ambient=[AccumulatedLight(optics, lamps), AccumulatedLight(optics, others)],
+    )
     summed = tuple(a + b for a, b in zip(lamps, others, strict=True))
-    alike(apart, expected_frames(optics, groups, LABELS, np.eye(4), 5, ambient=[Filed(optics, summed)]))
+    alike(apart, expected_frames(optics, groups, LABELS, np.eye(4), 5, ambient=[AccumulatedLight(optics, summed)]))
 
 
 def test_ambient_light_has_a_shadow_of_its_own() -> None:
@@ -213,7 +220,7 @@ def test_ambient_light_has_a_shadow_of_its_own() -> None:
     edges = np.linspace(*WINDOW, CELLS + 1)
     other = cell_optics(CAMERA.model_copy(update={"pixels": 40, "pixel_pitch": 0.15, "mask": "open"}), edges, edges)
     groups = random_groups(2, 7, 0.2)
-    frames = expected_frames(optics, groups, LABELS, np.eye(4), 0, ambient=[Filed(other, lamps)])
+    frames = expected_frames(optics, groups, LABELS, np.eye(4), 0, ambient=[AccumulatedLight(other, lamps)])
     plain = expected_frames(optics, groups, LABELS, np.eye(4), 0)
     mean = np.asarray((lamps[0] + lamps[1]).todense()).ravel() / 2
     expected = other.frame(np.arange(CELLS**2), mean)
@@ -225,7 +232,7 @@ def test_more_light_adds_to_the_light_of_its_rows(family: str) -> None:
     """Filed in the same cells it is as if it had been added; errors of one path go together, so they add first."""
     labels, weights = BESIDE[family]
     optics, groups, more = small_optics(), random_groups(3, 7, 0.2), random_groups(3, 8, 0.2)
-    apart = expected_frames(optics, groups, labels, weights, 5, more=[Filed(optics, tuple(more))])
+    apart = expected_frames(optics, groups, labels, weights, 5, more=[AccumulatedLight(optics, tuple(more))])
     alike(apart, expected_frames(optics, [a + b for a, b in zip(groups, more, strict=True)], labels, weights, 5))
 
 
@@ -235,7 +242,7 @@ def test_more_light_in_cells_of_its_own() -> None:
     coarse, optics = cell_optics(camera, edges, edges), small_optics()
     groups = random_groups(2, 7, 0.2)
     more = tuple(sparse.csr_array(np.random.default_rng(seed).random((PIXELS, 9))) for seed in (1, 2))
-    frames = expected_frames(optics, groups, LABELS, np.eye(4), 0, more=[Filed(coarse, more)])
+    frames = expected_frames(optics, groups, LABELS, np.eye(4), 0, more=[AccumulatedLight(coarse, more)])
     plain = expected_frames(optics, groups, LABELS, np.eye(4), 0)
     light = np.asarray((more[0] + more[1]).todense())[LABELS == 2].sum(axis=0) / 2
     difference = list(frames)[2].irradiance - list(plain)[2].irradiance
@@ -250,7 +257,7 @@ def test_exact_frames_are_mixed_by_the_weights(family: str) -> None:
     optics, groups = small_optics(8), random_groups(2, 7, 0.2)
     brought = np.random.default_rng(3).random((2, 8, 8))
     exact = ClassFrames(np.array([1, 3]), brought)
-    with_it = list(expected_frames(optics, groups, labels, weights, 0, glint=exact))
+    with_it = list(expected_frames(optics, groups, labels, weights, 0, specular=exact))
     without = list(expected_frames(optics, groups, labels, weights, 0))
     assert len(with_it) == len(weights)
     for found, plain, row in zip(with_it, without, weights, strict=True):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from mitsim.optics.forming import Filed, bound_of, probe_vectors, shares_of_bound
+from mitsim.optics.forming import AccumulatedLight, bound_of, probe_vectors, shares_of_bound
 from mitsim.optics.frames import ClassFrames, monte_carlo_bound, monte_carlo_error
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions
@@ -54,17 +54,20 @@ def test_the_sampling_error_is_told_without_frames(family: str) -> None:
     """That of the frames, and its bound, but for the energy, which the same signs tell.
 
     Nearly all energy is in the frames' means over columns, which are told exactly; of the rest eight signs tell a
-    half. Ambient light and glint are large parts of it: either left out would move the error by more than the gate.
+    half. Ambient light and specular chains are large parts of it: either left out would move the error by more than the
+    gate.
     """
     labels, weights = BESIDE[family]
     optics, groups, lamps = small_optics(), random_groups(4, 7, 0.3), ambient_groups(4)
     bright = next(iter(expected_frames(optics, groups, labels, weights, 0))).irradiance.mean()
     exact = ClassFrames(np.array([1, 3]), bright * np.random.default_rng(3).random((2, 40, 40)))
-    frames = expected_frames(optics, groups, labels, weights, 0, ambient=[Filed(optics, lamps)], glint=exact)
+    frames = expected_frames(
+        optics, groups, labels, weights, 0, ambient=[AccumulatedLight(optics, lamps)], specular=exact
+    )
     error, bound = frames.sampling_error()
     assert error == pytest.approx(monte_carlo_error(frames), rel=0.02)
     assert bound / error == pytest.approx(monte_carlo_bound(frames) / monte_carlo_error(frames), rel=1e-9)
-    for without in ({"glint": exact}, {"ambient": [Filed(optics, lamps)]}):
+    for without in ({"specular": exact}, {"ambient": [AccumulatedLight(optics, lamps)]}):
         other, _ = expected_frames(optics, groups, labels, weights, 0, **without).sampling_error()
         assert other != pytest.approx(monte_carlo_error(frames), rel=0.02)
 
@@ -76,9 +79,9 @@ def test_noise_is_told_by_light(family: str) -> None:
     (Planted: ambient light counted once, classes weighed by their share and not its square.)
     """
     labels, weights = BESIDE[family]
-    optics, lamps = small_optics(), Filed(small_optics(), ambient_groups(4))
+    optics, lamps = small_optics(), AccumulatedLight(small_optics(), ambient_groups(4))
     lights = [random_groups(4, seed, spread) for seed, spread in ((7, 0.3), (8, 0.1))]
-    more = [Filed(optics, tuple(lights[1]))]
+    more = [AccumulatedLight(optics, tuple(lights[1]))]
     by_light, by_ambient = expected_frames(optics, lights[0], labels, weights, 0, more, ambient=[lamps]).noise
 
     # Where shots are mixed, classes are formed, whose noise is taken for independent.

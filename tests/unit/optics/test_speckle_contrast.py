@@ -8,7 +8,7 @@ from scipy.special import ndtri
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.devices.camera import CameraGeometry, Rig
+from mitsim.devices.camera import CameraGeometry, Devices
 from mitsim.devices.projector import Coherence, ProjectorModel
 from mitsim.optics.speckle import contrast_of
 from tests.invented import sensor
@@ -19,7 +19,9 @@ WAVELENGTH = 600.0
 LINES = (638.0, 520.0, 445.0)
 
 
-def rig(mask: str = "open", pitch: float = PITCH, lines: tuple[float, ...] = (WAVELENGTH,), **coherence: float) -> Rig:
+def devices(
+    mask: str = "open", pitch: float = PITCH, lines: tuple[float, ...] = (WAVELENGTH,), **coherence: float
+) -> Devices:
     camera = CameraGeometry(
         pixels=8, pixel_pitch=pitch, mask=mask, mask_feature=FEATURE, mask_distance=MASK, scene_distance=DISTANCE
     )
@@ -27,7 +29,7 @@ def rig(mask: str = "open", pitch: float = PITCH, lines: tuple[float, ...] = (WA
         name="laser", effective_wavelength_nm=WAVELENGTH, wavelengths_nm=lines,
         radiant_shares=tuple(1 / wave for wave in lines), speckle=Coherence(**coherence),
     )  # fmt: skip
-    return Rig(camera, sensor(), projector, "test")
+    return Devices(camera, sensor(), projector, "test")
 
 
 def codes(rng: np.random.Generator, points: np.ndarray, mask: str) -> np.ndarray:
@@ -79,7 +81,7 @@ def test_it_is_that_of_fields_added_up(mask: str, beam: float | None, dots: int)
     lit = np.zeros((N, N))
     lit[::dots, ::dots] = 1
     coherence = {} if beam is None else {"beam_radius_mm": beam}
-    found = contrast_of(rig(mask, **coherence), (SIDE, SIDE), lit)
+    found = contrast_of(devices(mask, **coherence), (SIDE, SIDE), lit)
     with single_threaded_blas():  # the products are small
         expected, error = simulated(lit, mask, beam, 1000)
     # Four standard errors, and 3 % for points that are a sixth of a pixel apart.
@@ -90,27 +92,27 @@ def test_a_scanned_beam_has_as_many_modes_as_its_area_fits() -> None:
     """M = lit area / (pi r^2) for a beam far smaller than the picture and a pixel far smaller than its grain; dots have
     their part of that."""
     radius, white = 0.05, np.ones((N, N))
-    found = contrast_of(rig(pitch=1e-3, beam_radius_mm=radius, polarisation=1.0), (SIDE, SIDE), white)
+    found = contrast_of(devices(pitch=1e-3, beam_radius_mm=radius, polarisation=1.0), (SIDE, SIDE), white)
     assert found**-2 == pytest.approx((N * SIDE) ** 2 / (np.pi * radius**2), rel=0.05)
     dots = np.zeros((N, N))
     dots[::4, ::4] = 1
-    few = contrast_of(rig(pitch=1e-3, beam_radius_mm=radius, polarisation=1.0), (SIDE, SIDE), dots)
+    few = contrast_of(devices(pitch=1e-3, beam_radius_mm=radius, polarisation=1.0), (SIDE, SIDE), dots)
     assert (few / found) ** 2 == pytest.approx(16, rel=0.15), "edges of dots have less of the beam's neighbours"
 
 
 def test_light_at_once_has_as_many_modes_as_grains_fit_a_large_pixel() -> None:
     """M = pixel area x solid angle / lambda^2 (Goodman, 4.4), where that is many."""
-    found = contrast_of(rig(pitch=1.0, polarisation=1.0), (SIDE, SIDE), np.ones((N, N)))
+    found = contrast_of(devices(pitch=1.0, polarisation=1.0), (SIDE, SIDE), np.ones((N, N)))
     grains = 1.0**2 * (N * SIDE / DISTANCE) ** 2 / (WAVELENGTH * 1e-6) ** 2
     assert found**-2 == pytest.approx(grains, rel=0.03)
 
 
 def test_polarisations_and_lines_speckle_apart() -> None:
     tiny = {"pitch": 1e-6}
-    single = contrast_of(rig(**tiny, polarisation=1.0), (SIDE, SIDE), np.ones((N, N)))
+    single = contrast_of(devices(**tiny, polarisation=1.0), (SIDE, SIDE), np.ones((N, N)))
     assert single == pytest.approx(1, rel=1e-6), "a point of polarised light of one line: fully developed"
-    assert contrast_of(rig(**tiny), (SIDE, SIDE), np.ones((N, N))) == pytest.approx(1 / np.sqrt(2), rel=1e-6)
-    three = contrast_of(rig(**tiny, lines=LINES, polarisation=1.0), (SIDE, SIDE), np.ones((N, N)))
+    assert contrast_of(devices(**tiny), (SIDE, SIDE), np.ones((N, N))) == pytest.approx(1 / np.sqrt(2), rel=1e-6)
+    three = contrast_of(devices(**tiny, lines=LINES, polarisation=1.0), (SIDE, SIDE), np.ones((N, N)))
     assert three == pytest.approx(1 / np.sqrt(3), rel=1e-6), "equal shares of photons"
 
 
@@ -126,14 +128,14 @@ def test_lines_are_as_coherent_as_the_surface_is_smooth(roughness_um: float, lin
     fields = [np.exp(1j * (first + 4 * np.pi * heights / wave)).sum(axis=1) for wave in waves]
     light = np.square(np.abs(fields)).mean(axis=0) / points
     given = {"roughness_um": roughness_um, "linewidth_nm": linewidth_nm}
-    found = contrast_of(rig(pitch=1e-6, lines=LINES, polarisation=1.0, **given), (SIDE, SIDE), np.ones((N, N)))
+    found = contrast_of(devices(pitch=1e-6, lines=LINES, polarisation=1.0, **given), (SIDE, SIDE), np.ones((N, N)))
     # One in sqrt(2 x 6400) of a standard deviation, four times; 60 points are not quite many.
     assert found == pytest.approx(float(light.std()), rel=4 / np.sqrt(2 * count) + 1 / points)
 
 
 def test_no_light_has_no_speckle() -> None:
     with pytest.raises(MitsimError, match="no projector pixel is lit"):
-        contrast_of(rig(), (SIDE, SIDE), np.zeros((N, N)))
+        contrast_of(devices(), (SIDE, SIDE), np.zeros((N, N)))
 
 
 def test_pixels_that_are_tall_leave_what_wide_ones_leave_of_turned_light() -> None:
@@ -141,7 +143,7 @@ def test_pixels_that_are_tall_leave_what_wide_ones_leave_of_turned_light() -> No
     lit = np.random.default_rng(2).random((4, 6))
     tall, wide, square = (
         contrast_of(replace(made, camera=made.camera.model_copy(update=update)), (SIDE, SIDE), light)
-        for made in (rig("separable"),)
+        for made in (devices("separable"),)
         for update, light in (
             ({"row_pitch": 2 * PITCH}, lit),
             ({"pixel_pitch": 2 * PITCH, "row_pitch": PITCH}, lit.T),

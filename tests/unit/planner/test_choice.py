@@ -22,7 +22,7 @@ from mitsim.light.settings import (
 )
 from mitsim.planner.choose import cheapest, counted, predicted, value_of_refining
 from mitsim.planner.pilot import run_of
-from tests.unit.planner.invented_evidence import (
+from tests.unit.planner.invented_pilot_result import (
     ACCURACIES,
     APART,
     ONE_CLASS,
@@ -38,18 +38,18 @@ from tests.unit.planner.invented_evidence import (
 COSTLY = {"interreflection", "ambient", "diffraction", "black-level"}
 
 
-def random_evidence(seed: int) -> PilotResult:
+def random_pilot_result(seed: int) -> PilotResult:
     """Changes of any size and angle to each other, and light of any noise."""
     rng = np.random.default_rng(seed)
     sizes = {part: size * 10 ** rng.uniform(-1, 1) for part, size in SIZES.items()}
     mixed = rng.normal(size=(len(sizes), 6))
     mixed *= (np.array(list(sizes.values())) / np.linalg.norm(mixed, axis=1))[:, None]
-    looks = mixed[:, None] + 3e-5 * rng.normal(size=(len(sizes), REPLICATES, 6))
+    replicates = mixed[:, None] + 3e-5 * rng.normal(size=(len(sizes), REPLICATES, 6))
     names = "direct", "spread", "anchor_residual", "indirect", "from_camera", "indirect_residual"
     noises = {name: Noise(10 ** rng.uniform(-4, -1.5), 4, 0.5) for name in names}
     spread = replace(PILOT_RESULT.spread, noise=noises.pop("spread"))
     sample_costs = {name: replace(PILOT_RESULT.sample_costs[name], noise=noise) for name, noise in noises.items()}
-    found = ErrorCovariance.between(dict(zip(sizes, looks, strict=True)), 1.0)
+    found = ErrorCovariance.between(dict(zip(sizes, replicates, strict=True)), 1.0)
     return replace(PILOT_RESULT, changes=found, spread=spread).with_sample_costs(sample_costs)
 
 
@@ -61,7 +61,7 @@ def test_no_choice_that_fits_is_cheaper(accuracy: float, seed: int) -> None:
     Whatever is cheaper breaks the accuracy; and what was chosen keeps it. What takes no time stays on: no error is left
     in the hope that it makes up for another.
     """
-    pilot_result = random_evidence(seed)
+    pilot_result = random_pilot_result(seed)
     chosen = cheapest(accuracy, pilot_result, {})
     if not chosen.fits:
         return
@@ -125,7 +125,7 @@ def test_opposite_errors_are_left_together() -> None:
 
 
 @pytest.mark.parametrize("accuracy", ACCURACIES)
-def test_work_is_transport_and_optics_at_fixed_paces(accuracy: float) -> None:
+def test_work_is_transport_and_optics_at_fixed_unit_costs(accuracy: float) -> None:
     """Truth is the same for all choices, and none of it."""
     chosen = cheapest(accuracy, PILOT_RESULT, {})
     expected = stages(PILOT_RESULT, chosen.settings, FIXED)
@@ -229,7 +229,7 @@ def test_light_to_random_points_of_the_sensor_has_its_own_noise() -> None:
             assert 0.3 * loud.target < loud.noise < loud.target
 
 
-def test_what_looks_see_of_all_shots_needs_no_margin() -> None:
+def test_what_checks_see_of_all_shots_needs_no_margin() -> None:
     """Of 64 classes they see all, of 65 some: then the noise has as much margin as what the pilot saw of few frames.
 
     (Planted: a margin for both in both; none for either.)
@@ -245,7 +245,7 @@ def test_what_looks_see_of_all_shots_needs_no_margin() -> None:
 def test_samples_take_the_least_work_for_the_target() -> None:
     """Variances v / N add up to the target's over 1.1, as sampling stops by a bound that lies so far above the error.
 
-    N is in proportion to sqrt(v / price): the least sum of prices. Whole numbers make both a little better.
+    N is in proportion to sqrt(v / unit cost): the least sum of costs. Whole numbers make both a little better.
     """
     noises = {name: Noise(0.0, 1, 0.5) for name in ("direct", "anchor_residual", "indirect_residual")}
     noises["from_camera"] = Noise(3e-2, 2, 0.5)
@@ -259,8 +259,8 @@ def test_samples_take_the_least_work_for_the_target() -> None:
     settings = found.settings
     counts = settings.samples["indirect"], settings.samples["from_camera"]
     variances = pilot_result.sample_costs["indirect"].variance, pilot_result.sample_costs["from_camera"].variance
-    prices = 16_384 * FIXED.passes["indirect"], 20_000 * FIXED.passes["from_camera"]
-    kinds = list(zip(variances, counts, prices, strict=True))
+    unit_costs = 16_384 * FIXED.passes["indirect"], 20_000 * FIXED.passes["from_camera"]
+    kinds = list(zip(variances, counts, unit_costs, strict=True))
     assert math.sqrt(sum(v / n for v, n, _ in kinds) / GROUPS) == pytest.approx(found.target / 1.1, rel=0.01)
     assert math.sqrt(sum(v / n for v, n, _ in kinds) / GROUPS) < found.target / 1.1
     ratios = [n / math.sqrt(v / price) for v, n, price in kinds]
@@ -292,7 +292,7 @@ def test_wide_cells_hold_light_of_many_anchors() -> None:
     assert "8x8 in cells of 2x2 pixels leave" in wide_ones and ": 2x2 leave" in narrow_ones
 
 
-def test_doubt_about_coarse_cells_names_them() -> None:
+def test_the_value_of_refining_coarse_cells_names_them() -> None:
     """Indirect light in coarse cells may be 2e-3 off or not at all: to know it saves fine cells. (Planted: doubt about
     effects and numbers alone.)"""
     place = PILOT_RESULT.changes.parts.index(Approximation("indirect cells", 1))

@@ -45,7 +45,8 @@ def test_a_block_takes_no_more_than_is_counted(between: bool, layers: tuple[floa
     held = tracemalloc.get_traced_memory()[0]
     tracemalloc.reset_peak()
     bundle.accumulate(light, np.arange(PIXELS), 4)
-    # The light of the next paths is fetched meanwhile: it is held beside what is filed, and twice while it is fetched.
+    # The light of the next paths is fetched meanwhile: it is held beside what is accumulated, and twice while it is
+    # fetched.
     taken = tracemalloc.get_traced_memory()[1] + held
     tracemalloc.stop()
     assert taken <= PATHS * path_sample_bytes(settings)

@@ -31,7 +31,7 @@ def test_each_part_of_a_question_makes_another(small_scene: Callable[..., Path])
         question(bench, uniform, 1e-2, 3, {"blur": False}, 1),
         question(bench.with_board(0.99), uniform, 1e-2, 3, {}, 1),
         question(bench, uniform, 1e-2, 3, {}, 3),
-        question(replace(bench, rig=replace(bench.rig, sensor=sensor)), uniform, 1e-2, 3, {}, 1),
+        question(replace(bench, devices=replace(bench.devices, sensor=sensor)), uniform, 1e-2, 3, {}, 1),
         question(open_bench(small_scene(reflectance=SHADES[::-1])), uniform, 1e-2, 3, {}, 1),
     ]
     assert len({asked, *others}) == 1 + len(others)

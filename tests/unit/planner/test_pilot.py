@@ -159,7 +159,7 @@ def test_anchors_come_true(bench: Bench, pilot_result: PilotResult) -> None:
 @pytest.mark.slow
 def test_anchors_of_followed_light_come_true(bench: Bench, pilot_result: PilotResult) -> None:
     """Light between the ball, the wall and the sheet differs over the sensor of 24 mm. (Planted: paths from the camera
-    that are filed as seen from their start.)"""
+    that are accumulated as seen from their start.)"""
     every = frozenset(effects.present(bench)) - {"speckle"}
     base = Settings(depth=pilot_result.depth, subdivision=2, effects=every)
     light = np.linalg.norm(frames(bench, base))
@@ -175,16 +175,16 @@ def test_anchors_of_followed_light_come_true(bench: Bench, pilot_result: PilotRe
 @pytest.mark.parametrize("width", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_wide_cells_of_followed_light_come_true(bench: Bench, pilot_result: PilotResult, width: int) -> None:
     """What anchors see beyond their mean, in cells of several pixels and one layer, against cells of half a pixel and
-    two layers. (Planted: the mean filed in the cells of indirect light; cells twice as wide.)"""
+    two layers. (Planted: the mean accumulated in the cells of indirect light; cells twice as wide.)"""
     every = frozenset(effects.present(bench)) - {"speckle"}
     base = Settings(
         depth=pilot_result.depth, subdivision=2, effects=every, followed_anchors=2, layers=pilot_result.layers[2]
     )
     judge = frames(bench, replace(base, coarse_cells=2, coarse_layers=True))
     wide = replace(base, coarse_cells=2, coarse_layers=True, followed_width=width)
-    filed = Simulation(bench, wide)
-    assert filed.grids["indirect_residual"].bundle.grid.rows.size == pytest.approx(
-        2 * width * filed.grids["indirect"].bundle.grid.rows.size
+    accumulated = Simulation(bench, wide)
+    assert accumulated.grids["indirect_residual"].bundle.grid.rows.size == pytest.approx(
+        2 * width * accumulated.grids["indirect"].bundle.grid.rows.size
     )
     actual = change(frames(bench, wide), judge)
     assert actual > 1e-3, "the scene has to call for it"
@@ -263,7 +263,7 @@ def test_noise_comes_true(bench: Bench, pilot_result: PilotResult) -> None:
 
 
 @pytest.mark.slow
-def test_frames_of_looks_are_those_that_a_capture_forms(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_of_pilot_runs_are_those_that_a_capture_forms(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """At the sample's pixels, other rows than columns, from the same paths, with lamps and black pixels that leak.
     (Planted: lamps' light lost, the least light of a shot left out, places of rows for columns.)"""
     monkeypatch.setattr(pilot_samples, "_PLACES", 5)
@@ -274,13 +274,13 @@ def test_frames_of_looks_are_those_that_a_capture_forms(bench: Bench, monkeypatc
     everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
     found = EffectRuns(bench, everything, sample, 5)
     made = Simulation(bench, everything)
-    filed = [
+    accumulated = [
         made.accumulate("direct", pilot_direct, lighting.labels, sample.direct)
         + made.accumulate("indirect", PathSamples.joined(list(pilot_indirect)), lighting.labels, sample.followed)
         for pilot_direct, *pilot_indirect in zip(found.direct, *found.followed.values(), strict=True)
     ]
     assert made.physics.lamps and made.physics.black_level and sample.shape == (5, 4) and bench.geometry.pixels > 5
-    formed = [expected_of([(made, [light])], sample.rows, sample.lighting, 0) for light in filed]
+    formed = [expected_of([(made, [light])], sample.rows, sample.lighting, 0) for light in accumulated]
     expected = np.array([[frame.irradiance[np.ix_(*sample.places)] for frame in one] for one in formed])
     np.testing.assert_allclose(found.frames, expected, rtol=1e-9)
 
@@ -307,7 +307,7 @@ def test_indirect_light_is_looked_at_closer_where_noise_hides_what_coarse_cells_
     lighting = parse_patterns("dots:4", N).lighting
     sample = pilot_samples.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
     everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
-    first, close = (EffectRuns(bench, everything, sample, 5, (450.0, 330.0), told) for told in (1.0, 1e-7))
+    first, close = (EffectRuns(bench, everything, sample, 5, (450.0, 330.0), reported) for reported in (1.0, 1e-7))
     seen = [ErrorCovariance.between(found.changes, found.light**2) for found in (first, close)]
     open_ = [
         bound**2 - value**2 for value, bound in (each.estimate([Approximation("indirect cells", 1)]) for each in seen)
@@ -376,10 +376,10 @@ def test_a_mirror_shows_some_shots_only(shipped_bench: Callable[..., Bench]) -> 
     lighting = parse_patterns("dots:7", bench.n).lighting
     found = pilot.PilotRuns(bench, lighting, 1e-3, 1).pilot_result.effects["black-level"]
     made = Simulation(bench, Settings(depth=400.0, effects=frozenset(effects.present(bench))))
-    glint, black = made.specular_frames(lighting.labels), made.physics.black_level
-    assert glint is not None
+    specular, black = made.specular_frames(lighting.labels), made.physics.black_level
+    assert specular is not None
     seen = np.zeros((49, 512, 512))
-    seen[glint.classes] = glint.irradiance
+    seen[specular.classes] = specular.irradiance
     everything = black * seen.sum(axis=0)
     actual = np.linalg.norm(everything - black * seen) / np.linalg.norm(everything + (1 - black) * seen)
     assert found.value == pytest.approx(actual, rel=0.1)

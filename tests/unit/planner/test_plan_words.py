@@ -14,7 +14,7 @@ from mitsim.light.settings import Approximation, PilotResult, Settings
 from mitsim.planner.explain import SceneFacts, explain_plan
 from mitsim.scene.limits import Unfit
 from mitsim.scene.outline import Tag
-from tests.unit.planner.invented_evidence import PILOT_RESULT, SIZES, changes, plan, rows, stages, with_occluded
+from tests.unit.planner.invented_pilot_result import PILOT_RESULT, SIZES, changes, plan, rows, stages, with_occluded
 
 
 def bench(cuts: bool = False, shift: float = 0.0, feature: float = 0.06) -> Bench:
@@ -66,10 +66,10 @@ def test_devices_are_flagged_where_their_model_ends(
 def test_light_over_mirrors_that_is_not_resolved_is_told_with_their_kinds_and_the_first() -> None:
     mirrors = tuple(Tag(Path("a.xml"), line, "shape", {"type": kind}) for line, kind in ((7, "disk"), (9, "sphere")))
     facts = SceneFacts({}, 0.0, mirrors=(*mirrors, mirrors[1]))
-    (warning,) = explain_plan(1e-2, replace(PILOT_RESULT, glint=0.2), facts).warnings
+    (warning,) = explain_plan(1e-2, replace(PILOT_RESULT, unresolved_specular=0.2), facts).warnings
     assert warning.startswith("a.xml:7: shape: got 'disk'")
     assert "0.2 of the light" in warning and "2 sphere, 1 disk" in warning
-    assert not explain_plan(1e-2, replace(PILOT_RESULT, glint=1e-4), facts).warnings
+    assert not explain_plan(1e-2, replace(PILOT_RESULT, unresolved_specular=1e-4), facts).warnings
 
 
 def test_light_that_is_lost_over_a_mirror_is_told_with_its_place() -> None:
@@ -77,19 +77,19 @@ def test_light_that_is_lost_over_a_mirror_is_told_with_its_place() -> None:
     shapes = tuple(Tag(Path("a.xml"), line, "shape", {"type": "sphere"}) for line in (3, 7))
     place = "a.xml:7: shape: got 'sphere' in <shape type='sphere'>; "
 
-    def said(shapes: tuple[Tag, ...] = shapes, **lacking: float) -> tuple[str, ...]:
+    def message(shapes: tuple[Tag, ...] = shapes, **lacking: float) -> tuple[str, ...]:
         facts = SceneFacts(dict.fromkeys(EFFECTS, ""), 0.0, shapes=shapes)
         return explain_plan(1e-2, replace(PILOT_RESULT, mirror=1, **lacking), facts).warnings
 
-    assert said(left_out=1e-4) == ()
+    assert message(left_out=1e-4) == ()
     for part in (9.9e-3, 0.1):
-        (warning,) = said(left_out=part)
+        (warning,) = message(left_out=part)
         assert warning.startswith(f"{place}{part:.2g} of the light") and "left out of the frames" in warning
-    lobes, mirror = said(left_out=0.1, unresolved=0.2)
+    lobes, mirror = message(left_out=0.1, unresolved=0.2)
     assert "lobes too sharp" in lobes and mirror.startswith(place)
-    (lobes,) = said(left_out=5e-3, unresolved=0.2)
+    (lobes,) = message(left_out=5e-3, unresolved=0.2)
     assert "lobes too sharp" in lobes
-    (unknown,) = said((), left_out=0.1)
+    (unknown,) = message((), left_out=0.1)
     assert "largest: light over mirrors or curved glass both ways" in unknown
 
 
@@ -138,7 +138,7 @@ def test_seconds_are_those_of_every_stage_once() -> None:
 def test_a_row_tells_what_one_of_it_would_save_and_leave() -> None:
     """Seconds with and without, samples as they are; the error of one anchor, layer and point, not of two."""
     found = plan(pilot_result=FOLLOWS)
-    settings, told = found.settings, rows(found)
+    settings, reported = found.settings, rows(found)
     assert settings.anchors > 1 and settings.layers and settings.followed_anchors == 2
     for name, less in (
         ("anchors", replace(settings, anchors=1)),
@@ -146,8 +146,10 @@ def test_a_row_tells_what_one_of_it_would_save_and_leave() -> None:
         ("followed-anchors", replace(settings, followed_anchors=1)),
         ("diffraction", replace(settings, effects=settings.effects - {"diffraction"})),
     ):
-        assert told[name].seconds == pytest.approx(seconds(settings) - seconds(less)) and told[name].seconds > 0, name
-    assert told["followed-anchors"].error_if_off == pytest.approx(SIZES[Approximation("followed_anchors", 1)])
+        assert (
+            reported[name].seconds == pytest.approx(seconds(settings) - seconds(less)) and reported[name].seconds > 0
+        ), name
+    assert reported["followed-anchors"].error_if_off == pytest.approx(SIZES[Approximation("followed_anchors", 1)])
 
 
 def test_the_row_of_occluded_pixels_tells_their_number_and_what_they_leave() -> None:

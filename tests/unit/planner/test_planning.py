@@ -1,5 +1,5 @@
-"""Plans within a time: what is looked at, how finely, and what of the time is left for light, of invented prices; paces
-of invented launches, and samples for rare heavy paths."""
+"""Plans within a time: what is looked at, how finely, and what of the time is left for light, of invented unit costs;
+those of invented launches, and samples for rare heavy paths."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mitsim.light.settings import GROUPS, MOST_PATHS, REPLICATES, Noise, SampleC
 from mitsim.optics.forming import bound_of
 from mitsim.planner import pilot, planner
 from mitsim.planner.choose import _BOUND_OVER_ERROR, FIRST_ACCURACY, Candidate, _samples_for, cheapest
-from tests.unit.planner.invented_evidence import ONE_CLASS, plan
+from tests.unit.planner.invented_pilot_result import ONE_CLASS, plan
 
 LIGHTING, SEED, LOOKING, FRAMES = Lighting.uniform(4), 7, 0.5, {"sensor": 0.2, "write": 0.1}
 AROUND = planner.OPENING_S + sum(FRAMES.values()) + LOOKING
@@ -33,7 +33,7 @@ OWN = "the plan's own"
 class Invented:
     """Stands in for the choices of a look."""
 
-    pilot_result: Looks
+    pilot_result: CountedRuns
     switches: Mapping[str, bool]
 
     def seconds(self, accuracy: float) -> tuple[float, bool]:
@@ -43,7 +43,7 @@ class Invented:
 
 
 @dataclass
-class Looks:
+class CountedRuns:
     """Accuracies and seeds of looks, and what was decided at last; a finer one may find all dearer, or less kept."""
 
     asked: list[tuple[float, int]] = field(default_factory=list)
@@ -58,8 +58,8 @@ def made() -> Plan:
 
 
 @pytest.fixture
-def looks(made: Plan, monkeypatch: pytest.MonkeyPatch) -> Looks:
-    seen = Looks()
+def runs(made: Plan, monkeypatch: pytest.MonkeyPatch) -> CountedRuns:
+    seen = CountedRuns()
 
     class PilotRuns:
         seconds = LOOKING
@@ -98,44 +98,48 @@ def within(light: float, switches: Mapping[str, bool] | None = None) -> Plan:
         (math.inf, 1.58e-5, 1e-5),
     ],
 )
-def test_what_looks_leave_is_for_the_light(looks: Looks, light: float, bought: float, finer_look: float | None) -> None:
+def test_what_pilot_runs_leave_is_for_the_light(
+    runs: CountedRuns, light: float, bought: float, finer_look: float | None
+) -> None:
     """Opening, frames and looking come off; a finer look is taken where what it leaves buys a finer accuracy."""
     found = within(light)
     finer = [(finer_look, SEED)] if finer_look else []
-    assert looks.asked == [(FIRST_ACCURACY, SEED), *finer]
-    assert looks.decided == (looks, bought, {}) and found.accuracy == bought
+    assert runs.asked == [(FIRST_ACCURACY, SEED), *finer]
+    assert runs.decided == (runs, bought, {}) and found.accuracy == bought
     assert found.asked_seconds == AROUND + light and found.warnings == (OWN,)
 
 
-def test_what_is_switched_off_is_not_paid_for(looks: Looks) -> None:
+def test_what_is_switched_off_is_not_paid_for(runs: CountedRuns) -> None:
     """In both looks: 0.2 s buy what 0.4 do else, and so do 1.3 after another look."""
     off = {"diffraction": False}
     assert within(0.2, off).accuracy == 2.51e-3
-    assert within(2.3, off).accuracy == 3.98e-4 and looks.asked[-1] == (3.98e-4, SEED)
-    assert looks.decided == (looks, 3.98e-4, off)
+    assert within(2.3, off).accuracy == 3.98e-4 and runs.asked[-1] == (3.98e-4, SEED)
+    assert runs.decided == (runs, 3.98e-4, off)
 
 
-def test_too_few_seconds_are_told_with_what_all_would_take(looks: Looks) -> None:
+def test_too_few_seconds_are_told_with_what_all_would_take(runs: CountedRuns) -> None:
     found = within(-AROUND + 0.01)
     line, own = found.warnings
     assert found.accuracy == 0.3 and found.asked_seconds == pytest.approx(0.01) and own == OWN
     assert line.startswith("0.01 seconds are too few: even accuracy 0.3")
     assert f"to take {PRICE / 0.3 + AROUND:.1f} s from start to finish" in line
-    assert looks.asked == [(FIRST_ACCURACY, SEED)], "no time for another look"
+    assert runs.asked == [(FIRST_ACCURACY, SEED)], "no time for another look"
 
 
 @pytest.mark.parametrize(("dearer", "bought"), [(1.3, 1.58e-4), (1e5, 1e-3)])
-def test_a_finer_look_that_finds_all_dearer_buys_less_or_nothing(looks: Looks, dearer: float, bought: float) -> None:
-    looks.dearer = dearer
+def test_a_finer_look_that_finds_all_dearer_buys_less_or_nothing(
+    runs: CountedRuns, dearer: float, bought: float
+) -> None:
+    runs.dearer = dearer
     found = within(11.01)
-    assert len(looks.asked) == 2 and found.accuracy == bought and found.warnings == (OWN,)
+    assert len(runs.asked) == 2 and found.accuracy == bought and found.warnings == (OWN,)
 
 
-def test_a_finer_look_that_finds_no_accuracy_kept_takes_none_away(looks: Looks) -> None:
+def test_a_finer_look_that_finds_no_accuracy_kept_takes_none_away(runs: CountedRuns) -> None:
     """What the first look bought stands. (Planted: the loosest of all, 0.3, which the finer look can pay.)"""
-    looks.kept = 1.0
+    runs.kept = 1.0
     found = within(11.01)
-    assert len(looks.asked) == 2 and found.accuracy == 1e-3 and found.warnings == (OWN,)
+    assert len(runs.asked) == 2 and found.accuracy == 1e-3 and found.warnings == (OWN,)
 
 
 LAUNCH_S, PATH_S = 0.02, 1e-7
@@ -158,7 +162,7 @@ class Machine:
 @pytest.mark.parametrize("paths_per_sample", [4000, 25_280, 300_000])
 @pytest.mark.parametrize("planned", [3, 100, 5000])
 @pytest.mark.parametrize("disturbed", [-1, 0, 1, 2, 3, 4, 5, 6])
-def test_paces_are_those_of_launches_as_the_run_has_them(
+def test_unit_costs_are_those_of_launches_as_the_run_has_them(
     monkeypatch: pytest.MonkeyPatch, paths_per_sample: int, planned: int, disturbed: int
 ) -> None:
     """Within 1.5 times of what all launches of the run take together, one slow moment or none, where that is more than
@@ -220,7 +224,7 @@ def test_rare_heavy_paths_are_sampled_from_the_first() -> None:
     )
 
 
-def test_looks_go_on_while_few_heavy_paths_are_met() -> None:
+def test_pilot_runs_go_on_while_few_heavy_paths_are_met() -> None:
     """To the most, whatever they say that the run takes: 5 equal paths tell little of that; 50 end them at a tenth of
     it. (Planted: looks end at a tenth whatever they met.)"""
     plain = ONE_CLASS.sample_costs["from_camera"].variance
@@ -272,7 +276,7 @@ def test_bounds_of_few_heavy_paths_take_more_samples() -> None:
     assert 0.35 < float((bounds < target).mean()) < 0.75
 
 
-def test_noise_tells_how_unlike_looks_are() -> None:
+def test_noise_tells_how_unlike_replicates_are() -> None:
     """Four looks of which one has all the noise: a relative variance of 16/9 about; of even noise next to none. And as
     how many equal ones paths are: one that brings ten times as much as a hundred others is as 3.9 would be."""
     rng = np.random.default_rng(6)

@@ -1,7 +1,7 @@
 """Light of near surfaces at the edge of the view: the cells hold it, and what they do not hold is counted and
 said.
 
-A card at 150 mm stands before a camera whose rig is aligned to 400 mm. Through the field stop the sensor's edge sees
+A card at 150 mm stands before a camera that is aligned to 400 mm. Through the field stop the sensor's edge sees
 the card at tan-angles (from the centre) that no surface at 400 mm has. Judge: an integral over the card.
 """
 
@@ -53,8 +53,8 @@ def card_alone() -> float:
     return ALBEDO * SCALE / NEAR**2 * total
 
 
-def filed(bench: Bench, reach: float | None, samples: int = 64) -> tuple[float, float]:
-    """Irradiance that is filed, and that which is not."""
+def accumulated(bench: Bench, reach: float | None, samples: int = 64) -> tuple[float, float]:
+    """Irradiance that is accumulated, and that which is not."""
     made = Simulation(bench, Settings(depth=Z, anchors=3, reach=reach))
     labels = np.zeros(N * N, dtype=np.int64)
     light = made.accumulate("direct", made.direct.trace(5, 0, samples), labels, samples)
@@ -62,14 +62,14 @@ def filed(bench: Bench, reach: float | None, samples: int = 64) -> tuple[float, 
 
 
 def test_the_cells_hold_what_the_sensors_edge_sees_of_a_near_card(scene: Callable[..., Bench]) -> None:
-    """All light of the card is filed, to 0.5 %: 64 samples a pixel."""
+    """All light of the card is accumulated, to 0.5 %: 64 samples a pixel."""
     bench = scene("card", sheet_z=-500)
     reach = light_reach(Simulation(bench, Settings(depth=Z)), seed=1)
     assert reach is not None and STOP + HALF / Z < RIGHT / NEAR * 0.95 < reach < STOP + HALF / NEAR + 1e-6
-    kept, outside = filed(bench, reach)
+    kept, outside = accumulated(bench, reach)
     assert kept == pytest.approx(card_alone(), rel=5e-3) and outside == 0
     # The cells of 400 mm alone would lose light, and say how much.
-    few, lost = filed(bench, None)
+    few, lost = accumulated(bench, None)
     assert lost > 0.02 * kept and few + lost == pytest.approx(kept, rel=1e-12)
 
 

@@ -88,10 +88,10 @@ def test_a_card_before_a_board(patterns: str, baseline: tuple[float, float], lea
     known = PixelDepths(depths, 4e-4, 5e-6)
     ideal = known.final(true, known.solve(true)).image
     error = np.abs(found.mm - cards())
-    print(psnr(one.image), psnr(found.image), psnr(ideal), np.median(error), found.told.mean())
+    print(psnr(one.image), psnr(found.image), psnr(ideal), np.median(error), found.reliable.mean())
     assert not found.doubt and np.median(error) < 2 and (error < 5).mean() > 0.95
     assert psnr(found.image) > least and psnr(found.image) > psnr(one.image) + 20
-    assert found.told.mean() > 0.9
+    assert found.reliable.mean() > 0.9
 
 
 def tilted() -> np.ndarray:
@@ -137,9 +137,9 @@ def test_frames_at_fault_are_named(fault: str) -> None:
 
     found = reconstruct(with_frames(run, change), calibrated(), focus="map")
     assert not found.ok and found.misfit is not None and found.misfit.cause is Cause.FRAMES
-    (said,) = found.misfit.faults
-    assert said.numbers == ((3,) if fault == "black" else (2, 6))
-    assert ("no light" if fault == "black" else "exchanged") in said.words
+    (reported,) = found.misfit.faults
+    assert reported.numbers == ((3,) if fault == "black" else (2, 6))
+    assert ("no light" if fault == "black" else "exchanged") in reported.words
 
 
 @pytest.mark.parametrize(
@@ -265,8 +265,8 @@ def test_files_and_the_summary_have_the_depths(tmp_path: object) -> None:
     channels, _ = read_frame(folder / "depth.exr")
     assert image.depths is not None and set(channels) == {"depth_mm", "confidence"}
     np.testing.assert_allclose(channels["depth_mm"], image.depths.mm, rtol=1e-6)
-    said = image.summary()["depths"]
-    assert said["least_mm"] < 380 and said["most_mm"] > 420 and 0.9 < said["told_part"] <= 1
+    reported = image.summary()["depths"]
+    assert reported["least_mm"] < 380 and reported["most_mm"] > 420 and 0.9 < reported["told_part"] <= 1
     assert "mm, median" in str(image.focus) and "depth of each pixel" in image._repr_html_()
     reconstruct(run, factors).save(folder, overwrite=True)
     assert not (folder / "depth.exr").exists()

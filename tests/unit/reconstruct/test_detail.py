@@ -84,7 +84,7 @@ def test_disagreement_is_the_energy_of_the_image_error(patterns: str) -> None:
     sigma = np.outer(prepared.left.singular, prepared.right.singular)
     gain = sigma / (sigma**2 + 1e-4 * sigma.max() ** 2)
     model = Model(prepared, factors, (P_L, P_R))
-    slopes, zero, struck, told = model.slopes, np.zeros((N, N)), 0.0, 0.0
+    slopes, zero, struck, reported = model.slopes, np.zeros((N, N)), 0.0, 0.0
     for _ in range(200):
         rows, columns = 0.5 * rng.standard_normal((N, N)), 2 * rng.standard_normal((N, N))
         sums, image = prepared.accumulator(), rng.random((N, N))
@@ -96,8 +96,8 @@ def test_disagreement_is_the_energy_of_the_image_error(patterns: str) -> None:
         problem = prepared.problem(sums)
         expected = prepared.image(gain * sigma * prepared.coefficients(image))
         struck += np.square(prepared.image(gain * problem.projected) - expected).mean()
-        told += disagreement(model, gain, problem.halves, (zero, zero)).mean()
-    assert told == pytest.approx(struck, rel=0.1 if patterns == "uniform" else 0.06)
+        reported += disagreement(model, gain, problem.halves, (zero, zero)).mean()
+    assert reported == pytest.approx(struck, rel=0.1 if patterns == "uniform" else 0.06)
 
 
 def test_noise_is_taken_off_what_halves_disagree_on() -> None:
@@ -110,7 +110,7 @@ def test_noise_is_taken_off_what_halves_disagree_on() -> None:
     rng, family = np.random.default_rng(6), parse_patterns("dots:3", N, 0)
     factors, (P_L, P_R) = (shadow(), shadow(0.37)), (family.left.astype(float), family.right.astype(float))
     model = Model(prepare(*factors, P_L, P_R), factors, (P_L, P_R))
-    propagation, told = Propagation(model, 1e-6), 0.0
+    propagation, reported = Propagation(model, 1e-6), 0.0
     white, right = propagation.of_white(1.0), model.prepared.right
     dipoles = rng.standard_normal((40, N, N))
     seen = [model.moved[0].sum(axis=0).T @ d @ (right.basis * right.singular) for d in dipoles]
@@ -126,8 +126,8 @@ def test_noise_is_taken_off_what_halves_disagree_on() -> None:
         known = deviation**2 * white
         halves = model.prepared.problem(sums).halves
         assert halves
-        told += disagreement(propagation.model, propagation.gain, halves, (known, known)).mean()
-    assert told / 40 == pytest.approx(struck, rel=0.12)
+        reported += disagreement(propagation.model, propagation.gain, halves, (known, known)).mean()
+    assert reported / 40 == pytest.approx(struck, rel=0.12)
     # Light that moves along the rows is told by halves of the rows, and by what is known of those alone.
     everything = disagreement(propagation.model, propagation.gain, halves, (known, known))
     assert disagreement(propagation.model, propagation.gain, halves, (known, 1e6 * known)) == pytest.approx(everything)
@@ -140,7 +140,7 @@ def test_noise_is_taken_off_what_halves_disagree_on() -> None:
 def test_noise_alone_is_no_disagreement(patterns: str) -> None:
     """20 sessions of an even scene with noise in frames and factors, two sides: above 3 standard deviations are 2 and 0
     sessions. (Planted: the factors' noise left out.)"""
-    camera, told = Bench(shadow(), shadow()), 0
+    camera, reported = Bench(shadow(), shadow()), 0
     for seed in range(20):
         shots, factors = camera.run(patterns, np.full((N, N), 0.7), seed), camera.calibrated(seed, 0.01)
         sums, image = accumulate(shots, factors), reconstruct(shots, factors, 1e-9)
@@ -150,8 +150,8 @@ def test_noise_alone_is_no_disagreement(patterns: str) -> None:
         left, right = propagation.of_factors(factors.manifest.noise, image.image)
         halves = sums.prepared.problem(sums.frames).halves
         assert halves
-        told += disagreement(propagation.model, propagation.gain, halves, (frames + left, frames + right)).any()
-    assert told <= 3
+        reported += disagreement(propagation.model, propagation.gain, halves, (frames + left, frames + right)).any()
+    assert reported <= 3
 
 
 @pytest.mark.parametrize(
@@ -189,14 +189,14 @@ def test_light_of_one_side_weighs_the_dipoles_of_the_other() -> None:
     prepared = prepare(*factors, P, P)
     sigma = np.outer(prepared.left.singular, prepared.right.singular)
     gain = sigma / (sigma**2 + 1e-4 * sigma.max() ** 2)
-    model, zero, struck, told = Model(prepared, factors, (P, P)), np.zeros((N, N)), 0.0, 0.0
+    model, zero, struck, reported = Model(prepared, factors, (P, P)), np.zeros((N, N)), 0.0, 0.0
     for _ in range(200):
         sums = prepared.accumulator()
         sums.add(factors[0] @ rng.standard_normal((N, N)) @ model.slopes[1].T, 0, 0)
         problem = prepared.problem(sums)
         struck += np.square(prepared.image(gain * problem.projected)).mean()
-        told += disagreement(model, gain, problem.halves, (zero, zero)).mean()
-    assert told == pytest.approx(struck, rel=0.1)
+        reported += disagreement(model, gain, problem.halves, (zero, zero)).mean()
+    assert reported == pytest.approx(struck, rel=0.1)
 
 
 SMALL, PARTS = 64, 4

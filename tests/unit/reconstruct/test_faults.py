@@ -74,11 +74,11 @@ def test_a_frame_at_fault_is_named(patterns: str, fault: str) -> None:
     found = image(patterns, lambda frames: [*frames[:3], change(frames), *frames[4:]])
     assert not found.ok and found.status.verdict is Verdict.MISFIT and found.misfit is not None
     assert found.misfit.cause is Cause.FRAMES
-    (said,) = found.misfit.faults
-    assert said.fault.name.lower() == fault and said.numbers == (3,) and said.files == ("frame_00003.exr",)
-    assert words in said.words and words in str(found.status) and "capture these frames again" in str(found.status)
+    (reported,) = found.misfit.faults
+    assert reported.fault.name.lower() == fault and reported.numbers == (3,) and reported.files == ("frame_00003.exr",)
+    assert words in reported.words and words in str(found.status) and "capture these frames again" in str(found.status)
     summary = found.summary()["misfit"]
-    assert summary["cause"] == "frames" and summary["faults"] == [said.summary()]
+    assert summary["cause"] == "frames" and summary["faults"] == [reported.summary()]
 
 
 @pytest.mark.parametrize("patterns", FAMILIES)
@@ -91,8 +91,8 @@ def test_a_frame_that_is_clipped_where_noise_hides_it(patterns: str) -> None:
 
     misfit = reconstruct(with_frames(shots, cut), bench().calibrated(1)).misfit
     assert misfit is not None
-    (said,) = misfit.faults
-    assert said.fault.name == "CLIPPED" and said.numbers == (3,)
+    (reported,) = misfit.faults
+    assert reported.fault.name == "CLIPPED" and reported.numbers == (3,)
 
 
 def test_text_tells_the_brightness_of_dots() -> None:
@@ -103,8 +103,8 @@ def test_text_tells_the_brightness_of_dots() -> None:
     assert reconstruct(shots, factors).ok
     found = reconstruct(with_frames(shots, lambda frames: [*frames[:3], dim(frames[3]), *frames[4:]]), factors)
     assert found.misfit is not None
-    (said,) = found.misfit.faults
-    assert said.fault.name == "DIM" and said.numbers == (3,)
+    (reported,) = found.misfit.faults
+    assert reported.fault.name == "DIM" and reported.numbers == (3,)
 
 
 def test_a_dim_frame_of_dim_light() -> None:
@@ -114,8 +114,8 @@ def test_a_dim_frame_of_dim_light() -> None:
         with_frames(shots, lambda frames: [*frames[:3], dim(frames[3]), *frames[4:]]), bench().calibrated(1)
     )
     assert found.misfit is not None
-    (said,) = found.misfit.faults
-    assert said.fault.name == "DIM" and said.numbers == (3,)
+    (reported,) = found.misfit.faults
+    assert reported.fault.name == "DIM" and reported.numbers == (3,)
 
 
 @pytest.mark.parametrize("patterns", FAMILIES)
@@ -123,8 +123,8 @@ def test_frames_that_are_exchanged_are_named(patterns: str) -> None:
     """Of a signed family half of two pairs: which halves is told by the difference that they make."""
     found = image(patterns, lambda frames: [*frames[:2], frames[5], *frames[3:5], frames[2], *frames[6:]])
     assert found.misfit is not None
-    (said,) = found.misfit.faults
-    assert said.fault.name == "SWAPPED" and said.numbers == (2, 5)
+    (reported,) = found.misfit.faults
+    assert reported.fault.name == "SWAPPED" and reported.numbers == (2, 5)
 
 
 def powered(frames: Frames, powers: np.ndarray) -> Frames:
@@ -141,9 +141,9 @@ def test_a_lamp_that_flickers_between_the_halves_of_pairs(patterns: str) -> None
     flicker = 1 + 0.04 * np.random.default_rng(5).standard_normal(count)
     found = image(patterns, lambda frames: powered(frames, flicker))
     assert not found.ok and found.misfit is not None
-    (said,) = found.misfit.faults
-    assert said.fault.name == "FLICKER" and said.numbers == tuple(range(count))
-    differs = float(said.words.split("differ by ")[1].split(" %")[0])
+    (reported,) = found.misfit.faults
+    assert reported.fault.name == "FLICKER" and reported.numbers == tuple(range(count))
+    differs = float(reported.words.split("differ by ")[1].split(" %")[0])
     assert abs(differs / (100 * flicker.std()) - 1) < 0.15
     assert image(patterns, lambda frames: powered(frames, np.linspace(1, 0.99, count))).ok
     assert image(patterns, list).ok
@@ -155,16 +155,16 @@ def test_halves_of_two_pairs_exchanged(pair: tuple[int, int]) -> None:
     one, other = pair
     found = image("hadamard:4", lambda frames: [frames[{one: other, other: one}.get(n, n)] for n in range(len(frames))])
     assert found.misfit is not None
-    (said,) = found.misfit.faults
-    assert said.fault.name == "SWAPPED" and said.numbers == pair
+    (reported,) = found.misfit.faults
+    assert reported.fault.name == "SWAPPED" and reported.numbers == pair
 
 
 def test_halves_of_one_pair_exchanged() -> None:
     """Their sum is right, their difference the negative: what the other pairs tell of it decides."""
     found = image("hadamard:4", lambda frames: [*frames[:10], frames[11], frames[10], *frames[12:]])
     assert found.misfit is not None
-    (said,) = found.misfit.faults
-    assert said.fault.name == "SWAPPED" and said.numbers == (10, 11)
+    (reported,) = found.misfit.faults
+    assert reported.fault.name == "SWAPPED" and reported.numbers == (10, 11)
 
 
 @pytest.mark.parametrize("patterns", ["uniform", *FAMILIES, "dots:2", "hadamard:2"])
@@ -195,8 +195,8 @@ def test_the_only_frame_black_or_free_of_noise() -> None:
     clean = with_frames(shots, lambda frames: [BLACK + GAIN * (light + DARK)])
     found = reconstruct(clean, bench().calibrated(1)).misfit
     assert found is not None and found.chi_square < 0.1
-    (said,) = found.faults
-    assert said.fault.name == "NOISELESS" and said.numbers == (0,)
+    (reported,) = found.faults
+    assert reported.fault.name == "NOISELESS" and reported.numbers == (0,)
 
 
 def test_means_of_shots_of_a_sensor_without_adc_are_no_fault() -> None:
@@ -229,8 +229,8 @@ def test_patterns_that_repeat_may_look_alike() -> None:
     same = {**memory, files[0][0].file: memory[files[0][1].file]}
     found = reconstruct(Capture(both.manifest, memory=same), bench().calibrated(1)).misfit
     assert found is not None
-    (said,) = found.faults
-    assert said.fault.name == "REPEATED" and said.numbers == (0, 4)
+    (reported,) = found.faults
+    assert reported.fault.name == "REPEATED" and reported.numbers == (0, 4)
 
 
 def test_a_flat_capture_of_unstated_noise_says_nothing_of_noise() -> None:

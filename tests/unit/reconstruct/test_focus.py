@@ -120,8 +120,8 @@ def test_each_pixel_keeps_its_own_brightness(axis: int) -> None:
     falloff = 1 - 0.05 * across**2 + 0.04 * across
     noise = np.random.default_rng(axis).normal(0, 2e-3, (PIXELS, FINE))
     side = FactorOfDepths(shadow(400.0, axis, FINE) * falloff + noise, PARALLAX, axis)
-    told = side.brightness(np.arange(FINE))
-    np.testing.assert_allclose(told / told.mean() * falloff.mean(), falloff, rtol=2e-3)
+    reported = side.brightness(np.arange(FINE))
+    np.testing.assert_allclose(reported / reported.mean() * falloff.mean(), falloff, rtol=2e-3)
     found, known = side.at(1 / 360 - 1 / 400)
     truth = (shadow(360.0, axis, FINE) * falloff)[known]
     gain = (found[known] * truth).sum(axis=0) / np.square(truth).sum(axis=0)

@@ -75,7 +75,7 @@ def test_what_factors_explain_is_no_lack() -> None:
 
 
 @pytest.mark.parametrize("patterns", ["dots:4", "hadamard:8"])
-def test_misfit_is_foretold_and_the_mask_named(patterns: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_misfit_is_predicted_and_the_mask_named(patterns: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Scenes without print within pixels, to 5 %: it is predicted from an image that is itself off, by 0.02 rms at
     `dots:4`. (Planted: the cause never told by what is predicted.)"""
     monkeypatch.setattr(importlib.import_module("mitsim.reconstruct.misfit"), "print_energy", lambda *_: 0.0)

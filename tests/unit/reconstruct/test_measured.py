@@ -95,20 +95,20 @@ def test_the_folder_is_one_that_reconstruct_takes(tmp_path: Path) -> None:
 
 def test_what_is_not_known_is_left_out_and_said(tmp_path: Path) -> None:
     folder = RealSession().write(tmp_path / "frames")
-    told = calibrate_frames(folder).manifest
-    assert told.result["phi_error"] is None and told.result["noise_free_residual"] is None
-    assert told.board_reflectance is None and told.parallax is None
-    assert [text.split(":")[0] for text in told.result["not_known"]] == [
+    reported = calibrate_frames(folder).manifest
+    assert reported.result["phi_error"] is None and reported.result["noise_free_residual"] is None
+    assert reported.board_reflectance is None and reported.parallax is None
+    assert [text.split(":")[0] for text in reported.result["not_known"]] == [
         "phi_error, noise_free_residual",
         "board_reflectance",
         "parallax",
     ]
     bare = {name: value for name, value in DIGITAL.items() if name not in ("read_noise_e", "saturation_dn")}
     write_list(folder, digital=bare)
-    told = calibrate_frames(folder).manifest
-    assert told.result["response_noise"] is None
+    reported = calibrate_frames(folder).manifest
+    assert reported.result["response_noise"] is None
     assert {"digital.read_noise_e", "digital.saturation_dn"} <= {
-        text.split(":")[0] for text in told.result["not_known"]
+        text.split(":")[0] for text in reported.result["not_known"]
     }
 
 
@@ -164,9 +164,9 @@ def entries(**changes: Any) -> list[dict[str, Any]]:
 def test_lists_with_a_mistake_are_refused(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
     folder = RealSession().write(tmp_path / "frames")
     write_list(folder, **changes)
-    with pytest.raises(MitsimError) as told:
+    with pytest.raises(MitsimError) as reported:
         load_frames(folder)
-    assert words in str(told.value) and str(folder) in str(told.value)
+    assert words in str(reported.value) and str(folder) in str(reported.value)
 
 
 def test_folders_with_a_mistake_are_refused(tmp_path: Path) -> None:
@@ -174,10 +174,10 @@ def test_folders_with_a_mistake_are_refused(tmp_path: Path) -> None:
     folder = RealSession().write(tmp_path / "frames")
 
     def refusal() -> str:
-        with pytest.raises(MitsimError) as told:
+        with pytest.raises(MitsimError) as reported:
             calibrate_frames(folder, tmp_path / "cal")
         assert not (tmp_path / "cal").exists()
-        return str(told.value)
+        return str(reported.value)
 
     write_image(folder / "f_3.png", np.ones((20, 24)))
     assert "f_3.png is 20 x 24 pixels, but f_0.png is 24 x 20" in refusal()
@@ -203,9 +203,9 @@ def test_a_black_level_above_all_numbers_is_refused(tmp_path: Path, mode: str) -
     for number, (*_, light) in enumerate(session.shown(mode)):
         Image.fromarray((session.frame(light) / 16).astype(np.uint8)).save(folder / f"f_{number}.png")
     write_list(folder, signed_capture=mode, digital={**DIGITAL, "black_level_dn": 300})
-    with pytest.raises(MitsimError) as told:
+    with pytest.raises(MitsimError) as reported:
         calibrate_frames(folder, tmp_path / "cal")
-    message = str(told.value)
+    message = str(reported.value)
     assert "f_0.png" in message and "black_level_dn 300" in message and "\n" not in message
     assert not (tmp_path / "cal").exists()
 

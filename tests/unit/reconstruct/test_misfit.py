@@ -117,7 +117,7 @@ def test_saturation_is_named() -> None:
     assert found.signatures is not None and found.signatures.saturated > 1e-3
 
 
-def test_another_rig_is_named() -> None:
+def test_other_devices_are_named() -> None:
     """Factors of another camera that goes by the same name: its mask's features in another order."""
     image = recovered(bench(), calibrated=OTHER)
     assert not image.ok and misfit(image).cause is Cause.RIG
@@ -183,16 +183,18 @@ def test_lambda_is_told_whether_the_frames_fit(monkeypatch: pytest.MonkeyPatch) 
     """Where they do not, or where the calibration says that no factors do, lambda is chosen once more, knowing that.
 
     In small sessions the frames show it themselves and both choices agree, so what is said is looked at."""
-    said, solve = [], Prepared.solve
+    reported, solve = [], Prepared.solve
     monkeypatch.setattr(
-        Prepared, "solve", lambda *given, **named: said.append(named.get("explained", True)) or solve(*given, **named)
+        Prepared,
+        "solve",
+        lambda *given, **named: reported.append(named.get("explained", True)) or solve(*given, **named),
     )
     factors = bench().calibrated(0)
     odd = replace(factors, status=Status(Verdict.NOT_SEPARABLE, "Not separable"))
     for shift, known, expected in ((0.0, factors, [True]), (SHIFT, factors, [True, False]), (0.0, odd, [True, False])):
-        said.clear()
+        reported.clear()
         reconstruct(bench(shift).run("dots:3", picture(), 0), known)
-        assert said == expected
+        assert reported == expected
 
 
 def test_variance_of_digital_numbers() -> None:

@@ -28,7 +28,7 @@ TURNS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
-def said(patterns: str, change: Callable[[Frames], Frames]) -> tuple[Cause | None, str]:
+def reported(patterns: str, change: Callable[[Frames], Frames]) -> tuple[Cause | None, str]:
     shots = with_frames(CAMERA.run(patterns, picture(1), 1), change)
     misfit = reconstruct(shots, CAMERA.calibrated(1)).misfit
     assert misfit is not None
@@ -39,28 +39,28 @@ def said(patterns: str, change: Callable[[Frames], Frames]) -> tuple[Cause | Non
 @pytest.mark.parametrize("turn", TURNS)
 def test_turned_frames(patterns: str, turn: str) -> None:
     """As what they are; a good run says nothing."""
-    cause, words = said(patterns, lambda frames: [TURNS[turn](frame) for frame in frames])
+    cause, words = reported(patterns, lambda frames: [TURNS[turn](frame) for frame in frames])
     assert cause is Cause.ORIENTATION and turn in words
 
 
 @pytest.mark.parametrize("patterns", ["dots:4", "hadamard:4", "random:4"])
 def test_another_order(patterns: str) -> None:
-    assert said(patterns, lambda frames: [frames[-1], *frames[:-1]])[1].startswith("the frames are one step late")
-    assert said(patterns, lambda frames: [*frames[1:], frames[0]])[1].startswith("the frames are one step early")
-    cause, words = said(patterns, lambda frames: frames[::-1])
+    assert reported(patterns, lambda frames: [frames[-1], *frames[:-1]])[1].startswith("the frames are one step late")
+    assert reported(patterns, lambda frames: [*frames[1:], frames[0]])[1].startswith("the frames are one step early")
+    cause, words = reported(patterns, lambda frames: frames[::-1])
     # Signed patterns in the reverse order are others of the family, of a scene with negative pixels.
     assert cause is Cause.ORDER and ("negative" if patterns == "hadamard:4" else "reverse order") in words
 
 
 def test_all_halves_exchanged() -> None:
-    cause, words = said("hadamard:4", lambda frames: [frames[number ^ 1] for number in range(len(frames))])
+    cause, words = reported("hadamard:4", lambda frames: [frames[number ^ 1] for number in range(len(frames))])
     assert cause is Cause.ORDER and "negative" in words
 
 
 @pytest.mark.parametrize("patterns", ["uniform", "dots:4", "hadamard:4", "random:4"])
 def test_a_tone_curve(patterns: str) -> None:
     span = CODES - 1 - BLACK
-    cause, _ = said(
+    cause, _ = reported(
         patterns, lambda frames: [BLACK + span * (np.maximum(f - BLACK, 0) / span) ** (1 / 2.2) for f in frames]
     )
     assert cause is Cause.GAMMA
@@ -74,7 +74,7 @@ def test_the_tone_curve_of_displays() -> None:
         light = np.maximum(frame - BLACK, 0) / span
         return BLACK + span * np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
-    assert said("dots:4", lambda frames: [encoded(frame) for frame in frames])[1].endswith("the curve of sRGB")
+    assert reported("dots:4", lambda frames: [encoded(frame) for frame in frames])[1].endswith("the curve of sRGB")
 
 
 @pytest.mark.parametrize("patterns", ["uniform", "dots:4", "hadamard:4", "random:4"])
@@ -103,7 +103,7 @@ def test_light_of_walls_is_no_tone_curve() -> None:
 @pytest.mark.parametrize("patterns", ["uniform", "random:4"])
 def test_a_curve_between_is_none_of_its_neighbours(patterns: str) -> None:
     span = CODES - 1 - BLACK
-    cause, _ = said(
+    cause, _ = reported(
         patterns, lambda frames: [BLACK + span * (np.maximum(f - BLACK, 0) / span) ** (1 / 1.98) for f in frames]
     )
     assert cause is not None and cause is not Cause.GAMMA

@@ -177,7 +177,7 @@ def test_large_sensors_are_predicted_to_be_read_twice() -> None:
     """16 times the pixels take 16 times as long, and once more for frames that are not kept; memory grows with a frame,
     not with their number. (Planted: one look at frames that are not kept.)"""
 
-    def told(pixels: int, dots: int) -> ImageCost:
+    def reported(pixels: int, dots: int) -> ImageCost:
         family = parse_patterns(f"dots:{dots}", 128)
         captures = [None] * dots**2
         shots = SimpleNamespace(
@@ -186,7 +186,7 @@ def test_large_sensors_are_predicted_to_be_read_twice() -> None:
         side = np.zeros((pixels, 128))
         return predict_cost(shots, SimpleNamespace(left=side, right=side))  # type: ignore[arg-type]
 
-    small, large, many = told(512, 7), told(2048, 7), told(2048, 32)
+    small, large, many = reported(512, 7), reported(2048, 7), reported(2048, 32)
     assert 10 < large.seconds["accumulate"] / small.seconds["accumulate"] <= 16
     assert large.seconds["misfit"] > 30 * small.seconds["misfit"]
     assert large.seconds["misfit"] > large.seconds["accumulate"] / 2

@@ -56,7 +56,7 @@ def test_light_that_is_linear_between_dots_is_told_exactly(patterns: str) -> Non
     _, found, image = separated(family, frames)
     np.testing.assert_allclose(found.image, haze, atol=1e-8)
     np.testing.assert_allclose(image, scene, atol=1e-7)
-    assert 0 < found.told.min() < found.told.max() < 1
+    assert 0 < found.eigenvalues.min() < found.eigenvalues.max() < 1
 
 
 @pytest.mark.parametrize(("width", "left"), [(3.0, 0.2), (8.0, 0.15), (20.0, 0.15)])
@@ -82,10 +82,10 @@ def test_an_invented_global_matrix(width: float, left: float) -> None:
 
 def test_uniform_light_tells_nothing() -> None:
     """Global light looks like an image there."""
-    for patterns, said in (("uniform", "use dots:K with K of 2"), ("hadamard:4", "takes dots")):
+    for patterns, reported in (("uniform", "use dots:K with K of 2"), ("hadamard:4", "takes dots")):
         family = parse_patterns(patterns, N)
         frames = [FACTOR @ picture(n=N) @ FACTOR.T for _ in family.shots]
         model = prepare(FACTOR, FACTOR, *sides_of(family))
         weights = np.ones((N, N))
-        with pytest.raises(MitsimError, match=said):
+        with pytest.raises(MitsimError, match=reported):
             separate(model, (FACTOR, FACTOR), sides_of(family), weights, np.sum(frames, axis=0))

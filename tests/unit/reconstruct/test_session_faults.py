@@ -92,7 +92,7 @@ def test_a_good_session_is_left_as_it_is_to_the_bit() -> None:
     ],
 )
 @pytest.mark.parametrize("half", [("horizontal", 5, 1), ("vertical", 20, -1)])
-def test_a_wrong_frame_is_named_and_foretold_by_the_other_of_its_pair(
+def test_a_wrong_frame_is_named_and_predicted_by_the_other_of_its_pair(
     kind: str, change: Callable[[np.ndarray], np.ndarray], half: Half
 ) -> None:
     """(Planted: the other frame of the pair is named; the sign of the vector that it predicts is not turned.)"""

@@ -38,11 +38,11 @@ def test_uncertainty_is_shown_with_its_scale_and_sources() -> None:
     order = np.argsort(image.uncertainty.ravel(), kind="stable")
     assert np.all(np.diff(pictures[1].ravel()[order]) >= 0), "the less certain, the lighter"
     (line,) = (line for line in lines if line.startswith("standard uncertainty "))
-    told = dict(re.findall(r"([a-z ]+) (\d\.\de-\d+)", line.partition(": ")[2]))
-    values = [float(value) for value in told.values()]
+    reported = dict(re.findall(r"([a-z ]+) (\d\.\de-\d+)", line.partition(": ")[2]))
+    values = [float(value) for value in reported.values()]
     assert values == sorted(values, reverse=True) and len(values) >= 3
     budget = image.uncertainties.budget
-    for name, value in told.items():
+    for name, value in reported.items():
         assert float(value) == float(f"{budget[name.strip().replace(' ', '_')]:.1e}")
     assert line.startswith(f"standard uncertainty {image.summary()['uncertainty']:.1e} rms: ")
 

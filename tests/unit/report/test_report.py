@@ -236,14 +236,14 @@ def test_the_same_data_give_the_same_bytes(page: str) -> None:
 def test_only_a_solver_with_something_to_say_is_heard(page: str) -> None:
     assert "Solved" not in page
 
-    said = (
+    reported = (
         "Solved: every direction of the image is measured.",
         "Solved, but 3 of 9 directions are not measured above rounding.",
         "Rank deficient: 3 of 9 directions are not measured.",
     )
     families = tuple(
         replace(family, rendered=replace(family.rendered, status=text))
-        for family, text in zip(example().families, said, strict=False)
+        for family, text in zip(example().families, reported, strict=False)
         if family.rendered is not None
     )
     text = R.render_html(replace(example(), families=families))

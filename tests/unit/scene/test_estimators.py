@@ -44,9 +44,12 @@ def test_media_are_for_the_reference_alone(small_scene: Write, extra: str, name:
     path = small_scene(extra=extra, **VOLPATH)
     bench = open_bench(path, for_render=True)
     for action in (lambda: open_bench(path), lambda: bench.render("factored"), lambda: bench.plan("uniform")):
-        said = message(action)
+        reported = message(action)
         line = path.read_text().split(tag.split(" id")[0].replace("'", '"'))[0].count("\n") + 1
-        assert said.startswith(f"{path}:{line}: {name}: got a medium in {tag}; only the reference") and "\n" not in said
+        assert (
+            reported.startswith(f"{path}:{line}: {name}: got a medium in {tag}; only the reference")
+            and "\n" not in reported
+        )
     assert bench.render("reference", spp=4).mean.any()
 
 
@@ -60,8 +63,8 @@ def test_a_projector_whose_pixels_run_into_each_other_is_for_the_reference_alone
     path.write_text(text.replace(nearest, written, 1))
     bench = open_bench(path, for_render=True)
     for action in (lambda: open_bench(path), lambda: bench.render("factored"), lambda: bench.plan("uniform")):
-        said = message(action)
-        assert "filter_type: got 'bilinear'" in said and nearest in said and "blur_pixels" in said
+        reported = message(action)
+        assert "filter_type: got 'bilinear'" in reported and nearest in reported and "blur_pixels" in reported
     assert bench.render("reference", spp=4).mean.any()
 
 
@@ -83,10 +86,10 @@ def test_integrators_that_lose_light_are_refused(small_scene: Write, integrator:
     """`path` sees no light through a hole (-17.8 % of a wall behind a card that is not there) and no medium."""
     options = {"integrator": integrator, "integrator_options": ""}
     path = small_scene(extra=extra, **options)
-    said = message(lambda: open_bench(path, for_render=True).render("reference", spp=4))
+    reported = message(lambda: open_bench(path, for_render=True).render("reference", spp=4))
     line = path.read_text().split(extra)[0].count("\n") + 1
-    assert f"{path}:3: integrator: got '{integrator}' in <integrator type='{integrator}'>" in said
-    assert f"it loses light at small.xml:{line} ({cause}); use volpath" in said
+    assert f"{path}:3: integrator: got '{integrator}' in <integrator type='{integrator}'>" in reported
+    assert f"it loses light at small.xml:{line} ({cause}); use volpath" in reported
 
 
 def test_other_scenes_go_their_way(small_scene: Write) -> None:
@@ -108,9 +111,9 @@ def test_light_that_mirrors_bring_is_told_as_lost(small_scene: Write, glass: str
     unfit = open_bench(path).loaded.unfit
     lines = path.read_text().splitlines()
     line = next(number for number, text in enumerate(lines, 1) if "sphere" in text)
-    said = open_bench(path).render("reference", spp=4).warnings
-    assert unfit.caustics is not None and said == (unfit.caustics,) and unfit.lamps is None
-    assert f"small.xml:{line} ({glass})" in said[0] and "'projector'" in said[0] and f"{path}:" in said[0]
+    reported = open_bench(path).render("reference", spp=4).warnings
+    assert unfit.caustics is not None and reported == (unfit.caustics,) and unfit.lamps is None
+    assert f"small.xml:{line} ({glass})" in reported[0] and "'projector'" in reported[0] and f"{path}:" in reported[0]
     lit = small_scene("lit", extra=BALL.format("conductor") + BULB)
     lamps = open_bench(lit).loaded.unfit.lamps
     assert lamps is not None and "'point'" in lamps and "(conductor)" in lamps
@@ -169,7 +172,7 @@ def test_plans_captures_and_frames_say_once_what_they_lack(small_scene: Write, m
 
 
 def test_glass_in_an_instance_is_told_as_lost(small_scene: Write) -> None:
-    """It is no pane and casts no glint there, and an instance does not show its materials."""
+    """It is no pane and brings no specular chain there, and an instance does not show its materials."""
     group = '<shape type="shapegroup" id="group">{}</shape>'
     placed = (
         '<shape type="instance"><ref id="group"/><transform name="to_world"><translate z="20"/></transform></shape>'
@@ -177,8 +180,8 @@ def test_glass_in_an_instance_is_told_as_lost(small_scene: Write) -> None:
     path = small_scene(extra=group.format(BALL.format("dielectric")) + placed)
     loaded = open_bench(path).loaded
     assert loaded.mirrors and loaded.unfit.instances is not None and "'dielectric'" in loaded.unfit.instances
-    said = list(known_losses(loaded, {}))
-    assert said == [loaded.unfit.instances] and not list(known_losses(loaded, {"mirrors": False}))
+    reported = list(known_losses(loaded, {}))
+    assert reported == [loaded.unfit.instances] and not list(known_losses(loaded, {"mirrors": False}))
     matt = open_bench(small_scene("matt", extra=group.format(BALL.format("diffuse")) + placed)).loaded
     assert matt.unfit.instances is None and not matt.mirrors and matt.glossy
 

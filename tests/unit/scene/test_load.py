@@ -180,7 +180,9 @@ def test_a_lamp_that_is_no_area_is_refused_in_a_shape(small_scene: Write) -> Non
     text = path.read_text()
     end = text.rindex("</shape>")
     path.write_text(text[:end] + lamp + text[end:])
-    assert "type: got 'point'" in (told := refusal(path)) and "a shape holds area or mitsim_projector only" in told
+    assert (
+        "type: got 'point'" in (reported := refusal(path)) and "a shape holds area or mitsim_projector only" in reported
+    )
 
 
 def test_a_scene_without_our_sensor(tmp_path: Path) -> None:

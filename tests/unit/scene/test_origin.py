@@ -1,4 +1,4 @@
-"""A rig far from the origin is the rig at the origin, to the rounding of single precision there."""
+"""Devices far from the origin are the devices at the origin, to the rounding of single precision there."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -54,8 +54,8 @@ def standing(away: tuple[float, float, float]) -> str:
 
 def loaded(small_scene: Callable[..., Path], away: tuple[float, float, float], extra: str) -> LoadedScene:
     x, y, z = away
-    rig = f"1 0 0 {x!r} 0 1 0 {y!r} 0 0 1 {z!r} 0 0 0 1"
-    return load_scene(small_scene(rig=rig, extra=extra, integrator="volpath"))
+    pose = f"1 0 0 {x!r} 0 1 0 {y!r} 0 0 1 {z!r} 0 0 0 1"
+    return load_scene(small_scene(pose=pose, extra=extra, integrator="volpath"))
 
 
 def places(scene: LoadedScene) -> np.ndarray:

@@ -69,9 +69,9 @@ def test_the_hand_written_projector_is_the_plain_one_when_not_turned() -> None:
     assert np.allclose(corners[0, 0], [-0.15, -0.15]) and np.allclose(corners[1, 1], [0.15, 0.15])
 
 
-def test_the_grid_moves_with_the_rig(small_scene: Callable[..., Path]) -> None:
+def test_the_grid_moves_with_the_devices(small_scene: Callable[..., Path]) -> None:
     # A quarter turn about y and a shift, of camera, projector and sheet together.
-    grid = grid_of(small_scene(rig="0 0 1 50 0 1 0 -20 -1 0 0 30 0 0 0 1"))
+    grid = grid_of(small_scene(pose="0 0 1 50 0 1 0 -20 -1 0 0 30 0 0 0 1"))
     assert grid.row_tan == pytest.approx((-0.15, 0.15), abs=4 * FLOAT32)
     assert grid.column_tan == pytest.approx((-0.15, 0.15), abs=4 * FLOAT32)
     assert grid.keystone == 0

@@ -115,13 +115,13 @@ def test_shutters_of_the_shipped_cameras(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "reported"),
     [
         ({"shutter": "curtain"}, "shutter"),
         ({"line_time_us": 30.0}, "line_time_us 30 is of a rolling shutter; set shutter 'rolling'"),
         ({"shutter": "rolling", "line_time_us": 0.0}, "line_time_us"),
     ],
 )
-def test_a_shutter_that_cannot_be_is_one_line(changes: dict[str, Any], said: str) -> None:
-    with pytest.raises(MitsimError, match=rf"^camera[^\n]*{said}[^\n]*$"):
+def test_a_shutter_that_cannot_be_is_one_line(changes: dict[str, Any], reported: str) -> None:
+    with pytest.raises(MitsimError, match=rf"^camera[^\n]*{reported}[^\n]*$"):
         validate(SensorModel, {**SENSOR.model_dump(exclude_none=True), **changes}, "camera")

@@ -76,7 +76,7 @@ def test_nothing_taken_out_is_the_light_itself(far: SampledLight) -> None:
 
 def test_the_same_paths_are_traced_again(far: SampledLight) -> None:
     """To the renderer's float32. (Planted: another purpose's streams.)"""
-    again = traced_again(far, ablation._Filing(far.bench, far.simulation.settings, True, frozenset()))
+    again = traced_again(far, ablation._AblationSimulation(far.bench, far.simulation.settings, True, frozenset()))
     for own, other in zip(far.groups, again.groups, strict=True):
         for grid in GRIDS:
             assert abs(own[grid] - other[grid]).sum() <= 1e-6 * own["fine"].sum()
@@ -103,7 +103,7 @@ def test_a_turned_projector_has_a_keystone(turned: SampledLight) -> None:
     assert not ablation._off_plane(turned)
 
 
-def sharp_deposits(light: SampledLight) -> PathSamples:
+def sharp_path_samples(light: SampledLight) -> PathSamples:
     """A ray from each projector pixel, without blur."""
     settings = light.simulation.settings
     settings = replace(settings, effects=settings.effects - {"blur"})
@@ -123,7 +123,7 @@ def pixel_of(light: SampledLight, path_samples: PathSamples) -> FloatArray:
 def test_depth_is_parallax(far: SampledLight) -> None:
     """The projector, 60 mm aside (x = 60, column -60), 20 mm before the plane: light is seen 60 (1/380 - 1/400) aside,
     0.35 pixels, and without depth in its pixel on the plane. (Planted: the projector on the other side.)"""
-    path_samples, place = sharp_deposits(far), ablation._Place(far.bench)
+    path_samples, place = sharp_path_samples(far), ablation._Place(far.bench)
     aside = place.parallax(path_samples)
     assert np.allclose(aside[1], -60 * (1 / 380 - 1 / 400), rtol=1e-3) and np.abs(aside[0]).max() < 1e-6
     assert (pixel_of(far, path_samples) != path_samples.pixel).mean() > 0.2
@@ -134,7 +134,7 @@ def test_depth_is_parallax(far: SampledLight) -> None:
 
 def test_without_keystone_light_lies_in_its_pixel(turned: SampledLight) -> None:
     """(Planted: the homography the other way round.)"""
-    path_samples = sharp_deposits(turned)
+    path_samples = sharp_path_samples(turned)
     assert (pixel_of(turned, path_samples) != path_samples.pixel).mean() > 0.2
     straight = ablation._Place(turned.bench).moved(path_samples, frozenset({ablation.KEYSTONE}))
     assert np.array_equal(pixel_of(turned, straight), path_samples.pixel)
@@ -202,7 +202,7 @@ def test_detail_is_what_cells_of_a_pixel_differ_in(far: SampledLight) -> None:
 
 def test_what_hides_or_moves_points_leaves_them_where_they_are(far: SampledLight) -> None:
     """Where depth stays on, all points of a pixel have the mean of their values. (Planted: that of all pixels.)"""
-    path_samples = sharp_deposits(far)
+    path_samples = sharp_path_samples(far)
     two = PathSamples.joined([path_samples, replace(path_samples, value=3 * path_samples.value)])
     even = ablation._even(two, far.bench.n**2)
     assert np.allclose(even.value, 2 * np.tile(path_samples.value, 2)) and np.array_equal(even.row, two.row)
@@ -235,12 +235,12 @@ def test_lobes_are_averaged_over_anchors_with_their_weights(far: SampledLight) -
     )
     labels = np.arange(far.bench.n**2)
     bundle = simulation.grids["sharp"].bundle
-    filed, weights = bundle.accumulate(path_samples, labels, 1), simulation.mean_weights(bundle.anchors)
-    mean = ablation._even_lobes(filed, simulation)
+    accumulated, weights = bundle.accumulate(path_samples, labels, 1), simulation.mean_weights(bundle.anchors)
+    mean = ablation._even_lobes(accumulated, simulation)
     weight = weights[2] * weights[1]
     again = bundle.repeated(replace(bundle, anchors=1).accumulate(path_samples.averaged(weights), labels, 1))
     assert abs(mean - again).max() < 1e-12 and mean.sum() == pytest.approx(9 * weight)
-    assert ablation._even_lobes(filed, far.simulation) is filed, "nothing to average where nothing is sharp"
+    assert ablation._even_lobes(accumulated, far.simulation) is accumulated, "nothing to average where nothing is sharp"
 
 
 def test_what_is_moved_is_added_up_on_the_host(far: SampledLight) -> None:
@@ -249,5 +249,5 @@ def test_what_is_moved_is_added_up_on_the_host(far: SampledLight) -> None:
     settings = replace(far.simulation.settings, anchors=3, samples={"anchor_residual": 1e4})
     labels = np.arange(far.bench.n**2)
     for off, held in ((frozenset[str](), True), (frozenset({ablation.DEPTH}), False)):
-        filing = ablation._Filing(far.bench, settings, True, off)
-        assert (filing.accumulator("anchor_residual", labels, 1) is not None) == held
+        accumulating = ablation._AblationSimulation(far.bench, settings, True, off)
+        assert (accumulating.accumulator("anchor_residual", labels, 1) is not None) == held

@@ -181,8 +181,8 @@ def test_extrapolated_points_are_hollow(study: AccuracyFindings) -> None:
     faces = [[line.get_markerfacecolor() for line in axes.lines] for axes in (runs, reference)]
     assert len(faces[0]) == count + 1 + 2 and "white" not in faces[0], "points, rings, judge and sensor noise"
     assert faces[1] == ["white"] * 3 + ["none"], "points and rings"
-    said = {row.setting.removeprefix("accuracy ") for row in study.rows if not row.extrapolated}
-    assert said and said <= {text.get_text() for text in runs.texts}
+    reported = {row.setting.removeprefix("accuracy ") for row in study.rows if not row.extrapolated}
+    assert reported and reported <= {text.get_text() for text in runs.texts}
 
 
 def test_what_does_not_fit_is_left_out_and_named(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -191,8 +191,8 @@ def test_what_does_not_fit_is_left_out_and_named(bench: Bench, monkeypatch: pyte
     found = accuracy.measure(bench, Request.of(patterns=PATTERNS, seed=SEED), Job())
     [row] = found.rows
     assert row.accuracies == (accuracy.QUOTED,) and row.spread.repeats == 1, "the default is run whatever it takes"
-    said = "\n".join(found.left_out)
-    assert "accuracy 0.03 " in said and "time of diffraction" in said and "reference at 16 spp" in said
+    reported = "\n".join(found.left_out)
+    assert "accuracy 0.03 " in reported and "time of diffraction" in reported and "reference at 16 spp" in reported
     assert found.speedup_at_equal_error is None and not found.opening
     assert all(part.cost == "not timed" and part.error_if_off >= 0 for part in found.effects)
     assert any("(once)" in line for line in found.lines()) and found.figures()

@@ -55,9 +55,9 @@ def test_noise_is_told_by_source_and_by_factor() -> None:
     )
     found = dict(error_budget._noises(stand, session))
     common = factors[1].sum(axis=1)
-    told = found.pop((SESSION, "shot noise"))
+    reported = found.pop((SESSION, "shot noise"))
     # Of noise of its own a mean over N responses; what these share is in the first of N columns.
-    assert told.left == pytest.approx(6 / 3 / (common @ common) * (1 / N + 0.5 / N)) and told.right == 0
+    assert reported.left == pytest.approx(6 / 3 / (common @ common) * (1 / N + 0.5 / N)) and reported.right == 0
     rendering = error_budget.session_rendering(np.ones(1), np.full(1, 0.1), factors)
     assert amounts(found.pop((SESSION, RENDERING))) == pytest.approx(amounts(rendering))
     assert found == {("capture", "read noise"): Noise(), ("capture", RENDERING): Noise(light=36.25)}, "no speckle"
@@ -71,11 +71,11 @@ def test_sampled_light_of_a_board_multiplies_columns() -> None:
     dark pixels; the mean of the weights' squares.)"""
     left, right = 1 + RNG.random((3, N)), 1 + RNG.random((5, N))
     found = error_budget.session_rendering(np.array([0.5, 0.0, 2.0]), np.array([0.05, 9.0, 0.4]), (left, right))
-    for factor, told in ((right, found.left_light), (left, found.right_light)):
+    for factor, reported in ((right, found.left_light), (left, found.right_light)):
         common = factor.sum(axis=1)
         weights = [float(column @ common) / float(common @ common) for column in factor.T]
         assert sum(weights) == pytest.approx(1)
-        assert told == pytest.approx(0.025 * sum(weight**2 for weight in weights))
+        assert reported == pytest.approx(0.025 * sum(weight**2 for weight in weights))
 
 
 def test_what_is_not_explained_is_a_loss_of_its_own() -> None:

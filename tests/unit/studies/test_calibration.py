@@ -126,12 +126,12 @@ def test_bias_and_angle_are_second_derivatives_by_every_entry() -> None:
 
 def test_light_and_time_of_a_session_are_counted() -> None:
     """8 patterns of either side, two halves, three repeats at 0.02 and 0.08 s; each pair is a uniform frame's light."""
-    lit = lit_session(7, rig=CLIPPED, repeats=3, exposure_ladder=(1.0, 4.0))
+    lit = lit_session(7, devices=CLIPPED, repeats=3, exposure_ladder=(1.0, 4.0))
     found = session_cost(lit)
     assert found["frames"] == 2 * 16 * 3 * 2 and found["exposure_seconds"] == pytest.approx(2 * 16 * 3 * 0.1)
     assert found["photoelectrons"] == pytest.approx(float(lit.uniform_rate.sum()) * 16 * 3 * 0.1)
     assert found["photons"] == pytest.approx(2 * found["photoelectrons"])
-    dark = lit_session(7, "uniform", rig=CLIPPED, dark_frames=5)
+    dark = lit_session(7, "uniform", devices=CLIPPED, dark_frames=5)
     assert session_cost(dark)["exposure_seconds"] == pytest.approx((18 + 5) * 0.02)
     shown = 2 + 2 * float((1 + dark.session.signs).sum()) / 2 / 7
     assert session_cost(dark)["photoelectrons"] == pytest.approx(float(dark.uniform_rate.sum()) * shown * 0.02)
@@ -164,14 +164,14 @@ def test_noise_by_source_is_all_noise() -> None:
     in the shot noise; repeats left out of what is shared.)"""
     fields = {"repeats": 2, "exposure_ladder": (1.0, 2.0)}
     for mode, extra in (("pair", {}), ("uniform", {"dark_frames": 3})):
-        lit = lit_session(7, mode, rig=CLIPPED, **fields, **extra)
+        lit = lit_session(7, mode, devices=CLIPPED, **fields, **extra)
         own, shared = lit.response_variances("horizontal")
         assert set(own) == set(shared) == {"shot noise", "dark current", "read noise", "quantisation"}
         whole = sum(part.mean() for parts in (own, shared) for part in parts.values())
         assert whole == pytest.approx(lit.response_variance("horizontal").mean())
         assert all(part.any() == (mode == "uniform") for part in shared.values())
     sensor, time = CLIPPED.sensor, EXPOSURE_S
-    own, shared = lit_session(7, "uniform", rig=CLIPPED, repeats=2, dark_frames=3).response_variances("vertical")
+    own, shared = lit_session(7, "uniform", devices=CLIPPED, repeats=2, dark_frames=3).response_variances("vertical")
     dark, read = sensor.dark_current_e_per_s / time, sensor.read_noise_e**2 / time**2
     assert own["dark current"] == pytest.approx(4 * dark / 2)
     assert shared["dark current"] == pytest.approx(dark / 2 + dark / 3)
@@ -192,9 +192,9 @@ def test_sampled_light_of_a_session_multiplies_columns_of_its_factors() -> None:
         columns = [(own * exact).sum(axis=0) / np.square(exact).sum(axis=0) for own, exact in sides]
         squares.append([np.var(each / each.mean(), ddof=1) for each in columns])
     flux = rng.random(49) + 0.5
-    told = session_rendering(flux, 0.01 * flux, factors)
-    assert np.mean(squares, axis=0) == pytest.approx([told.left_light, told.right_light], rel=0.33)
-    assert told.right_light == pytest.approx(1e-4 / 7, rel=0.5), "the mean over a row of pixels"
+    reported = session_rendering(flux, 0.01 * flux, factors)
+    assert np.mean(squares, axis=0) == pytest.approx([reported.left_light, reported.right_light], rel=0.33)
+    assert reported.right_light == pytest.approx(1e-4 / 7, rel=0.5), "the mean over a row of pixels"
     dark = session_rendering(np.zeros(49), flux, factors)
     assert dark.left_light == dark.right_light == 0
 
@@ -217,11 +217,11 @@ def test_all_sources_together_are_what_the_image_is_off(
     bench = open_bench(str(small_scene(name="even")), variant, camera=own)
     found = measure(bench, Request.of(patterns="dots:4", accuracy=2e-3, seed=1), Job())
     assert found.image["predicted_psnr_db"] == pytest.approx(found.image["psnr_db"], abs=0.5)
-    told = {(row.of, row.source): row.squared_error for row in found.losses}
-    left = told.pop(("unexplained", "not explained"))
-    assert told["capture", largest] > 0.7 * sum(told.values()) and told["session", "rendering"] > 0
-    assert found.image["predicted_psnr_db"] == pytest.approx(-10 * np.log10(sum(told.values())))
-    assert found.image["psnr_db"] == pytest.approx(-10 * np.log10(sum(told.values()) + left)) and not found.warnings
+    reported = {(row.of, row.source): row.squared_error for row in found.losses}
+    left = reported.pop(("unexplained", "not explained"))
+    assert reported["capture", largest] > 0.7 * sum(reported.values()) and reported["session", "rendering"] > 0
+    assert found.image["predicted_psnr_db"] == pytest.approx(-10 * np.log10(sum(reported.values())))
+    assert found.image["psnr_db"] == pytest.approx(-10 * np.log10(sum(reported.values()) + left)) and not found.warnings
 
 
 def print_of_squares(pixels: float) -> FloatArray:
@@ -230,10 +230,12 @@ def print_of_squares(pixels: float) -> FloatArray:
     return 25 + 200 * np.not_equal.outer(place.astype(int) % 2, place.astype(int) % 2)
 
 
-def losses_of(scene: Path, variant: str, seed: int = 1, **rig: Path) -> tuple[CalibrationFindings, dict[str, LossRow]]:
+def losses_of(
+    scene: Path, variant: str, seed: int = 1, **devices: Path
+) -> tuple[CalibrationFindings, dict[str, LossRow]]:
     """Findings of a session of 16 patterns, and losses by name."""
     found = measure(
-        open_bench(str(scene), variant, **rig), Request.of(patterns="dots:4", accuracy=2e-3, seed=seed), Job()
+        open_bench(str(scene), variant, **devices), Request.of(patterns="dots:4", accuracy=2e-3, seed=seed), Job()
     )
     return found, {row.name: row for row in found.losses}
 
@@ -267,11 +269,13 @@ def test_a_cause_without_a_row_is_said_to_be_missing(
     assert "a cause is missing" in " ".join(found.lines())
 
 
-@pytest.mark.parametrize(("errors", "said"), [(0.9, "within its standard error"), (-2.0, "chance makes 4.6% of all")])
-def test_what_is_not_explained_is_said_by_its_standard_errors(errors: float, said: str) -> None:
+@pytest.mark.parametrize(
+    ("errors", "message"), [(0.9, "within its standard error"), (-2.0, "chance makes 4.6% of all")]
+)
+def test_what_is_not_explained_is_said_by_its_standard_errors(errors: float, message: str) -> None:
     row = LossRow("unexplained", "not explained", "", 0.0, 0.0, errors * 1e-6, 1e-6)
     found = CalibrationFindings((), (), (), {}, (0.1, 0.2), SPENT, IMAGE, (row,))
-    assert said in " ".join(found.lines()) and said in found.parts()[0].lead.lower() and not found.warnings
+    assert message in " ".join(found.lines()) and message in found.parts()[0].lead.lower() and not found.warnings
 
 
 def test_the_page_has_every_loss_in_one_table() -> None:

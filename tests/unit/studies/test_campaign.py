@@ -72,8 +72,8 @@ def begun(folder: Path) -> list[str]:
 def contents(folder: Path) -> dict[str, bytes]:
     """All that tells of results: time and place apart."""
     kept = {file.name: file.read_bytes() for file in folder.iterdir() if file.suffix in (".csv", ".png", ".html")}
-    told = json.loads((folder / "toy.json").read_text())
-    return kept | {"rows": json.dumps([told["rows"], told["claims"], told["figures"]]).encode()}
+    reported = json.loads((folder / "toy.json").read_text())
+    return kept | {"rows": json.dumps([reported["rows"], reported["claims"], reported["figures"]]).encode()}
 
 
 def test_every_point_is_measured_once_and_put_together(run: Run, tmp_path: Path) -> None:
@@ -84,9 +84,9 @@ def test_every_point_is_measured_once_and_put_together(run: Run, tmp_path: Path)
     assert {file.name for file in folder.iterdir()} == {"toy.json", "toy.csv", "toy.html", "squares.png", "points"}
     rows = list(csv.DictReader((folder / "toy.csv").open()))
     assert [row["place"] + row["number"] for row in rows] == sorted(ALL), "in the order of the points"
-    told = json.loads((folder / "toy.json").read_text())
-    assert told["rows"][4]["square"] == float(rows[4]["square"]) == pytest.approx(4, abs=0.1)
-    assert told["status"] == "complete" and told["kind"] == "toy" and told["figures"] == ["squares.png"]
+    reported = json.loads((folder / "toy.json").read_text())
+    assert reported["rows"][4]["square"] == float(rows[4]["square"]) == pytest.approx(4, abs=0.1)
+    assert reported["status"] == "complete" and reported["kind"] == "toy" and reported["figures"] == ["squares.png"]
     page = (folder / "toy.html").read_text()
     assert "Two squared is four" in page and "data:image/png;base64," in page and "<script" not in page
 
@@ -196,9 +196,9 @@ def test_no_module_is_imported_because_a_file_names_it(
     monkeypatch.syspath_prepend(str(folder))
     part = tmp_path / "part"
     shutil.copytree(whole[1], part)
-    told = json.loads((part / "toy.json").read_text())
+    reported = json.loads((part / "toy.json").read_text())
     for name in ("lab.study", "harmless", "..harmless", "os.path", ["lab.study"], {"a": 1}, None, 3, "\x1b[2J.a"):
-        (part / "toy.json").write_text(json.dumps({**told, "study": name}))
+        (part / "toy.json").write_text(json.dumps({**reported, "study": name}))
         for experiment in (None, TOY):
             with pytest.raises(MitsimError, match=r"is of the study .*merged by its name") as refusal:
                 merge([part], tmp_path / "joined", experiment)
@@ -211,8 +211,8 @@ def test_parts_of_other_versions_are_not_signed_by_this_one(run: Run, tmp_path: 
     parts = [tmp_path / "a", tmp_path / "b"]
     for part in parts:
         shutil.copytree(whole[1], part)
-        told = json.loads((part / "toy.json").read_text())
-        (part / "toy.json").write_text(json.dumps({**told, "versions": {"mitsim": "0.1"}}))
+        reported = json.loads((part / "toy.json").read_text())
+        (part / "toy.json").write_text(json.dumps({**reported, "versions": {"mitsim": "0.1"}}))
     with pytest.raises(MitsimError, match="measured by other versions"):
         merge(parts, tmp_path / "joined", TOY)
     assert not (tmp_path / "joined").exists()
@@ -268,8 +268,8 @@ def test_bad_folders_are_refused(run: Run, tmp_path: Path) -> None:
         merge([tmp_path / "other"], tmp_path / "joined")
     run("new")
     head = tmp_path / "new" / "toy.json"
-    told = json.loads(head.read_text())
-    head.write_text(json.dumps({**told, "versions": {**told["versions"], "mitsim": "0.1"}}))
+    reported = json.loads(head.read_text())
+    head.write_text(json.dumps({**reported, "versions": {**reported["versions"], "mitsim": "0.1"}}))
     with pytest.raises(MitsimError, match="measured by other versions"):
         run("new")
     run("fresh")

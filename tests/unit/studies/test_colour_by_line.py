@@ -80,9 +80,9 @@ def test_the_command_line_tells_every_line(
     run, calibration = pair
     command = ["reconstruct", str(run), "--calibration", str(calibration), "-o", str(tmp_path / "image"), "--json"]
     assert main(command) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert [line["name"] for line in told["channels"]] == ["638nm", "520nm", "445nm"]
-    assert all(line["psnr"] > 30 and line["status"] for line in told["channels"]) and len(told["matrix"]) == 3
+    reported = json.loads(capsys.readouterr().out)
+    assert [line["name"] for line in reported["channels"]] == ["638nm", "520nm", "445nm"]
+    assert all(line["psnr"] > 30 and line["status"] for line in reported["channels"]) and len(reported["matrix"]) == 3
     assert main([*command, "--lambda", "3"]) == 2, "an image of other inputs is kept"
     assert "638nm" in (tmp_path / "image" / "colour.json").read_text()
     assert main([*command, "--lambda", "3", "--overwrite"]) == 0

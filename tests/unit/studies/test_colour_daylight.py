@@ -28,7 +28,7 @@ def line(patterns: str, rates: float = 1e4, lamp: float = 1e5) -> DaylitLine:
     """A small camera, its frames even, with an IMX249 of so many pixels."""
     rng, family = np.random.default_rng(0), parse_patterns(patterns, N, 0)
     sensor = load_model(locate("imx249", "calibration", ".toml"), SensorModel)
-    bench = SimpleNamespace(sensor=sensor, rig=SimpleNamespace(sensor=sensor))
+    bench = SimpleNamespace(sensor=sensor, devices=SimpleNamespace(sensor=sensor))
     factors = SimpleNamespace(
         sides=(rng.random((PIXELS, N)), rng.random((PIXELS, N))), manifest=SimpleNamespace(centre=False)
     )
@@ -109,8 +109,8 @@ def rows_of(measured: float, kept: float | None) -> Table:
                     {**own, "method": method, "draw": k, "mean_delta_e": 4 + share * measured + 0.01 * k}
                     for k in (-1, 1)
                 ]
-            told = {"kept_lx": kept or 0.0, "repeats": 3.0 if kept else None, "power": lux / kept if kept else None}
-            rows.append({**own, "method": LEAST, "mean_delta_e": 4 + share, **told})
+            reported = {"kept_lx": kept or 0.0, "repeats": 3.0 if kept else None, "power": lux / kept if kept else None}
+            rows.append({**own, "method": LEAST, "mean_delta_e": 4 + share, **reported})
     return Table(tuple(rows))
 
 

@@ -45,13 +45,17 @@ def test_lines_come_apart_and_have_their_colours(pair: tuple[Path, Path], tmp_pa
         kept = read_frame(tmp_path / "image" / name / "image.exr")[0]["reflectance"]
         assert np.allclose(kept, found.colours.images[..., number], atol=1e-6)
     floor = delta_e(ColourModel.of_lines(LINES).xyz(chart().at(LINES)), chart().xyz)
-    told = json.loads((tmp_path / "image" / "colour.json").read_text())
-    assert told["kind"] == "colour-image" and told["mosaic"] == "joint" and told["psnr"] == found.colours.psnr_db
-    assert told["delta_e_floor"] == pytest.approx(floor.mean()) and told["delta_e_chart"] < floor.mean() + 1
-    assert [patch["name"] for patch in told["patches"]] == list(chart().names)
-    assert told["unexplained"] < 3.5e-3 and found.ok
+    reported = json.loads((tmp_path / "image" / "colour.json").read_text())
+    assert (
+        reported["kind"] == "colour-image"
+        and reported["mosaic"] == "joint"
+        and reported["psnr"] == found.colours.psnr_db
+    )
+    assert reported["delta_e_floor"] == pytest.approx(floor.mean()) and reported["delta_e_chart"] < floor.mean() + 1
+    assert [patch["name"] for patch in reported["patches"]] == list(chart().names)
+    assert reported["unexplained"] < 3.5e-3 and found.ok
     seen = found.colours.delta_e
-    assert seen is not None and told["delta_e"] == pytest.approx(seen.mean())
+    assert seen is not None and reported["delta_e"] == pytest.approx(seen.mean())
     page = (tmp_path / "image" / "report.html").read_text()
     assert all(text in page for text in ("638 nm", "black 2", "The truth", "joint", "the chart in this image"))
     assert "data:image/png" in found._repr_html_() and "520nm" in found._repr_html_()
@@ -108,9 +112,9 @@ def test_the_command_line_tells_of_every_line(
     run, calibration = pair
     command = ["reconstruct", str(run), "--calibration", str(calibration), "-o", str(tmp_path / "image")]
     assert main([*command, "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert [line["name"] for line in told["channels"]] == ["638nm", "520nm", "445nm"]
-    assert told["mosaic"] == "joint" and told["steps"] > 0 and told["lambda"] > 0
+    reported = json.loads(capsys.readouterr().out)
+    assert [line["name"] for line in reported["channels"]] == ["638nm", "520nm", "445nm"]
+    assert reported["mosaic"] == "joint" and reported["steps"] > 0 and reported["lambda"] > 0
     assert main([*command, "--mosaic", "half", "--overwrite"]) == 1, "planes that see several lines have no camera"
     half = capsys.readouterr()
     assert "half: lambda" in half.out and "Misfit" in half.err

@@ -108,7 +108,7 @@ def test_a_small_scene_is_studied_whole(small_scene: Callable[..., Path], tmp_pa
     command = ["study", "colour", str(path), "-o", str(tmp_path / "out"), "--quick", "--jobs", "1", "--json", "--quiet"]
     done = subprocess.run([sys.executable, "-m", "mitsim", *command], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert told["points"] >= 6 and {row["way"] for row in told["rows"]} >= {colour_study.OWN, "mosaic, joint"}
-    own = [row for row in told["rows"] if row["way"] == colour_study.OWN and row["patterns"] == "dots:7"]
+    reported = json.loads(done.stdout)
+    assert reported["points"] >= 6 and {row["way"] for row in reported["rows"]} >= {colour_study.OWN, "mosaic, joint"}
+    own = [row for row in reported["rows"] if row["way"] == colour_study.OWN and row["patterns"] == "dots:7"]
     assert all(row["psnr_db"] > 25 for row in own)

@@ -107,14 +107,16 @@ def test_what_does_not_fit_is_refused_before_an_earlier_demo_is_removed(
     bench = open_bench(shared_scene("refused", n=16), variant)
     with pytest.raises(MitsimError, match="dots:17"):
         demo(bench, earlier, Request.of(patterns="dots:17"))
-    bottomless = replace(bench, rig=replace(bench.rig, sensor=bench.sensor.model_copy(update={"full_well_e": np.inf})))
+    bottomless = replace(
+        bench, devices=replace(bench.devices, sensor=bench.sensor.model_copy(update={"full_well_e": np.inf}))
+    )
     with pytest.raises(MitsimError, match="no full well to fill"):
         demo(bottomless, earlier, Request.of(patterns="dots:2"))
     assert (earlier / "report.html").read_text() == "yesterday's"
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "reported"),
     [
         ("uniform", "Uniform"),
         ("dots:7", "49 dots"),
@@ -123,5 +125,5 @@ def test_what_does_not_fit_is_refused_before_an_earlier_demo_is_removed(
         ("random:3", "9 random"),
     ],
 )
-def test_labels(name: str, said: str) -> None:
-    assert label(name) == said
+def test_labels(name: str, reported: str) -> None:
+    assert label(name) == reported

@@ -147,7 +147,9 @@ def test_separability_of_each_light(study: diffraction_study.DiffractionFindings
 
 
 def test_a_camera_without_a_full_well_is_refused_before_any_light_is_traced(bench: Bench, tmp_path: Path) -> None:
-    bottomless = replace(bench, rig=replace(bench.rig, sensor=bench.sensor.model_copy(update={"full_well_e": np.inf})))
+    bottomless = replace(
+        bench, devices=replace(bench.devices, sensor=bench.sensor.model_copy(update={"full_well_e": np.inf}))
+    )
     with pytest.raises(MitsimError, match="no full well to fill"):
         find_study("diffraction")(bottomless, tmp_path / "out", None, None)
     assert not (tmp_path / "out").exists()

@@ -83,7 +83,7 @@ def test_closed_forms_say_what_a_ripple_costs(request: pytest.FixtureRequest, so
     line_us = 1e6 * waves / hertz / (bench.geometry.frame_shape[0] * bench.sensor.binning)
     shutter = {"shutter": "rolling", "line_time_us": line_us} if waves else {}
     lit = copy(still.lit)
-    lit.bench = replace(bench, rig=replace(bench.rig, sensor=bench.sensor.model_copy(update=shutter)))
+    lit.bench = replace(bench, devices=replace(bench.devices, sensor=bench.sensor.model_copy(update=shutter)))
     drift = Drift.model_validate({f"{source}_ripple": 0.1, f"{source}_ripple_hz": hertz})
     found = [replace(still, lit=lit, seed=seed).outcome(drift) for seed in range(5)]
     lost = np.mean([outcome.lost_db for outcome in found])
@@ -146,7 +146,7 @@ def test_a_mask_turned_over_a_region_shifts_that_part_of_its_shadow(stand: Drift
     """As many rows as columns, which lie elsewhere. (Planted: rows' places for the columns'.)"""
     bench = stand.lit.bench
     camera = bench.geometry.model_copy(update={"roi": (3, 20, 30, 30)})
-    part = replace(bench, rig=replace(bench.rig, camera=camera))
+    part = replace(bench, devices=replace(bench.devices, camera=camera))
     lit = cast(LitScene, SimpleNamespace(bench=part, light=stand.lit.light))
     found, whole = (
         np.asarray(sum(np.einsum("ir,jc->irjc", *pair) for pair in each._turn(1e-3)))
@@ -187,9 +187,9 @@ def test_an_image_is_off_the_still_one_by_the_noise_that_is_predicted_of_its_cap
     """Of noisy frames and of expected ones, by one lambda: 256 pixels, whose mean square scatters by 9 %, three times
     that. (Planted: electrons for electrons a second; each datum counted twice.)"""
     capture = [noise for name, noise in stand.noises.items() if name != SESSION]
-    told = sum(stand.linear.variance(stand.lit.truth, noise) for noise in capture) / stand.lit.truth.size
+    reported = sum(stand.linear.variance(stand.lit.truth, noise) for noise in capture) / stand.lit.truth.size
     still = stand.clear(stand.factors, stand.lit.light)
-    assert np.mean(np.square(stand._before.image - still)) == pytest.approx(told, rel=0.27)
+    assert np.mean(np.square(stand._before.image - still)) == pytest.approx(reported, rel=0.27)
 
 
 def test_points_are_every_kind_alone() -> None:

@@ -1,6 +1,6 @@
 """The error of an image split by cause: paint of another brightness, a sensor that fills up, a mirror in closed form.
 
-One small rig for all: 16 x 16 projector pixels, 64 x 64 sensor pixels of 90 um, so that a mirror image moves over it.
+One small bench for all: 16 x 16 projector pixels, 64 x 64 sensor pixels of 90 um, so that a mirror image moves over it.
 """
 
 from __future__ import annotations

@@ -46,23 +46,23 @@ def test_points_are_models_by_frames_and_sessions_by_how_they_are_taken() -> Non
 
 
 @dataclass(frozen=True)
-class ToyRig:
+class ToyDevices:
     camera: CameraGeometry
 
 
 @dataclass(frozen=True)
 class ToyBench:
-    rig: ToyRig
+    devices: ToyDevices
 
     @property
     def geometry(self) -> CameraGeometry:
-        return self.rig.camera
+        return self.devices.camera
 
 
 def test_the_camera_as_built_has_its_mask_off_its_place() -> None:
     """(Planted: rows and columns exchanged; the offset in place of what is added to it.)"""
     camera = CameraGeometry(pixels=64, pixel_pitch=0.02, mask_distance=2.0, scene_distance=400.0, mask_offset_row=0.01)
-    built = models_study.as_built(cast(Any, ToyBench(ToyRig(camera)))).rig.camera
+    built = models_study.as_built(cast(Any, ToyBench(ToyDevices(camera)))).devices.camera
     assert built.mask_distance == pytest.approx(2.05)
     assert (built.mask_offset_row, built.mask_offset_column) == pytest.approx((0.047, -0.021))
 

@@ -133,10 +133,10 @@ def test_the_page_of_a_sweep_says_what_was_swept_and_its_command_repeats_it(tmp_
     assert not experiment.figures(results)
     section = Section.of(experiment, "sweep", scope, (), {}, results)
     page = build_page([section], tmp_path / "sweep.html", section.title).read_text()
-    said = (
+    reported = (
         "mitsim study sweep photograph --over mask=separable,flatcam --measure psnr,misfit --patterns dots:4 --seed 3"
     )
-    assert section.command == said and "Sweep of mask" in page and "Zheng" not in page
+    assert section.command == reported and "Sweep of mask" in page and "Zheng" not in page
     assert "1 of 2 images are flagged" in page
     (table,) = section.tables
     assert table.rows == (("separable", "31.2", "0", "0 of 1"), ("flatcam", "20.0", "0.0500", "1 of 1"))

@@ -180,8 +180,8 @@ def test_the_draw_of_gains_scatters_by_each_alone(name: str) -> None:
               [0.3 * FRAME * one for one in alone] + common)]  # fmt: skip
     for changed, disturbances in cases:
         moved = [solved(each, shown) for each in disturbances]
-        told = sum(4 * np.vdot(error, each) ** 2 + 2 * np.vdot(each, each) ** 2 for each in moved)
-        assert image(shown).scatter(SCENE, changed, error) == pytest.approx(told, rel=1e-9)
+        reported = sum(4 * np.vdot(error, each) ** 2 + 2 * np.vdot(each, each) ** 2 for each in moved)
+        assert image(shown).scatter(SCENE, changed, error) == pytest.approx(reported, rel=1e-9)
 
 
 def test_decibels_of_a_gain_are_known_exactly() -> None:

@@ -16,7 +16,7 @@ def test_a_spread_has_a_middle_between_its_ends() -> None:
 
 
 @pytest.mark.parametrize(
-    ("with_it", "without", "said"),
+    ("with_it", "without", "reported"),
     [
         ([2.0, 2.1, 2.2], [1.0, 1.1, 1.2], "1 s (0.8 to 1.2)"),
         ([1.0, 1.1, 1.2], [2.0, 2.1, 2.2], "within noise (at most 0 s)"),
@@ -27,10 +27,10 @@ def test_a_spread_has_a_middle_between_its_ends() -> None:
     ids=["apart", "faster with it", "overlapping", "once, a little", "once, far apart"],
 )
 def test_a_difference_is_told_where_the_spreads_allow_no_other_sign(
-    with_it: list[float], without: list[float], said: str
+    with_it: list[float], without: list[float], reported: str
 ) -> None:
     extra = Extra.between(Spread.of(with_it), Spread.of(without))
-    assert str(extra) == said and extra.within_noise is ("noise" in said)
+    assert str(extra) == reported and extra.within_noise is ("noise" in reported)
     assert "-" not in str(extra), "no cost is negative"
 
 

@@ -88,11 +88,11 @@ def test_factors_of_the_diagonal_explain_every_place(lit: dict[str, LitScene], m
     mask = MovedMask(scene, model, factors, 0)
     allowed = 1e-7 if model == IDEALISED else 0.02 if kind == "separable" else 0.25
     for row, column in product(PLACES, repeat=2):
-        told, seen = factors[row][0] @ scene.truth @ factors[column][1].T, rate(mask, row, column)
+        reported, seen = factors[row][0] @ scene.truth @ factors[column][1].T, rate(mask, row, column)
         if kind == "flatcam":
-            told, seen = (each - each.mean(axis=0) for each in (told, seen))
-            told, seen = (each - each.mean(axis=1, keepdims=True) for each in (told, seen))
-        assert np.linalg.norm(told - seen) < allowed * np.linalg.norm(seen), (row, column)
+            reported, seen = (each - each.mean(axis=0) for each in (reported, seen))
+            reported, seen = (each - each.mean(axis=1, keepdims=True) for each in (reported, seen))
+        assert np.linalg.norm(reported - seen) < allowed * np.linalg.norm(seen), (row, column)
 
 
 @pytest.mark.parametrize("kind", ["separable", "flatcam"])
@@ -162,8 +162,8 @@ def test_how_a_session_shares_its_product_does_not_matter(lit: dict[str, LitScen
 
     found = _consistent(odd, scene.bench, white)
     for row, column in product(PLACES, repeat=2):
-        told = found[row][0] @ scene.truth @ found[column][1].T
-        np.testing.assert_allclose(told, rate(mask, row, column), rtol=1e-6)
+        reported = found[row][0] @ scene.truth @ found[column][1].T
+        np.testing.assert_allclose(reported, rate(mask, row, column), rtol=1e-6)
 
 
 @pytest.mark.parametrize(("gain", "verdict"), [(0.2, "not confirmed"), (0.9, "confirmed")])

@@ -149,7 +149,7 @@ def test_quantisation_costs_a_twelfth_of_its_step(studio: Studio, setup: Setup, 
     allowed. (Planted: 1/6; the gain of one pixel of four.)"""
     bench, lit = levels.lit.bench, studio.lit(setup)
     eight = {"bits": 8, "gain_dn_per_e": 7e-3, "black_level_dn": 2.0}
-    camera = replace(bench, rig=replace(bench.rig, sensor=bench.sensor.model_copy(update=eight)))
+    camera = replace(bench, devices=replace(bench.devices, sensor=bench.sensor.model_copy(update=eight)))
     light = replace(lit.light, simulation=Simulation(camera, lit.light.simulation.settings))
     other, scene_ablation = LitScene(light), Ablation.of(light)
     squares = []

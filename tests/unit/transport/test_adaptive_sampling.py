@@ -28,12 +28,12 @@ def test_repeated_light_is_the_same_light(shared_scene: Callable[..., Path], sha
     again = plain.with_adaptive_counts(repeats.tolist())
     paths_per_sample = repeats.sum() * 16 if shared else by_pixel(repeats.tolist(), N).sum()
     assert again.paths_per_sample == paths_per_sample
-    looks = [[side.trace(seed, 0, 256) for seed in range(SEEDS)] for side in (plain, again)]
-    found = np.array([[summed(look, 256, N) for look in side] for side in looks])
+    runs = [[side.trace(seed, 0, 256) for seed in range(SEEDS)] for side in (plain, again)]
+    found = np.array([[summed(run, 256, N) for run in side] for side in runs])
     means, errors = found.mean(axis=1), found.std(axis=1, ddof=1) / np.sqrt(SEEDS)
     bound = SIGMAS * np.hypot(*errors)
     assert (np.abs(means[0] - means[1]) <= bound).all() and bound[0].sum() < 0.2 * means[0, 0].sum()
-    each = [[np.bincount(look.pixel, look.value, N * N) for look in side] for side in looks]
+    each = [[np.bincount(run.pixel, run.value, N * N) for run in side] for side in runs]
     variance = np.var(each, axis=1).reshape(2, -1)
     for count in (1, 2, 5):
         such = by_pixel(repeats.tolist(), N) == count

@@ -33,10 +33,10 @@ def board(z: float, bsdf: dict | None = None) -> dict:
 
 def picture(light: dict, z: float, half: float, x: float = 0.0, spp: int = 256, **scene: dict) -> np.ndarray:
     """(64, 64) irradiance on a board at z, seen squarely over x +- half, y +- half; row 0 at +y, column 0 at +x."""
-    look = mi.ScalarAffineTransform4f().look_at(origin=[x, 0, z - 100], target=[x, 0, z], up=[0, 1, 0])
+    run = mi.ScalarAffineTransform4f().look_at(origin=[x, 0, z - 100], target=[x, 0, z], up=[0, 1, 0])
     film = {"type": "hdrfilm", "width": 64, "height": 64, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
     fov = float(np.degrees(2 * np.arctan(half / 100)))
-    camera = {"type": "perspective", "fov": fov, "to_world": look, "film": film}
+    camera = {"type": "perspective", "fov": fov, "to_world": run, "film": film}
     path = {"type": "path", "max_depth": 2}
     parts = {"type": "scene", "integrator": path, "camera": camera, "board": board(z), **light, **scene}
     return np.array(mi.render(mi.load_dict(parts), spp=spp, seed=3), dtype=np.float64)[..., 0] * np.pi / ALBEDO

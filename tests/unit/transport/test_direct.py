@@ -90,7 +90,7 @@ def test_all_anchors_see_the_same_points(large: Bench) -> None:
 
 
 def test_a_spread_sensor_is_the_mean_over_it(large: Bench) -> None:
-    """Random points of the sensor, filed as one anchor: the mean of the irradiance over the sensor."""
+    """Random points of the sensor, accumulated as one anchor: the mean of the irradiance over the sensor."""
     spread = DirectTracer(large.setup, 1, spread=True)
     totals = np.array([by_pixel(spread.trace(seed, 0, 16), 16).sum() for seed in range(8)])
     node, weight = np.polynomial.legendre.leggauss(4)
@@ -125,7 +125,7 @@ def test_a_patch_of_the_print_darkens_its_own_pixels(small_scene: Callable[..., 
 
 
 def test_light_is_seen_where_it_was_reflected(small_scene: Callable[..., Path]) -> None:
-    """A sheet at 200 mm, half the rig's distance, where the window spans x from 0 to 60 mm: columns -0.30 to 0."""
+    """A sheet at 200 mm, half the aligned distance, where the window spans x from 0 to 60 mm: columns -0.30 to 0."""
     found = tracer(open_bench(small_scene(sheet_z=200, fov=40))).trace(0, 0, 4)
     assert found.column.min() == pytest.approx(-0.30, abs=0.01) and found.column.max() == pytest.approx(0, abs=0.01)
     assert np.abs(found.row).max() == pytest.approx(0.15, abs=0.01)

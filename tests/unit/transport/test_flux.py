@@ -96,8 +96,8 @@ def test_sums_are_those_of_blocks_however_they_are_traced(
 
     (Planted: a sample's number without the block's first; the same stream in all groups.)
     """
-    rig = bench(0.3, 0.5)
-    tracer = FluxTracer(rig.setup, True)
+    devices = bench(0.3, 0.5)
+    tracer = FluxTracer(devices.setup, True)
     first = np.full_like(LIT, 3)
     whole = tracer.sums(5, 2, LIT, first, 40)[0]
     lit = whole[0] > 0

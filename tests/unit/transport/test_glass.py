@@ -107,7 +107,7 @@ def test_lines_apart_keep_their_places_and_power() -> None:
 
 
 @pytest.mark.parametrize(
-    ("values", "said"),
+    ("values", "reported"),
     [
         ({"glass": "n-bk8"}, "glass: got 'n-bk8'; give n-bk7, n-sf11"),
         ({"glass": "water", "index": 1.5, "abbe": 50.0}, "index: the index is told by glass already"),
@@ -120,7 +120,7 @@ def test_lines_apart_keep_their_places_and_power() -> None:
         ({"wavelength": 100.0}, "wavelength: got 100.0"),
     ],
 )
-def test_bad_glass_is_refused(values: dict[str, object], said: str) -> None:
+def test_bad_glass_is_refused(values: dict[str, object], reported: str) -> None:
     with pytest.raises((MitsimError, RuntimeError), match="mitsim_glass: ") as caught:
         mi.load_dict({"type": "mitsim_glass", **values})
-    assert said in str(caught.value)
+    assert reported in str(caught.value)

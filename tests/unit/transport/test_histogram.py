@@ -53,7 +53,7 @@ WAYS = ((400.0,), DEPTHS)
 
 
 @pytest.mark.parametrize("depths", WAYS)
-def test_all_light_is_filed_and_under_its_own_row(depths: tuple[float, ...]) -> None:
+def test_all_light_is_accumulated_and_under_its_own_row(depths: tuple[float, ...]) -> None:
     made, found = bundle(depths), path_samples()
     light = made.accumulate(found, LABELS, samples=4)
     assert light.shape == (4, made.size)
@@ -147,8 +147,8 @@ def test_light_averaged_over_the_anchors() -> None:
 
 
 @pytest.mark.parametrize("depths", WAYS)
-def test_filed_light_averaged_over_the_anchors(depths: tuple[float, ...]) -> None:
-    """Averaged before it is filed or after, light is the same."""
+def test_accumulated_light_averaged_over_the_anchors(depths: tuple[float, ...]) -> None:
+    """Averaged before it is accumulated or after, light is the same."""
     found, weights, made = path_samples(), np.array([0.7, 0.3]), bundle(depths)
     before = bundle(depths, anchors=1).accumulate(found.averaged(weights), LABELS).toarray()
     assert np.allclose(made.averaged(made.accumulate(found, LABELS), weights).toarray(), before, rtol=1e-12, atol=0)
@@ -165,7 +165,7 @@ def test_light_of_one_anchor_repeated_for_all(depths: tuple[float, ...]) -> None
 
 @pytest.mark.usefixtures("variant")
 def test_small_light_beside_great_light_is_counted() -> None:
-    """4096 paths of 1 beside one of 2^24, where float32 has steps of 2: what is fetched and filed is exact."""
+    """4096 paths of 1 beside one of 2^24, where float32 has steps of 2: what is fetched and accumulated is exact."""
     import mitsuba as mi
 
     from mitsim.transport.accumulator import DeviceAccumulator
@@ -185,11 +185,11 @@ def test_small_light_beside_great_light_is_counted() -> None:
 
 
 @pytest.mark.usefixtures("variant")
-def test_ledgers_of_several_lines_are_fetched_together() -> None:
+def test_accumulators_of_several_lines_are_fetched_together() -> None:
     """Each holds what it would hold alone, where others have light and it has none too; then all are empty.
 
-    (Planted: light in the order of its numbers; what is lit by the first line; light of all lines filed as the first's,
-    or fetched as that; sums that are not emptied.)
+    (Planted: light in the order of its numbers; what is lit by the first line; light of all lines accumulated as the
+    first's, or fetched as that; sums that are not emptied.)
     """
     import drjit as dr
     import mitsuba as mi

@@ -107,7 +107,7 @@ def test_both_sides_find_the_same_light_at_every_anchor(
 ) -> None:
     """Beside a shiny wall, on a sensor of 24 mm: how much, and in which mean direction and depth the centre files it.
 
-    (Planted: the camera's paths filed as their start sees them.)
+    (Planted: the camera's paths accumulated as their start sees them.)
     """
     bench = open_bench(shared_scene("wall", extra=CORNER, pitch=0.375, mask_feature=0.3), for_render=True)
     geometry = bench.geometry

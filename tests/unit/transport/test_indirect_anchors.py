@@ -122,7 +122,9 @@ def test_a_path_in_several_lines_is_the_same_at_every_anchor(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("launch", [2**22, 9 * 512 + 5])
-def test_ledgers_hold_what_anchors_are_brought(beside: Bench, launch: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_accumulators_hold_what_anchors_are_brought(
+    beside: Bench, launch: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The light that is handed out, by anchor and class of pixels; the same units however paths are launched. (Planted:
     rows for columns of anchors; launches that begin with the first path again.)"""
     points = SensorPoints(beside.geometry.half_width, 3)
@@ -140,7 +142,7 @@ def test_ledgers_hold_what_anchors_are_brought(beside: Bench, launch: int, monke
     assert np.array_equal(caustics.value, host.value[host.kind == DIRECT]) and caustics.value.size
     expected = bundle.accumulate(host.where(host.kind == INDIRECT), labels)
     found = whole.fetch()[0].light()[0]
-    # Which layer light is filed in is drawn: all layers together are the same.
+    # Which layer light is accumulated in is drawn: all layers together are the same.
     by_place = [np.asarray(light.toarray()).reshape(light.shape[0], 2, -1).sum(axis=1) for light in (expected, found)]
     near = np.isclose(*by_place, rtol=1e-5, atol=1e-7 * by_place[0].max())
     # Rounding moves what lies on the edge of a cell.

@@ -110,10 +110,10 @@ def test_hits_are_those_of_the_tracer_that_would_find_the_light(
     samples = 2**21 // tracer.paths_per_sample
     connected = tracer.trace(0, 0, samples).value
     light, moment = connected.sum() / samples, np.square(connected).sum() / samples
-    told = left_out_of(bench, 0)
-    plate = int(np.argmax(told.lobes))
-    assert told.lobes[plate] == pytest.approx(light, rel=0.1)
-    assert told.hits[plate] == pytest.approx(light**2 / moment, rel=0.3)
+    reported = left_out_of(bench, 0)
+    plate = int(np.argmax(reported.lobes))
+    assert reported.lobes[plate] == pytest.approx(light, rel=0.1)
+    assert reported.hits[plate] == pytest.approx(light**2 / moment, rel=0.3)
 
 
 def test_a_lens_finds_light_as_often_as_paths_run_into_it(shared_scene: Callable[..., Path]) -> None:
@@ -121,7 +121,7 @@ def test_a_lens_finds_light_as_often_as_paths_run_into_it(shared_scene: Callable
     path = shared_scene("ball_and_lens", extra=BALL.replace('value="5"', 'value="60"'), sheet_z=WALL)
     bench = open_bench(path)
     pinhole, small, large = (
-        left_out_of(replace(bench, rig=replace(bench.rig, projector=lens)), 0, 2**18)
+        left_out_of(replace(bench, devices=replace(bench.devices, projector=lens)), 0, 2**18)
         for lens in (bench.projector.model_copy(update={"aperture_radius_mm": radius}) for radius in (0.0, 4.0, 8.0))
     )
     ball = int(np.argmax(pinhole.mirrors))

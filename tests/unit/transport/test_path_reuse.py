@@ -1,4 +1,4 @@
-"""Shared second points: the same light as paths of their own bring, less noise, and the accumulator that it is filed
+"""Shared second points: the same light as paths of their own bring, less noise, and the accumulator that it is added up
 in.
 
 Gates on Monte Carlo means are seven standard errors of eight independent seeds: five sigma of the t distribution.
@@ -114,11 +114,10 @@ def test_a_shared_path_tells_as_much_as_several(shared_scene: Callable[..., Path
     edges = np.linspace(-1, 1, 7) * bench.geometry.tan_half_fov
 
     def variance(side: IndirectTracer) -> float:
-        looks = [side.trace(seed, 0, 16) for seed in range(24)]
-        seen_in = [np.digitize(look.row, edges) * 8 + np.digitize(look.column, edges) for look in looks]
+        runs = [side.trace(seed, 0, 16) for seed in range(24)]
+        seen_in = [np.digitize(run.row, edges) * 8 + np.digitize(run.column, edges) for run in runs]
         light = [
-            np.bincount(look.pixel * 64 + place, look.value, N * N * 64)
-            for look, place in zip(looks, seen_in, strict=True)
+            np.bincount(run.pixel * 64 + place, run.value, N * N * 64) for run, place in zip(runs, seen_in, strict=True)
         ]
         return float(np.var(light, axis=0).sum())
 
@@ -147,7 +146,9 @@ def test_diffuse_surfaces_need_no_look_at_their_material(
 
 
 @pytest.mark.parametrize("depths", [(400.0,), (450.0, 380.0, 300.0)])
-def test_the_ledger_holds_what_the_host_files(shared_scene: Callable[..., Path], depths: tuple[float, ...]) -> None:
+def test_the_accumulator_holds_what_the_host_accumulates(
+    shared_scene: Callable[..., Path], depths: tuple[float, ...]
+) -> None:
     """Row by row to rounding, and place by place where layers are summed; a window of a third of the view leaves some
     light outside."""
     bench = open_bench(shared_scene(f"ledger {len(depths)}", extra=SCENES["shiny wall"]))
@@ -170,7 +171,9 @@ def test_the_ledger_holds_what_the_host_files(shared_scene: Callable[..., Path],
 
 
 @pytest.mark.parametrize("mirrors", [False, True])
-def test_the_ledger_holds_paths_of_their_own_at_every_anchor(shared_scene: Callable[..., Path], mirrors: bool) -> None:
+def test_the_accumulator_holds_paths_of_their_own_at_every_anchor(
+    shared_scene: Callable[..., Path], mirrors: bool
+) -> None:
     """Place by place, all but caustics: those stay on the host."""
     bench = opened(shared_scene(f"anchors {mirrors}", extra=SCENES["mirror wall"]))
     points = SensorPoints(bench.geometry.half_width, anchors=3)

@@ -87,18 +87,16 @@ def traced(folder: str, names: Sequence[str]) -> dict[str, Any]:
         bench = SpectralBench.of(open_bench(path, "llvm_ad_spectral", None, place / "lines.toml"), RUN).whole
         own, shared = tracers(bench)
         assert shared.shares() and shared.all_diffuse == ("shiny" not in name)
-        looks = [[side.trace(seed, 0, SAMPLES) for seed in range(SEEDS)] for side in (own, shared)]
+        runs = [[side.trace(seed, 0, SAMPLES) for seed in range(SEEDS)] for side in (own, shared)]
         grid = aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov)
         bundle, labels = Bundle(grid, 1, (400.0,)), np.arange(N * N) % 5
         accumulator = DeviceAccumulator(bundle, labels, shared.board, len(LINES))
         rest = shared.trace(0, 0, SAMPLES, accumulator)
-        every = looks[1][0].by_line(len(LINES))
+        every = runs[1][0].by_line(len(LINES))
         found[name] = {
-            "own": [by_line(look) for look in looks[0]],
-            "shared": [by_line(look) for look in looks[1]],
-            "whole": [
-                [look.value.sum(), look.lines[: len(LINES)].sum()] for look in looks[1] if look.lines is not None
-            ],
+            "own": [by_line(run) for run in runs[0]],
+            "shared": [by_line(run) for run in runs[1]],
+            "whole": [[run.value.sum(), run.lines[: len(LINES)].sum()] for run in runs[1] if run.lines is not None],
             "ledgers": [
                 (sums.light()[0] + bundle.accumulate(light, labels)).sum(axis=1).tolist()
                 for sums, light in zip(accumulator.fetch(), rest.by_line(len(LINES)), strict=True)
@@ -141,8 +139,8 @@ every_scene = pytest.mark.parametrize(
 @every_scene
 def test_each_line_is_that_of_paths_of_their_own(light: Callable[[str], dict[str, Any]], name: str) -> None:
     """Of each fourth of the pixels' columns: how much, and from which mean row."""
-    looks = np.array([light(name)[way] for way in ("own", "shared")])
-    means, errors = looks.mean(axis=1), looks.std(axis=1, ddof=1) / SEEDS**0.5
+    runs = np.array([light(name)[way] for way in ("own", "shared")])
+    means, errors = runs.mean(axis=1), runs.std(axis=1, ddof=1) / SEEDS**0.5
     bound = SIGMAS * np.hypot(*errors)
     assert (np.abs(means[0] - means[1]) <= bound + 1e-9 * means.max()).all()
     lit = means[0, :, :4] > 0.01 * means[0, :, :4].max()
@@ -160,7 +158,7 @@ def test_each_line_lights_a_coloured_sphere_by_its_own_reflectance(light: Callab
 
 
 @every_scene
-def test_lines_add_up_and_ledgers_hold_each(light: Callable[[str], dict[str, Any]], name: str) -> None:
+def test_lines_add_up_and_accumulators_hold_each(light: Callable[[str], dict[str, Any]], name: str) -> None:
     """All light is the sum of the lines', and an accumulator of each line holds what the host files."""
     whole = np.array(light(name)["whole"])
     assert len(whole) == SEEDS

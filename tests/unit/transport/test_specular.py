@@ -118,7 +118,7 @@ def test_no_mirror_no_beams_and_a_depth_of_at_least_one(variant: str) -> None:
     scene = scene_with(sheet=plane(0, 400, {"type": "diffuse"}))
     beams = trace_specular_chains(scene, scene.sensors()[0], projector(scene))
     assert len(beams) == 0 and beams.unresolved == 0
-    with pytest.raises(MitsimError, match="max_depth of glints is 0"):
+    with pytest.raises(MitsimError, match="max_depth of specular chains is 0"):
         trace_specular_chains(scene, scene.sensors()[0], projector(scene), max_depth=0)
 
 

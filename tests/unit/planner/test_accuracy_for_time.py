@@ -18,7 +18,7 @@ from mitsim.planner.choose import (
     cheapest,
     time_warnings,
 )
-from tests.unit.planner.invented_evidence import PILOT_RESULT
+from tests.unit.planner.invented_pilot_result import PILOT_RESULT
 
 TIMES = (0.01, 0.3, 0.95, 1.0, 2.0, 4.0, 10.0, 40.0, 1e5)
 
@@ -67,7 +67,7 @@ def test_what_is_bought_fits_and_the_next_finer_does_not(bought: list[AccuracyFo
         assert candidates.seconds(finer)[0] > seconds
 
 
-def test_no_finer_than_the_evidence_is_good_for(bought: list[AccuracyForTime], candidates: Candidates) -> None:
+def test_no_finer_than_the_pilot_result_is_good_for(bought: list[AccuracyForTime], candidates: Candidates) -> None:
     assert bought[-1].accuracy >= 1e-4 and bought[-1].fits
     assert accuracy_for_time(candidates, math.inf, FIRST_ACCURACY).accuracy == FIRST_ACCURACY
     kept, costly_effects = (accuracy_for_time(candidates, math.inf, 0.0, kept=kept) for kept in (True, False))

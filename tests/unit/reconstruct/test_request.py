@@ -33,12 +33,12 @@ def test_what_an_image_may_be_asked_by_is_taken(asked: tuple[float | str, str, f
     ImageRequest(*asked)
 
 
-@pytest.mark.parametrize(("asked", "name", "said"), REFUSED)
+@pytest.mark.parametrize(("asked", "name", "reported"), REFUSED)
 def test_what_no_image_is_made_by_is_refused(
-    asked: tuple[float | str, str, float | str | None, int], name: str, said: str
+    asked: tuple[float | str, str, float | str | None, int], name: str, reported: str
 ) -> None:
     """By the name of the argument, and by what it may be. (Planted: 0 taken for a depth, a bool for a number.)"""
-    with pytest.raises(ArgumentError, match=said) as refusal:
+    with pytest.raises(ArgumentError, match=reported) as refusal:
         ImageRequest(*asked)
     assert refusal.value.argument == name
 

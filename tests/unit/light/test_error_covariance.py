@@ -8,7 +8,7 @@ import pytest
 
 from mitsim.light.passes import even
 from mitsim.light.settings import REPLICATES, Approximation, ErrorCovariance, Noise
-from tests.unit.planner.invented_evidence import PILOT_RESULT, SIZES, changes, plan, rows
+from tests.unit.planner.invented_pilot_result import PILOT_RESULT, SIZES, changes, plan, rows
 
 
 def seen(*vectors: list[float]) -> ErrorCovariance:
@@ -28,7 +28,7 @@ def test_changes_add_up_with_their_signs() -> None:
     assert found.estimate([]) == (0.0, 0.0)
 
 
-def test_the_noise_of_looks_is_no_change_and_bounds_hold() -> None:
+def test_the_noise_of_replicates_is_no_change_and_bounds_hold() -> None:
     """500 scenes whose change of 1e-3 is seen with noise of 3e-3 in each look: unbiased squares, 95 % of bounds."""
     part, scenes = Approximation("blur"), 500
     squares, held = [], 0

@@ -19,7 +19,7 @@ from mitsim.light.cost_model import (
 )
 from mitsim.light.settings import GROUPS, Forming, Noise, SampleCost, Settings
 from mitsim.optics.forming import PROBES
-from tests.unit.planner.invented_evidence import PILOT_RESULT, plan
+from tests.unit.planner.invented_pilot_result import PILOT_RESULT, plan
 
 FORMING = Forming(pixels=50, cells=10, lit=0.5, terms=3.0, shots=4, classes=4)
 ONE = Numbers.coarsest()
@@ -159,7 +159,8 @@ def test_every_shot_is_looked_through_once_more_than_it_is_formed() -> None:
 
 
 def test_lines_share_paths_and_form_and_file_each_its_own() -> None:
-    """Three lines: two fifths more tracing, and all else three times. (Planted: shadows of one line; filing of one.)"""
+    """Three lines: two fifths more tracing, and all else three times. (Planted: shadows of one line; accumulating of
+    one.)"""
     three = replace(PILOT_RESULT, forming=replace(PILOT_RESULT.forming, lines=3))
     settings = plan(pilot_result=PILOT_RESULT).settings
     numbers = Numbers.of(settings)
@@ -175,7 +176,7 @@ def test_lines_share_paths_and_form_and_file_each_its_own() -> None:
     assert truth_seconds(three, settings, FIXED) == pytest.approx(1.4 * truth_seconds(PILOT_RESULT, settings, FIXED))
 
 
-def test_a_ledger_is_emptied_and_looked_through_where_it_has_room() -> None:
+def test_an_accumulator_is_emptied_and_looked_through_where_it_has_room() -> None:
     """4 classes of 20 x 20 cells in two layers, where light is followed over several surfaces."""
     numbers = replace(ONE, indirect=1.0, coarse_cells=2.0, layers=2.0)
     places = 4 * 20**2 * 2

@@ -84,15 +84,15 @@ def frames(bench: Bench, settings: Settings, samples: int = 32) -> np.ndarray:
     for name, each in made.passes.items():
         count = samples if name == "direct" else samples // 8
         seen = each.tracer.trace(integer(5, each.row.stream == "direct"), 0, count)
-        filed = made.accumulate(name, seen, lighting.labels, count)
-        light = filed if light is None else light + filed
+        accumulated = made.accumulate(name, seen, lighting.labels, count)
+        light = accumulated if light is None else light + accumulated
     return np.stack([frame.irradiance for frame in made.expected([light], np.arange(9), lighting, 0)])
 
 
 def test_anchors_of_their_own_do_what_as_many_do_for_all(bench: Bench) -> None:
     """Three anchors for all pixels leave much that 12 for all show; with 12 for these pixels alone, next to nothing.
 
-    The points on the surfaces are the same. (Planted: what they see filed with its mean; no samples of theirs.)
+    The points on the surfaces are the same. (Planted: what they see accumulated with its mean; no samples of theirs.)
     """
     few = Settings(depth=Z, anchors=3, layers=(Z, NEAR), coarse_layers=True)
     pixels = occluded_pixels(Simulation(bench, few), 1e-4, 3)
@@ -132,7 +132,7 @@ def test_where_a_shot_shows_none_or_nothing_else_all_have_the_same_anchors(
 
 
 @pytest.mark.slow
-def test_pixels_that_are_traced_apart_are_no_occluded_ones(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pixels_with_a_pass_of_their_own_are_no_occluded_ones(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """(Planted: the look goes by a simulation without them.)"""
     found = occluded_pixels(Simulation(bench, Settings(depth=Z)), 1e-3, 0)
     sharp = SharpPixels(found[::2], 2, (-0.1, 0.1, -0.1, 0.1))

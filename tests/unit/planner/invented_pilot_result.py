@@ -57,8 +57,8 @@ def changes(sizes: dict[Approximation, float], noise: float = 0.0, seed: int = 0
     space = count + 40
     exact = np.zeros((count, space))
     exact[:, :count] = vectors
-    looks = exact[:, None] + noise * rng.normal(size=(count, REPLICATES, space)) / math.sqrt(space)
-    return ErrorCovariance.between(dict(zip(sizes, looks, strict=True)), 1.0)
+    replicates = exact[:, None] + noise * rng.normal(size=(count, REPLICATES, space)) / math.sqrt(space)
+    return ErrorCovariance.between(dict(zip(sizes, replicates, strict=True)), 1.0)
 
 
 PILOT_RESULT = PilotResult(
@@ -95,13 +95,13 @@ def rows(found: Plan) -> dict[str, PlanRow]:
 
 
 def stages(pilot_result: PilotResult, settings: Settings, costs: UnitCosts) -> dict[str, float]:
-    """Seconds of each stage: paths, filing of what they bring, looks at the error; rays of the truth; frames."""
+    """Seconds of each stage: paths, accumulating of what they bring, looks at the error; rays of the truth; frames."""
     forming, numbers = pilot_result.forming, Numbers.of(settings)
     held = entries(pilot_result.sample_costs["direct"].paths, forming.classes, numbers, settings)
-    filing = accumulation_seconds(forming, numbers, held, costs)
+    accumulating = accumulation_seconds(forming, numbers, held, costs)
     looking = checking_seconds(forming, numbers, costs)
     return {
-        "transport": sum(tracing_seconds(pilot_result, settings, costs).values()) + filing + looking,
+        "transport": sum(tracing_seconds(pilot_result, settings, costs).values()) + accumulating + looking,
         "truth": truth_seconds(pilot_result, settings, costs),
         "optics": optics_seconds(forming, numbers, costs),
     }

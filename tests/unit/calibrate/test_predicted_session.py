@@ -45,16 +45,16 @@ def test_drawn_noise_is_that_of_exposed_frames_number_by_number(mode: str, n: in
     the first column of 8 would have a ninth. All numbers together are known to 3 %.
     """
     lit = lit_session(n, mode, repeats=repeats)
-    foreseen = PredictedSession.of(lit, Job())
-    clean = foreseen.estimate(None)
-    drawn, found = [foreseen.estimate(lit, draw) for draw in range(DRAWS)], exposed(lit)
+    predicted = PredictedSession.of(lit, Job())
+    clean = predicted.estimate(None)
+    drawn, found = [predicted.estimate(lit, draw) for draw in range(DRAWS)], exposed(lit)
     for side in ("left", "right"):
         law, seen = squares(drawn, clean, side), squares(found, clean, side)
         for axis in (0, 1):
             np.testing.assert_allclose(law.mean(axis=axis), seen.mean(axis=axis), rtol=0.36)
         assert law.mean() == pytest.approx(seen.mean(), rel=0.15)
-    told = [np.mean([each.separability_residual for each in those]) for those in (drawn, found)]
-    assert told[0] == pytest.approx(told[1], rel=0.02)
+    reported = [np.mean([each.separability_residual for each in those]) for those in (drawn, found)]
+    assert reported[0] == pytest.approx(reported[1], rel=0.02)
     assert np.mean([each.predicted_error for each in drawn]) == pytest.approx(
         np.mean([each.predicted_error for each in found]), rel=0.02
     )
@@ -70,8 +70,8 @@ def test_without_noise_it_is_the_noise_free_session() -> None:
 
 def test_equal_numbers_draw_equal_noise_which_falls_with_the_repeats() -> None:
     lit = lit_session(4)
-    foreseen = PredictedSession.of(lit, Job())
+    predicted = PredictedSession.of(lit, Job())
     often = replace(lit, session=replace(lit.session, recipe=lit.session.recipe.model_copy(update={"repeats": 16})))
-    clean, once, many = foreseen.estimate(None), foreseen.estimate(lit, 3), foreseen.estimate(often, 3)
+    clean, once, many = predicted.estimate(None), predicted.estimate(lit, 3), predicted.estimate(often, 3)
     np.testing.assert_allclose(many.left - clean.left, (once.left - clean.left) / 4, rtol=1e-9, atol=1e-9)
-    assert not np.allclose(foreseen.estimate(lit, 4).left, once.left, rtol=1e-6)
+    assert not np.allclose(predicted.estimate(lit, 4).left, once.left, rtol=1e-6)

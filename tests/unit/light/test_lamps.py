@@ -121,20 +121,22 @@ def traced(folder: str) -> list[dict[str, Any]]:
         assert whole.counted_lamps is not None
         simulation = Simulation(whole, Settings(depth=400.0, effects=frozenset({"ambient"})))
         assert isinstance(simulation.from_camera, LampTracer)
-        looks = [simulation.from_camera.trace(seed, 0, SAMPLES) for seed in range(SEEDS)]
-        lines = [[light.value.sum() / SAMPLES for light in look.by_line(len(LINES))] for look in looks]
-        bands = [np.bincount(look.pixel - whole.n**2, look.value) / SAMPLES for look in looks]
+        traced_runs = [simulation.from_camera.trace(seed, 0, SAMPLES) for seed in range(SEEDS)]
+        lines = [[light.value.sum() / SAMPLES for light in run.by_line(len(LINES))] for run in traced_runs]
+        bands = [np.bincount(run.pixel - whole.n**2, run.value) / SAMPLES for run in traced_runs]
         mirrors = FromCameraTracer(simulation.setup, simulation.aim, Paths(mirrors=True))
         mirrored = CombinedTracer(mirrors, simulation.from_camera)
         both = mirrored.trace(0, 0, SAMPLES).by_line(len(LINES)) if lamp == "flat" else []
         labels = np.zeros(whole.n**2, dtype=np.int64)
-        filed = [simulation.accumulate("indirect", look.by_line(3)[2], labels, SAMPLES)["fine"] for look in looks[:1]]
+        accumulated = [
+            simulation.accumulate("indirect", run.by_line(3)[2], labels, SAMPLES)["fine"] for run in traced_runs[:1]
+        ]
         found.append(
             {
                 "lines": np.array(lines).tolist(),
                 "bands": np.array(bands).tolist(),
                 "together": [float(light.value.sum()) / SAMPLES for light in both],
-                "filed": np.asarray(filed[0].sum(axis=1)).tolist(),
+                "accumulated": np.asarray(accumulated[0].sum(axis=1)).tolist(),
                 "shares": whole.counted_lamps.shares.tolist() if whole.counted_lamps.shares is not None else [],
                 "edges": list(whole.counted_lamps.bands),
                 "spectra": [list(each.wavelengths_nm) for each in whole.counted_lamps.spectra],
@@ -156,9 +158,9 @@ def through_filters(place: Path, scene: Path, lamp: str) -> dict[str, Any]:
     for name, each in {"lines": colours.whole, "alone": colours.benches[1]}.items():
         tracer = Simulation(each, Settings(depth=400.0, effects=frozenset({"ambient"}))).from_camera
         assert isinstance(tracer, CombinedTracer) and len(tracer.tracers) == 3
-        looks = [tracer.trace(seed, 0, SAMPLES) for seed in range(SEEDS if name == "lines" else 1)]
-        lines = [look.by_line(len(LINES) if name == "lines" else 1) for look in looks]
-        found[name] = [[np.bincount(one.pixel - bench.n**2, one.value, 12).tolist() for one in look] for look in lines]
+        traced_runs = [tracer.trace(seed, 0, SAMPLES) for seed in range(SEEDS if name == "lines" else 1)]
+        lines = [run.by_line(len(LINES) if name == "lines" else 1) for run in traced_runs]
+        found[name] = [[np.bincount(one.pixel - bench.n**2, one.value, 12).tolist() for one in run] for run in lines]
     assert counted_lamps.shares is not None
     return {
         **found,
@@ -171,9 +173,7 @@ def through_filters(place: Path, scene: Path, lamp: str) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def light(tmp_path_factory: pytest.TempPathFactory) -> Mapping[tuple[str, str, bool], dict[str, Any]]:
     """Light of each case, from one child process: this one has another variant."""
-    program = (
-        "import json, sys; from tests.unit.light.test_lamplight import traced; print(json.dumps(traced(sys.argv[1])))"
-    )
+    program = "import json, sys; from tests.unit.light.test_lamps import traced; print(json.dumps(traced(sys.argv[1])))"
     command = [sys.executable, "-c", program, str(tmp_path_factory.mktemp("lamps"))]
     root = Path(__file__).parents[3]
     done = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=root, check=False)
@@ -195,7 +195,7 @@ def test_every_line_sees_the_lamp_as_its_closed_form(light: Mapping[Any, dict[st
         assert 7 * error < 0.01 * expected
         assert abs(runs[:, line].mean() - expected) < 7 * error + 2e-4 * expected, (case, wavelength)
     assert found["together"] in ([], pytest.approx(runs[0], rel=1e-12)), "beside paths over mirrors, which see none"
-    assert sum(found["filed"]) == pytest.approx(runs[0, 2], rel=1e-6) and found["filed"][0] == 0
+    assert sum(found["accumulated"]) == pytest.approx(runs[0, 2], rel=1e-6) and found["accumulated"][0] == 0
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -227,7 +227,7 @@ def test_pixels_count_the_lamp_each_through_its_filter(light: Mapping[Any, dict[
         for at, share in zip(LINES, SHARES, strict=True)
         for name, part in planes.items()
     )
-    looks = np.array(found["lines"]).reshape(SEEDS, len(LINES), len(FILTERS), 4) / SAMPLES
+    traced_runs = np.array(found["lines"]).reshape(SEEDS, len(LINES), len(FILTERS), 4) / SAMPLES
     every = {name: counted(lamp, sheet, curve, min(curve), max(curve)) for name, curve in FILTERS.items()}
     whole = sum(planes[name] * every[name] for name in FILTERS)
     for number, (name, curve) in enumerate(FILTERS.items()):
@@ -237,7 +237,7 @@ def test_pixels_count_the_lamp_each_through_its_filter(light: Mapping[Any, dict[
             planes[name] * np.array(bands) / whole, abs=0.01
         )
         for line, share in enumerate(SHARES):
-            runs = looks[:, line, number].sum(axis=1) * power / share / planes[name]
+            runs = traced_runs[:, line, number].sum(axis=1) * power / share / planes[name]
             expected, error = geometry / (ALBEDO * 3e4) * every[name], runs.std(ddof=1) / np.sqrt(SEEDS)
             assert 7 * error < 0.01 * expected
             assert abs(runs.mean() - expected) < 7 * error + 2e-4 * expected, (lamp, name, line)
@@ -301,8 +301,10 @@ def test_lamps_light_that_is_not_counted_flags_a_run(part: float, flagged: bool)
     light: Any = SimpleNamespace(
         bench=SimpleNamespace(counted_lamps=counted_lamps), plan=SimpleNamespace(accuracy=1e-3)
     )
-    said = list(_of_unknown_light(light, cast("Any", SimpleNamespace(ambient_part=part))))
-    assert bool(said) is flagged and all("4.0% of the lamps' light is in no frame" in sentence for sentence in said)
+    reported = list(_of_unknown_light(light, cast("Any", SimpleNamespace(ambient_part=part))))
+    assert bool(reported) is flagged and all(
+        "4.0% of the lamps' light is in no frame" in sentence for sentence in reported
+    )
 
 
 def test_lines_are_planned_with_their_lamps_lit(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -100,7 +100,7 @@ def test_a_curve_of_one_wavelength_of_spectra_counts_nothing() -> None:
         Response.of(sensor(quantum_efficiency=None, quantum_efficiency_curve=curve))
 
 
-def test_lamplight_has_four_rows_of_each_response() -> None:
+def test_lamps_have_four_rows_of_each_response() -> None:
     """(Planted: rows of the one before; ranges of any response in the place of all.)"""
     responses = (
         Response(np.ones(2), (400.0, 700.0)),
