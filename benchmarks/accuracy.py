@@ -41,7 +41,7 @@ from mitsim.core.seeds import integer
 from mitsim.light.light import Sampling, trace_light
 from mitsim.light.settings import Estimate
 from mitsim.optics.frames import monte_carlo_bound, monte_carlo_error
-from mitsim.planner.choose import predicted
+from mitsim.planner.choose import predicted_candidate
 from mitsim.planner.planner import make_plan
 from mitsim.studies.accuracy_parts import Stand
 
@@ -68,11 +68,11 @@ def answer(scene: str, noise: float) -> npt.NDArray[np.float32]:
     family = bench.family(PATTERNS, SEED)
     stand = Stand(bench, family, ANSWERS[0], Job(), FINEST / SEEN)
     finest = stand.finest(stand.plan(FINEST))
-    samples = predicted(noise, stand.pilot_result, finest.settings, {}).settings
+    samples = predicted_candidate(noise, stand.pilot_result, finest.settings, {}).settings
     plan = replace(finest, settings=samples, sampling_target=noise)
     halves = []
     for seed in ANSWERS:
-        light = trace_light(bench, plan, family.lighting, integer(seed, "answer"), Sampling(by_pixel=False)).merged()
+        light = trace_light(bench, plan, family.lighting, integer(seed, "answer"), Sampling(by_pixel=False)).merge()
         halves.append([frame.irradiance.astype(np.float32) for frame in light.frames(family.lighting, 0)])
     return np.array(halves)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.studies.characterise import Row, characterise
 from mitsim.studies.emva_options import Procedure
@@ -22,7 +22,7 @@ SHOWN = {"system_gain": "K [DN/e-]", "quantum_efficiency": "eta", "dark_noise": 
 
 def cameras() -> dict[str, SensorModel]:
     """Shipped cameras by name."""
-    paths = sorted(shipped("calibration").glob("*.toml"))
+    paths = sorted(shipped_path("calibration").glob("*.toml"))
     return {path.stem: load_sensor(path) for path in paths if "full_well_e" in path.read_text(encoding="utf-8")}
 
 

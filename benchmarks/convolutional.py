@@ -32,7 +32,7 @@ import numpy as np
 from anchor_psnr import photograph
 from solver import dots, frames_of, paper_factor, summed
 
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.mask_profile import load_psf
 from mitsim.devices.patterns import parse_patterns
@@ -59,7 +59,7 @@ def camera_of(psf: np.ndarray, cropped: bool) -> ConvolutionalCamera:
 
 def quality(psf: np.ndarray, case: Case, seed: int) -> Iterator[Row]:
     """PSNR of every photograph and convention."""
-    sensor, (cropped, k) = load_sensor(shipped("calibration", "imx249.toml")), case
+    sensor, (cropped, k) = load_sensor(shipped_path("calibration", "imx249.toml")), case
     classes = Classes(camera_of(psf, cropped), k)
     for convention in CONVENTIONS[: 2 if k > 1 else 1]:
         for name in PHOTOGRAPHS:
@@ -70,7 +70,7 @@ def quality(psf: np.ndarray, case: Case, seed: int) -> Iterator[Row]:
                 "convention": convention,
                 "image": name,
                 "psnr_db": round(db, 2),
-                "divided_db": round(psnr(classes.divided(shots.frames, solution.lam), truth), 2),
+                "divided_db": round(psnr(classes.divide(shots.frames, solution.lam), truth), 2),
                 "lambda_relative": solution.lam / classes.largest,
                 "saturated": shots.saturated,
             }
@@ -78,7 +78,7 @@ def quality(psf: np.ndarray, case: Case, seed: int) -> Iterator[Row]:
 
 def speed(psf: np.ndarray, case: Case, seed: int) -> Iterator[Row]:
     """CPU seconds of both solvers (mitsim.studies.convolutional_study.race)."""
-    sensor, truth = load_sensor(shipped("calibration", "imx249.toml")), photograph(PHOTOGRAPHS[0], False)
+    sensor, truth = load_sensor(shipped_path("calibration", "imx249.toml")), photograph(PHOTOGRAPHS[0], False)
     classes, whole = (Classes(camera_of(psf, cropped), case[1]) for cropped in (case[0], False))
     row = race(classes, whole, truth, sensor, seed)
     for mark in ("", "_exact"):

@@ -30,14 +30,14 @@ LINES = Spectrum(np.array([450.0, 520.0, 638.0]), np.array([0.3, 0.3, 0.4]))
 
 
 def camera(**mask: object) -> CameraGeometry:
-    return MaskProfile.model_validate({"feature_mm": 0.06, **mask}).worn(CameraGeometry.checked("benchmark"), Path())
+    return MaskProfile.model_validate({"feature_mm": 0.06, **mask}).put_on(CameraGeometry.build("benchmark"), Path())
 
 
 def of_rank(terms: int) -> CameraGeometry:
     """A camera whose mask is the sum of so many separable terms."""
     random = np.random.default_rng(terms)
     values = random.random((128, terms)) @ random.random((terms, 128)) / terms
-    return CameraGeometry.checked("benchmark", mask="plate", mask_plate=Plate(0.06, values, f"{terms} terms"))
+    return CameraGeometry.build("benchmark", mask="plate", mask_plate=Plate(0.06, values, f"{terms} terms"))
 
 
 def light(subdivision: int, period: int) -> tuple[Directions, np.ndarray, np.ndarray]:

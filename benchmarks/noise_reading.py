@@ -57,7 +57,7 @@ class Case:
 
 def factor_at(distance: float) -> np.ndarray:
     """Phi (512, 128) of the paper's camera with its mask at ``distance`` [mm]."""
-    camera = CameraGeometry.checked("the paper's camera", mask_distance=distance)
+    camera = CameraGeometry.build("the paper's camera", mask_distance=distance)
     mask, scene = camera.build_mask(), centred_edges(N, WIDTH_MM / N)
     profile = mask.terms[0][1]
     return scene_factor(profile, mask.feature_mm, camera.pixel_edges, scene, distance, camera.scene_distance)

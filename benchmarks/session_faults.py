@@ -28,7 +28,7 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.devices.patterns import stripe_signs
-from mitsim.devices.session import SIDES, UNIFORM, Half, Side, taken
+from mitsim.devices.session import SIDES, UNIFORM, Half, Side, halves_in_order
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.captured_session import calibrate_frames
 from mitsim.reconstruct.estimate_factors import predicted_error
@@ -194,7 +194,7 @@ def session(camera: Camera, folder: Path, fault: Fault | None) -> Path:
     """Files of a session with a ``fault``, in a new ``folder``."""
     rng, signs, traits = np.random.default_rng([camera.seed, 7]), stripe_signs(camera.n), camera.traits
     folder.mkdir()
-    order = taken(signs.shape[1], not camera.uniform)
+    order = halves_in_order(signs.shape[1], not camera.uniform)
     uniform = camera.light(np.ones((camera.n, camera.n))) * camera.scale
     still = traits["ambient"] * uniform.mean() + DARK
     gain = min(1.0, BRIGHTEST / float(uniform.max() + still))

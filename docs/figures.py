@@ -115,7 +115,7 @@ def closed() -> dict[str, float]:
     """Figures that follow from the shipped devices and the paper's geometry: no machine's."""
     import numpy as np
 
-    from mitsim.core.configuration import load_model, shipped
+    from mitsim.core.configuration import load_model, shipped_path
     from mitsim.devices.camera import CameraGeometry, Devices
     from mitsim.devices.projector import Coherence, ProjectorModel, Spectrum
     from mitsim.devices.sensor import load_sensor
@@ -125,7 +125,7 @@ def closed() -> dict[str, float]:
     from mitsim.reconstruct.colour import ColourModel, chart, delta_e
 
     camera, n, window = CameraGeometry(), 128, 120.0
-    projector = load_model(shipped("calibration", "mp_cl1.toml"), ProjectorModel)
+    projector = load_model(shipped_path("calibration", "mp_cl1.toml"), ProjectorModel)
     lines = projector.wavelengths_nm
     patches = delta_e(ColourModel.of_lines(lines).xyz(chart().at(lines)), chart().xyz)
     pitch = window / n / camera.scene_distance
@@ -142,7 +142,7 @@ def closed() -> dict[str, float]:
     def contrast(lit: Any, **coherence: float) -> float:
         devices = Devices(
             camera,
-            load_sensor(shipped("calibration", "imx249.toml")),
+            load_sensor(shipped_path("calibration", "imx249.toml")),
             projector.model_copy(update={"speckle": Coherence(**coherence)}),
             "",
         )

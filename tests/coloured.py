@@ -105,7 +105,7 @@ def mosaic_folders(
     files = [frame_name(index) for index in range(len(lights))]
     ambient = AmbientFile(file=AMBIENT, shots=16) if lamp else None
     held = RunManifest(camera={}, digital=digital, patterns=Patterns.of(family, files), ambient_frame=ambient)
-    shots = Capture.recorded(memory, held)
+    shots = Capture.from_recorder(memory, held)
     named = MosaicManifest.model_validate({**manifest("mosaic-run"), "mosaic": "BGGR", "weights": WEIGHTS})
     known = {name: LineTruth(image, np.full(image.shape, 1e-4), 0.99) for name, image in images.items()}
     run, calibration = place / "run", place / "cal"

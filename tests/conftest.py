@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from tests.kept_plans import plans_kept
 
 pytest_plugins = ["tests.robustness"]
@@ -176,7 +176,7 @@ def shipped_bench(variant: str) -> Callable[..., object]:
 
     @cache
     def load(name: str, **defines: str) -> object:
-        return open_bench(shipped("scenes", name, "scene.xml"), variant, **defines)
+        return open_bench(shipped_path("scenes", name, "scene.xml"), variant, **defines)
 
     return load
 

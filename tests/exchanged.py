@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mitsim.core.manifests import AmbientFile, CalibrationManifest, Digital, Patterns, RunHead, RunManifest, ShotFile
-from mitsim.core.runs import AMBIENT, claimed, frame_name
+from mitsim.core.runs import AMBIENT, claim_run, frame_name
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.solution import Status, Verdict
 
@@ -67,7 +67,7 @@ def made(
         digital = dn if real_output else np.rint(np.maximum(dn, 0))
         return {"DN": digital.astype(kind), "electrons": electrons.astype(np.float32)}
 
-    with claimed(folder / "run", head, resume=False) as run:
+    with claim_run(folder / "run", head, resume=False) as run:
         run.begin()
         run.write_truth(scene, 0.99, np.full(SCENE, 2e-3))
         for index, (i, j, sign) in enumerate(shots):

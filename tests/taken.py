@@ -39,7 +39,7 @@ class RealBench:
     def of(cls, bench: Bench, accuracy: float, patterns: str = "dots:7") -> RealBench:
         """That of a ``bench``, whose frames of ``patterns`` are good to ``accuracy``."""
         board = bench.with_board(0.99).light(patterns, accuracy=accuracy)
-        return cls(bench, board.merged(), bench.light(patterns, accuracy=accuracy).merged())
+        return cls(bench, board.merge(), bench.light(patterns, accuracy=accuracy).merge())
 
     def white(self, light: SampledLight) -> float:
         """Exposure [s] after which a white picture fills four fifths of the camera's range."""

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 import mitsim
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from tests.exchanged import made
 
 PACKAGE = Path(mitsim.__file__).parent
@@ -342,7 +342,7 @@ def refusing(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "bad").mkdir()
     (folder / "bad" / "manifest.json").write_text("{}")
     (folder / "bad" / "session.toml").write_text("n = 4")
-    camera = shipped("calibration", "imx249.toml").read_text()
+    camera = shipped_path("calibration", "imx249.toml").read_text()
     (folder / "endless.toml").write_text(re.sub(r"(?m)^full_well_e = .*", "full_well_e = inf", camera))
     (folder / "slip.toml").write_text(re.sub(r"(?m)^bits = .*", "bits = 5", camera))
     (folder / "masked.toml").write_text(f'{camera}\n[mask]\nkind = "separable"\nfeature_mm = 0.03\n')
@@ -351,7 +351,7 @@ def refusing(tmp_path_factory: pytest.TempPathFactory) -> Path:
         f'name = "x"\neffective_wavelength_nm = 550\nwavelengths_nm = {[float(wave) for wave in waves]}\n'
         f"radiant_shares = {[0.2 for _ in waves]}\n"
     )
-    recipe = shipped("calibration", "session.toml").read_text()
+    recipe = shipped_path("calibration", "session.toml").read_text()
     (folder / "depths.toml").write_text(f"depths = [350.0, 400.0]\n{recipe}")
     made(folder / "made")
     return folder

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mitsim.core.configuration import read_toml, shipped
+from mitsim.core.configuration import read_toml, shipped_path
 from tests.shipped_scenes import SCENES, opened, projected
 
 # One sheet of 128 mm at 400 mm, as the paper has it.
@@ -178,7 +178,7 @@ def test_power_follows_from_the_projector_file(name: str) -> None:
     text = (SCENES / name / "scene.xml").read_text(encoding="utf-8")
     written = re.search(r'<default name="projector_scale" value="([^"]+)"', text)
     assert written is not None and float(written[1]) == POWER
-    light = read_toml(shipped("calibration", "mp_cl1.toml"))
+    light = read_toml(shipped_path("calibration", "mp_cl1.toml"))
     watts = light["luminous_flux_lm"] / light["luminous_efficacy_lm_per_w"]
     width_m = 0.4 / light["throw_ratio"]
     irradiance = watts / (width_m * width_m * 9 / 16)

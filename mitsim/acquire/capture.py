@@ -31,13 +31,13 @@ from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Request, Task
 from mitsim.core.arrays import FloatArray, whole_hdf5
 from mitsim.core.environment import deciding_versions, versions
-from mitsim.core.errors import ArgumentError, MitsimError, checked, cut
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
 from mitsim.core.exr import Channel
 from mitsim.core.files import FRAMES, output_folder
 from mitsim.core.job import Job
 from mitsim.core.manifests import Patterns, RunHead, RunManifest
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.core.runs import AMBIENT, Capture, LineTruth, MosaicCapture, Recorder, claimed, frame_name
+from mitsim.core.runs import AMBIENT, Capture, LineTruth, MosaicCapture, Recorder, claim_run, frame_name
 from mitsim.core.spectral_manifests import MOSAIC, RUN, ColourManifest, MosaicManifest, write_colours
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import load_recipe
@@ -82,7 +82,7 @@ class Light(SampledLight):
     """Sampled light of one scene, ready to be exposed; its attributes are those of
     :class:`mitsim.light.light.SampledLight`."""
 
-    @checked
+    @check_arguments
     def expose(
         self, patterns: str = "dots:7", output: Path | str | None = None, job: Job | None = None, **request: Any
     ) -> Capture:
@@ -106,7 +106,7 @@ class Light(SampledLight):
         """
         return expose(self, patterns, output, job, **request)
 
-    @checked
+    @check_arguments
     def save(self, path: Path | str) -> Path:
         """Write the light to the HDF5 file ``path``, which is replaced; returns it. Frames are formed of it without
         mitsim, as docs/exchange.md shows.
@@ -148,7 +148,7 @@ def expose(
     patterns, output, job, request
         as for :meth:`Light.expose`, which has the errors raised as well.
     """
-    own = replace(light.plan, request=request_of(light.plan, {}).changed(patterns=patterns))
+    own = replace(light.plan, request=request_of(light.plan, {}).with_values(patterns=patterns))
     bench = SpectralBench(light.bench)
     return capture(bench, request_of(own, request), Task.of(output, job=job), lights=[light]).runs[0]
 
@@ -162,7 +162,7 @@ def request_of(plan: Plan | str, changes: Mapping[str, Any]) -> Request:
         if "patterns" in changes:
             raise ArgumentError("patterns", f"{cut(repr(changes['patterns']))}: beside the plan {plan!r}; give one")
         return Request.of(patterns=plan, **changes)
-    request = _request(plan).changed(**changes)
+    request = _request(plan).with_values(**changes)
     for name in ("patterns", "accuracy", "seconds", "effects"):
         if getattr(request, name) != getattr(_request(plan), name):
             raise ArgumentError(
@@ -236,7 +236,7 @@ def capture(
         asked = {**request.deciding, "versions": deciding_versions()}
         heads = [RunHead.of({**each.provenance(), **each.identity(), **asked}) for each in readings]
         recorders = [
-            places.enter_context(claimed(place, head, task.resume)) if place else Recorder()
+            places.enter_context(claim_run(place, head, task.resume)) if place else Recorder()
             for place, head in zip(folders, heads, strict=True)
         ]
         with job.planning(request.patterns):
@@ -275,7 +275,7 @@ def _run(
     ambient = None
     with job.clock.stage("ambient frame"):
         if takes_ambient_frame(request.ambient_frame, family, expected):
-            ambient = AmbientFrame.exposed(exposer, expected, request.ambient_shots or ambient_shots(family))
+            ambient = AmbientFrame.expose(exposer, expected, request.ambient_shots or ambient_shots(family))
     if ambient:
         single = {"DN": ambient.digital, "electrons": ambient.electrons}
         channels: dict[str, Channel] = {name: values.astype(np.float32) for name, values in single.items()}
@@ -310,7 +310,7 @@ def _run(
     foreign = _foreign(light, totals, request)
     if foreign and not manifest.warnings:  # within the accuracy: said, but no reason to flag the run
         warnings.warn(foreign, stacklevel=5)
-    return Capture.recorded(recorder, manifest)
+    return Capture.from_recorder(recorder, manifest)
 
 
 @contextmanager

@@ -23,7 +23,7 @@ from typing import Generic
 import numpy as np
 
 from mitsim.acquire.spectral import SpectralBench, line_alone, plan_request
-from mitsim.bench.apparatus import Apparatus, Opened, reopened
+from mitsim.bench.apparatus import Apparatus, Opened, reopen
 from mitsim.bench.request import Request, check_untimed
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
@@ -95,12 +95,12 @@ def choose_colour(bench: Opened, request: Request) -> Coloured[Opened]:
     looked = time.perf_counter() - started
     left = request
     if 0 < errors[chosen] <= most:
-        left = request.changed(accuracy=math.sqrt(request.accuracy**2 - errors[chosen] ** 2))
+        left = request.with_values(accuracy=math.sqrt(request.accuracy**2 - errors[chosen] ** 2))
     if chosen == MONO:
-        own = reopened(bench, bench.variant) if spectral else bench
+        own = reopen(bench, bench.variant) if spectral else bench
         plan = plan_request(own, left)
     else:
-        whole = spectral or reopened(bench, spectral_of(bench.variant))
+        whole = spectral or reopen(bench, spectral_of(bench.variant))
         own = whole if chosen == LINES else whole.in_bands(bands_of(chosen))
         plan = SpectralBench.of(own, RUN).plan(left)
     plan = plan.taking(plan=plan.predicted["plan"] + looked)
@@ -190,7 +190,7 @@ class _ColourPilot(Generic[Opened]):
     @cached_property
     def spectral(self) -> Opened:
         """The bench in the variant that knows wavelengths, which is set from then on."""
-        return reopened(self._bench, spectral_of(self._bench.variant))
+        return reopen(self._bench, spectral_of(self._bench.variant))
 
     def errors(self, names: Iterable[str]) -> dict[str, float]:
         """What each candidate leaves, by the ``names``."""

@@ -62,7 +62,7 @@ class Exposer:
             frame.irradiance, self.exposure_s, self.devices.sensor, self.devices.projector.effective_wavelength_nm
         )
 
-    def lit(self, frame: Frame, *names: str | int) -> FloatArray:
+    def shot_electrons(self, frame: Frame, *names: str | int) -> FloatArray:
         """Expected photoelectrons of ``frame``, with the speckle of its own that ``names`` find."""
         return add_speckle(self.electrons(frame), self.speckle, stream(self.seed, "speckle", *names))
 
@@ -88,7 +88,7 @@ class Exposer:
         variance = mean_variance(electrons, self.exposure_s, self.devices.sensor)
         return math.sqrt(variance) / self.devices.sensor.gain_dn_per_e
 
-    def saturated(self, digital: Digital, electrons: FloatArray) -> bool:
+    def saturates(self, digital: Digital, electrons: FloatArray) -> bool:
         """Whether a pixel of a ``digital`` frame, of expected ``electrons``, reached the full well or the ADC's end."""
         return saturated_pixels(digital, electrons, self.exposure_s, self.devices.sensor) > 0
 
@@ -107,7 +107,7 @@ class Exposer:
 
     def _measurement(self, frame: Frame, *names: str | int) -> FloatArray:
         """Noisy electrons a second of the frame ``names``."""
-        return self.rate(self.digital(self.lit(frame, *names), *names))
+        return self.rate(self.digital(self.shot_electrons(frame, *names), *names))
 
 
 def in_chunks(items: Iterable[Item]) -> Iterator[list[Item]]:
@@ -239,7 +239,7 @@ class AmbientFrame:
     saturated: bool
 
     @classmethod
-    def exposed(cls, exposer: Exposer, expected: ExpectedFrames, shots: int) -> AmbientFrame:
+    def expose(cls, exposer: Exposer, expected: ExpectedFrames, shots: int) -> AmbientFrame:
         """The mean of noisy shots, each with streams of its own.
 
         Parameters
@@ -256,7 +256,7 @@ class AmbientFrame:
             names = [("ambient", shot) for shot in range(start, min(start + step, shots))]
             for digital in in_threads(lambda name: exposer.digital(electrons, *name), names):
                 total += digital
-                saturated |= exposer.saturated(digital, electrons)
+                saturated |= exposer.saturates(digital, electrons)
         return cls(shots, electrons, total / shots, saturated)
 
 
@@ -270,7 +270,7 @@ def taken_off(exposer: Exposer, family: PatternFamily, expected: ExpectedFrames)
     """
     if not takes_ambient_frame("auto", family, expected):
         return 0.0
-    return exposer.rate(AmbientFrame.exposed(exposer, expected, ambient_shots(family)).digital)
+    return exposer.rate(AmbientFrame.expose(exposer, expected, ambient_shots(family)).digital)
 
 
 # -------- Shots of a family: expected frames made noisy, and recorded
@@ -431,7 +431,7 @@ class Shooting:
 
     def _expose(self, item: tuple[int, Shot, Frame]) -> _Exposed:
         index, shot, frame = item
-        electrons = self.exposer.lit(frame, *shot.names)
+        electrons = self.exposer.shot_electrons(frame, *shot.names)
         digital = self.exposer.digital(electrons, *shot.names)
         energy = sum_of_squares(electrons)
         return _Exposed(
@@ -441,7 +441,7 @@ class Shooting:
             digital=digital,
             rendering_noise=self.exposer.rendering_noise(frame),
             sensor_noise=self.exposer.sensor_noise(electrons),
-            saturated=self.exposer.saturated(digital, electrons),
+            saturated=self.exposer.saturates(digital, electrons),
             light=float(electrons.sum()),
             energy=energy,
             signal=sum_of_squares(electrons - self.always) if self.always.any() else energy,
@@ -503,7 +503,7 @@ def drift_mask(bench: Apparatus, drift: Drift) -> Apparatus:
     """
     row, column, axis = drift.mask_mm
     camera, kinds = bench.geometry, " and ".join(kind for kind in drift.kinds if kind in _OF_TERMS)
-    if kinds and camera.correlated(camera.diffracts):
+    if kinds and camera.is_correlated(camera.diffracts):
         raise MitsimError(
             f"drift: {kinds} would be formed of separable terms, and {camera.mask_words} has none; turn or tilt that "
             "mask in the camera file's [mask]"
@@ -580,7 +580,7 @@ class DriftedExposer(Exposer):
         """Expected photoelectrons (m, m') of ``frame`` in the time that the shutter is open."""
         return self._open.electrons(frame)
 
-    def lit(self, frame: Frame, *names: str | int) -> FloatArray:
+    def shot_electrons(self, frame: Frame, *names: str | int) -> FloatArray:
         """Expected photoelectrons of the ``frame`` that ``names`` find, projector and lamps at their level."""
         rows = len(frame.irradiance)
         power, lamp = (
@@ -588,7 +588,7 @@ class DriftedExposer(Exposer):
             for source, level in zip(("power", "lamp"), self.levels[names], strict=True)
         )
         light = frame.irradiance + (power - 1) * (frame.irradiance - self.ambient)
-        return super().lit(replace(frame, irradiance=light + (lamp - 1) * self.ambient), *names)
+        return super().shot_electrons(replace(frame, irradiance=light + (lamp - 1) * self.ambient), *names)
 
     def digital(self, electrons: FloatArray, *names: str | int) -> Digital:
         """Noisy digital numbers of expected ``electrons``; ``names`` find the frame's own noise."""

@@ -16,7 +16,7 @@ from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import FEWEST_PASSES, REFERENCE, check_accuracy, check_samples
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import DEFAULT_VARIANT, load_variant, versions
-from mitsim.core.errors import MitsimError, checked
+from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.exr import write_frame
 from mitsim.core.job import Cost, Job
 from mitsim.core.seeds import integer
@@ -68,7 +68,7 @@ class Rendered:
         """What the command line reports, but for the file's name."""
         return {**self.facts, "mean": float(self.mean.mean()), "mc_error": self.mc_error, "warnings": self.warnings}
 
-    @checked
+    @check_arguments
     def save(self, path: Path | str) -> Path:
         """Write the frame and its error to the OpenEXR file ``path``, which is replaced; returns it.
 
@@ -86,11 +86,11 @@ class Rendered:
         return f"Rendered({rows} x {columns}: {self.facts['estimator']}, relative noise {self.mc_error:.1e})"
 
     def _repr_html_(self) -> str:
-        from mitsim.core.images import card, scaled, span
+        from mitsim.core.images import card, normalise, span
 
         grey = self.mean.mean(axis=2)
         facts = f"mean {grey.mean():.3g} W/m^2, relative noise {self.mc_error:.1e}"
-        pictures = {f"irradiance\n{span(grey, 'W/m^2')}": scaled(grey)}
+        pictures = {f"irradiance\n{span(grey, 'W/m^2')}": normalise(grey)}
         return card(f"Rendered: {self.facts['estimator']}", pictures, (facts, *self.warnings))
 
 
@@ -186,7 +186,7 @@ def _samples(bench: Apparatus, estimator: str, spp: int | None) -> int:
 
 
 @contextmanager
-def projected(bench: Apparatus, pattern: FloatArray) -> Iterator[None]:
+def show_pattern(bench: Apparatus, pattern: FloatArray) -> Iterator[None]:
     """Show a ``pattern`` (n, n) of 0..1 on the ``bench``'s projector while the context lasts, for the reference."""
     import mitsuba as mi
 

@@ -164,7 +164,7 @@ class SpectralBench:
         plan = plan_request(roughest, request, len(self.benches))
         if roughest.counted_lamps is not None and "ambient" not in plan.settings.effects:
             # Beside a weaker line lamps may count.
-            request = request.changed(effects={**request.effects, "ambient": True})
+            request = request.with_values(effects={**request.effects, "ambient": True})
             plan = plan_request(roughest, request, len(self.benches))
         return plan
 
@@ -517,15 +517,15 @@ class _Look:
         (first, last), (begin, end) = response.range_nm, SPECTRA_NM
         parts = math.ceil((last - first) / MOST_LINES / _STEP_NM)
 
-        def seen(*bands: Band) -> FloatArray:
+        def fit_response(*bands: Band) -> FloatArray:
             """(bands,) light of each."""
             light = LampTracer(tracer, LampResponse(response, bands, (1.0,))).trace(stream, 0, _SAMPLES)
             return np.asarray(np.bincount(light.pixel - tracer.projector.n**2, light.value, MOST_LINES) / _SAMPLES)
 
         # (bands, parts)
-        light = np.stack([seen(*response.bands(MOST_LINES, part, parts)) for part in range(parts)], axis=1)
+        light = np.stack([fit_response(*response.bands(MOST_LINES, part, parts)) for part in range(parts)], axis=1)
         middles = [[(low + high) / 2 for low, high in response.bands(MOST_LINES, part, parts)] for part in range(parts)]
-        unknown = seen((begin, first), (last, end), (end - _END_NM, end), (end, end))
+        unknown = fit_response((begin, first), (last, end), (end - _END_NM, end), (end, end))
         return cls(
             light.sum(axis=1),
             tuple(map(_spectrum, np.array(middles).T, light)),

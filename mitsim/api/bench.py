@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mitsim.bench.apparatus import Apparatus, open_apparatus, reopened
+from mitsim.bench.apparatus import Apparatus, open_apparatus, reopen
 from mitsim.bench.request import Request, SessionRequest, Task
 from mitsim.core.environment import DEFAULT_VARIANT
-from mitsim.core.errors import checked
+from mitsim.core.errors import check_arguments
 from mitsim.core.job import Job
 
 # What needs numpy, or the renderer, is imported where it is used: what opens a bench refuses a misspelt name first.
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 # ---- Opening a bench ----
 
 
-@checked
+@check_arguments
 def open_bench(
     scene: Path | str,
     variant: str = DEFAULT_VARIANT,
@@ -83,7 +83,7 @@ class Bench(Apparatus):
 
     # ---- The plan, and light of the scene ----
 
-    @checked
+    @check_arguments
     def plan(self, patterns: str = "dots:7", **request: Any) -> Plan:
         """What will be simulated, why, and what it costs, by a short look at the scene.
 
@@ -103,7 +103,7 @@ class Bench(Apparatus):
 
         return plan_request(self, Request.of(patterns=patterns, **request))
 
-    @checked
+    @check_arguments
     def light(self, patterns: str = "dots:7", job: Job | None = None, **request: Any) -> Light:
         """Light of the scene by projector pixel, traced once, from which any family can be exposed. MitsimError as
         :meth:`plan`.
@@ -126,7 +126,7 @@ class Bench(Apparatus):
 
     # ---- Captures ----
 
-    @checked
+    @check_arguments
     def capture(
         self,
         plan: Plan | str = "dots:7",
@@ -166,7 +166,7 @@ class Bench(Apparatus):
 
     # ---- Spectral lines and colour filters ----
 
-    @checked
+    @check_arguments
     def capture_lines(
         self,
         patterns: Plan | str = "dots:7",
@@ -204,7 +204,7 @@ class Bench(Apparatus):
         known = None if isinstance(patterns, str) else patterns
         return capture_lines(self, request_of(patterns, request), task, known)
 
-    @checked
+    @check_arguments
     def choose_colour(self, patterns: str = "dots:7", **request: Any) -> Coloured[Self]:
         """Mono, bands or lines: the cheapest that is predicted to leave at most half of the accuracy of the colours.
 
@@ -226,13 +226,13 @@ class Bench(Apparatus):
 
         return choose_colour(self, Request.of(patterns=patterns, **request))
 
-    @checked
+    @check_arguments
     def in_variant(self, variant: str) -> Bench:
         """The same bench loaded anew into a ``variant``, which is set from then on; objects of the variant before must
         not be used with it. MitsimError as :func:`mitsim.open_bench`."""
-        return reopened(self, variant)
+        return reopen(self, variant)
 
-    @checked
+    @check_arguments
     def calibrate_lines(
         self,
         seed: int = 0,
@@ -262,7 +262,7 @@ class Bench(Apparatus):
 
         return calibrate_lines(self, SessionRequest(seed, accuracy, recipe), task)
 
-    @checked
+    @check_arguments
     def capture_mosaic(
         self,
         patterns: str = "dots:7",
@@ -298,7 +298,7 @@ class Bench(Apparatus):
 
         return capture_mosaic(self, Request.of(patterns=patterns, **request), task)
 
-    @checked
+    @check_arguments
     def calibrate_mosaic(
         self,
         seed: int = 0,
@@ -333,7 +333,7 @@ class Bench(Apparatus):
 
     # ---- Calibration sessions ----
 
-    @checked
+    @check_arguments
     def calibrate(
         self,
         seed: int = 0,
@@ -371,7 +371,7 @@ class Bench(Apparatus):
 
         return calibrate(self, SessionRequest(seed, accuracy, recipe), task)
 
-    @checked
+    @check_arguments
     def calibrate_depths(
         self,
         seed: int = 0,
@@ -395,7 +395,7 @@ class Bench(Apparatus):
 
         return calibrate_depths(self, SessionRequest(seed, accuracy, recipe), Task.of(output, resume, job))
 
-    @checked
+    @check_arguments
     def write_session(
         self,
         frames: Path | str,
@@ -422,7 +422,7 @@ class Bench(Apparatus):
 
     # ---- Renderings, and the same devices before a board ----
 
-    @checked
+    @check_arguments
     def render(
         self,
         estimator: Literal["reference", "factored"] = "reference",
@@ -456,7 +456,7 @@ class Bench(Apparatus):
 
         return render(self, estimator, spp, accuracy, seed, effects, job)
 
-    @checked
+    @check_arguments
     def with_board(self, reflectance: float, shape: BoardShape | None = None, depth: float | None = None) -> Self:
         """The same devices before a diffuse board. MitsimError for a reflectance or a depth that no board has.
 

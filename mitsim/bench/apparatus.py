@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from mitsim.core.configuration import DEFAULT_CAMERA, load_model, locate
 from mitsim.core.environment import DEFAULT_VARIANT, load_variant
-from mitsim.core.errors import ArgumentError, MitsimError, checked
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.devices.patterns import read_name
 from mitsim.scene.outline import Outline, SceneFiles, lit_side
 
@@ -156,7 +156,7 @@ class Apparatus:
         """Row and column tan-angles of the projector's window on the aligned plane."""
         return self.loaded.pixels.row_tan, self.loaded.pixels.column_tan
 
-    @checked
+    @check_arguments
     def windows_at(self, depth: float) -> tuple[tuple[float, float], tuple[float, float]]:
         """The same on a plane at ``depth`` [mm]; ArgumentError for one that is not in front of the camera."""
         check_depth(depth)
@@ -180,7 +180,7 @@ class Apparatus:
         """How the factors of a calibration on the aligned plane move with depth, as its manifest states it."""
         return self.parallax_from(self.geometry.scene_distance)
 
-    @checked
+    @check_arguments
     def parallax_from(self, depth: float) -> Parallax:
         """The same of a calibration at ``depth`` [mm]; ArgumentError for one that is not beyond the mask."""
         from mitsim.core.manifests import Parallax
@@ -226,7 +226,7 @@ class Apparatus:
             for window, half in zip(self.windows, geometry.half_sides, strict=True)
         )
 
-    @checked
+    @check_arguments
     def family(self, patterns: str, seed: int = 0) -> PatternFamily:
         """The family ``patterns`` on this projector, ``seed`` for random ones; MitsimError when it does not fit."""
         from mitsim.devices.patterns import parse_patterns
@@ -296,7 +296,7 @@ class Apparatus:
             },
         }
 
-    @checked
+    @check_arguments
     def in_bands(self, count: int) -> Self:
         """The same bench whose projector has ``count`` bands of its lines as lines; MitsimError as
         :meth:`mitsim.devices.projector.ProjectorModel.in_bands`."""
@@ -405,7 +405,7 @@ def open_apparatus(
     return Apparatus(loaded, devices, variant, defines)
 
 
-def reopened(bench: Opened, variant: str) -> Opened:
+def reopen(bench: Opened, variant: str) -> Opened:
     """The ``bench`` loaded anew into a ``variant``, which is set from then on. MitsimError as
     :func:`mitsim.api.bench.open_bench`."""
     from mitsim.devices.mask_profile import load_mask
@@ -420,7 +420,7 @@ def reopened(bench: Opened, variant: str) -> Opened:
 def _wear(loaded: LoadedScene, mask: MaskProfile | None, camera: Path) -> None:
     """Put a ``mask`` of the file of a ``camera``, where it has one, before the sensor of a ``loaded`` scene."""
     if mask is not None:
-        loaded.camera.wear(mask.worn(loaded.camera.geometry, camera.parent))
+        loaded.camera.wear(mask.put_on(loaded.camera.geometry, camera.parent))
 
 
 def _tune(loaded: LoadedScene, projector: ProjectorModel) -> None:

@@ -77,7 +77,7 @@ class Physics:
         )
 
     @classmethod
-    def simulated(cls, bench: Apparatus, effects: Collection[str]) -> Physics:
+    def with_effects(cls, bench: Apparatus, effects: Collection[str]) -> Physics:
         """What ``bench`` has of ``effects``; all others take their neutral values."""
         physics = cls.of(bench)
         for effect in EFFECTS.values():

@@ -239,7 +239,7 @@ class Request(BaseModel):
             values["effects"] = parse_switches(str(values["effects"]))
         return validate(cls, values, "request")
 
-    def changed(self, **values: object) -> Request:
+    def with_values(self, **values: object) -> Request:
         """The same request with other ``values``; MitsimError as :meth:`of`."""
         return Request.of(**{**self.model_dump(exclude_unset=True), **values})
 

@@ -23,7 +23,7 @@ from mitsim.core.parallel import in_threads
 from mitsim.devices.camera import CameraGeometry, side_of
 from mitsim.devices.patterns import Lighting, stripe_signs
 from mitsim.devices.projector import Spectrum
-from mitsim.devices.session import UNIFORM, BoardShape, Half, SessionRecipe, taken
+from mitsim.devices.session import UNIFORM, BoardShape, Half, SessionRecipe, halves_in_order
 from mitsim.light.cost_model import FIXED, Numbers, forming_seconds, frame_seconds, frames_at_once, light_bytes
 from mitsim.light.light import SampledLight, Sampling, trace_lines
 from mitsim.light.plan import Plan
@@ -31,7 +31,7 @@ from mitsim.light.settings import Forming, Settings
 from mitsim.light.simulation import Simulation
 from mitsim.optics.frames import Frame, at_once, mixes
 from mitsim.optics.shadow import Directions, SeparableTerms
-from mitsim.optics.terms import best_term, centred, shadow_terms
+from mitsim.optics.terms import best_term, centre_terms, shadow_terms
 from mitsim.planner.planner import make_plan
 from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, decibels
 
@@ -134,7 +134,7 @@ class Session:
             Directions.cells(np.linspace(*edges, self.bench.n + 1)) for edges in self.bench.windows_at(self.distance)
         )
         terms = shadow_terms(geometry, rows, columns, self.distance, spectrum)
-        return centred(terms) if self.centre else terms
+        return centre_terms(terms) if self.centre else terms
 
     @cached_property
     def signs(self) -> FloatArray:
@@ -151,7 +151,7 @@ class Session:
         """Whether a +-1 pattern is the difference of two shots, and not taken from one and a uniform shot."""
         return self.recipe.signed_capture == "pair"
 
-    def filtered(self, light: FloatArray) -> FloatArray:
+    def through_filters(self, light: FloatArray) -> FloatArray:
         """What passes the filters of ``light`` (pixels, pixels)."""
         return light if self.filters is None else light * self.filters
 
@@ -165,7 +165,7 @@ class Session:
     def order(self) -> list[Half]:
         """What the lit frames show, as they are taken; each with all exposures, one after the other, and of each all
         repeats. Dark frames come last."""
-        return taken(self.signs.shape[1], self.pairs, self.recipe.order, self.recipe.order_seed)
+        return halves_in_order(self.signs.shape[1], self.pairs, self.recipe.order, self.recipe.order_seed)
 
     @cached_property
     def powers(self) -> Mapping[tuple[str, int], FloatArray]:
@@ -218,7 +218,7 @@ class Session:
         with job.clock.stage("transport"):
             sampling, lighting = Sampling(purpose="calibration"), _lines(self.bench.n)
             lights = trace_lines(self.board, boards, plan, lighting, self.seed, sampling, job.progress)
-        return [light.merged() for light in lights]
+        return [light.merge() for light in lights]
 
 
 def _lines(n: int) -> Lighting:
@@ -277,7 +277,7 @@ def session_seconds(board: Apparatus, count: int, shots: int, settings: Settings
         shots=count,
         classes=n,
         geometric_terms=float(board.geometry.mask_terms),
-        correlated=(board.geometry.drawn(waves=False), board.geometry.drawn(board.geometry.diffracts)),
+        correlated=(board.geometry.is_drawn(waves=False), board.geometry.is_drawn(board.geometry.diffracts)),
     )
     numbers = replace(Numbers.of(settings), mixed=0.0)  # what black pixels leak is added to frames
     seconds = 2 * float(forming_seconds(forming, numbers, n if mixed else count, _UNIT_COSTS))

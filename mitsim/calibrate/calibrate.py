@@ -255,8 +255,8 @@ def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
         "unexplained_residual": noisy.unexplained,
         "noise_free_residual": clean.separability_residual,
         "phi_error": _factor_error(noisy, clean),
-        "faults": faults.listed(frame_words),
-        "lamp": faults.lamp.listed(),
+        "faults": faults.faults_for_manifest(frame_words),
+        "lamp": faults.lamp.for_manifest(),
         "shadow_residual": lacks and lacks.residual,
         "condition": noisy.condition,
         "exposure_s": lit.exposure_s,
@@ -353,11 +353,14 @@ def session_sums(lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Ch
     def response(kind: str, side: str, number: int, frame: Frame) -> Response:
         return lit.noisy(side, number, frame) if kind == NOISY else Response(lit.noise_free(frame))
 
-    def seen(sums: Sequence[StripeSums], shown: tuple[int, Frame]) -> list[tuple[ResponseFit, int]]:
+    def fit_response(sums: Sequence[StripeSums], shown: tuple[int, Frame]) -> list[tuple[ResponseFit, int]]:
         each = [response(kind, sums[0].side, *shown) for kind in kinds]
-        return [(own.seen(one.rate, shown[0], one.light), one.saturated) for own, one in zip(sums, each, strict=True)]
+        return [
+            (own.fit_response(one.rate, shown[0], one.light), one.saturated)
+            for own, one in zip(sums, each, strict=True)
+        ]
 
-    stripes = SessionSums.kept(checkpoint, kinds)
+    stripes = SessionSums.from_checkpoint(checkpoint, kinds)
     if stripes is None:
         stripes = SessionSums({}, 0)
         with job.clock.stage("sensor"):
@@ -368,7 +371,7 @@ def session_sums(lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Ch
                 stripes.saturated += one.saturated + other.saturated
     saved = time.monotonic()
     for side, sums in zip(SIDES, zip(*stripes.sums.values(), strict=True), strict=True):
-        for looked in lit.each(side, partial(seen, sums), job, sums[0].done):
+        for looked in lit.each(side, partial(fit_response, sums), job, sums[0].done):
             for own, (vectors, saturated) in zip(sums, looked, strict=True):
                 own.put(vectors)
                 stripes.saturated += saturated

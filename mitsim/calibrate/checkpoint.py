@@ -207,7 +207,7 @@ class SessionSums:
         checkpoint.save("stripes", arrays)
 
     @classmethod
-    def kept(cls, checkpoint: Checkpoint, kinds: Sequence[str]) -> SessionSums | None:
+    def from_checkpoint(cls, checkpoint: Checkpoint, kinds: Sequence[str]) -> SessionSums | None:
         """Those of an interrupted session in a ``checkpoint``, of some ``kinds`` of responses; None where there are
         none."""
         arrays = checkpoint.load("stripes")

@@ -85,7 +85,7 @@ class LitSession:
             n, signs = session.bench.n, session.signs
             white = next(iter(light.frames(Lighting.uniform(n), session.seed)))
             exposure = Exposure(None, session.recipe.exposure_fraction)
-            exposure_s = exposure.choose(session.bench.devices, float(session.filtered(white.irradiance).max()))
+            exposure_s = exposure.choose(session.bench.devices, float(session.through_filters(white.irradiance).max()))
         stripes = PatternFamily("stripes", signs[:, 1:2].astype(np.int8), np.ones((n, 1), np.int8))
         return cls(session, light, white, exposure_s, light.speckle(stripes))
 
@@ -122,7 +122,7 @@ class LitSession:
             if self.session.filters is not None:
                 weight = weight / np.square(self.session.filters)
             single: dict[str, FloatArray | float] = {
-                SHOT: self.session.filtered(self.uniform_rate) / time,
+                SHOT: self.session.through_filters(self.uniform_rate) / time,
                 DARK: sensor.superpixel_dark_current_e_per_s / time,
                 READ: sensor.superpixel_reading_noise_e**2 / time**2,
                 ROUNDING: rounding / time**2,
@@ -151,7 +151,7 @@ class LitSession:
             number of the first pattern.
         """
 
-        def used(item: tuple[int, Frame]) -> Result:
+        def use_response(item: tuple[int, Frame]) -> Result:
             number, frame = item
             return use((number, self._with_leak(frame) if number else frame))
 
@@ -162,7 +162,7 @@ class LitSession:
             if chunk is None:
                 return
             with job.clock.stage("sensor"):
-                results = in_threads(used, chunk)
+                results = in_threads(use_response, chunk)
             job.progress(f"{side} stripes", (chunk[-1][0] + 1) / self.session.signs.shape[1])
             yield from results
 
@@ -273,7 +273,7 @@ class LitSession:
             for index in range(number):
                 total += self._read(exposer, still, "dark", exposure, index)
             rates.append(exposer.rate(total / number))
-        return {side: self._without_filters(ladder.merged(rates)) for side, ladder in self.ladders.items()}
+        return {side: self._without_filters(ladder.merge(rates)) for side, ladder in self.ladders.items()}
 
     @cached_property
     def uniform_rate(self) -> FloatArray:
@@ -299,7 +299,11 @@ class LitSession:
         ladder = self.ladders[side]
         found = [
             self._mean_of_repeats(
-                self._shot_electrons(irradiance, exposure, side, index), exposure, ladder.used(exposure), side, index
+                self._shot_electrons(irradiance, exposure, side, index),
+                exposure,
+                ladder.used_pixels(exposure),
+                side,
+                index,
             )
             for exposure in range(len(self._exposers))
         ]
@@ -307,8 +311,8 @@ class LitSession:
 
     def _shot_electrons(self, irradiance: FloatArray, exposure: int, *names: str | int) -> FloatArray:
         """Expected electrons of a shot. Speckle of a board at rest is the same in all repeats and exposures."""
-        passed = Frame(self.session.filtered(irradiance), 0.0, 0.0, 0.0)
-        return self._exposers[exposure].lit(passed, "calibration", *names)
+        passed = Frame(self.session.through_filters(irradiance), 0.0, 0.0, 0.0)
+        return self._exposers[exposure].shot_electrons(passed, "calibration", *names)
 
     def _mean_of_repeats(
         self, lit: FloatArray, exposure: int, used: Chosen, side: str, index: int
@@ -331,8 +335,8 @@ class LitSession:
             light = powers[repeat] * lit
             digital = self._read(exposer, light, *repeat_names((side, index), exposure, repeat))
             if used is True:
-                return digital, int(exposer.saturated(digital, light))
-            return digital, int(exposer.saturated(np.where(used, digital, 0), np.where(used, light, 0.0)))
+                return digital, int(exposer.saturates(digital, light))
+            return digital, int(exposer.saturates(np.where(used, digital, 0), np.where(used, light, 0.0)))
 
         digital, count = read(0)
         if repeats == 1:
@@ -355,7 +359,7 @@ class LitSession:
     def _rate(self, shot: _Shot, rows: slice) -> FloatArray:
         """Rates of some ``rows`` of a ``shot``."""
         each = zip(self._exposers, shot.digital, strict=True)
-        merged = shot.ladder.merged((exposer.rate(digital[rows]) for exposer, digital in each), rows)
+        merged = shot.ladder.merge((exposer.rate(digital[rows]) for exposer, digital in each), rows)
         return self._without_filters(merged, rows)
 
     def _without_filters(self, rate: FloatArray, rows: slice = slice(None)) -> FloatArray:

@@ -22,7 +22,7 @@ from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.lit_session import LitSession
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import versions
-from mitsim.core.errors import MitsimError, checked
+from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.files import output_folder
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, Digital, FactorNoise, FittedNumber, ModelledFactors
@@ -48,7 +48,7 @@ _SIGNIFICANT = 3.0
 # -------- Factors of the fitted model
 
 
-@checked
+@check_arguments
 def calibrate_model(
     bench: Apparatus,
     modelling: Modelling,
@@ -134,7 +134,7 @@ def model_of(bench: Apparatus, model: Model) -> ModelledCamera:
     """The ``model``, geometric or wave, of a ``bench`` as it was to be built. MitsimError for a mask that is tilted, or
     whose shadow is drawn on a raster: a fit moves a few profiles."""
     geometry = bench.geometry
-    if geometry.drawn(model == "wave" and geometry.diffracts) or any(geometry.mask_tilt):
+    if geometry.is_drawn(model == "wave" and geometry.diffracts) or any(geometry.mask_tilt):
         raise MitsimError(
             f"calibrate: a {model} model has a mask of one or two separable terms, mounted straight, and "
             f"{geometry.mask_words} is not; describe it so in the camera's [mask] (a fit finds its rotation), or "
@@ -147,7 +147,7 @@ def simulate_responses(lit: LitSession, modelling: Modelling) -> tuple[list[Show
     """Noisy responses of a session ``lit``, as many as a ``modelling`` uses, and of how many frames they are."""
     session, n = lit.session, lit.session.bench.n
     pairs, repeats, signs = session.pairs, session.recipe.repeats, session.signs
-    chosen = modelling.chosen(_changes(signs), pairs, repeats)
+    chosen = modelling.used_patterns(_changes(signs), pairs, repeats)
     row, column = np.divmod(np.arange(n * n), n)
     formed: dict[tuple[str, int], Frame] = {}
     for side, labels in zip(SIDES, (row, column), strict=True):
@@ -177,7 +177,7 @@ def _of_frames(bench: Apparatus, session: SessionFrames, modelling: Modelling) -
             "the scene of these devices"
         )
     signs = stripe_signs(listed.n).astype(np.float64)
-    chosen = modelling.chosen(_changes(signs), pairs, listed.repeats)
+    chosen = modelling.used_patterns(_changes(signs), pairs, listed.repeats)
     shown = []
     for (side, index), (rate, noise) in zip(chosen, chosen_responses(session, chosen), strict=True):
         rows, columns = bench.geometry.frame_shape
@@ -267,7 +267,7 @@ def _noise(camera: ModelledCamera, fitted: Fitted) -> FactorNoise:
     here, places = camera.factors(fitted.placement), []
     for name in fitted.free:
         step = STEPS.get(name, GAIN_STEP * fitted.placement.gain)
-        there = camera.factors(fitted.placement.moved({name: step}))
+        there = camera.factors(fitted.placement.move({name: step}))
         places.append([((on - at) / step).ravel() for on, at in zip(there, here, strict=True)])
     left, right = (
         float(np.sqrt(max(np.sum(fitted.covariance * (slopes @ slopes.T)), 0.0) / slopes.shape[1]))
@@ -296,7 +296,7 @@ def _rotation(camera: ModelledCamera, fitted: Fitted) -> Sequence[str]:
     angle, error = fitted.placement.mask_rotation, fitted.errors.get("mask_rotation")
     if error is None or abs(angle) < _SIGNIFICANT * error:
         return ()
-    turned = [(angle * left, right) for left, right in camera.turned(fitted.placement)]
+    turned = [(angle * left, right) for left, right in camera.rotation_terms(fitted.placement)]
     lost = best_term([camera.factors(fitted.placement), *turned]).residual
     if lost <= SEPARABLE_RESIDUAL:
         return ()
@@ -439,10 +439,10 @@ class _Pass:
     def of(cls, camera: ModelledCamera, shown: Sequence[Shown], free: Sequence[str], start: Placement) -> _Pass:
         """The problem near ``start``; other parameters as for :func:`fit_placement`."""
         steps = {name: STEPS.get(name, GAIN_STEP * start.gain) for name in free}
-        turned = camera.turned(start) if "mask_rotation" in free else []
+        turned = camera.rotation_terms(start) if "mask_rotation" in free else []
         empty = cls(camera, start, steps, turned, shown, [], np.zeros(0))
         far = [(name, sign * _REACH * step) for name, step in steps.items() if name != "gain" for sign in (-1, 1)]
-        near = [start, *(start.moved({name: step}) for name, step in far)]
+        near = [start, *(start.move({name: step}) for name, step in far)]
         # A rotation of 0 would leave out its directions.
         spanning = [*turned, *(term for place in near for term in empty.terms(place)[:1])]
         directions, data = [], []
@@ -455,7 +455,7 @@ class _Pass:
 
     def placement(self, x: FloatArray) -> Placement:
         """That of variables ``x``, in steps from the start."""
-        return self.start.moved(
+        return self.start.move(
             {name: step * float(value) for (name, step), value in zip(self.steps.items(), x, strict=True)}
         )
 
@@ -512,7 +512,7 @@ def _first_guess(camera: ModelledCamera, uniform: Shown, free: Sequence[str]) ->
     geometric = replace(camera, spectrum=None)  # a shadow's fringes move with it
     lefts, rights = [], []
     for shift in shifts:
-        (pair,) = _vectors_of([geometric.factors(camera.built.moved(dict.fromkeys(_SHIFTS, float(shift))))], uniform)
+        (pair,) = _vectors_of([geometric.factors(camera.built.move(dict.fromkeys(_SHIFTS, float(shift))))], uniform)
         lefts.append(pair[0])
         rights.append(pair[1])
     products = np.stack(lefts) @ uniform.rate @ np.stack(rights).T
@@ -528,7 +528,7 @@ def _first_guess(camera: ModelledCamera, uniform: Shown, free: Sequence[str]) ->
     if not gain > 0:
         raise MitsimError("the response to uniform light has nothing of the camera's shadow; check mask and geometry")
     moves = {name: float(shifts[index]) for name, index in zip(_SHIFTS, (row, column), strict=True) if name in free}
-    return camera.built.moved({**moves, "gain": gain - camera.built.gain})
+    return camera.built.move({**moves, "gain": gain - camera.built.gain})
 
 
 _SHIFTS = ("mask_shift_row", "mask_shift_column")

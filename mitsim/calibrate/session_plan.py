@@ -31,7 +31,7 @@ from mitsim.calibrate.board_session import Session, session_seconds
 from mitsim.calibrate.calibrate import NOISE_FREE, session_sums
 from mitsim.calibrate.lit_session import LitSession
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError, checked
+from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.job import Clock, Job
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.core.parallel import single_threaded_blas
@@ -171,7 +171,7 @@ class CalibrationPlan:
         ]
 
 
-@checked
+@check_arguments
 def plan_calibration(
     bench: Apparatus,
     psnr: float,

@@ -54,7 +54,7 @@ from mitsim.cli.study_verb import study
 from mitsim.core.errors import MitsimError, printable
 from mitsim.core.spectral_manifests import LINES, RUN
 from mitsim.core.spectral_manifests import MOSAIC as MOSAIC_RUN
-from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped, end_uncaught, stopped
+from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped, end_uncaught, is_stopped
 
 if TYPE_CHECKING:
     from mitsim.api.bench import Bench
@@ -123,7 +123,7 @@ def _usage(error: Any) -> str:
 
 
 def _fail(message: str) -> None:
-    if stopped():
+    if is_stopped():
         end_stopped()  # what an interrupt became on its way, as of a module that was being imported
     print(f"mitsim: {' '.join(printable(message).split())}", file=sys.stderr)
     sys.exit(2)

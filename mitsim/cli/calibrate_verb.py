@@ -26,8 +26,8 @@ from mitsim.cli.options import (
     in_colour,
     is_given,
     option,
+    option_name,
     request_of,
-    spelled,
     verb,
 )
 from mitsim.cli.screen import finish, payload_of_lines, total_of_lines
@@ -122,11 +122,11 @@ def calibrate(
         return _fit(context, scene, modelling, folder, session, devices, limited)
     for name in ("frames_used", "fit", "model"):
         if (value := getattr(modelled, name)) is not None:
-            raise MitsimError(f"{spelled(name)} {value}: is for --model without --plan; leave it out")
+            raise MitsimError(f"{option_name(name)} {value}: is for --model without --plan; leave it out")
     if session.frames is not None:
         folder = Planned().folder(session.output)
         if others := sorted({name for name in context.params if is_given(context, name)} - _OF_FRAMES):
-            given = spelled(others[0])
+            given = option_name(others[0])
             raise MitsimError(f"--frames {session.frames}: frames and their list decide; leave out {given}")
         return _calibrate_frames(session.frames, folder, devices.camera, limited)
     if scene is None:
@@ -323,7 +323,7 @@ def _fit(
     for name in ("resume", "write_frames", "colour", *of_frames_alone):
         if is_given(context, name):
             other = " of --frames" if name in of_frames_alone else ""
-            raise MitsimError(f"{spelled(name)}: is of no use with --model{other}; leave it out")
+            raise MitsimError(f"{option_name(name)}: is of no use with --model{other}; leave it out")
     seed = session.request["seed"]
     recipe, frames = load_recipe(session.recipe), session.frames and load_frames(session.frames)
     check_output(folder)

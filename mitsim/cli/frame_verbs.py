@@ -15,8 +15,8 @@ from mitsim.cli.options import (
     Seed,
     number_of,
     option,
+    option_name,
     refuse_unused,
-    spelled,
     verb,
 )
 from mitsim.cli.screen import finish
@@ -159,7 +159,7 @@ def _mosaic_options(options: dict[str, Any], way: str) -> dict[str, Any]:
     for name, neutral in (("focus", None), ("method", "tikhonov"), ("margin", 0), ("depth_range", None)):
         if options[name] != neutral:
             raise MitsimError(
-                f"{spelled(name)} {options[name]}: runs behind colour filters are solved by tikhonov at the "
+                f"{option_name(name)} {options[name]}: runs behind colour filters are solved by tikhonov at the "
                 "calibrated depth; leave it out"
             )
     return {"lam": options["lam"], "overwrite": options["overwrite"], "way": way}

@@ -87,14 +87,14 @@ def verb(function: Callable[..., int]) -> Callable[..., int]:
         options += _options_of(groups[name]) if name in groups else [_option(name, hints[name], parameter.default)]
 
     @functools.wraps(function)
-    def ungrouped(**values: Any) -> int:
+    def call_ungrouped(**values: Any) -> int:
         for name, group in groups.items():
             values[name] = group(**{field: values.pop(field) for field in group.__dataclass_fields__})
         return function(**values)
 
-    ungrouped.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
-    ungrouped.__annotations__ = {option.name: option.annotation for option in options}
-    return ungrouped
+    call_ungrouped.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
+    call_ungrouped.__annotations__ = {option.name: option.annotation for option in options}
+    return call_ungrouped
 
 
 def _options_of(group: Any) -> Iterator[inspect.Parameter]:
@@ -395,7 +395,7 @@ def check_work(output: Path, resume: bool, kind: str, several: bool = False) -> 
 # ---- options that are not to be given --------------------------------------------------------------------------------
 
 
-def spelled(name: str) -> str:
+def option_name(name: str) -> str:
     """The option of the parameter ``name``."""
     return _SPELLED.get(name, f"--{name.replace('_', '-')}")
 
@@ -425,7 +425,7 @@ def refuse_unused(context: typer.Context, names: Sequence[str], where: str) -> N
     """
     for name in names:
         if is_given(context, name):
-            raise MitsimError(f"{spelled(name)}: has no effect {where}; leave it out")
+            raise MitsimError(f"{option_name(name)}: has no effect {where}; leave it out")
 
 
 def message_of(error: MitsimError) -> str:

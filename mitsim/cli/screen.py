@@ -60,7 +60,7 @@ def _log() -> Progress:
 
 def print_plan(plan: Plan) -> None:
     """Print the ``plan``'s effects, with reasons, and what it takes."""
-    with written():
+    with write_at_end():
         _print_plan(plan)
 
 
@@ -101,7 +101,7 @@ def finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequence
     warnings
         on stderr, in either case.
     """
-    with written():
+    with write_at_end():
         if as_json:
             from mitsim.core.files import plain
 
@@ -143,7 +143,7 @@ def total_of_lines(payload: Mapping[str, Any]) -> str:
 
 
 @contextmanager
-def written() -> Iterator[None]:
+def write_at_end() -> Iterator[None]:
     """What is printed in this context is written when it ends. Where nobody reads any more, the program ends as by
     SIGPIPE, quietly; MitsimError where standard output takes no more for another reason, such as a full disk."""
     try:

@@ -37,7 +37,7 @@ class Configuration(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
-def shipped(*parts: str) -> Path:
+def shipped_path(*parts: str) -> Path:
     """A file or folder that comes with mitsim, for example ``shipped("calibration", "imx249.toml")`` of ``parts``.
 
     A wheel carries them inside the package, a source tree beside it. MitsimError when it is in neither.
@@ -184,7 +184,7 @@ def locate(name: Path | str, shelf: Literal["scenes", "calibration"], ending: st
     text, path = str(name), Path(name)
     if (isinstance(name, str) and (os.sep in text or path.suffix)) or len(path.parts) != 1 or path.suffix:
         return path / ending if inside and path.is_dir() else path
-    folder = shipped(shelf)
+    folder = shipped_path(shelf)
     known = folder / text / ending if inside else folder / f"{text}{ending}"
     if known.is_file():
         return known

@@ -86,7 +86,7 @@ _KINDS: dict[str, Kind] = {
 }
 
 
-def checked(function: Callable[P, R]) -> Callable[P, R]:
+def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
     """A public ``function`` that refuses arguments of another kind than it is annotated with: ArgumentError, a line
     with the argument, the value and what is allowed."""
     signature = inspect.signature(function)
@@ -96,7 +96,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
     rest = next((kinds[name] for name, each in signature.parameters.items() if each.kind == each.VAR_KEYWORD), [])
 
     @functools.wraps(function)
-    def called(*arguments: P.args, **named: P.kwargs) -> R:
+    def call(*arguments: P.args, **named: P.kwargs) -> R:
         for name, value in _each(signature, signature.bind(*arguments, **named).arguments):
             allowed = kinds.get(name, rest)
             if allowed and not any(allows(value) for _, allows in allowed):
@@ -104,7 +104,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
                 raise ArgumentError(name, f"{cut(repr(value))}: give {words}")
         return function(*arguments, **named)
 
-    return called
+    return call
 
 
 def _each(signature: inspect.Signature, bound: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
@@ -121,7 +121,7 @@ def _each(signature: inspect.Signature, bound: Mapping[str, Any]) -> Iterator[tu
 
 def checked_fields(made: C) -> C:
     """The class ``made``, which refuses such arguments when it is called: see :func:`checked`."""
-    made.__init__ = checked(vars(made)["__init__"])  # type: ignore[misc]
+    made.__init__ = check_arguments(vars(made)["__init__"])  # type: ignore[misc]
     return made
 
 

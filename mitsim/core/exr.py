@@ -35,7 +35,7 @@ from mitsim.core.files import (
     check_plain,
     fits_a_frame,
     parse_json,
-    resolved,
+    resolve,
     stderr_silenced,
     whole_file,
 )
@@ -136,7 +136,7 @@ def verify(folder: Path, name: str, checksums: Mapping[str, str], remedy: str) -
     MitsimError
         when they differ, or the name leads out of the folder by a link.
     """
-    if not resolved(folder / name).is_relative_to(resolved(folder)):
+    if not resolve(folder / name).is_relative_to(resolve(folder)):
         raise MitsimError(f"{folder / name}: leads out of its folder; copy the file there")
     expected = checksums.get(name)
     if expected is not None and checksum(folder / name) != expected:

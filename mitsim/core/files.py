@@ -37,7 +37,7 @@ def whole_file(path: Path | str) -> Iterator[Path]:
     path = Path(path)
     _check_name(path)
     _check_plain(path)
-    target = resolved(path)
+    target = resolve(path)
     if target.is_symlink():
         raise MitsimError(f"file {path}: cannot be written (it is a link that leads to itself); remove it")
     part = _beside(target, f".{os.getpid()}-{threading.get_ident()}.part")
@@ -152,7 +152,7 @@ def output_file(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     MitsimError as for :func:`prepare_output`, and when another process holds the file.
     """
     path = prepare_output(path, overwrite, "file")
-    with _lock(path, _beside(resolved(path), LOCK)):
+    with _lock(path, _beside(resolve(path), LOCK)):
         yield prepare_output(path, overwrite, "file")  # nobody wrote it between the first look and the lock
 
 
@@ -171,10 +171,10 @@ def check_apart(path: Path | str, inputs: Iterable[Path | str]) -> None:
     MitsimError
         when the output is one of the files, by whatever name, or a file in one of the folders.
     """
-    place = resolved(path)
+    place = resolve(path)
     for each in map(Path, inputs):
-        same = place == resolved(each) or (place.exists() and each.exists() and place.samefile(each))
-        if same or (each.is_dir() and place.exists() and place.is_relative_to(resolved(each))):
+        same = place == resolve(each) or (place.exists() and each.exists() and place.samefile(each))
+        if same or (each.is_dir() and place.exists() and place.is_relative_to(resolve(each))):
             raise MitsimError(f"output {path}: would replace {each}, which is read; choose another name")
 
 
@@ -371,7 +371,7 @@ def check_plain(path: Path | str, what: str = "file") -> os.stat_result:
     return status
 
 
-def resolved(path: Path | str) -> Path:
+def resolve(path: Path | str) -> Path:
     """Where ``path`` leads, links followed as far as they lead: ``Path.resolve`` raises RuntimeError for one that leads
     to itself, before Python 3.13."""
     return Path(os.path.realpath(path))

@@ -459,7 +459,7 @@ def span(values: npt.ArrayLike, unit: str) -> str:
     return f"{low} to {high} {unit}"
 
 
-def scaled(values: npt.ArrayLike) -> npt.NDArray[np.float64]:
+def normalise(values: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Numbers ``values`` with their range brought to 0..1; 0 where all are equal."""
     shown = np.asarray(values, dtype=np.float64)
     low, high = float(shown.min()), float(shown.max())

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 
-from mitsim.core.errors import ArgumentError, MitsimError, checked, checked_fields, cut
-from mitsim.core.worker import OutOfTime, stopped
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields, cut
+from mitsim.core.worker import OutOfTime, is_stopped
 
 Progress = Callable[[str, float], None]
 """Called with a stage's name and its finished part, 0 to 1."""
@@ -46,7 +46,7 @@ class Clock:
         finally:
             self._stages[name] = self._stages.get(name, 0.0) + time.perf_counter() - started
 
-    @checked
+    @check_arguments
     def add(self, stages: Mapping[str, float], prefix: str = "") -> None:
         """Take over the ``stages`` [s] of another clock, except its total, ``prefix`` before their names."""
         try:
@@ -205,7 +205,7 @@ def within(seconds: float) -> Iterator[None]:
 
 
 def _ring(_: int, __: FrameType | None) -> None:
-    if stopped():  # by a signal, whose interrupt was lost: see mitsim.core.worker
+    if is_stopped():  # by a signal, whose interrupt was lost: see mitsim.core.worker
         raise KeyboardInterrupt
     raise OutOfTime
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import ArgumentError, MitsimError, checked, cut
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
 from mitsim.core.exr import (
     Channel,
     Channels,
@@ -30,7 +30,7 @@ from mitsim.core.exr import (
     write_frame,
 )
 from mitsim.core.files import output_folder, sweep
-from mitsim.core.images import card, scaled, span
+from mitsim.core.images import card, normalise, span
 from mitsim.core.manifests import MANIFEST, Digital, RunHead, RunManifest, read_head, read_manifest, write_manifest
 from mitsim.core.spectral_manifests import MosaicManifest, read_mosaic, write_colours
 
@@ -79,7 +79,7 @@ class Capture:
         self._memory = memory or {}
 
     @classmethod
-    def recorded(cls, recorder: Recorder, manifest: RunManifest) -> Capture:
+    def from_recorder(cls, recorder: Recorder, manifest: RunManifest) -> Capture:
         """The capture whose shots a ``recorder`` has, finished by its ``manifest``."""
         return cls(recorder.finish(manifest), recorder.folder, dict(sorted(recorder.files.items())))
 
@@ -147,10 +147,10 @@ class Capture:
 
     def measurements(self, shape: tuple[int, int] | None = None) -> Iterator[tuple[FloatArray, int, int]]:
         """(frame, i, j) of every pattern; see :meth:`measured`, which also takes ``shape``."""
-        for each in self.measured(shape):
+        for each in self.pattern_measurements(shape):
             yield each.frame, each.row, each.column
 
-    def measured(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
+    def pattern_measurements(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
         """What was measured under every pattern, read one at a time; the halves of a signed one come as their
         difference, others without the ambient frame, if one was taken. MitsimError for a frame that is missing,
         damaged, not finite or of another ``shape`` than is asked for."""
@@ -197,7 +197,7 @@ class Capture:
         names = [shot.file for shot in self.manifest.patterns.captures] + ([] if ambient is None else [ambient.file])
         return (*names, TRUTH) if self._has_truth else tuple(names)
 
-    @checked
+    @check_arguments
     def read(self, name: str) -> tuple[Channels, Metadata]:
         """Channels and metadata of one of the :attr:`files`, by its ``name``. MitsimError for one that is missing or
         damaged."""
@@ -251,13 +251,13 @@ class Capture:
             **{name: getattr(manifest, name) for name in known},
         }
 
-    @checked
+    @check_arguments
     def save(self, folder: Path | str) -> Path:
         """Write the RUN folder that `mitsim capture` writes, to a new or empty ``folder``; returns it.
 
         MitsimError when it holds something, or cannot be written.
         """
-        with claimed(Path(folder), self.manifest, resume=False) as run:
+        with claim_run(Path(folder), self.manifest, resume=False) as run:
             if self.folder is not None:
                 for name in (*self.files, MANIFEST):
                     if (self.folder / name).is_file():
@@ -279,7 +279,7 @@ class Capture:
         shots = self.manifest.patterns.captures[:_SHOWN]
         frames = [self._channel(shot.file, "DN") for shot in shots]
         pictures = {
-            f"shot {i}, pattern ({shot.row}, {shot.column})\n{span(frame, 'DN')}": scaled(frame)
+            f"shot {i}, pattern ({shot.row}, {shot.column})\n{span(frame, 'DN')}": normalise(frame)
             for i, (shot, frame) in enumerate(zip(shots, frames, strict=True))
         }
         truth = {} if self.truth is None else {"truth\nreflectance 0 to 1": self.truth}
@@ -315,7 +315,7 @@ class Capture:
         return stack
 
 
-@checked
+@check_arguments
 def load_run(folder: Path | str) -> Capture:
     """The capture in the RUN folder ``folder``. MitsimError when it is not a complete one."""
     return Capture(read_manifest(Path(folder), RunManifest), Path(folder))
@@ -502,7 +502,7 @@ class MosaicCapture:
         each = (self.truths[name] for name in self.manifest.names)
         return np.stack([one.reflectance * (one.board / (board or one.board)) for one in each], axis=-1)
 
-    @checked
+    @check_arguments
     def save(self, folder: Path | str) -> Path:
         """Write the folder that `mitsim capture --colour mosaic` writes, to a new or empty ``folder``; returns it.
 
@@ -532,7 +532,7 @@ class MosaicCapture:
         return self.shots._repr_html_()
 
 
-@checked
+@check_arguments
 def load_mosaic(folder: Path | str) -> MosaicCapture:
     """The run behind colour filters in ``folder``. MitsimError when it is not a complete one."""
     folder = Path(folder)
@@ -719,7 +719,7 @@ def _pixels(channels: Channels) -> str:
 
 
 @contextmanager
-def claimed(path: Path, head: RunHead, resume: bool) -> Iterator[RunFolder]:
+def claim_run(path: Path, head: RunHead, resume: bool) -> Iterator[RunFolder]:
     """A folder for a run, checked before any work; if that fails before writing, a new folder is removed.
 
     Parameters

@@ -141,7 +141,7 @@ def held_back() -> Iterator[None]:
             signal.raise_signal(kept[0])
 
 
-def stopped() -> bool:
+def is_stopped() -> bool:
     """Whether a signal asked this process to end."""
     return _stopped_by is not None
 
@@ -157,7 +157,7 @@ def end_uncaught(error: BaseException) -> NoReturn:
     """Say in one line what nobody caught, with the file that has its traceback, and exit with 2: 1 would say that there
     is a result. Of an ``error`` that an interrupt became on its way, as of a module that was being imported, the
     interrupt is said."""
-    if stopped():
+    if is_stopped():
         end_stopped()
     import tempfile
     import traceback
@@ -263,7 +263,7 @@ def _unraisable(lost: sys.UnraisableHookArgs) -> None:
     :mod:`mitsim.core.job` come again of themselves."""
     if lost.exc_type is OutOfTime:
         return
-    if not stopped():
+    if not is_stopped():
         sys.__unraisablehook__(lost)
     elif lost.exc_type is KeyboardInterrupt:
         signal.setitimer(signal.ITIMER_REAL, _AGAIN_S, _AGAIN_S)

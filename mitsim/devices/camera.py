@@ -150,7 +150,7 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
                 f"mask_thickness: got {self.mask_thickness:g} mm; a mask of more than {FEW} separable terms, or one "
                 f"that is blurred, dusty, turned or tilted ({self.mask_plate.words}), is thin, so set 0"
             )
-        if self.pitches[0] != self.pitches[1] and self.drawn(waves=True):
+        if self.pitches[0] != self.pitches[1] and self.is_drawn(waves=True):
             raise ValueError(
                 f"row_pitch: got {self.pitches[0]:g} beside pixel_pitch {self.pitches[1]:g}; the shadow of "
                 f"{self.mask_words} is drawn on a raster of square cells, so give square pixels, or a mask of one or "
@@ -159,7 +159,7 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
         return self
 
     @classmethod
-    def checked(cls, where: str, **values: object) -> CameraGeometry:
+    def build(cls, where: str, **values: object) -> CameraGeometry:
         """Build from loose ``values``; a bad one raises MitsimError with one line that begins with ``where``."""
         return validate(cls, values, where)
 
@@ -283,7 +283,7 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
         """Nodes of rows and of columns from which the shadow of a tilted mask is formed (:mod:`mitsim.optics.terms`),
         with ``waves`` or without; None where it is not: of an even mask, one that is drawn on a raster, and one that
         would take too many terms."""
-        if not any(self.mask_tilt) or self.drawn(waves):
+        if not any(self.mask_tilt) or self.is_drawn(waves):
             return None
         farthest = self.tan_half_fov * self.mask_reach / min(self.pitches)
         by_column, by_row = (
@@ -309,14 +309,14 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
     @property
     def mask_terms(self) -> int:
         """Separable terms of the mask as it is mounted, 1 where it has no closed form."""
-        if self.drawn(waves=False):
+        if self.is_drawn(waves=False):
             return 1
         return len(self.build_mask().terms) * math.prod(self.tilt_nodes(waves=False) or (1,))
 
-    def correlated(self, waves: bool) -> bool:
+    def is_correlated(self, waves: bool) -> bool:
         """Whether frames behind the mask, with ``waves`` or without, are correlations with a shadow that is drawn,
         as it must be or as was chosen."""
-        return self.drawn(waves) or (self.mask_fft and self.may_be_drawn(waves))
+        return self.is_drawn(waves) or (self.mask_fft and self.may_be_drawn(waves))
 
     def may_be_drawn(self, waves: bool) -> bool:
         """Whether frames behind the mask, with ``waves`` or without, may as well be sums of terms as correlations with
@@ -324,9 +324,9 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
         pixels."""
         mask = self.build_mask()
         still = self.mask_motion is None and not any(self.mask_tilt) and self.pitches[0] == self.pitches[1]
-        return isinstance(mask, Plate) and still and not (waves or self.drawn(waves)) and mask.crosses is None
+        return isinstance(mask, Plate) and still and not (waves or self.is_drawn(waves)) and mask.crosses is None
 
-    def drawn(self, waves: bool) -> bool:
+    def is_drawn(self, waves: bool) -> bool:
         """Whether the mask's shadow, with ``waves`` or without, is drawn on a raster because it has no short closed
         form: of what is turned, of a picture of light, and of the waves behind many terms."""
         mask = self.build_mask()
@@ -338,7 +338,7 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
     def few_wave_terms(self) -> bool:
         """Whether waves behind the mask are a sum of few separable terms: of a mask of one or two that is mounted
         straight, and at rest."""
-        return self.diffracts and not self.drawn(waves=True) and not any(self.mask_tilt) and self.mask_motion is None
+        return self.diffracts and not self.is_drawn(waves=True) and not any(self.mask_tilt) and self.mask_motion is None
 
     def fresnel_number(self, wavelength_nm: float) -> float:
         """a^2 / (lambda d) of one mask feature at ``wavelength_nm``: well above 1, a geometric shadow is good."""

@@ -20,7 +20,7 @@ from mitsim.core.files import read_json
 from mitsim.core.imagelist import Raw, Wanted, image_files
 from mitsim.core.manifests import MOST_PIXELS, MOST_SHOTS, Digital, FileName, Parallax, Plain
 from mitsim.devices.patterns import stripe_count
-from mitsim.devices.session import MOST_REPEATS, MOST_RUNGS, UNIFORM, Exposures, Half, Merge, Side, taken
+from mitsim.devices.session import MOST_REPEATS, MOST_RUNGS, UNIFORM, Exposures, Half, Merge, Side, halves_in_order
 
 LISTS = ("session.toml", "session.json")
 """Names of the list."""
@@ -134,7 +134,7 @@ class SessionFrames:
         """Whether a +-1 pattern is the difference of two frames, and not taken from one and a uniform one."""
         return self.listed.signed_capture == "pair"
 
-    def repeated(self, half: Half, exposure: int = 0) -> tuple[StripeFile, ...]:
+    def repeats_of(self, half: Half, exposure: int = 0) -> tuple[StripeFile, ...]:
         """All repeats of one ``half`` of a pattern, at one ``exposure`` of the ladder."""
         return tuple(self.shots[(*half, exposure, repeat)] for repeat in range(self.listed.repeats))
 
@@ -202,7 +202,7 @@ def load_frames(folder: Path | str) -> SessionFrames:
 
 def _keys_of_session(listed: FrameList) -> Iterator[Key]:
     """Frames of a session in the order in which they are listed."""
-    for half in taken(stripe_count(listed.n), listed.signed_capture == "pair"):
+    for half in halves_in_order(stripe_count(listed.n), listed.signed_capture == "pair"):
         for exposure in range(len(listed.exposure_ladder)):
             for repeat in range(listed.repeats):
                 yield *half, exposure, repeat

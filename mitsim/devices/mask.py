@@ -213,7 +213,7 @@ class Dust(ByValue):
         self._hold(centres_mm=np.array(self.centres_mm, dtype=np.float64))
 
     @classmethod
-    def scattered(cls, per_mm2: float, radius_mm: float, opacity: float, extent_mm: float, seed: int) -> Dust:
+    def scatter(cls, per_mm2: float, radius_mm: float, opacity: float, extent_mm: float, seed: int) -> Dust:
         """Dust drawn at random over a square mask: as many discs as Poisson's law gives, evenly.
 
         Parameters
@@ -229,7 +229,7 @@ class Dust(ByValue):
         count = int(draws.poisson(per_mm2 * extent_mm**2))
         return cls((draws.random((count, 2)) - 0.5) * extent_mm, radius_mm, opacity)
 
-    def turned(self, quarters: int) -> Dust:
+    def turn(self, quarters: int) -> Dust:
         """The same on a mask turned by so many ``quarters`` of a turn, as ``numpy.rot90`` turns its features."""
         row, column = self.centres_mm.T
         for _ in range(quarters % 4):

@@ -17,7 +17,7 @@ from mitsim.core.job import Cost, Limits
 from mitsim.core.seeds import stream
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import Dust, Flaws, MaskKind, etch, mls_mask
-from mitsim.devices.plate import LARGEST, Plate, read_drawing, squared
+from mitsim.devices.plate import LARGEST, Plate, make_square, read_drawing
 
 _OWN = {
     **dict.fromkeys(get_args(MaskKind), ("order",)),
@@ -124,7 +124,7 @@ class MaskProfile(Configuration):
 
     def plate(self, folder: Path) -> Plate:
         """The plate as it is made; files count from ``folder``. MitsimError for one too large."""
-        drawn = self.drawn(folder)
+        drawn = self.plate_drawing(folder)
         if self.flawless:
             return drawn
         values, lines, feature = drawn.values, None, drawn.feature_mm
@@ -138,7 +138,7 @@ class MaskProfile(Configuration):
         values = self.opaque_transmission + (self.clear_transmission - self.opaque_transmission) * values
         extent = drawn.extent_mm + 2 * max(self.over_etch_um, 0.0) * 1e-3
         dust = (
-            Dust.scattered(self.dust_per_mm2, self.dust_radius_um * 1e-3, self.dust_opacity, extent, self.dust_seed)
+            Dust.scatter(self.dust_per_mm2, self.dust_radius_um * 1e-3, self.dust_opacity, extent, self.dust_seed)
             if self.dust_per_mm2
             else None
         )
@@ -146,12 +146,12 @@ class MaskProfile(Configuration):
         if turn % _QUARTER == 0:
             quarters = int(turn // _QUARTER)
             values, turn = np.rot90(values, quarters), 0.0
-            dust = dust and dust.turned(quarters)
+            dust = dust and dust.turn(quarters)
         flaws = Flaws(self.edge_blur_um * 1e-3, turn, (self.tilt_row_mrad, self.tilt_column_mrad), dust)
         stated = [f"{name} {getattr(self, name):g}" for name in type(self).model_fields if name in self._stated]
         return Plate(feature, values, ", ".join([drawn.words, *stated]), lines, flaws)
 
-    def pictured(self, folder: Path, mask_distance_mm: float) -> Plate:
+    def plate_of_light(self, folder: Path, mask_distance_mm: float) -> Plate:
         """The light behind a phase mask as a plate: how much brighter each place is than without a mask.
 
         A point at depth z0 lights a picture's pixel of side p as one of side p (1 - d/z0) on the mask. Of its light the
@@ -176,7 +176,7 @@ class MaskProfile(Configuration):
                 f"{mask_distance_mm:g} mm"
             )
         light = load_psf(path, self.psf_reduce, LARGEST // 2)
-        feature, values = squared(light, self.feature_mm * self.psf_reduce * (1 - mask_distance_mm / distance))
+        feature, values = make_square(light, self.feature_mm * self.psf_reduce * (1 - mask_distance_mm / distance))
         values *= float(self.aperture_mm2 or 0.0) / (values.sum() * feature**2)
         words = f"point spread function {path.name} of {distance:g} mm, aperture {self.aperture_mm2:g} mm2"
         return Plate(feature, values, words, irradiance=True)
@@ -187,7 +187,7 @@ class MaskProfile(Configuration):
         named = {name for name in _FLAWS - _DUST if getattr(self, name) != type(self).model_fields[name].default}
         return named | (_DUST if self.dust_per_mm2 else set())
 
-    def drawn(self, folder: Path) -> Plate:
+    def plate_drawing(self, folder: Path) -> Plate:
         """The plate as it is drawn; files count from ``folder``."""
         if self.kind in get_args(MaskKind):
             if 2**self.order - 1 > LARGEST:
@@ -200,7 +200,7 @@ class MaskProfile(Configuration):
             return Plate(self.feature_mm, np.asarray(values), f"{self.kind}, order {self.order}")
         if self.kind == "drawing":
             path = folder / str(self.file)
-            return Plate(*squared(read_drawing(path), self.feature_mm), words=f"drawing {path.name}")
+            return Plate(*make_square(read_drawing(path), self.feature_mm), words=f"drawing {path.name}")
         side = self.features or 0
         if self.kind == "mura":
             return Plate(self.feature_mm, mura(side), f"MURA of {side} features")
@@ -208,17 +208,17 @@ class MaskProfile(Configuration):
         words = f"random mask of {side} features, open part {self.open_part:g}, seed {self.seed}"
         return Plate(self.feature_mm, (draws < self.open_part).astype(np.float64), words)
 
-    def worn(self, camera: CameraGeometry, folder: Path) -> CameraGeometry:
+    def put_on(self, camera: CameraGeometry, folder: Path) -> CameraGeometry:
         """The ``camera`` with this mask; a drawing's file counts from ``folder``. MitsimError as for a plate."""
         mask: dict[str, object] = {"mask_feature": self.feature_mm, "mask_plate": None}
         if self.kind == "psf":
-            picture = self.pictured(folder, camera.mask_distance)
+            picture = self.plate_of_light(folder, camera.mask_distance)
             mask |= {"mask": "plate", "mask_plate": picture, "mask_feature": picture.feature_mm}
         elif self.kind in get_args(MaskKind) and self.flawless:
             mask |= {"mask": self.kind, "mask_order": self.order}
         else:
             mask |= {"mask": "plate", "mask_plate": self.plate(folder)}
-        return CameraGeometry.checked("camera file: [mask]", **{**dict(camera), **mask})
+        return CameraGeometry.build("camera file: [mask]", **{**dict(camera), **mask})
 
 
 def mura(features: int) -> FloatArray:

@@ -356,7 +356,7 @@ def read_drawing(path: Path) -> FloatArray:
     return transmissions
 
 
-def squared(values: FloatArray, feature_mm: float) -> tuple[float, FloatArray]:
+def make_square(values: FloatArray, feature_mm: float) -> tuple[float, FloatArray]:
     """A drawing ``values`` (rows, columns) of pixels of ``feature_mm`` with opaque margins that make it square about
     its centre, and before it the side of its pixels: half of that where the margins need half a pixel."""
     if (values.shape[0] - values.shape[1]) % 2:

@@ -13,8 +13,8 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import AfterValidator, Field, model_validator
 
-from mitsim.core.configuration import Configuration, load_model, shipped, validate
-from mitsim.core.errors import ArgumentError, MitsimError, checked, checked_fields
+from mitsim.core.configuration import Configuration, load_model, shipped_path, validate
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields
 from mitsim.devices.sensor import ExposureFraction
 
 # -------- The white board of a calibration session
@@ -308,10 +308,10 @@ class SessionRecipe(Configuration):
         return self
 
 
-@checked
+@check_arguments
 def load_recipe(path: Path | str | None = None) -> SessionRecipe:
     """The recipe in the TOML file at ``path``, or the shipped one; MitsimError names the field that breaks a rule."""
-    return load_model(Path(path) if path is not None else shipped("calibration", "session.toml"), SessionRecipe)
+    return load_model(Path(path) if path is not None else shipped_path("calibration", "session.toml"), SessionRecipe)
 
 
 def recipe_text(recipe: SessionRecipe) -> str:
@@ -353,7 +353,7 @@ def halves(count: int, pairs: bool) -> Iterator[list[Half]]:
             yield [(side, index, sign) for sign in ((1, -1) if pairs else (1,))]
 
 
-def taken(count: int, pairs: bool, order: Order = "listed", seed: int = 0) -> list[Half]:
+def halves_in_order(count: int, pairs: bool, order: Order = "listed", seed: int = 0) -> list[Half]:
     """The same in the order in which they are taken. What is subtracted in a pair is taken one after the other.
 
     Parameters
@@ -432,7 +432,7 @@ class Modelling:
         """What is fitted, each once."""
         return tuple(name for name in UNITS if name in (*self.fitted, "gain"))
 
-    def chosen(self, changes: Sequence[int], pairs: bool, repeats: int) -> list[tuple[Side, int]]:
+    def used_patterns(self, changes: Sequence[int], pairs: bool, repeats: int) -> list[tuple[Side, int]]:
         """Side and number of the +-1 patterns whose frames are used: uniform light, then ever finer stripes, vertical
         and horizontal ones. Coarse stripes cast the deepest shadows, which a mask's fringes change least.
 
@@ -458,7 +458,7 @@ def frames_of(chosen: Sequence[tuple[Side, int]], pairs: bool, repeats: int) -> 
     Parameters
     ----------
     chosen, pairs, repeats
-        as :meth:`Modelling.chosen` has them.
+        as :meth:`Modelling.used_patterns` has them.
     """
     sides = len({side for side, _ in chosen})
     return repeats * (2 * len(chosen) if pairs else len(chosen) + sides)

@@ -21,7 +21,7 @@ from mitsim.devices.framelist import FrameList
 from mitsim.devices.patterns import parse_patterns, stripe_signs
 from mitsim.devices.projector import ProjectorModel
 from mitsim.devices.sensor import check_exposure, digital_of, load_sensor
-from mitsim.devices.session import UNIFORM, taken
+from mitsim.devices.session import UNIFORM, halves_in_order
 from mitsim.exchange.packed import Packed, Run, shots_of
 
 PATTERNS = "patterns.json"
@@ -60,10 +60,10 @@ class Raster:
     @classmethod
     def of(cls, projector: str) -> Raster:
         """Of the ``projector``, a name or TOML file. MitsimError where it does not say its rows and columns."""
-        return cls.known(load_model(locate(projector, "calibration", ".toml"), ProjectorModel).model_dump())
+        return cls.of_projector(load_model(locate(projector, "calibration", ".toml"), ProjectorModel).model_dump())
 
     @classmethod
-    def known(cls, model: Mapping[str, Any]) -> Raster:
+    def of_projector(cls, model: Mapping[str, Any]) -> Raster:
         """Of a projector's ``model``, as a run's manifest has it; MitsimError as :meth:`of`."""
         if not model:
             raise ArgumentError("projector", "is not known of a run of imported frames; give its name or file")
@@ -138,7 +138,7 @@ def draw_stripes(folder: Path, projector: str, listed: FrameList) -> dict[str, A
     """
     n, raster, signs = listed.n, Raster.of(projector), stripe_signs(listed.n)
     light, shots = [], []
-    for number, (side, index, sign) in enumerate(taken(signs.shape[1], listed.signed_capture == "pair")):
+    for number, (side, index, sign) in enumerate(halves_in_order(signs.shape[1], listed.signed_capture == "pair")):
         stripes = signs[:, index, None] if side == "horizontal" else signs[None, :, index]
         light.append(np.broadcast_to(np.ones((1, 1)) if sign == UNIFORM else (1 + sign * stripes) / 2, (n, n)))
         shots.append(
@@ -465,4 +465,4 @@ def _raster(run: Packed[RunManifest], projector: str | None) -> Raster:
     if projector is not None:
         return Raster.of(projector)
     known = run.manifest.configuration.get("projector_model")
-    return Raster.known(known if isinstance(known, dict) else {})
+    return Raster.of_projector(known if isinstance(known, dict) else {})

@@ -122,7 +122,7 @@ def measurements(shots: Capture) -> FloatArray:
     """(K K', rows, columns) electrons a second of every pattern of ``shots``, row-major over (i, j): differences of
     signed pairs, others less the ambient frame. MitsimError for a frame that cannot be read."""
     columns = shots.patterns[1].shape[1]
-    frames = {each.row * columns + each.column: each.frame for each in shots.measured()}
+    frames = {each.row * columns + each.column: each.frame for each in shots.pattern_measurements()}
     return np.stack([frames[index] for index in sorted(frames)])
 
 

@@ -159,7 +159,7 @@ class Numbers:
         return cls(*[1.0] * 8)
 
     @classmethod
-    def chosen(
+    def of_counts(
         cls, counts: Sequence[Number], effects: frozenset[str], occluded: int = 0, raster_cells: int = 0
     ) -> Numbers:
         """Those of the eight that are chosen, with ``effects``.
@@ -182,7 +182,7 @@ class Numbers:
         of_direct = settings.anchors, len(settings.depths), settings.subdivision
         of_few = settings.followed_anchors, settings.occluded_anchors, settings.followed_width
         counts = [float(each) for each in (*of_direct, *of_few, settings.coarse_cells, settings.coarse_layers)]
-        return cls.chosen(counts, settings.effects, len(settings.with_own_anchors), settings.raster_cells)
+        return cls.of_counts(counts, settings.effects, len(settings.with_own_anchors), settings.raster_cells)
 
 
 def in_waves(effects: frozenset[str]) -> bool:
@@ -374,7 +374,7 @@ def tracing_seconds(pilot_result: PilotResult, settings: Settings, costs: UnitCo
     return {
         name: traced_for(pilot_result.forming.lines, pilot_result.forming.parted)
         * GROUPS
-        * float(PASSES[name].whole(PASSES[name].predicted(settings)))
+        * float(PASSES[name].whole(PASSES[name].predicted_samples(settings)))
         * sample_cost.paths
         * costs.passes[name]
         * float(PASSES[name].connections(settings))
@@ -417,7 +417,7 @@ def entries(pixels: int, classes: int, numbers: Numbers, samples: Settings | Map
 
     def of(name: str) -> Number:
         row = PASSES[name]
-        return row.whole(row.predicted(samples) if isinstance(samples, Settings) else samples.get(name, 1.0))
+        return row.whole(row.predicted_samples(samples) if isinstance(samples, Settings) else samples.get(name, 1.0))
 
     coarse, layers = np.square(numbers.coarse_cells), np.minimum(numbers.coarse_layers, _SPLIT)
 
@@ -468,7 +468,7 @@ def truth_seconds(pilot_result: PilotResult, settings: Settings, costs: UnitCost
     return (
         traced_for(pilot_result.forming.lines, pilot_result.forming.parted)
         * costs.ray
-        * predicted_rays(direct.paths, float(row.whole(row.predicted(settings))), rate)
+        * predicted_rays(direct.paths, float(row.whole(row.predicted_samples(settings))), rate)
     )
 
 
@@ -578,7 +578,7 @@ def light_bytes(bench: Apparatus, classes: int, settings: Settings, lines: int =
     geometry, cells = bench.geometry, bench.n * max(settings.subdivision, settings.coarse_cells) * settings.anchors
     terms = geometry.mask_terms if geometry.mask_terms > FEW else 0
     factors = _TERM_BYTES * terms * max(geometry.frame_shape) * cells * len(settings.depths)
-    if settings.raster or geometry.drawn(geometry.diffracts):
+    if settings.raster or geometry.is_drawn(geometry.diffracts):
         factors = max(
             0.0 if settings.raster else factors,
             raster_bytes(geometry.model_copy(update={"mask_cells": settings.raster_cells}), bench.waves),
@@ -622,10 +622,10 @@ def cells_to_choose(geometry: CameraGeometry, spectrum: Spectrum | None) -> tupl
     """
     fewest = cells_per_pixel(geometry)
 
-    def held(cells: int) -> bool:
+    def holds(cells: int) -> bool:
         return raster_bytes(geometry.model_copy(update={"mask_cells": cells}), spectrum) <= _MOST_BYTES
 
-    return fewest, *filter(held, (math.ceil(by * fewest) for by in _FINER))
+    return fewest, *filter(holds, (math.ceil(by * fewest) for by in _FINER))
 
 
 def drawing_seconds(geometry: CameraGeometry, spectrum: Spectrum | None) -> float:
@@ -640,7 +640,7 @@ def drawing_seconds(geometry: CameraGeometry, spectrum: Spectrum | None) -> floa
     """
     mask = geometry.mask_plate
     waves = spectrum is not None
-    if mask is None or not (geometry.drawn(waves) or geometry.may_be_drawn(waves)):
+    if mask is None or not (geometry.is_drawn(waves) or geometry.may_be_drawn(waves)):
         return 0.0
     cells, turned = float(cells_a_side(geometry, spectrum)) ** 2, bool(mask.flaws.turn_deg)
     if spectrum is None or mask.irradiance:

@@ -132,7 +132,7 @@ class Grids:
         places: Places | None = None,
     ) -> None:
         self.bench, self.settings, self.places = bench, settings, places
-        self.physics = Physics.simulated(bench, settings.effects)
+        self.physics = Physics.with_effects(bench, settings.effects)
         if settings.raster:
             by_fft = self.physics.geometry.model_copy(update={"mask_fft": True, "mask_cells": settings.raster_cells})
             self.physics = replace(self.physics, geometry=by_fft)

@@ -14,7 +14,7 @@ import numpy as np
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.board import before_board
 from mitsim.core.arrays import FloatArray, Labels
-from mitsim.core.errors import checked
+from mitsim.core.errors import check_arguments
 from mitsim.core.job import Progress, silent
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
@@ -209,7 +209,7 @@ class SampledLight:
         probed = self.looked.at(self, rows, lighting.weights.shape[1]) if self.looked and seed == self.seed else None
         return expected_of([(self.simulation, self.groups)], rows, lighting, seed, leaking, probed)
 
-    @checked
+    @check_arguments
     def rows_of(self, lighting: Lighting) -> Labels:
         """(rows,) class of ``lighting`` that each row of the light belongs to; ValueError as :meth:`frames`."""
         rows = np.zeros(int(self.labels.max()) + 1, dtype=np.int64)
@@ -234,7 +234,7 @@ class SampledLight:
             "warnings": [*self.warnings, *self.unreached],
         }
 
-    @checked
+    @check_arguments
     def behind(self, bench: Apparatus) -> SampledLight:
         """The same light before the camera of another ``bench``, of which only the mask may differ: light is traced up
         to it."""
@@ -244,7 +244,7 @@ class SampledLight:
         """Contrast of speckle in frames of a ``family`` (None: of a white picture); 0 where it is left out."""
         return self.bench.speckle(family) if self.simulation.physics.speckle else 0.0
 
-    def merged(self) -> SampledLight:
+    def merge(self) -> SampledLight:
         """The same light as one group: frames come without a variance, and faster."""
         return replace(self, groups=(reduce(add, self.groups) / len(self.groups),))
 
@@ -475,7 +475,8 @@ def _some(lighting: Lighting, count: int) -> Lighting:
 
 
 def _error_growth(light: SampledLight, lighting: Lighting, checked: Lighting) -> tuple[float, float]:
-    """How much larger the error of all shots of a ``lighting``, and its bound, are than those of the shots ``checked``.
+    """How much larger the error of all shots of a ``lighting``, and its bound, are than those of the shots
+    ``check_arguments``.
 
     By what the groups of the ``light`` differ in the total light of each shot: a heavy path that no checked shot sees
     shows there, without forming a frame. What may be chance counts as 1.

@@ -229,7 +229,7 @@ class Pass:
         """Whether ``effects`` call for it."""
         return not self.effects or bool(self.effects & effects)
 
-    def predicted(self, settings: Settings) -> float:
+    def predicted_samples(self, settings: Settings) -> float:
         """Samples of a group that ``settings`` predict."""
         return settings.samples.get(self.name, 1.0)
 

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from mitsim.bench.request import Request
-from mitsim.core.errors import MitsimError, checked
+from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.images import table
 from mitsim.core.spectral_manifests import MONO
 from mitsim.light.settings import Estimate, Settings
@@ -147,7 +147,7 @@ class Plan:
     asked_seconds: float | None = None
     colour: ColourChoice | None = None
 
-    @checked
+    @check_arguments
     def row(self, name: str) -> PlanRow:
         """What is said of the effect or discretisation called ``name``; MitsimError when there is none."""
         rows = {row.name: row for row in self.effects}
@@ -160,7 +160,7 @@ class Plan:
         systematic = self.systematic_error, self.systematic_bound
         return Estimate(*(math.hypot(*both) for both in zip(systematic, noise, strict=True)))
 
-    @checked
+    @check_arguments
     def taking(self, **seconds: float) -> Plan:
         """The same plan, with the ``seconds`` of more stages in its prediction."""
         stages = {**self.predicted, **seconds}
@@ -176,7 +176,7 @@ class Plan:
         """The plan as JSON holds it."""
         from mitsim.light.passes import PASSES  # with what traces them: a plan that is read needs no renderer
 
-        samples = {row.samples_key: row.predicted(self.settings) for row in PASSES.values()}
+        samples = {row.samples_key: row.predicted_samples(self.settings) for row in PASSES.values()}
         settings = {**asdict(replace(self.settings, samples={})), "effects": sorted(self.settings.effects), **samples}
         del settings["samples"]
         own = replace(self, request=None, cost=None, colour=self.colour or self._uncoloured)

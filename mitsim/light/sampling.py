@@ -190,7 +190,7 @@ class SampledPass:
     variance: float
     work: float
 
-    def left(self, samples: int) -> float:
+    def variance_left(self, samples: int) -> float:
         """Variance of so many ``samples``."""
         rate = PASSES[self.name].variance_rate
         if rate == 1:
@@ -219,7 +219,7 @@ def cheapest_samples(lights: Sequence[SampledPass], allowed: float) -> dict[str,
     best, least = {light.name: light.steps[-1] for light in stepped}, math.inf
     best |= {light.name: _LARGEST_GROWTH * light.done for light in others}
     for counts in product(*(light.steps for light in stepped)):
-        left = allowed - sum(light.left(count) for light, count in zip(stepped, counts, strict=True))
+        left = allowed - sum(light.variance_left(count) for light, count in zip(stepped, counts, strict=True))
         shared = _shared_out(others, left)
         if shared is None:
             continue

@@ -189,7 +189,7 @@ class Noise:
             return _FEWEST_SAMPLES + 0 * target
         return self.samples * (self.error / target) ** (1 / self.rate)
 
-    def left(self, samples: Number) -> Number:
+    def error_left(self, samples: Number) -> Number:
         """The error at so many ``samples`` a cell."""
         return self.error * (samples / self.samples) ** -self.rate
 
@@ -264,7 +264,7 @@ class ErrorCovariance:
         products = np.ascontiguousarray(pairs.transpose(1, 3, 0, 2))
         return cls(tuple(seen), products / energy if energy > 0 else products)
 
-    def squared(self, chosen: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def squared_errors(self, chosen: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(m,) squared changes by m sums of parts and their standard errors, from ``chosen`` (m, parts) weights.
 
         The mean product of two different replicates, and its jackknife over replicates.
@@ -282,7 +282,7 @@ class ErrorCovariance:
     def estimate(self, parts: Collection[Approximation]) -> Estimate:
         """Relative change of the frames by all ``parts`` together; parts that were not measured change nothing."""
         chosen = np.array([[part in parts for part in self.parts]], dtype=np.float64)
-        squared, spread = (float(values[0]) for values in self.squared(chosen))
+        squared, spread = (float(values[0]) for values in self.squared_errors(chosen))
         least = max(squared, 0.0)
         return Estimate(math.sqrt(least), math.sqrt(least + SURE * spread))
 
@@ -346,7 +346,7 @@ class Drawn:
     needed: bool = False
     cells: tuple[int, ...] = (4,)
 
-    def left(self, cells: int) -> Estimate | None:
+    def error_left(self, cells: int) -> Estimate | None:
         """What a raster of so many ``cells`` a pixel leaves; 0: the fewest."""
         finer = (cells or self.cells[0]) / self.cells[0]
         return self.error and Estimate(*(error * finer**-RASTER_RATE for error in self.error))

@@ -73,7 +73,7 @@ class Simulation(Tracers):
         for row in PASSES.values():
             several = not row.anchors or getattr(self.settings, row.anchors) > 1
             if several and (tracer := row.tracer(self)) is not None:
-                found[row.name] = TracedPass(row, tracer, row.predicted(self.settings))
+                found[row.name] = TracedPass(row, tracer, row.predicted_samples(self.settings))
         return found
 
     @cached_property
@@ -87,7 +87,7 @@ class Simulation(Tracers):
     def follow(self, seed: int, samples: int) -> PathSamples:
         """Light of :attr:`indirect` and :attr:`from_camera` in ``samples`` of each from ``seed``."""
         tracers = [tracer for tracer in (self.indirect, self.from_camera) if tracer is not None]
-        return PathSamples.joined([tracer.trace(seed, 0, samples) for tracer in tracers])
+        return PathSamples.join([tracer.trace(seed, 0, samples) for tracer in tracers])
 
     # ---- Accumulation
 
@@ -140,7 +140,7 @@ class Simulation(Tracers):
         bundle = self.grids[row.grid].bundle
         if row.anchors:
             return self._estimate({row.grid: self._residual(bundle, light[row.grid])})
-        mean = found if bundle.anchors == 1 else found.averaged(self.mean_weights(bundle.anchors))
+        mean = found if bundle.anchors == 1 else found.average(self.mean_weights(bundle.anchors))
         received, outside = float(mean.value.sum()) / samples, bundle.outside(mean) / samples
         return self._estimate(light, received, outside, self.flux(mean, samples) if row.flux else None)
 
@@ -153,7 +153,7 @@ class Simulation(Tracers):
             return self._estimate({grid: light}, received, outside)
         pixels, weights = self._pixels_of(row), self.mean_weights(bundle.anchors)
         beyond = np.einsum("pab,a,b->p", found.beyond(samples), weights, weights)
-        by_pixel = np.asarray(bundle.averaged(light, weights).sum(axis=1))[: len(pixels)] + beyond
+        by_pixel = np.asarray(bundle.average(light, weights).sum(axis=1))[: len(pixels)] + beyond
         rows = np.append(labels[pixels], labels.max() + 1 + np.arange(self.lamp_rows))
         shape = int(labels.max()) + 1 + self.lamp_rows, len(rows)
         classes = sparse.csr_array((np.ones(len(rows)), (rows, np.arange(len(rows)))), shape=shape)
@@ -169,7 +169,7 @@ class Simulation(Tracers):
 
     def _residual(self, bundle: Bundle, light: sparse.csr_array) -> sparse.csr_array:
         """``light`` beyond its mean over the sensor."""
-        return light - bundle.repeated(bundle.averaged(light, self.mean_weights(bundle.anchors)))
+        return light - bundle.repeat(bundle.average(light, self.mean_weights(bundle.anchors)))
 
     def flux(self, mean: PathSamples, samples: int) -> FloatArray:
         """(n^2,) irradiance of each projector pixel's direct light, of a ``mean`` over the sensor in so many
@@ -276,14 +276,14 @@ def expected_of(
     probed
         what the frames of other shots say of the same classes, as :class:`ExpectedFrames` takes it.
     """
-    light = emitted(parts[0][0].physics, lighting, leaking)
+    light = emission(parts[0][0].physics, lighting, leaking)
     formed = [simulation.with_optics(groups, len(rows)) for simulation, groups in parts]
     lights, ambient = ([each for part in formed for each in part[kind]] for kind in (0, 1))
     specular = parts[-1][0].specular_frames(lighting.labels)
     return ExpectedFrames(lights, Lighting(rows, light), seed, ambient, specular, probed)
 
 
-def emitted(physics: Physics, lighting: Lighting, leaking: bool = True) -> FloatArray:
+def emission(physics: Physics, lighting: Lighting, leaking: bool = True) -> FloatArray:
     """(shots, classes) light of each class of pixels in each shot, as a part of its full power.
 
     Parameters

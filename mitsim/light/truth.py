@@ -116,7 +116,7 @@ class _Flux:
     most."""
 
     def __init__(self, bench: Apparatus, effects: frozenset[str], seed: int, name: str, samples: int) -> None:
-        physics, loaded, pixels = Physics.simulated(bench, effects), bench.loaded, bench.n**2
+        physics, loaded, pixels = Physics.with_effects(bench, effects), bench.loaded, bench.n**2
         setup = replace(bench.setup, projector=physics.projector, geometry=physics.geometry)
         self._tracer = FluxTracer(setup, loaded.glossy)
         self._seed = integer(seed, "truth", name)

@@ -23,7 +23,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.shadow import Directions, SeparableTerms
-from mitsim.optics.terms import best_term, centred, shadow_terms
+from mitsim.optics.terms import best_term, centre_terms, shadow_terms
 
 _ANGLE = 2.0
 """Half the power of a cosine that light of a flat board to a flat sensor falls with: four."""
@@ -62,7 +62,7 @@ class Placement:
     projector_column: float = 0.0
     gain: float = 1.0
 
-    def moved(self, steps: Mapping[str, float]) -> Placement:
+    def move(self, steps: Mapping[str, float]) -> Placement:
         """The same with ``steps`` added to some of its numbers, by name."""
         return replace(self, **{name: getattr(self, name) + step for name, step in steps.items()})
 
@@ -96,7 +96,7 @@ class ModelledCamera:
     def factors(self, placement: Placement) -> tuple[FloatArray, FloatArray]:
         """(m, n) left and (m', n) right factor [sqrt(electrons / s)] of the mask at a ``placement``, but not turned."""
         left, right = self._cached_factors(
-            placement.moved({"gain": 1 - placement.gain, "mask_rotation": -placement.mask_rotation})
+            placement.move({"gain": 1 - placement.gain, "mask_rotation": -placement.mask_rotation})
         )
         root = np.sqrt(placement.gain)
         return left * root, right * root
@@ -120,7 +120,7 @@ class ModelledCamera:
             )
         )
         terms = [(left, right) for (left, _), (_, right) in zip(by_row, by_column, strict=True)]
-        best = best_term(centred(terms) if self.geometry.centred else terms)
+        best = best_term(centre_terms(terms) if self.geometry.centred else terms)
         return best.left, best.right
 
     def _axis(self, distance: float, offset: float, directions: Directions) -> SeparableTerms:
@@ -131,11 +131,11 @@ class ModelledCamera:
         terms = shadow_terms(camera, directions, directions, camera.scene_distance, self.spectrum)
         return [(left * of_rows, right * of_columns) for left, right in terms]
 
-    def turned(self, placement: Placement) -> SeparableTerms:
+    def rotation_terms(self, placement: Placement) -> SeparableTerms:
         """What a rotation of the mask at a ``placement`` adds to the product of its factors, for each radian."""
         step = {"mask_shift_row": _DERIVED_MM, "mask_shift_column": _DERIVED_MM}
-        ahead = self.factors(placement.moved(step))
-        behind = self.factors(placement.moved({name: -value for name, value in step.items()}))
+        ahead = self.factors(placement.move(step))
+        behind = self.factors(placement.move({name: -value for name, value in step.items()}))
         # A mask that moves on by o is seen at s - o.
         slopes = [(back - on) / (2 * _DERIVED_MM) for on, back in zip(ahead, behind, strict=True)]
         left, right = self.factors(placement)

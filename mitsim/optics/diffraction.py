@@ -229,7 +229,7 @@ def _thin_means_at(
     beyond: float, shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions, wavelength_nm: float
 ) -> FloatArray:
     """The same of waves from ``beyond`` [mm] the mask's distance."""
-    met, half_cell = shadow.met(directions), shadow.half_cell(directions)
+    met, half_cell = shadow.on_tilted_mask(directions), shadow.half_cell(directions)
     reach = shadow.half_pixel + half_cell
     low, high = met.min() - reach, met.max() + reach
     waves = _prepare(replace(shadow, distance_mm=shadow.distance_mm + beyond), wavelength_nm, low, high)

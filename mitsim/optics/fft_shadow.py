@@ -433,7 +433,7 @@ def wave_samplers(
     depth, tau
         of the source [mm], and its tan-angles along rows and columns.
     """
-    if geometry.drawn(spectrum is not None):
+    if geometry.is_drawn(spectrum is not None):
         return _of_plate(raster(geometry, depth, spectrum), geometry.mask_offset)
     shadow = ShadowGeometry.of(geometry, depth)
     reach = geometry.half_width + geometry.mask_distance * geometry.tan_half_fov + max(geometry.pitches)
@@ -454,7 +454,7 @@ def wave_samplers(
 
 def geometric_samplers(geometry: CameraGeometry) -> list[SampledTerm]:
     """The geometric shadow of the mask of ``geometry``, as samplers."""
-    if geometry.drawn(waves=False):
+    if geometry.is_drawn(waves=False):
         return _of_plate(raster(geometry, geometry.scene_distance), geometry.mask_offset)
     return _of_plate(geometry.build_mask(), geometry.mask_offset)
 

@@ -74,7 +74,9 @@ def form_frames(
 
     def form(row: int) -> None:
         for number, (optics, parts) in enumerate(mixed):
-            frame, seen = optics.seen([_row(part, row) for part in parts], probes, None if number else frames[row])
+            frame, seen = optics.frame_and_products(
+                [_row(part, row) for part in parts], probes, None if number else frames[row]
+            )
             if number:
                 frames[row] += frame
             probed[row] += seen.ravel()
@@ -183,7 +185,7 @@ class Mixture:
         ``basis`` (b, ...) lay: those are overwritten, for no memory is as dear as new memory."""
         common = mix_frames(self.least[None], basis)[0] if self.least.any() else None
 
-        def turned(shot: int) -> FloatArray:
+        def weigh_in_place(shot: int) -> FloatArray:
             (number,), (weight,) = _row(self.own, shot)
             frame: FloatArray = basis[number]
             if weight != 1:
@@ -192,7 +194,7 @@ class Mixture:
                 frame += common
             return frame
 
-        return in_threads(turned, range(len(self.weights)))
+        return in_threads(weigh_in_place, range(len(self.weights)))
 
     def shots(self, basis: FloatArray, start: int, stop: int) -> Sequence[FloatArray]:
         """Shots of the frames that are held; some may be of these themselves.
@@ -208,7 +210,7 @@ class Mixture:
             return list(mix_frames(self.weights[start:stop], basis))
         common = mix_frames(self.least[None], basis)[0] if self.least.any() else None
 
-        def added(shot: int) -> FloatArray:
+        def add_up(shot: int) -> FloatArray:
             numbers, weights = _row(self.own, shot)
             if common is None and list(weights) == [1]:
                 return np.asarray(basis[numbers[0]])
@@ -220,7 +222,7 @@ class Mixture:
                     total += basis[number] if weight == 1 else weight * basis[number]
             return total
 
-        return in_threads(added, range(start, stop))
+        return in_threads(add_up, range(start, stop))
 
 
 def pair_shots(weights: FloatArray) -> tuple[FloatArray, Mixture] | None:

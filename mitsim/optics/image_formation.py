@@ -186,7 +186,7 @@ class FrameOptics:
         self.shape = (anchors * self.cells[0], anchors * self.cells[1])
 
         def layer(depth: float) -> _Raster | _Terms:
-            if geometry.correlated(spectrum is not None):
+            if geometry.is_correlated(spectrum is not None):
                 correlation = _correlation(geometry, rows, columns, depth, spectrum)
                 return _Raster(correlation, weights, places, self.cells)
             return _Terms(_shadow(geometry, rows, columns, depth, spectrum, places), weights)
@@ -195,7 +195,7 @@ class FrameOptics:
 
     def frame(self, flat: IntArray, light: FloatArray) -> FloatArray:
         """(m, m') irradiance of ``light`` [W m^-2] at increasing indices ``flat`` into (layers, *shape)."""
-        return self.seen([(flat, light)], None)[0]
+        return self.frame_and_products([(flat, light)], None)[0]
 
     def probe(self, estimates: Sequence[Entries], vectors: FloatArray | None = None) -> FloatArray:
         """Frames of several ``estimates`` times ``vectors`` (m', probes): (m, estimates * probes).
@@ -208,7 +208,7 @@ class FrameOptics:
             total += layer.probe(lit, vectors)
         return total
 
-    def seen(
+    def frame_and_products(
         self, estimates: Sequence[Entries], vectors: FloatArray | None, out: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
         """The frame of the mean of several estimates, and the product of each one's frame with some vectors.
@@ -321,7 +321,7 @@ def raster_error(
         shadow = replace(ShadowGeometry.of(drawn, depth), mask=raster(drawn, depth, spectrum))
         return Correlation(shadow, rows, columns, drawn.pixel_fill_factor).image(light, row, column)
 
-    known = not few.drawn(spectrum is not None)
+    known = not few.is_drawn(spectrum is not None)
     coarse = frame(1)
     if known:
         terms = shadow_terms(few, rows, columns, depth, spectrum)

@@ -176,7 +176,7 @@ class ShadowGeometry:
         """(m, c) mask coordinates [mm] of rays from pixel centres toward ``directions``, of an even mask."""
         return self.shrink * self.pixel_centres_mm[:, None] + self.distance_mm * directions.centres[None, :]
 
-    def met(self, directions: Directions) -> FloatArray:
+    def on_tilted_mask(self, directions: Directions) -> FloatArray:
         """The same on the tilted mask, for ``directions`` along an axis of :meth:`from_mask`."""
         (growth, beyond), even = self.tilt[0], self.crossings(directions)
         if not (growth or beyond):
@@ -245,9 +245,9 @@ def _thin_means(shadow: ShadowGeometry, profiles: list[FloatArray], directions: 
     """(terms, m, c) mean transmissions."""
     feature, even = shadow.mask.feature_mm, shadow.mask.even
     if not even or shadow.half_pixel + shadow.half_cell(directions) > _WIDE * feature:
-        boxes = shadow.met(directions), shadow.half_pixel, shadow.half_cell(directions)
+        boxes = shadow.on_tilted_mask(directions), shadow.half_pixel, shadow.half_cell(directions)
         return np.stack([profile.box_means(*boxes) for profile in shadow.clear(profiles, 0.0)])
-    centre = shadow.met(directions) / feature
+    centre = shadow.on_tilted_mask(directions) / feature
     half_pixel, half_cell = np.array(shadow.half_pixel / feature), np.array(shadow.half_cell(directions) / feature)
     return np.stack([_trapezoid_mean(profile, centre, half_pixel, half_cell) for profile in profiles])
 

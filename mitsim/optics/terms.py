@@ -54,19 +54,19 @@ def shadow_terms(
         rows and columns of a frame, increasing; None: all.
     """
     shadow, waves = ShadowGeometry.of(geometry, depth, places), spectrum is not None
-    if geometry.drawn(waves):
+    if geometry.is_drawn(waves):
         shadow, spectrum = replace(shadow, mask=raster(geometry, depth, spectrum)), None
     if geometry.mask_motion is not None:
         others = rows, columns, depth, spectrum, places
         return moving_terms(geometry, shadow, rows, columns, lambda still: shadow_terms(still, *others))
 
-    def formed(shadow: ShadowGeometry) -> SeparableTerms:
+    def form(shadow: ShadowGeometry) -> SeparableTerms:
         if spectrum is None:
             return geometric_terms(shadow, rows, columns)
         return wave_terms(shadow, rows, columns, spectrum)
 
     nodes = geometry.tilt_nodes(waves)
-    terms = tilted_terms(shadow, rows, columns, geometry.mask_tilt, nodes, formed) if nodes else formed(shadow)
+    terms = tilted_terms(shadow, rows, columns, geometry.mask_tilt, nodes, form) if nodes else form(shadow)
     if geometry.pixel_fill_factor == 1:
         return terms
     return [(geometry.pixel_fill_factor * left, right) for left, right in terms]
@@ -117,13 +117,13 @@ def moving_terms(
     assert motion is not None
     still = geometry.model_copy(update={"mask_motion": None})
 
-    def shifted(by_mm: float) -> SeparableTerms:
+    def shift_mask(by_mm: float) -> SeparableTerms:
         """Of the mask moved by so much the other way, along both axes."""
         row, column = geometry.mask_offset
         return at_rest(still.model_copy(update={"mask_offset_row": row - by_mm, "mask_offset_column": column - by_mm}))
 
     def shaking(by_mm: float) -> SeparableTerms:
-        return _mean_of(shifted, by_mm, motion.vibration_um / 1e3) if motion.vibration_um else shifted(by_mm)
+        return _mean_of(shift_mask, by_mm, motion.vibration_um / 1e3) if motion.vibration_um else shift_mask(by_mm)
 
     angle = motion.rotation_mrad / 1e3
     if not angle:
@@ -334,14 +334,14 @@ def _singular(terms: SeparableTerms) -> tuple[FloatArray, Callable[[int], Separa
     )
     turn_left, values, turn_right = np.linalg.svd(small_left @ small_right.T)
 
-    def split(number: int) -> SeparableTerm:
+    def split_term(number: int) -> SeparableTerm:
         root = np.sqrt(values[number])
         return (
             (root * left @ turn_left[:, number]).reshape(terms[0][0].shape),
             (root * right @ turn_right[number]).reshape(terms[0][1].shape),
         )
 
-    return values, split
+    return values, split_term
 
 
 def relative_difference(terms: SeparableTerms, reference: SeparableTerms) -> float:
@@ -350,7 +350,7 @@ def relative_difference(terms: SeparableTerms, reference: SeparableTerms) -> flo
     return float(np.sqrt(_energy([*terms, *minus]) / _energy(reference)))
 
 
-def centred(terms: SeparableTerms) -> SeparableTerms:
+def centre_terms(terms: SeparableTerms) -> SeparableTerms:
     """``terms`` of frames from which the means of rows and columns are taken: that of every factor's columns is."""
     return [(left - left.mean(axis=0), right - right.mean(axis=0)) for left, right in terms]
 

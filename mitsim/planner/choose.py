@@ -165,7 +165,7 @@ class Candidates:
         return float(table.work[index]) + truth, bool(table.fits[index])
 
 
-def predicted(
+def predicted_candidate(
     accuracy: float, pilot_result: PilotResult, settings: Settings, switches: Mapping[str, bool]
 ) -> Candidate:
     """What ``settings`` leave and take with samples of their own for the rest of the budget.
@@ -184,7 +184,7 @@ def _table_of(
     accuracy: float, pilot_result: PilotResult, settings: Settings, switches: Mapping[str, bool], sure: float
 ) -> _Table:
     """Predictions of ``settings`` alone; all else as for :func:`cheapest`."""
-    row = np.array([[*counted(settings), settings.coarse_cells, settings.coarse_layers]], dtype=np.float64)
+    row = np.array([[*counts_of(settings), settings.coarse_cells, settings.coarse_layers]], dtype=np.float64)
     drawn = pilot_result.raster[in_waves(settings.effects)]
     cells = (settings.raster_cells or drawn.cells[0]) if settings.raster or drawn.needed else 0
     return _Table(accuracy, pilot_result, (settings.effects, cells), row, _omissions(switches), sure)
@@ -240,7 +240,7 @@ class _Table:
         self.effects, self.raster_cells = form
         self.accuracy, self.pilot_result, self.rows = accuracy, pilot_result, rows
         self.given, self.sure = given, sure
-        self.numbers = Numbers.chosen([*rows.T], self.effects, len(pilot_result.occluded), self.raster_cells)
+        self.numbers = Numbers.of_counts([*rows.T], self.effects, len(pilot_result.occluded), self.raster_cells)
 
     def at(self, accuracy: float) -> _Table:
         """The same combinations at an ``accuracy``: what does not depend on it is shared.
@@ -341,9 +341,9 @@ class _Table:
         ]
         drawn += [self.pilot_result.sharp.left**2] if self.pilot_result.sharp else []
         cells = self.raster_cells
-        of_raster = self.pilot_result.raster[in_waves(self.effects)].left(cells) if cells else None
+        of_raster = self.pilot_result.raster[in_waves(self.effects)].error_left(cells) if cells else None
         drawn += [of_raster[sure > 0] ** 2] if of_raster else []
-        squared, spread = changes.squared(chosen)
+        squared, spread = changes.squared_errors(chosen)
         return np.asarray(np.sqrt(np.maximum(np.maximum(squared, 0) + sure * spread, 0) + sum(drawn)))
 
     def _weight(self, part: Approximation) -> FloatArray:
@@ -474,10 +474,10 @@ def _samples_for(kind: SampleCost, target: Number) -> Number:
 
 
 def _noise_after(kind: SampleCost, samples: Number) -> Number:
-    return kind.noise.left(samples)
+    return kind.noise.error_left(samples)
 
 
-def counted(settings: Settings) -> tuple[int, ...]:
+def counts_of(settings: Settings) -> tuple[int, ...]:
     """The numbers in ``settings`` that :data:`COUNTED` names."""
     numbers = Numbers.of(settings)
     return tuple(int(getattr(numbers, name)) for name in COUNTED)
@@ -549,19 +549,19 @@ def accuracy_for_time(candidates: Candidates, seconds: float, finest: float, kep
         whether the choice must be predicted to keep the accuracy; else only its price counts.
     """
 
-    def tried(accuracy: float) -> AccuracyForTime:
+    def try_accuracy(accuracy: float) -> AccuracyForTime:
         taken, keeps = candidates.seconds(accuracy)
         return AccuracyForTime(accuracy, taken, taken <= seconds and (keeps or not kept))
 
     grid = accuracies(finest)
-    best, too_fine = tried(grid[0]), len(grid)
+    best, too_fine = try_accuracy(grid[0]), len(grid)
     if not best.fits:
         # What keeps no accuracy at all is for the plan to say; here only time counts.
         return AccuracyForTime(best.accuracy, best.seconds, best.seconds <= seconds)
     coarse = 0
     while too_fine - coarse > 1:
         middle = (coarse + too_fine) // 2
-        found = tried(grid[middle])
+        found = try_accuracy(grid[middle])
         if found.fits:
             best, coarse = found, middle
         else:

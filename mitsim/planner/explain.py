@@ -30,7 +30,7 @@ from mitsim.light.cost_model import (
 from mitsim.light.passes import FOLLOWED
 from mitsim.light.plan import Plan, PlanRow, State
 from mitsim.light.settings import Estimate, PilotResult, Settings
-from mitsim.planner.choose import Candidate, cheapest, predicted
+from mitsim.planner.choose import Candidate, cheapest, predicted_candidate
 from mitsim.transport.missed import polished_shapes
 
 if TYPE_CHECKING:
@@ -271,7 +271,7 @@ class _Words:
 
     def _without(self, settings: Settings) -> str:
         """What the total error would be with other ``settings``."""
-        other = predicted(self.accuracy, self.pilot_result, settings, {})
+        other = predicted_candidate(self.accuracy, self.pilot_result, settings, {})
         total = math.hypot(other.systematic.bound, self.chosen.noise)
         return f"without it the error would be up to {total:.1e}, and {self.accuracy:g} is allowed"
 
@@ -333,7 +333,7 @@ class _Words:
     @property
     def _of_raster(self) -> Estimate | None:
         """What the raster leaves that is chosen, or one of the fewest cells where the mask may be drawn on one."""
-        return self.pilot_result.raster[self._waves].left(self.chosen.settings.raster_cells)
+        return self.pilot_result.raster[self._waves].error_left(self.chosen.settings.raster_cells)
 
     def _shadow(self) -> tuple[PlanRow, ...]:
         """How frames behind a mask of more than two terms are formed."""

@@ -172,7 +172,7 @@ class PilotRuns:
             changes = len(self.followed.changes)
         elif run == "occluded":
             count = len(self.occluded.pixels) if self.occluded else 0
-            if self.occluded is None or finer.occluded(count) == now.occluded(count):
+            if self.occluded is None or finer.samples_of_occluded(count) == now.samples_of_occluded(count):
                 return math.inf
             paths = costs["penumbra"] * FINER * self.occluded.paths / REPLICATES * self.occluded.connections
             changes = len(self.occluded.changes)

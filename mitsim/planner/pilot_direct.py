@@ -30,7 +30,7 @@ from mitsim.light.settings import (
     Settings,
     SharpPixels,
 )
-from mitsim.light.simulation import Simulation, emitted
+from mitsim.light.simulation import Simulation, emission
 from mitsim.optics.fft_shadow import cells_per_pixel
 from mitsim.optics.forming import AccumulatedLight
 from mitsim.optics.frames import ExpectedFrames
@@ -190,7 +190,7 @@ class DirectRuns:
             seconds=seconds,
             product=_product_seconds(),
             geometric_terms=float(geometry.mask_terms),
-            correlated=(geometry.drawn(waves=False), geometry.drawn(geometry.diffracts)),
+            correlated=(geometry.is_drawn(waves=False), geometry.is_drawn(geometry.diffracts)),
             phases=float(cells_per_pixel(geometry) ** 2),
             drawing=(drawing_seconds(geometry, None), drawing_seconds(geometry, waves)),
             parted=bool(self.bench.loaded.parting),
@@ -204,17 +204,17 @@ class DirectRuns:
         shot = sparse.csr_array(self.sample.lighting.weights[:1]) @ light[: self.sample.lighting.weights.shape[1]]
         light = shot.toarray().reshape(bundle.anchors, bundle.cells[0], bundle.anchors, bundle.cells[1])
 
-        def drawn(spectrum: Spectrum | None) -> Drawn:
+        def draw_shadow(spectrum: Spectrum | None) -> Drawn:
             waves = spectrum is not None
-            if not (geometry.drawn(waves) or geometry.may_be_drawn(waves)):
+            if not (geometry.is_drawn(waves) or geometry.may_be_drawn(waves)):
                 return Drawn()
             seen = light[0, :, 0]
             error, known = raster_error(geometry, bundle.rows, bundle.columns, self.base.depth, spectrum, seen)
             found = Estimate(error, _SURE_OF_RASTER * error) if known else Estimate(*(error * by for by in _OF_FINER))
-            return Drawn(found, geometry.drawn(waves), cells_to_choose(geometry, spectrum))
+            return Drawn(found, geometry.is_drawn(waves), cells_to_choose(geometry, spectrum))
 
-        without, waves = drawn(None), self.bench.waves
-        return without, drawn(waves) if waves else without
+        without, waves = draw_shadow(None), self.bench.waves
+        return without, draw_shadow(waves) if waves else without
 
     def _lit_rows(self, simulation: Simulation, light: sparse.csr_array) -> float:
         """Rows of cells that hold light in a shot, their mean."""
@@ -231,7 +231,7 @@ class DirectRuns:
     def _form(
         self, simulation: Simulation, path_samples: list[PathSamples], samples: int, sharp: Sequence[PathSamples] = ()
     ) -> FloatArray:
-        sample, light = self.sample, emitted(simulation.physics, self.sample.lighting)
+        sample, light = self.sample, emission(simulation.physics, self.sample.lighting)
         grids = simulation.grids
         frames = sample.frames(grids["fine"], path_samples, samples, light)
         return frames + sample.frames(grids["sharp"], sharp, sample.sharp(simulation), light) if sharp else frames

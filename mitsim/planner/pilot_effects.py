@@ -20,9 +20,9 @@ from mitsim.light.cost_model import SHARED_COST
 from mitsim.light.grids import Grid
 from mitsim.light.passes import PASSES, PassTracer
 from mitsim.light.settings import REPLICATES, Approximation, ErrorCovariance, Noise, SampleCost, Settings
-from mitsim.light.simulation import Simulation, emitted
+from mitsim.light.simulation import Simulation, emission
 from mitsim.planner.pilot_direct import SHARP_RATE, shown_pixels, tracer_of
-from mitsim.planner.pilot_samples import EVEN_CELLS, Known, Sample, coarsened, heavy_paths, ladder, noise, norm
+from mitsim.planner.pilot_samples import EVEN_CELLS, Known, Sample, coarsening_changes, heavy_paths, ladder, noise, norm
 from mitsim.transport import records
 from mitsim.transport.indirect import adaptive_counts, block_moments, effect_of
 from mitsim.transport.integrator import KINDS
@@ -94,7 +94,7 @@ class EffectRuns:
         """Change of the frames by coarse cells for indirect light; none where there is no such light."""
         if not any(light.value.size for light in self._bounced):
             return {}
-        return coarsened("indirect", partial(self._indirect, self._bounced, self._closer[1]), self.layers)
+        return coarsening_changes("indirect", partial(self._indirect, self._bounced, self._closer[1]), self.layers)
 
     def _indirect(
         self, bounced: Sequence[PathSamples], samples: int, cells: int, layers: tuple[float, ...]
@@ -120,7 +120,7 @@ class EffectRuns:
         replicates, samples, tracer = self.followed["indirect"], self.sample.followed, self.simulation.indirect
         if tracer is None or not any(light.value.size for light in self._first_bounced):
             return replicates, samples
-        seen = coarsened("indirect", partial(self._indirect, self._first_bounced, samples), ())
+        seen = coarsening_changes("indirect", partial(self._indirect, self._first_bounced, samples), ())
         value, bound = ErrorCovariance.between(seen, self.light**2).estimate(seen)
         wanted = math.ceil(samples * (bound**2 - value**2) / (_OPEN * self.accuracy) ** 2)
         more = min(wanted, self.sample.closer(tracer.paths_per_sample))
@@ -252,7 +252,7 @@ class EffectRuns:
     @staticmethod
     def _by_kind(followed: dict[str, list[PathSamples]]) -> dict[str, list[PathSamples]]:
         """Light of several tracers together by its kind, replicate by replicate."""
-        replicates = [PathSamples.joined(replicates) for replicates in zip(*followed.values(), strict=True)]
+        replicates = [PathSamples.join(replicates) for replicates in zip(*followed.values(), strict=True)]
         return {
             name: [replicate.where(replicate.kind == kind) for replicate in replicates] for name, kind in KINDS.items()
         }
@@ -275,7 +275,7 @@ class EffectRuns:
         """Frames of light replicate by replicate, where there is any; ``samples`` of followed light, if not as many as
         of all."""
         sample, known, physics = self.sample, self._known, simulation.physics
-        light, few = emitted(physics, sample.lighting), samples or sample.followed
+        light, few = emission(physics, sample.lighting), samples or sample.followed
         grids = simulation.grids
         parts = [(grids["fine"], direct, sample.direct), (grids["fine"], followed.get("direct", ()), few)]
         parts.append((grids["sharp"], sharp, sample.sharp(simulation)))
@@ -375,7 +375,7 @@ class AnchorRuns:
     @cached_property
     def changes(self) -> dict[Approximation, FloatArray]:
         """Change of the frames by every number of anchors that was tried, and by coarse cells for what they see."""
-        return {**self._until(self.tolerance), **coarsened(self._pass.name, self._coarsen, self.layers)}
+        return {**self._until(self.tolerance), **coarsening_changes(self._pass.name, self._coarsen, self.layers)}
 
     @property
     def of_few(self) -> dict[Approximation, FloatArray]:
@@ -408,7 +408,7 @@ class AnchorRuns:
     ) -> FloatArray:
         """Frames of light to a few anchors beyond its mean, in a ``simulation``; of all of it, where they are known."""
         weights, grids = simulation.mean_weights(self.few), self._grids(simulation)
-        mean = [replicate.averaged(weights) for replicate in replicates]
+        mean = [replicate.average(weights) for replicate in replicates]
         frames = self._form(grids, replicates, samples) if frames is None else frames
         return frames - self._form([grid.of_mean for grid in grids], mean, samples)
 
@@ -456,7 +456,7 @@ class PenumbraRuns(AnchorRuns):
 
     def _choose(self, sample: Sample) -> None:
         self.pixels = np.intersect1d(shown_pixels(self.base, sample), self.base.occluded)
-        self._samples, self._lanes = sample.occluded(len(self.pixels)), len(self.base.occluded)
+        self._samples, self._lanes = sample.samples_of_occluded(len(self.pixels)), len(self.base.occluded)
 
 
 class FollowedRuns(AnchorRuns):
@@ -550,4 +550,4 @@ def _tracers(simulation: Simulation) -> list[PassTracer]:
 
 def _join(traced: Sequence[list[PathSamples]]) -> list[PathSamples]:
     """Light of several tracers together, replicate by replicate."""
-    return [PathSamples.joined(replicates) for replicates in zip(*traced, strict=True)]
+    return [PathSamples.join(replicates) for replicates in zip(*traced, strict=True)]

@@ -133,7 +133,7 @@ class Sample:
         """Samples of so many ``paths`` that a closer replicate at followed light takes at most."""
         return self._within(_CLOSER * self.followed, paths)
 
-    def occluded(self, pixels: int) -> int:
+    def samples_of_occluded(self, pixels: int) -> int:
         """Samples of each of so many occluded ``pixels``, in each replicate."""
         return max(_FEWEST_OCCLUDED, min(self.times * _OCCLUDED, _MOST_OCCLUDED) // max(pixels, 1))
 
@@ -224,7 +224,9 @@ class Sample:
             frames = np.zeros((len(replicates), *self.shape))
             if optics:
                 share = patterns[row][classes_of]
-                seen = optics.probe([gathered(place, value * share[pixel], size) for place, value, pixel in entries])
+                seen = optics.probe(
+                    [gather_places(place, value * share[pixel], size) for place, value, pixel in entries]
+                )
                 frames = np.moveaxis(seen.reshape(len(frames[0]), len(frames), -1), 1, 0)
             # The replicates are held with the frames: their numbers must not be given to others.
             known[keys[row]] = replicates, frames
@@ -280,7 +282,7 @@ def _gain(last: float, before: float) -> float:
     return min(last / before, _UNKNOWN_GAIN) if before > 0 else _UNKNOWN_GAIN
 
 
-def coarsened(
+def coarsening_changes(
     name: str, frames: Callable[[int, tuple[float, ...]], FloatArray], layers: tuple[float, ...]
 ) -> dict[Approximation, FloatArray]:
     """Change of the frames by one coarse cell a pixel for light called ``name``, and by one layer for it.
@@ -299,7 +301,7 @@ def coarsened(
     return {**changes, Approximation(f"{name} layers", 1): frames(1, layers) - one} if layers else changes
 
 
-def gathered(places: Labels, values: FloatArray, size: int) -> Entries:
+def gather_places(places: Labels, values: FloatArray, size: int) -> Entries:
     """Distinct places that hold light, increasing, and the light of each.
 
     Parameters
@@ -342,7 +344,7 @@ def heavy_paths(tracer: FromCameraTracer | CombinedTracer, seed: int, samples: i
     """
     each = max(1, _AT_ONCE // tracer.paths_per_sample)
     parts = [tracer.trace(seed, first, min(each, samples - first)) for first in range(0, samples, each)]
-    return PathSamples.joined([part.where(part.kind != AMBIENT) for part in parts])
+    return PathSamples.join([part.where(part.kind != AMBIENT) for part in parts])
 
 
 def noise(seen: FloatArray) -> float:

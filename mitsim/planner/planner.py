@@ -27,7 +27,7 @@ from mitsim.planner.choose import (
     Candidates,
     accuracy_for_time,
     cheapest,
-    predicted,
+    predicted_candidate,
     time_warnings,
     value_of_refining,
 )
@@ -187,7 +187,7 @@ def _with_heavy_paths(
             if sample_cost.variance > known[name].variance
         }
         pilot_result = runs.pilot_result.with_sample_costs(heavier)
-        planned = predicted(accuracy, pilot_result, chosen.settings, switches)
+        planned = predicted_candidate(accuracy, pilot_result, chosen.settings, switches)
         seconds = tracing_seconds(pilot_result, planned.settings, FIXED)
         if sum(seconds.values()) <= _HEAVIER * sum(plain.values()):
             return runs.pilot_result, chosen

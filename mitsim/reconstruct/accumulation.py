@@ -252,9 +252,9 @@ class Accumulation:
         problem = self.prepared.problem(self.frames)
         return np.where(problem.sigma > 0, problem.projected, 0.0)
 
-    def measured(self) -> Iterable[Measurement]:
+    def measurements_again(self) -> Iterable[Measurement]:
         """All measurements once more: those that are kept, or reads them."""
-        return self.kept or self.shots.measured()
+        return self.kept or self.shots.pattern_measurements()
 
     def solution(self, lam: float | Literal["auto"]) -> Solution:
         """Their image at ``lam``."""
@@ -295,7 +295,7 @@ def accumulate(shots: Capture, factors: Factors, method: str = TIKHONOV) -> Accu
     noise = FrameNoise(shots.manifest, ambient)
     frames, kept = prepared.accumulator(), list[Measurement]()
     few = keeps_frames(shots, factors)
-    for measurement in shots.measured((len(factors.left), len(factors.right))):
+    for measurement in shots.pattern_measurements((len(factors.left), len(factors.right))):
         frames.add(measurement.frame, measurement.row, measurement.column)
         noise.add(measurement)
         if few:

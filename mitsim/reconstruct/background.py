@@ -113,13 +113,13 @@ class _Padded(DerivedCapture):
 def _wider(parallax: Parallax, sizes: tuple[int, int], cells: int) -> Parallax:
     """The ``parallax`` of windows of ``sizes`` pixels with so many ``cells`` more on each side."""
 
-    def extended(edges: tuple[float, float], size: int) -> tuple[float, float]:
+    def extend(edges: tuple[float, float], size: int) -> tuple[float, float]:
         more = (edges[1] - edges[0]) * cells / size
         return edges[0] - more, edges[1] + more
 
     names = ("row_tan", "row_mm"), ("column_tan", "column_mm")
     update = {
-        name: extended(getattr(parallax, name), size) for size, own in zip(sizes, names, strict=True) for name in own
+        name: extend(getattr(parallax, name), size) for size, own in zip(sizes, names, strict=True) for name in own
     }
     return parallax.model_copy(update=update)
 

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import locate
 from mitsim.core.environment import versions
-from mitsim.core.errors import MitsimError, checked
+from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.exr import checksum, verify
 from mitsim.core.files import output_folder
 from mitsim.core.images import image_size, own_end, read_image
@@ -58,7 +58,7 @@ _CLIPPED, _FEW = 2e-3, 10
 # ---- From the frames of a real session to factors ----
 
 
-@checked
+@check_arguments
 def calibrate_frames(
     folder: Path | str | SessionFrames,
     output: Path | str | None = None,
@@ -161,8 +161,8 @@ def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -
         "phi_error": None,
         "predicted_phi_error": error,
         "response_noise": noise,
-        "faults": found.listed(session.frame_name),
-        "lamp": found.lamp.listed(),
+        "faults": found.faults_for_manifest(session.frame_name),
+        "lamp": found.lamp.for_manifest(),
         "condition": estimate.condition,
         "exposure_s": listed.digital.exposure_s,
         "saturated_frames": len(readings.saturated),
@@ -228,7 +228,7 @@ def _check_sizes(session: SessionFrames) -> None:
 def _check_levels(session: SessionFrames, uniform: FloatArray) -> None:
     """MitsimError where frames have no light by the levels that the list of a ``session`` states, ``uniform`` (rows,
     columns) being the brighter of both uniform responses [electrons/s]."""
-    first = session.repeated((SIDES[0], 0, 1 if session.pairs else UNIFORM))[0]
+    first = session.repeats_of((SIDES[0], 0, 1 if session.pairs else UNIFORM))[0]
     values, digital = read_image(session.folder / first.file, session.wanted), session.listed.digital
     if digital.rate(values).max() <= 0 or not uniform.any():
         raise MitsimError(
@@ -361,7 +361,7 @@ class _Readings:
         ]
         found = {}
         for side, other in zip(SIDES, reversed(SIDES), strict=True):
-            frames = self.session.repeated((other, 0, 1 if self.session.pairs else UNIFORM))
+            frames = self.session.repeats_of((other, 0, 1 if self.session.pairs else UNIFORM))
             uniform = self._read(frames, True)
             found[side] = Ladder.of(digitals, uniform.rate, uniform.shots, listed.ladder_merge)
         return found
@@ -377,7 +377,7 @@ class _Readings:
             return dict.fromkeys(SIDES, found)
         each = [found[digital.exposure_s] for digital in self._ladders[SIDES[0]].digitals]
         return {
-            side: {each[0].exposure_s: _Reading(ladder.merged(own.rate for own in each), ladder, each[0].shots)}
+            side: {each[0].exposure_s: _Reading(ladder.merge(own.rate for own in each), ladder, each[0].shots)}
             for side, ladder in self._ladders.items()
         }
 
@@ -385,7 +385,7 @@ class _Readings:
         """Dark ``frames`` of one exposure without one that has light which the others have not; it is noted in
         ``odd``."""
         levels = np.array([float(self._read([frame], True).rate.mean()) for frame in frames])
-        uniform = self._read(self.session.repeated((SIDES[0], 0, UNIFORM)), True).rate.mean()
+        uniform = self._read(self.session.repeats_of((SIDES[0], 0, UNIFORM)), True).rate.mean()
         parts = (levels - np.median(levels)) / uniform
         lit = np.abs(parts) > _LIT
         if not lit.any():
@@ -399,10 +399,10 @@ class _Readings:
             )
         return frames if few else [frame for frame, one in zip(frames, lit, strict=True) if not one]
 
-    def clipped(self, half: Half) -> bool:
+    def is_clipped(self, half: Half) -> bool:
         """Whether many pixels of a frame share its largest number."""
         for exposure in range(len(self.session.listed.exposure_ladder)):
-            for frame in self.session.repeated(half, exposure):
+            for frame in self.session.repeats_of(half, exposure):
                 values = read_image(self.session.folder / frame.file, self.session.wanted)
                 if np.count_nonzero(values == values.max()) > max(_CLIPPED * values.size, _FEW):
                     return True
@@ -411,17 +411,17 @@ class _Readings:
     def _merge(self, half: Half) -> _Reading:
         """What shows a ``half`` of a pattern, of all exposures and repeats."""
         if self._ladders is None:
-            return self._read(self.session.repeated(half), True)
+            return self._read(self.session.repeats_of(half), True)
         ladder = self._ladders[half[0]]
         rates = []
         for number in range(len(ladder.digitals)):
-            frames, used = self.session.repeated(half, number), ladder.used(number)
+            frames, used = self.session.repeats_of(half, number), ladder.used_pixels(number)
             rates.append(self._read(frames, used).rate)
-            both = np.asarray(used & ladder.used(0))
+            both = np.asarray(used & ladder.used_pixels(0))
             if number and both.any():
-                names = frames[0].file, self.session.repeated(half)[0].file
+                names = frames[0].file, self.session.repeats_of(half)[0].file
                 self._compare(half, _Compared.of(names, -number, rates[-1][both], rates[0][both]))
-        return _Reading(ladder.merged(rates), ladder, self.session.listed.repeats)
+        return _Reading(ladder.merge(rates), ladder, self.session.listed.repeats)
 
     def _compare(self, half: Half, compared: _Compared) -> None:
         """Note it, once."""
@@ -465,7 +465,7 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Ch
     taken = SessionConditions(
         session.order,
         session.frame_name,
-        readings.clipped,
+        readings.is_clipped,
         bool(readings.saturated),
         step=(digital.step_dn or 0.0) / digital.gain_dn_per_e / digital.exposure_s,
         wrong=readings.wrong(),
@@ -495,13 +495,13 @@ def _sums(
     step = 4 * workers()
     for side, own in zip(SIDES, sums, strict=True):
 
-        def looked(index: int, side: Side = side, own: StripeSums = own) -> tuple[ResponseFit, float]:
+        def fit_response(index: int, side: Side = side, own: StripeSums = own) -> tuple[ResponseFit, float]:
             response, variance, light = readings.response(side, index)
-            return own.seen(response, index, light), variance
+            return own.fit_response(response, index, light), variance
 
         for start in range(1, count, step):
             with job.clock.stage("frames"):
-                chunk = in_threads(looked, range(start, min(start + step, count)))
+                chunk = in_threads(fit_response, range(start, min(start + step, count)))
             for seen, variance in chunk:
                 own.put(seen)
                 variances.append(variance)
@@ -568,7 +568,7 @@ class Ladder:
             weights /= weights.sum(axis=0)
         return cls(tuple(digitals), weights)
 
-    def merged(self, rates: Iterable[FloatArray], rows: slice = slice(None)) -> FloatArray:
+    def merge(self, rates: Iterable[FloatArray], rows: slice = slice(None)) -> FloatArray:
         """``rates`` (rows, columns) of one frame at each exposure as one; ``rows`` are those that they are of."""
         each = iter(rates)
         if self.weights is None:
@@ -578,7 +578,7 @@ class Ladder:
             total += weight * rate
         return total
 
-    def used(self, exposure: int) -> Chosen:
+    def used_pixels(self, exposure: int) -> Chosen:
         """(rows, columns) whether pixels are read at an ``exposure``."""
         return True if self.weights is None else np.asarray(self.weights[exposure] > 0)
 

@@ -433,7 +433,7 @@ class Readings:
             fit = left < most * unexplained**2 and (left < _AT_MOST**2 or most > _FITS)
             if fit or left < chance:
                 fits.append(Reading(cause, words, float(np.sqrt(left))))
-        return min(fits, key=lambda reading: reading.left, default=None) or self.curved()
+        return min(fits, key=lambda reading: reading.left, default=None) or self.tone_curve()
 
     def _left_over(self, frames: Frames) -> tuple[float, float]:
         """Part of the energy of ``frames`` that the model leaves, and that noise is expected to leave."""
@@ -466,14 +466,14 @@ class Readings:
                 yield Cause.ORDER, f"the frames are {words}", self._reorder(order), cut
 
     def _each(self, turn: Callable[[FloatArray], FloatArray]) -> Frames:
-        for each in self._data.measured():
+        for each in self._data.measurements_again():
             noise = float(self._noise.variance[each.row, each.column]) * each.frame.size
             yield np.ascontiguousarray(turn(each.frame)), each.row, each.column, noise
 
     def _shots(self) -> Iterator[tuple[int, FloatArray]]:
         """Number and light of each shot."""
         number = {(shot.row, shot.column, shot.sign): n for n, shot in enumerate(self._captures)}
-        for each in self._data.measured():
+        for each in self._data.measurements_again():
             shots = (each.frame,) if each.shots == 1 else _shots(each)
             for sign, light in zip((0,) if each.shots == 1 else (1, -1), shots, strict=True):
                 yield number[each.row, each.column, sign], light
@@ -494,13 +494,13 @@ class Readings:
 
     # ---- Tone curves that numbers went through
 
-    def curved(self) -> Reading | None:
+    def tone_curve(self) -> Reading | None:
         """The tone curve that the numbers went through; None where they are as likely without, where dark or bright
         ones do not fit with it, or where the sensor's noise is not stated."""
         digital = self._digital
         if not digital.noise_is_stated:
             return None
-        largest = max(float(read.max()) for each in self._data.measured() for read in _shots(each))
+        largest = max(float(read.max()) for each in self._data.measurements_again() for read in _shots(each))
         own = float(digital.rate(np.array(digital.saturation_dn))) if digital.saturation_dn else largest
         own, dark = max(own + digital.dark_current_e_per_s, _TINY), digital.dark_current_e_per_s
         most = self._compare(_Curve(_power(1.0), own, own)).unlikely
@@ -559,7 +559,7 @@ class Readings:
         def linear(read: FloatArray) -> FloatArray:
             return curve.light(read + dark) - dark
 
-        for each in self._data.measured():
+        for each in self._data.measurements_again():
             pair = _shots(each)
             halves = [linear(read) for read in pair]
             light = np.asarray(sum(halves))

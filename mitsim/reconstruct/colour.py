@@ -106,7 +106,7 @@ class JointMosaic:
         seen = self.lefts[:, :, rows] @ lit @ self.rights[:, :, columns].transpose(0, 2, 1)
         return np.asarray((self._filters(seen.shape[1:]) * seen).sum(axis=0))
 
-    def gathered(self, frame: FloatArray, row: int, column: int) -> FloatArray:
+    def gather(self, frame: FloatArray, row: int, column: int) -> FloatArray:
         """Adjoint of :meth:`frame`: (lines, n, n') of a ``frame`` (m, m').
 
         Parameters
@@ -315,10 +315,10 @@ class ColourModel:
 
         MitsimError for lines beyond the chart's spectra.
         """
-        return cls.fitted(wavelengths_nm, chart().at(wavelengths_nm), f"{CHART}, spectra at the lines")
+        return cls.fit(wavelengths_nm, chart().at(wavelengths_nm), f"{CHART}, spectra at the lines")
 
     @classmethod
-    def fitted(cls, wavelengths_nm: Sequence[float], patches: npt.ArrayLike, fitted_on: str) -> ColourModel:
+    def fit(cls, wavelengths_nm: Sequence[float], patches: npt.ArrayLike, fitted_on: str) -> ColourModel:
         """The model that brings the patches of a picture of the chart nearest to their colours, in XYZ.
 
         Parameters

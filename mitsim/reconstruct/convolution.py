@@ -20,7 +20,7 @@ paper's equation 8 does for separable cameras. Within a class
 
 **Whole light.** Where the sensor gets all light, G depends on p - p' alone: it is one convolution with h's
 autocorrelation r taken at every k-th place, the same for all classes. On the whole plane the equations are solved by a
-division, in the Fourier domain, by S + lambda, where S is the spectrum |H|^2 folded k times (:meth:`Classes.divided`).
+division, in the Fourier domain, by S + lambda, where S is the spectrum |H|^2 folded k times (:meth:`Classes.divide`).
 That answer takes the plane beyond the projector's window for unknown; the one that knows it to be dark solves a section
 of that convolution, by conjugate gradients on grids of 2n/k pixels a side, all frames' transforms being done with once.
 
@@ -110,7 +110,7 @@ class ConvolutionalCamera:
         (row, column), (rows, columns) = self.origin, self.shape
         return np.asarray(fft.irfft2(spectrum, self._grid)[row : row + rows, column : column + columns])
 
-    def correlated(self, frame: npt.ArrayLike) -> FloatArray:
+    def correlate(self, frame: npt.ArrayLike) -> FloatArray:
         """Adjoint of :meth:`image_of`: (n, n) sum of a ``frame`` weighted by the light of each scene pixel."""
         (row, column), (rows, columns) = self.origin, self.shape
         placed = np.zeros(self._grid)
@@ -122,15 +122,15 @@ class ConvolutionalCamera:
         for light in self._lights(family):
             yield self.image_of(light * np.asarray(scene))
 
-    def projected(self, family: PatternFamily, frames: Iterable[FloatArray]) -> FloatArray:
+    def project(self, family: PatternFamily, frames: Iterable[FloatArray]) -> FloatArray:
         """Adjoint of :meth:`frames`: (n, n) sum over the patterns of a ``family`` and their ``frames``."""
         total = np.zeros((self.n, self.n))
         count = family.left.shape[1] * family.right.shape[1]
-        for light, frame in zip(self._lights(family), self.checked(frames, count), strict=True):
-            total += light * self.correlated(frame)
+        for light, frame in zip(self._lights(family), self.check_frames(frames, count), strict=True):
+            total += light * self.correlate(frame)
         return total
 
-    def checked(self, frames: Iterable[FloatArray], count: int) -> Iterator[FloatArray]:
+    def check_frames(self, frames: Iterable[FloatArray], count: int) -> Iterator[FloatArray]:
         """``frames`` one by one. MitsimError where one has not the sensor's shape or a number that is not finite,
         or where there are not ``count`` of them."""
         seen = 0
@@ -193,9 +193,9 @@ def solve_iteratively(
     """
 
     def normal(image: FloatArray) -> FloatArray:
-        return camera.projected(family, camera.frames(family, image))
+        return camera.project(family, camera.frames(family, image))
 
-    return conjugate_gradients(normal, camera.projected(family, frames), lam, None, tolerance, iterations, watch)
+    return conjugate_gradients(normal, camera.project(family, frames), lam, None, tolerance, iterations, watch)
 
 
 def conjugate_gradients(
@@ -284,12 +284,12 @@ class Classes:
         """Largest of S: what lambda is to be compared with."""
         return float(self._power.max())
 
-    def projected(self, frames: Iterable[FloatArray]) -> FloatArray:
-        """(n, n) sum of all ``frames`` weighted by the light of each scene pixel: `ConvolutionalCamera.projected`, each
+    def project(self, frames: Iterable[FloatArray]) -> FloatArray:
+        """(n, n) sum of all ``frames`` weighted by the light of each scene pixel: `ConvolutionalCamera.project`, each
         frame taken at its own pixels only."""
         return self._interleave(spectrum for spectrum in self._fold_frames(frames))
 
-    def divided(self, frames: Iterable[FloatArray], lam: float) -> FloatArray:
+    def divide(self, frames: Iterable[FloatArray], lam: float) -> FloatArray:
         """(n, n) image by one division, of ``frames`` at ``lam``: the Tikhonov image of a plane without a dark
         surround, exact for the whole light."""
         weight = 1 / (self._power + check_lambda(lam))
@@ -332,7 +332,7 @@ class Classes:
         for a, b in product(range(self.k), repeat=2):
             pixels = slice(a, None, self.k), slice(b, None, self.k)
             light[pixels] = image[pixels]
-            total[pixels] = self.camera.correlated(self.camera.image_of(light))[pixels]
+            total[pixels] = self.camera.correlate(self.camera.image_of(light))[pixels]
             light[pixels] = 0
         return total
 
@@ -390,7 +390,9 @@ class Classes:
         """Spectrum of each frame's correlation with h at the pixels of its class."""
         weight = self._spectrum.conj()
         (row, column), (rows, columns) = self.camera.origin, self.camera.shape
-        for (a, b), frame in zip(product(range(self.k), repeat=2), self.camera.checked(frames, self.k**2), strict=True):
+        for (a, b), frame in zip(
+            product(range(self.k), repeat=2), self.camera.check_frames(frames, self.k**2), strict=True
+        ):
             placed = np.zeros(self._spectrum.shape)
             # Moved so that the class's first pixel is the first number.
             placed[:rows, :columns] = frame
@@ -465,7 +467,7 @@ class FactorisedClasses:
         Parameters
         ----------
         projected
-            (n, n) :meth:`Classes.projected` of them.
+            (n, n) :meth:`Classes.project` of them.
         tolerance
             relative residual of the normal equations at which conjugate gradients end.
         """

@@ -74,7 +74,8 @@ class Defects:
         """The capture of ``data`` whose readings at these pixels are those that all others tell."""
         prepared, weights = data.prepared, data.weights
         values = {
-            (each.row, each.column): prepared.as_solved(each.frame)[self.rows, self.columns] for each in data.measured()
+            (each.row, each.column): prepared.as_solved(each.frame)[self.rows, self.columns]
+            for each in data.measurements_again()
         }
         # Of a reading that is changed the means of its row and column take up their part.
         gain = (1 - 1 / prepared.left.sensor_size) * (1 - 1 / prepared.right.sensor_size) if prepared.centre else 1.0
@@ -128,10 +129,10 @@ class LeftOut(DerivedCapture):
         super().__init__(data.shots)
         self._data, self._defects, self.moved = data, defects, moved
 
-    def measured(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
+    def pattern_measurements(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
         """As of the capture itself, whose ``shape`` is known, with other readings at its defective pixels."""
         places = self._defects.rows, self._defects.columns
-        for each in self._data.measured():
+        for each in self._data.measurements_again():
             frame, light = each.frame.copy(), each.light.copy()
             frame[places] += self.moved[each.row, each.column]
             # Of a pair's sum nothing is told but that it is no less than the difference.

@@ -140,7 +140,7 @@ def best_depth(shots: Capture, factors: Factors, depth_range: tuple[float, float
         for a calibration without parallax, or a frame that cannot be read; ArgumentError for a range that too little of
         the sensor knows.
     """
-    return _Search(shots, factors, depth_range).found()
+    return _Search(shots, factors, depth_range).find()
 
 
 class _Search:
@@ -168,7 +168,7 @@ class _Search:
         self.pixel = 1 / max(self._all.reach(axis) for axis in (0, 1))
         self._unknowns = self._all.shape[0] * self._all.shape[1]
 
-    def found(self) -> Depth:
+    def find(self) -> Depth:
         """The lowest valley, and all that may be as low."""
         margin = 2 * _RESOLUTION * self.pixel
         valleys = sorted(self._valleys(*self._ends))
@@ -296,7 +296,7 @@ class _Search:
         side of the pixels' centres, so no other depth explains it."""
         there = move_factors(self._factors, self._mm(shift))
         evidence = Evidence(there.factors, self._all.patterns)
-        for each in there.of(self._shots).measured():
+        for each in there.of(self._shots).pattern_measurements():
             frame = centre_frame(each.frame) if there.factors.manifest.centre else each.frame
             evidence.collect(each, frame, float(self._all.noise.variance[each.row, each.column]))
         return float(np.nan_to_num(evidence.print_part()))
@@ -395,7 +395,7 @@ class CommonBasis:
         left, right = self._bases
         self.stack = np.zeros((self.patterns[0].shape[1], left.size, self.patterns[1].shape[1], right.size))
         self.noise = FrameNoise(shots.manifest)
-        for each in shots.measured((len(factors.left), len(factors.right))):
+        for each in shots.pattern_measurements((len(factors.left), len(factors.right))):
             frame = each.frame[self._parts[0], self._parts[1]]
             frame = centre_frame(frame) if self._centre else frame
             self.energy += float(np.square(frame).sum())
@@ -416,16 +416,16 @@ class CommonBasis:
 
     def side(self, axis: int, shift: float | FloatArray) -> FloatArray:
         """(r, n) factor of an ``axis`` on its basis, 1/z changed by ``shift`` [1/mm] for all pixels or for each."""
-        return self._bases[axis].seen(self._own(self._columns_at(axis, shift)))
+        return self._bases[axis].project(self._own(self._columns_at(axis, shift)))
 
-    def widened(self, axis: int, pixels: int) -> FloatArray:
+    def widen(self, axis: int, pixels: int) -> FloatArray:
         """(r, ``pixels`` + n + ``pixels``) columns of an ``axis`` on its basis, with those that light beside the window
         has: of the outermost pixels, moved there by their depth."""
         edges = self.edges(axis)
         before, beyond = (self._columns_at(axis, offset / edges) for offset in (-pixels, pixels))
         count = before.shape[1]
         columns = np.hstack([before[:, :pixels], self._columns_at(axis, 0.0), beyond[:, count - pixels :]])
-        return self._bases[axis].seen(self._own(columns))
+        return self._bases[axis].project(self._own(columns))
 
     def edges(self, axis: int) -> FloatArray:
         """(n,) projector pixels along an ``axis`` that a change of 1/z by 1/mm moves the light of each."""
@@ -498,7 +498,7 @@ class _Basis:
         """(m, size) vectors for frames of pattern ``index``."""
         return self._by_pattern.get(index, self._vectors[0])
 
-    def seen(self, columns: FloatArray) -> FloatArray:
+    def project(self, columns: FloatArray) -> FloatArray:
         """(size, n) the ``columns`` (m, n) on the basis of each."""
         if len(self._vectors) == 1:
             return np.asarray(self._vectors[0].T @ columns)

@@ -175,7 +175,7 @@ def depth_map(
         for other patterns than dots, devices without parallax, a calibration that does not state it, or a frame that
         cannot be read.
     """
-    return _Search(shots, factors, depth_range).found(lam)
+    return _Search(shots, factors, depth_range).find(lam)
 
 
 class _Search:
@@ -194,7 +194,7 @@ class _Search:
         self._all, self.width, self.pixel = self._arrivals.depths, self._arrivals.width, self._arrivals.pixel
         self._pixels = PixelDepths(self._all, self._arrivals.reach, STEP * self.pixel)
 
-    def found(self, lam: float | Literal["auto"]) -> DepthMap:
+    def find(self, lam: float | Literal["auto"]) -> DepthMap:
         """The depths that explain most, and the image at ``lam``; in doubt the calibrated one everywhere."""
         middle = self._middle / self.pixel
         tried = {(look, middle): self._left_over(self._arrivals.most(look, middle)[0]) for look in LAMBDAS}
@@ -549,7 +549,7 @@ class Arrivals:
         axes, and so many beside the window, taken for lit; K = 1 along an axis without."""
         sides, patterns = [], []
         for axis, opened in enumerate(self._open):
-            side = self.depths.widened(axis, self._margin) if opened else self.depths.side(axis, 0.0)
+            side = self.depths.widen(axis, self._margin) if opened else self.depths.side(axis, 0.0)
             sides.append(side)
             patterns.append(np.ones((side.shape[1], 1)) if opened else self.depths.patterns[axis])
         prepared = prepare(sides[0], sides[1], patterns[0], patterns[1])

@@ -181,9 +181,9 @@ class StripeSums:
 
     def add(self, response: npt.ArrayLike) -> None:
         """Add the next ``response`` (rows, columns); MitsimError for another shape or values that are not finite."""
-        self.put(self.seen(response, self.done))
+        self.put(self.fit_response(response, self.done))
 
-    def seen(self, response: npt.ArrayLike, number: int, light: FloatArray | None = None) -> ResponseFit:
+    def fit_response(self, response: npt.ArrayLike, number: int, light: FloatArray | None = None) -> ResponseFit:
         """What a response adds; MitsimError as :meth:`add`.
 
         Changes nothing, so that responses are looked at in several threads.

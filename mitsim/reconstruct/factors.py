@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitsim.core.arrays import FloatArray, SeparableTerm
-from mitsim.core.errors import MitsimError, checked, cut
+from mitsim.core.errors import MitsimError, check_arguments, cut
 from mitsim.core.exr import Channels, Metadata, checksum, finite_channel, read_frame, verify, write_frame
 from mitsim.core.files import output_folder
-from mitsim.core.images import card, scaled, span
+from mitsim.core.images import card, normalise, span
 from mitsim.core.manifests import SIDES, CalibrationManifest, FactorNoise, read_manifest, write_manifest
 from mitsim.core.runs import Capture
 from mitsim.devices.patterns import PatternFamily, parse_patterns
@@ -112,7 +112,7 @@ class Factors:
         centre = str(self.manifest.centre).encode()
         return hashlib.sha256(self.left.tobytes() + self.right.tobytes() + centre).hexdigest()
 
-    @checked
+    @check_arguments
     def save(self, folder: Path | str) -> Path:
         """Write the CAL folder that `mitsim calibrate` writes, to a new or empty ``folder``; returns it.
 
@@ -121,7 +121,7 @@ class Factors:
         with output_folder(folder) as place:
             return self.write(place)
 
-    @checked
+    @check_arguments
     def write(self, folder: Path) -> Path:
         """The same in a ``folder`` that this process holds already (:func:`mitsim.core.files.output_folder`)."""
         metadata: dict[str, str | float] = {"unit": "sqrt(e-/s)"}
@@ -135,7 +135,7 @@ class Factors:
         write_manifest(folder, self.manifest.model_copy(update={"checksums": checksums, "status": "complete"}))
         return folder
 
-    @checked
+    @check_arguments
     def check_fit(self, shots: Capture) -> None:
         """MitsimError when ``shots`` are of another camera, mask, distance, projector or light: the first thing that
         differs."""
@@ -156,7 +156,7 @@ class Factors:
                     f"{factor.shape[1]}; calibrate with this projector"
                 )
 
-    @checked
+    @check_arguments
     def operator(self, patterns: str | PatternFamily, seed: int = 0) -> LinearOperator:
         """The whole model as a linear operator, with its adjoint.
 
@@ -215,7 +215,7 @@ class Factors:
 
     def _repr_html_(self) -> str:
         pictures = {
-            f"{name}: {side.shape[0]} sensor x {side.shape[1]} projector pixels\n{span(side, 'sqrt(e-/s)')}": scaled(
+            f"{name}: {side.shape[0]} sensor x {side.shape[1]} projector pixels\n{span(side, 'sqrt(e-/s)')}": normalise(
                 side
             )
             for name, side in self._sides()
@@ -251,7 +251,7 @@ def _factor_noise(estimate: Estimate) -> FactorNoise | None:
     return FactorNoise(left=float(left), right=float(right), unexplained=estimate.unexplained)
 
 
-@checked
+@check_arguments
 def load_calibration(folder: Path | str) -> Factors:
     """The factors in the CAL folder ``folder``. MitsimError when it is not a complete calibration."""
     folder = Path(folder)

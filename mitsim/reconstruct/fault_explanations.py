@@ -199,7 +199,7 @@ class Explanations:
         """
         check, patterns = self._check, list(off)[:_MOST_PAIRS]
 
-        def exchanged(one: tuple[Pattern, int], other: tuple[Pattern, int]) -> bool:
+        def are_exchanged(one: tuple[Pattern, int], other: tuple[Pattern, int]) -> bool:
             # Of a half each.
             noise = mean.size * float(check.noise.variance[one[0]] + check.noise.variance[other[0]]) / 2
             apart = (halves[one] + halves[other[0], -other[1]] - mean, halves[other] + halves[one[0], -one[1]] - mean)
@@ -219,7 +219,7 @@ class Explanations:
             }
             image = check.image(self._together(frames))
             variation = float(sum(np.abs(np.diff(image, axis=axis)).sum() for axis in (0, 1)))
-            ranked.append((-sum(exchanged(*pair) for pair in combinations(wrong, 2)), variation, wrong))
+            ranked.append((-sum(are_exchanged(*pair) for pair in combinations(wrong, 2)), variation, wrong))
         return dict(min(ranked)[2])
 
     # ---- fits
@@ -332,10 +332,10 @@ class Explanations:
     def _least_scale(self, one: _Suspect, start: float) -> tuple[float, float]:
         """The part of its light that a frame has, and what it leaves divided by that."""
 
-        def left(ratio: float) -> float:
+        def rest(ratio: float) -> float:
             return self._beyond({one.pattern: one.frame / ratio}, one.variance / ratio**2) * ratio**2
 
-        found = minimize_scalar(left, bounds=(0.3 * start, min(3 * start, 10.0)), method="bounded")
+        found = minimize_scalar(rest, bounds=(0.3 * start, min(3 * start, 10.0)), method="bounded")
         return float(found.x), float(found.fun)
 
     def _lost_part(self, one: _Suspect) -> Iterable[_Named]:
@@ -462,7 +462,7 @@ class Explanations:
         """Shots that are equal to another, but for noise."""
         check = self._check
         found: dict[tuple[int, ...], list[_Named]] = {}
-        for each in check.data.measured():
+        for each in check.data.measurements_again():
             pattern = each.row, each.column
             signs = (1, -1) if each.shots == 2 else (0,)
             variance = float(check.noise.variance[pattern])

@@ -102,7 +102,7 @@ def move_factors(factors: Factors, depth_mm: float) -> MovedFactors:
         }
         manifest = manifest.model_copy(update={"noise": noise.model_copy(update=less)})
     moved = replace(factors, left=left[rows], right=right[columns], manifest=manifest, lacking=())
-    seen = [float((side.hidden(shift) < _HIDDEN).mean()) for side in sides]
+    seen = [float((side.hidden_part(shift) < _HIDDEN).mean()) for side in sides]
     return MovedFactors(moved, rows, columns, (len(factors.left), len(factors.right)), 1 - seen[0] * seen[1])
 
 
@@ -162,7 +162,7 @@ class FactorOfDepths:
         # The image stays light relative to the board's, as the sensor as a whole sees it.
         return shadows * np.divide(passed, mean, out=np.zeros_like(passed), where=mean > 0), _whole(known)
 
-    def hidden(self, shift: float) -> FloatArray:
+    def hidden_part(self, shift: float) -> FloatArray:
         """(n,) part of each column's light that the field stop keeps from the sensor at another depth: 1/z changed by
         ``shift`` [1/mm]; 0 where the calibration states no stop, or its own window was cut."""
         return np.asarray(1 - self._transmission(self._source_columns(shift)).mean(axis=0))
@@ -338,9 +338,9 @@ class DerivedCapture(Capture):
         """What is taken off every frame."""
         return self.whole.ambient
 
-    def measured(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
+    def pattern_measurements(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
         """What was measured, of a ``shape`` that is asked for."""
-        return self.whole.measured(shape)
+        return self.whole.pattern_measurements(shape)
 
 
 class _Part(DerivedCapture):
@@ -350,9 +350,9 @@ class _Part(DerivedCapture):
         super().__init__(whole)
         self._part = part
 
-    def measured(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
+    def pattern_measurements(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
         """As of the whole sensor, whose frames must have the shape that the calibration's have."""
-        for each in self.whole.measured(self._part.sensor):
+        for each in self.whole.pattern_measurements(self._part.sensor):
             yield replace(each, frame=self._cut(each.frame), light=self._cut(each.light))
 
     @cached_property

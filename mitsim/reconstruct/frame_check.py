@@ -301,7 +301,7 @@ def odd_brightness(check: LeaveOneOut, weights: FloatArray, good: BoolArray) -> 
     good
         (K, K') which of them count.
     """
-    image, lit = check.image(weights), check.lit(good)
+    image, lit = check.image(weights), check.lit_pixels(good)
     near = check.neighbours(image, lit)
     least = max(_LEAST, _FEW / good.size)
     middles = {pattern: _median(seen / payload) for pattern, seen, payload in _beside(check, image, near, good)}

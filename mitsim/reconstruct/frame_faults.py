@@ -165,7 +165,7 @@ class LeaveOneOut:
         filtered = np.divide(self._kept * weights, self.sigma, out=np.zeros_like(weights), where=self.sigma > 0)
         return self.prepared.image(filtered)
 
-    def lit(self, good: BoolArray) -> BoolArray:
+    def lit_pixels(self, good: BoolArray) -> BoolArray:
         """(n, n') pixels that a ``good`` pattern lights."""
         left, right = ((side != 0).astype(np.float64) for side in self.patterns)
         return np.asarray(left @ good @ right.T > 0)
@@ -182,7 +182,7 @@ class LeaveOneOut:
     def measurements(self, patterns: Iterable[Pattern]) -> dict[Pattern, Measurement]:
         """Those of ``patterns``."""
         wanted = set(patterns)
-        return {key: each for each in self.data.measured() if (key := (each.row, each.column)) in wanted}
+        return {key: each for each in self.data.measurements_again() if (key := (each.row, each.column)) in wanted}
 
     def all_but(self, bad: Iterable[Pattern]) -> BoolArray:
         """(K, K') whether patterns are none of the ``bad``."""
@@ -206,7 +206,7 @@ class LeaveOneOut:
         if not self.exclusive and max(self._periods) > 1:
             # One pattern of +-1 that is wrong is a comb of the dots' period, without a mean.
             image = uniform_filter(image, self._periods, mode="nearest")
-        lit = self.lit(self.all_but(bad))
+        lit = self.lit_pixels(self.all_but(bad))
         image = np.where(lit, image, self.neighbours(image, lit))
         left_duals, right_duals = self.prepared.left.duals, self.prepared.right.duals
         weights = np.asarray(self.sigma * (left_duals.T @ image @ right_duals))
@@ -249,7 +249,7 @@ class LeaveOneOut:
             good = zip(*np.nonzero(self.all_but(bad)), strict=True)
             total = sum((each.light for each in self.measurements(good).values()), start=np.zeros(()))
         others = max(self.noise.variance.size - len(set(bad)), 2)
-        for each in self.data.measured():
+        for each in self.data.measurements_again():
             pattern, frame = (each.row, each.column), self.prepared.as_solved(each.frame)
             residual = frame - self.prepared.frame(weights, pattern)
             sums.residual[pattern], sums.power[pattern] = sum_of_squares(residual), each.power

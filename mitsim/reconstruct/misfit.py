@@ -149,7 +149,7 @@ class Misfit:
             "map": self.tiles.tolist(),
         }
 
-    def judged(self, status: Status) -> Status:
+    def judge(self, status: Status) -> Status:
         """The ``status`` of a solution with this misfit."""
         if not self.flagged or self.cause is None:
             return status
@@ -212,7 +212,7 @@ class Residuals:
     def of(cls, data: Accumulation, evidence: Evidence) -> Residuals:
         """Of all measurements of accumulated ``data``, which are read once more; ``evidence`` is empty."""
         sums = cls(data.prepared, data.weights, data.noise, evidence)
-        for measurement in data.measured():
+        for measurement in data.measurements_again():
             sums.add(measurement)
         return sums
 
@@ -292,7 +292,7 @@ class Residuals:
         noise = float(self.variance.sum()) * self._prepared.spare
         return float(self.squares.sum()) < noise * (1 - _QUIET - _chance(self._noise, float(self.pixels.sum())) / 2)
 
-    def expected(self, factor_energy: float) -> FloatArray:
+    def expected_energy(self, factor_energy: float) -> FloatArray:
         """(tiles, tiles) energy that is expected of the residual: the sensor's noise less what the fit takes up, the
         error of simulated frames where the light is, and ``factor_energy`` evenly."""
         rendering = self._noise.rendering * self.power / max(float(self.power.sum()), _TINY)
@@ -332,7 +332,7 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     evidence = Evidence(data.factors, data.shots.patterns, lack.energy if lack else None)
     lam = solution.lam if data.solver.linear else _LAMBDA_BESIDE * prepared.problem(data.frames).scale
     check, sums = FrameCheck(data, lam), Residuals.of(data, evidence)
-    expected = sums.expected(factor_energy or 0.0)
+    expected = sums.expected_energy(factor_energy or 0.0)
     balance = Balance(sums.residual, sums.energy, expected, sums.pixels, factor_energy is not None)
     found, excess = balance.misfit(noise, of_ramps)
     if evidence.predicted is not None:
@@ -350,7 +350,7 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
         beside = beside_noise / max(float(sums.energy.sum()), _TINY)
         reading = readings.fitting(found.unexplained, beside, check.all_off(sums.by_pattern, beside_noise))
     elif noise.stated and sums.quiet:
-        reading = readings.curved()
+        reading = readings.tone_curve()
     if reading:
         return found.read_as(reading)
     faults = check.faults(sums.by_pattern, beside_noise)

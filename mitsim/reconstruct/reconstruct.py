@@ -13,10 +13,10 @@ from typing import Any, Literal
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import ArgumentError, MitsimError, checked
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.exr import write_frame
 from mitsim.core.files import output_folder, plain, read_json, whole_file, write_json
-from mitsim.core.images import card, png, scaled, span
+from mitsim.core.images import card, normalise, png, span
 from mitsim.core.job import Clock, Cost, Limits
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
@@ -126,7 +126,7 @@ class Reconstruction(Solution):
             "predicted_memory_bytes": self.predicted and self.predicted.memory_bytes,
         }
 
-    @checked
+    @check_arguments
     def save(self, folder: Path | str, overwrite: bool = False, more: Mapping[str, Any] | None = None) -> Path:
         """Write image.exr, image.png (for display), result.json, and where known uncertainty.exr and depth.exr.
 
@@ -151,7 +151,7 @@ class Reconstruction(Solution):
         with output_folder(folder, overwrite=may_replace(Path(folder), self.inputs, overwrite)) as place:
             return self.write(place, more)
 
-    @checked
+    @check_arguments
     def write(self, folder: Path, more: Mapping[str, Any] | None = None) -> Path:
         """The same in a ``folder`` that this process holds already (:func:`mitsim.core.files.output_folder`); ``more``
         are further entries of result.json."""
@@ -178,9 +178,9 @@ class Reconstruction(Solution):
         pictures = {"reflectance 0 to 1": self.image}
         if self.uncertainty is not None:
             caption = f"standard uncertainty of each pixel\n{span(self.uncertainty, 'of reflectance')}"
-            pictures[caption] = scaled(self.uncertainty)
+            pictures[caption] = normalise(self.uncertainty)
         if self.depths:
-            pictures[f"depth of each pixel\n{span(self.depths.mm, 'mm')}"] = scaled(self.depths.mm)
+            pictures[f"depth of each pixel\n{span(self.depths.mm, 'mm')}"] = normalise(self.depths.mm)
         return card(f"Reconstruction: {self.status.verdict.value}", pictures, (str(self.status), *self.trust, facts))
 
 
@@ -244,7 +244,7 @@ _OF_THE_SCENE = Cause.GLOSS, Cause.INDIRECT, Cause.DETAIL, Cause.UNKNOWN, Cause.
 
 
 @single_threaded_blas()
-@checked
+@check_arguments
 def reconstruct(
     shots: Capture,
     factors: Factors,
@@ -304,7 +304,7 @@ def reconstruct(
     data, solution, misfit = _fit(data, depth, lam, clock)
     with clock.stage("uncertainty"):
         uncertainties = uncertainty(data, solution) if solver.linear and not _by_pixel(depth) else None
-    status = misfit.judged(solution.status) if misfit else solution.status
+    status = misfit.judge(solution.status) if misfit else solution.status
     image = solution.image
     if beside:
         image = beside.inside(image)

@@ -77,14 +77,14 @@ class DiagonalProblem:
 
     def taken_energy(self, lam: float) -> float:
         """Energy within the model's range that the Tikhonov solution at ``lam`` leaves out."""
-        return float(np.sum(np.square((1 - self.kept(lam)) * self.projected)))
+        return float(np.sum(np.square((1 - self.kept_share(lam)) * self.projected)))
 
     def image_energy(self, lam: float) -> float:
         """||X||^2 of the Tikhonov image X at ``lam``."""
-        kept = self.kept(lam)
+        kept = self.kept_share(lam)
         return float(np.sum(np.square((kept * self.projected)[kept > 0] / self.sigma[kept > 0])))
 
-    def kept(self, lam: float) -> FloatArray:
+    def kept_share(self, lam: float) -> FloatArray:
         """(r, r') share sigma^2 / (sigma^2 + ``lam``) of each coefficient that is kept; 0 beyond the rank."""
         squared = np.square(self.sigma)
         return np.divide(squared, squared + lam, out=np.zeros_like(squared), where=squared > 0)
@@ -116,7 +116,7 @@ def risk_score(problem: DiagonalProblem, lam: float, noise: float | FloatArray) 
     measured = problem.sigma > 0
     sigma, data = problem.sigma[measured], np.square(problem.projected[measured])
     variance = np.broadcast_to(noise, problem.sigma.shape)[measured]
-    kept = problem.kept(lam)[measured]
+    kept = problem.kept_share(lam)[measured]
     errors = ((kept - 2) * (data - variance) + kept * variance) / (np.square(sigma) + lam)
     return float(np.sum(sigma**RISK_POWER * errors))
 
@@ -128,7 +128,7 @@ def movement(problem: DiagonalProblem, lam: float) -> float:
     quasi-optimality criterion of Tikhonov and Glasko (1965), which takes no number for the noise and so holds for
     errors of any spectrum.
     """
-    kept = problem.kept(lam)
+    kept = problem.kept_share(lam)
     measured = kept > 0
     return float(np.sum(np.square((kept * (1 - kept) * problem.projected)[measured] / problem.sigma[measured])))
 

@@ -537,9 +537,9 @@ class CheckedSession:
         """A sentence for each fault; ``name`` says which frame it is."""
         return (*(fault.words(name) for fault in self.faults), *self.lamp.warnings())
 
-    def listed(self, name: Callable[[Half], str]) -> list[dict[str, Any]]:
+    def faults_for_manifest(self, name: Callable[[Half], str]) -> list[dict[str, Any]]:
         """Faults for a manifest; ``name`` says which frame it is."""
-        return [fault.listed(name) for fault in self.faults]
+        return [fault.for_manifest(name) for fault in self.faults]
 
 
 def check_session(

@@ -60,7 +60,7 @@ class Lamp:
     remaining: float = 0.0
     corrected: bool = False
 
-    def listed(self) -> dict[str, float] | None:
+    def for_manifest(self) -> dict[str, float] | None:
         """The same for a manifest; None of a steady one."""
         return asdict(self) if self.drift or self.flicker else None
 
@@ -146,7 +146,7 @@ class _Frames:
         # A pattern of coarse stripes is hardly predicted by the light of others, but by the shadow.
         far = own.far()
 
-        def fitted(degree: int) -> tuple[FloatArray, FloatArray, FloatArray, npt.NDArray[np.bool_], float]:
+        def fit(degree: int) -> tuple[FloatArray, FloatArray, FloatArray, npt.NDArray[np.bool_], float]:
             """Lines' polynomials as patterns show them, least squares and their inverse, patterns that count, and the
             robust scatter."""
             lines = own.signs.T @ np.polynomial.legendre.legvander(np.linspace(-1, 1, n), degree) / shown[:, None]
@@ -163,8 +163,8 @@ class _Frames:
             return lines, found, inverse, kept, scatter
 
         degree = min(_DEGREE[0], n // _DEGREE[1] - 1)
-        lines, found, inverse, kept, scatter = fitted(degree)
-        self.smooth = scatter < _SMOOTH * fitted(degree + 2)[-1]
+        lines, found, inverse, kept, scatter = fit(degree)
+        self.smooth = scatter < _SMOOTH * fit(degree + 2)[-1]
         lines_found, powers_found = np.split(found, [degree + 1])
         lines_inverse, powers_inverse = np.split(inverse, [degree + 1])
         self.own, self.places = own, places

@@ -253,7 +253,7 @@ class SessionFault:
         names = " and ".join(self._names(name, self.index))
         return f"frames: {names}: {self.detail}{other}; {self.repair}{cost}"
 
-    def listed(self, name: Callable[[Half], str]) -> dict[str, Any]:
+    def for_manifest(self, name: Callable[[Half], str]) -> dict[str, Any]:
         """The same for a manifest; ``name`` says which frame it is."""
         return {"frames": self._names(name, self.index), **asdict(self)}
 

@@ -142,12 +142,12 @@ class Prepared:
             f"{right.condition:.1e})"
         )
 
-    def correlated(self) -> Prepared:
+    def with_correlation(self) -> Prepared:
         """The same model for images whose neighbouring pixels are alike; frames go to its own accumulator. MitsimError
         for the Gram method."""
         with single_threaded_blas():
-            left = correlated(self.left)
-            return replace(self, left=left, right=left if self.right is self.left else correlated(self.right))
+            left = correlate_side(self.left)
+            return replace(self, left=left, right=left if self.right is self.left else correlate_side(self.right))
 
     def accumulator(self) -> Accumulator:
         """An empty sum to add frames to."""
@@ -526,7 +526,7 @@ def covariance_root(size: int) -> FloatArray:
     return np.asarray(np.linalg.cholesky(NEIGHBOURS ** np.abs(place[:, None] - place)))
 
 
-def correlated(side: Side) -> Side:
+def correlate_side(side: Side) -> Side:
     """A ``side`` whose scene pixels are correlated with their neighbours. MitsimError for one of Gram matrices."""
     if not side.projected:
         raise MitsimError("method gram: has no image of correlated pixels; prepare by svd")

@@ -330,7 +330,7 @@ class Markov(Tikhonov):
 
     def init(self, camera: Factors, patterns: Patterns) -> Prepared:
         """The ``camera``'s model under ``patterns``, factorised in the basis of correlated pixels."""
-        return super().init(camera, patterns).correlated()
+        return super().init(camera, patterns).with_correlation()
 
 
 class TotalVariation(Tikhonov):

@@ -478,7 +478,7 @@ class Propagation:
         told_by_data = problem.data_count > np.count_nonzero(problem.sigma)
         noise = coefficient_noise(problem) if told_by_data else variance
         spectrum = scene_spectrum(self.model.sides, problem, noise)
-        lost = 1 - problem.kept(self.lam)
+        lost = 1 - problem.kept_share(self.lam)
         if spectrum is None or not lost.any():
             return np.zeros((len(self.model.sides[0].basis), len(self.model.sides[1].basis))), 1.0
         power, image = np.square(self._sigma), self.model.prepared.image

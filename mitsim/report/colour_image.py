@@ -106,7 +106,7 @@ class ColourImage:
         model, board = ColourModel.of_lines(lines.wavelengths_nm), board or 1.0
         if place is not None:
             means = board * place.means(images)
-            model = ColourModel.fitted(lines.wavelengths_nm, means, "the chart in this image")
+            model = ColourModel.fit(lines.wavelengths_nm, means, "the chart in this image")
         return cls(lines, images, board, model, truth, place)
 
     @property

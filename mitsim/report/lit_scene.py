@@ -40,7 +40,7 @@ from mitsim.optics.forming import AccumulatedLight
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions, SeparableTerms
-from mitsim.optics.terms import best_term, centred, relative_difference, shadow_terms
+from mitsim.optics.terms import best_term, centre_terms, relative_difference, shadow_terms
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
@@ -83,7 +83,7 @@ class LitScene:
         """How near an ``image`` (n, n) is to the truth."""
         return Quality.of(image, self.truth, self.light.apparent.error)
 
-    def expected(
+    def expected_frames(
         self, model: str, family: PatternFamily, plane: Plane | None = None, bench: Apparatus | None = None
     ) -> ExpectedFrames:
         """Frames without noise.
@@ -105,7 +105,7 @@ class LitScene:
         camera = self._ideal if bench is None else IdealCamera(bench, bench.geometry.mask)
         return camera.frames(family, self.truth * self.board_flux, plane)
 
-    def rendered(self, factors: Factors, family: PatternFamily, seed: int) -> Unexposed:
+    def rendered_frames(self, factors: Factors, family: PatternFamily, seed: int) -> Unexposed:
         """Rendered frames with calibrated factors.
 
         Parameters
@@ -118,7 +118,7 @@ class LitScene:
         sides = factors.left, factors.right
         return Unexposed(self, RENDERED, family, sides, factors.manifest.centre, seed)
 
-    def idealised(self, family: PatternFamily, seed: int, plane: Plane | None = None) -> Unexposed:
+    def idealised_frames(self, family: PatternFamily, seed: int, plane: Plane | None = None) -> Unexposed:
         """Frames of the paper's model, with its own factors.
 
         Parameters
@@ -132,11 +132,11 @@ class LitScene:
         return Unexposed(self, IDEALISED, family, camera.calibrated(self.board_flux), camera.centre, seed + 1, plane)
 
     def _uniform_s(self, model: str) -> float:
-        return peak_time(self.bench, self.expected(model, self.bench.family("uniform")))
+        return peak_time(self.bench, self.expected_frames(model, self.bench.family("uniform")))
 
     @cached_property
     def _merged(self) -> SampledLight:
-        return self.light.merged()
+        return self.light.merge()
 
     @cached_property
     def _ideal(self) -> IdealCamera:
@@ -175,7 +175,7 @@ class Unexposed:
     @cached_property
     def expected(self) -> ExpectedFrames:
         """The frames, without noise."""
-        return self.lit.expected(self.model, self.family, self.plane)
+        return self.lit.expected_frames(self.model, self.family, self.plane)
 
     def seconds(self, exposure: str) -> float:
         """Exposure time [s] of each frame by the convention ``exposure``, one of ``CONVENTIONS`` or :data:`DIM`."""
@@ -184,7 +184,7 @@ class Unexposed:
             return peak_time(self.lit.bench, self.expected) * (DIM_E / peak_e if exposure == DIM else 1.0)
         return self.lit.uniform_s(self.model) / (len(self.family.shots) if exposure == EQUAL_TOTAL else 1)
 
-    def prepared(self, binning: int = 1) -> Prepared:
+    def prepare(self, binning: int = 1) -> Prepared:
         """The factorised model of frames whose pixels are averaged ``binning`` x ``binning``. MitsimError where such
         squares do not fill a frame."""
         rows, columns = (len(side) for side in self.sides)
@@ -204,7 +204,7 @@ class Unexposed:
         seconds, binning
             as for :meth:`solve`.
         """
-        model = self.prepared(binning)
+        model = self.prepare(binning)
         (sums,) = accumulate(self.exposer(seconds), self.family, self.expected, [model], binning)
         return model, sums
 
@@ -229,7 +229,7 @@ class Unexposed:
     @single_threaded_blas()
     def clear(self, lam: float) -> FloatArray:
         """(n, n) image of the frames without noise, by a lambda ``lam``; lamps' light is taken off without any, too."""
-        model, exposer, expected = self.prepared(), self.exposer(1.0), self.expected
+        model, exposer, expected = self.prepare(), self.exposer(1.0), self.expected
         off = exposer.electrons(expected.projector_off) if takes_ambient_frame("auto", self.family, expected) else 0.0
         sums, positive = model.accumulator(), np.zeros(())
         for shot, frame in zip(self.family.shots, expected, strict=True):
@@ -349,7 +349,7 @@ class IdealCamera:
     @cached_property
     def factors(self) -> Pair:
         """(pixels, n) left and right factor of the nearest separable operator, of transmissions."""
-        best = best_term(centred(self.terms) if self.centre else self.terms)
+        best = best_term(centre_terms(self.terms) if self.centre else self.terms)
         return best.left, best.right
 
     def calibrated(self, board_flux: float) -> Pair:
@@ -449,7 +449,7 @@ def shadow_row(light: str, systems: Mapping[str, IdealCamera]) -> ShadowRow:
         scene_pixel=relative_difference(system.terms, geometric.terms),
         factor=relative_error(sign * factor, assumed),
         separability=best_term(system.terms).residual,
-        separability_centred=best_term(centred(system.terms)).residual,
+        separability_centred=best_term(centre_terms(system.terms)).residual,
     )
 
 

@@ -161,7 +161,7 @@ def fitting_factors(shots: MosaicCapture, calibration: Path) -> dict[str, Factor
 def _add_frames(solver: Solver, shots: MosaicCapture, shape: tuple[int, int]) -> float:
     """Every frame of ``shots`` (``shape``) added to a ``solver``; returns the part of their squares that is noise."""
     data = noise = 0.0
-    for each in shots.shots.measured(shape):
+    for each in shots.shots.pattern_measurements(shape):
         solver.add(each.frame, each.row, each.column)
         data += float(np.square(each.frame).sum())
         noise += float(np.maximum(shots.shots.manifest.digital.variance(each.light, each.shots), 0.0).sum())
@@ -403,7 +403,7 @@ class _Joint:
         self._gathered = np.zeros(self._model.shape)
 
     def add(self, frame: FloatArray, row: int, column: int) -> None:
-        self._gathered += self._model.gathered(frame, row, column)
+        self._gathered += self._model.gather(frame, row, column)
         self._planes.add(frame, row, column)
 
     def images(self, lam: Lambda, relative: bool = False) -> LineImages:

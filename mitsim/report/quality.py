@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from mitsim.core.errors import MitsimError, checked
+from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.files import output_folder
 from mitsim.core.runs import load_run
 from mitsim.core.spectral_manifests import IMAGE, is_coloured, is_mosaic, read_colours, same_lines
@@ -84,7 +84,7 @@ def reconstruct(
     return judged
 
 
-@checked
+@check_arguments
 def reconstruct_colours(
     run: Path | str,
     calibration: Path | str,

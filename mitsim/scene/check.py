@@ -110,7 +110,7 @@ def check_file(
     # Groups are in the scene by their instances alone.
     shapes = [plugin for plugin in PLUGINS["shape"].split() if plugin != "shapegroup"]
     facts = tuple(files.used), tree.limits, Unfit.of(outline, tree.nodes)
-    listed = tuple(tree.listed(shapes)), tuple(tree.listed(SMALL_LAMPS)), tuple(tree.coloured), tuple(tree.parting)
+    listed = tuple(tree.tags_of(shapes)), tuple(tree.tags_of(SMALL_LAMPS)), tuple(tree.coloured), tuple(tree.parting)
     without_normals = frozenset(name for name, given in tree.normals.items() if given == {False})
     return CheckedScene(outline, config, state, *facts, *listed, tree.samples, without_normals)
 
@@ -164,7 +164,7 @@ class _Tree:
                 self._check_camera(node)
         self._check_sizes()
 
-    def listed(self, plugins: Sequence[str]) -> Iterator[Tag]:
+    def tags_of(self, plugins: Sequence[str]) -> Iterator[Tag]:
         """Tags of the root's own objects that are one of the ``plugins``."""
         for child in (self.nodes[index] for index in references(self.nodes[0].props)):
             if child.props.plugin_name() in plugins:

@@ -142,7 +142,7 @@ class Outline:
         def refuse(what: str) -> MitsimError:
             return MitsimError(f"{path}:{parser.CurrentLineNumber}: {what}")
 
-        def declared(version: str, encoding: str | None, standalone: int) -> None:
+        def declare(version: str, encoding: str | None, standalone: int) -> None:
             if encoding is not None and encoding.lower() not in ("utf-8", "us-ascii"):
                 raise refuse(f"encoding: got {cut(encoding)!r}; write the scene in UTF-8")
 
@@ -188,7 +188,7 @@ class Outline:
                 if any(attributes.get("type") == "projector" for attributes in outer):
                     self.projected.append(self._files.folder / texts.get("value", ""))
 
-        parser.XmlDeclHandler = declared
+        parser.XmlDeclHandler = declare
         parser.StartDoctypeDeclHandler = doctype
         parser.ProcessingInstructionHandler = instruction
         parser.StartElementHandler = start
@@ -223,7 +223,7 @@ class Outline:
         self._values.setdefault(name, value)
 
     def _include(self, tag: Tag, name: str, above: tuple[Path, ...]) -> None:
-        path = self._files.included(tag, name)
+        path = self._files.include(tag, name)
         if path.resolve() in above:
             raise tag.refusal("include", path.name, "it comes back to itself; remove one of the two")
         if self._opened > _MOST_INCLUDES or len(above) > _DEEPEST_INCLUDE:
@@ -324,7 +324,7 @@ class SceneFiles:
             _check_native(path, folder)
         return path
 
-    def included(self, tag: Tag, name: str) -> Path:
+    def include(self, tag: Tag, name: str) -> Path:
         """The file ``name`` of the ``<include>`` at ``tag``, beside the file that names it; MitsimError as a
         resource."""
         path = self._find(tag, tag.path.parent, name)

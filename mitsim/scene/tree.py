@@ -65,9 +65,9 @@ def move_to_camera(outline: Outline, state: mi.parser.ParserState) -> tuple[tupl
     cameras = [node for node in nodes if node.props.plugin_name() == "mitsim_lensless"]
     away, reach = np.eye(4), _ALIGNED
     if cameras:
-        away[:3, 3] = -placed(cameras[0].props)[:3, 3]
+        away[:3, 3] = -placement_of(cameras[0].props)[:3, 3]
         reach = float(cameras[0].props.get("scene_distance", reach))
-    places = {index: away @ placed(nodes[index].props) for index in standing(nodes)}
+    places = {index: away @ placement_of(nodes[index].props) for index in standing(nodes)}
     for index, place in places.items():
         props, distance = nodes[index].props, float(np.linalg.norm(place[:3, 3]))
         if props.plugin_name() == "projector" and distance * _ROUNDING > _COARSEST * reach:
@@ -144,7 +144,7 @@ def _is(node: mi.parser.SceneNode, kind: str) -> bool:
     return plugin in PLUGINS[kind].split() and plugin != "shapegroup"
 
 
-def placed(props: mi.Properties, centred: bool = True) -> FloatArray:
+def placement_of(props: mi.Properties, centred: bool = True) -> FloatArray:
     """(4, 4) from an object to the world.
 
     Parameters
@@ -243,8 +243,10 @@ def with_thin_shapes_as_meshes(outline: Outline, state: mi.parser.ParserState) -
 
 def _thin_shapes(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Iterator[int]:
     """Numbers of the nodes of thin cylinders and small lamps; MitsimError for what cannot be held."""
-    eyes = [placed(node.props)[:3, 3] for node in nodes if node.props.plugin_name() == "projector"] + [np.zeros(3)]
-    places = [placed(nodes[index].props)[:3, 3] for index in standing(nodes)]
+    eyes = [placement_of(node.props)[:3, 3] for node in nodes if node.props.plugin_name() == "projector"] + [
+        np.zeros(3)
+    ]
+    places = [placement_of(nodes[index].props)[:3, 3] for index in standing(nodes)]
     for index, to_world in _occurrences(nodes):
         props, kind = nodes[index].props, nodes[index].props.plugin_name()
         if kind not in _FINEST:
@@ -284,7 +286,7 @@ def _occurrences(nodes: Sequence[mi.parser.SceneNode]) -> Iterator[tuple[int, Fl
         yield index, np.eye(4)
         if nodes[index].props.plugin_name() == "instance":
             for group in references(nodes[index].props):
-                yield from ((own, placed(nodes[index].props)) for own in standing(nodes, group))
+                yield from ((own, placement_of(nodes[index].props)) for own in standing(nodes, group))
 
 
 def _replace(nodes: Sequence[mi.parser.SceneNode], index: int, path: Path) -> None:
@@ -302,8 +304,8 @@ def _replace(nodes: Sequence[mi.parser.SceneNode], index: int, path: Path) -> No
 
 def _extent(props: mi.Properties, to_world: FloatArray) -> tuple[list[FloatArray], float]:
     """Ends or centre in the world, and the largest radius there."""
-    local = to_world @ placed(props, centred=False)
-    ends = [(to_world @ placed(props))[:3, 3]]
+    local = to_world @ placement_of(props, centred=False)
+    ends = [(to_world @ placement_of(props))[:3, 3]]
     if props.plugin_name() == "cylinder":
         ends.append(local[:3, :3] @ _point(props, "p1", (0, 0, 1)) + local[:3, 3])
     stretch = float(np.linalg.svd(local[:3, :3], compute_uv=False)[0])
@@ -330,7 +332,7 @@ def prism(props: mi.Properties) -> Mesh:
     x, y = _axes_across((last - first) / np.linalg.norm(last - first))
     normal = np.cos(2 * np.pi * u)[..., None] * x + np.sin(2 * np.pi * u)[..., None] * y
     grown = radius * (np.pi / _SIDES) / np.sin(np.pi / _SIDES)  # a perimeter of 2 pi r
-    mirrored = bool(np.linalg.det(placed(props)[:3, :3]) < 0)
+    mirrored = bool(np.linalg.det(placement_of(props)[:3, :3]) < 0)
     return _in_world(props, first + v[..., None] * (last - first) + grown * normal, normal, (u, v), mirrored)
 
 
@@ -351,7 +353,7 @@ def _in_world(
 ) -> Mesh:
     """The mesh of a grid (k, l, 3) of points and normals in the frame of ``props``; ``turned``: its triangles the other
     way round."""
-    matrix = placed(props, centred=False)
+    matrix = placement_of(props, centred=False)
     triangles = _triangles(*uv[0].shape)
     points = points.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
     normals = normals.reshape(-1, 3) @ np.linalg.inv(matrix[:3, :3])

@@ -106,7 +106,7 @@ def expose(
         streams of their own, so that switching one noise off leaves the other's draw as it was. Row noise is drawn
         from a child of the latter.
     """
-    light, dark = gathered(expected_electrons, exposure_s, model)
+    light, dark = mean_electrons(expected_electrons, exposure_s, model)
     shape = np.shape(light)
     offset = reading_offset(shape, model, read_rng)
     light = light.reshape(-1)
@@ -161,7 +161,7 @@ def add_dark_current(expected_electrons: npt.ArrayLike, exposure_s: float, model
     return expected + model.superpixel_dark_current_e_per_s * exposure_s
 
 
-def gathered(
+def mean_electrons(
     expected_electrons: npt.ArrayLike, exposure_s: float, model: SensorModel
 ) -> tuple[FloatArray, FloatArray | float]:
     """Light after crosstalk and each pixel's response, and dark electrons: their sum is what is drawn. Deterministic.
@@ -199,7 +199,7 @@ def most_gathered(expected_electrons: FloatArray, exposure_s: float, model: Sens
         as :func:`gathered` has them.
     """
     if model.has_fixed_pattern or model.crosstalk:
-        light, dark = gathered(expected_electrons, exposure_s, model)
+        light, dark = mean_electrons(expected_electrons, exposure_s, model)
         return float((light + dark).max())
     return float(add_dark_current(expected_electrons.max(), exposure_s, model))
 
@@ -421,18 +421,18 @@ def _run(
     dr, types = compiled_arrays()
     quarter = -(-len(result) // LANE)
 
-    def shared(value: float | None) -> Any:
+    def share(value: float | None) -> Any:
         return None if value is None else dr.opaque(types.Float64, value, 1)
 
     def quarters(values: FloatArray | float | None) -> Sequence[Any]:
         if not isinstance(values, np.ndarray):
-            return [shared(values)] * LANE
+            return [share(values)] * LANE
         if len(values) < LANE * quarter:
             values = np.pad(values, (0, LANE * quarter - len(values)), mode="edge")
         return [types.Float64(part) for part in values.reshape(LANE, quarter)]
 
     every = SimpleNamespace(**{
-        name: tuple(map(shared, value)) if isinstance(value, tuple) else shared(value)
+        name: tuple(map(share, value)) if isinstance(value, tuple) else share(value)
         for name, value in numbers.items()
     })  # fmt: skip
     lane = dr.opaque(types.UInt32, first, 1) + dr.arange(types.UInt32, quarter)

@@ -19,7 +19,7 @@ from mitsim.sensor.chain import (
     bend,
     checked_light,
     clip_at_full_well,
-    gathered,
+    mean_electrons,
     most_gathered,
     poisson_quantile,
     reading_offset,
@@ -124,7 +124,7 @@ def frame_moments(
     Where an end of the ADC is within eight deviations, or too little noise dithers its codes, the moments are those of
     rounded and cut numbers: summed over the counts below 1e4 electrons, and averaged over 129 of them above.
     """
-    light, dark = gathered(expected_electrons, exposure_s, model)
+    light, dark = mean_electrons(expected_electrons, exposure_s, model)
     expected = np.asarray(light + dark)
     offset = reading_offset(expected.shape, model, None)
     if offset is not None or model.linearity:

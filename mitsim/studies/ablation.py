@@ -222,12 +222,12 @@ class _AblationSimulation(Simulation):
         if isinstance(found, DeviceSums) or not (name == "direct" or PASSES[name].anchors):
             return super().accumulate(name, found, labels, samples)
         if name != "direct":
-            return super().accumulate(name, self._place.moved(found, self._off), labels, samples)
+            return super().accumulate(name, self._place.move(found, self._off), labels, samples)
         if _WHOLE in self._off:
             seen = self._place.whole(found, _POINTS * self.settings.subdivision, KEYSTONE in self._off)
         else:
             even = _even(found, self.bench.n**2) if DETAIL in self._off else found
-            seen = self._place.moved(even, self._off)
+            seen = self._place.move(even, self._off)
         return replace(super().accumulate(name, seen, labels, samples), flux=self.flux(found, samples))
 
 
@@ -245,7 +245,7 @@ class _Place:
             str(loaded.path), loaded.projector, loaded.camera, grid, bench.geometry.scene_distance
         )
 
-    def moved(self, path_samples: PathSamples, off: frozenset[str]) -> PathSamples:
+    def move(self, path_samples: PathSamples, off: frozenset[str]) -> PathSamples:
         """``path_samples`` without depth and keystone, where these are ``off``."""
         if not off & {DEPTH, KEYSTONE}:
             return path_samples
@@ -357,7 +357,7 @@ def _even_lobes(sharp: sparse.csr_array, simulation: Simulation) -> sparse.csr_a
     one = (layer * rows + row) * columns + column
     entries = weights[first] * weights[second], (np.arange(bundle.size), one)
     mean = sparse.csr_array(entries, shape=(bundle.size, bundle.size // bundle.anchors**2))
-    return bundle.repeated(sparse.csr_array(sharp @ mean))
+    return bundle.repeat(sparse.csr_array(sharp @ mean))
 
 
 def _scale(light: LightEstimate, by: FloatArray) -> LightEstimate:

@@ -13,7 +13,7 @@ from operator import add
 import numpy as np
 
 from mitsim.acquire.exposure import NoiseTarget
-from mitsim.acquire.reference import projected, render
+from mitsim.acquire.reference import render, show_pattern
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.effects import EFFECTS, Physics, names, present
 from mitsim.bench.request import Exposure
@@ -39,7 +39,7 @@ from mitsim.light.simulation import Simulation
 from mitsim.metrics import relative_error
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.planner import pilot
-from mitsim.planner.choose import counted, predicted
+from mitsim.planner.choose import counts_of, predicted_candidate
 from mitsim.planner.explain import SceneFacts, explain_plan
 from mitsim.studies.ablation import MOST, OfOrders, ablations, reform
 from mitsim.studies.accuracy_findings import Budget, JudgeFacts, PartCost, Row, Spread, Timed
@@ -175,7 +175,7 @@ def _fill(now: Settings, finer: Settings) -> Settings:
 def _choose_samples(stand: Stand, settings: Settings) -> tuple[float, float, Settings]:
     """The finest accuracy whose samples take at most _LONGEST_S at fixed paces, these seconds, and the settings."""
     for accuracy in _ACCURACIES:
-        choice = predicted(accuracy, stand.pilot_result, settings, {})
+        choice = predicted_candidate(accuracy, stand.pilot_result, settings, {})
         if choice.work <= _LONGEST_S:
             break
     return accuracy, choice.work, choice.settings
@@ -249,7 +249,7 @@ class Judge:
         stand, shots = self.stand, self.stand.family.shots
         index, bench = len(shots) // 2, stand.bench
         lighting = stand.family.lighting.shots([index])
-        with projected(bench, stand.family.light(shots[index])):
+        with show_pattern(bench, stand.family.light(shots[index])):
             started = time.perf_counter()
             render(bench, "reference", _SAMPLES[0], 1e-3, stand.seed)  # compiles the kernels
             predicted_s = time.perf_counter() - started
@@ -288,7 +288,7 @@ def _within(stand: Stand, plan: Plan, seconds: float) -> tuple[Plan, float]:
     accuracy = plan.accuracy / _FINEST_OVER
     while True:
         # What its numbers leave is stated; sampling alone is given the time.
-        choice = predicted(accuracy, stand.pilot_result, plan.settings, {})
+        choice = predicted_candidate(accuracy, stand.pilot_result, plan.settings, {})
         if choice.work <= seconds or accuracy > plan.accuracy:
             return replace(plan, settings=choice.settings, sampling_target=choice.target), choice.work
         accuracy *= _STEP
@@ -470,7 +470,7 @@ class Stand:
         pilot_result, now = self.pilot_result, plan.settings
         anchors, layers, cells, followed, occluded, _ = (
             next((finer for finer in pilot_result.ladders[name] if finer > count), count)
-            for name, count in zip(COUNTED, counted(now), strict=True)
+            for name, count in zip(COUNTED, counts_of(now), strict=True)
         )
         settings = replace(
             now,
@@ -489,7 +489,7 @@ class Stand:
     def discretisation(self, settings: Settings) -> float:
         """Relative error that the numbers in ``settings`` are predicted to leave."""
         return self.pilot_result.error(
-            *(Approximation(*both) for both in zip(COUNTED, counted(settings), strict=True))
+            *(Approximation(*both) for both in zip(COUNTED, counts_of(settings), strict=True))
         ).value
 
     def trace(

@@ -136,7 +136,7 @@ class Runs:
         self._stand, self._judge, self._opening = stand, judge, opening
         # Speckle is drawn anew in every frame and is no error of the light.
         off = {"speckle": False} if "speckle" in present(stand.bench) else {}
-        self._request = request.changed(effects={**request.effects, **off})
+        self._request = request.with_values(effects={**request.effects, **off})
         self._runs: list[_Run] = []
 
     def measure(
@@ -196,7 +196,7 @@ class Runs:
         for accuracy in sorted(accuracies, reverse=True):
             plan = self._stand.plan(accuracy)
             # With the samples that are taken: parts of one are as good as a whole one.
-            taken = {row.name: float(row.whole(row.predicted(plan.settings))) for row in PASSES.values()}
+            taken = {row.name: float(row.whole(row.predicted_samples(plan.settings))) for row in PASSES.values()}
             settings = replace(plan.settings, samples=taken)
             groups.setdefault(settings, []).append(accuracy)
             lit[settings] = plan.predicted_seconds
@@ -208,7 +208,7 @@ class Runs:
 
     def _begin(self, accuracies: tuple[float, ...]) -> _Run:
         """A run at the tightest of its ``accuracies`` that was not made yet."""
-        request = self._request.changed(accuracy=min(accuracies))
+        request = self._request.with_values(accuracy=min(accuracies))
         light: list[float] = []
         found: list[tuple[float, float]] = []
 

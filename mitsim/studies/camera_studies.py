@@ -53,8 +53,8 @@ _COMPARABLE_DB = 1.0
 def _distance_points(scope: Scope) -> Sequence[Point]:
     return Point.grid(
         [
-            scope.setup.changed(mask_distance=distance).printed(name)
-            for distance in scope.chosen(DISTANCES_MM, _FEW_MM)
+            scope.setup.with_parameters(mask_distance=distance).with_print(name)
+            for distance in scope.choose(DISTANCES_MM, _FEW_MM)
             for name in scope.pictures
         ],
         "model patterns exposure seed",
@@ -111,11 +111,11 @@ _STABLE_DB = 3.0
 
 def _binning_points(scope: Scope) -> Sequence[Point]:
     return Point.grid(
-        map(scope.setup.printed, scope.pictures),
+        map(scope.setup.with_print, scope.pictures),
         "model patterns binning seed",
         seed=scope.seeds,
-        patterns=scope.chosen(_FAMILIES, _SHOWN),
-        binning=scope.chosen(BINNINGS, (_FINE, _COARSE)),
+        patterns=scope.choose(_FAMILIES, _SHOWN),
+        binning=scope.choose(BINNINGS, (_FINE, _COARSE)),
         model=MODELS,
     )
 
@@ -178,12 +178,12 @@ _SHOWS = 0.4
 
 
 def _resolution_points(scope: Scope) -> Sequence[Point]:
-    pairs = scope.chosen(PAIRS_A_MM, (0.13, 0.26, 0.52))
+    pairs = scope.choose(PAIRS_A_MM, (0.13, 0.26, 0.52))
     return Point.grid(
-        map(scope.setup.printed, [f"bars {each:g}" for each in pairs] + ["edge"]),
+        map(scope.setup.with_print, [f"bars {each:g}" for each in pairs] + ["edge"]),
         "model patterns exposure seed",
         seed=scope.repeats,
-        patterns=scope.chosen(RESOLVING, ("uniform", "dots:7")),
+        patterns=scope.choose(RESOLVING, ("uniform", "dots:7")),
         model=MODELS,
         exposure=(EQUAL_FRAME,),
     )
@@ -191,7 +191,7 @@ def _resolution_points(scope: Scope) -> Sequence[Point]:
 
 def _resolution_measure(studio: Studio, point: Point) -> Found:
     image = studio.image(point.setup, point["model"], point["patterns"], int(point["seed"]), EQUAL_FRAME)
-    lit = studio.lit(point.setup)
+    lit = studio.lit_scene(point.setup)
     kind, _, frequency = str(point.setup.picture).partition(" ")
     pixel_mm, row = _pixel_mm(lit), point.row(**image.row())
     if kind == "edge":

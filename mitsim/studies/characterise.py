@@ -215,9 +215,9 @@ def _characterise(
     sensor: SensorModel, procedure: Procedure, capacity: float, job: Job, output: str | None = None
 ) -> Characterisation:
     frames = Frames.of(sensor, procedure, capacity)
-    expected = frames.expected()
+    expected = frames.expect()
     spread = emva.figures(draw_sessions(frames, expected))
-    session = frames.measured(job)
+    session = frames.measure(job)
     found = emva.figures(session)
     # Without a quantum efficiency light is counted in electrons, and there is none to find.
     names = [name for name in UNITS if sensor.states_efficiency or name != "quantum_efficiency"]
@@ -457,7 +457,7 @@ class Frames:
     def _pair(self, electrons: float, exposure_s: float, name: str, index: int = 0) -> emva.Pair:
         return emva.pair_of(*(self._frame(electrons, exposure_s, name, index, side) for side in (0, 1)))
 
-    def measured(self, job: Job) -> Session:
+    def measure(self, job: Job) -> Session:
         """What the frames say, which are taken one after the other; ``job`` is told how far it is."""
         job.progress("light", 0.0)
         steps = in_threads(
@@ -486,7 +486,7 @@ class Frames:
         for index in range(self.procedure.frames):
             yield self._frame(electrons, self.exposure_s, name, index)
 
-    def expected(self) -> Session:
+    def expect(self) -> Session:
         """The same statistics as closed forms expect them of all specimens; nonuniformity as it was set."""
         ladder, dark = self._expected_pair(self.electrons), self._expected_pair(0.0)
         series = [self._expected_pair(0.0, time) for time in self.dark_times]

@@ -69,7 +69,7 @@ def ladder_points(scope: Scope, setup: Setup) -> list[Point]:
     lux = " ".join(f"{each:g}" for each in ladder)
     return [
         Point.of(setup, way=BY_LUX, patterns=patterns, seed=scope.seeds[0], ladder=lux, draws=draws)
-        for patterns in scope.chosen(_LADDER_FAMILIES, _LADDER_FAMILIES[:1])
+        for patterns in scope.choose(_LADDER_FAMILIES, _LADDER_FAMILIES[:1])
     ]
 
 
@@ -93,19 +93,19 @@ def measure_ladder(
     model, known = ColourModel.of_lines([line.wavelength_nm for line in lines]), chart()
     board = lines[0].factors.manifest.board_reflectance or 1.0
 
-    def judged(means: FloatArray) -> FloatArray:
+    def judge(means: FloatArray) -> FloatArray:
         return delta_e(model.xyz(means * board), known.xyz)
 
     lit = [lit_lines.DaylitLine.of(line, light, str(point["patterns"]), int(point["seed"])) for line in lines]
     draws = list(product(ladder, range(int(point["draws"]))))
     exposures = [(lux / lit_lines.FULL_LX, draw) for lux, draw in draws]
-    images = [each.images(exposures, [each.model, each.model.correlated()], each.shots) for each in lit]
+    images = [each.images(exposures, [each.model, each.model.with_correlation()], each.shots) for each in lit]
     truth = place.means(np.stack([line.lit.truth for line in lines], axis=-1))
     goal = float(delta_e(model.xyz(known.at(model.wavelengths_nm)), known.xyz).mean()) + GOAL
 
     def least(lux: float, repeats: float = 1.0) -> float:
         variances = [each.least_variance(lux / lit_lines.FULL_LX, place) / repeats for each in lit]
-        return lit_lines.expected_delta_e(truth, np.stack(variances, axis=-1), judged)
+        return lit_lines.expected_delta_e(truth, np.stack(variances, axis=-1), judge)
 
     def repeats(lux: float) -> float | None:
         part = lit_lines.most(lambda part: least(lux, 1 / part) <= goal, *_VARIANCES)
@@ -113,7 +113,7 @@ def measure_ladder(
 
     kept = lit_lines.most(lambda lux: least(lux) <= goal, *_BETWEEN_LX)
     rows = [
-        point.row(lux=lux, draw=draw, method=method, mean_delta_e=float(judged(place.means(image)).mean()))
+        point.row(lux=lux, draw=draw, method=method, mean_delta_e=float(judge(place.means(image)).mean()))
         for (lux, draw), by_line in zip(draws, zip(*images, strict=True), strict=True)
         for method, image in zip((TIKHONOV, MARKOV), np.moveaxis(np.array(by_line), 0, -1), strict=True)
     ]
@@ -239,9 +239,9 @@ def _points(scope: Scope) -> Sequence[Point]:
     setup = scope.setup if scope.pictures == (None,) else replace(scope.setup, scene="colour_checker")
     seen = {
         OWN: FAMILIES,
-        ONE: scope.chosen(FAMILIES, (_SHOWN,)),
-        **{way: scope.chosen(FAMILIES, (_SHOWN,)) for way in DAYLIGHT},
-        **{f"mosaic, {way}": scope.chosen((_SHOWN, "hadamard:8"), (_SHOWN,)) for way in lit_lines.available_ways()},
+        ONE: scope.choose(FAMILIES, (_SHOWN,)),
+        **{way: scope.choose(FAMILIES, (_SHOWN,)) for way in DAYLIGHT},
+        **{f"mosaic, {way}": scope.choose((_SHOWN, "hadamard:8"), (_SHOWN,)) for way in lit_lines.available_ways()},
     }
     points = [
         Point.of(setup, way=way, patterns=patterns, seed=seed)
@@ -292,7 +292,7 @@ def _judge(point: Point, wavelengths: Sequence[float], images: FloatArray, truth
     """Rows of all patches of the chart in ``images`` (n, n, lines), and its colours."""
     place, known, fixed = _place(point.setup.scene), chart(), ColourModel.of_lines(wavelengths)
     means = place.means(images)
-    seen, fitted = fixed.xyz(means), ColourModel.fitted(wavelengths, means, "").xyz(means)
+    seen, fitted = fixed.xyz(means), ColourModel.fit(wavelengths, means, "").xyz(means)
     columns: dict[str, Any] = {
         "floor": delta_e(fixed.xyz(known.at(wavelengths)), known.xyz),
         "delta_e": delta_e(seen, known.xyz),

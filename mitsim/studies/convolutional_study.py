@@ -84,13 +84,13 @@ def _points(scope: Scope) -> Sequence[Point]:
     for number, name in enumerate(scope.pictures):
         for psf, file in [(MEASURED, measured)] * (measured is not None) + [(TRACED, None)]:
             for seed in scope.seeds:
-                for k in scope.chosen(PERIODS, (1, 7)):
+                for k in scope.choose(PERIODS, (1, 7)):
                     case: dict[str, Value] = {"psf": psf, "file": file, "patterns": k * k, "seed": seed}
-                    found.append(Point.of(setup.printed(name), **case, part="quality"))
+                    found.append(Point.of(setup.with_print(name), **case, part="quality"))
                     sensors = (WHOLE, CROPPED) if number == 0 and seed == scope.seeds[0] else ()
                     found += [
-                        Point.of(setup.printed(name), **case, part="speed", sensor=sensor)
-                        for sensor in scope.chosen(sensors, sensors[:1])
+                        Point.of(setup.with_print(name), **case, part="speed", sensor=sensor)
+                        for sensor in scope.choose(sensors, sensors[:1])
                     ]
     return found
 
@@ -104,7 +104,7 @@ def _truth(studio: Studio, point: Point) -> FloatArray:
     """(n, n) reflectance: of a test image, or what a scene of one's own shows."""
     name = point.setup.picture
     if name is None:
-        return studio.lit(point.setup).truth
+        return studio.lit_scene(point.setup).truth
     block = SIDE // _N
     return np.asarray(picture(name).reshape(_N, block, _N, block).mean(axis=(1, 3)) / 255)
 
@@ -383,7 +383,7 @@ def best_image(classes: Classes, shots: DiffuserShots, truth: FloatArray) -> tup
     truth
         (n, n) image.
     """
-    projected = classes.projected(shots.frames)
+    projected = classes.project(shots.frames)
     return best_by_psnr(lambda lam: classes.factorise(lam).solve(projected), truth, classes.largest)
 
 
@@ -464,7 +464,7 @@ def race(classes: Classes, whole: Classes, truth: FloatArray, sensor: SensorMode
 
 def _time(factorised: FactorisedClasses, frames: FloatArray, tolerance: float) -> tuple[Solution, float]:
     start = time.process_time()
-    solution = factorised.solve(factorised.classes.projected(frames), tolerance)
+    solution = factorised.solve(factorised.classes.project(frames), tolerance)
     return solution, time.process_time() - start
 
 

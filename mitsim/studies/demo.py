@@ -306,13 +306,13 @@ class Comparison:
         """
         lit, seed = self._lit, self.light.seed
         family = lit.bench.family(name, seed)
-        frames, ideal = lit.rendered(self.factors, family, seed), lit.idealised(family, seed)
+        frames, ideal = lit.rendered_frames(self.factors, family, seed), lit.idealised_frames(family, seed)
         times = {convention: frames.seconds(convention) for convention in CONVENTIONS}
         rendered = {times[EQUAL_PEAK]: self._recover(shots or expose(self.light, name))}
         for time in times.values():
             if time not in rendered:
                 rendered[time] = self._recovery(frames, time)
-        singular = np.sort(frames.prepared().left.singular ** 2)[::-1]
+        singular = np.sort(frames.prepare().left.singular ** 2)[::-1]
         examples = family.shots[0], family.shots[int(len(family.shots) * _SECOND_SHOWN)]
         return FamilyResult(
             name=name,
@@ -327,9 +327,9 @@ class Comparison:
 
     def white(self) -> Digital:
         """The noisy frame of uniform light at equal peak [DN]."""
-        frames = self._lit.rendered(self.factors, self.light.bench.family("uniform"), self.light.seed)
+        frames = self._lit.rendered_frames(self.factors, self.light.bench.family("uniform"), self.light.seed)
         (shot,), (frame,), exposer = frames.family.shots, frames.expected, frames.exposer(frames.seconds(EQUAL_PEAK))
-        return exposer.digital(exposer.lit(frame, *shot.names), *shot.names)
+        return exposer.digital(exposer.shot_electrons(frame, *shot.names), *shot.names)
 
     @cached_property
     def _lit(self) -> LitScene:

@@ -45,11 +45,11 @@ _ROBUST_DB = 3.0
 
 
 def _points(scope: Scope) -> Sequence[Point]:
-    setups = [scope.setup.printed(name) for name in scope.chosen(scope.pictures, scope.pictures[:1])]
-    seed, depths = scope.seeds[0], scope.chosen(DEPTHS_MM, (380.0, 400.0))
-    families = scope.chosen(FAMILIES, ("dots:7",))
-    planes = [("columns", baseline) for baseline in scope.chosen(BASELINES_MM, (0.0, 60.0))]
-    planes += [(along, 60.0) for along in scope.chosen(("rows", "both"), ())]
+    setups = [scope.setup.with_print(name) for name in scope.choose(scope.pictures, scope.pictures[:1])]
+    seed, depths = scope.seeds[0], scope.choose(DEPTHS_MM, (380.0, 400.0))
+    families = scope.choose(FAMILIES, ("dots:7",))
+    planes = [("columns", baseline) for baseline in scope.choose(BASELINES_MM, (0.0, 60.0))]
+    planes += [(along, 60.0) for along in scope.choose(("rows", "both"), ())]
     ideal = [
         Point.of(setup, model=IDEALISED, patterns=family, seed=seed, depth=depth, baseline=baseline, along=along)
         for setup in setups
@@ -59,7 +59,7 @@ def _points(scope: Scope) -> Sequence[Point]:
     ]
     moved = [
         Point.of(
-            setup.changed(sheet_z=depth, **({"scene_distance": depth} if focus == OWN else {})),
+            setup.with_parameters(sheet_z=depth, **({"scene_distance": depth} if focus == OWN else {})),
             model=RENDERED, patterns="dots:7", seed=seed, depth=depth, focus=focus,
         )
         for setup in setups
@@ -69,7 +69,7 @@ def _points(scope: Scope) -> Sequence[Point]:
     ]  # fmt: skip
     deep = [
         Point.of(replace(scope.setup, scene=scene), model=RENDERED, patterns=family, seed=each, focus=focus)
-        for scene, both in scope.chosen(tuple(DEEP.items()), tuple(DEEP.items())[:1])
+        for scene, both in scope.choose(tuple(DEEP.items()), tuple(DEEP.items())[:1])
         for each in scope.repeats
         for family in both
         for focus in (NONE, MAP)
@@ -82,9 +82,9 @@ def _measure(studio: Studio, point: Point) -> Found:
     setup, values = point.setup, dict(point.values)
     patterns, seed = str(values["patterns"]), int(point["seed"])
     if point["model"] == IDEALISED:
-        lit = studio.lit(setup)
+        lit = studio.lit_scene(setup)
         baseline = tuple(float(point["baseline"]) * part for part in ALONG[point["along"]])
-        frames = lit.idealised(
+        frames = lit.idealised_frames(
             lit.bench.family(patterns, seed), seed, Plane(point["depth"], (baseline[0], baseline[1]))
         )
         image = Image.of(frames, frames.seconds(EQUAL_PEAK))
@@ -100,7 +100,7 @@ def _claims(results: Results) -> Sequence[Claim]:
     near = min(abs(depth - CALIBRATED_MM) for depth in table.distinct("depth") if depth != CALIBRATED_MM)
     small = max(near, _SMALL_MM)
 
-    def lost(rows: Table) -> Mean:
+    def worse_loss(rows: Table) -> Mean:
         """At the worse of both depths."""
         there = rows.where(depth=CALIBRATED_MM)
         beside = [depth for depth in rows.distinct("depth") if abs(depth - CALIBRATED_MM) == small]
@@ -108,8 +108,8 @@ def _claims(results: Results) -> Sequence[Claim]:
         return max(losses, key=lambda loss: loss.value)
 
     ideal = table.where(model=IDEALISED, patterns="dots:7", along="columns")
-    losses = {baseline: lost(ideal.where(baseline=baseline)) for baseline in ideal.distinct("baseline")}
-    rendered = lost(table.where(model=RENDERED, patterns="dots:7", focus=NONE))
+    losses = {baseline: worse_loss(ideal.where(baseline=baseline)) for baseline in ideal.distinct("baseline")}
+    rendered = worse_loss(table.where(model=RENDERED, patterns="dots:7", focus=NONE))
     holds = {baseline: claims.within(loss, high=_ROBUST_DB) for baseline, loss in losses.items()}
     robust = [baseline for baseline, each in holds.items() if each]
     by_baseline = ", ".join(f"{loss} dB at {baseline:g} mm" for baseline, loss in losses.items())

@@ -166,7 +166,7 @@ def measure(bench: Bench, request: Request, job: Job) -> DiffractionFindings:
         the scene, patterns, seed and accuracy (diffraction is on, whatever it is worth), progress and limits.
     """
     Exposure().check(bench.sensor, bench.devices.camera_file)
-    request = request.changed(effects={**request.effects, "diffraction": True})
+    request = request.with_values(effects={**request.effects, "diffraction": True})
     families = [bench.family(name, request.seed) for name in dict.fromkeys((request.patterns, "uniform"))]
     light = bench.light(job=job, **request.model_dump())
     trials = _Trials(families, light.truth, float(light.apparent.board_flux.mean()), request.seed)
@@ -175,9 +175,9 @@ def measure(bench: Bench, request: Request, job: Job) -> DiffractionFindings:
         job.progress("idealised frames", done / len(MASKS))
         cameras = {name: IdealCamera(bench, mask, spectrum) for name, spectrum in lights(bench).items()}
         shadows += [shadow_row(name, cameras) for name in cameras]
-        quality += list(trials.idealised(cameras))
+        quality += list(trials.idealised_rows(cameras))
     job.progress("rendered session", 0.0)
-    quality += list(trials.rendered(light, request.accuracy, job))
+    quality += list(trials.rendered_rows(light, request.accuracy, job))
     return DiffractionFindings(bench, request.patterns, tuple(shadows), tuple(quality))
 
 
@@ -190,7 +190,7 @@ class _Trials:
     flux: float
     seed: int
 
-    def idealised(self, cameras: Mapping[str, IdealCamera]) -> Iterator[QualityRow]:
+    def idealised_rows(self, cameras: Mapping[str, IdealCamera]) -> Iterator[QualityRow]:
         """Frames of an evenly lit plane in every light, solved with geometric factors and with the true shadow's."""
         for name, camera in cameras.items():
             known = {ASSUMED: cameras[GEOMETRIC].calibrated(self.flux)}
@@ -201,7 +201,7 @@ class _Trials:
                 exposer = Exposer(camera.bench.devices, peak_time(camera.bench, expected), self.seed)
                 yield from self._rows(("idealised", camera.mask, name), exposer, family, expected, known)
 
-    def rendered(self, light: SampledLight, accuracy: float, job: Job) -> Iterator[QualityRow]:
+    def rendered_rows(self, light: SampledLight, accuracy: float, job: Job) -> Iterator[QualityRow]:
         """Rendered frames of the scene, solved with geometric factors and with those of a rendered noisy session.
 
         Without diffraction the same light of scene and board goes through the geometric shadow.
@@ -212,7 +212,7 @@ class _Trials:
         board = session.trace(session.plan(accuracy, job), job)
         assumed = IdealCamera(bench, mask).calibrated(self.flux)
         for name, absent in ((PROJECTOR, frozenset[str]()), (GEOMETRIC, frozenset({"diffraction"}))):
-            scene = reform(light, absent).merged()
+            scene = reform(light, absent).merge()
             fitted, _ = estimate(LitSession.of(session, reform(board, absent), job), job)
             known = {ASSUMED: assumed, CALIBRATED: (fitted.left, fitted.right)}
             for family in self.families:

@@ -35,7 +35,7 @@ from mitsim.acquire.exposure import (
 from mitsim.bench.apparatus import Apparatus
 from mitsim.calibrate.board_session import Session
 from mitsim.core.arrays import FloatArray
-from mitsim.core.configuration import DEFAULT_CAMERA, locate, shipped
+from mitsim.core.configuration import DEFAULT_CAMERA, locate, shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import PatternFamily, read_name, stripe_signs
 from mitsim.devices.projector import Spectrum
@@ -181,7 +181,7 @@ class DriftStand:
         lit
             the scene in light of the projector that moved; None: its light as it was.
         """
-        after, auto = self.measured(drift, session, lit)
+        after, auto = self.psnrs(drift, session, lit)
         return Outcome(**vars(self.predict(drift)), after_db=after, auto_db=auto)
 
     def predict(self, drift: Drift) -> Prediction:
@@ -195,9 +195,7 @@ class DriftStand:
         """PSNR [dB] without a drift."""
         return psnr(self._before.image, self.lit.truth)
 
-    def measured(
-        self, drift: Drift, session: Factors | None = None, lit: LitScene | None = None
-    ) -> tuple[float, float]:
+    def psnrs(self, drift: Drift, session: Factors | None = None, lit: LitScene | None = None) -> tuple[float, float]:
         """PSNR [dB] after a drift, with the lambda from before it and with the solver's own.
 
         Parameters
@@ -207,7 +205,7 @@ class DriftStand:
         """
         scene, model = lit or self.lit, self._model
         if session is not None:
-            model = scene.rendered(session, self.family, self.seed).prepared()
+            model = scene.rendered_frames(session, self.family, self.seed).prepare()
         solutions = self._solve(drift, scene, model)
         same, own = (psnr(solution.image, scene.truth) for solution in solutions)
         return same, own
@@ -215,7 +213,7 @@ class DriftStand:
     def _solve(self, drift: Drift, scene: LitScene, model: Prepared) -> tuple[Solution, Solution]:
         bench = scene.bench
         moved = any(drift.mask_mm) or drift.motion is not None or drift.tilt_mrad is not None
-        expected = scene.expected(RENDERED, self.family, bench=drift_mask(bench, drift) if moved else None)
+        expected = scene.expected_frames(RENDERED, self.family, bench=drift_mask(bench, drift) if moved else None)
         base = self._frames.exposer(self.exposure_s)
         ambient = expected.projector_off.irradiance if expected.has_ambient else 0.0
         exposer = DriftedExposer(bench.devices, base.exposure_s, base.seed, base.speckle, drift, self.family, ambient)
@@ -224,7 +222,7 @@ class DriftStand:
 
     @cached_property
     def _frames(self) -> Unexposed:
-        return self.lit.rendered(self.factors, self.family, self.seed)
+        return self.lit.rendered_frames(self.factors, self.family, self.seed)
 
     @cached_property
     def exposure_s(self) -> float:
@@ -233,7 +231,7 @@ class DriftStand:
 
     @cached_property
     def _model(self) -> Prepared:
-        return self._frames.prepared()
+        return self._frames.prepare()
 
     @cached_property
     def _before(self) -> Solution:
@@ -282,14 +280,14 @@ class DriftStand:
             image = replace(image, left=self.factors.left @ left, right=self.factors.right @ right)
             others = [(self.factors.left, self.factors.right), (-image.left, image.right)]
             changed = replace(changed, terms=[*changed.terms, *others])
-        return image.expected(self.lit.truth, changed, self._noise)
+        return image.expected_image(self.lit.truth, changed, self._noise)
 
     @cached_property
     def fixed(self) -> Mapping[str, FloatArray]:
         """(n, n) what each difference of the sensor's pixels adds to the image."""
-        still = self.linear.expected(self.lit.truth).image
+        still = self.linear.expected_image(self.lit.truth).image
         alone = {NONUNIFORMITY: Changed(response=self._response), OFFSETS: Changed(added=self._fixed_frame)}
-        return {name: self.linear.expected(self.lit.truth, each).image - still for name, each in alone.items()}
+        return {name: self.linear.expected_image(self.lit.truth, each).image - still for name, each in alone.items()}
 
     def clear(self, factors: Factors, light: SampledLight) -> FloatArray:
         """(n, n) image of frames without noise, with the lambda of the image without a drift.
@@ -301,7 +299,7 @@ class DriftStand:
         light
             of the scene.
         """
-        return LitScene(light).rendered(factors, self.family, self.seed).clear(self.linear.lam)
+        return LitScene(light).rendered_frames(factors, self.family, self.seed).clear(self.linear.lam)
 
     @cached_property
     def linear(self) -> LinearImage:
@@ -496,7 +494,7 @@ def _points(scope: Scope) -> Sequence[Point]:
             _setup(scope, kind), recipe=scope.recipe, patterns=scope.patterns, kind=kind, unit=DRIFT_UNITS[kind],
             amount=amount, seed=seed,
         )
-        for seed in scope.chosen(range(first, first + _SEEDS), scope.seeds)
+        for seed in scope.choose(range(first, first + _SEEDS), scope.seeds)
         for kind, each in amounts.items()
         for amount in each
     ]  # fmt: skip
@@ -516,20 +514,20 @@ def _setup(scope: Scope, kind: str) -> Setup:
     """The scope's own scene, or a sheet with one print; before a lamp where a lamp is to drift."""
     if scope.pictures == (None,):
         return scope.setup
-    setup = scope.setup.printed(TEST_IMAGES[0])
-    return replace(setup, scene=_LAMP_SCENE).changed(lamp=_LAMP) if kind in _LAMPS else setup
+    setup = scope.setup.with_print(TEST_IMAGES[0])
+    return replace(setup, scene=_LAMP_SCENE).with_parameters(lamp=_LAMP) if kind in _LAMPS else setup
 
 
 def recipe_of(path: str | None) -> SessionRecipe:
     """The recipe at ``path``, or the shipped one with a drift; MitsimError as :func:`load_recipe`."""
-    return load_recipe(shipped("calibration", "drift.toml") if path is None else Path(path))
+    return load_recipe(shipped_path("calibration", "drift.toml") if path is None else Path(path))
 
 
 def _measure(studio: Studio, point: Point) -> Found:
     setup, seed, kind = point.setup, int(point["seed"]), str(point["kind"])
     recipe = recipe_of(point["recipe"])
     drift = recipe.drift.alone(kind, float(point["amount"]))
-    lit = studio.lit(setup)
+    lit = studio.lit_scene(setup)
 
     def stand() -> DriftStand:
         family = lit.bench.family(point["patterns"], seed)
@@ -555,7 +553,7 @@ def _session(studio: Studio, point: Point, recipe: SessionRecipe, drift: Drift) 
     seed, own = int(point["seed"]), recipe.model_copy(update={"drift": drift})
     if own.model_copy(update={"source": ""}) == load_recipe().model_copy(update={"source": ""}):
         return studio.factors(point.setup, seed)
-    blank = point.setup.printed(None)
+    blank = point.setup.with_print(None)
     return studio.once(
         "drifting session", 2, (blank, seed, own), lambda: studio.bench(blank).calibrate(seed, recipe=own)
     )

@@ -214,7 +214,7 @@ def _of_scene(scatter: Scatter, seen: Mapping[str, FloatArray], sampled: Noise) 
         moved = scatter.common(sampled, last - image) / scene.size
         found[SCENE, ERROR_SOURCES[name]] = _Part(_square(last - scene) - _square(image - scene), moved)
         last = image
-    bias = _square(exact.expected(scene).image - scene)
+    bias = _square(exact.expected_image(scene).image - scene)
     rest = _square(last - scene) - bias - exact.variance(scene, sampled) / scene.size
     found[SCENE, REST] = _Part(rest, scatter.deviation(sampled, last - scene) / scene.size)
     found[SOLVER, LAMBDA] = _Part(bias)

@@ -47,11 +47,11 @@ _SPECTRUM = "spectrum"
 
 def _patterns_points(scope: Scope) -> Sequence[Point]:
     return [
-        Point.of(scope.setup.printed(name), model=model, patterns=family, exposure=exposure, seed=seed)
+        Point.of(scope.setup.with_print(name), model=model, patterns=family, exposure=exposure, seed=seed)
         for name in scope.pictures
         for seed in scope.seeds
-        for family in scope.chosen(FAMILIES, _FEW)
-        for exposure in (*scope.chosen(CONVENTIONS, CONVENTIONS[:2]), *((DIM,) if family in _STATED else ()))
+        for family in scope.choose(FAMILIES, _FEW)
+        for exposure in (*scope.choose(CONVENTIONS, CONVENTIONS[:2]), *((DIM,) if family in _STATED else ()))
         for model in MODELS
     ]
 
@@ -62,7 +62,7 @@ def _patterns_measure(studio: Studio, point: Point) -> Found:
     count = frames.family.left.shape[1] * frames.family.right.shape[1]
     arrays = dict(made.arrays)
     if point["patterns"] in _SHOWN and point["model"] == RENDERED:
-        arrays[_SPECTRUM] = frames.prepared().left.singular ** 2
+        arrays[_SPECTRUM] = frames.prepare().left.singular ** 2
     return replace(made, rows=tuple({**row, "patterns_count": count} for row in made.rows), arrays=arrays)
 
 
@@ -129,7 +129,7 @@ def _family(studio: Studio, point: Point) -> PatternFamily:
 
 
 def _exposure_points(scope: Scope) -> Sequence[Point]:
-    setups = map(scope.setup.printed, scope.pictures)
+    setups = map(scope.setup.with_print, scope.pictures)
     return Point.grid(setups, "model patterns seed", seed=scope.seeds, patterns=SHARED, model=MODELS)
 
 
@@ -148,7 +148,7 @@ def _law(frames: Unexposed, seconds: float) -> dict[str, float]:
     """Signal to error of a least-squares image without regularisation, measured and by the law."""
     truth = frames.lit.truth
     signal, error = (float(np.linalg.norm(each)) for each in (truth, frames.solve(seconds, 0.0).image - truth))
-    model = frames.prepared()
+    model = frames.prepare()
     rho = float(np.sqrt(np.square(1 / np.outer(model.left.singular, model.right.singular)).sum()))
     return {"ser": signal / error, "ser_law": signal / (frames.noise(seconds) * rho)}
 
@@ -197,9 +197,9 @@ def _ambient_points(scope: Scope) -> Sequence[Point]:
     own = scope.pictures == (None,)
     setup = scope.setup if own else replace(scope.setup, scene="lamp_bench")
     setups = [
-        setup.printed(name).changed(lamp=f"{radiance:g}")
-        for name in scope.chosen(scope.pictures, scope.pictures[:1])
-        for radiance in scope.chosen(RADIANCES, RADIANCES[::2])
+        setup.with_print(name).with_parameters(lamp=f"{radiance:g}")
+        for name in scope.choose(scope.pictures, scope.pictures[:1])
+        for radiance in scope.choose(RADIANCES, RADIANCES[::2])
     ]
     fixed = {"model": (RENDERED,), "exposure": (EQUAL_PEAK,)}
     return Point.grid(setups, "model patterns exposure seed", seed=scope.seeds, patterns=AMBIENT_FAMILIES, **fixed)

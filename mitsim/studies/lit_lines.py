@@ -159,7 +159,7 @@ def daylight_frame(setup: Setup, folder: Path) -> tuple[FloatArray, float]:
     bench = _open(setup, scene)
     bench = replace(bench, devices=replace(bench.devices, projector=bench.projector.at(mean)))
     light = bench.light("uniform", accuracy=setup.accuracy)
-    return light.merged().frames(bench.family("uniform").lighting, light.seed).projector_off.irradiance, mean
+    return light.merge().frames(bench.family("uniform").lighting, light.seed).projector_off.irradiance, mean
 
 
 def replace_spectra(scene: str, folder: Path, weigh: Weigh) -> Path:
@@ -306,7 +306,7 @@ def mosaic_shots(lines: Lines, patterns: str, seed: int) -> MosaicShots:
     devices, weights = first.bench.devices, filter_weights(lines)
     # Light, and what is noise of a shot, is of electrons: any time and wavelength between them.
     one_second = [Exposer(line.lit.bench.devices, 1.0, 0) for line in lines]
-    expected = [line.lit.expected("rendered", family) for line in lines]
+    expected = [line.lit.expected_frames("rendered", family) for line in lines]
     passed = behind(weights, devices.camera.frame_shape)
     rates = [
         np.einsum("lij,lij->ij", passed, [unit.electrons(frame) for unit, frame in zip(one_second, shot, strict=True)])
@@ -412,7 +412,7 @@ class DaylitLine:
     def rates(self) -> list[FloatArray]:
         """(m, m') electrons a second of every shot in the dark."""
         unit = Exposer(self.line.lit.bench.devices, 1.0, 0)
-        return [unit.electrons(frame) for frame in self.line.lit.expected(RENDERED, self.family)]
+        return [unit.electrons(frame) for frame in self.line.lit.expected_frames(RENDERED, self.family)]
 
     @cached_property
     def levels(self) -> tuple[FloatArray, float]:

@@ -45,18 +45,23 @@ _SUFFICES_DB = 0.5
 
 
 def _points(scope: Scope) -> Sequence[Point]:
-    seeds = scope.chosen((0, 1), scope.seeds[:1])
+    seeds = scope.choose((0, 1), scope.seeds[:1])
     return [
         Point.of(
-            scope.setup.printed(name), exposure_fraction=fraction, factors=factors, mode=mode, wanted=wanted, seed=seed
+            scope.setup.with_print(name),
+            exposure_fraction=fraction,
+            factors=factors,
+            mode=mode,
+            wanted=wanted,
+            seed=seed,
         )
-        for name in scope.chosen(scope.pictures[:2], scope.pictures[:1])
-        for fraction in scope.chosen(_EXPOSURES, _EXPOSURES[:1])
+        for name in scope.choose(scope.pictures[:2], scope.pictures[:1])
+        for fraction in scope.choose(_EXPOSURES, _EXPOSURES[:1])
         for factors in FACTORS
         for mode, wanted in (
             [(mode, 0) for mode in _MODES]
             if factors == MEASURED
-            else [("pair", frames) for frames in scope.chosen(_FRAMES, (2, 16))]
+            else [("pair", frames) for frames in scope.choose(_FRAMES, (2, 16))]
         )
         for seed in seeds
     ]
@@ -82,7 +87,7 @@ def _recipe(point: Point) -> SessionRecipe:
 def _measure(studio: Studio, point: Point) -> Found:
     bench, seed, recipe = studio.bench(point.setup), int(point["seed"]), _recipe(point)
     lit = studio.once(
-        "as built", 1, point.setup, lambda: LitScene(studio.lit(point.setup).light.behind(as_built(bench)))
+        "as built", 1, point.setup, lambda: LitScene(studio.lit_scene(point.setup).light.behind(as_built(bench)))
     )
     predicted = _session(studio, point.setup, recipe)
     reported: dict[str, Any] = {}
@@ -96,7 +101,7 @@ def _measure(studio: Studio, point: Point) -> Found:
         numbers = factors.manifest.result["parameters"]
         reported = {name: numbers[name]["value"] for name in ("mask_distance", "mask_shift_row", "mask_shift_column")}
         reported["unexplained"] = factors.manifest.result["unexplained_residual"]
-    exposed = lit.rendered(factors, lit.bench.family(PATTERNS), seed)
+    exposed = lit.rendered_frames(factors, lit.bench.family(PATTERNS), seed)
     image = Image.of(exposed, exposed.seconds(EQUAL_PEAK))
     return finding(point, None, **image.row(), frames=frames, **reported)
 
@@ -104,14 +109,14 @@ def _measure(studio: Studio, point: Point) -> Found:
 def _session(studio: Studio, setup: Setup, recipe: SessionRecipe) -> PredictedSession:
     """The session of the camera as built, by a recipe's way of signed patterns; its light and responses are kept."""
 
-    def formed() -> PredictedSession:
-        bench, job = studio.bench(setup.printed(None)), Job()
+    def form() -> PredictedSession:
+        bench, job = studio.bench(setup.with_print(None)), Job()
         planned = Session(bench, load_recipe(), 0)
         light = planned.trace(planned.plan(setup.accuracy, job), job)
         session = Session(as_built(bench), load_recipe(), 0)
         return PredictedSession.of(LitSession.of(session, light.behind(session.board), job), job)
 
-    kept: PredictedSession = studio.once("session as built", 1, setup.printed(None), formed)
+    kept: PredictedSession = studio.once("session as built", 1, setup.with_print(None), form)
     return PredictedSession(kept.by(recipe), kept.sums)
 
 

@@ -66,10 +66,10 @@ EXPOSURES = (EQUAL_PEAK, EQUAL_FRAME)
 
 
 def _points(scope: Scope) -> Sequence[Point]:
-    sides = scope.chosen((1, *GRIDS), (1, 7))
+    sides = scope.choose((1, *GRIDS), (1, 7))
     cases = [(UNIFORM, side) for side in sides] + [(name, side) for name in (SWEPT, DOTS) for side in sides[1:]]
     return [
-        Point.of(scope.setup.printed(name), model=model, patterns=method, frames=side**2, seed=seed)
+        Point.of(scope.setup.with_print(name), model=model, patterns=method, frames=side**2, seed=seed)
         for name in (scope.pictures[:1] if scope.quick else scope.pictures)
         for seed in scope.seeds
         for method, side in [*cases, (LINE, 7)]
@@ -78,7 +78,7 @@ def _points(scope: Scope) -> Sequence[Point]:
 
 
 def _measure(studio: Studio, point: Point) -> Found:
-    method, side, lit = point["patterns"], round(point["frames"] ** 0.5), studio.lit(point.setup)
+    method, side, lit = point["patterns"], round(point["frames"] ** 0.5), studio.lit_scene(point.setup)
     images = _moving(studio, point, lit) if method in (SWEPT, LINE) else _still(studio, point, lit)
     rows = tuple(point.row(exposure=exposure, **image.row()) for exposure, image in images.items())
     kept = point.setup.picture in (*QUICK_IMAGES, None) and side in (1, 7) and method != LINE
@@ -119,7 +119,7 @@ def _factors(studio: Studio, point: Point, lit: LitScene) -> Places:
     """Of a camera with its mask at seven places, the middle one on the axis."""
     places = _spread(7, lit.bench.geometry.mask_feature)
     if point["model"] == RENDERED:
-        blank, seed = point.setup.printed(None), int(point["seed"])  # whatever is printed
+        blank, seed = point.setup.with_print(None), int(point["seed"])  # whatever is printed
         return studio.once(
             "places", 1, (blank, places, seed), lambda: calibrated_places(studio.bench(blank), places, seed)
         )
@@ -305,7 +305,7 @@ class MovedMask:
     seed: int
     _formed: dict[tuple[float, float], ExpectedFrames] = field(default_factory=dict)
 
-    def expected(self, row_mm: float, column_mm: float) -> ExpectedFrames:
+    def expected_frames(self, row_mm: float, column_mm: float) -> ExpectedFrames:
         """The frame through the mask at one place, without noise.
 
         Parameters
@@ -316,7 +316,7 @@ class MovedMask:
         place = row_mm, column_mm
         if place not in self._formed:
             bench = move_mask(self.lit.bench, *place)
-            self._formed[place] = self.lit.expected(self.model, bench.family("uniform"), bench=bench)
+            self._formed[place] = self.lit.expected_frames(self.model, bench.family("uniform"), bench=bench)
         return self._formed[place]
 
     def seconds(self, rows_mm: Sequence[float], columns_mm: Sequence[float], exposure: str) -> float:
@@ -331,7 +331,7 @@ class MovedMask:
         """
         places = list(product(rows_mm, columns_mm))
         if exposure == EQUAL_PEAK:
-            brightest = max(peak_irradiance(self.expected(*place)) for place in places)
+            brightest = max(peak_irradiance(self.expected_frames(*place)) for place in places)
             return Exposure().choose(self.lit.bench.devices, brightest)
         return self.lit.uniform_s(self.model) / (len(places) if exposure == EQUAL_TOTAL else 1)
 
@@ -366,7 +366,7 @@ class MovedMask:
 
     def _measure_at(self, row_mm: float, column_mm: float, seconds: float) -> FloatArray:
         """Noisy electrons a second at one place, of ambient light what a user takes off."""
-        bench, expected = self.lit.bench, self.expected(row_mm, column_mm)
+        bench, expected = self.lit.bench, self.expected_frames(row_mm, column_mm)
         speckle = self.lit.light.simulation.physics.speckle if self.model == RENDERED else 0.0
         exposer = Exposer(bench.devices, seconds, integer(self.seed, "mask", f"{row_mm:g}", f"{column_mm:g}"), speckle)
         family = bench.family("uniform")

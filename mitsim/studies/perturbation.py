@@ -92,7 +92,7 @@ class Axis:
         """(m, r) sum of the slabs."""
         return np.asarray(self.slabs.sum(axis=0))
 
-    def seen(self, factor: FloatArray) -> FloatArray:
+    def terms_of(self, factor: FloatArray) -> FloatArray:
         """(K, r, n) terms of G of a ``factor``."""
         return np.asarray(np.einsum("kmr,mn,nk->krn", self.slabs, factor, self.patterns, optimize=True))
 
@@ -231,7 +231,7 @@ class LinearImage:
     lam: float
     centre: bool = False
 
-    def expected(self, scene: FloatArray, changed: Changed | None = None, noise: Noise | None = None) -> Expected:
+    def expected_image(self, scene: FloatArray, changed: Changed | None = None, noise: Noise | None = None) -> Expected:
         """The image of a scene.
 
         Parameters
@@ -246,7 +246,7 @@ class LinearImage:
         cameras = [(self.left, self.right), *changed.terms]  # U has no means where frames are to lose theirs
         weights = np.zeros_like(self.filter)
         gain, apart = (np.broadcast_to(each, self._count) for each in (changed.gain, changed.gain_apart))
-        seen = [(left.seen(first), right.seen(second)) for first, second in cameras]
+        seen = [(left.terms_of(first), right.terms_of(second)) for first, second in cameras]
         for row, column in np.ndindex(gain.shape):
             weights += gain[row, column] * _together(seen, row, column, scene)
         even = [(left.seen_evenly(first), right.seen_evenly(second)) for first, second in cameras]
@@ -290,7 +290,7 @@ class LinearImage:
         cameras = [(self.left, self.right), *changed.terms]
         lit = 1 + 2 * changed.leak
         for rms in changed.flicker:
-            varied = [(left.seen(_by_row(rms) * first), right.seen(second)) for first, second in cameras]
+            varied = [(left.terms_of(_by_row(rms) * first), right.terms_of(second)) for first, second in cameras]
             evenly = [(left.seen_evenly(_by_row(rms) * first), right.seen_evenly(second)) for first, second in cameras]
             for row, column in np.ndindex(self._count):
                 term = _together(varied, row, column, scene)

@@ -37,10 +37,10 @@ _VISIBLE_DB = 1.0
 
 def _points(scope: Scope) -> Sequence[Point]:
     return Point.grid(
-        map(scope.setup.printed, scope.chosen(scope.pictures, scope.pictures[:1])),
+        map(scope.setup.with_print, scope.choose(scope.pictures, scope.pictures[:1])),
         "model patterns exposure seed method",
         seed=scope.seeds,
-        patterns=scope.chosen(FAMILIES, _SHOWN),
+        patterns=scope.choose(FAMILIES, _SHOWN),
         model=MODELS,
         method=METHODS,
         exposure=(EQUAL_FRAME,),

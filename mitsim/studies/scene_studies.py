@@ -109,7 +109,8 @@ def split(frames: Unexposed, twin: LitScene, seconds: float) -> Split:
 
     own, matt = lit.truth, twin.truth
     even, direct = (
-        LitScene(each).expected(RENDERED, family) for each in (as_bright(twin.light, lit.light), direct_of(lit.light))
+        LitScene(each).expected_frames(RENDERED, family)
+        for each in (as_bright(twin.light, lit.light), direct_of(lit.light))
     )
     images = [image(even, light), image(direct, light), image(frames.expected, light), image(frames.expected, read)]
     parts = {
@@ -193,10 +194,11 @@ def _reflectivity_points(scope: Scope) -> Sequence[Point]:
     base = replace(scope.setup, accuracy=max(scope.setup.accuracy, _ACCURACY))
     if scope.pictures == (None,):
         return [Point.of(base, subject=base.scene, seed=seed) for seed in scope.repeats]
-    setups = {name: [replace(base, scene=name)] for name in scope.chosen(SHIPPED, (CARD, DISC))}
+    setups = {name: [replace(base, scene=name)] for name in scope.choose(SHIPPED, (CARD, DISC))}
     for name, shape in () if scope.quick else SHAPES.items():
         setups[name] = [
-            replace(base, scene="highlight").changed(roughness=each, **shape) for each in ROUGHNESSES[: _COUNTS[name]]
+            replace(base, scene="highlight").with_parameters(roughness=each, **shape)
+            for each in ROUGHNESSES[: _COUNTS[name]]
         ]
     return [
         Point.of(setup, subject=name, seed=seed)
@@ -209,13 +211,13 @@ def _reflectivity_points(scope: Scope) -> Sequence[Point]:
 def _reflectivity_measure(studio: Studio, point: Point) -> Found:
     seed = int(point["seed"])
     factors = _factors(studio, point.setup, seed)
-    twin = studio.lit(point.setup.changed(finish="matt"))
-    lit = studio.lit(point.setup)
+    twin = studio.lit_scene(point.setup.with_parameters(finish="matt"))
+    lit = studio.lit_scene(point.setup)
     rows, images = [], dict(zip(_TRUTHS, (twin.truth, lit.truth), strict=True))
     for name in GLOSS_FAMILIES:
         family = lit.bench.family(name, seed)
-        frames = lit.rendered(factors, family, seed)
-        times = frames.seconds(EQUAL_PEAK), peak_time(twin.bench, twin.expected(RENDERED, family))
+        frames = lit.rendered_frames(factors, family, seed)
+        times = frames.seconds(EQUAL_PEAK), peak_time(twin.bench, twin.expected_frames(RENDERED, family))
         for exposure, seconds in zip(EXPOSURES, times, strict=True):
             found = split(frames, twin, seconds)
             image = found.solution.image
@@ -366,12 +368,12 @@ Measured = list[tuple[Shot, FloatArray]]
 def _separation_points(scope: Scope) -> Sequence[Point]:
     base = replace(scope.setup, accuracy=max(scope.setup.accuracy, _ACCURACY))
     own = scope.pictures == (None,)
-    setups = [base] if own else [replace(base, scene=name) for name in scope.chosen(SCENES, SCENES[:1])]
+    setups = [base] if own else [replace(base, scene=name) for name in scope.choose(SCENES, SCENES[:1])]
     return [
         Point.of(setup, subject=setup.scene, patterns=family, seed=seed)
         for setup in setups
         for seed in scope.repeats
-        for family in scope.chosen(DOTS, DOTS[1:2])
+        for family in scope.choose(DOTS, DOTS[1:2])
     ]
 
 
@@ -384,7 +386,7 @@ def _separation_measure(studio: Studio, point: Point) -> Found:
     margin = _MARGIN * max(frames.family.left.shape[1], frames.family.right.shape[1])
     left, right = (FactorOfDepths(factor, parallax, axis).beyond(margin)[0] for axis, factor in enumerate(frames.sides))
     electrons = frames.exposer(1.0).electrons
-    direct = [electrons(frame) for frame in LitScene(direct_of(lit.light)).expected(RENDERED, frames.family)]
+    direct = [electrons(frame) for frame in LitScene(direct_of(lit.light)).expected_frames(RENDERED, frames.family)]
     bounced = [electrons(frame) - own for frame, own in zip(frames.expected, direct, strict=True)]
     known = global_truth(lit.light)
     rows, arrays = [], {"direct, true": lit.truth, "global, true": known}
@@ -412,7 +414,7 @@ def _separate_images(
     seen
         the factors, and more columns beside.
     """
-    model = frames.prepared()
+    model = frames.prepare()
     measured = _noisy(frames, [own + more for own, more in zip(direct, bounced, strict=True)])
     whole = _weights(model, measured)
     patterns = frames.family.left.astype(float), frames.family.right.astype(float)

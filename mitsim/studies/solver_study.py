@@ -164,7 +164,7 @@ def dots(n: int, k: int) -> FloatArray:
 
 def paper_factor() -> FloatArray:
     """Phi (512, 128) of the paper's camera and scene: both sides of its idealised model."""
-    camera = CameraGeometry.checked("the paper's camera")
+    camera = CameraGeometry.build("the paper's camera")
     scene = centred_edges(_SCENE_PIXELS, _SCENE_WIDTH / _SCENE_PIXELS)
     mask = camera.build_mask()
     return scene_factor(

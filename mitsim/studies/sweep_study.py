@@ -36,7 +36,7 @@ def _points(scope: Scope) -> Sequence[Point]:
     for chosen in product(*values):
         setting = dict(zip(names, chosen, strict=True))
         for picture in scope.pictures:
-            setup = _setup(scope.setup, setting).printed(picture)
+            setup = _setup(scope.setup, setting).with_print(picture)
             fixed: dict[str, Value] = {"patterns": scope.patterns, "exposure": EQUAL_PEAK, "seed": scope.seeds[0]}
             knobs: dict[str, Value] = {name: setting.get(name, other) for name, other in fixed.items()}
             light = {name: setting[name] for name in ("accuracy",) if name in setting}
@@ -46,7 +46,7 @@ def _points(scope: Scope) -> Sequence[Point]:
 
 def _setup(setup: Setup, setting: Mapping[str, str]) -> Setup:
     parameters = {name: value for name, value in setting.items() if name not in NO_SCENE}
-    changed = setup.changed(**parameters)
+    changed = setup.with_parameters(**parameters)
     return replace(changed, accuracy=number_of("accuracy", setting["accuracy"])) if "accuracy" in setting else changed
 
 

@@ -117,7 +117,7 @@ class Sessions:
         right = _align(found.right, whole.right) + _align(noisy.right, whole.right) - whole.right
         return replace(Factors.of(replace(found, left=left, right=right), self._manifest), manifest=noisy.manifest)
 
-    def idealised(self, sides: tuple[FloatArray, FloatArray]) -> Factors:
+    def idealised_factors(self, sides: tuple[FloatArray, FloatArray]) -> Factors:
         """Factors with these ``sides``, which nobody measured."""
         return Factors(*sides, self._manifest, Status(Verdict.CALIBRATED, "Factors of the idealised camera"))
 
@@ -183,7 +183,7 @@ class Levels:
             seed,
         )
         camera = IdealCamera(lit.bench, lit.bench.geometry.mask)
-        self._assumed = sessions.idealised(camera.calibrated(float(lit.light.apparent.board_flux.mean())))
+        self._assumed = sessions.idealised_factors(camera.calibrated(float(lit.light.apparent.board_flux.mean())))
         fills = fills_well(lit.bench.sensor, lit.light.simulation.physics.speckle)
         own = {SATURATION: fills, QUANTISATION: lit.bench.sensor.bits is not None, CALIBRATION_NOISE: True}
         self.effects = tuple(name for name in EFFECTS if name in scene_ablation.effects or own.get(name, False))
@@ -196,7 +196,7 @@ class Levels:
         bench = replace(light.bench, devices=replace(light.bench.devices, sensor=sensor))
         request = light.plan.request
         assert request is not None
-        options = request.changed(patterns=self._patterns, seed=self._seed, exposure_fraction=fraction)
+        options = request.with_values(patterns=self._patterns, seed=self._seed, exposure_fraction=fraction)
         shots = capture(SpectralBench(bench), options, lights=[self._ablation.without(off)]).runs[0]
         calibrated = self._sessions.factors(off, CALIBRATION_NOISE not in off)
         found = {}
@@ -246,7 +246,7 @@ _KEPT = 64
 
 def _points(scope: Scope) -> Sequence[Point]:
     pictures = [name for name in scope.pictures if name in (*QUICK_IMAGES, None)] or list(scope.pictures)
-    setups, ways = map(scope.setup.printed, scope.chosen(pictures, pictures[:1])), scope.chosen(WAYS, WAYS[:2])
+    setups, ways = map(scope.setup.with_print, scope.choose(pictures, pictures[:1])), scope.choose(WAYS, WAYS[:2])
     fixed = {"patterns": (PATTERNS,)}
     return Point.grid(setups, "patterns seed way effect", seed=scope.repeats, way=ways, effect=EFFECTS, **fixed)
 
@@ -254,7 +254,7 @@ def _points(scope: Scope) -> Sequence[Point]:
 def _measure(studio: Studio, point: Point) -> Found:
     """What the effect changes, and the level that it comes to: without it, for one that is left out."""
     setup, seed, way, effect = point.setup, int(point["seed"]), point["way"], str(point["effect"])
-    lit = studio.lit(setup)
+    lit = studio.lit_scene(setup)
     scene_ablation = studio.once("ablation", 1, setup, lambda: Ablation.of(lit.light))
     sessions = studio.once("sessions", 1, (setup, seed), lambda: Sessions(lit.bench, seed))
     levels = studio.once(

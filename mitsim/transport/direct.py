@@ -19,7 +19,7 @@ from mitsim.devices.projector import Lines
 from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import OpticalSetup, Reception, SensorPoints, landing, sample_wavelengths
 from mitsim.transport.integrator import PATHS_PER_LAUNCH, InFlight, Tracer
-from mitsim.transport.plugins.base import rows_columns, shuffled, split_by_line, stratified, streams
+from mitsim.transport.plugins.base import rows_columns, shuffle, sobol_point, split_by_line, streams
 from mitsim.transport.records import DIRECT, PathSamples, Sightings, check_finite
 from mitsim.transport.transmission import Arrival
 
@@ -62,7 +62,7 @@ class DirectTracer(Tracer):
     def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
         seen, anchor = self._sightings(flight)
         if accumulator is None:
-            return [PathSamples.fetched(seen, DIRECT, anchor)]
+            return [PathSamples.fetch(seen, DIRECT, anchor)]
         for place, share in accumulator.shares(seen, anchor):
             accumulator.add([light * share for light in seen.by_line(accumulator.lines)], seen.pixel, place)
         dr.eval(accumulator.sums)
@@ -76,7 +76,7 @@ class DirectTracer(Tracer):
         row, column = anchor // anchors, anchor % anchors
         # Streams belong to pixels: every anchor is connected to the same points.
         shared, rng = streams(flight.seed, pixel, flight.sample)
-        jitter, weight = self._place(number, row, column, stratified(flight.sample, shared))
+        jitter, weight = self._place(number, row, column, sobol_point(flight.sample, shared))
         wavelengths, spectral = sample_wavelengths(self.setup.camera, rng, self.projector.lines)
         ray = self.setup.rays.sample(pixel, jitter, rng, wavelengths)
         sensor = self._sensor(row, column, flight.sample, shared, rng)
@@ -113,7 +113,7 @@ class DirectTracer(Tracer):
         """Points of the sensor, in the camera's frame; ``shared`` belongs to all samples of a stream."""
         if self.points.spread:
             # A sixth of the variance of plain random points in compact_disc, half in gift_card (32 samples a pixel).
-            return self.points.inside(stratified(shuffled(sample, shared), shared))
+            return self.points.inside(sobol_point(shuffle(sample, shared), shared))
         return self.points.at(row, column, rng)
 
 
@@ -191,11 +191,11 @@ class FluxTracer:
         """Mean irradiance that one ray of each ``pixel`` brings to the sensor."""
         pixels = dr.opaque(mi.UInt32, self._setup.projector.n**2)
         shared, rng = streams(seed, pixel + group * pixels, sample)
-        jitter = stratified(sample, shared)
+        jitter = sobol_point(sample, shared)
         wavelengths, spectral = sample_wavelengths(self._setup.camera, rng, lines)
         ray = self._setup.rays.sample(pixel, jitter, rng, wavelengths)
-        point = stratified(shuffled(sample, shared), shared)
-        turn = stratified(shuffled(sample, shared), shared) if self._glossy else None
+        point = sobol_point(shuffle(sample, shared), shared)
+        turn = sobol_point(shuffle(sample, shared), shared) if self._glossy else None
         sensor, flux = self._sensor.inside(point), self._setup.rays.flux(pixel, wavelengths) * spectral
 
         def add_light(
@@ -384,7 +384,7 @@ class AimedTracer(DirectTracer):
         number, sample = index % dr.opaque(mi.UInt32, count), index // dr.opaque(mi.UInt32, count)
         pixel = dr.gather(mi.UInt32, mi.UInt32(self._pixels), number)
         shared, rng = streams(_SEED, pixel, sample)
-        jitter = stratified(sample, shared)
+        jitter = sobol_point(sample, shared)
         wavelengths, _ = sample_wavelengths(self.setup.camera, rng, self.projector.lines)
         ray = self.setup.rays.sample(pixel, jitter, rng, wavelengths)
         none = _Axis(mi.Float(0), mi.Float(0), mi.Float(1), mi.Bool(False))

@@ -45,7 +45,7 @@ from mitsim.transport.integrator import (
     camera_part,
     is_delta,
 )
-from mitsim.transport.plugins.base import rows_columns, shuffled, stratified, streams, x_y
+from mitsim.transport.plugins.base import rows_columns, shuffle, sobol_point, streams, x_y
 from mitsim.transport.records import CellAxis, CellGrid, PathSamples, Sightings
 from mitsim.transport.transmission import refracted_way
 
@@ -171,7 +171,7 @@ class CameraPaths(PathIntegrator[State]):
         grid, columns = tracer.grid, dr.opaque(mi.UInt32, tracer.grid.shape[1])
         shared, rng = streams(flight.seed, cell, flight.sample)
         # A path that leaves a cell's very edge could be accumulated in the next cell by rounding.
-        jitter = _MARGIN + (1 - 2 * _MARGIN) * stratified(flight.sample, shared)
+        jitter = _MARGIN + (1 - 2 * _MARGIN) * sobol_point(flight.sample, shared)
         sensor = tracer.points.at(*self.anchor, rng)
         self.origin, nearness = rows_columns(sensor.x, sensor.y), dr.opaque(mi.Float, 1 / tracer.points.distance)
         self.row = _place(grid.rows, cell // columns, jitter.x) - self.origin[0] * nearness
@@ -197,7 +197,7 @@ class CameraPaths(PathIntegrator[State]):
         """Light on the host of every path."""
         kept = self.follow(self.paths).sightings
         dr.eval(kept)
-        return [PathSamples.fetched(seen, KINDS[kind], self.anchor) for kind, seen in kept.items()]
+        return [PathSamples.fetch(seen, KINDS[kind], self.anchor) for kind, seen in kept.items()]
 
     # ---- lights that paths run into ---------------------------------------------------------------------------------
 
@@ -441,7 +441,7 @@ class LampTracer(FromCameraTracer):
         sample, shared
             number of each path's sample, and the numbers that all samples of its cell share.
         """
-        place = stratified(shuffled(sample, shared), shared).x
+        place = sobol_point(shuffle(sample, shared), shared).x
         counts = mi.Float(self.counted.response.counts.astype(np.float32))
         steps = len(self.counted.response.counts) - 1
         step = (SPECTRA_NM[1] - SPECTRA_NM[0]) / steps
@@ -504,4 +504,4 @@ class CombinedTracer:
         seed, first, samples
             as there.
         """
-        return PathSamples.joined([tracer.trace(seed, first, samples) for tracer in self.tracers])
+        return PathSamples.join([tracer.trace(seed, first, samples) for tracer in self.tracers])

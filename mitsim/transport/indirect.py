@@ -29,7 +29,7 @@ from mitsim.core.arrays import FloatArray, mean_of_neighbours
 from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import SensorPoints, Way, sample_wavelengths
 from mitsim.transport.integrator import KINDS, FollowingTracer, InFlight, PathIntegrator, PathState, camera_part
-from mitsim.transport.plugins.base import stratified, streams
+from mitsim.transport.plugins.base import sobol_point, streams
 from mitsim.transport.records import PathSamples, Sightings
 
 _ROOMS = (4**2, 12**2)
@@ -78,7 +78,7 @@ class IndirectTracer(FollowingTracer):
         pixel, row, column = self.points.of(index, self.projector.n**2)
         # Stratified where it tells most: a pixel is small, but its light goes every way from the first surface.
         shared, rng = streams(flight.seed, pixel, sample)
-        return Emission(pixel, (row, column), rng, stratified(sample, shared), weight)
+        return Emission(pixel, (row, column), rng, sobol_point(sample, shared), weight)
 
     def _paths(self, emission: Emission) -> ProjectorPaths:
         return ProjectorPaths(self, emission)
@@ -176,7 +176,7 @@ class ProjectorPaths(PathIntegrator[PathState]):
         """Light on the host of every path at every anchor; of indirect light none where there is an ``accumulator``."""
         paths = self.follow(self.paths)
         if accumulator is None:
-            return self.connections.fetched(paths.sightings, tuple(paths.sightings))
+            return self.connections.fetch(paths.sightings, tuple(paths.sightings))
         drawn = paths.rng.next_float32()
 
         def add(held: Held, number: mi.UInt32) -> None:
@@ -186,7 +186,7 @@ class ProjectorPaths(PathIntegrator[PathState]):
 
         held = self.connections.at_each(paths.sightings, mi.Bool(True), add)
         caustics = tuple(kind for kind in held if kind == "direct")
-        return self.connections.fetched(held, caustics, accumulator.sums)
+        return self.connections.fetch(held, caustics, accumulator.sums)
 
 
 # -------- Connections of a path: to one point of the sensor, or to every anchor
@@ -227,11 +227,11 @@ class _OneConnection:
         visit(held, mi.UInt32(0))
         return held
 
-    def fetched(self, held: Held, kinds: Sequence[str], also: object = ()) -> list[PathSamples]:
+    def fetch(self, held: Held, kinds: Sequence[str], also: object = ()) -> list[PathSamples]:
         """Light of some ``kinds`` on the host; what it takes is worked out with that of ``also``: apart, each would
         follow all paths again."""
         dr.eval([held[kind] for kind in kinds], also)
-        return [PathSamples.fetched(held[kind], KINDS[kind], self._anchor) for kind in kinds]
+        return [PathSamples.fetch(held[kind], KINDS[kind], self._anchor) for kind in kinds]
 
 
 class _AnchorConnections(_OneConnection):
@@ -270,7 +270,7 @@ class _AnchorConnections(_OneConnection):
         found: Held = dr.while_loop((mi.UInt32(0), held), lambda number, _: active & (number < self._count), step)[1]
         return found
 
-    def fetched(self, held: Held, kinds: Sequence[str], also: object = ()) -> list[PathSamples]:
+    def fetch(self, held: Held, kinds: Sequence[str], also: object = ()) -> list[PathSamples]:
         paths = dr.width(self._pixel)
         size, first = paths * self._points.count, dr.arange(mi.UInt32, paths) * self._count
         found = {kind: [dr.zeros(mi.Float, size) for _ in range(self._numbers)] for kind in kinds}
@@ -285,7 +285,7 @@ class _AnchorConnections(_OneConnection):
         dr.eval(found, self._pixel, also)
         index = dr.arange(mi.UInt32, size)
         pixel, anchor = dr.gather(mi.UInt32, self._pixel, index // self._count), self.anchor(index % self._count)
-        return [PathSamples.fetched(_sightings(pixel, values), KINDS[kind], anchor) for kind, values in found.items()]
+        return [PathSamples.fetch(_sightings(pixel, values), KINDS[kind], anchor) for kind, values in found.items()]
 
 
 def _differing(seen: Sightings) -> list[mi.Float]:

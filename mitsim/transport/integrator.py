@@ -148,7 +148,7 @@ class Tracer(ABC):
         for tracer in self.per_wavelength:
             for sample, index in launches(self.paths_per_sample // count, first, samples, at_once):
                 parts += tracer._launch(InFlight(dr.opaque(mi.UInt32, seed), sample, index), accumulator)
-        return PathSamples.joined(parts)
+        return PathSamples.join(parts)
 
 
 @dataclass(frozen=True)

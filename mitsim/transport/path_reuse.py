@@ -37,7 +37,7 @@ from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import Way
 from mitsim.transport.indirect import MEMBERS, SIDE, Emission, IndirectTracer, ProjectorPaths, blocks_of
 from mitsim.transport.integrator import InFlight, camera_part, shading_correction
-from mitsim.transport.plugins.base import generator, split_by_line, stratified
+from mitsim.transport.plugins.base import generator, sobol_point, split_by_line
 from mitsim.transport.records import INDIRECT, PathSamples, Sightings, check_finite
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ class PathReuseTracer(IndirectTracer):
         none, seed = dr.zeros(mi.UInt32, dr.width(flight.index)), flight.seed
         rng = generator(seed ^ (sample * 0x9E3779B9 + 1), pixel)
         place = (member + sample * _STEP + sample // _TURN) % MEMBERS
-        first_turn = stratified(sample * MEMBERS + place, generator(seed, block))
+        first_turn = sobol_point(sample * MEMBERS + place, generator(seed, block))
         return Emission(pixel, (none, none), rng, first_turn, dr.select(inside, mi.Float(weight), 0))
 
     def _paths(self, emission: Emission) -> ReusedPaths:
@@ -180,7 +180,7 @@ class ReusedPaths(ProjectorPaths):
             self.beyond = [unit[line] for line in range(self.tracer.lines)]
         kept.value = dr.select(self.follows, 0, kept.value)
         dr.eval(vars(self))
-        return self.connections.fetched(self.paths.sightings, tuple(self.paths.sightings))
+        return self.connections.fetch(self.paths.sightings, tuple(self.paths.sightings))
 
     def _first_vertex(self) -> None:
         """The first surface, and each path's turn there."""

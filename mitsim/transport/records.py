@@ -131,7 +131,7 @@ class PathSamples:
     lines: npt.NDArray[np.float32] | None = None
 
     @classmethod
-    def joined(cls, parts: Sequence[PathSamples]) -> PathSamples:
+    def join(cls, parts: Sequence[PathSamples]) -> PathSamples:
         """All ``parts`` in one; no light where there are none."""
         parts = parts or [cls.none()]
         if len(parts) == 1:
@@ -149,7 +149,7 @@ class PathSamples:
         return [replace(self, value=self.lines[line].astype(np.float64), lines=None) for line in range(lines)]
 
     @classmethod
-    def fetched(cls, seen: Sightings, kind: int, anchors: tuple[mi.UInt32, mi.UInt32] | None = None) -> PathSamples:
+    def fetch(cls, seen: Sightings, kind: int, anchors: tuple[mi.UInt32, mi.UInt32] | None = None) -> PathSamples:
         """Lit connections of one kind from the renderer's arrays.
 
         Parameters
@@ -196,7 +196,7 @@ class PathSamples:
         index, number = np.zeros(0, dtype=np.int64), np.zeros(0)
         return cls(index, index, index, number, number, number, number, np.zeros(0, dtype=np.int16))
 
-    def averaged(self, weights: FloatArray) -> PathSamples:
+    def average(self, weights: FloatArray) -> PathSamples:
         """Light of one anchor: the mean over all of them, with ``weights`` (anchors,) along rows and columns."""
         first = np.zeros_like(self.pixel)
         value = self.value * weights[self.anchor_row] * weights[self.anchor_column]
@@ -318,7 +318,7 @@ class Bundle:
     def _inside(self, path_samples: PathSamples) -> npt.NDArray[np.bool_]:
         return self.grid.rows.holds(path_samples.row) & self.grid.columns.holds(path_samples.column)
 
-    def repeated(self, light: sparse.csr_array) -> sparse.csr_array:
+    def repeat(self, light: sparse.csr_array) -> sparse.csr_array:
         """``light`` that was accumulated with one anchor, (rows, size / anchors^2), as if every anchor saw it."""
         entries = light.tocoo()
         height, width = self.cells
@@ -333,7 +333,7 @@ class Bundle:
         copied = np.tile(entries.data, copies), (rows, columns)
         return sparse.coo_array(copied, shape=(light.shape[0], self.size)).tocsr()
 
-    def averaged(self, light: sparse.csr_array, weights: FloatArray) -> sparse.csr_array:
+    def average(self, light: sparse.csr_array, weights: FloatArray) -> sparse.csr_array:
         """``light`` (rows, size) as one anchor's, (rows, size / anchors^2): the mean with ``weights`` (anchors,) along
         rows and columns."""
         entries = light.tocoo()

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mitsim.optics.terms import centred as centred_terms
+from mitsim.optics.terms import centre_terms as centred_terms
 from mitsim.reconstruct.solver import centre_frame, prepare
 from mitsim.reconstruct.solvers import solve_tv
 from tests.hard.hard_models import EPS, frames_of, shadow, summed

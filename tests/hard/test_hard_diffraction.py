@@ -220,7 +220,7 @@ def test_waves_through_openings_below_half_a_wavelength_are_refused(
     bare, at, line = CameraGeometry(pixels=32), Directions([0.0, 0.1], 0.0), Spectrum(np.array([638.0]), np.ones(1))
 
     def frame(feature: float) -> np.ndarray:
-        camera = MaskProfile.model_validate({**FINE[name], "feature_mm": feature}).worn(bare, tmp_path)
+        camera = MaskProfile.model_validate({**FINE[name], "feature_mm": feature}).put_on(bare, tmp_path)
         return FrameOptics(camera, at, at, (400.0,), 1, line).frame(np.array([0]), np.ones(1))
 
     started = time.process_time()
@@ -240,7 +240,7 @@ def test_fine_pixels_of_a_drawing_are_no_features(tmp_path: Path) -> None:
     for pixel, side in ((2e-3, 8), (1.25e-4, 128)):
         np.save(tmp_path / f"{side}.npy", np.pad(np.ones((side, side)), side // 8))
         table = {"kind": "drawing", "file": f"{side}.npy", "feature_mm": pixel}
-        camera = MaskProfile.model_validate(table).worn(CameraGeometry(pixels=32), tmp_path)
+        camera = MaskProfile.model_validate(table).put_on(CameraGeometry(pixels=32), tmp_path)
         at, line = Directions([0.0, 0.1], 0.0), Spectrum(np.array([638.0]), np.ones(1))
         frames.append(FrameOptics(camera, at, at, (400.0,), 1, line).frame(np.array([0]), np.ones(1)))
     np.testing.assert_allclose(frames[1], frames[0], rtol=0, atol=1e-3 * frames[0].max())

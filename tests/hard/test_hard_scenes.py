@@ -52,7 +52,7 @@ def frame_at(write: Callable[..., Path], scale: float) -> np.ndarray:
     uniform = Lighting.uniform(N)
     found = simulation.accumulate("direct", simulation.direct.trace(1, 0, 64), uniform.labels, 64)
     found = found + simulation.accumulate("indirect", simulation.follow(1, 64), uniform.labels, 64)
-    return next(iter(simulation.expected([found], np.arange(1), uniform, 0))).irradiance
+    return next(iter(simulation.expected_frames([found], np.arange(1), uniform, 0))).irradiance
 
 
 @pytest.mark.slow

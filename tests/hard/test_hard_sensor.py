@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy import special, stats
 
 from mitsim.acquire.exposure import Exposer
-from mitsim.core.configuration import shipped, validate
+from mitsim.core.configuration import shipped_path, validate
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel, load_sensor
@@ -210,8 +210,8 @@ def test_read_noise_above_a_small_full_well_is_no_saturation(well: float, bits: 
     camera = exposer(full_well_e=well, read_noise_e=20.0, bits=bits, black_level_dn=500.0)
     dark, light = np.zeros((64, 64)), np.full((64, 64), 1.0 + 2 * well)
     frame = camera.digital(dark, "dark")
-    assert frame.max() > 500 + well and not camera.saturated(frame, dark)
-    assert camera.saturated(camera.digital(light, "light"), light)
+    assert frame.max() > 500 + well and not camera.saturates(frame, dark)
+    assert camera.saturates(camera.digital(light, "light"), light)
 
 
 def test_saturation_is_seen_where_it_is() -> None:
@@ -227,7 +227,7 @@ def test_saturation_is_seen_where_it_is() -> None:
         ({"dark_current_e_per_s": 1500.0}, 0.0, True),
     ):
         camera, light = exposer(**changes), np.full(shape, mean)
-        assert camera.saturated(camera.digital(light, "any"), light) == expected, (changes, mean)
+        assert camera.saturates(camera.digital(light, "any"), light) == expected, (changes, mean)
 
 
 # ---- refusals
@@ -250,7 +250,7 @@ def test_codes_that_a_frame_cannot_hold_are_refused(bits: int, binning: int, fit
 @pytest.mark.parametrize("value", [math.nan, math.inf, -1.0, 1e13, 1e300])
 @pytest.mark.parametrize("field", ["pixel_pitch_um", "read_noise_e", "dark_current_e_per_s", "gain_dn_per_e"])
 def test_numbers_beyond_all_cameras_are_refused_in_one_line(field: str, value: float) -> None:
-    fields = {**load_sensor(shipped("calibration", "imx249.toml")).model_dump(), field: value}
+    fields = {**load_sensor(shipped_path("calibration", "imx249.toml")).model_dump(), field: value}
     with pytest.raises(MitsimError, match=rf"^camera\.toml: {field}: got [^\n]+$"):
         validate(SensorModel, fields, "camera.toml")
 

@@ -94,6 +94,6 @@ def test_the_largest_and_smallest_allowed_units(size: float) -> None:
         sums = summed(prepared, frames_of(factor / size**2, factor, P, P, image))
         solution = prepared.solve(sums, relative * prepared.problem(sums).scale)
         assert np.isfinite(solution.image).all() and 0 <= solution.residual < 1
-        kept = prepared.problem(sums).kept(solution.lam)
+        kept = prepared.problem(sums).kept_share(solution.lam)
         expected = prepared.image(kept * prepared.coefficients(image / size**2))
         assert np.linalg.norm(solution.image - expected) <= solution.rounding * np.linalg.norm(image / size**2)

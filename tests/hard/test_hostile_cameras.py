@@ -47,9 +47,9 @@ def test_a_camera_with_one_hostile_value(tmp_path: Path, lab_camera: str, value:
 
 @pytest.fixture
 def lab_camera() -> str:
-    from mitsim.core.configuration import shipped
+    from mitsim.core.configuration import shipped_path
 
-    text = shipped("calibration", "imx249.toml").read_text()
+    text = shipped_path("calibration", "imx249.toml").read_text()
     assert "bits = 12" in text
     return text
 

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.acquire.reference import projected
+from mitsim.acquire.reference import show_pattern
 from mitsim.api.bench import Bench, open_bench
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from mitsim.devices.patterns import Lighting
 from mitsim.light.light import Sampling, trace_light
 from mitsim.light.settings import Settings
@@ -82,7 +82,7 @@ def test_the_lamp_of_the_bench(shipped_bench: Callable[..., Bench]) -> None:
 
     bench = shipped_bench("lamp_bench", mask="open")
     frame = ambient_frame(bench, anchors=2)
-    reflectance = np.asarray(imread(shipped("scenes", "lamp_bench", "reflectance.png")), dtype=float) / 255
+    reflectance = np.asarray(imread(shipped_path("scenes", "lamp_bench", "reflectance.png")), dtype=float) / 255
     assert reflectance.ndim == 2
     rows, columns = reflectance.shape
     y, x = 64 - (np.arange(rows) + 0.5) * 128 / rows, 64 - (np.arange(columns) + 0.5) * 128 / columns
@@ -138,7 +138,7 @@ def test_the_sky_itself(small_scene: SmallScene) -> None:
 )
 def test_pixels_and_thick_masks_agree(tmp_path: Path, options: dict[str, float], effect: str) -> None:
     folder = tmp_path / "photograph"
-    shutil.copytree(shipped("scenes", "photograph"), folder)
+    shutil.copytree(shipped_path("scenes", "photograph"), folder)
     text = (folder / "scene.xml").read_text()
     added = "".join(f'<float name="{name}" value="{value}"/>' for name, value in options.items())
     text, found = re.subn(r'(<sensor type="mitsim_lensless"[^>]*>)', rf"\1{added}", text)
@@ -180,7 +180,7 @@ def reference_with_lens(bench: Bench, shown: np.ndarray, spp: int) -> tuple[np.n
     from mitsim.transport.plugins.lens import aperture_scene_parts
 
     plugins.register()
-    with projected(bench, shown):
+    with show_pattern(bench, shown):
         parts = aperture_scene_parts(
             bench.loaded.projector, bench.projector_optics.aperture, bench.projector_optics.focus
         )
@@ -245,7 +245,7 @@ def test_black_pixels_shine_by_one_over_the_contrast(shipped_bench: Callable[...
         forced = {"black-level": on, "diffraction": False, "mirrors": True, "interreflection": False}
         plan = make_plan(bench, lighting, 3e-2, 31, forced)
         light = trace_light(bench, plan, lighting, 31, Sampling(by_pixel=False))
-        frames[on] = np.stack([frame.irradiance for frame in light.merged().frames(lighting, 0)])
+        frames[on] = np.stack([frame.irradiance for frame in light.merge().frames(lighting, 0)])
     uniform = frames[False][9]
     expected = 0.01 * uniform + 0.99 * frames[False]
     assert np.linalg.norm(frames[True] - expected) < 1e-9 * np.linalg.norm(expected)

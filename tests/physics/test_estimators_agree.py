@@ -31,7 +31,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mitsim.acquire.reference import projected
+from mitsim.acquire.reference import show_pattern
 from mitsim.api.bench import Bench
 from mitsim.devices.patterns import Lighting
 from mitsim.light.light import SampledLight, Sampling, trace_light
@@ -94,7 +94,7 @@ def reference_of(bench: Bench, spp: int, shown: np.ndarray) -> tuple[np.ndarray,
 
     total = np.zeros(bench.geometry.frame_shape)
     square = total.copy()
-    with projected(bench, shown):
+    with show_pattern(bench, shown):
         for seed in range(PASSES):
             frame = np.array(
                 mi.render(bench.loaded.scene, sensor=bench.loaded.camera, spp=spp, seed=100 + seed), dtype=np.float64

@@ -55,7 +55,7 @@ def path(scene: Path, spp: int, seed: int) -> Measured:
     """Mitsuba's ``path``. Runs of one seed share each path's first reflection, so it cancels in total - direct."""
     import mitsuba as mi
 
-    from mitsim.acquire.reference import projected
+    from mitsim.acquire.reference import show_pattern
     from mitsim.api.bench import open_bench
 
     bench = open_bench(scene, for_render=True)
@@ -63,7 +63,7 @@ def path(scene: Path, spp: int, seed: int) -> Measured:
     integrators = [mi.load_dict({"type": "path", "max_depth": depth}) for depth in (2, -1)]
     found = []
     for index, capture in enumerate(family.shots):
-        with projected(bench, family.light(capture)):
+        with show_pattern(bench, family.light(capture)):
             one, total = (
                 np.array(
                     mi.render(bench.loaded.scene, integrator=i, sensor=bench.loaded.camera, spp=spp, seed=seed + index)

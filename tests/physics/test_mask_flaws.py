@@ -28,7 +28,7 @@ LINES = Spectrum(np.array([450.0, 638.0]), np.array([0.4, 0.6]))
 
 
 def made(**fields: object) -> CameraGeometry:
-    return MaskProfile.model_validate({"kind": "separable", "feature_mm": 0.06, "order": 5, **fields}).worn(
+    return MaskProfile.model_validate({"kind": "separable", "feature_mm": 0.06, "order": 5, **fields}).put_on(
         BARE, Path()
     )
 
@@ -117,7 +117,7 @@ def test_a_frame_equals_rays_counted_through_a_turned_or_dusty_mask(kind: str) -
     }
     fields = {**flaws["turned"], **flaws["dusty"]} if kind == "both" else flaws[kind]
     random = {"kind": "random", "feature_mm": 0.06, "features": 31, **fields}
-    camera = MaskProfile.model_validate(random).worn(BARE, Path())
+    camera = MaskProfile.model_validate(random).put_on(BARE, Path())
     plate = camera.build_mask()
     assert isinstance(plate, Plate) and (plate.flaws == NO_FLAWS) == (kind == "dusty")
     tau, depth = np.array([0.03, -0.02]), 30.0
@@ -151,7 +151,7 @@ def test_the_reference_meets_turned_blurred_and_tilted_masks(variant: str) -> No
     camera = MaskProfile.model_validate(
         {"kind": "random", "feature_mm": 0.06, "features": 31, "rotation_deg": 5.0, "tilt_row_mrad": 40.0,
          "tilt_column_mrad": -25.0, "over_etch_um": 3.0}
-    ).worn(BARE, Path())  # fmt: skip
+    ).put_on(BARE, Path())  # fmt: skip
     origin, way, light = rays(camera)
     plate = camera.build_mask()
     # The tilted plane: z = d + tan(a) (row - o) + tan(b) column; index coordinates are -y and -x.

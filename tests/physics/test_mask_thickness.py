@@ -176,7 +176,7 @@ def test_wall_shift_in_features() -> None:
 
 def test_a_mask_reaching_into_the_scene_is_refused() -> None:
     with pytest.raises(MitsimError, match="mask_thickness 398"):
-        CameraGeometry.checked("here", mask_thickness=398.0)
+        CameraGeometry.build("here", mask_thickness=398.0)
     at = Directions([0.0], 0.0)
     with pytest.raises(MitsimError, match=r"beyond the mask at 2\.5 mm"):
         shadow_terms(CameraGeometry(mask_thickness=0.5), at, at, 2.2)

@@ -19,7 +19,7 @@ from mitsim.api.bench import open_bench
 from mitsim.bench.effects import EFFECTS
 from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.model import model_of
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import mls_mask
@@ -44,7 +44,7 @@ def drawn(kind: str, order: int) -> np.ndarray:
 
 def camera_file(folder: Path, name: str, values: np.ndarray | None) -> Path:
     """The default camera with a drawing ``values`` for a mask; as it is without one."""
-    path, text = folder / f"{name}.toml", shipped("calibration", "imx249.toml").read_text(encoding="utf-8")
+    path, text = folder / f"{name}.toml", shipped_path("calibration", "imx249.toml").read_text(encoding="utf-8")
     if values is not None:
         np.save(folder / f"{name}.npy", values)
         text += f'\n[mask]\nkind = "drawing"\nfeature_mm = 0.06\nfile = "{name}.npy"\n'

@@ -467,7 +467,7 @@ def mirror_part(light) -> np.ndarray:
     whole = next(iter(light.frames(LIT, 0))).irradiance
     without = copy.copy(light.simulation)
     without.specular_frames = lambda labels: None
-    traced = without.expected(light.groups, np.zeros(1, np.int64), LIT, 0)
+    traced = without.expected_frames(light.groups, np.zeros(1, np.int64), LIT, 0)
     return whole - next(iter(traced)).irradiance
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel, load_sensor, paper_sensor
 from mitsim.sensor import chain, moments
@@ -29,7 +29,7 @@ EXPOSURE_S = 0.01
 
 @pytest.fixture(scope="module")
 def camera() -> SensorModel:
-    return load_sensor(shipped("calibration", "imx249.toml"))
+    return load_sensor(shipped_path("calibration", "imx249.toml"))
 
 
 def pair(model: SensorModel, mean_e: float, side: int, exposure_s: float, name: str) -> tuple[float, float]:

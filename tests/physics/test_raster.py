@@ -17,7 +17,7 @@ from scipy.special import fresnel
 
 from mitsim.api.bench import open_bench
 from mitsim.bench.effects import EFFECTS, Physics
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask_profile import MaskProfile
@@ -35,7 +35,7 @@ LINES = Spectrum(np.array([450.0, 638.0]), np.array([0.4, 0.6]))
 
 
 def made(**fields: object) -> CameraGeometry:
-    return MaskProfile.model_validate({"feature_mm": 0.06, **fields}).worn(BARE, Path())
+    return MaskProfile.model_validate({"feature_mm": 0.06, **fields}).put_on(BARE, Path())
 
 
 def irradiance(camera: CameraGeometry, tau: tuple[float, float], depth: float, degrees: float) -> np.ndarray:
@@ -115,7 +115,7 @@ def test_fringes_of_far_edges_do_not_add_up() -> None:
     """Uniform light behind 511 features a side, of which the farthest are 15 mm away: to 5e-4 of its closed form.
     (Planted: the field at points, not its means from one to the next: 2.5e-3.)"""
     profile = MaskProfile(kind="separable", feature_mm=0.06, over_etch_um=1e-9)
-    camera, line = profile.worn(CameraGeometry(pixels=64), Path()), Spectrum(np.array([562.0]), np.ones(1))
+    camera, line = profile.put_on(CameraGeometry(pixels=64), Path()), Spectrum(np.array([562.0]), np.ones(1))
     assert off_the_closed_form(camera, line, 64) < 5e-4
 
 
@@ -147,7 +147,7 @@ def psf_camera(folder: Path, pixel: float = 0.02) -> tuple[CameraGeometry, np.nd
     np.save(folder / "light.npy", 3.0 + light)
     table = {"kind": "psf", "feature_mm": pixel / 2, "file": "light.npy", "psf_distance_mm": 400.0, "aperture_mm2": 1.5}
     bare = CameraGeometry(pixels=50, pixel_pitch=pixel)
-    return MaskProfile.model_validate(table).worn(bare, folder), light / light.sum()
+    return MaskProfile.model_validate(table).put_on(bare, folder), light / light.sum()
 
 
 def test_a_picture_of_light_is_the_frame_of_its_point(tmp_path: Path) -> None:
@@ -184,7 +184,7 @@ def test_a_camera_with_a_picture_of_light_misses_nothing(
     light = np.zeros((80, 80))
     light[20:60, 20:60] = 200 * np.random.default_rng(2).random((40, 40))
     Image.fromarray(light.astype(np.uint8)).save(tmp_path / "light.png")
-    text = shipped("calibration", "imx249.toml").read_text(encoding="utf-8")
+    text = shipped_path("calibration", "imx249.toml").read_text(encoding="utf-8")
     table = 'kind = "psf"\nfeature_mm = 0.01172\nfile = "light.png"\npsf_distance_mm = 400.0\naperture_mm2 = 0.3\n'
     (tmp_path / "camera.toml").write_text(f"{text}\n[mask]\n{table}", encoding="utf-8")
     bench = open_bench(small_scene(), variant, tmp_path / "camera.toml")
@@ -204,12 +204,12 @@ def judged(camera: CameraGeometry, at: Directions, light: np.ndarray) -> tuple[f
     by_fft = camera.model_copy(update={"mask_fft": True})
     places = np.flatnonzero(light)
     coarse = FrameOptics(by_fft, at, at, (400.0,), 1).frame(places, light.ravel()[places])
-    if camera.drawn(waves=False):
+    if camera.is_drawn(waves=False):
         third = camera.model_copy(update={"mask_cells": 3 * rasters.cells_per_pixel(camera)})
         drawn = replace(ShadowGeometry.of(camera, 400.0), mask=raster(third, 400.0))
         fine = Correlation(drawn, at, at).image(light, row, row)
     else:
-        assert by_fft.correlated(waves=False) and not camera.correlated(waves=False)
+        assert by_fft.is_correlated(waves=False) and not camera.is_correlated(waves=False)
         fine = FrameOptics(camera, at, at, (400.0,), 1).frame(places, light.ravel()[places])
     predicted, known = raster_error(camera, at, at, 400.0, None, light)
     return predicted, float(np.linalg.norm(coarse - fine) / np.linalg.norm(fine)), known
@@ -227,11 +227,11 @@ def judged(camera: CameraGeometry, at: Directions, light: np.ndarray) -> tuple[f
 def test_what_a_raster_leaves_is_predicted(mask: dict[str, object]) -> None:
     """Of dots, from 64 x 64 of 96 x 96 pixels; sums and FFT agree to it. (Planted: not sharpened; etched lines
     taken for even ones.)"""
-    camera = MaskProfile.model_validate({"feature_mm": 0.06, **mask}).worn(CameraGeometry(pixels=96), Path())
+    camera = MaskProfile.model_validate({"feature_mm": 0.06, **mask}).put_on(CameraGeometry(pixels=96), Path())
     light = np.zeros((40, 40))
     light[3::7, 3::7] = 1
     predicted, found, known = judged(camera, Directions.cells(np.linspace(-0.15, 0.15, 41)), light)
-    assert known == (not camera.drawn(waves=False))
+    assert known == (not camera.is_drawn(waves=False))
     assert predicted / 2 < found < 1.5 * predicted
     assert found < (2.5e-4 if mask["kind"] == "random" else 4.5e-4)
 
@@ -258,7 +258,7 @@ def test_a_plan_may_choose_cells_that_memory_holds() -> None:
 
     def turned_by_a_degree(pixels: int) -> CameraGeometry:
         profile = MaskProfile(kind="separable", feature_mm=0.06, rotation_deg=1.0)
-        return profile.worn(CameraGeometry(pixels=pixels), Path())
+        return profile.put_on(CameraGeometry(pixels=pixels), Path())
 
     assert [cells_to_choose(turned_by_a_degree(pixels), None) for pixels in (40, 512)] == [(6, 8, 12), (6, 8)]
     camera = turned_by_a_degree(40)

@@ -15,7 +15,7 @@ from scipy import stats
 
 from mitsim import psnr, reconstruct
 from mitsim.api.bench import Bench, open_bench
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask_profile import MaskProfile
@@ -52,7 +52,7 @@ def bench_of(write: Write, rows: int, columns: int, crop: dict[str, int], tall: 
     assert old in text
     stated = (TALL if tall else "") + more.get("numbers", "")
     path.write_text(text.replace(old, film).replace("<film", f"{stated}<film"), encoding="utf-8")
-    camera = shipped("calibration", "imx249.toml")
+    camera = shipped_path("calibration", "imx249.toml")
     if tall:
         high = path.with_name("high.toml")
         high.write_text(f"{camera.read_text(encoding='utf-8')}row_pitch_um = 11.72\n", encoding="utf-8")
@@ -96,10 +96,10 @@ def test_frames_of_a_part_of_a_sensor_are_its_frames_part(small_scene: Write, ex
 def test_any_masks_shadow_on_a_part_is_the_wholes_part(mask: dict[str, object], by_fft: bool) -> None:
     """By sums, by FFT as chosen and as needed, and tilted, which is interpolated between other nodes: within 1e-4.
     (Planted: crossings of rows for columns in the tilt.)"""
-    whole = MaskProfile.model_validate({"feature_mm": 0.06, **mask}).worn(CameraGeometry(pixels=64), Path())
+    whole = MaskProfile.model_validate({"feature_mm": 0.06, **mask}).put_on(CameraGeometry(pixels=64), Path())
     whole = whole.model_copy(update={"mask_fft": by_fft})
     part = whole.model_copy(update={"rows": 48, "columns": 60, "roi": (4, 9, 41, 30)})
-    assert by_fft == (whole.correlated(waves=False) and not whole.drawn(waves=False))
+    assert by_fft == (whole.is_correlated(waves=False) and not whole.is_drawn(waves=False))
     at, light = Directions.cells(np.linspace(-0.15, 0.15, 21)), np.random.default_rng(0).random(400)
     seen = [FrameOptics(each, at, at, (400.0,), 1).frame(np.arange(400), light) for each in (whole, part)]
     expected = seen[0][12:53, 11:41]
@@ -110,14 +110,16 @@ def test_any_masks_shadow_on_a_part_is_the_wholes_part(mask: dict[str, object], 
 def test_what_is_chosen_behind_a_mask_follows_the_sensors_shape() -> None:
     """No raster under tall pixels; what one leaves is told of a corner's region as of the whole; a tilt has nodes for
     the finer pitch. (Planted: tall pixels not looked at; the region kept on the few pixels; the coarser pitch.)"""
-    random = MaskProfile(kind="random", feature_mm=0.06, features=61).worn(CameraGeometry(pixels=96), Path())
+    random = MaskProfile(kind="random", feature_mm=0.06, features=61).put_on(CameraGeometry(pixels=96), Path())
     tall = random.model_copy(update={"row_pitch": 2 * random.pixel_pitch})
     assert random.may_be_drawn(waves=False) and not tall.may_be_drawn(waves=False)
     at, light = Directions.cells(np.linspace(-0.15, 0.15, 21)), np.random.default_rng(0).random((20, 20))
     corner = random.model_copy(update={"roi": (70, 70, 26, 26)})
     reported = [raster_error(each, at, at, 400.0, None, light)[0] for each in (random, corner)]
     assert reported[0] == reported[1] > 0
-    tilted = MaskProfile(kind="separable", feature_mm=0.06, order=6, tilt_row_mrad=20.0).worn(CameraGeometry(), Path())
+    tilted = MaskProfile(kind="separable", feature_mm=0.06, order=6, tilt_row_mrad=20.0).put_on(
+        CameraGeometry(), Path()
+    )
     fine = tilted.model_copy(update={"row_pitch": tilted.pixel_pitch / 2})
     assert max(fine.tilt_nodes(waves=False) or ()) > 1.5 * max(tilted.tilt_nodes(waves=False) or ())
 

@@ -14,7 +14,7 @@ import pytest
 from scipy.special import fresnel
 
 from mitsim.api.bench import open_bench
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.projector import Spectrum
@@ -29,7 +29,7 @@ LINE = Spectrum(np.array([550.0]), np.array([1.0]))
 def made(kind: str, row: float, column: float, bare: CameraGeometry = BARE) -> CameraGeometry:
     own = {"features": 127} if kind == "mura" else {"order": 7}
     table = {"kind": kind, "feature_mm": 0.06, "tilt_row_mrad": row, "tilt_column_mrad": column, **own}
-    return MaskProfile.model_validate(table).worn(bare, Path())
+    return MaskProfile.model_validate(table).put_on(bare, Path())
 
 
 def met(camera: CameraGeometry, tau: tuple[float, float], depth: float, fine: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -111,7 +111,7 @@ def test_waves_behind_a_tilted_mask_are_fresnels_integrals() -> None:
 def test_the_reference_tilts_its_mask_alike(small_scene: Callable[..., Path], variant: str, tmp_path: Path) -> None:
     """Slope of what the tilt changes in the reference's frame on what it changes in the factored one, 8 seeds of 256
     samples a pixel: 1 to five standard errors of their mean. (Planted: the sign; rows for columns.)"""
-    text = shipped("calibration", "imx249.toml").read_text(encoding="utf-8")
+    text = shipped_path("calibration", "imx249.toml").read_text(encoding="utf-8")
     benches = []
     for name, tilt in (("even", 1e-9), ("tilted", 80.0)):
         table = f'kind = "separable"\nfeature_mm = 0.06\norder = 7\ntilt_column_mrad = {tilt}\n'

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from mitsim.core.exr import read_frame
 from tests.system.conftest import tree
 from tests.unit.transport.test_path_reuse import WALL
@@ -65,7 +65,7 @@ def worn(folder: Path, mask: str) -> tuple[str, ...]:
     """The options of a camera with that table ``mask``, kept in a ``folder``; none for the scene's own."""
     if not mask:
         return ()
-    text = shipped("calibration", "imx249.toml").read_text(encoding="utf-8")
+    text = shipped_path("calibration", "imx249.toml").read_text(encoding="utf-8")
     (folder / "camera.toml").write_text(f"{text}\n[mask]\n{mask}", encoding="utf-8")
     return "--camera", str(folder / "camera.toml")
 

@@ -139,7 +139,7 @@ def run_experiment(
             store.save(point, found)
             left = (time.perf_counter() - started) / done * (len(todo) - done)
             job.progress(f"{study}: {done} of {len(todo)} points, {_duration_text(left)} left", done / len(todo))
-        return campaign.finished(folder, store, time.perf_counter() - started)
+        return campaign.finish(folder, store, time.perf_counter() - started)
 
 
 def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | None = None) -> CampaignResult:
@@ -184,7 +184,7 @@ def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | Non
     with campaign.folder(output) as (folder, store):
         for part in parts:
             store.take(Store(Path(part) / POINTS))
-        return campaign.finished(folder, store, time.perf_counter() - started)
+        return campaign.finish(folder, store, time.perf_counter() - started)
 
 
 def _all(scope: Scope, output: Path | str, each: Callable[[str, Path], CampaignResult]) -> CampaignResult:
@@ -250,7 +250,7 @@ class _Campaign:
             self._write(folder, status="incomplete")
             yield folder, store
 
-    def finished(self, folder: Path, store: Store, seconds: float) -> CampaignResult:
+    def finish(self, folder: Path, store: Store, seconds: float) -> CampaignResult:
         """Table, claims, figures and page, where all points are there; measuring them took so many ``seconds``."""
         from mitsim.studies.framework.page import Section, build_page
 
@@ -365,7 +365,7 @@ def in_processes(
     # Processes are ended, not asked to end: what they leave in their temporary folder goes with it.
     scratch = tempfile.TemporaryDirectory(prefix="mitsim-study-")
     folders = scratch.name, shared or scratch.name
-    crew = [_Worker.started(name, folders) for _ in range(min(jobs, len(batches)))]
+    crew = [_Worker.start(name, folders) for _ in range(min(jobs, len(batches)))]
     try:
         while True:
             for worker in crew:
@@ -389,7 +389,7 @@ def in_processes(
                             "--jobs 1"
                         )
                     waiting.appendleft(tuple(worker.left))
-                    crew[crew.index(worker)] = _Worker.started(name, folders)
+                    crew[crew.index(worker)] = _Worker.start(name, folders)
                 else:
                     yield worker.left.popleft(), answer
     finally:
@@ -447,7 +447,7 @@ class _Worker:
     left: deque[Point] = field(default_factory=deque)
 
     @classmethod
-    def started(cls, name: str, folders: tuple[str, str]) -> _Worker:
+    def start(cls, name: str, folders: tuple[str, str]) -> _Worker:
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
         process = context.Process(target=_serve, args=(name, folders, theirs), daemon=True)

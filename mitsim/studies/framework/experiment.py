@@ -65,12 +65,12 @@ class Setup:
     outside: bool = False
     accuracy: float = 1e-3
 
-    def changed(self, **parameters: object) -> Setup:
+    def with_parameters(self, **parameters: object) -> Setup:
         """The same with other ``parameters`` of the scene."""
         new = {**dict(self.parameters), **{name: f"{value}" for name, value in parameters.items()}}
         return replace(self, parameters=tuple(sorted(new.items())))
 
-    def printed(self, picture: str | None) -> Setup:
+    def with_print(self, picture: str | None) -> Setup:
         """The same with another ``picture`` on its print."""
         return replace(self, picture=picture)
 
@@ -191,9 +191,9 @@ class Scope:
     def repeats(self) -> tuple[int, ...]:
         """Seeds of what has no prints to take means over: three of a whole study, so that its means have errors."""
         three = (self.seeds[0] + more for more in range(3))
-        return self.chosen(tuple(dict.fromkeys((*self.seeds, *three))), self.seeds)
+        return self.choose(tuple(dict.fromkeys((*self.seeds, *three))), self.seeds)
 
-    def chosen(self, everything: Sequence[Any], few: Sequence[Any]) -> tuple[Any, ...]:
+    def choose(self, everything: Sequence[Any], few: Sequence[Any]) -> tuple[Any, ...]:
         """``few`` where the study is quick, otherwise ``everything``."""
         return tuple(few if self.quick else everything)
 

@@ -138,13 +138,13 @@ class Studio:
         """
         return self.once("bench", 3, setup, lambda: self._open(setup))
 
-    def lit(self, setup: Setup) -> LitScene:
+    def lit_scene(self, setup: Setup) -> LitScene:
         """The scene of a ``setup`` in its light."""
         return self.once("light", 1, setup, lambda: LitScene(self.bench(setup).light(accuracy=setup.accuracy)))
 
     def factors(self, setup: Setup, seed: int) -> Factors:
         """What a session with the camera of a ``setup`` estimates, its noise from ``seed``; whatever is printed."""
-        blank = setup.printed(None)
+        blank = setup.with_print(None)
         return self.once("factors", 4, (blank, seed), lambda: self._calibrate(blank, seed))
 
     def frames(self, setup: Setup, model: str, patterns: str | PatternFamily, seed: int = 0) -> Unexposed:
@@ -157,10 +157,12 @@ class Studio:
         patterns
             the family, or its name.
         """
-        lit = self.lit(setup)
+        lit = self.lit_scene(setup)
         family = lit.bench.family(patterns, seed) if isinstance(patterns, str) else patterns
         return (
-            lit.rendered(self.factors(setup, seed), family, seed) if model == RENDERED else lit.idealised(family, seed)
+            lit.rendered_frames(self.factors(setup, seed), family, seed)
+            if model == RENDERED
+            else lit.idealised_frames(family, seed)
         )
 
     def image(

@@ -149,14 +149,14 @@ def seed_of(seed: int | mi.UInt32) -> mi.UInt32:
     return dr.opaque(mi.UInt32, seed) if isinstance(seed, int) else seed
 
 
-def stratified(index: mi.UInt32, rng: mi.PCG32) -> mi.Point2f:
+def sobol_point(index: mi.UInt32, rng: mi.PCG32) -> mi.Point2f:
     """Point ``index`` of a Sobol sequence in the unit square, scrambled by numbers drawn from ``rng``."""
     first = _scramble(dr.brev(index), rng.next_uint32())
     second = _scramble(_second_dimension(index), rng.next_uint32())
     return mi.Point2f(_unit(first), _unit(second))
 
 
-def shuffled(index: mi.UInt32, rng: mi.PCG32) -> mi.UInt32:
+def shuffle(index: mi.UInt32, rng: mi.PCG32) -> mi.UInt32:
     """Numbers of samples in another order, drawn from ``rng``, in which each aligned block of 2^m is again one.
 
     :func:`stratified` points of them are as even as those of ``index`` and independent of these, so two pairs of

@@ -45,7 +45,7 @@ import mitsuba as mi
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from mitsim.core.configuration import read_toml, shipped, validate
+from mitsim.core.configuration import read_toml, shipped_path, validate
 from mitsim.core.errors import MitsimError
 from mitsim.transport.plugins.base import bsdf_class, numbers
 
@@ -95,7 +95,7 @@ class GlassModel(BaseModel):
     wavelength: float | None = Field(None, ge=_VISIBLE[0], le=_VISIBLE[1], description="of mono variants [nm]")
 
     @classmethod
-    def checked(cls, **values: object) -> GlassModel:
+    def build(cls, **values: object) -> GlassModel:
         """Build from loose ``values``; a bad one raises MitsimError with one line."""
         model = validate(cls, values, PLUGIN)
         given = [name for name in ("glass", "sellmeier", "index") if getattr(model, name) is not None]
@@ -111,7 +111,7 @@ class GlassModel(BaseModel):
                 f"{PLUGIN}: sellmeier: got {len(model.sellmeier)} numbers; give pairs B_1, C_1, B_2, C_2, ..."
             )
         for wavelength in np.linspace(*_VISIBLE, _CHECKED_WAVELENGTHS):
-            squared = model.squared(float(wavelength))
+            squared = model.index_squared(float(wavelength))
             if not 1 <= squared <= _MOST_INDEX**2:
                 raise MitsimError(
                     f"{PLUGIN}: {given[0]}: its index squared is {squared:.4g} at {wavelength:.0f} nm; give glass "
@@ -119,7 +119,7 @@ class GlassModel(BaseModel):
                 )
         return model
 
-    def squared(self, wavelength: Length) -> Length:
+    def index_squared(self, wavelength: Length) -> Length:
         """Square of the index of refraction at a ``wavelength`` [nm], a number or Dr.Jit's."""
         square = (wavelength * 1e-3) ** 2
         if self.index is not None and self.abbe is not None:
@@ -138,7 +138,7 @@ def _model(props: mi.Properties) -> GlassModel:
             values["sellmeier"] = numbers(str(text).strip(" []"))
         except ValueError:
             raise MitsimError(f"{PLUGIN}: sellmeier: got {text!r}; give numbers separated by commas") from None
-    return GlassModel.checked(**values)
+    return GlassModel.build(**values)
 
 
 def is_glass(material: mi.BSDF) -> bool:
@@ -172,7 +172,7 @@ def plugin_class() -> type:
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
             self.model = _model(props)
-            usual = read_toml(shipped("calibration", "mp_cl1.toml"))["effective_wavelength_nm"]
+            usual = read_toml(shipped_path("calibration", "mp_cl1.toml"))["effective_wavelength_nm"]
             self.wavelength = dr.opaque(mi.Float, self.model.wavelength or usual)
             both = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
             refracted = mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.NonSymmetric
@@ -194,7 +194,7 @@ def plugin_class() -> type:
             active: mi.Bool = True,
         ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
             wavelength = si.wavelengths[0] if mi.is_spectral else self.wavelength
-            part, cosine, eta_it, eta_ti = mi.fresnel(si.wi.z, dr.sqrt(self.model.squared(wavelength)))
+            part, cosine, eta_it, eta_ti = mi.fresnel(si.wi.z, dr.sqrt(self.model.index_squared(wavelength)))
             kinds = mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission
             may = [ctx.is_enabled(kind, component) for component, kind in enumerate(kinds)]
             # Where both may be, chance decides and the weight is 1; else the weight is the part.

@@ -69,7 +69,7 @@ import mitsuba as mi
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from mitsim.core.configuration import read_toml, shipped, validate
+from mitsim.core.configuration import read_toml, shipped_path, validate
 from mitsim.core.errors import MitsimError
 from mitsim.transport.plugins.base import bsdf_class, numbers
 
@@ -102,7 +102,7 @@ class GratingModel(BaseModel):
     shares: tuple[Share, ...]
 
     @classmethod
-    def checked(cls, **values: object) -> GratingModel:
+    def build(cls, **values: object) -> GratingModel:
         """Build from loose ``values``; a bad one raises MitsimError with one line."""
         model = validate(cls, values, PLUGIN)
         total = sum(model.orders.values()) + model.diffuse
@@ -131,7 +131,7 @@ class GratingModel(BaseModel):
 
 
 def _model(props: mi.Properties) -> GratingModel:
-    light = read_toml(shipped("calibration", "mp_cl1.toml"))
+    light = read_toml(shipped_path("calibration", "mp_cl1.toml"))
     values: dict[str, Any] = {}
     if "wavelengths" not in props:
         values = {"wavelengths": light["wavelengths_nm"], "shares": light["radiant_shares"]}
@@ -140,7 +140,7 @@ def _model(props: mi.Properties) -> GratingModel:
             value = props[name]
             values[name] = value if name == "grooves" else _numbers(name, value)
     values.setdefault("shares", [1.0] * len(values["wavelengths"]))
-    return GratingModel.checked(**values)
+    return GratingModel.build(**values)
 
 
 def _numbers(name: str, value: Any) -> object:
@@ -201,7 +201,7 @@ def plugin_class() -> type:
             zero = self.orders.index(0)
             values = {name: float(value.ravel()[0]) for name, value in changed.items()}
             lists = {"efficiencies": parts[zero:].tolist(), "negative_efficiencies": parts[:zero][::-1].tolist()}
-            self.model = GratingModel.checked(**{**self.model.model_dump(), **values, **lists})
+            self.model = GratingModel.build(**{**self.model.model_dump(), **values, **lists})
 
         # ---- what the derivation in the module's docstring says
 

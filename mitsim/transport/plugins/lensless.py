@@ -73,8 +73,8 @@ from mitsim.transport.plugins.base import (
     generator,
     rigidity_error,
     rows_columns,
-    shuffled,
-    stratified,
+    shuffle,
+    sobol_point,
     turn_and_origin,
     x_y,
 )
@@ -92,7 +92,7 @@ def _geometry(props: mi.Properties, film: mi.Film) -> CameraGeometry:
         values |= {"rows": rows, "columns": columns}
     if shown != [columns, rows]:
         values["roi"] = first[1], first[0], shown[1], shown[0]
-    return CameraGeometry.checked(PLUGIN, pixels=max(rows, columns), **values)
+    return CameraGeometry.build(PLUGIN, pixels=max(rows, columns), **values)
 
 
 def _check_rigid(transform: mi.AffineTransform4f) -> None:
@@ -188,8 +188,8 @@ def plugin_class() -> type:
             pixel = mi.UInt32(place.y) * columns + mi.UInt32(place.x)
             rng = generator(dr.opaque(mi.UInt32, seed), pixel)
             index = dr.arange(mi.UInt32, dr.width(film)) % dr.opaque(mi.UInt32, paths)
-            film = (place + stratified(index, rng)) / count
-            return film, stratified(shuffled(index, rng), rng)
+            film = (place + sobol_point(index, rng)) / count
+            return film, sobol_point(shuffle(index, rng), rng)
 
         def _on_sensor(self, film: mi.Point2f) -> mi.Point2f:
             """Points (0..1) of the region of interest, which the film shows, on the whole sensor (0..1)."""
@@ -218,7 +218,7 @@ def plugin_class() -> type:
                 for start, centre in zip(rows_columns(u.x, u.y), geometry.mask_offset, strict=True)
             ]
             width = 2 * stop * geometry.mask_distance / side
-            row, column, part = self._openings.drawn(mi.Point2f(*first), width, sample)
+            row, column, part = self._openings.draw(mi.Point2f(*first), width, sample)
             t = mi.Vector2f(*x_y(*(place * (2 * stop / width) - stop for place in (row, column))))
             return t, part
 
@@ -302,7 +302,7 @@ class OpenAxis:
         self._before = mi.UInt32(before.astype(np.uint32))
         self._places = mi.UInt32(np.append(np.flatnonzero(bits), len(bits)).astype(np.uint32))
 
-    def seen(self, low: mi.Float, width: float) -> _Seen:
+    def open_within(self, low: mi.Float, width: float) -> _Seen:
         """What is open from ``low`` on over a ``width``."""
         # From the feature that holds its start: the width of a narrow view keeps its digits.
         start = mi.UInt32(dr.clip(low, 0, self._size))
@@ -332,7 +332,7 @@ class _Seen:
     skipped: mi.Float
     length: mi.Float
 
-    def drawn(self, number: mi.Float) -> mi.Float:
+    def draw(self, number: mi.Float) -> mi.Float:
         """Distance from the range's start, in features, of the open place that a ``number`` in [0, 1) means."""
         place = self.skipped + number * self.length
         whole = mi.UInt32(place)
@@ -346,7 +346,7 @@ class Openings:
     def __init__(self, mask: Mask | Plate) -> None:
         self._grids = [(OpenAxis(rows), OpenAxis(columns)) for rows, columns in mask.openings]
 
-    def drawn(self, corner: mi.Point2f, width: float, number: mi.Point2f) -> tuple[mi.Float, mi.Float, mi.Float]:
+    def draw(self, corner: mi.Point2f, width: float, number: mi.Point2f) -> tuple[mi.Float, mi.Float, mi.Float]:
         """An open place of a square window, each as likely as any other.
 
         Parameters
@@ -363,14 +363,16 @@ class Openings:
         row and column from the window's first corner, in features, and the part of the window that is open: where it is
         0 the place means nothing.
         """
-        grids = [(rows.seen(corner.x, width), columns.seen(corner.y, width)) for rows, columns in self._grids]
+        grids = [
+            (rows.open_within(corner.x, width), columns.open_within(corner.y, width)) for rows, columns in self._grids
+        ]
         areas = [rows.length * columns.length for rows, columns in grids]
         total = sum(areas[1:], areas[0])
         left, (rows, columns) = number.y * total, grids[0]
-        chosen = [rows.drawn(number.x), columns.drawn(_part(left, areas[0]))]
+        chosen = [rows.draw(number.x), columns.draw(_part(left, areas[0]))]
         for (rows, columns), area, before in zip(grids[1:], areas[1:], areas, strict=False):
             further, left = left >= before, left - before
-            place = rows.drawn(number.x), columns.drawn(_part(left, area))
+            place = rows.draw(number.x), columns.draw(_part(left, area))
             chosen = [dr.select(further, new, old) for new, old in zip(place, chosen, strict=True)]
         row, column = (dr.clip(place, 0, width) for place in chosen)
         return row, column, total / width**2

@@ -55,7 +55,7 @@ def chosen(monkeypatch: pytest.MonkeyPatch) -> Callable[..., bands.Coloured]:
 
         monkeypatch.setattr(bands._ColourPilot, "__init__", looking)
         monkeypatch.setattr(bands._ColourPilot, "errors", found)
-        monkeypatch.setattr(bands, "reopened", lambda of, variant: of.reopened(variant))
+        monkeypatch.setattr(bands, "reopen", lambda of, variant: of.reopened(variant))
         monkeypatch.setattr(bands, "plan_request", planned)
 
         def of_lines(whole: Any, kind: str) -> Any:
@@ -202,7 +202,7 @@ def test_a_look_finds_what_bands_leave_of_all_lines(
     monkeypatch.setattr(bands._ColourPilot, "__init__", lambda self, whole: setattr(self, "_bench", whole))
     monkeypatch.setattr(bands._ColourPilot, "_path_samples", path_samples)
     monkeypatch.setattr(bands._ColourPilot, "_electrons", electrons)
-    monkeypatch.setattr(bands, "reopened", lambda of, variant: replace(of, variant=variant))
+    monkeypatch.setattr(bands, "reopen", lambda of, variant: replace(of, variant=variant))
     monkeypatch.setattr(bands, "line_alone", lambda of, line: replace(of, alone=line))
     look: Any = bands._ColourPilot
     found = look(OfLines(own=lines)).errors(["lines", "bands:1", "bands:2", "mono"])

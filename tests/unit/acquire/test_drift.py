@@ -13,7 +13,7 @@ import pytest
 from mitsim.acquire.exposure import AmbientFrame, DriftedExposer, Exposer, drift_mask, levels, taken_off, warmer
 from mitsim.api.bench import Bench
 from mitsim.calibrate.board_session import Session
-from mitsim.core.configuration import load_model, shipped
+from mitsim.core.configuration import load_model, shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
 from mitsim.devices.camera import CameraGeometry, Devices
@@ -28,11 +28,11 @@ from mitsim.optics.terms import shadow_terms
 from mitsim.sensor.chain import ripple_level, ripple_response
 
 PIXELS, SECONDS, SEED = 12, 0.01, 5
-SENSOR = load_sensor(shipped("calibration", "imx249.toml"))
+SENSOR = load_sensor(shipped_path("calibration", "imx249.toml"))
 DEVICES = Devices(
     CameraGeometry(pixels=PIXELS),
     SENSOR,
-    load_model(shipped("calibration", "mp_cl1.toml"), ProjectorModel),
+    load_model(shipped_path("calibration", "mp_cl1.toml"), ProjectorModel),
     "imx249.toml",
 )
 FAMILY = parse_patterns("dots:2", 4)
@@ -54,7 +54,7 @@ def test_without_drift_frames_are_the_same_bit_for_bit() -> None:
     still, drifting = Exposer(DEVICES, SECONDS, SEED), exposer()
     assert np.array_equal(frames(drifting), frames(still))
     for shot, frame in zip(FAMILY.shots, FRAMES, strict=True):
-        assert np.array_equal(drifting.lit(frame, *shot.names), still.lit(frame, *shot.names))
+        assert np.array_equal(drifting.shot_electrons(frame, *shot.names), still.shot_electrons(frame, *shot.names))
 
 
 def test_power_scales_the_projectors_light_and_lamps_that_of_lamps() -> None:
@@ -63,7 +63,7 @@ def test_power_scales_the_projectors_light_and_lamps_that_of_lamps() -> None:
         for shot, frame in zip(FAMILY.shots, FRAMES, strict=True):
             expected = power * (frame.irradiance - AMBIENT) + lamp * AMBIENT
             unit = Exposer(DEVICES, SECONDS, SEED).electrons(Frame(expected, 0.0, 0.0, 0.0))
-            assert np.allclose(camera.lit(frame, *shot.names), unit, rtol=1e-12)
+            assert np.allclose(camera.shot_electrons(frame, *shot.names), unit, rtol=1e-12)
 
 
 def test_ramps_and_flicker_are_of_frames_in_their_order() -> None:
@@ -112,8 +112,7 @@ def test_an_ambient_frame_holds_the_lamps_as_they_were() -> None:
     assert np.array_equal(taken_off(exposer(lamp=0.5), FAMILY, lit), known)
     flickering = exposer(lamp_flicker=0.2)
     found = (
-        AmbientFrame.exposed(flickering, lit, 16).digital.mean()
-        - AmbientFrame.exposed(exposer(), lit, 16).digital.mean()
+        AmbientFrame.expose(flickering, lit, 16).digital.mean() - AmbientFrame.expose(exposer(), lit, 16).digital.mean()
     )
     electrons = exposer().electrons(Lit.projector_off).mean()
     assert found == pytest.approx((flickering.ambient_levels.mean() - 1) * electrons * SENSOR.gain_dn_per_e, rel=0.2)
@@ -175,7 +174,7 @@ def test_a_mask_that_tilts_casts_the_shadow_of_one_that_was_made_so() -> None:
             "tilt_row_mrad": rows,
             "tilt_column_mrad": columns,
         }
-        return MaskProfile.model_validate(table).worn(DEVICES.camera.model_copy(update={"pixels": 48}), Path())
+        return MaskProfile.model_validate(table).put_on(DEVICES.camera.model_copy(update={"pixels": 48}), Path())
 
     def frame(camera: CameraGeometry) -> np.ndarray:
         cells = Directions.cells(np.linspace(-0.15, 0.15, 4))
@@ -202,7 +201,7 @@ def test_what_cannot_be_formed_is_refused() -> None:
     with pytest.raises(MitsimError, match=r"^drift: [^\n]*mirrors$"):
         drift_mask(bench(mirrors=True), Drift(vibration_um=1.0))
     mask = MaskProfile.model_validate({"kind": "separable", "feature_mm": 0.06, "order": 5, "rotation_deg": 1.0})
-    turned = mask.worn(DEVICES.camera, Path())
+    turned = mask.put_on(DEVICES.camera, Path())
     for drift in (Drift(vibration_um=1.0), Drift(mask_tilt_columns_mrad=1.0)):
         with pytest.raises(MitsimError, match=rf"^drift: {drift.kinds[0]} [^\n]*\[mask\]$"):
             drift_mask(bench(mask="plate", mask_plate=turned.mask_plate), drift)
@@ -236,7 +235,7 @@ def test_a_ripple_is_a_level_of_each_row_by_a_phase_of_each_frame() -> None:
             own = {"power": frame.irradiance - AMBIENT, "lamp": AMBIENT}
             unit = Exposer(DEVICES, SECONDS, SEED).electrons(Frame(own[source], 0.0, 0.0, 0.0))
             whole = Exposer(DEVICES, SECONDS, SEED).electrons(frame)
-            level = 1 + (camera.lit(frame, *shot.names) / 1.5 - whole) / unit
+            level = 1 + (camera.shot_electrons(frame, *shot.names) / 1.5 - whole) / unit
             assert np.allclose(level, level[:, :1], rtol=1e-9)
             phase = stream(SEED, "drift", f"{source} ripple", *shot.names).uniform(0, 2 * np.pi)
             response = ripple_response(devices.sensor, open_s, 37.0, PIXELS)

@@ -99,7 +99,7 @@ def test_a_signed_measurement_is_the_plain_difference_of_its_two_frames() -> Non
     camera = exposer(dark_current_e_per_s=40.0, black_level_dn=20.0)
     frames = [frame(1e-6 * (2 + index)) for index in range(len(family.shots))]
     rates = [
-        camera.rate(camera.digital(camera.lit(light, *shot.names), *shot.names))
+        camera.rate(camera.digital(camera.shot_electrons(light, *shot.names), *shot.names))
         for shot, light in zip(family.shots, frames, strict=True)
     ]
     measured = list(camera.measurements(family, frames))

@@ -183,7 +183,7 @@ def test_lamps_are_seen_by_each_pixel_through_its_filter(shared_scene: Callable[
             none[:1], none[:1], none[:1], place[3:4], place[5:6], place[:1] * 0 + 0.0025, np.array([unit]),
             np.full(1, DIRECT, np.int16),
         )  # fmt: skip
-        accumulated = simulation.accumulate("indirect", PathSamples.joined([lamps, spot]), none[:1].repeat(n**2), 1)
+        accumulated = simulation.accumulate("indirect", PathSamples.join([lamps, spot]), none[:1].repeat(n**2), 1)
         plan: Any = SimpleNamespace(settings=settings)
         zeros = np.zeros(n**2)
         truth = Truth(np.zeros((n, n)), np.zeros((n, n)), np.ones(n**2), 1)

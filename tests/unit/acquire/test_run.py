@@ -268,7 +268,7 @@ def test_what_a_plan_was_made_for_is_not_changed() -> None:
         with pytest.raises(ArgumentError, match="plan anew") as caught:
             capture.request_of(own, changes)
         assert caught.value.argument == name
-    assert capture.request_of(made, {"exposure": 0.01, "accuracy": 2e-2}) == made.request.changed(exposure=0.01)
+    assert capture.request_of(made, {"exposure": 0.01, "accuracy": 2e-2}) == made.request.with_values(exposure=0.01)
     assert capture.request_of(timed, {"exposure": 0.01}) == Request.of(seconds=3.0, exposure=0.01)
 
 
@@ -376,7 +376,9 @@ def test_measurements_are_the_noisy_response_to_each_pattern(bench: Bench) -> No
         assert residual.std() == pytest.approx(noise, rel=0.06)
     # To the last bit: a half that weighs 0.999 is less than the noise. (Planted.)
     noisy = {
-        (shot.row, shot.column, shot.sign): exposer.rate(exposer.digital(exposer.lit(frame, *shot.names), *shot.names))
+        (shot.row, shot.column, shot.sign): exposer.rate(
+            exposer.digital(exposer.shot_electrons(frame, *shot.names), *shot.names)
+        )
         for shot, frame in zip(family.shots, expected, strict=True)
     }
     assert all(np.array_equal(rate, noisy[i, j, 1] - noisy[i, j, -1]) for (i, j), rate in measured.items())

@@ -10,7 +10,7 @@ from PIL import Image
 
 from mitsim.acquire.sense import irradiance_behind_lens, read_image, sense
 from mitsim.bench.request import Exposure, check_ending
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame, write_frame
 from mitsim.devices.sensor import load_sensor
@@ -120,7 +120,7 @@ def test_what_is_no_image_is_refused_in_a_line(tmp_path: Path) -> None:
     with pytest.raises(MitsimError, match="wavelength"):
         sense(IMAGE, CAMERA, wavelength_nm=0.0)
     with pytest.raises(MitsimError, match="mosaic BGGR of colour filters, which an image of one channel"):
-        sense(IMAGE, load_sensor(shipped("calibration", "ov5647.toml")))
+        sense(IMAGE, load_sensor(shipped_path("calibration", "ov5647.toml")))
 
 
 def test_a_png_holds_16_bits(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.session import load_recipe
 from mitsim.light.settings import Settings
@@ -85,7 +85,7 @@ def test_the_board_faces_the_camera_wherever_it_stands(small_scene: Callable[...
 
 def test_recipes_are_checked(tmp_path: Path) -> None:
     assert load_recipe().signed_capture in ("pair", "uniform")
-    text = shipped("calibration", "session.toml").read_text()
+    text = shipped_path("calibration", "session.toml").read_text()
     bad = tmp_path / "session.toml"
     bad.write_text(text.replace('signed_capture = "pair"', 'signed_capture = "single"'))
     with pytest.raises(MitsimError, match="signed_capture: got 'single'"):

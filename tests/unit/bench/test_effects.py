@@ -83,7 +83,7 @@ def frame(bench: Bench, *names: str) -> np.ndarray:
     labels = np.zeros(N * N, dtype=np.int64)
     light = simulation.accumulate("direct", simulation.direct.trace(3, 0, 8), labels, 8)
     light = light + simulation.accumulate("indirect", simulation.follow(3, 4), labels, 4)
-    (shot,) = simulation.expected([light], np.zeros(1, dtype=np.int64), Lighting(labels, np.array([[0.5]])), 0)
+    (shot,) = simulation.expected_frames([light], np.zeros(1, dtype=np.int64), Lighting(labels, np.array([[0.5]])), 0)
     return shot.irradiance
 
 
@@ -112,7 +112,7 @@ def test_neutral_values(everything: Bench, name: str) -> None:
 
 def test_a_simulation_has_what_is_on(everything: Bench) -> None:
     for name in EFFECTS:
-        physics = Physics.simulated(everything, {name})
+        physics = Physics.with_effects(everything, {name})
         on = {
             other
             for other, effect in EFFECTS.items()

@@ -12,7 +12,7 @@ import pytest
 
 from mitsim.api.bench import open_bench
 from mitsim.bench import apparatus as opening
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices import mask_profile
 
@@ -58,7 +58,7 @@ def camera(tmp_path: Path) -> Callable[..., Path]:
     """The shipped camera's file with other lines."""
 
     def write(**changes: str) -> Path:
-        stated = shipped("calibration", "imx249.toml").read_text().splitlines()
+        stated = shipped_path("calibration", "imx249.toml").read_text().splitlines()
         kept = [line for line in stated if line.partition(" =")[0] not in changes]
         path = tmp_path / "own.toml"
         path.write_text("\n".join([*(f"{name} = {value}" for name, value in changes.items() if value), *kept]))
@@ -170,13 +170,13 @@ def test_a_camera_that_is_blind_to_the_projector_is_refused(
 def test_a_mask_of_the_camera_is_worn_and_is_the_only_one(loader: Loader, scene: Path) -> None:
     """(Planted: the mask left off when a bench is opened anew; both taken.)"""
     seen: list[Any] = []
-    loader.mask = SimpleNamespace(worn=lambda geometry, folder: seen.append((geometry.pitches, folder)) or "mask")
+    loader.mask = SimpleNamespace(put_on=lambda geometry, folder: seen.append((geometry.pitches, folder)) or "mask")
     bench = open_bench(scene, albedo=0.25)
     folder = opening.check_devices(None, None)[0].parent
     assert loader.worn == ["mask"] and seen == [(PITCHES, folder)]
     with pytest.raises(MitsimError, match="was set to 'mura' as well; give one of the two"):
         open_bench(scene, mask="mura")
-    other = opening.reopened(bench, "llvm_ad_rgb")
+    other = opening.reopen(bench, "llvm_ad_rgb")
     assert loader.worn == ["mask", "mask"] and other.variant == "llvm_ad_rgb" and other.devices is bench.devices
     assert loader.asked[-1] == ("llvm_ad_rgb", scene, {"albedo": "0.25"}, {"outside": True})
     assert other.loaded is not bench.loaded

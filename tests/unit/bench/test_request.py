@@ -30,8 +30,8 @@ def test_effects_may_be_written_as_on_the_command_line() -> None:
 def test_a_request_is_a_value() -> None:
     """Frozen, and equal to another of the same fields; a change gives another one."""
     request = Request.of(seed=3)
-    assert request == Request.of(seed=3) and request.changed(seed=3) == request
-    assert request.changed(patterns="uniform") == Request.of(seed=3, patterns="uniform")
+    assert request == Request.of(seed=3) and request.with_values(seed=3) == request
+    assert request.with_values(patterns="uniform") == Request.of(seed=3, patterns="uniform")
     with pytest.raises(ValueError, match="frozen"):
         request.seed = 4  # type: ignore[misc]
     assert Request.of(**request.model_dump(mode="json")) == request, "as the manifest holds it"
@@ -40,7 +40,7 @@ def test_a_request_is_a_value() -> None:
 def test_seconds_or_an_accuracy() -> None:
     """Not both; the manifest holds the one that was asked for, and reads back as the same request."""
     request = Request.of(seconds=10.0, seed=2)
-    assert request.changed(patterns="uniform") == Request.of(seconds=10.0, seed=2, patterns="uniform")
+    assert request.with_values(patterns="uniform") == Request.of(seconds=10.0, seed=2, patterns="uniform")
     assert Request.of(**request.deciding) == request and "accuracy" not in request.deciding
     assert "seconds" not in Request.of().deciding and Request.of().deciding["accuracy"] == 1e-3
     for seconds in (1e-6, 10.0, LONGEST_S):
@@ -48,7 +48,7 @@ def test_seconds_or_an_accuracy() -> None:
             ({"accuracy": 1e-3}, "seconds", "give seconds or an accuracy, not both"),
             ({"noise_fraction": 0.1}, "noise_fraction", "give one of both"),
         ):
-            for ask in (Request.of, Request.of(seconds=seconds).changed):
+            for ask in (Request.of, Request.of(seconds=seconds).with_values):
                 with pytest.raises(ArgumentError, match=f"^{named} .*: .*{reported}$") as caught:
                     ask(seconds=seconds, **other)
                 assert caught.value.argument == named

@@ -43,7 +43,7 @@ def shown(
     """Responses of a camera at a ``placement`` with white ``noise``, a part of their mean under uniform light."""
     signs, even = stripe_signs(N).astype(np.float64), np.ones(N)
     angle = placement.mask_rotation
-    terms = [model.factors(placement), *((angle * left, right) for left, right in model.turned(placement))]
+    terms = [model.factors(placement), *((angle * left, right) for left, right in model.rotation_terms(placement))]
     random, found = np.random.default_rng(seed), []
     level = noise * abs(np.outer(terms[0][0].sum(axis=1), terms[0][1].sum(axis=1))).mean()
     for side, index in which:
@@ -55,7 +55,7 @@ def shown(
 
 def patterns(frames: int) -> list[tuple[str, int]]:
     signs = stripe_signs(N)
-    return Modelling("wave", frames).chosen(np.count_nonzero(np.diff(signs, axis=0), axis=0).tolist(), True, 1)
+    return Modelling("wave", frames).used_patterns(np.count_nonzero(np.diff(signs, axis=0), axis=0).tolist(), True, 1)
 
 
 def deviations(fitted: Fitted, truth: Placement) -> FloatArray:
@@ -79,7 +79,7 @@ def test_planted_offsets_come_back_within_three_of_their_own_standard_errors(mas
     stated too large would not be seen by that: their squares' mean is above 0.1 with 99.9 % (chi-square of 6).
     """
     model = camera(mask=mask)
-    truth = model.built.moved(PLANTED)
+    truth = model.built.move(PLANTED)
     fitted = fit_placement(model, shown(model, truth, 0.1, patterns(frames), 4), FITTED)
     off = deviations(fitted, truth)
     assert np.abs(off).max() < 3 and np.square(off).mean() > 0.1
@@ -91,7 +91,7 @@ def test_planted_offsets_come_back_within_three_of_their_own_standard_errors(mas
 def test_standard_errors_are_those_that_fits_scatter_by() -> None:
     """Twelve sessions: their 72 deviations have a mean square of 1 within 0.5, three deviations of chi-square."""
     model = camera(None)
-    truth = model.built.moved(PLANTED)
+    truth = model.built.move(PLANTED)
     found = [
         deviations(fit_placement(model, shown(model, truth, 0.1, patterns(6), seed), FITTED), truth)
         for seed in range(12)
@@ -113,7 +113,7 @@ def test_numbers_that_act_alike_are_refused() -> None:
 
 def test_a_mask_far_off_is_refused_and_not_found_elsewhere() -> None:
     model = camera(None)
-    away = model.built.moved({"mask_shift_column": 0.31})
+    away = model.built.move({"mask_shift_column": 0.31})
     with pytest.raises(MitsimError, match=r"mask_shift_column: the mask is off by 0\.3 mm or more"):
         fit_placement(model, shown(model, away, 0.01, patterns(4), 0), FITTED)
 
@@ -121,13 +121,13 @@ def test_a_mask_far_off_is_refused_and_not_found_elsewhere() -> None:
 def test_what_is_held_stays_and_what_is_missing_shows() -> None:
     """A geometric model of a wave-optical camera leaves a part unexplained, as a shift that is not fitted does."""
     model = camera()
-    data = shown(model, model.built.moved({"gain": 9.0}), 0.01, patterns(6), 1)
+    data = shown(model, model.built.move({"gain": 9.0}), 0.01, patterns(6), 1)
     right = fit_placement(model, data, ("gain",))
     assert right.free == ("gain",) and right.placement == replace(model.built, gain=right.placement.gain)
     assert right.placement.gain == pytest.approx(10, rel=1e-3) and right.unexplained < 0.01
     wrong = fit_placement(camera(None), data, FITTED)
     assert wrong.unexplained > 0.015 and wrong.chi_square > 5
-    moved = shown(model, model.built.moved({"mask_shift_row": 0.01}), 0.01, patterns(6), 1)
+    moved = shown(model, model.built.move({"mask_shift_row": 0.01}), 0.01, patterns(6), 1)
     assert fit_placement(model, moved, ("gain",)).unexplained > 0.03
 
 
@@ -162,7 +162,9 @@ def test_a_turned_mask_casts_the_shadow_that_rays_through_it_make() -> None:
 
     row, column = 3, 12
     change = frame(angle, row, column) - frame(0.0, row, column)
-    reported = sum(angle * np.outer(left[:, row], right[:, column]) for left, right in model.turned(model.built))
+    reported = sum(
+        angle * np.outer(left[:, row], right[:, column]) for left, right in model.rotation_terms(model.built)
+    )
     assert np.linalg.norm(reported) > 0.02 * np.linalg.norm(frame(0.0, row, column))
     falloff = np.prod([(1 + tau[points * each : points * (each + 1)].mean() ** 2) ** -2 for each in (row, column)])
     reported = reported / falloff
@@ -179,7 +181,7 @@ def test_the_model_of_a_part_of_a_sensor_is_the_models_part(spectrum: Spectrum |
     part = replace(whole, geometry=geometry)
 
     def operators(model: ModelledCamera) -> list[FloatArray]:
-        products = [model.factors(placement)], model.turned(placement)
+        products = [model.factors(placement)], model.rotation_terms(placement)
         return [np.asarray(sum(np.einsum("ir,jc->irjc", *pair) for pair in terms)) for terms in products]
 
     for found, every, most in zip(operators(part), operators(whole), (1e-9, 0.03), strict=True):
@@ -189,13 +191,13 @@ def test_the_model_of_a_part_of_a_sensor_is_the_models_part(spectrum: Spectrum |
 
 def test_frames_are_chosen_from_coarse_to_fine_and_counted() -> None:
     changes = [0, 5, 1, 3]
-    assert Modelling("wave", 2).chosen(changes, True, 1) == [("horizontal", 0)]
-    chosen = Modelling("wave", 9).chosen(changes, True, 1)
+    assert Modelling("wave", 2).used_patterns(changes, True, 1) == [("horizontal", 0)]
+    chosen = Modelling("wave", 9).used_patterns(changes, True, 1)
     assert chosen == [("horizontal", 0), ("vertical", 2), ("horizontal", 2), ("vertical", 3)]
     assert frames_of(chosen, True, 1) == 8 and frames_of(chosen, False, 3) == 18
-    assert len(Modelling("wave", 8).chosen(changes, True, 2)) == 2
-    assert len(Modelling("wave", 8).chosen(changes, False, 1)) == 6
-    assert len(Modelling("wave", 1000).chosen(changes, True, 1)) == 7
+    assert len(Modelling("wave", 8).used_patterns(changes, True, 2)) == 2
+    assert len(Modelling("wave", 8).used_patterns(changes, False, 1)) == 6
+    assert len(Modelling("wave", 1000).used_patterns(changes, True, 1)) == 7
 
 
 def test_words_are_checked() -> None:

@@ -58,7 +58,7 @@ def test_a_rough_model_is_flagged(bench: Any, kept_plans: None) -> None:
 def test_frames_of_a_real_session_are_fitted_in_their_folder(bench: Any, tmp_path: Path) -> None:
     """Frames of a camera whose mask is off, written as numbers; the scene states it as it was to be."""
     model = model_of(bench, "wave")
-    truth = model.built.moved({"mask_shift_row": 0.02, "mask_distance": 0.03, "gain": 4e5 / bench.n})
+    truth = model.built.move({"mask_shift_row": 0.02, "mask_distance": 0.03, "gain": 4e5 / bench.n})
     real = RealSession(n=bench.n)
     real.left, real.right = model.factors(truth)
     factors = ms.calibrate_model(

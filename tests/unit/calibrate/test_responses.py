@@ -286,7 +286,7 @@ def test_factors_of_both_kinds_at_once_are_those_of_each_alone(mode: str) -> Non
 
 def test_saturated_shots_are_counted_once_across_an_interruption(monkeypatch: pytest.MonkeyPatch) -> None:
     """All shots, the uniform one of each side too: 2 x (1 + 16)."""
-    monkeypatch.setattr(Exposer, "saturated", lambda *_: True)
+    monkeypatch.setattr(Exposer, "saturates", lambda *_: True)
     lit, kept = lit_session(13, "uniform"), Kept()
     assert estimate(lit, Job())[1] == lit.session.shots == 34
     kept.left = 3

@@ -33,7 +33,7 @@ def board(n: int, pixels: int, mask: str = "separable") -> Any:
             frame_shape=(pixels, pixels),
             mask_terms=1 + (mask == "flatcam"),
             diffracts=True,
-            drawn=lambda waves: False,
+            is_drawn=lambda waves: False,
         ),
         SimpleNamespace(weights=(0.5, 0.3, 0.2)),
     )

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from mitsim.core.errors import ArgumentError, checked, checked_fields
+from mitsim.core.errors import ArgumentError, check_arguments, checked_fields
 
 Alias = Literal["a", "b"] | int
 
@@ -23,7 +23,7 @@ class Finer(Plan):
     """What inherits from it is one."""
 
 
-@checked
+@check_arguments
 def work(
     plan: Plan | str = "dots:7",
     output: Path | str | None = None,

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel, ConfigDict, Field
 
-from mitsim.core.configuration import load_model, read_toml, shipped, validate
+from mitsim.core.configuration import load_model, read_toml, shipped_path, validate
 from mitsim.core.errors import MitsimError
 
 
@@ -50,14 +50,14 @@ def test_unreadable_files_are_named(tmp_path: Path) -> None:
 
 
 def test_shipped_files_are_found_and_missing_ones_named() -> None:
-    assert shipped("calibration", "imx249.toml").is_file()
+    assert shipped_path("calibration", "imx249.toml").is_file()
     with pytest.raises(MitsimError, match=r"calibration/none\.toml: not found"):
-        shipped("calibration", "none.toml")
+        shipped_path("calibration", "none.toml")
 
 
 def test_the_shipped_projector_is_consistent_with_itself() -> None:
     # Derived figures must follow from the ones they are derived from, to the digits written.
-    data = read_toml(shipped("calibration", "mp_cl1.toml"))
+    data = read_toml(shipped_path("calibration", "mp_cl1.toml"))
     shares, lines = data["radiant_shares"], data["wavelengths_nm"]
     assert sum(shares) == pytest.approx(1.0, abs=1e-9)
     effective = sum(s * w for s, w in zip(shares, lines, strict=True))

@@ -5,7 +5,7 @@ import io
 import numpy as np
 from PIL import Image
 
-from mitsim.core.images import card, png, scaled, span, table
+from mitsim.core.images import card, normalise, png, span, table
 
 
 def opened(data: bytes) -> np.ndarray:
@@ -32,7 +32,7 @@ def test_a_span_is_short() -> None:
 
 
 def test_scaled_numbers_fill_their_range() -> None:
-    assert np.array_equal(scaled([2, 4, 3]), [0, 1, 0.5]) and np.array_equal(scaled([[5, 5]]), [[0, 0]])
+    assert np.array_equal(normalise([2, 4, 3]), [0, 1, 0.5]) and np.array_equal(normalise([[5, 5]]), [[0, 0]])
 
 
 def test_text_is_escaped_and_numbers_stand_right() -> None:

@@ -11,7 +11,7 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame
 from mitsim.core.manifests import Digital, Patterns, RunHead, RunManifest
-from mitsim.core.runs import Capture, Recorder, claimed, frame_name, load_run
+from mitsim.core.runs import Capture, Recorder, claim_run, frame_name, load_run
 from mitsim.devices.patterns import parse_patterns
 
 N, PIXELS = 6, 5
@@ -31,7 +31,7 @@ def recorded(to: Recorder, patterns: str = "hadamard:2") -> Capture:
         assert not to.keeps(index)
         to.write_frame(index, {"DN": dn, "electrons": electrons}, metadata)
     head = RunHead.of(CONFIGURATION)
-    return Capture.recorded(
+    return Capture.from_recorder(
         to,
         RunManifest(
             configuration=head.configuration,
@@ -46,7 +46,7 @@ def recorded(to: Recorder, patterns: str = "hadamard:2") -> Capture:
 
 
 def on_disk(folder: Path) -> Capture:
-    with claimed(folder, RunHead.of(CONFIGURATION), resume=False) as run:
+    with claim_run(folder, RunHead.of(CONFIGURATION), resume=False) as run:
         return recorded(run)
 
 
@@ -126,16 +126,16 @@ def test_an_unfinished_run_says_how_to_go_on(tmp_path: Path) -> None:
     """Repeating the command must not end in advice that throws finished frames away."""
     run = tmp_path / "run"
     on_disk(run)
-    with claimed(run, RunHead.of(CONFIGURATION), resume=True) as again:
+    with claim_run(run, RunHead.of(CONFIGURATION), resume=True) as again:
         again.begin()
     with (
         pytest.raises(MitsimError, match="unfinished capture with 8 finished frames; go on with resume=True"),
-        claimed(run, RunHead.of(CONFIGURATION), resume=False),
+        claim_run(run, RunHead.of(CONFIGURATION), resume=False),
     ):
         pass
     with (
         pytest.raises(MitsimError, match=r"resume=True: .* another configuration \(seed differ\)"),
-        claimed(run, RunHead.of({**CONFIGURATION, "seed": 4}), resume=True),
+        claim_run(run, RunHead.of({**CONFIGURATION, "seed": 4}), resume=True),
     ):
         pass
 

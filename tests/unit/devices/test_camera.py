@@ -67,8 +67,8 @@ def test_tall_pixels_behind_a_mask_on_a_raster_are_refused() -> None:
     """Its cells are square. A mask of one term has no raster. (Planted: let pass.)"""
     tall = CameraGeometry(pixels=8, row_pitch=0.02)
     with pytest.raises(MitsimError, match=r"row_pitch: got 0\.02 beside pixel_pitch 0\.01172; .* give square pixels"):
-        MaskProfile(kind="separable", feature_mm=0.06, order=5, rotation_deg=1.0).worn(tall, Path())
-    assert MaskProfile(kind="flatcam", feature_mm=0.06, order=5).worn(tall, Path()).row_pitch == 0.02
+        MaskProfile(kind="separable", feature_mm=0.06, order=5, rotation_deg=1.0).put_on(tall, Path())
+    assert MaskProfile(kind="flatcam", feature_mm=0.06, order=5).put_on(tall, Path()).row_pitch == 0.02
 
 
 @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ def test_tall_pixels_behind_a_mask_on_a_raster_are_refused() -> None:
 )
 def test_bad_numbers_are_refused_in_one_line(field: str, value: object) -> None:
     with pytest.raises(MitsimError, match="here: ") as caught:
-        CameraGeometry.checked("here", **{field: value})
+        CameraGeometry.build("here", **{field: value})
     assert "\n" not in str(caught.value) and field in str(caught.value)
 
 

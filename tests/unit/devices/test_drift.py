@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.session import DRIFT_PARAMETERS, DRIFT_UNITS, DRIFT_WORDS, Drift, MaskMotion, load_recipe
@@ -52,12 +52,12 @@ def test_what_cannot_be_is_one_line(kind: str, amount: float, reported: str) -> 
 
 def test_the_shipped_drift_is_of_the_shipped_session(tmp_path: Path) -> None:
     """All kinds move in it; its session is that of session.toml. (Planted: another exposure there.)"""
-    recipe = load_recipe(shipped("calibration", "drift.toml"))
+    recipe = load_recipe(shipped_path("calibration", "drift.toml"))
     assert recipe.drift.kinds == tuple(DRIFT_UNITS)
     bare = {"drift": Drift(), "source": ""}
     assert recipe.model_copy(update=bare) == load_recipe().model_copy(update=bare)
     bad = tmp_path / "bad.toml"
-    bad.write_text(shipped("calibration", "drift.toml").read_text().replace("power = 0.005", 'power = "5 %"'))
+    bad.write_text(shipped_path("calibration", "drift.toml").read_text().replace("power = 0.005", 'power = "5 %"'))
     with pytest.raises(MitsimError, match=r"drift\.power"):
         load_recipe(bad)
 

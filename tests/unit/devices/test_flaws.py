@@ -25,7 +25,9 @@ def made(kind: str = "separable", **fields: object) -> Plate:
 def test_an_etched_masks_open_area_is_that_of_longer_or_shorter_runs(grow: float) -> None:
     """A separable mask: each run of open features is 2 e longer. (Planted: grown on one side.)"""
     plate = made(over_etch_um=grow)
-    bits = np.concatenate(([0], MaskProfile(kind="separable", feature_mm=0.06, order=6).drawn(Path()).terms[0][1], [0]))
+    bits = np.concatenate(
+        ([0], MaskProfile(kind="separable", feature_mm=0.06, order=6).plate_drawing(Path()).terms[0][1], [0])
+    )
     runs = np.count_nonzero(np.diff(bits) > 0)
     assert len(plate.terms) == 1 and plate.crosses is not None
     open_mm = bits.sum() * 0.06 + runs * 2 * grow * 1e-3
@@ -71,7 +73,7 @@ def test_quarter_turns_are_numpys_and_no_flaw_is_no_change() -> None:
     assert apart.mean() < 2e-3
     assert (one.transmission(*at) != plain.transmission(*at)).sum() > 5
     named = MaskProfile(kind="separable", feature_mm=0.06, rotation_deg=0.0, dust_seed=3)
-    assert named.flawless and named.worn(BARE, Path()) == CameraGeometry(pixels=64)
+    assert named.flawless and named.put_on(BARE, Path()) == CameraGeometry(pixels=64)
 
 
 def test_a_disc_of_dust_takes_its_area() -> None:
@@ -137,7 +139,7 @@ def test_masks_too_large_for_their_flaws_are_refused_in_one_line() -> None:
             profile.plate(Path())
     for flaw in ({"edge_blur_um": 1.0}, {"rotation_deg": 1.0}, {"tilt_row_mrad": 1.0}):
         with pytest.raises(MitsimError, match="mask_thickness"):
-            MaskProfile.model_validate({"kind": "separable", "feature_mm": 0.06, **flaw}).worn(
+            MaskProfile.model_validate({"kind": "separable", "feature_mm": 0.06, **flaw}).put_on(
                 CameraGeometry(mask_thickness=0.1), Path()
             )
-    MaskProfile(kind="separable", feature_mm=0.06, over_etch_um=1.0).worn(CameraGeometry(mask_thickness=0.1), Path())
+    MaskProfile(kind="separable", feature_mm=0.06, over_etch_um=1.0).put_on(CameraGeometry(mask_thickness=0.1), Path())

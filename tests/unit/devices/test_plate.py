@@ -12,7 +12,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import mls_mask
 from mitsim.devices.mask_profile import MaskProfile, load_mask, mura
-from mitsim.devices.plate import LEFT_OUT, Plate, read_drawing, squared, within
+from mitsim.devices.plate import LEFT_OUT, Plate, make_square, read_drawing, within
 
 
 def drawn(kind: str, order: int = 6) -> np.ndarray:
@@ -148,9 +148,9 @@ def test_a_plate_that_is_closed_where_it_is_seen_keeps_few_features() -> None:
 
 
 def test_drawings_are_squared_about_their_centre() -> None:
-    feature, values = squared(np.ones((2, 4)), 0.1)
+    feature, values = make_square(np.ones((2, 4)), 0.1)
     assert feature == 0.1 and values.tolist() == [[0] * 4, [1] * 4, [1] * 4, [0] * 4]
-    feature, values = squared(np.ones((1, 2)), 0.1)
+    feature, values = make_square(np.ones((1, 2)), 0.1)
     assert feature == 0.05 and values.sum(axis=1).tolist() == [0, 4, 4, 0]
 
 
@@ -217,14 +217,14 @@ def test_a_camera_wears_a_profile_and_cameras_without_stay_what_they_were() -> N
     }
     known -= {"mask_lean_mrad", "mask_cells", "rows", "columns", "row_pitch", "roi"}
     assert set(bare.identity) == known and bare.mask_terms == 1 and bare.diffracts and not bare.centred
-    flatcam = MaskProfile(kind="flatcam", feature_mm=0.05, order=5).worn(bare, Path())
+    flatcam = MaskProfile(kind="flatcam", feature_mm=0.05, order=5).put_on(bare, Path())
     assert flatcam == CameraGeometry(mask="flatcam", mask_feature=0.05, mask_order=5, mask_offset_row=0.5)
-    random = MaskProfile(kind="random", feature_mm=0.05, features=60).worn(bare, Path())
+    random = MaskProfile(kind="random", feature_mm=0.05, features=60).put_on(bare, Path())
     assert random.build_mask() == random.mask_plate and random.mask_offset_row == 0.5 and random.mask_feature == 0.05
     assert random.mask_terms == 60 and random.diffracts and "sha256" in str(random.identity["mask_plate"])
-    assert random == MaskProfile(kind="random", feature_mm=0.05, features=60).worn(bare, Path()) != bare
-    assert MaskProfile(kind="mura", feature_mm=0.05, features=61).worn(bare, Path()).centred
+    assert random == MaskProfile(kind="random", feature_mm=0.05, features=60).put_on(bare, Path()) != bare
+    assert MaskProfile(kind="mura", feature_mm=0.05, features=61).put_on(bare, Path()).centred
     with pytest.raises(MitsimError, match="mask_thickness"):
-        MaskProfile(kind="random", feature_mm=0.05, features=60).worn(CameraGeometry(mask_thickness=0.1), Path())
+        MaskProfile(kind="random", feature_mm=0.05, features=60).put_on(CameraGeometry(mask_thickness=0.1), Path())
     with pytest.raises(MitsimError, match="plate"):
-        CameraGeometry.checked("scene", mask="plate")
+        CameraGeometry.build("scene", mask="plate")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from mitsim.core.configuration import load_model, shipped, validate
+from mitsim.core.configuration import load_model, shipped_path, validate
 from mitsim.core.errors import MitsimError
 from mitsim.devices.projector import Lines, ProjectorModel, Spectrum
 
@@ -17,7 +17,7 @@ BASE = {"name": "test", "effective_wavelength_nm": 550.0}
 
 
 def test_the_shipped_file_is_a_projector_with_its_sources() -> None:
-    model = load_model(shipped("calibration", "mp_cl1.toml"), ProjectorModel)
+    model = load_model(shipped_path("calibration", "mp_cl1.toml"), ProjectorModel)
     assert (model.luminous_flux_lm, model.columns, model.rows, model.laser_class) == (32.0, 1920, 720, "3R")
     assert "wavelengths_nm" in model.assumed and "radiant_shares" in model.derived and model.source
     assert model.black_level == pytest.approx(1 / 80_000)

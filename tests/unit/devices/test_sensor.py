@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.sensor import SensorModel, load_sensor, paper_sensor
 from tests.invented import sensor
@@ -90,14 +90,14 @@ def test_a_model_does_not_change() -> None:
     ],
 )
 def test_a_bad_file_is_one_line(tmp_path: Path, line: str, message: str) -> None:
-    text = shipped("calibration", "imx249.toml").read_text(encoding="utf-8")
+    text = shipped_path("calibration", "imx249.toml").read_text(encoding="utf-8")
     (tmp_path / "a.toml").write_text(text.replace("read_noise_e = 6.7", line))
     with pytest.raises(MitsimError, match=rf"^file [^\n]*a\.toml: {message}[^\n]*"):
         load_sensor(tmp_path / "a.toml")
 
 
 def test_the_shipped_sensor_fills_its_adc_but_does_not_overflow_it() -> None:
-    model = load_sensor(shipped("calibration", "imx249.toml"))
+    model = load_sensor(shipped_path("calibration", "imx249.toml"))
     assert model.superpixel_pitch_um == pytest.approx(11.72)  # the paper's binned pitch
     assert model.largest_dn is not None
     top = model.superpixel_full_well_e * model.gain_dn_per_e + model.superpixel_black_level_dn

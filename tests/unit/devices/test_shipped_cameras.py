@@ -10,13 +10,15 @@ from typing import Any
 import pytest
 
 from mitsim.api.bench import open_bench
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.sensor import load_sensor
 
 SERVES = re.compile(r"^# Serves: ([a-z, ]+)\. ", flags=re.M)
 SENSORS = sorted(
-    path for path in Path(shipped("calibration")).glob("*.toml") if "full_well_e" in path.read_text(encoding="utf-8")
+    path
+    for path in Path(shipped_path("calibration")).glob("*.toml")
+    if "full_well_e" in path.read_text(encoding="utf-8")
 )
 
 

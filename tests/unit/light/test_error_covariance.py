@@ -34,7 +34,7 @@ def test_the_noise_of_replicates_is_no_change_and_bounds_hold() -> None:
     squares, held = [], 0
     for seed in range(scenes):
         found = changes({part: 1e-3}, 3e-3, seed)
-        squares.append(float(found.squared(np.ones((1, 1)))[0][0]))
+        squares.append(float(found.squared_errors(np.ones((1, 1)))[0][0]))
         held += found.estimate([part]).bound >= 1e-3
     error = np.std(squares) / math.sqrt(scenes)
     assert np.mean(squares) == pytest.approx(1e-6, abs=3 * error) and error < 1e-7

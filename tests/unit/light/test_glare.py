@@ -9,7 +9,7 @@ import pytest
 from mitsim.api.bench import open_bench
 from mitsim.devices.patterns import Lighting
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation, emitted
+from mitsim.light.simulation import Simulation, emission
 
 pytestmark = pytest.mark.usefixtures("variant")
 N, FIELD, GROUPS, SAMPLES = 16, 4, 8, 256
@@ -52,7 +52,7 @@ def test_a_chessboard_has_the_ansi_contrast(made: Simulation) -> None:
     in 200, of Student's t with 7 degrees of freedom), which are below 1 %.
     """
     labels = WHITE.ravel().astype(np.int64)
-    shown = emitted(made.physics, Lighting(labels, np.array([[0.0, 1.0]])))[0]
+    shown = emission(made.physics, Lighting(labels, np.array([[0.0, 1.0]])))[0]
     middle = np.isin(np.arange(N) % FIELD, (FIELD // 2 - 1, FIELD // 2))
     chosen, contrasts = np.outer(middle, middle), []
     for seed in range(GROUPS):

@@ -187,7 +187,7 @@ def test_what_a_look_finds_is_used_again(bench: Bench, plan: Plan, family: Light
     assert looked is not None
     pairs, other = Lighting(family.labels // 2, np.eye(8)), light.behind(bench)
     unlit = Lighting(family.labels, np.hstack([family.weights, np.ones((16, 1))]))  # a class that no pixel has
-    cases = [(light, family, 3), (light, pairs, 3), (light, family, 4), (light.merged(), family, 3), (other, family, 3)]
+    cases = [(light, family, 3), (light, pairs, 3), (light, family, 4), (light.merge(), family, 3), (other, family, 3)]
     cases.append((light, unlit, 3))
     for which, shots, seed in cases:
         plain = replace(which, looked=None).frames(shots, seed)
@@ -317,7 +317,7 @@ def test_light_for_another_family_says_how_much_worse_its_frames_are(bench: Benc
 
 def test_merged_light_has_the_same_frames(bench: Bench, plan: Plan, family: Lighting) -> None:
     light = trace_light(bench, plan, family, 3)
-    merged = light.merged()
+    merged = light.merge()
     assert np.allclose(stacked(merged.frames(family, 0)), stacked(light.frames(family, 0)), rtol=1e-9)
     assert monte_carlo_error(merged.frames(family, 0)) == 0 < monte_carlo_error(light.frames(family, 0))
 

@@ -59,7 +59,7 @@ def uniform(made: Simulation, samples: int = 8, weight: float = 1.0) -> np.ndarr
     labels = np.zeros(N * N, dtype=np.int64)
     light = made.accumulate("direct", made.direct.trace(3, 0, samples), labels, samples)
     light = light + made.accumulate("indirect", made.follow(3, 4), labels, 4)
-    (frame,) = made.expected([light], np.zeros(1, dtype=np.int64), Lighting(labels, np.array([[weight]])), 0)
+    (frame,) = made.expected_frames([light], np.zeros(1, dtype=np.int64), Lighting(labels, np.array([[weight]])), 0)
     return frame.irradiance
 
 
@@ -191,7 +191,7 @@ def test_followed_lights_mean_and_its_anchors_make_one_frame(bench: Bench) -> No
     same = [
         replace(one, anchor_row=one.anchor_row + a, anchor_column=one.anchor_column + b) for a, b in np.ndindex(2, 2)
     ]
-    light = made.accumulate("indirect_residual", PathSamples.joined(same), labels, 16)["indirect_residual"]
+    light = made.accumulate("indirect_residual", PathSamples.join(same), labels, 16)["indirect_residual"]
     assert np.abs(light.data).max(initial=0) < 1e-15
     ambient = [made.from_camera.trace(seed, 0, 64) for seed in range(2)]
     assert all((one.kind == AMBIENT).any() for one in ambient)

@@ -29,7 +29,7 @@ PART = BARE.model_copy(update={"rows": 20, "columns": 12, "roi": (3, 1, 8, 10)})
 
 
 def turned(bare: CameraGeometry = BARE, **flaws: float) -> CameraGeometry:
-    return MaskProfile(kind="separable", feature_mm=0.06, order=6, rotation_deg=2.0, **flaws).worn(bare, Path())
+    return MaskProfile(kind="separable", feature_mm=0.06, order=6, rotation_deg=2.0, **flaws).put_on(bare, Path())
 
 
 def summed(camera: CameraGeometry, depth: float, light: np.ndarray) -> np.ndarray:
@@ -80,7 +80,7 @@ def test_anchors_layers_and_places_are_those_of_separable_frames(bare: CameraGeo
     seen = optics.probe(estimates, vectors)
     assert seen.shape == (3, 6)
     np.testing.assert_allclose(seen[:, :3], frame @ vectors, rtol=1e-10)
-    both, _ = optics.seen(estimates, None)
+    both, _ = optics.frame_and_products(estimates, None)
     half = optics.frame(*estimates[1])
     np.testing.assert_allclose(both, (frame + half) / 2, rtol=0, atol=1e-12 * expected.mean())
 

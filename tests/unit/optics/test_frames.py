@@ -186,7 +186,7 @@ def test_estimates_that_light_different_places_are_seen_as_each_is() -> None:
     optics = FrameOptics(CAMERA, Directions.cells(edges), Directions.cells(edges), (60.0, 20.0), 2)
     estimates = [(np.sort(rng.choice(800, 60, replace=False)), rng.random(60)) for _ in range(3)]
     vectors = rng.standard_normal((96, 4))
-    frame, probed = optics.seen(estimates, vectors)
+    frame, probed = optics.frame_and_products(estimates, vectors)
     alone = [optics.frame(*estimate) for estimate in estimates]
     assert np.allclose(frame, sum(alone) / 3, rtol=1e-12)
     assert np.allclose(probed, np.concatenate([one @ vectors for one in alone], axis=1), rtol=1e-10)
@@ -205,7 +205,7 @@ def test_light_that_fills_its_cells_casts_what_its_parts_do() -> None:
         for flat, light in estimates
     ]
     alone = [np.sum(each, axis=0) for each in parts]
-    frame, probed = optics.seen(estimates, vectors)
+    frame, probed = optics.frame_and_products(estimates, vectors)
     np.testing.assert_allclose(frame, sum(alone) / 3, rtol=1e-12)
     np.testing.assert_allclose(probed, np.concatenate([one @ vectors for one in alone], axis=1), rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(optics.seen(estimates, None)[0], frame, rtol=1e-12)
+    np.testing.assert_allclose(optics.frame_and_products(estimates, None)[0], frame, rtol=1e-12)

@@ -76,8 +76,8 @@ def test_what_interpolation_leaves_below_zero_is_reported() -> None:
 def test_frames_are_formed_as_often_as_is_promised(family: str, formed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every frame is asked for twice: to find the brightest pixel, and to expose it."""
     labels, weights = BESIDE[family]
-    count, seen = [], FrameOptics.seen
-    monkeypatch.setattr(FrameOptics, "seen", lambda *arguments: count.append(0) or seen(*arguments))
+    count, seen = [], FrameOptics.frame_and_products
+    monkeypatch.setattr(FrameOptics, "frame_and_products", lambda *arguments: count.append(0) or seen(*arguments))
     frames = expected_frames(small_optics(8), random_groups(1, 7), labels, weights, 0)
     for _ in range(2):
         assert len(list(frames)) == len(weights)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import hadamard
 
-from mitsim.optics.terms import best_term, centred, lacking, relative_difference
+from mitsim.optics.terms import best_term, centre_terms, lacking, relative_difference
 from mitsim.reconstruct.estimate_factors import estimate_factors
 
 Terms = list[tuple[np.ndarray, np.ndarray]]
@@ -71,7 +71,7 @@ def test_centred_factors_give_centred_frames() -> None:
     frame = sum(left @ scene @ right.T for left, right in terms)
     frame -= frame.mean(axis=0)
     frame -= frame.mean(axis=1, keepdims=True)
-    assert np.allclose(sum(left @ scene @ right.T for left, right in centred(terms)), frame)
+    assert np.allclose(sum(left @ scene @ right.T for left, right in centre_terms(terms)), frame)
 
 
 @pytest.mark.parametrize("count", [1, 3])

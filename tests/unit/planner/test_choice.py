@@ -20,7 +20,7 @@ from mitsim.light.settings import (
     Settings,
     SharpPixels,
 )
-from mitsim.planner.choose import cheapest, counted, predicted, value_of_refining
+from mitsim.planner.choose import cheapest, counts_of, predicted_candidate, value_of_refining
 from mitsim.planner.pilot import run_of
 from tests.unit.planner.invented_pilot_result import (
     ACCURACIES,
@@ -76,7 +76,7 @@ def test_no_choice_that_fits_is_cheaper(accuracy: float, seed: int) -> None:
     others += [replace(now, coarse_cells=count, coarse_layers=all_) for count in (1, 2, 4, 8) for all_ in (False, True)]
     others += [replace(now, effects=frozenset({"blur", "speckle"}), anchors=1, layers=(), subdivision=1)]
     for settings in others:
-        other = predicted(accuracy, pilot_result, settings, {})
+        other = predicted_candidate(accuracy, pilot_result, settings, {})
         assert not other.fits or other.work >= chosen.work * (1 - 1e-12)
 
 
@@ -85,7 +85,7 @@ def test_the_total_is_predicted_from_all_that_is_left(accuracy: float) -> None:
     """At right angles, squares add up. Where nothing is followed, it does not matter to how many points."""
     chosen = cheapest(accuracy, PILOT_RESULT, {})
     settings = chosen.settings
-    counts = zip(COUNTED, counted(settings), strict=True)
+    counts = zip(COUNTED, counts_of(settings), strict=True)
     parts = {Approximation(*count) for count in counts}
     parts |= {Approximation(name) for name in PILOT_RESULT.effects if name not in settings.effects}
     assert {part.name for part in parts if not part.count} == set(PILOT_RESULT.effects) - settings.effects
@@ -121,7 +121,7 @@ def test_opposite_errors_are_left_together() -> None:
         vectors[Approximation("diffraction")] = sign * np.full((REPLICATES, 2), 5.6e-4)
         pilot_result = replace(PILOT_RESULT, changes=ErrorCovariance.between(vectors, 1.0), apart={})
         bare = replace(cheapest(1e-3, pilot_result, {}).settings, effects=frozenset({"blur"}), subdivision=1)
-        assert predicted(1e-3, pilot_result, bare, {}).fits == fits
+        assert predicted_candidate(1e-3, pilot_result, bare, {}).fits == fits
 
 
 @pytest.mark.parametrize("accuracy", ACCURACIES)
@@ -136,7 +136,9 @@ def test_light_that_is_missing_leaves_less_for_other_errors_to_be_part_of() -> N
     """A fifth of the light, and a tenth, come over what no tracer finds: errors are those of the rest."""
     settings = cheapest(1e-2, PILOT_RESULT, {}).settings
     lacking = replace(PILOT_RESULT, unresolved=0.2, left_out=0.1)
-    before, after = (predicted(1e-2, pilot_result, settings, {}).systematic for pilot_result in (PILOT_RESULT, lacking))
+    before, after = (
+        predicted_candidate(1e-2, pilot_result, settings, {}).systematic for pilot_result in (PILOT_RESULT, lacking)
+    )
     assert before.value > 1e-3 and after == pytest.approx([0.3 + 0.7 * error for error in before])
 
 
@@ -209,7 +211,7 @@ def test_occluded_pixels_have_several_anchors_where_the_others_do(accuracy: floa
     assert (settings.anchors > 1) == (settings.occluded_anchors > 1) and settings.occluded == tuple(range(150))
     assert chosen.fits and chosen.total.bound <= accuracy
     left = {1: 6e-3, 2: 3e-3, 5: 7e-4, 16: 1e-4, 32: 3e-5}[settings.occluded_anchors]
-    with_none = predicted(accuracy, with_occluded({1: 0.0}), replace(settings, occluded_anchors=1), {})
+    with_none = predicted_candidate(accuracy, with_occluded({1: 0.0}), replace(settings, occluded_anchors=1), {})
     assert chosen.systematic.value == pytest.approx(math.hypot(with_none.systematic.value, left), rel=1e-6)
     off = cheapest(1e-3, pilot_result, {"anchors": False})
     assert off.settings.anchors == off.settings.occluded_anchors == 1 and off.fits, "what the user wants does not count"
@@ -285,7 +287,7 @@ def test_wide_cells_hold_light_of_many_anchors() -> None:
     settings = chosen.settings
     assert chosen.fits and (settings.followed_anchors, settings.followed_width) == (8, 2)
     assert entries(PILOT_RESULT.sample_costs["direct"].paths, 49, Numbers.of(settings), settings) <= 2**25
-    narrow = predicted(5e-4, without, replace(settings, followed_width=1), {}).systematic.value
+    narrow = predicted_candidate(5e-4, without, replace(settings, followed_width=1), {}).systematic.value
     assert chosen.systematic.value == pytest.approx(math.hypot(narrow, 5e-5), rel=1e-6)
     assert cheapest(1e-2, found, {}).settings.followed_width == 1, "one anchor sees nothing beyond its mean"
     wide_ones, narrow_ones = (rows(each)["followed-anchors"].reason for each in (plan(5e-4, found), plan(1e-4)))
@@ -311,7 +313,7 @@ def test_what_interpolation_leaves_of_sharp_light_counts() -> None:
         replace(ONE_CLASS, sharp=each).with_sample_costs({"sharp": light}) for each in (sharp, replace(sharp, left=0.0))
     )
     chosen = cheapest(1e-3, found, {})
-    without = predicted(1e-3, exact, replace(chosen.settings, sharp=exact.sharp), {})
+    without = predicted_candidate(1e-3, exact, replace(chosen.settings, sharp=exact.sharp), {})
     assert chosen.fits and chosen.systematic.value == pytest.approx(math.hypot(without.systematic.value, 6e-4))
     assert not cheapest(5e-4, found, {}).fits
     assert any("anchors of sharp light (7x7), 6.0e-04" in warning for warning in plan(5e-4, found).warnings)

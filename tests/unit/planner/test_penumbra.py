@@ -86,7 +86,7 @@ def frames(bench: Bench, settings: Settings, samples: int = 32) -> np.ndarray:
         seen = each.tracer.trace(integer(5, each.row.stream == "direct"), 0, count)
         accumulated = made.accumulate(name, seen, lighting.labels, count)
         light = accumulated if light is None else light + accumulated
-    return np.stack([frame.irradiance for frame in made.expected([light], np.arange(9), lighting, 0)])
+    return np.stack([frame.irradiance for frame in made.expected_frames([light], np.arange(9), lighting, 0)])
 
 
 def test_anchors_of_their_own_do_what_as_many_do_for_all(bench: Bench) -> None:
@@ -145,6 +145,6 @@ def test_pixels_with_a_pass_of_their_own_are_no_occluded_ones(bench: Bench, monk
 def test_a_longer_look_has_an_end(pixels: int) -> None:
     """Whatever certainty is worth: a look at one pixel grew until 20 GB were full. (Planted: no limit.)"""
     sample = Sample.of(parse_patterns("dots:3", N).lighting, (64, 64), mirrors=False)
-    counts = [replace(sample, times=4**looks).occluded(pixels) for looks in range(12)]
+    counts = [replace(sample, times=4**looks).samples_of_occluded(pixels) for looks in range(12)]
     assert counts == sorted(counts) and counts[0] >= 4 and counts[-1] == counts[5]
     assert counts[-1] * pixels <= max(2**11, 4 * pixels)

@@ -121,8 +121,8 @@ def test_gloss_makes_noise_at_random_points_of_the_sensor(small_scene: Callable[
     made = Simulation(bench, Settings(depth=found.depth, anchors=2))
     groups = [made.accumulate("direct", made.direct.trace(seed, 0, 16), lighting.labels, 16) for seed in range(8)]
     actual = monte_carlo_error(expected_of([(made, groups)], np.arange(16), lighting, 0)) * 8**0.5
-    assert promised(float(found.spread.noise.left(16)), actual)
-    assert found.spread.noise.left(16) > 10 * found.sample_costs["direct"].noise.left(16)
+    assert promised(float(found.spread.noise.error_left(16)), actual)
+    assert found.spread.noise.error_left(16) > 10 * found.sample_costs["direct"].noise.error_left(16)
 
 
 def test_depth_and_layers(bench: Bench, pilot_result: PilotResult) -> None:
@@ -276,7 +276,7 @@ def test_frames_of_pilot_runs_are_those_that_a_capture_forms(bench: Bench, monke
     made = Simulation(bench, everything)
     accumulated = [
         made.accumulate("direct", pilot_direct, lighting.labels, sample.direct)
-        + made.accumulate("indirect", PathSamples.joined(list(pilot_indirect)), lighting.labels, sample.followed)
+        + made.accumulate("indirect", PathSamples.join(list(pilot_indirect)), lighting.labels, sample.followed)
         for pilot_direct, *pilot_indirect in zip(found.direct, *found.followed.values(), strict=True)
     ]
     assert made.physics.lamps and made.physics.black_level and sample.shape == (5, 4) and bench.geometry.pixels > 5

@@ -29,7 +29,7 @@ def test_the_matrix_is_the_least_squares_one_that_keeps_white() -> None:
 def test_colours_that_a_matrix_can_tell_are_told_exactly() -> None:
     """Patches that are a picture of their own colours: the fitted matrix undoes the mixing."""
     mixing = np.array([[0.6, 0.3, 0.1], [0.2, 0.7, 0.1], [0.1, 0.1, 0.8]])
-    model = ColourModel.fitted(LINES, chart().xyz / white_xyz() @ mixing.T, "a picture")
+    model = ColourModel.fit(LINES, chart().xyz / white_xyz() @ mixing.T, "a picture")
     found = model.xyz(chart().xyz / white_xyz() @ mixing.T)
     assert np.allclose(found, chart().xyz, atol=1e-12) and delta_e(found, chart().xyz).max() < 1e-9
 
@@ -60,6 +60,6 @@ def test_lines_that_no_eye_sees_are_refused() -> None:
     with pytest.raises(MitsimError, match=r"a line has 1064 nm, and the chart's spectra are of 380 to 780 nm"):
         ColourModel.of_lines((520.0, 1064.0))
     with pytest.raises(MitsimError, match=r"patches are \(24, 2\) with 0 values"):
-        ColourModel.fitted(LINES, chart().at(LINES[:2]), "a picture")
+        ColourModel.fit(LINES, chart().at(LINES[:2]), "a picture")
     with pytest.raises(MitsimError, match="with 1 values that are not finite"):
-        ColourModel.fitted(LINES, np.where(np.arange(72).reshape(24, 3) == 5, np.nan, 0.5), "a picture")
+        ColourModel.fit(LINES, np.where(np.arange(72).reshape(24, 3) == 5, np.nan, 0.5), "a picture")

@@ -82,7 +82,7 @@ def test_frames_are_the_definition_s_and_their_adjoint_is_the_transpose(
     frames = np.stack(list(camera.frames(family, scene)))
     np.testing.assert_allclose(frames.ravel(), whole @ scene.ravel(), atol=1e-12)
     data = rng.standard_normal(frames.shape)
-    np.testing.assert_allclose(camera.projected(family, data).ravel(), whole.T @ data.ravel(), atol=1e-12)
+    np.testing.assert_allclose(camera.project(family, data).ravel(), whole.T @ data.ravel(), atol=1e-12)
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
@@ -97,8 +97,8 @@ def test_both_solvers_find_the_dense_minimiser(sensor: tuple[int, int] | None, k
     family, classes = parse_patterns(name, n), Classes(camera, k)
     iterative = solve_iteratively(camera, family, frames, lam, 1e-11)
     assert iterative.ok and distance(iterative.image, exact) < 1e-6
-    projected = classes.projected(frames)
-    np.testing.assert_allclose(projected, camera.projected(family, frames), atol=1e-13)
+    projected = classes.project(frames)
+    np.testing.assert_allclose(projected, camera.project(family, frames), atol=1e-13)
     direct = classes.factorise(lam).solve(projected, 1e-11)
     assert direct.ok and classes.factorised == (sensor is not None)
     assert distance(direct.image, exact) < (1e-6 if sensor is None else 1e-10)
@@ -110,7 +110,7 @@ def test_classes_too_large_to_factorise_are_solved_with_the_crop_in_each_step() 
     frames, _ = noisy(camera, "dots:2")
     classes, lam = Classes(camera, 2), 1e-2 * float(np.square(camera.psf).sum())
     assert not classes.factorised
-    direct = classes.factorise(lam).solve(classes.projected(frames), 1e-9)
+    direct = classes.factorise(lam).solve(classes.project(frames), 1e-9)
     iterative = solve_iteratively(camera, parse_patterns("dots:2", 2 * side), frames, lam, 1e-9)
     assert direct.ok and distance(direct.image, iterative.image.ravel()) < 1e-6
     assert direct.iterations < iterative.iterations  # the division is near the inverse
@@ -138,7 +138,7 @@ def test_one_division_is_the_minimiser_of_a_scene_as_large_as_its_grid(k: int) -
         plane = np.zeros(grid)
         plane[tuple(np.transpose(places))] = tikhonov(whole, data.ravel(), lam)
         image += plane[:6, :6]
-    assert distance(classes.divided(frames, lam), image.ravel()) < 1e-10
+    assert distance(classes.divide(frames, lam), image.ravel()) < 1e-10
 
 
 def test_noise_free_frames_give_the_scene_back() -> None:
@@ -147,7 +147,7 @@ def test_noise_free_frames_give_the_scene_back() -> None:
         camera = ConvolutionalCamera(spread(), 9, sensor)
         classes = Classes(camera, 3)
         frames = list(camera.frames(parse_patterns("dots:3", 9), scene))
-        image = classes.factorise(0.0).solve(classes.projected(frames), 1e-12).image
+        image = classes.factorise(0.0).solve(classes.project(frames), 1e-12).image
         np.testing.assert_allclose(image, scene, atol=1e-9)
 
 
@@ -189,7 +189,7 @@ def test_nothing_seen_is_a_dark_image() -> None:
 def test_frames_that_do_not_fit_are_refused_by_both_solvers(frames: np.ndarray, words: str) -> None:
     camera = ConvolutionalCamera(np.ones((3, 3)), 4)
     with pytest.raises(MitsimError, match=words):
-        Classes(camera, 2).projected(frames)
+        Classes(camera, 2).project(frames)
     with pytest.raises(MitsimError, match=words):
         solve_iteratively(camera, parse_patterns("dots:2", 4), frames, 1e-3)
 

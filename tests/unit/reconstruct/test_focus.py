@@ -174,7 +174,7 @@ def test_the_calibrated_depth_has_the_calibrations_own_factors() -> None:
     there = move_factors(factors, 400.0)
     assert np.array_equal(there.factors.left, factors.left) and np.array_equal(there.factors.right, factors.right)
     frames, own = shots(400.0), there.of(shots(400.0))
-    for a, b in zip(frames.measured(), own.measured(), strict=True):
+    for a, b in zip(frames.pattern_measurements(), own.pattern_measurements(), strict=True):
         assert np.array_equal(a.frame, b.frame)
     assert np.array_equal(reconstruct(frames, factors, focus=400.0).image, reconstruct(frames, factors).image)
 
@@ -317,7 +317,7 @@ def test_the_field_stop_cuts_what_moves_beyond_it() -> None:
     stopped = PARALLAX.model_copy(update={"stop_tan": 0.16})
     factor, shift = np.ones((PIXELS, FINE)), 1 / 330 - 1 / 400
     side = FactorOfDepths(factor, stopped, 1)
-    found, hidden = side.at(shift)[0], side.hidden(shift)
+    found, hidden = side.at(shift)[0], side.hidden_part(shift)
     place = (np.arange(PIXELS) - (PIXELS - 1) / 2) * PITCH
     centre = (np.arange(FINE) + 0.5) * WINDOW / FINE - WINDOW / 2
     tangent = centre + BASELINE[1] * shift - place[:, None] / 330
@@ -327,7 +327,7 @@ def test_the_field_stop_cuts_what_moves_beyond_it() -> None:
     np.testing.assert_allclose(found[:, lit], (seen / np.maximum(seen.mean(axis=0), 1e-9))[:, lit], atol=1e-6)
     assert not found[:, ~lit].any() and 0 < (hidden > 0.5).sum() < FINE / 4
     unstated = FactorOfDepths(factor, PARALLAX, 1)
-    assert not unstated.hidden(shift).any() and not side.hidden(0.0).any()
+    assert not unstated.hidden_part(shift).any() and not side.hidden_part(0.0).any()
 
 
 def test_light_that_the_field_stop_hides_is_told() -> None:

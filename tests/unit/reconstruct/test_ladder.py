@@ -18,7 +18,7 @@ def test_pixels_are_read_where_a_uniform_frame_cannot_saturate_them() -> None:
     """Of 9000 electrons a second, 1820 in 0.2 s, dark ones too; five deviations of this frame, scaled from the first,
     are 400 more. (Planted: no room.)"""
     used = Ladder.of(DIGITALS, LIGHT, 1, "weighted")
-    assert [used.used(number).tolist() for number in range(3)] == [
+    assert [used.used_pixels(number).tolist() for number in range(3)] == [
         [[True, True, True, True]],
         [[True, True, False, False]],
         [[True, True, False, False]],
@@ -45,5 +45,5 @@ def test_weights_are_those_of_the_least_variance() -> None:
 
 def test_one_exposure_is_left_as_it_is() -> None:
     alone = Ladder((FIRST,))
-    assert alone.merged([LIGHT]) is LIGHT and alone.used(0) is True
+    assert alone.merge([LIGHT]) is LIGHT and alone.used_pixels(0) is True
     assert alone.variance(LIGHT, 2) == FIRST.variance(float(LIGHT.mean()), 2)

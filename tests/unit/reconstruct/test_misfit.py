@@ -223,13 +223,13 @@ def test_chance_is_rare() -> None:
 
 def test_both_halves_of_a_pair_count_alike() -> None:
     """To the last bit: a half that weighs 0.999 leaves a thousandth of the uniform light in every measurement, which is
-    less than its noise. (Planted in Capture.measured.)"""
+    less than its noise. (Planted in Capture.pattern_measurements.)"""
     shots = bench().run("hadamard:4", picture(), 0)
     rate = {
         (shot.row, shot.column, shot.sign): shots.manifest.digital.rate(dn)
         for shot, dn in zip(shots.manifest.patterns.captures, shots.dn, strict=True)
     }
-    for each in shots.measured():
+    for each in shots.pattern_measurements():
         positive, negative = rate[each.row, each.column, 1], rate[each.row, each.column, -1]
         assert np.array_equal(each.frame, positive - negative) and np.array_equal(each.light, positive + negative)
         assert each.shots == 2 and each.power == pytest.approx(np.sum(positive**2 + negative**2), rel=1e-12)

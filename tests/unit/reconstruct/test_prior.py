@@ -24,7 +24,7 @@ def model(patterns: str) -> tuple[Prepared, np.ndarray, tuple[np.ndarray, np.nda
     left, right = rng.random((13, ROWS)), rng.random((11, COLUMNS))
     P_L, P_R = (parse_patterns(patterns, size, 0).left.astype(float) for size in (ROWS, COLUMNS))
     whole = np.concatenate([np.kron(left * p, right * q) for p in P_L.T for q in P_R.T])
-    return prepare(left, right, P_L, P_R).correlated(), whole, (P_L, P_R)
+    return prepare(left, right, P_L, P_R).with_correlation(), whole, (P_L, P_R)
 
 
 def solved(prepared: Prepared, data: np.ndarray, counts: tuple[int, int], lam: float) -> Solution:
@@ -69,7 +69,7 @@ def test_what_frames_do_not_tell_is_the_likeliest(left: str, lam: float) -> None
     data += 0.1 * rng.standard_normal(data.shape)
     inverse = np.linalg.pinv(whole @ known @ whole.T + lam * np.eye(len(whole)), rcond=1e-12)
     expected = known @ whole.T @ inverse @ data
-    prepared = prepare(factor, right, *lit).correlated()
+    prepared = prepare(factor, right, *lit).with_correlation()
     found = solved(prepared, data.reshape(1, *factor.shape[:1], 11), (1, 1), lam)
     assert found.image.ravel() == pytest.approx(expected, abs=1e-5 * np.abs(expected).max())
 
@@ -78,7 +78,7 @@ def test_a_rank_stays_what_it_is() -> None:
     """Rounding of a camera of 64 pixels and rank 20 makes values of 1e-14 of the largest. (Planted: kept; cut at
     eps / n; ones in their place.)"""
     rng, lit = np.random.default_rng(0), np.ones((64, 1))
-    side = prepare(*(rng.random((128, 20)) @ rng.random((20, 64)) for _ in range(2)), lit, lit).correlated().left
+    side = prepare(*(rng.random((128, 20)) @ rng.random((20, 64)) for _ in range(2)), lit, lit).with_correlation().left
     assert (side.singular == 0).sum() == 44 and side.singular[19] > 1e-4 * side.singular[0]
 
 
@@ -105,10 +105,10 @@ def test_the_covariance_is_that_of_a_first_order_markov_field() -> None:
 
 def test_equal_sides_are_factorised_once_and_gram_is_refused() -> None:
     factor, lit = np.random.default_rng(0).random((9, 5)), np.ones((5, 1))
-    found = prepare(factor, factor, lit, lit).correlated()
+    found = prepare(factor, factor, lit, lit).with_correlation()
     assert found.left is found.right and found.left.slabs[0].matrix.shape == (9, 5)
     with pytest.raises(MitsimError, match="prepare by svd"):
-        prepare(factor, factor, lit, lit, method="gram").correlated()
+        prepare(factor, factor, lit, lit, method="gram").with_correlation()
 
 
 def test_rounding_is_told_by_the_covariance_too() -> None:

@@ -52,7 +52,7 @@ def shots(factors: Factors) -> Capture:
     memory.write_truth(scene, 0.99)
     head = RunHead.of({"seed": 2})
     files = [frame_name(index) for index in range(len(family.shots))]
-    return Capture.recorded(
+    return Capture.from_recorder(
         memory,
         RunManifest(
             configuration=head.configuration,
@@ -122,7 +122,7 @@ def test_solvers_prepare_once_and_solve_any_number_of_scenes(shots: Capture, fac
         images = []
         for scale in (1.0, 2.0, 1.0):
             sums = prepared.accumulator()
-            for each in shots.measured():
+            for each in shots.pattern_measurements():
                 sums.add(scale * each.frame, each.row, each.column)
             images.append(solver.compute(prepared, sums, 1e-9 if solver.linear else "auto").image)
         assert np.array_equal(images[0], images[2])

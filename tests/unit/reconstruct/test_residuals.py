@@ -54,7 +54,7 @@ def test_what_is_expected_of_residuals_adds_up() -> None:
     sums = Residuals(prepared, np.zeros((3, 2)), SimpleNamespace(rendering=5.0), None)  # type: ignore[arg-type]
     sums.variance, sums.power[:] = np.full((8, 8), 2.0), rng.random((8, 8))
     assert sums.pixels.sum() == 320
-    assert sums.expected(7.0).sum() == pytest.approx(2.0 * 64 * (1 - 6 / 320) + 5 + 7)
+    assert sums.expected_energy(7.0).sum() == pytest.approx(2.0 * 64 * (1 - 6 / 320) + 5 + 7)
 
 
 def test_centring_takes_up_noise_as_well() -> None:

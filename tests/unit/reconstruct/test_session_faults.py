@@ -11,14 +11,14 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.devices.patterns import stripe_signs
-from mitsim.devices.session import SIDES, Half, taken
+from mitsim.devices.session import SIDES, Half, halves_in_order
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.estimate_factors import StripeSums, stripe_sums
 from mitsim.reconstruct.session_faults import CheckedSession, SessionConditions, check_session
 
 N, PIXELS = 32, (90, 100)
 SIGNS = stripe_signs(N).astype(float)
-ORDER = taken(N, True)
+ORDER = halves_in_order(N, True)
 Frames = dict[Half, np.ndarray]
 
 
@@ -58,7 +58,7 @@ def judged(shown: Frames, pairs: bool = True) -> CheckedSession:
     for own in sums:
         for index in range(1, N):
             response, light = pair(own.side, index)
-            own.put(own.seen(response, index, light))
+            own.put(own.fit_response(response, index, light))
     return check_session(sums, SIGNS, SessionConditions(ORDER))
 
 
@@ -78,7 +78,7 @@ def error(found: CheckedSession) -> tuple[float, float]:
 
 def test_a_good_session_is_left_as_it_is_to_the_bit() -> None:
     found = judged(frames())
-    assert not found.faults and found.lamp.listed() is None and found.extra == (0, 0)
+    assert not found.faults and found.lamp.for_manifest() is None and found.extra == (0, 0)
     assert all(isinstance(own, StripeSums) and own.done == N for own in found.sums)
 
 
@@ -160,7 +160,7 @@ def test_a_coarse_pattern_that_is_dim_without_a_pair_is_no_flicker() -> None:
     for index in (16, 8, 24):
         half = "horizontal", index, 1
         (fault,) = (found := judged({**good, half: good[half] / 2}, pairs=False)).faults
-        assert (fault.index, fault.kind) == (index, "dim") and found.lamp.listed() is None
+        assert (fault.index, fault.kind) == (index, "dim") and found.lamp.for_manifest() is None
         assert error(found)[0] < 1.3 * error(found)[1]
 
 
@@ -185,7 +185,7 @@ def test_a_board_of_uneven_lines_is_no_flicker() -> None:
     rng = np.random.default_rng(5)
     uneven = [1 + 0.015 * rng.standard_normal(N) for _ in PIXELS]
     found = judged(frames(lines=uneven), pairs=False)
-    assert found.lamp.listed() is None and not found.faults
+    assert found.lamp.for_manifest() is None and not found.faults
 
 
 def test_a_wrong_uniform_frame_without_pairs_is_refused() -> None:

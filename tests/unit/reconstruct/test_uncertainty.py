@@ -43,7 +43,7 @@ class Small:
         prepared = prepare(*self.factors, *self.patterns)
         covariance = np.eye(N)
         if prior:
-            prepared, covariance = prepared.correlated(), markov(N)
+            prepared, covariance = prepared.with_correlation(), markov(N)
         lam = 1e-3 * (prepared.left.singular.max() * prepared.right.singular.max()) ** 2
         self.propagation = Propagation(Model(prepared, self.factors, self.patterns), lam)
         self.A = self.matrix(*self.factors)
@@ -200,7 +200,7 @@ def test_the_spectrum_tells_the_energy_of_what_is_not_seen(patterns: str, fall: 
     patterns, _, prior = patterns.partition(" ")
     family, side = parse_patterns(patterns, 32, 0), shadow(n=32)
     prepared = prepare(side, side, family.left.astype(float), family.right.astype(float))
-    prepared = prepared.correlated() if prior else prepared
+    prepared = prepared.with_correlation() if prior else prepared
     sigma = np.outer(prepared.left.singular, prepared.right.singular)
     ratios = []
     for seed in range(6):
@@ -251,7 +251,7 @@ def test_what_lambda_takes_away() -> None:
     lam = automatic_lambda(problem)
     propagation = Propagation(sums.model, lam)
     found, factor = propagation.of_regularisation(problem, 0.0)
-    lost = np.square((1 - problem.kept(lam)) * sums.prepared.coefficients(picture()))
+    lost = np.square((1 - problem.kept_share(lam)) * sums.prepared.coefficients(picture()))
     assert lost.mean() / 2 < found.mean() < 4 * lost.mean()  # never above twice the error
     assert 1 < factor < 2
     found, _ = Propagation(sums.model, 1e-6 * problem.scale).of_regularisation(problem, 0.0)

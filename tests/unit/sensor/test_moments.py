@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.sensor import moments
@@ -100,6 +100,6 @@ def test_moments_of_linear_noise_are_those_without_short_cuts() -> None:
 
 def test_the_shipped_camera_s_noise_is_linear_from_the_dark_to_a_percent_below_its_well() -> None:
     """What the short cut is for: a frame that leaves it costs four times as much."""
-    model = load_sensor(shipped("calibration", "imx249.toml"))
+    model = load_sensor(shipped_path("calibration", "imx249.toml"))
     first, last = moments._linear(model)
     assert first == 0 and 0.95 < last / model.superpixel_full_well_e < 1

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.core.configuration import shipped, validate
+from mitsim.core.configuration import shipped_path, validate
 from mitsim.core.errors import MitsimError
 from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.sensor.chain import expose, ripple_level, ripple_response
 from mitsim.sensor.moments import frame_moments
 
-SENSOR = load_sensor(shipped("calibration", "imx249.toml"))
+SENSOR = load_sensor(shipped_path("calibration", "imx249.toml"))
 ROWS, HERTZ, AMPLITUDE = 40, 120.0, 0.7
 LINE_US = 90.0
 
@@ -101,12 +101,14 @@ def test_under_constant_light_a_rolling_shutter_changes_nothing() -> None:
 
 def test_shutters_of_the_shipped_cameras(tmp_path: Path) -> None:
     """Nothing is said of a global one in manifests, so that they stay as they are."""
-    rolling = {name: load_sensor(shipped("calibration", f"{name}.toml")) for name in ("imx477", "ov5647", "mt9m034")}
+    rolling = {
+        name: load_sensor(shipped_path("calibration", f"{name}.toml")) for name in ("imx477", "ov5647", "mt9m034")
+    }
     assert {name: sensor.shutter for name, sensor in rolling.items()} == dict.fromkeys(rolling, "rolling")
     assert rolling["imx477"].known_line_time_s() * 3040 == pytest.approx(0.0869, abs=1e-4)
     assert rolling["ov5647"].known_line_time_s() * 0x7B0 == pytest.approx(1 / 15.63, rel=1e-3)
     for name in ("imx249", "imx250", "imx255", "mt9m031"):
-        sensor = load_sensor(shipped("calibration", f"{name}.toml"))
+        sensor = load_sensor(shipped_path("calibration", f"{name}.toml"))
         assert sensor.shutter == "global" and sensor.known_line_time_s() == 0
         assert not {"shutter", "line_time_us"} & set(sensor.identity)
     assert rolling["ov5647"].identity["shutter"] == "rolling"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mitsim.core.configuration import shipped, validate
+from mitsim.core.configuration import shipped_path, validate
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel, load_sensor
@@ -135,7 +135,7 @@ def test_row_noise_leaves_other_draws_as_they_were() -> None:
 
 
 def test_effects_of_zero_are_no_effects() -> None:
-    model = load_sensor(shipped("calibration", "imx249.toml"))
+    model = load_sensor(shipped_path("calibration", "imx249.toml"))
     expected = np.linspace(0, 1.3e5, 64 * 48).reshape(64, 48)
 
     def frame(model: SensorModel) -> np.ndarray:
@@ -237,7 +237,7 @@ def test_crosstalk_shares_light_with_four_neighbours_and_keeps_it() -> None:
     # Of a superpixel's light that of the pixels at its sides is shared: 1/b of it.
     model = camera(binning=4, crosstalk=0.2, dark_current_e_per_s=0.0)
     assert model.superpixel_crosstalk == pytest.approx(0.05)
-    assert chain.gathered(spot, 1.0, model)[0][2, 2] == pytest.approx(95)
+    assert chain.mean_electrons(spot, 1.0, model)[0][2, 2] == pytest.approx(95)
 
 
 def test_counts_that_share_light_stay_independent_of_their_neighbours() -> None:

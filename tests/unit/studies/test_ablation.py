@@ -89,7 +89,7 @@ def test_without_all_it_is_the_idealised_model(scene: str, request: pytest.Fixtu
     blurred, under a keystone. (Planted: each effect left in.)"""
     light = request.getfixturevalue(scene)
     ablated, lit = Ablation.of(light), LitScene(light)
-    wanted = np.stack([frame.irradiance for frame in lit.expected(IDEALISED, light.bench.family(FAMILY))])
+    wanted = np.stack([frame.irradiance for frame in lit.expected_frames(IDEALISED, light.bench.family(FAMILY))])
     whole = frozenset(ablated.effects)
     assert apart(frames(ablated.without(whole)), wanted) < 5e-5
     for effect in whole - {ablation.SPECKLE, ablation.DETAIL}:
@@ -127,7 +127,7 @@ def test_depth_is_parallax(far: SampledLight) -> None:
     aside = place.parallax(path_samples)
     assert np.allclose(aside[1], -60 * (1 / 380 - 1 / 400), rtol=1e-3) and np.abs(aside[0]).max() < 1e-6
     assert (pixel_of(far, path_samples) != path_samples.pixel).mean() > 0.2
-    back = place.moved(path_samples, frozenset({ablation.DEPTH}))
+    back = place.move(path_samples, frozenset({ablation.DEPTH}))
     assert np.allclose(back.inverse_depth, 1 / 400) and np.array_equal(pixel_of(far, back), path_samples.pixel)
     assert ablation._off_plane(far)
 
@@ -136,7 +136,7 @@ def test_without_keystone_light_lies_in_its_pixel(turned: SampledLight) -> None:
     """(Planted: the homography the other way round.)"""
     path_samples = sharp_path_samples(turned)
     assert (pixel_of(turned, path_samples) != path_samples.pixel).mean() > 0.2
-    straight = ablation._Place(turned.bench).moved(path_samples, frozenset({ablation.KEYSTONE}))
+    straight = ablation._Place(turned.bench).move(path_samples, frozenset({ablation.KEYSTONE}))
     assert np.array_equal(pixel_of(turned, straight), path_samples.pixel)
     assert np.array_equal(straight.inverse_depth, path_samples.inverse_depth)
 
@@ -203,7 +203,7 @@ def test_detail_is_what_cells_of_a_pixel_differ_in(far: SampledLight) -> None:
 def test_what_hides_or_moves_points_leaves_them_where_they_are(far: SampledLight) -> None:
     """Where depth stays on, all points of a pixel have the mean of their values. (Planted: that of all pixels.)"""
     path_samples = sharp_path_samples(far)
-    two = PathSamples.joined([path_samples, replace(path_samples, value=3 * path_samples.value)])
+    two = PathSamples.join([path_samples, replace(path_samples, value=3 * path_samples.value)])
     even = ablation._even(two, far.bench.n**2)
     assert np.allclose(even.value, 2 * np.tile(path_samples.value, 2)) and np.array_equal(even.row, two.row)
 
@@ -238,7 +238,7 @@ def test_lobes_are_averaged_over_anchors_with_their_weights(far: SampledLight) -
     accumulated, weights = bundle.accumulate(path_samples, labels, 1), simulation.mean_weights(bundle.anchors)
     mean = ablation._even_lobes(accumulated, simulation)
     weight = weights[2] * weights[1]
-    again = bundle.repeated(replace(bundle, anchors=1).accumulate(path_samples.averaged(weights), labels, 1))
+    again = bundle.repeat(replace(bundle, anchors=1).accumulate(path_samples.average(weights), labels, 1))
     assert abs(mean - again).max() < 1e-12 and mean.sum() == pytest.approx(9 * weight)
     assert ablation._even_lobes(accumulated, far.simulation) is accumulated, "nothing to average where nothing is sharp"
 

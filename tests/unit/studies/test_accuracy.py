@@ -15,7 +15,7 @@ from mitsim.bench.request import Request
 from mitsim.core.job import Clock, Job
 from mitsim.light.light import Sampling, trace_light
 from mitsim.light.settings import GROUPS
-from mitsim.planner.choose import counted
+from mitsim.planner.choose import counts_of
 from mitsim.planner.planner import make_plan
 from mitsim.report import plots
 from mitsim.studies import accuracy_parts
@@ -140,11 +140,11 @@ def test_a_judge_takes_a_plans_own_numbers_where_its_time_does_not_buy_finer_one
     for seconds, taken in ((math.inf, finest), (dear, finest), (0.99 * dear, plan.settings), (0.0, plan.settings)):
         answer = Judge.trace(stand, plan, seconds)
         own, seed = traced.pop()
-        assert counted(own.settings) == counted(taken) and own.settings.effects == taken.effects
+        assert counts_of(own.settings) == counts_of(taken) and own.settings.effects == taken.effects
         assert seed == answer.facts.seed == SEED + 1
         assert answer.facts.systematic_error == stand.discretisation(taken) > 0
         assert own.sampling_target < 3e-2 / 9 or seconds < math.inf
-    assert counted(finest) != counted(plan.settings)
+    assert counts_of(finest) != counts_of(plan.settings)
 
 
 def test_the_front_is_marked_among_what_was_measured(study: AccuracyFindings) -> None:

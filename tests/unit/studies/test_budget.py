@@ -119,7 +119,9 @@ def test_a_cause_has_what_the_image_gains_without_it() -> None:
     """Beside those that are out already; the rest is neither lambda's nor of the sampling that is in all images."""
     kept, sampled = 0.9 * SCENE, Noise(light=2.0)
     images = [kept + size * STEADY for size in (3.0, 2.0, 0.5)]
-    solver = SimpleNamespace(expected=lambda light: Expected(0.9 * light), variance=lambda _, noise: 1e-3 * noise.light)
+    solver = SimpleNamespace(
+        expected_image=lambda light: Expected(0.9 * light), variance=lambda _, noise: 1e-3 * noise.light
+    )
     scatter: Any = SimpleNamespace(
         solver=solver,
         scene=SCENE,

@@ -15,7 +15,7 @@ from mitsim.api.bench import open_bench
 from mitsim.bench.request import Request
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimate, estimates
 from mitsim.core.arrays import FloatArray
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.devices.patterns import Lighting
@@ -151,7 +151,7 @@ def test_what_lambda_takes_of_a_scene_is_a_loss_of_the_solvers() -> None:
     """Nine tenths of the scene are left without noise: a hundredth of its square is lambda's, and nothing the light's.
     (Planted: lambda's part left out; all of it told as the rest of the light.)"""
     scene = np.random.default_rng(9).random((7, 7))
-    solver = SimpleNamespace(expected=lambda light: Expected(0.9 * light), variance=lambda *_: 0.0)
+    solver = SimpleNamespace(expected_image=lambda light: Expected(0.9 * light), variance=lambda *_: 0.0)
     scatter: Any = SimpleNamespace(solver=solver, scene=scene, common=lambda *_: 0.0, deviation=lambda *_: 0.0)
     found = _of_scene(scatter, {"": 0.9 * scene}, Noise())
     assert found[SOLVER, LAMBDA].square == pytest.approx(0.01 * float(np.square(scene).mean()))
@@ -211,7 +211,7 @@ def test_all_sources_together_are_what_the_image_is_off(
     """An even print, of which the model leaves nothing out: to 0.5 dB of a loss that the nonuniformity is most of, its
     rows' and columns' part of the response nothing of it."""
     own = tmp_path / "camera.toml"
-    stated = shipped("calibration", "imx249.toml").read_text().splitlines()
+    stated = shipped_path("calibration", "imx249.toml").read_text().splitlines()
     kept = [line for line in stated if line.partition(" =")[0] not in camera]
     own.write_text("\n".join([*(f"{name} = {value}" for name, value in camera.items()), *kept]))
     bench = open_bench(str(small_scene(name="even")), variant, camera=own)
@@ -261,7 +261,7 @@ def test_a_cause_without_a_row_is_said_to_be_missing(
 ) -> None:
     """A camera that is not linear, of which no row knows. (Planted: a warning for none.)"""
     own = tmp_path / "camera.toml"
-    own.write_text(f"linearity = [0.03]\n{shipped('calibration', 'imx249.toml').read_text()}")
+    own.write_text(f"linearity = [0.03]\n{shipped_path('calibration', 'imx249.toml').read_text()}")
     found, rows = losses_of(small_scene("even"), variant, camera=own)
     assert rows["not explained"].squared_error > 10 * rows["not explained"].deviation
     (warning,) = found.warnings

@@ -67,7 +67,7 @@ def test_colours_of_the_chart_are_those_of_its_spectra_at_the_lines(pair: tuple[
 
 def test_the_matrix_is_fitted_on_the_chart_where_it_is_known(pair: tuple[Path, Path], tmp_path: Path) -> None:
     found = reconstruct_colours(*pair, tmp_path / "image", PLACE)
-    expected = ColourModel.fitted(LINES, PLACE.means(found.reflectances), "")
+    expected = ColourModel.fit(LINES, PLACE.means(found.reflectances), "")
     assert np.array_equal(found.model.matrix, expected.matrix)
     assert not np.array_equal(found.model.matrix, ColourModel.of_lines(LINES).matrix)
     kept = json.loads((tmp_path / "image" / "colour.json").read_text())

@@ -11,7 +11,7 @@ import pytest
 from mitsim.acquire import capture
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.request import Request
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.runs import load_run
@@ -42,7 +42,7 @@ def test_first_sentence_of_the_opening_comment(tmp_path: Path, text: str, line: 
     assert scene_line(path) == line
 
 
-@pytest.mark.parametrize("path", sorted(shipped("scenes").glob("*/scene.xml")), ids=lambda path: path.parent.name)
+@pytest.mark.parametrize("path", sorted(shipped_path("scenes").glob("*/scene.xml")), ids=lambda path: path.parent.name)
 def test_every_shipped_scene_says_what_it_is(path: Path) -> None:
     line = scene_line(path)
     assert line.startswith(f"{path.parent.name}: ") and len(line) > 40

@@ -15,7 +15,7 @@ from mitsim.devices.patterns import hadamard_matrix
 from mitsim.devices.projector import Spectrum
 from mitsim.metrics import relative_error
 from mitsim.optics.shadow import Directions
-from mitsim.optics.terms import best_term, centred, shadow_terms
+from mitsim.optics.terms import best_term, centre_terms, shadow_terms
 from mitsim.reconstruct.estimate_factors import estimate_factors
 from mitsim.report import lit_scene
 from mitsim.report.lit_scene import IdealCamera
@@ -108,7 +108,7 @@ def test_calibration_finds_the_best_separable_factors(bench: Bench) -> None:
     if not camera.centre:
         assert difference < 1e-10
     else:
-        assert 1e-4 < difference < best_term(centred(camera.terms)).residual
+        assert 1e-4 < difference < best_term(centre_terms(camera.terms)).residual
 
 
 def test_the_geometric_mask_costs_image_quality_and_the_true_shadow_does_not(

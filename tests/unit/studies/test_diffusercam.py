@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import parse_patterns
 from mitsim.devices.sensor import load_sensor
@@ -15,7 +15,7 @@ from mitsim.report import CONVENTIONS
 from mitsim.studies.convolutional_study import best_image, race, take
 
 N = 12
-SENSOR = load_sensor(shipped("calibration", "imx249.toml"))
+SENSOR = load_sensor(shipped_path("calibration", "imx249.toml"))
 BLUR = np.exp(-np.square(np.arange(-8, 9) / 1.5) / 2)
 CAMERA = ConvolutionalCamera(np.outer(BLUR, BLUR) / BLUR.sum() ** 2, N, (22, 25))
 TRUTH = np.random.default_rng(2).uniform(0.1, 0.9, (N, N))
@@ -46,7 +46,7 @@ def test_the_best_lambda_is_found_to_a_tenth_of_a_decibel() -> None:
     classes = Classes(CAMERA, 1)
     shots = take(CAMERA, parse_patterns("uniform", N), TRUTH, SENSOR)
     solution, db = best_image(classes, shots, TRUTH)
-    projected = classes.projected(shots.frames)
+    projected = classes.project(shots.frames)
     fine = [
         psnr(classes.factorise(classes.largest * 10**exponent).solve(projected).image, TRUTH)
         for exponent in np.arange(-9, 0.01, 0.05)

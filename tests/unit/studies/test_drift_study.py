@@ -14,7 +14,7 @@ import pytest
 
 from mitsim.acquire.exposure import drift_mask, drift_projector
 from mitsim.cli.study_verb import recipe_for, scope_of
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.session import DRIFT_UNITS, Drift, load_recipe
 from mitsim.report import RENDERED
@@ -40,7 +40,7 @@ LAMP = """<emitter type="point">
 def stand(shared_scene: Callable[..., Path], variant: str) -> Iterator[DriftStand]:
     setup = Setup(str(shared_scene("drift", reflectance=PRINT)), variant=variant)
     with Studio() as studio:
-        lit = studio.lit(setup)
+        lit = studio.lit_scene(setup)
         yield DriftStand(lit, studio.factors(setup, SEED), RECIPE, lit.bench.family("dots:4"), SEED)
 
 
@@ -49,7 +49,7 @@ def lamp_stand(stand: DriftStand, shared_scene: Callable[..., Path], variant: st
     """The same before a lamp, which the session that found its factors does not see."""
     setup = Setup(str(shared_scene("drift_lamp", reflectance=PRINT, extra=LAMP)), variant=variant)
     with Studio() as studio:
-        yield replace(stand, lit=studio.lit(setup))
+        yield replace(stand, lit=studio.lit_scene(setup))
 
 
 def test_without_drift_the_image_is_the_same_bit_for_bit(stand: DriftStand) -> None:
@@ -112,12 +112,12 @@ def test_a_tilt_changes_the_image_as_it_is_predicted_to(stand: DriftStand, drift
     bench, images = stand.lit.bench, []
     for each in (Drift(), drift):
         sums = stand._model.accumulator()
-        expected = stand.lit.expected(RENDERED, stand.family, bench=drift_mask(bench, each))
+        expected = stand.lit.expected_frames(RENDERED, stand.family, bench=drift_mask(bench, each))
         for frame, shot in zip(expected, stand.family.shots, strict=True):
             sums.add(stand._frames.exposer(1.0).electrons(frame), shot.row, shot.column)
         images.append(stand._model.solve(sums, stand.linear.lam).image)
     still, tilted = (
-        stand.linear.expected(stand.lit.truth, stand._frame_changes(each)).image for each in (Drift(), drift)
+        stand.linear.expected_image(stand.lit.truth, stand._frame_changes(each)).image for each in (Drift(), drift)
     )
     changed = images[1] - images[0]
     assert np.linalg.norm(tilted - still - changed) < 0.15 * np.linalg.norm(changed)
@@ -199,7 +199,7 @@ def test_points_are_every_kind_alone() -> None:
     points, few = (experiment.points(Scope(Setup(), ("astronaut", "page"), quick=quick)) for quick in (False, True))
     assert {point["kind"] for point in points} == set(DRIFT_UNITS) and len(points) == 4 * len(DRIFT_UNITS)
     assert len({point.key for point in points}) == len(points) and {p.key for p in few} <= {p.key for p in points}
-    drift = load_recipe(shipped("calibration", "drift.toml")).drift
+    drift = load_recipe(shipped_path("calibration", "drift.toml")).drift
     assert all(point["amount"] == getattr(drift, point["kind"]) for point in points)
     assert {p.setup.scene for p in points if p["kind"].startswith("lamp")} == {"lamp_bench"}
     asked = experiment.points(Scope(Setup(), (None,), sweep=(("power", ("0.1", "0.2")),), quick=True))
@@ -228,7 +228,9 @@ def test_options_of_the_study() -> None:
     with pytest.raises(MitsimError, match=r"^sensor 'Aptina MT9M034': [^\n]*give line_time_us[^\n]*$"):
         find_experiment("drift").points(replace(unknown, sweep=(("power_ripple", ("0.1",)),)))
     with pytest.raises(MitsimError, match="moves nothing"):
-        find_experiment("drift").points(Scope(Setup(), (None,), recipe=str(shipped("calibration", "session.toml"))))
+        find_experiment("drift").points(
+            Scope(Setup(), (None,), recipe=str(shipped_path("calibration", "session.toml")))
+        )
 
 
 def test_claims_hold_predictions_against_what_was_measured() -> None:

@@ -96,7 +96,7 @@ def test_a_full_well_is_told_apart(lit: Callable[..., LitScene]) -> None:
     seconds = frames.seconds(EQUAL_PEAK)
     short, long = (split(frames, scene, time) for time in (seconds, 4 * seconds))
     assert rms(short)[SATURATION] < 1e-9
-    model, exposer = frames.prepared(), frames.exposer(4 * seconds)
+    model, exposer = frames.prepare(), frames.exposer(4 * seconds)
     sums = model.accumulator()
     for shot, frame in zip(frames.family.shots, frames.expected, strict=True):
         electrons = exposer.electrons(frame)

@@ -90,7 +90,7 @@ def test_the_mean_is_the_solvers_image(case: str, name: str, centre: bool) -> No
     in differences; uniform light of the other sign; responses without the gain.)"""
     shown = family(name)
     changed, frames = CASES[case](shown)
-    found = image(shown, centre).expected(SCENE, changed)
+    found = image(shown, centre).expected_image(SCENE, changed)
     assert np.allclose(found.image, solved(frames, shown, centre), rtol=1e-9, atol=1e-9)
     assert found.variance == 0
 
@@ -98,7 +98,7 @@ def test_the_mean_is_the_solvers_image(case: str, name: str, centre: bool) -> No
 def test_gains_of_two_frames_weigh_what_black_pixels_leak() -> None:
     """As all of their light. (Planted: the leak once.)"""
     shown = family("hadamard:2")
-    found = image(shown).expected(SCENE, gained(shown, leak=LEAK)).image
+    found = image(shown).expected_image(SCENE, gained(shown, leak=LEAK)).image
     assert np.allclose(found, solved(gains(shown)[..., None, None] * seen(shown, LEAK), shown), rtol=1e-9, atol=1e-9)
 
 
@@ -159,7 +159,7 @@ def test_variances_are_sums_over_all_that_varies(name: str) -> None:
         (Changed(added=FRAME, added_gain=0.0, added_common=(0.5 * rows, 0.2)), None, 1.0, common_rows),
     ]
     for changed, noise, variance, disturbances in cases:
-        found = image(shown).expected(SCENE, changed, noise).variance
+        found = image(shown).expected_image(SCENE, changed, noise).variance
         assert found == pytest.approx(variance * energy(disturbances), rel=1e-9), (changed, noise)
 
 
@@ -189,5 +189,5 @@ def test_decibels_of_a_gain_are_known_exactly() -> None:
     gain squared.)"""
     shown = family("dots:2")
     exact = LinearImage(LEFT, RIGHT, shown, 1e-12)
-    found = exact.expected(SCENE, Changed(gain=1.02)).psnr_db(SCENE)
+    found = exact.expected_image(SCENE, Changed(gain=1.02)).psnr_db(SCENE)
     assert found == pytest.approx(-20 * np.log10(0.02 * np.sqrt(np.square(SCENE).mean())), abs=1e-6)

@@ -86,7 +86,7 @@ def test_exposures_follow_their_conventions(studio: Studio, setup: Setup, model:
 
 
 def test_light_and_factors_are_made_once(studio: Studio, setup: Setup) -> None:
-    assert studio.lit(setup).light is studio.lit(setup).light
+    assert studio.lit_scene(setup).light is studio.lit_scene(setup).light
     assert studio.factors(setup, 3) is studio.factors(setup, 3)
     assert studio.factors(setup, 3) is not studio.factors(setup, 4)
 
@@ -119,12 +119,12 @@ def test_another_picture_is_on_the_print(studio: Studio, shared_scene: Callable[
     path.write_text(path.read_text().replace("printed_reflectance.png", "reflectance.png"))
     own = path.parent / "printed_reflectance.png"
     before = own.rename(path.parent / "reflectance.png").read_bytes()
-    truth = studio.lit(setup).truth
+    truth = studio.lit_scene(setup).truth
     # The sheet is 128 mm wide, of which the projector's 16 pixels light 120.
     seen = picture("coins")[16:-16, 16:-16].reshape(16, 30, 16, 30).mean(axis=(1, 3)) / 255 / 0.99
     assert np.abs(truth - seen).max() < 0.03 and truth.std() > 0.1
     assert (path.parent / "reflectance.png").read_bytes() == before
-    blank = studio.lit(Setup(str(path), variant=variant, accuracy=1e-2)).truth
+    blank = studio.lit_scene(Setup(str(path), variant=variant, accuracy=1e-2)).truth
     assert np.abs(blank - 100 / 255 / 0.99).max() < 0.01
 
 
@@ -152,17 +152,17 @@ def test_frames_that_are_not_square_are_averaged_by_rows_and_columns(studio: Stu
     frames = studio.frames(setup, IDEALISED, "dots:4")
     wide = replace(frames, sides=(np.ones((48, 16)), np.ones((84, 16))))
     with pytest.raises(MitsimError, match=r"frames of 48 x 84 pixels: cannot be averaged 8 x 8; .* multiples of 8"):
-        wide.prepared(8)
+        wide.prepare(8)
 
 
 def test_an_idealised_plane_casts_the_shadow_of_its_depth(studio: Studio, setup: Setup) -> None:
     """Frames of 16 dots at 370 mm, lit from 60 mm beside, against factors of that plane in closed form; at the
     calibrated distance they are those without a plane, whatever the baseline. (Planted: light moved the other way.)"""
-    lit = studio.lit(setup)
+    lit = studio.lit_scene(setup)
     bench, family = lit.bench, lit.bench.family("dots:4")
     camera, z = bench.geometry, 370.0
     own, there = (
-        [frame.irradiance for frame in lit.expected(IDEALISED, family, plane)]
+        [frame.irradiance for frame in lit.expected_frames(IDEALISED, family, plane)]
         for plane in (None, Plane(camera.scene_distance, (25.0, -60.0)))
     )
     assert np.allclose(own, there, rtol=1e-12)
@@ -171,7 +171,7 @@ def test_an_idealised_plane_casts_the_shadow_of_its_depth(studio: Studio, setup:
     for window, baseline in zip(bench.windows, (25.0, -60.0), strict=True):
         edges = z * (np.linspace(*window, bench.n + 1) + baseline * (1 / z - 1 / camera.scene_distance))
         sides.append(scene_factor(profile, camera.mask_feature, camera.pixel_edges, edges, camera.mask_distance, z))
-    for shot, frame in zip(family.shots, lit.expected(IDEALISED, family, Plane(z, (25.0, -60.0))), strict=True):
+    for shot, frame in zip(family.shots, lit.expected_frames(IDEALISED, family, Plane(z, (25.0, -60.0))), strict=True):
         expected = sides[0] @ (family.light(shot) * lit.truth) @ sides[1].T
         scale = np.vdot(expected, frame.irradiance) / np.vdot(expected, expected)
         assert np.linalg.norm(frame.irradiance - scale * expected) < 1e-6 * np.linalg.norm(frame.irradiance)

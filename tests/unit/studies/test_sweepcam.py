@@ -40,12 +40,12 @@ def setups(shared_scene: Callable[..., Path], variant: str) -> dict[str, Setup]:
 @pytest.fixture(scope="module")
 def lit(setups: dict[str, Setup]) -> dict[str, LitScene]:
     with Studio() as studio:
-        return {kind: studio.lit(setup) for kind, setup in setups.items()}
+        return {kind: studio.lit_scene(setup) for kind, setup in setups.items()}
 
 
 def rate(mask: MovedMask, row: float, column: float) -> np.ndarray:
     """Electrons a second of the frame at one place, without noise."""
-    (frame,) = mask.expected(row, column)
+    (frame,) = mask.expected_frames(row, column)
     bench = mask.lit.bench
     return electrons_from_irradiance(frame.irradiance, 1.0, bench.sensor, bench.projector.effective_wavelength_nm)
 
@@ -63,10 +63,10 @@ def test_traced_light_through_a_moved_mask_is_that_of_a_scene_that_states_it(
     offsets = '<float name="mask_offset_row" value="-0.6"/> <float name="mask_offset_column" value="0.42"/>'
     stated.write_text(path.read_text().replace('<float name="fov"', f'{offsets} <float name="fov"', 1))
     with Studio() as studio:
-        own = studio.lit(replace(setup, scene=str(stated)))
-        (frame,) = own.expected(model, own.bench.family("uniform"))
+        own = studio.lit_scene(replace(setup, scene=str(stated)))
+        (frame,) = own.expected_frames(model, own.bench.family("uniform"))
     mask = MovedMask(lit["separable"], model, {}, 0)
-    (found,), (swapped,) = mask.expected(-0.6, 0.42), mask.expected(0.42, -0.6)
+    (found,), (swapped,) = mask.expected_frames(-0.6, 0.42), mask.expected_frames(0.42, -0.6)
     size = np.linalg.norm(frame.irradiance)
     assert np.linalg.norm(found.irradiance - frame.irradiance) < 0.01 * size
     assert np.linalg.norm(swapped.irradiance - frame.irradiance) > 0.3 * size

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitsim.calibrate.calibrate import estimate
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 from mitsim.core.job import Job
 from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.light.simulation import Simulation
@@ -67,7 +67,7 @@ def studio() -> Iterator[Studio]:
 
 @pytest.fixture(scope="module")
 def levels(studio: Studio, setup: Setup) -> Levels:
-    lit = studio.lit(setup)
+    lit = studio.lit_scene(setup)
     return Levels(lit, Ablation.of(lit.light), Sessions(lit.bench, 3), FAMILY, 3)
 
 
@@ -147,7 +147,7 @@ def test_quantisation_costs_a_twelfth_of_its_step(studio: Studio, setup: Setup, 
     """The same draws, rounded or not, of eight bits: images differ by 1/12 DN^2 a datum through the solver, the sum of
     1 / s^2 over the singular values of the idealised model. 3 seeds of 256 pixels tell that to 5 %; three of them are
     allowed. (Planted: 1/6; the gain of one pixel of four.)"""
-    bench, lit = levels.lit.bench, studio.lit(setup)
+    bench, lit = levels.lit.bench, studio.lit_scene(setup)
     eight = {"bits": 8, "gain_dn_per_e": 7e-3, "black_level_dn": 2.0}
     camera = replace(bench, devices=replace(bench.devices, sensor=bench.sensor.model_copy(update=eight)))
     light = replace(lit.light, simulation=Simulation(camera, lit.light.simulation.settings))
@@ -157,8 +157,8 @@ def test_quantisation_costs_a_twelfth_of_its_step(studio: Studio, setup: Setup, 
         own = Levels(other, scene_ablation, levels._sessions, FAMILY, seed)
         rounded, exact = (own.images(on)[MODELS[0]] for on in (frozenset({QUANTISATION}), frozenset[str]()))
         squares.append(float(np.square(rounded - exact).mean()))
-    frames = other.idealised(bench.family(FAMILY), 0)
-    model, step_s = frames.prepared(), camera.sensor.gain_dn_per_e * frames.seconds(EQUAL_PEAK)
+    frames = other.idealised_frames(bench.family(FAMILY), 0)
+    model, step_s = frames.prepare(), camera.sensor.gain_dn_per_e * frames.seconds(EQUAL_PEAK)
     gain = np.square(1 / np.outer(model.left.singular, model.right.singular)).sum() / other.truth.size
     assert np.mean(squares) == pytest.approx(gain / 12 / step_s**2, rel=0.15)
 
@@ -187,7 +187,7 @@ def test_ways_differ_by_the_effect_alone(effect: str) -> None:
 
 
 def sensor() -> SensorModel:
-    return load_sensor(shipped("calibration", "imx249.toml"))
+    return load_sensor(shipped_path("calibration", "imx249.toml"))
 
 
 def test_a_sensor_without_saturation_keeps_its_steps() -> None:

@@ -13,8 +13,8 @@ from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point,
 
 
 def points(scope: Scope) -> Sequence[Point]:
-    numbers = scope.chosen((1, 2, 3), (1, 2))
-    return [Point.of(scope.setup.changed(mask=place), number=number) for place in "abcd" for number in numbers]
+    numbers = scope.choose((1, 2, 3), (1, 2))
+    return [Point.of(scope.setup.with_parameters(mask=place), number=number) for place in "abcd" for number in numbers]
 
 
 def measure(_: object, point: Point) -> Found:

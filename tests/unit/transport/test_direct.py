@@ -188,7 +188,7 @@ def test_seeds_samples_and_launches(white: Bench, monkeypatch: pytest.MonkeyPatc
     assert all(np.array_equal(getattr(whole, name), getattr(again, name)) for name in vars(whole))
     assert not np.isin(whole.row, other.row).any()
     # A sequence in pieces, in samples or in launches, is the same sequence.
-    pieces = PathSamples.joined([trace.trace(1, 0, 1), trace.trace(1, 1, 3)])
+    pieces = PathSamples.join([trace.trace(1, 0, 1), trace.trace(1, 1, 3)])
     monkeypatch.setattr(integrator.Tracer, "paths_per_launch", 300)
     launches = trace.trace(1, 0, 4)
     for parts in (pieces, launches):

@@ -61,7 +61,7 @@ def test_an_even_sky(outdoors: Bench, interreflection: bool) -> None:
     total, error = mean(np.array([one.value.sum() / 128 for one in found]))
     assert SIGMAS * error < 0.03 * expected
     assert abs(total - expected) < SIGMAS * error
-    one = PathSamples.joined(found)
+    one = PathSamples.join(found)
     on_sheet = (np.abs(one.row) < sheet) & (np.abs(one.column) < sheet)
     assert one.value[on_sheet].sum() / (128 * SEEDS) == pytest.approx(seen(sheet), rel=0.02)
     assert 1 / one.inverse_depth[on_sheet] == pytest.approx(np.full(on_sheet.sum(), 400.0), rel=1e-5)
@@ -79,7 +79,7 @@ def test_seeds_and_launches(outdoors: Bench, monkeypatch: pytest.MonkeyPatch) ->
     whole, again, other = trace.trace(6, 0, 4), trace.trace(6, 0, 4), trace.trace(7, 0, 4)
     assert all(np.array_equal(getattr(whole, name), getattr(again, name)) for name in vars(whole))
     assert np.isin(whole.row, other.row).mean() < 0.01
-    pieces = PathSamples.joined([trace.trace(6, 0, 1), trace.trace(6, 1, 3)])
+    pieces = PathSamples.join([trace.trace(6, 0, 1), trace.trace(6, 1, 3)])
     monkeypatch.setattr(integrator.Tracer, "paths_per_launch", 300)
     for parts in (pieces, trace.trace(6, 0, 4)):
         assert np.allclose(parts.row, whole.row, atol=1e-6) and np.allclose(parts.value, whole.value, rtol=1e-5)

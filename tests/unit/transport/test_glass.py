@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import open_bench
-from mitsim.bench.apparatus import reopened
+from mitsim.bench.apparatus import reopen
 from mitsim.core.errors import MitsimError
 from mitsim.devices.projector import Lines
 from mitsim.transport.plugins.glass import GlassModel, is_glass, tune
@@ -30,12 +30,12 @@ PUBLISHED = {
 
 
 def index(model: GlassModel, nanometres: float) -> float:
-    return float(np.sqrt(model.squared(nanometres)))
+    return float(np.sqrt(model.index_squared(nanometres)))
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_indices_are_those_published(name: str) -> None:
-    model, (n_d, abbe) = GlassModel.checked(glass=name), PUBLISHED[name]
+    model, (n_d, abbe) = GlassModel.build(glass=name), PUBLISHED[name]
     assert index(model, 587.56) == pytest.approx(n_d, abs=6e-5)
     dispersion = index(model, 486.13) - index(model, 656.27)
     assert (index(model, 587.56) - 1) / dispersion == pytest.approx(abbe, rel=2e-3)
@@ -43,7 +43,7 @@ def test_indices_are_those_published(name: str) -> None:
 
 def test_index_and_abbe_number_are_what_they_say() -> None:
     """At the lines that define them, and N-SF11 by its two numbers to 0.003 all over the visible."""
-    model, sf11 = GlassModel.checked(index=1.78472, abbe=25.68), GlassModel.checked(glass="n-sf11")
+    model, sf11 = GlassModel.build(index=1.78472, abbe=25.68), GlassModel.build(glass="n-sf11")
     assert index(model, 587.56) == pytest.approx(1.78472)
     assert 0.78472 / (index(model, 486.13) - index(model, 656.27)) == pytest.approx(25.68)
     assert max(abs(index(model, nm) - index(sf11, nm)) for nm in range(440, 700)) < 3e-3
@@ -53,7 +53,7 @@ def test_a_face_does_what_plain_glass_of_that_index_does() -> None:
     """Reflected, refracted or either, of light and of importance, from both sides, beyond the critical angle too."""
     glass = mi.load_dict({"type": "mitsim_glass", "glass": "n-sf11", "wavelength": 500.0})
     plain = mi.load_dict(
-        {"type": "dielectric", "int_ior": index(GlassModel.checked(glass="n-sf11"), 500), "ext_ior": 1.0}
+        {"type": "dielectric", "int_ior": index(GlassModel.build(glass="n-sf11"), 500), "ext_ior": 1.0}
     )
     assert is_glass(glass) and not is_glass(plain)
     random = np.random.default_rng(1)
@@ -94,7 +94,7 @@ def test_a_bench_s_glass_has_its_projectors_wavelength(small_scene: Callable[...
     (tmp_path / "red.toml").write_text('name = "red"\neffective_wavelength_nm = 638\n')
     glass = '<shape type="sphere"><float name="radius" value="5"/><bsdf type="mitsim_glass"/></shape>'
     bench = open_bench(small_scene(extra=glass), "llvm_ad_mono", None, tmp_path / "red.toml")
-    for opened in (bench, reopened(bench, "llvm_ad_mono")):
+    for opened in (bench, reopen(bench, "llvm_ad_mono")):
         found = {name: value for name, value in mi.traverse(opened.loaded.scene) if name.endswith("bsdf.wavelength")}
         assert [float(value[0]) for value in found.values()] == [638]
         assert opened.projector_optics.parted and opened.projector_optics.per_wavelength == (opened.projector_optics,)

@@ -126,7 +126,7 @@ def test_no_light_is_an_empty_matrix() -> None:
 def test_parts_join_in_order() -> None:
     found = path_samples()
     first = np.arange(400) < 150
-    joined = PathSamples.joined([found.where(first), PathSamples.none(), found.where(~first)])
+    joined = PathSamples.join([found.where(first), PathSamples.none(), found.where(~first)])
     assert all(np.array_equal(getattr(joined, name), getattr(found, name)) for name in vars(found))
     assert joined.pixel.dtype == np.int64
 
@@ -142,7 +142,7 @@ def test_light_averaged_over_the_anchors() -> None:
     """The mean of bilinear weights: the light of each anchor times its row's and its column's weight."""
     found, weights = path_samples(), np.array([0.7, 0.3])
     light = unpacked(bundle(), bundle().accumulate(found, LABELS).toarray())
-    mean = unpacked(bundle(anchors=1), bundle(anchors=1).accumulate(found.averaged(weights), LABELS).toarray())
+    mean = unpacked(bundle(anchors=1), bundle(anchors=1).accumulate(found.average(weights), LABELS).toarray())
     assert np.allclose(mean[:, :, 0, :, 0], np.einsum("a,b,claybx->clyx", weights, weights, light), rtol=1e-12)
 
 
@@ -150,15 +150,15 @@ def test_light_averaged_over_the_anchors() -> None:
 def test_accumulated_light_averaged_over_the_anchors(depths: tuple[float, ...]) -> None:
     """Averaged before it is accumulated or after, light is the same."""
     found, weights, made = path_samples(), np.array([0.7, 0.3]), bundle(depths)
-    before = bundle(depths, anchors=1).accumulate(found.averaged(weights), LABELS).toarray()
-    assert np.allclose(made.averaged(made.accumulate(found, LABELS), weights).toarray(), before, rtol=1e-12, atol=0)
+    before = bundle(depths, anchors=1).accumulate(found.average(weights), LABELS).toarray()
+    assert np.allclose(made.average(made.accumulate(found, LABELS), weights).toarray(), before, rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("depths", WAYS)
 def test_light_of_one_anchor_repeated_for_all(depths: tuple[float, ...]) -> None:
     made, single = bundle(depths), bundle(depths, anchors=1)
-    light = single.accumulate(path_samples().averaged(np.array([0.5, 0.5])), LABELS)
-    shown, one = unpacked(made, made.repeated(light).toarray()), unpacked(single, light.toarray())
+    light = single.accumulate(path_samples().average(np.array([0.5, 0.5])), LABELS)
+    shown, one = unpacked(made, made.repeat(light).toarray()), unpacked(single, light.toarray())
     for a, b in np.ndindex(2, 2):
         assert np.array_equal(shown[:, :, a, :, b], one[:, :, 0, :, 0])
 
@@ -176,7 +176,7 @@ def test_small_light_beside_great_light_is_counted() -> None:
     zeros = [mi.Float(np.zeros(4097, np.float32)) for _ in range(2)]
     depth = mi.Float(np.full(4097, 1 / 400, np.float32))
     seen = Sightings(mi.Float(light), mi.UInt32(np.zeros(4097, np.uint32)), *zeros, depth)
-    fetched, alone = PathSamples.fetched(seen, DIRECT), bundle(anchors=1)
+    fetched, alone = PathSamples.fetch(seen, DIRECT), bundle(anchors=1)
     assert fetched.value.dtype == np.float64 and fetched.value.sum() == 2.0**24 + 4096
     assert alone.accumulate(fetched, LABELS).sum() == 2.0**24 + 4096
     accumulator = DeviceAccumulator(alone, LABELS, one=2.0**24)

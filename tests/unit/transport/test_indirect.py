@@ -174,7 +174,7 @@ def test_seeds_and_launches(hollow: Bench, monkeypatch: pytest.MonkeyPatch) -> N
     whole, again, other = trace.trace(6, 0, 64), trace.trace(6, 0, 64), trace.trace(7, 0, 64)
     assert all(np.array_equal(getattr(whole, name), getattr(again, name)) for name in vars(whole))
     assert np.isin(whole.row, other.row).mean() < 0.01
-    pieces = PathSamples.joined([trace.trace(6, 0, 20), trace.trace(6, 20, 44)])
+    pieces = PathSamples.join([trace.trace(6, 0, 20), trace.trace(6, 20, 44)])
     monkeypatch.setattr(integrator.Tracer, "paths_per_launch", 3000)
     order = np.argsort(whole.value)
     for parts in (pieces, trace.trace(6, 0, 64)):

@@ -135,7 +135,7 @@ def test_accumulators_hold_what_anchors_are_brought(
     caustics, host = tracer.trace(4, 0, 8, whole), tracer.trace(4, 0, 8)
     units = np.array(whole.sums)
     monkeypatch.setattr(IndirectTracer, "paths_per_launch", launch)
-    again = PathSamples.joined([tracer.trace(4, first, 4, parts) for first in (0, 4)])
+    again = PathSamples.join([tracer.trace(4, first, 4, parts) for first in (0, 4)])
     assert units.any() and np.array_equal(np.array(parts.sums), units)
     for name in ("kind", "pixel", "anchor_row", "anchor_column", "value"):
         assert np.array_equal(getattr(again, name), getattr(caustics, name)), name

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsim.transport.plugins.base import generator, shuffled, stratified
+from mitsim.transport.plugins.base import generator, shuffle, sobol_point
 
 pytestmark = pytest.mark.usefixtures("variant")
 SIGMAS = 5.0
@@ -17,7 +17,7 @@ def points(samples: int, streams: int = 1, seed: int = 7, first: int = 0) -> np.
     """(streams, samples, 2) points ``first``.. of some streams of one seed."""
     lane = np.arange(streams * samples)
     index, stream = mi.UInt32(first + lane % samples), mi.UInt32(lane // samples)
-    found = stratified(index, generator(mi.UInt32(seed), stream))
+    found = sobol_point(index, generator(mi.UInt32(seed), stream))
     return np.stack([np.array(found.x), np.array(found.y)], axis=1).reshape(streams, samples, 2).astype(np.float64)
 
 
@@ -90,7 +90,7 @@ def test_two_pairs_of_dimensions_pad_to_four() -> None:
     streams, samples = 256, 64
     lane = np.arange(streams * samples)
     index, rng = mi.UInt32(lane % samples), generator(mi.UInt32(7), mi.UInt32(lane // samples))
-    first, second = stratified(index, rng), stratified(shuffled(index, rng), rng)
+    first, second = sobol_point(index, rng), sobol_point(shuffle(index, rng), rng)
     pairs = [np.stack([np.array(p.x), np.array(p.y)], axis=1).reshape(streams, samples, 2) for p in (first, second)]
     for found in pairs[1]:
         assert len(np.unique(np.floor(found * 8).astype(int) @ [8, 1])) == samples
