@@ -110,8 +110,8 @@ class Session:
 
     @cached_property
     def mask_warnings(self) -> tuple[str, ...]:
-        """What the best separable camera leaves of this one's shadow between projector pixels and sensor, where it is
-        much, and what of it waves make. Stripes, whose lines add up, show less of it."""
+        """A warning where no separable camera comes near this one's shadow between projector pixels and sensor, with
+        the residual and the part of it that diffraction makes. Stripes show less of it, since their lines add up."""
         geometry, spectrum = self.bench.geometry, self.bench.spectrum
         rays = residual = best_term(self.shadow(geometry)).residual
         if geometry.few_wave_terms and spectrum is not None:

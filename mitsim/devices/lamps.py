@@ -157,7 +157,7 @@ class CountedLamps(ByValue):
         return slice(response * MOST_LINES, (response + 1) * MOST_LINES)
 
     def units_of(self, lines: Lines) -> tuple[float, ...]:
-        """Irradiance [W m^-2] of each of ``lines``, which are of the projector, that a count of 1 stands for."""
+        """Irradiance [W m^-2] of each of the projector's ``lines`` for a count of 1."""
         known = dict(self.units)
         return tuple(known[wavelength] for wavelength in lines.wavelengths_nm)
 
@@ -171,7 +171,7 @@ class CountedLamps(ByValue):
 
 
 def line_units(sensor: SensorModel, lines: Lines) -> tuple[float, ...]:
-    """Irradiance [W m^-2] of each of the ``lines`` that makes as many electrons as a count of 1 of the ``sensor``.
+    """Irradiance [W m^-2] of each line at which the ``sensor`` counts 1.
 
     Behind a mosaic the lines have parts of the count, as of their power, that make as many in the mean over all pixels:
     s_l / sum_k s_k w_k lambda_k, with w_k the electrons a photon of line k. A line's own light is then as much beside

@@ -175,8 +175,8 @@ class Plate(ByValue):
 
     @cached_property
     def residuals(self) -> tuple[float, float]:
-        """What the best single term leaves of the transmission, rms, as a part of it: as it is, and of what is left
-        when the means of rows and columns are taken off, as a part of that."""
+        """Rms residual of the best single separable term, relative to the transmission; and the same once the means of
+        rows and columns are subtracted."""
         width = None if self.lines_mm is None else np.diff(self.lines_mm)
         centred = self.values - np.average(self.values, axis=0, weights=width)
         centred -= np.average(centred, axis=1, weights=width)[:, None]
@@ -190,7 +190,7 @@ class Plate(ByValue):
 
     @property
     def residual(self) -> float:
-        """What the best separable mask leaves of what a solver uses of this one, rms, as a part of it."""
+        """Rms residual of the best separable mask, relative to what a solver uses of this one."""
         return min(self.residuals)
 
     @cached_property
@@ -241,7 +241,7 @@ class Plate(ByValue):
 
     @property
     def cover(self) -> int:
-        """Features of a side of a square, its centre the mask's, that holds the mask as it is mounted."""
+        """Side, in features, of the smallest centred square that holds the mask as it is mounted."""
         return int(np.ceil(self.flaws.reach(self.extent_mm) / self.feature_mm))
 
     def transmission(self, s_row: npt.ArrayLike, s_col: npt.ArrayLike) -> FloatArray:

@@ -383,8 +383,8 @@ def tracing_seconds(pilot_result: PilotResult, settings: Settings, costs: UnitCo
 
 
 def traced_for(lines: int, parted: bool = False) -> float:
-    """Times what one line takes that tracing and accumulating take for so many ``lines`` on the same paths, or on paths
-    of their own where glass has ``parted`` them."""
+    """Cost of tracing and accumulating so many ``lines``, relative to one line. They share their paths unless glass has
+    ``parted`` them."""
     return lines if parted else 1 + _FURTHER_LINE * (lines - 1)
 
 

@@ -355,7 +355,7 @@ def trace_lines(
 
 @single_threaded_blas()
 def traced_again(light: SampledLight, simulation: Simulation, purpose: str = "scene") -> SampledLight:
-    """The same paths of a light, as far as another simulation has their tracers, accumulated as that does.
+    """The paths of a light, traced again and accumulated by another ``simulation``, as far as it has their tracers.
 
     Parameters
     ----------

@@ -226,7 +226,8 @@ class Mixture:
 
 
 def pair_shots(weights: FloatArray) -> tuple[FloatArray, Mixture] | None:
-    """Shots of which all others are one, or what one leaves of the light of all pixels; and all shots by these.
+    """Pairs of complementary shots: those to form, and how all shots follow from them. A shot equals a formed one, or
+    is the light of all pixels less a formed one.
 
     Patterns of +1 and -1 are shown as two shots that add up to the light of all pixels (of Hadamard patterns the first
     is that light), so half of the shots need no product of matrices. None where ``weights`` (shots, classes) have

@@ -128,8 +128,8 @@ class DirectRuns:
         return found
 
     def sample_cost(self, light: float) -> SampleCost:
-        """Monte Carlo error of one estimate of what the sensor's centre sees, relative to all ``light``, how fast it
-        falls, and its paths."""
+        """Monte Carlo error of one estimate of the light at the sensor's centre, relative to all ``light``; how fast it
+        falls with samples; and paths of a sample."""
         return self._sample_cost(self._noise, light)
 
     def spread(self, light: float) -> SampleCost:

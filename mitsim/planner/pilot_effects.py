@@ -154,7 +154,7 @@ class EffectRuns:
         return SampleCost.relative(error, self.light, samples, paths_per_sample)
 
     def with_more(self, samples: int) -> SampleCost:
-        """The same of what is followed from the camera, by replicates of so many ``samples`` of their own."""
+        """Sample cost of from-camera light, measured anew by replicates of so many ``samples``."""
         tracer = self.simulation.from_camera
         if tracer is None or not self.light:
             return SampleCost.none()
@@ -204,7 +204,8 @@ class EffectRuns:
 
     @property
     def sample_costs(self) -> dict[str, SampleCost]:
-        """That of every pass that is followed to one point of the sensor, and of sharp pixels where there are any."""
+        """Sample costs of all passes that are traced to one point of the sensor, and of sharp pixels if there are
+        any."""
         found = {name: self.sample_cost(name) for name in _FOLLOWED}
         tracer = self.simulation.sharp
         return {**found, "sharp": self._sharp_cost(tracer.paths_per_sample)} if tracer else found

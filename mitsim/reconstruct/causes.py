@@ -572,7 +572,8 @@ class Readings:
 
 
 def multiple(noise: FrameNoise, chi_square: float) -> Reading | None:
-    """That all numbers of a run are multiples of one, where its noise says that they were multiplied.
+    """A finding that all numbers of a run are multiples of one factor, where the noise shows that they were multiplied
+    by it.
 
     Multiplied numbers count too many electrons: their variance is that many times the shot noise of so many. A camera
     whose file knows of the factor has the noise that it states.

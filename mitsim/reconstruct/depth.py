@@ -58,7 +58,8 @@ _LAMBDA = 1e-3
 
 @dataclass(frozen=True)
 class Alternative:
-    """Another depth [mm] that explains the measurements as well, and what it explains less, rms part of all of them."""
+    """Another depth [mm] that explains the measurements as well, and how much less it explains (rms, relative to all
+    measurements)."""
 
     mm: float
     difference: float

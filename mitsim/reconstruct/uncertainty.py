@@ -468,8 +468,9 @@ class Propagation:
         return np.asarray(np.einsum("pkl,qkl->pq", *products, optimize=True))
 
     def of_regularisation(self, problem: DiagonalProblem, variance: float) -> tuple[FloatArray, float]:
-        """(n, n') mean square of what lambda takes away of the image of a ``problem``, whose data have the stated
-        ``variance`` where no more data than unknowns tell it; and the factor, either way, that its root is known to.
+        """(n, n') mean square of what lambda takes away from the image of a ``problem``, and the factor within which
+        its root is known. The ``variance`` of the data is used where there are no more data than unknowns to measure it
+        by.
 
         A coefficient's mean square is told by its datum and by the scene's spectrum, each as well as it knows. The mean
         is lost as an image of ones is, detail where there is more of it than of noise and detail everywhere: that is

@@ -234,7 +234,7 @@ _VOLUMETRIC = ("volpath", "volpathmis")
 
 @dataclass(frozen=True)
 class Unfit:
-    """Why an estimator must not be given a scene, and which light it loses of one that it may be given; None: none.
+    """Why each estimator refuses a scene, and which light it loses of a scene that it takes. None: no refusal, no loss.
 
     Attributes
     ----------

@@ -245,7 +245,7 @@ class Judge:
         return max(math.sqrt(max(distance**2 - noise**2, 0.0)), noise / 2)
 
     def reference(self, budget: Budget) -> Iterator[Row]:
-        """Rows of the reference, against light with the effects that it has, as far as the ``budget`` goes."""
+        """Rows that compare the reference with light that has the same effects, as far as the ``budget`` goes."""
         stand, shots = self.stand, self.stand.family.shots
         index, bench = len(shots) // 2, stand.bench
         lighting = stand.family.lighting.shots([index])

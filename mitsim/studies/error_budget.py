@@ -108,8 +108,8 @@ class _Budget:
 
 
 def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> tuple[list[LossRow], list[str]]:
-    """Rows of noise, of the scene, of what is not explained and of every drift of the recipe, and what could not be
-    predicted.
+    """Rows of the error budget: noise, scene, every drift of the recipe, and the unexplained rest; and what could not
+    be predicted.
 
     Parameters
     ----------

@@ -132,10 +132,9 @@ def direct_of(light: SampledLight) -> SampledLight:
 
 
 def as_bright(matt: SampledLight, glossy: SampledLight) -> SampledLight:
-    """Direct light of a ``matt`` scene, made as bright as that of a ``glossy`` one, projector pixel by projector pixel.
-
-    By what was traced into the frames, not by the truth: what sampling left in a pixel's brightness is no gloss.
-    """
+    """Direct light of a ``matt`` scene, scaled projector pixel by projector pixel to the brightness of a ``glossy``
+    one. The scale comes from the traced light and not from the truth, so that sampling noise of a pixel's brightness
+    does not count as gloss."""
     lit = matt.flux > _DARK * matt.apparent.board_flux
     ratio = np.divide(glossy.flux, matt.flux, out=np.zeros_like(glossy.flux), where=lit)
     rows = sparse.diags_array(np.append(ratio, 1.0))  # the last row is ambient light

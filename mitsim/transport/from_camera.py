@@ -397,8 +397,8 @@ class LampResponse:
 
 
 class LampTracer(FromCameraTracer):
-    """Lamps' light alone, at wavelengths of its own. The light of band b is deposited as that of pixel n^2 + b, b from
-    the first, as an irradiance of the projector's line, or of each of its lines."""
+    """Lamps' light alone, at wavelengths of its own. Light of band b, counted from 0, is given to pixel number n^2 + b,
+    as an irradiance at the projector's line, or at each of its lines."""
 
     of_projector = False
     by_line = True

@@ -134,7 +134,8 @@ class Passage:
         return dr.max(part) > 0, part
 
     def along(self, ray: mi.Ray3f, light: mi.Spectrum, state: State, visit: Callable[[Arrival, State], State]) -> State:
-        """What is made of all surfaces that rays meet one behind another, as far as these let light pass.
+        """The state after ``visit`` of every surface on the way of each ray, up to the first that lets no light
+        straight on.
 
         Neighbouring rays are taken for coherent, which are found faster.
 
