@@ -29,7 +29,7 @@ def operator_of(mosaic: JointMosaic) -> LinearOperator:
         return np.stack([mosaic.frame(images.reshape(mosaic.shape), *shot) for shot in shots]).ravel()
 
     def adjoint(frames: np.ndarray) -> np.ndarray:
-        return sum(mosaic.gathered(frames.reshape(size)[shot], *shot) for shot in shots).ravel()
+        return sum(mosaic.gather(frames.reshape(size)[shot], *shot) for shot in shots).ravel()
 
     count = int(np.prod(size)), int(np.prod(mosaic.shape))
     return LinearOperator(count, matvec=forward, rmatvec=adjoint, dtype=np.dtype(np.float64))
