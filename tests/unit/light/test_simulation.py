@@ -11,7 +11,7 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.effects import EFFECTS
 from mitsim.devices.patterns import Lighting
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation
+from mitsim.light.simulation import Simulation, expected_of
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions
 from mitsim.transport.records import AMBIENT, PathSamples
@@ -58,7 +58,7 @@ def uniform(made: Simulation, samples: int = 8, weight: float = 1.0) -> np.ndarr
     labels = np.zeros(N * N, dtype=np.int64)
     light = made.accumulate("direct", made.direct.trace(3, 0, samples), labels, samples)
     light = light + made.accumulate("indirect", made.follow(3, 4), labels, 4)
-    (frame,) = made.expected([light], np.zeros(1, dtype=np.int64), Lighting(labels, np.array([[weight]])), 0)
+    (frame,) = expected_of([(made, [light])], np.zeros(1, dtype=np.int64), Lighting(labels, np.array([[weight]])), 0)
     return frame.irradiance
 
 
