@@ -468,7 +468,7 @@ def test_samples_are_not_added_up_in_32_bits() -> None:
 
 # ---- sizes and names -------------------------------------------------------------------------------------------------
 
-MOST_FILES, MOST_LINES_OF_CODE = 248, 40_600
+MOST_FILES, MOST_LINES_OF_CODE = 201, 39_500
 """What the house was when its rooms were last counted, and room for an extension or two: a change that needs more says
 so here. A new file or line is one more that the next reader has to know."""
 LONG = 450
@@ -482,7 +482,7 @@ PARTICIPLE = re.compile(
     "|given|gone|grown|held|hidden|kept|known|laid|led|left|lent|lit|lost|made|meant|met|paid|said|seen|sent|shown"
     "|spent|split|spoken|struck|sunk|swept|taken|thought|thrown|told|understood|worn|written|[a-z]+[^e]ed"
 )
-MOST_PARTICIPLES = 154
+MOST_PARTICIPLES = 5
 """Functions that are named by a participle alone: what was done is no name of what a function does or gives. A change
 takes some away, and adds none."""
 REPLACED = {"anatomy", "deposits", "filed", "foreseen", "foretold", "glint", "lamplight", "ledger", "rig", "tray"}

@@ -481,22 +481,22 @@ def lit_by_lamps(bench: Apparatus, effects: Mapping[str, bool], seed: int) -> Ap
     settings = Settings(bench.geometry.scene_distance, effects=found)
     tracer = Simulation(bench, settings, pixels=min(bench.n, _CELLS)).from_camera
     assert isinstance(tracer, FromCameraTracer), "lamps are followed, not yet apart"
-    looks = [_Look.of(response, tracer, integer(seed, "lamplight")) for response in responses]
-    light = np.concatenate([response.part * look.light for response, look in zip(responses, looks, strict=True)])
+    runs = [_LampRuns.of(response, tracer, integer(seed, "lamplight")) for response in responses]
+    light = np.concatenate([response.part * run.light for response, run in zip(responses, runs, strict=True)])
     lines = bench.projector.lines
     counted_lamps = CountedLamps(
         responses,
         tuple(band for response in responses for band in response.bands(MOST_LINES)),
-        tuple(spectrum for look in looks for spectrum in look.spectra),
+        tuple(spectrum for run in runs for spectrum in run.spectra),
         light / light.sum() if light.any() else np.full(len(light), 1 / len(light)),
-        max(look.unknown for look in looks),
+        max(run.unknown for run in runs),
         tuple(zip(lines.wavelengths_nm, line_units(bench.counting, lines), strict=True)),
     )
     return replace(bench, counted_lamps=counted_lamps)
 
 
 @dataclass(frozen=True)
-class _Look:
+class _LampRuns:
     """What one response counts: ``light`` (bands,) and ``spectra`` of each of its bands, and the part ``unknown``."""
 
     light: FloatArray
@@ -504,7 +504,7 @@ class _Look:
     unknown: float
 
     @classmethod
-    def of(cls, response: Response, tracer: FromCameraTracer, stream: int) -> _Look:
+    def of(cls, response: Response, tracer: FromCameraTracer, stream: int) -> _LampRuns:
         """By a few paths.
 
         Parameters

@@ -140,7 +140,7 @@ class Exposure:
 def _check_range(name: str, value: float, least: float, most: float, rule: str) -> float:
     """``value``, or ArgumentError with the ``rule``, which has {} in place of the least and the most."""
     if not least <= value <= most:
-        raise ArgumentError(name, f"{value:g}: give {rule.format(f'{least:g} to {most:g}')}")
+        raise ArgumentError(name, f"{value}: give {rule.format(f'{least:g} to {most:g}')}")
     return value
 
 

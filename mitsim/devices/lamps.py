@@ -171,7 +171,7 @@ class CountedLamps(ByValue):
 
 
 def line_units(sensor: SensorModel, lines: Lines) -> tuple[float, ...]:
-    """Irradiance [W m^-2] of each line at which the ``sensor`` counts 1.
+    """Irradiance [W m^-2] of each of the ``lines`` at which the ``sensor`` counts 1.
 
     Behind a mosaic the lines have parts of the count, as of their power, that make as many in the mean over all pixels:
     s_l / sum_k s_k w_k lambda_k, with w_k the electrons a photon of line k. A line's own light is then as much beside

@@ -142,13 +142,13 @@ class Separation:
         (m, m') of each frame, in the frames' unit; to be taken off.
     image
         (n, n') reflectance that it looks like under uniform light, all of it from lit pixels.
-    told
+    eigenvalues
         (modes,) part of each mode of it that lit pixels do not explain, smallest first.
     """
 
     common: FloatArray
     image: FloatArray
-    told: FloatArray
+    eigenvalues: FloatArray
 
 
 @single_threaded_blas()

@@ -422,7 +422,7 @@ def _separate_images(
     less = _weights(model, [(shot, frame - found.common) for shot, frame in measured])
     solved = {_ALL: whole, SEPARATED: less, ALONE: _weights(model, _noisy(frames, direct))}
     images = {name: model.solve(sums).image for name, sums in solved.items()}
-    return {**images, GLOBAL: found.image}, float(found.told[0])
+    return {**images, GLOBAL: found.image}, float(found.eigenvalues[0])
 
 
 def _direct_by_factors(frames: Unexposed, shot: Shot) -> FloatArray:

@@ -15,7 +15,7 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import Lighting
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation
+from mitsim.light.simulation import Simulation, expected_of
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.integrator import Paths
@@ -52,7 +52,7 @@ def frame_at(write: Callable[..., Path], scale: float) -> np.ndarray:
     uniform = Lighting.uniform(N)
     found = simulation.accumulate("direct", simulation.direct.trace(1, 0, 64), uniform.labels, 64)
     found = found + simulation.accumulate("indirect", simulation.follow(1, 64), uniform.labels, 64)
-    return next(iter(simulation.expected_frames([found], np.arange(1), uniform, 0))).irradiance
+    return next(iter(expected_of([(simulation, [found])], np.arange(1), uniform, 0))).irradiance
 
 
 @pytest.mark.slow

@@ -18,6 +18,7 @@ from scipy.signal import max_len_seq
 
 from mitsim.devices.patterns import Lighting, parse_patterns
 from mitsim.light.light import Sampling, trace_light
+from mitsim.light.simulation import expected_of
 from mitsim.optics.fft_shadow import geometric_samplers
 from mitsim.optics.mirror_frames import SpecularFrames, specular_frames
 from mitsim.planner.planner import make_plan
@@ -467,7 +468,7 @@ def mirror_part(light) -> np.ndarray:
     whole = next(iter(light.frames(LIT, 0))).irradiance
     without = copy.copy(light.simulation)
     without.specular_frames = lambda labels: None
-    traced = without.expected_frames(light.groups, np.zeros(1, np.int64), LIT, 0)
+    traced = expected_of([(without, light.groups)], np.zeros(1, np.int64), LIT, 0)
     return whole - next(iter(traced)).irradiance
 
 

@@ -20,7 +20,7 @@ from mitsim.bench.effects import EFFECTS, Effect, Physics, _registry, _value
 from mitsim.core.errors import ArgumentError
 from mitsim.devices.patterns import Lighting
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation
+from mitsim.light.simulation import Simulation, expected_of
 from tests.extended import Section, Step
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -83,7 +83,7 @@ def frame(bench: Bench, *names: str) -> np.ndarray:
     labels = np.zeros(N * N, dtype=np.int64)
     light = simulation.accumulate("direct", simulation.direct.trace(3, 0, 8), labels, 8)
     light = light + simulation.accumulate("indirect", simulation.follow(3, 4), labels, 4)
-    (shot,) = simulation.expected_frames([light], np.zeros(1, dtype=np.int64), Lighting(labels, np.array([[0.5]])), 0)
+    (shot,) = expected_of([(simulation, [light])], np.zeros(1, dtype=np.int64), Lighting(labels, np.array([[0.5]])), 0)
     return shot.irradiance
 
 

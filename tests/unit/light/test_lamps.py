@@ -30,7 +30,7 @@ from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum
 from mitsim.light.grids import Grid
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation
+from mitsim.light.simulation import Simulation, expected_of
 from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer, LampTracer
 from mitsim.transport.integrator import Paths
 from mitsim.transport.records import PathSamples
@@ -285,7 +285,7 @@ def test_the_mask_diffracts_each_band_by_its_own_wavelengths(small_scene: Callab
             none + bench.n**2 + band, none, none, place, place, place / 8, np.ones(1), none.astype(np.int16)
         )
         light = simulation.accumulate("indirect", spot, labels, 1)
-        expected = simulation.expected_frames([light], labels[:1], Lighting.uniform(bench.n).shots([0]), 0)
+        expected = expected_of([(simulation, [light])], labels[:1], Lighting.uniform(bench.n).shots([0]), 0)
         alone = Grid(simulation.grids["fine"].bundle, bench.geometry, spectrum).optics
         found = expected.projector_off.irradiance
         row = light["fine"][[1 + band]].tocsr()

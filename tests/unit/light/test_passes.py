@@ -99,8 +99,8 @@ def test_a_new_pass_is_its_row_and_its_integrator(small_scene: Callable[..., Pat
 
 
 def test_a_row_predicts_the_samples_that_settings_have() -> None:
-    assert PASSES["direct"].predicted(Settings(400.0)) == 1.0
-    assert PASSES["direct"].predicted(Settings(400.0, samples={"direct": 6.0})) == 6.0
+    assert PASSES["direct"].predicted_samples(Settings(400.0)) == 1.0
+    assert PASSES["direct"].predicted_samples(Settings(400.0, samples={"direct": 6.0})) == 6.0
 
 
 def test_a_residual_connects_to_all_anchors_or_to_none() -> None:

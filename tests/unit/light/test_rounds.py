@@ -80,7 +80,7 @@ def test_two_lights_share_the_work_whatever_their_sizes() -> None:
         ]
         allowed = variances.sum() / rng.uniform(1.1, 6)
         found = cheapest_samples(lights, allowed)
-        assert sum(light.left(found[light.name]) for light in lights) <= allowed * (1 + 1e-9)
+        assert sum(light.variance_left(found[light.name]) for light in lights) <= allowed * (1 + 1e-9)
         assert all(found[light.name] >= light.done for light in lights)
         first = np.arange(done[0], 40 * done[0] + 1)
         rest = allowed - variances[0] * done[0] / first
@@ -116,11 +116,11 @@ class Counted:
         self.simulation: Any = SimpleNamespace(
             passes={self.name: SimpleNamespace(tracer=self, row=self.row, trace=self.trace)},
             paths_at_once=4 * self.paths_per_sample,
-            accumulators=lambda name, labels, lines: (),
+            accumulator=lambda name, labels, lines: None,
             accumulate=lambda name, found, labels, samples: found / samples,
         )
 
-    def trace(self, seed: int, first: int, samples: int, accumulators: object) -> Any:
+    def trace(self, seed: int, first: int, samples: int, accumulator: object) -> Any:
         assert 0 < samples <= 4
         numbers = range(first, first + samples)
         self.traced += numbers

@@ -11,7 +11,7 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.effects import EFFECTS
 from mitsim.devices.patterns import Lighting
 from mitsim.light.settings import Settings
-from mitsim.light.simulation import Simulation
+from mitsim.light.simulation import Simulation, expected_of
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions
 from mitsim.transport.records import AMBIENT, PathSamples
@@ -59,7 +59,7 @@ def uniform(made: Simulation, samples: int = 8, weight: float = 1.0) -> np.ndarr
     labels = np.zeros(N * N, dtype=np.int64)
     light = made.accumulate("direct", made.direct.trace(3, 0, samples), labels, samples)
     light = light + made.accumulate("indirect", made.follow(3, 4), labels, 4)
-    (frame,) = made.expected_frames([light], np.zeros(1, dtype=np.int64), Lighting(labels, np.array([[weight]])), 0)
+    (frame,) = expected_of([(made, [light])], np.zeros(1, dtype=np.int64), Lighting(labels, np.array([[weight]])), 0)
     return frame.irradiance
 
 
@@ -120,8 +120,8 @@ def test_each_effect_changes_its_own_part(bench: Bench, effect: str) -> None:
         "black-level": on.physics.black_level == pytest.approx(BLACK),
         "diffraction": on.physics.spectrum is not None,
         "ambient": bool(on.physics.lamps) and on.from_camera is not None and len(on.from_camera.paths.emitters) == 1,
-        "interreflection": on.indirect is not None and on.indirect.interreflection,
-        "mirrors": on.indirect is not None and on.indirect.mirrors and on.from_camera.paths.mirrors,
+        "interreflection": on.indirect is not None and on.indirect.paths.interreflection,
+        "mirrors": on.indirect is not None and on.indirect.paths.mirrors and on.from_camera.paths.mirrors,
     }
     assert [name for name, holds in changed.items() if holds] == [effect]
     if effect not in ("mask-thickness", "pixel-response"):

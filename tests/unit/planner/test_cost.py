@@ -31,7 +31,6 @@ def path_samples() -> PathSamples:
         inverse_depth=1 / random.uniform(300, 400, PATHS),
         value=np.ones(PATHS),
         kind=np.full(PATHS, DIRECT, dtype=np.int16),
-        lane=np.arange(PATHS),
     )
 
 

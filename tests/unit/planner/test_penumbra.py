@@ -15,7 +15,7 @@ from mitsim.api.bench import Bench, open_bench
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting, parse_patterns
 from mitsim.light.settings import Settings, SharpPixels
-from mitsim.light.simulation import Simulation
+from mitsim.light.simulation import Simulation, expected_of
 from mitsim.planner import pilot
 from mitsim.planner.pilot_direct import occluded_pixels
 from mitsim.planner.pilot_samples import Sample
@@ -84,9 +84,9 @@ def frames(bench: Bench, settings: Settings, samples: int = 32) -> np.ndarray:
     for name, each in made.passes.items():
         count = samples if name == "direct" else samples // 8
         seen = each.tracer.trace(integer(5, each.row.stream == "direct"), 0, count)
-        accumulated = made.accumulate(name, seen, lighting.labels, count)
-        light = accumulated if light is None else light + accumulated
-    return np.stack([frame.irradiance for frame in made.expected_frames([light], np.arange(9), lighting, 0)])
+        filed = made.accumulate(name, seen, lighting.labels, count)
+        light = filed if light is None else light + filed
+    return np.stack([frame.irradiance for frame in expected_of([(made, [light])], np.arange(9), lighting, 0)])
 
 
 def test_anchors_of_their_own_do_what_as_many_do_for_all(bench: Bench) -> None:

@@ -8,7 +8,7 @@ import pytest
 from mitsim.transport.connect import OpticalSetup
 from mitsim.transport.missed import Highlights, highlights
 from mitsim.transport.projector import ProjectorOptics
-from tests.physics.test_mirror import SCALE, Devices, N
+from tests.physics.test_mirror import SCALE, MirrorBench, N
 
 PLACES = np.array([[12.3, 5.1, 371.0], [-31.7, 20.9, 388.3], [2.6, -33.2, 362.9]])
 
@@ -19,7 +19,7 @@ def found(alpha: float, radius: float, **more: dict) -> Highlights:
         f"ball{i}": {"type": "sphere", "center": place.tolist(), "radius": radius, "bsdf": gloss}
         for i, place in enumerate(PLACES)
     }
-    scene = Devices((60, 0, 0)).scene("open", 64, **balls, **more)
+    scene = MirrorBench((60, 0, 0)).scene("open", 64, **balls, **more)
     projector = ProjectorOptics(scene.emitters()[0], N, 0, N, (N, 2 * N))
     camera = scene.sensors()[0]
     return highlights(OpticalSetup(scene, camera, projector, camera.geometry))
