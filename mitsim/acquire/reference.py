@@ -15,7 +15,7 @@ import numpy as np
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import FEWEST_PASSES, REFERENCE, check_accuracy, check_samples
 from mitsim.core.arrays import FloatArray
-from mitsim.core.environment import DEFAULT_VARIANT, load_variant, versions
+from mitsim.core.environment import DEFAULT_VARIANT, keep_scenes, load_variant, versions
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.exr import write_frame
 from mitsim.core.job import Cost, Job
@@ -141,7 +141,8 @@ def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) 
         child = integer(seed, "reference", index)
         loaded.camera.stratify((integer(seed, "reference points", index), each))
         try:
-            image = np.array(mi.render(loaded.scene, sensor=loaded.camera, spp=each, seed=child), dtype=np.float64)
+            with keep_scenes():
+                image = np.array(mi.render(loaded.scene, sensor=loaded.camera, spp=each, seed=child), dtype=np.float64)
         except RuntimeError as error:
             cause: BaseException = error
             while cause.__cause__ is not None:  # what Dr.Jit raises says only that something below it failed

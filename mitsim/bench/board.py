@@ -13,6 +13,7 @@ import numpy as np
 
 from mitsim.bench.apparatus import Opened, check_depth
 from mitsim.core.arrays import FloatArray
+from mitsim.core.environment import keep_scenes
 from mitsim.core.errors import ArgumentError
 from mitsim.devices.session import BoardShape
 from mitsim.scene.limits import Unfit
@@ -128,6 +129,7 @@ def bowed_surface(shape: BoardShape, half: float) -> tuple[FloatArray, FloatArra
     return np.stack([x, y, part * (x**2 + y**2)], axis=-1), normals
 
 
+@keep_scenes()
 def missed_pixels(bench: Apparatus) -> int:
     """Projector pixels of a ``bench`` before its board that do not light a whole piece of it, seen by the camera: the
     ray of a corner misses the board, or meets a side that the projector or the camera does not see."""

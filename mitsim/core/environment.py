@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import json
 import os
 import platform
@@ -100,6 +101,23 @@ def _set_variant(name: str) -> ModuleType:
         drjit.set_thread_count(_FEWEST_THREADS)
     module: ModuleType = mitsuba
     return module
+
+
+@contextmanager
+def keep_scenes() -> Iterator[None]:
+    """Have Python's collector wait while the context lasts, so that no scene goes while a kernel is put together.
+
+    A scene that nobody holds, but for a cycle, goes when the collector finds it: at any line. Dr.Jit (1.5.0) counts the
+    objects of all scenes where a call of one begins. If the count changes between two calls of a kernel, a function is
+    in it twice, and LLVM ends the process.
+    """
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collecting:
+            gc.enable()
 
 
 @contextmanager

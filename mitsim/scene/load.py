@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.environment import one_thread
+from mitsim.core.environment import keep_scenes, one_thread
 from mitsim.core.errors import MitsimError
 from mitsim.scene.check import check_file, looking_beside
 from mitsim.scene.limits import Range, Unfit
@@ -65,6 +65,7 @@ class LoadedScene:
         return self.grid
 
 
+@keep_scenes()
 def load_scene(
     path: Path, defines: Mapping[str, str] | None = None, needs_projector: bool = True, outside: bool = False
 ) -> LoadedScene:

@@ -22,6 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.environment import keep_scenes
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Lines
 from mitsim.optics.image_formation import anchor_positions
@@ -171,6 +172,7 @@ class OpticalSetup:
         return ProjectorRays(self.projector)
 
     @cached_property
+    @keep_scenes()
     def board(self) -> float:
         """Irradiance [W m^-2] by the light of a projector pixel, from a white board at the aligned distance."""
         pixel = dr.arange(mi.UInt32, self.projector.n**2)
@@ -471,6 +473,7 @@ _LAMP_POINTS = 2**10
 """Points of a lamp: how much of it is seen is known to some percent."""
 
 
+@keep_scenes()
 def shines_in(scene: mi.Scene, camera: mi.Sensor, lamp: mi.Emitter) -> bool:
     """Whether a point of the sensor sees the ``lamp`` within the field stop.
 
@@ -493,6 +496,7 @@ def shines_in(scene: mi.Scene, camera: mi.Sensor, lamp: mi.Emitter) -> bool:
     return bool(np.array(met & seen).any())
 
 
+@keep_scenes()
 def part_of_view(scene: mi.Scene, camera: mi.Sensor, shape: mi.Shape) -> float:
     """Part of the field stop, in tan-angles, in which the sensor's centre sees a ``shape`` that shines; where nothing
     is before it.

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.environment import keep_scenes
 from mitsim.devices.projector import Lines
 from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import OpticalSetup, Reception, SensorPoints, landing, sample_wavelengths
@@ -141,6 +142,7 @@ class FluxTracer:
         self._setup, self._glossy = setup, glossy
         self._sensor = SensorPoints(setup.geometry.half_width, spread=True)
 
+    @keep_scenes()
     def sums(self, seed: int, groups: int, pixels: IntArray, first: IntArray, samples: int) -> FloatArray:
         """(lines, groups, m) light of m blocks of samples, each summed [W m^-2]; one line where light is not told
         apart.

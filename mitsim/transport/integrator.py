@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import drjit as dr
 import mitsuba as mi
 
+from mitsim.core.environment import keep_scenes
 from mitsim.transport.connect import OpticalSetup, SensorPoints
 from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT, PathSamples
 
@@ -124,6 +125,7 @@ class Tracer(ABC):
     def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
         """Light of the paths of one kernel, but for what is added up in the ``accumulator``."""
 
+    @keep_scenes()
     def trace(
         self, seed: int, first: int = 0, samples: int = 1, accumulator: DeviceAccumulator | None = None
     ) -> PathSamples:

@@ -26,6 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, Labels, mean_of_neighbours
+from mitsim.core.environment import keep_scenes
 from mitsim.transport.connect import LensHit, OpticalSetup, Reception, landing, sample_wavelengths
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.from_camera import CameraPaths, CameraState, FromCameraTracer
@@ -80,6 +81,7 @@ class LeftOut:
         return float(light.sum()), int(np.argmax(light)) if light.any() else None
 
 
+@keep_scenes()
 def left_out_light(setup: OpticalSetup, grid: CellGrid, seed: int, samples: int) -> LeftOut:
     """Light that is left out, or may be.
 
@@ -233,6 +235,7 @@ class Highlights:
         return Highlights(self.pixels[seldom], self.irradiance[seldom], self.moments[seldom])
 
 
+@keep_scenes()
 def highlights(setup: OpticalSetup) -> Highlights:
     """Highlights of all glossy balls of a ``setup`` that the projector's pinhole and the sensor's centre both see."""
     scene, projector = setup.scene, setup.projector
@@ -391,6 +394,7 @@ class SharpLight:
         return cls(0.0, 0.0, math.inf, np.zeros(pixels), np.zeros(pixels), math.inf)
 
 
+@keep_scenes()
 def sharp_light(setup: OpticalSetup, seed: int, samples: int) -> SharpLight:
     """Direct light over lobes too sharp for connections.
 
@@ -532,6 +536,7 @@ class _Lobes:
     def __init__(self, setup: OpticalSetup) -> None:
         self.setup, self.least = setup, dr.full(mi.Float, _LEAST_SHARP, setup.projector.n**2)
 
+    @keep_scenes()
     def trace(self, pixels: Labels, seed: int, first: int, samples: int, wider: float = 1.0) -> _LobeLight:
         """What rays ``first`` to ``first + samples`` - 1 of ``pixels`` meet on a sensor so many times ``wider``."""
         squares, met, weights = 0.0, [], []

@@ -23,6 +23,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.environment import keep_scenes
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.optics.mirror_frames import Beams
@@ -71,6 +72,7 @@ def has_mirrors(scene: mi.Scene) -> bool:
     return bool(delta_bsdfs(scene, int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)))
 
 
+@keep_scenes()
 def trace_specular_chains(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, max_depth: int = 16) -> Beams:
     """All beams that leave the projector, meet perfect mirrors or lenses alone, and reach the sensor.
 
