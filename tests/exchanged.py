@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mitsim.core.manifests import AmbientFile, CalibrationManifest, Digital, Patterns, RunHead, RunManifest, ShotFile
-from mitsim.core.runs import AMBIENT, claim_run, frame_name
+from mitsim.core.recorders import AMBIENT, claim_run, frame_name
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.solution import Status, Verdict
 

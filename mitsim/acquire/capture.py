@@ -37,7 +37,8 @@ from mitsim.core.files import FRAMES, output_folder
 from mitsim.core.job import Job
 from mitsim.core.manifests import Patterns, RunHead, RunManifest
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.core.runs import AMBIENT, Capture, LineTruth, MosaicCapture, Recorder, claim_run, frame_name
+from mitsim.core.recorders import AMBIENT, Recorder, claim_run, frame_name
+from mitsim.core.runs import Capture, LineTruth, MosaicCapture
 from mitsim.core.spectral_manifests import MOSAIC, RUN, ColourManifest, MosaicManifest, write_colours
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import load_recipe

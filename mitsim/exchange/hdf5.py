@@ -21,7 +21,8 @@ from mitsim.core.exr import Channels, Metadata, Value
 from mitsim.core.files import FRAME_LIMITS, MOST_BYTES, MOST_PIXELS, check_plain, fits_a_frame, parse_json
 from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import CalibrationManifest, RunManifest
-from mitsim.core.runs import TRUTH, Capture
+from mitsim.core.recorders import TRUTH
+from mitsim.core.runs import Capture
 from mitsim.core.spectral_manifests import CALIBRATION, MOSAIC, RUN
 from mitsim.exchange.packed import (
     FACTORS,

@@ -30,7 +30,7 @@ from mitsim.core.arrays import FloatArray, read_variables, write_variables
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.exr import Channel, Channels, Metadata
 from mitsim.core.manifests import SIDES, CalibrationManifest, Digital, RunManifest, ShotFile
-from mitsim.core.runs import TRUTH
+from mitsim.core.recorders import TRUTH
 from mitsim.core.spectral_manifests import CALIBRATION, MOSAIC, RUN, ColourManifest
 from mitsim.exchange.formats import PLANES, check_channel
 from mitsim.exchange.packed import (

@@ -27,7 +27,8 @@ from mitsim.core.manifests import (
     read_manifest,
     write_manifest,
 )
-from mitsim.core.runs import TRUTH, load_run
+from mitsim.core.recorders import TRUTH
+from mitsim.core.runs import load_run
 from mitsim.core.spectral_manifests import (
     CALIBRATION,
     COLOUR,

@@ -24,7 +24,7 @@ from mitsim.core.imagelist import image_files
 from mitsim.core.images import Numbers, image_pages, read_images
 from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import AmbientFile, CalibrationManifest, Digital, Patterns, RunHead, RunManifest
-from mitsim.core.runs import AMBIENT, frame_name
+from mitsim.core.recorders import AMBIENT, frame_name
 from mitsim.devices.patterns import PatternFamily, parse_patterns
 from mitsim.devices.sensor import SensorModel, digital_of, load_sensor
 from mitsim.exchange.formats import PLANES, RealCapture

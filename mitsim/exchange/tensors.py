@@ -16,7 +16,8 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import whole_file
 from mitsim.core.manifests import SIDES, RunManifest
-from mitsim.core.runs import TRUTH, Capture, load_run
+from mitsim.core.recorders import TRUTH
+from mitsim.core.runs import Capture, load_run
 from mitsim.exchange.packed import FACTORS, Calibration, Packed, Run
 from mitsim.reconstruct.colour import behind
 

@@ -25,7 +25,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.exr import Channel, read_frame
 from mitsim.core.files import write_json
 from mitsim.core.job import Clock, Job
-from mitsim.core.runs import Capture, frame_name
+from mitsim.core.recorders import frame_name
+from mitsim.core.runs import Capture
 from mitsim.devices.session import load_recipe
 from mitsim.light.light import SampledLight, pinhole_view
 from mitsim.reconstruct.factors import Factors
