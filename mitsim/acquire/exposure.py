@@ -31,7 +31,7 @@ from mitsim.light.settings import GROUPS, Estimate
 from mitsim.optics.forming import bound_of
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.optics.speckle import add_speckle
-from mitsim.scene.load import window_at
+from mitsim.scene.window import window_at
 from mitsim.sensor.chain import (
     Digital,
     dn_to_electrons,

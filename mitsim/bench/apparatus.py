@@ -163,7 +163,7 @@ class Apparatus:
         if depth == self.geometry.scene_distance:
             return self.windows
         if depth not in self._windows:
-            from mitsim.scene.load import window_at
+            from mitsim.scene.window import window_at
 
             loaded = self.loaded
             found = window_at(str(loaded.path), loaded.projector, loaded.camera, loaded.pixels, depth)

@@ -33,7 +33,7 @@ from mitsim.light.simulation import Simulation
 from mitsim.planner.pilot_direct import SMOOTH, DirectRuns, occluded_pixels, sharp_pixels
 from mitsim.planner.pilot_effects import AnchorRuns, EffectRuns, FollowedRuns, PenumbraRuns
 from mitsim.planner.pilot_samples import GOOD_ENOUGH, Sample
-from mitsim.scene.load import why_dark
+from mitsim.scene.darkness import why_dark
 from mitsim.transport.missed import LeftOut, SharpLight, highlights, left_out_light, sharp_light, with_neighbours
 
 RUNS = ("cells", "effects", "anchors", "followed", "occluded")

@@ -387,7 +387,7 @@ _MOST_TEXELS = 1 << 24
 
 def lit_side(picture: Path) -> int | None:
     """Rows and columns of the lit square in the PNG file ``picture``; None where it is no such picture: what is wrong
-    with it, :func:`mitsim.scene.load.locate_projector` says."""
+    with it, :func:`mitsim.scene.window.locate_projector` says."""
     from PIL.PngImagePlugin import PngImageFile
 
     try:

@@ -45,7 +45,7 @@ from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation, TracedPass, expected_of
 from mitsim.light.truth import Truth
 from mitsim.optics.frames import ClassFrames, ExpectedFrames
-from mitsim.scene.load import straightening
+from mitsim.scene.window import straightening
 from mitsim.transport.accumulator import DeviceAccumulator, DeviceSums
 from mitsim.transport.integrator import ANY, FollowingTracer
 from mitsim.transport.plugins.base import rows_columns, turn_and_origin

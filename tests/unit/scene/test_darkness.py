@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from mitsim.scene.load import load_scene, why_dark
+from mitsim.scene.darkness import why_dark
+from mitsim.scene.load import load_scene
 
 pytestmark = pytest.mark.usefixtures("variant")
 Write = Callable[..., Path]

@@ -1,0 +1,197 @@
+"""The projector's pixel grid: from a stock ``projector`` emitter to n x n pixels and the directions they light.
+
+The emitter's texture in the scene file is its all-white frame: the rectangle of lit texels is the *window* that the
+patterns use, n x n pixels, and the dark texels around it are canvas. A window off the canvas's centre is a lens shift,
+as real projectors have it, and casts no keystone. Rows and columns follow the project's convention (row 0 at +y,
+column 0 at +x for one looking along +z), which is also how Mitsuba lays texels out for an unrotated projector.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+
+_NO_KEYSTONE = 1e-3
+"""Projector pixels: chosen so that what rounding makes of a shifted lens is none; it shows in no frame."""
+
+
+_MOST_ACROSS = 16384
+"""Projector pixels across the camera's field: light is collected in cells of their size, and the shadow of so many
+takes 67 MB for a sensor of 512 pixels and one layer. The paper's geometry has 150; a fov of 1e-6 degrees took 24 GB."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """Window of n x n projector pixels in a canvas.
+
+    Attributes
+    ----------
+    n
+        pixels a side of the window.
+    first_row, first_column
+        canvas texel of the window's pixel (0, 0); between texels where a picture has drifted.
+    canvas
+        (rows, columns) of the whole texture.
+    """
+
+    n: int
+    first_row: float
+    first_column: float
+    canvas: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class ProjectorGrid(Window):
+    """A projector's window, and where it lands on the camera's aligned plane.
+
+    Attributes
+    ----------
+    row_tan, column_tan
+        (first edge, last edge) of the window as tan-angles y/z and x/z from the camera, index coordinates, on the plane
+        at the camera's scene distance (bounding box when the projector casts a keystone).
+    keystone
+        largest departure of the window's corners from that box, in projector pixels; 0 for a shifted lens.
+    """
+
+    row_tan: tuple[float, float]
+    column_tan: tuple[float, float]
+    keystone: float
+
+
+def locate_projector(where: str, projector: mi.Emitter, camera: mi.Sensor) -> ProjectorGrid:
+    """Find the lit window of a projector and its place in front of a camera.
+
+    Parameters
+    ----------
+    where
+        what an error begins with, the scene's path.
+    projector
+        a stock emitter whose bitmap shows the window.
+    camera
+        the sensor, which carries its geometry.
+
+    Raises
+    ------
+    MitsimError
+        when the texture is no bitmap with a lit square window, or it does not light the camera's aligned plane.
+    """
+    parameters = mi.traverse(projector)
+    if "irradiance.data" not in parameters:
+        raise MitsimError(
+            f"{where}: the projector's irradiance is not a bitmap; "
+            "give a raw bitmap texture whose white texels are the projector's pixels"
+        )
+    texels = np.array(parameters["irradiance.data"])
+    lit = texels.reshape(texels.shape[0], texels.shape[1], -1).max(axis=-1) > 0
+    rows, columns = np.flatnonzero(lit.any(axis=1)), np.flatnonzero(lit.any(axis=0))
+    if not rows.size:
+        raise MitsimError(f"{where}: the projector's bitmap is all black; its white texels are the projector's pixels")
+    height, width = int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1
+    if height != width or not lit[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].all():
+        raise MitsimError(
+            f"{where}: the lit texels of the projector's bitmap span {height}x{width} and must fill a square; "
+            "paint the window white"
+        )
+    z = camera.geometry.scene_distance
+    window = Window(width, int(rows[0]), int(columns[0]), (int(lit.shape[0]), int(lit.shape[1])))
+    corners = _window_corners(where, projector, camera, window, z)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    span = float((high - low).min())
+    across = 2 * camera.geometry.tan_half_fov * width / span if span > 0 else np.inf
+    if across > _MOST_ACROSS:
+        raise MitsimError(
+            f"{where}: the camera's field is {across:.3g} pixels of the projector wide; at most {_MOST_ACROSS} are "
+            "simulated, so widen the projector's fov, or narrow the camera's"
+        )
+    ideal = np.array([[low[0], low[1]], [low[0], high[1]], [high[0], low[1]], [high[0], high[1]]])
+    keystone = float(np.abs((corners - ideal) / (high - low)).max()) * width
+    return ProjectorGrid(
+        **vars(window),
+        row_tan=(float(low[0]), float(high[0])),
+        column_tan=(float(low[1]), float(high[1])),
+        keystone=keystone if keystone > _NO_KEYSTONE else 0.0,
+    )
+
+
+def window_at(
+    where: str, projector: mi.Emitter, camera: mi.Sensor, grid: ProjectorGrid, depth: float
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Row and column tan-angles (first edge, last edge) of the window on a plane in front of the camera.
+
+    Parameters
+    ----------
+    where, projector, camera
+        as in :func:`locate_projector`, whose result is ``grid``.
+    grid
+        the window on the projector's canvas.
+    depth
+        distance of the plane [mm].
+
+    Raises
+    ------
+    MitsimError
+        when the projector does not light the plane.
+    """
+    corners = _window_corners(where, projector, camera, grid, depth)
+    (top, left), (bottom, right) = corners.min(axis=0), corners.max(axis=0)
+    return (float(top), float(bottom)), (float(left), float(right))
+
+
+def straightening(
+    where: str, projector: mi.Emitter, camera: mi.Sensor, grid: ProjectorGrid, depth: float
+) -> FloatArray:
+    """(3, 3) homography that takes tan-angles (row, column, 1) on the plane at ``depth`` to where the same projector
+    pixel would lie if the window filled its bounding box evenly: what takes a keystone out.
+
+    Parameters
+    ----------
+    where, projector, camera, grid, depth
+        as in :func:`window_at`.
+
+    Raises
+    ------
+    MitsimError
+        when the projector does not light the plane.
+    """
+    corners = _window_corners(where, projector, camera, grid, depth)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    return _homography(corners, np.where([[0, 0], [0, 1], [1, 0], [1, 1]], high, low))
+
+
+def _window_corners(where: str, projector: mi.Emitter, camera: mi.Sensor, window: Window, z: float) -> FloatArray:
+    """(4, 2) tan-angles (row, column) of the window's corners on the plane at ``z``, in index coordinates.
+
+    Between that plane and the projector's image lies a homography; four probes of the emitter determine it.
+    """
+    half = 0.25 * z  # any four points do
+    probes = np.array([[half, half], [half, -half], [-half, half], [-half, -half]])
+    interaction = dr.zeros(mi.SurfaceInteraction3f, len(probes))
+    interaction.p = camera.world_transform() @ mi.Point3f(probes[:, 0], probes[:, 1], z)
+    sample, _ = projector.sample_direction(interaction, mi.Point2f(0.5))
+    uv = np.array(sample.uv, dtype=np.float64).T
+    uv = uv.T if uv.shape[0] == 2 and uv.shape[1] == len(probes) else uv
+    homography = _homography(uv, probes) if np.isfinite(uv).all() else np.full((3, 3), np.nan)
+    rows = (window.first_row + window.n * np.array([0, 0, 1, 1])) / window.canvas[0]
+    columns = (window.first_column + window.n * np.array([0, 1, 0, 1])) / window.canvas[1]
+    mapped = np.stack([columns, rows, np.ones(4)], axis=1) @ homography.T
+    points = mapped[:, :2] / mapped[:, 2:]
+    if not np.isfinite(points).all():
+        raise MitsimError(
+            f"{where}: the projector does not light the plane at {z:g} mm from the camera; aim it at the scene"
+        )
+    return np.stack([-points[:, 1] / z, -points[:, 0] / z], axis=1)
+
+
+def _homography(source: FloatArray, target: FloatArray) -> FloatArray:
+    """3 x 3 matrix that maps four points (x, y) of ``source`` to ``target`` (direct linear transform)."""
+    rows = []
+    for (x, y), (u, v) in zip(source, target, strict=True):
+        rows.append([x, y, 1, 0, 0, 0, -u * x, -u * y, -u])
+        rows.append([0, 0, 0, x, y, 1, -v * x, -v * y, -v])
+    return np.asarray(np.linalg.svd(np.array(rows))[2][-1].reshape(3, 3))
