@@ -21,8 +21,8 @@ from mitsim.core.exr import write_frame
 from mitsim.core.job import Cost, Job
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
-from mitsim.light.cost_model import frames_cost
 from mitsim.light.light import Sampling, trace_light
+from mitsim.light.memory import frames_cost
 from mitsim.planner.explain import unseen_lamps
 from mitsim.planner.planner import make_plan
 

@@ -37,8 +37,8 @@ from mitsim.core.spectral_manifests import MOSAIC, MOST_LINES, ColourManifest, L
 from mitsim.devices.lamps import SPECTRA_NM, Band, CountedLamps, Response, line_units
 from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.devices.projector import Lines, Spectrum
-from mitsim.light.cost_model import frame_seconds, frames_cost
 from mitsim.light.light import SampledLight, Sampling
+from mitsim.light.memory import frame_seconds, frames_cost
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation

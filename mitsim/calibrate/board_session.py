@@ -14,7 +14,8 @@ from functools import cached_property
 
 import numpy as np
 
-from mitsim.acquire.exposure import camera_warnings, levels
+from mitsim.acquire.drifting import levels
+from mitsim.acquire.exposure import camera_warnings
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.board import before_board, missed_pixels
 from mitsim.core.arrays import FloatArray
@@ -24,8 +25,9 @@ from mitsim.devices.camera import CameraGeometry, side_of
 from mitsim.devices.patterns import Lighting, stripe_signs
 from mitsim.devices.projector import Spectrum
 from mitsim.devices.session import UNIFORM, BoardShape, Half, SessionRecipe, halves_in_order
-from mitsim.light.cost_model import FIXED, Numbers, forming_seconds, frame_seconds, frames_at_once, light_bytes
+from mitsim.light.cost_model import FIXED, Numbers, forming_seconds
 from mitsim.light.light import SampledLight, Sampling, trace_lines
+from mitsim.light.memory import frame_seconds, frames_at_once, light_bytes
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Forming, Settings
 from mitsim.light.simulation import Simulation

@@ -18,7 +18,7 @@ from mitsim.core.seeds import integer
 from mitsim.core.worker import workers
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum
-from mitsim.light.cost_model import cells_to_choose, drawing_seconds
+from mitsim.light.memory import cells_to_choose, drawing_seconds
 from mitsim.light.settings import (
     GROUPS,
     REPLICATES,

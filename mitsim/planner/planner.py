@@ -15,7 +15,8 @@ from mitsim.core.arrays import Labels
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
-from mitsim.light.cost_model import FIXED, frame_seconds, tracing_seconds, unit_costs_of
+from mitsim.light.cost_model import FIXED, tracing_seconds, unit_costs_of
+from mitsim.light.memory import frame_seconds
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, MOST_PATHS, REPLICATES, PilotResult, SampleCost
 from mitsim.light.simulation import Simulation

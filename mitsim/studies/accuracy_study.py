@@ -33,7 +33,7 @@ from mitsim.bench.request import Request, Task
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.core.runs import Capture
-from mitsim.light.cost_model import frame_seconds
+from mitsim.light.memory import frame_seconds
 from mitsim.light.passes import PASSES
 from mitsim.light.settings import Settings
 from mitsim.report import plots

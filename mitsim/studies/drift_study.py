@@ -23,15 +23,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mitsim.acquire.capture import trace_request
-from mitsim.acquire.exposure import (
-    DriftedExposer,
-    ambient_shots,
-    drift_mask,
-    drift_projector,
-    levels,
-    takes_ambient_frame,
-    warmer,
-)
+from mitsim.acquire.drifting import DriftedExposer, drift_mask, drift_projector, levels, warmer
+from mitsim.acquire.exposure import ambient_shots, takes_ambient_frame
 from mitsim.bench.apparatus import Apparatus
 from mitsim.calibrate.board_session import Session
 from mitsim.core.arrays import FloatArray

@@ -13,7 +13,7 @@ PROGRAM = """
 import sys
 from pathlib import Path
 from mitsim.api.bench import open_bench
-from mitsim.light.cost_model import frames_cost
+from mitsim.light.memory import frames_cost
 from mitsim.core.configuration import shipped
 
 def used():

@@ -22,7 +22,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.projector import Spectrum
-from mitsim.light.cost_model import cells_to_choose
+from mitsim.light.memory import cells_to_choose
 from mitsim.optics import fft_shadow as rasters
 from mitsim.optics.fft_shadow import Correlation, raster
 from mitsim.optics.image_formation import FrameOptics, raster_error

@@ -13,7 +13,7 @@ from mitsim.core.job import Job
 from mitsim.core.recorders import Recorder
 from mitsim.devices.patterns import parse_patterns
 from mitsim.light import cost_model
-from mitsim.light.cost_model import frames_at_once, frames_bytes
+from mitsim.light.memory import frames_at_once, frames_bytes
 from mitsim.light.settings import GROUPS
 from mitsim.optics import frames as forming
 from tests.unit.acquire.test_exposer import PIXELS, exposer, frame

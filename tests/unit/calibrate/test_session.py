@@ -25,7 +25,7 @@ from mitsim.devices.camera import CameraGeometry, centred_edges
 from mitsim.devices.framelist import FrameList
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.session import SIDES, SessionRecipe, load_recipe
-from mitsim.light.cost_model import FRAMES_AT_ONCE, frame_seconds
+from mitsim.light.memory import FRAMES_AT_ONCE, frame_seconds
 from mitsim.light.plan import Plan
 from mitsim.light.settings import PATHS_AT_ONCE, Settings
 from mitsim.optics.frames import mixes

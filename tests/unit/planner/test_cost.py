@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import open_bench
-from mitsim.light.cost_model import path_sample_bytes
+from mitsim.light.memory import path_sample_bytes
 from mitsim.light.sampling import Group, trace_groups
 from mitsim.light.settings import PATHS_AT_ONCE, Settings, SharpPixels
 from mitsim.light.simulation import Simulation
