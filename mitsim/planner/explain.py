@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -79,16 +79,21 @@ class SceneFacts:
     def of(cls, bench: Apparatus, switches: Mapping[str, bool] | None = None) -> SceneFacts:
         """The facts of ``bench``, without what effects that the user's ``switches`` put out would bring."""
         loaded, off = bench.loaded, {name for name, on in (switches or {}).items() if not on}
-        warnings = (*known_losses(loaded, switches or {}), *_limits(bench, waves="diffraction" not in off))
+        warnings = (*known_losses(loaded, switches or {}), *_limits(bench, off))
         notes = {name: effect.note(bench) for name, effect in EFFECTS.items()}
         polished = polished_shapes(loaded.scene) if loaded.mirrors and loaded.shapes else ()
         mirrors = tuple(loaded.shapes[number] for number in polished)
         return cls(notes, loaded.pixels.keystone, warnings, loaded.shapes, mirrors, _spectrum(bench))
 
 
-def _limits(bench: Apparatus, waves: bool) -> Iterator[str]:
-    """What the model of a ``bench``'s devices does not cover, where diffraction is simulated or not."""
-    geometry = bench.geometry
+def _limits(bench: Apparatus, off: Collection[str]) -> Iterator[str]:
+    """What the model of a ``bench``'s devices does not cover, of effects that are not ``off``."""
+    geometry, waves = bench.geometry, "diffraction" not in off
+    if bench.projector.glare and bench.loaded.mirrors and not {"glare", "mirrors"} & set(off):
+        yield (
+            f"{bench.projector.glare:.2g} of the light over mirrors alone is to be scattered in the projector's lens "
+            "(ansi_contrast), and stays in its own pixels; --effects=-glare says that no scattering is meant"
+        )
     if bench.field_stop_cuts:
         yield (
             "the field stop (fov) cuts into the projector's window for part of the sensor; its edge is blurred over "

@@ -17,7 +17,9 @@ from mitsim.scene.outline import Tag
 from tests.unit.planner.invented_pilot_result import PILOT_RESULT, SIZES, changes, plan, rows, stages, with_occluded
 
 
-def bench(cuts: bool = False, shift: float = 0.0, feature: float = 0.06) -> Bench:
+def bench(
+    cuts: bool = False, shift: float = 0.0, feature: float = 0.06, glare: float = 0.0, mirrors: bool = False
+) -> Bench:
     geometry = SimpleNamespace(
         wall_shift_features=shift, mask_thickness=0.5, mask_feature=feature, diffracts=True, mask_plate=None,
         build_mask=lambda: SimpleNamespace(opening_mm=2 * feature),
@@ -31,12 +33,13 @@ def bench(cuts: bool = False, shift: float = 0.0, feature: float = 0.06) -> Benc
             pixels=SimpleNamespace(keystone=2.5),
             unfit=Unfit(),
             shapes=(),
-            mirrors=False,
+            mirrors=mirrors,
             small_lamps=(),
             coloured=(),
             parting=(),
         ),
         lines=None,
+        projector=SimpleNamespace(glare=glare),
         sensor=SimpleNamespace(quantum_efficiency_curve=None),
     )
 
@@ -50,6 +53,9 @@ def bench(cuts: bool = False, shift: float = 0.0, feature: float = 0.06) -> Benc
         (bench(shift=1.0), ["0.5 mm shifts the far face by 1.0 features"]),
         (bench(feature=6.2e-4), []),
         (bench(feature=6.1e-4), ["less than 2 wavelengths of 620 nm"]),
+        (bench(glare=0.02), []),
+        (bench(mirrors=True), []),
+        (bench(glare=0.02, mirrors=True), ["0.02 of the light over mirrors alone is to be scattered"]),
     ],
 )
 def test_devices_are_flagged_where_their_model_ends(
