@@ -190,7 +190,8 @@ def _unit(bits: mi.UInt32) -> mi.Float:
 def panchromatic(radiance: mi.UnpolarizedSpectrum) -> mi.Float:
     """One number for a spectrum of ``radiance``, by a flat response: the mean over channels, or over wavelengths that
     have the weights of :func:`mitsim.transport.connect.sample_wavelengths`."""
-    return dr.mean(radiance)
+    # dr.mean would write the number of lanes into the kernel: another kernel for each number of paths.
+    return dr.sum(radiance) / len(radiance)
 
 
 def split_by_line(light: mi.UnpolarizedSpectrum, lines: int) -> list[mi.Float]:

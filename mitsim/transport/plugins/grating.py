@@ -255,7 +255,7 @@ def plugin_class() -> type:
             density = self._distribution(si, wo) * cosine_o
             total = self._total()
             # Lobes are drawn by their part and the channel evenly: the pdf is the mean over channels.
-            pdf = dr.select(active & (total > 0), dr.mean(density) / total, 0)
+            pdf = dr.select(active & (total > 0), dr.sum(density) / len(density) / total, 0)
             return mi.depolarizer(dr.select(active, self.reflectance * density, 0)), pdf
 
         def sample(
