@@ -297,6 +297,7 @@ def _run(
         paths=light.paths,
         lost_light=light.lost,
         seconds=job.clock.seconds(),
+        kernels=job.clock.kernels(),
         predicted_memory_bytes=frames_cost(bench, plan.settings, family.lighting).memory_bytes,
         warnings=light.warnings + tuple(_warnings(light, totals, shooting, request)),
         versions=versions(),

@@ -261,6 +261,7 @@ def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
         "condition": noisy.condition,
         "exposure_s": lit.exposure_s,
         "seconds": job.clock.seconds(),
+        "kernels": job.clock.kernels(),
         "predicted": plan.predicted,
         "predicted_seconds": plan.predicted_seconds,
         "predicted_memory_bytes": plan.cost and plan.cost.memory_bytes,

@@ -249,6 +249,7 @@ def modelled_factors(
         "condition": max(squared_condition(left), squared_condition(right)),
         "exposure_s": manifest.digital.exposure_s if manifest.digital else None,
         "seconds": job.clock.seconds(),
+        "kernels": job.clock.kernels(),
         "warnings": warnings,
     }
     update = {

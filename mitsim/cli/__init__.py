@@ -49,7 +49,7 @@ from mitsim.cli.options import (
     request_of,
     verb,
 )
-from mitsim.cli.screen import finish, payload_of_lines, print_plan, total_of_lines
+from mitsim.cli.screen import finish, kernel_lines, payload_of_lines, print_plan, total_of_lines
 from mitsim.cli.study_verb import study
 from mitsim.core.errors import MitsimError, printable
 from mitsim.core.spectral_manifests import LINES, RUN
@@ -177,6 +177,7 @@ def demo(
 @verb
 def plan(scene: Scene, sampling: OfPatterns, devices: Coloured, common: Common) -> int:
     """What will be simulated, why, and what it costs, before any long work."""
+    from mitsim.core.environment import compiled_kernels
     from mitsim.core.job import running_seconds
 
     request = request_of(sampling)
@@ -187,7 +188,8 @@ def plan(scene: Scene, sampling: OfPatterns, devices: Coloured, common: Common) 
     found = _plan_of(bench, devices.colour, request).taking(start=starting)
     if not common.as_json:
         print_plan(found)
-    return finish(common.as_json, found.payload(), [], found.warnings)
+    kernels = asdict(compiled_kernels())
+    return finish(common.as_json, {**found.payload(), "kernels": kernels}, kernel_lines(kernels), found.warnings)
 
 
 def _plan_of(bench: Bench, colour: str, request: dict[str, Any]) -> Plan:
@@ -279,7 +281,7 @@ def _capture_lines(payload: Mapping[str, Any]) -> list[str]:
             f"{part['exposure_s']:.3g} s a frame"
             for part in payload["channels"]
         ]
-        return [*each, total_of_lines(payload), *_colour_lines(payload)]
+        return [*each, total_of_lines(payload), *kernel_lines(payload["kernels"]), *_colour_lines(payload)]
     frames = f"{payload['frames']} frames of {payload['shape'][0]}x{payload['shape'][1]}"
     if "mosaic" in payload:
         return [
@@ -295,6 +297,7 @@ def _capture_lines(payload: Mapping[str, Any]) -> list[str]:
         f"Monte Carlo error {payload['mc_error']:.1e}, {payload['mc_to_sensor_noise']:.0%} of the sensor's noise; "
         f"exposure {payload['exposure_s']:.3g} s a frame; memory {payload['memory_bytes'] / 2**30:.2g} GiB "
         f"of at most {payload['predicted_memory_bytes'] / 2**30:.2g} predicted",
+        *kernel_lines(payload["kernels"]),
         *_colour_lines(payload),
     ]
     if payload["asked_seconds"] is not None:

@@ -250,6 +250,7 @@ def transport(
             light.save(output)
     size = output.stat().st_size
     payload = {**light.summary(), "bytes": size, "seconds": job.clock.seconds(), "output": str(output)}
+    payload["kernels"] = job.clock.kernels()
     shape, taken = payload["shape"], payload["seconds"]
     lines = [
         f"Light of {payload['n']}x{payload['n']} projector pixels to {shape[0]}x{shape[1]} of the sensor in "

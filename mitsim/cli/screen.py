@@ -130,11 +130,21 @@ def payload_of_lines(kind: str, results: Mapping[str, Mapping[str, Any]], output
     return {
         "kind": colours.kind,
         "channels": [{**line.model_dump(), **results[line.name]} for line in colours.channels],
-        "seconds": results[colours.names[-1]]["seconds"],
+        **{name: results[colours.names[-1]].get(name) for name in ("seconds", "kernels")},
         **{name: results[colours.names[0]].get(name) for name in ("colour",) if kind == RUN},
         "warnings": tuple(f"{name}: {text}" for name, result in results.items() for text in result["warnings"]),
         "output": str(output),
     }
+
+
+def kernel_lines(kernels: Mapping[str, float]) -> list[str]:
+    """The line that is said of compiled ``kernels``: their number and seconds; none where there are none."""
+    if not kernels["number"]:
+        return []
+    return [
+        f"{kernels['number']} kernels compiled in {kernels['seconds']:.1f} s of these; Dr.Jit's cache holds them for "
+        "later runs"
+    ]
 
 
 def total_of_lines(payload: Mapping[str, Any]) -> str:

@@ -11,10 +11,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import FrameType
 
+from mitsim.core.environment import compiled_kernels
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields, cut
 from mitsim.core.worker import OutOfTime, is_stopped
 
@@ -36,6 +37,7 @@ class Clock:
     def __init__(self, start: float = 0.0) -> None:
         self._started = time.perf_counter() - start
         self._stages: dict[str, float] = {"start": start} if start else {}
+        self._compiled = compiled_kernels()
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -60,6 +62,11 @@ class Clock:
     def seconds(self) -> dict[str, float]:
         """Stages and ``total`` since the clock was made [s]."""
         return {**self._stages, "total": time.perf_counter() - self._started}
+
+    def kernels(self) -> dict[str, float]:
+        """``number`` of kernels that were compiled since the clock was made, and ``seconds`` that it took: later runs
+        find them in Dr.Jit's cache, and are the faster by so much."""
+        return asdict(compiled_kernels().since(self._compiled))
 
 
 # ---- What work may take ----

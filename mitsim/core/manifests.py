@@ -330,6 +330,8 @@ class RunManifest(RunHead):
     """Part of the light that came from beyond the plan's directions; it is in no frame."""
     seconds: dict[str, float] = {}
     """By stage; `imports`: of modules that no earlier work needed."""
+    kernels: dict[str, int | float] = {}
+    """`number` of kernels that no cache held, and `seconds`, of those above, that it took to compile them."""
     predicted_memory_bytes: float | None = None
     """Memory that this was predicted to take at most, beyond what the program held before."""
 

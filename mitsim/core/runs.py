@@ -232,7 +232,7 @@ class Capture:
         known = (
             "mc_error", "total_error", "total_error_bound", "total_error_of_projector",
             "mc_to_sensor_noise", "sensor_noise", "heaviest_group", "truth_error", "lost_light",
-            "seconds", "predicted_memory_bytes", "warnings",
+            "seconds", "kernels", "predicted_memory_bytes", "warnings",
         )  # fmt: skip
         return {
             "frames": len(manifest.patterns.captures),

@@ -88,7 +88,8 @@ class ReportData:
     errors are shown as a picture. ``frames`` are (m, m) [DN] by caption, ``exposure`` says which convention the
     reconstructions used, ``calibration`` is what `calibrate --json`
     says of the session, and its ``status``. ``accuracy`` and ``effects`` are the plan's. ``warnings`` say why the
-    results are flagged, at the head of the page. ``error`` is of the expected frames, all in all.
+    results are flagged, at the head of the page. ``error`` is of the expected frames, all in all. ``kernels`` are the
+    ``number`` that was compiled, and the ``seconds`` of that.
     """
 
     title: str
@@ -107,6 +108,7 @@ class ReportData:
     error: float | None = None
     effects: tuple[PlanRow, ...] = ()
     seconds: Mapping[str, float] = field(default_factory=dict)
+    kernels: Mapping[str, float] = field(default_factory=dict)
     configuration: Mapping[str, object] = field(default_factory=dict)
     seeds: Mapping[str, int] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)

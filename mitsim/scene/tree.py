@@ -105,8 +105,8 @@ def check_meshes(moved: Sequence[tuple[Tag, float]], scene: mi.Scene) -> None:
         if not distance:
             continue
         if shape.is_mesh():
-            vertices = np.array(shape.vertex_position(mi.UInt32(np.arange(shape.vertex_count()))), dtype=np.float64)
-            nearest = float(np.sqrt(np.square(vertices).sum(axis=0)).min(initial=np.inf))
+            vertices = np.array(mi.traverse(shape)["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+            nearest = float(np.sqrt(np.square(vertices).sum(axis=1)).min(initial=np.inf))
         else:
             box = shape.bbox()
             nearest = float(np.linalg.norm(np.clip(0, np.array(box.min), np.array(box.max))))

@@ -172,7 +172,10 @@ def _window_corners(where: str, projector: mi.Emitter, camera: mi.Sensor, window
     half = 0.25 * z  # any four points do
     probes = np.array([[half, half], [half, -half], [-half, half], [-half, -half]])
     interaction = dr.zeros(mi.SurfaceInteraction3f, len(probes))
-    interaction.p = camera.world_transform() @ mi.Point3f(probes[:, 0], probes[:, 1], z)
+    # Opaque numbers keep the compiled kernel the same for every plane.
+    place, across, away = dr.arange(mi.UInt32, len(probes)), dr.opaque(mi.Float, half), dr.opaque(mi.Float, z)
+    x, y = (dr.select((place & bit) == 0, across, -across) for bit in (2, 1))
+    interaction.p = camera.world_transform() @ mi.Point3f(x, y, away)
     sample, _ = projector.sample_direction(interaction, mi.Point2f(0.5))
     uv = np.array(sample.uv, dtype=np.float64).T
     uv = uv.T if uv.shape[0] == 2 and uv.shape[1] == len(probes) else uv

@@ -443,7 +443,8 @@ def _run(
         kind(stages(every, *(value[k] for value in values), *(types.Float64(four[k]) for four in deviates)))
         for k in range(LANE)
     ]
-    dr.eval(filled)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):  # which each thread has for itself
+        dr.eval(filled)
     dr.sync_thread()
     for k, part in enumerate(filled):
         room = result[k * quarter : (k + 1) * quarter]

@@ -48,7 +48,8 @@ _OPENING = re.compile(r"\s*(?:<\?xml[^>]*\?>)?\s*(?:<scene[^>]*>)?\s*<!--(.*?)--
 class DemoResult:
     """What `mitsim demo` reports: PSNR [dB] by family, rendered and idealised, at equal peak, and by exposure
     convention; what the main family gains over uniform light, as a number and in words; the truth's standard error; how
-    far to trust each family's image; and where the page is."""
+    far to trust each family's image; wall time by stage, and the kernels that were compiled in it; and where the page
+    is."""
 
     psnr: dict[str, float]
     psnr_ideal: dict[str, float]
@@ -59,6 +60,7 @@ class DemoResult:
     truth_error: float
     trust: dict[str, dict[str, Any]]
     seconds: dict[str, float]
+    kernels: dict[str, float]
     report: str
     warnings: tuple[str, ...]
 
@@ -133,7 +135,8 @@ def _run(bench: Bench, folder: Path, request: Request, names: tuple[str, ...], j
         frames = {_caption("uniform", 0, 1): comparison.white(), **_frames(shots, folder / "run", request.patterns)}
     evidence = _Evidence(light, shots, factors, families, request.patterns)
     with job.clock.stage("report"):
-        page = replace(_page(evidence), render=view, frames=frames, seconds=job.clock.seconds())
+        kernels = job.clock.kernels()
+        page = replace(_page(evidence), render=view, frames=frames, seconds=job.clock.seconds(), kernels=kernels)
         report = build_report(page, folder / DEMO_PAGE)
     psnr = {name: f.rendered.quality.psnr_db for name, f in families.items() if f.rendered}
     return DemoResult(
@@ -146,6 +149,7 @@ def _run(bench: Bench, folder: Path, request: Request, names: tuple[str, ...], j
         truth_error=light.apparent.error,
         trust={name: f.rendered.trust.summary() for name, f in families.items() if f.rendered and f.rendered.trust},
         seconds=job.clock.seconds(),
+        kernels=kernels,
         report=str(report),
         warnings=evidence.warnings,
     )

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from mitsim.core.arrays import FloatArray, Labels
+from mitsim.core.environment import compiled_kernels
 from mitsim.core.errors import MitsimError
 from mitsim.transport.records import Bundle, CellAxis, Sightings
 
@@ -249,6 +250,7 @@ class DeviceAccumulator:
         dr.eval(lit, units)
         self.sums = dr.zeros(mi.UInt64, self._entries * self.lines)
         found = Lit(np.array(lit), self._rows, self._bundle.size, self._bundle.lamps)
+        compiled_kernels()
         return [DeviceSums(self, found, np.array(each)) for each in units]
 
 

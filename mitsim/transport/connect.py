@@ -78,14 +78,25 @@ class SensorPoints:
         row, column
             of the anchor.
         rng
-            draws the random points.
+            draws the random points, and nothing else.
         """
-        if self.spread:
-            return self.inside(mi.Point2f(rng.next_float32(), rng.next_float32()))
-        if self.anchors == 1:
-            return mi.Point3f(0)
-        positions = mi.Float(self.positions.astype(np.float32))
-        return mi.Point3f(*x_y(dr.gather(mi.Float, positions, row), dr.gather(mi.Float, positions, column)), 0)
+        spread = dr.opaque(mi.Bool, self.spread)
+        return self.chosen(row, column, mi.Point2f(rng.next_float32(spread), rng.next_float32(spread)))
+
+    def chosen(self, row: mi.UInt32, column: mi.UInt32, point: mi.Point2f) -> mi.Point3f:
+        """The same, where random points are told: one kernel serves the centre, anchors, and random points.
+
+        Parameters
+        ----------
+        row, column
+            of the anchor.
+        point
+            of the unit square, which stands for a random one.
+        """
+        # Of one number alone Dr.Jit would make another kernel.
+        positions = mi.Float(np.append(self.positions, 0).astype(np.float32))
+        anchor = mi.Point3f(*x_y(dr.gather(mi.Float, positions, row), dr.gather(mi.Float, positions, column)), 0)
+        return dr.select(dr.opaque(mi.Bool, self.spread), self.inside(point), anchor)
 
     def inside(self, point: mi.Point2f) -> mi.Point3f:
         """Each ``point`` of the unit square on the sensor, in the camera's frame."""

@@ -80,7 +80,8 @@ class DirectTracer(Tracer):
         jitter, weight = self._place(number, row, column, sobol_point(flight.sample, shared))
         wavelengths, spectral = sample_wavelengths(self.setup.camera, rng, self.projector.lines)
         ray = self.setup.rays.sample(pixel, jitter, rng, wavelengths)
-        sensor = self._sensor(row, column, flight.sample, shared, rng)
+        # A sixth of the variance of plain random points in compact_disc, half in gift_card (32 samples a pixel).
+        sensor = self.points.chosen(row, column, sobol_point(shuffle(flight.sample, shared), shared))
         flux = self.setup.rays.flux(pixel, wavelengths) * spectral * (weight * share)
 
         def add_light(at: Arrival, state: tuple[Sightings, mi.PCG32]) -> tuple[Sightings, mi.PCG32]:
@@ -107,15 +108,6 @@ class DirectTracer(Tracer):
     ) -> tuple[mi.Point2f, mi.Float]:
         """Where in its pixel a ray starts, by the pixel's place in the list and the anchor, and the ray's weight."""
         return jitter, mi.Float(1)
-
-    def _sensor(
-        self, row: mi.UInt32, column: mi.UInt32, sample: mi.UInt32, shared: mi.PCG32, rng: mi.PCG32
-    ) -> mi.Point3f:
-        """Points of the sensor, in the camera's frame; ``shared`` belongs to all samples of a stream."""
-        if self.points.spread:
-            # A sixth of the variance of plain random points in compact_disc, half in gift_card (32 samples a pixel).
-            return self.points.inside(sobol_point(shuffle(sample, shared), shared))
-        return self.points.at(row, column, rng)
 
 
 # -------- Direct light on the sensor as a whole

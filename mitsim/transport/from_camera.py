@@ -196,7 +196,7 @@ class CameraPaths(PathIntegrator[State]):
     def path_samples(self) -> list[PathSamples]:
         """Light on the host of every path."""
         kept = self.follow(self.paths).sightings
-        dr.eval(kept)
+        dr.eval(kept, self.anchor)
         return [PathSamples.fetch(seen, KINDS[kind], self.anchor) for kind, seen in kept.items()]
 
     # ---- lights that paths run into ---------------------------------------------------------------------------------
@@ -325,7 +325,7 @@ class CameraPaths(PathIntegrator[State]):
     @property
     def _lamps(self) -> mi.UInt32:
         """The pixel that lamps' light goes by."""
-        return mi.UInt32(self.tracer.projector.n**2)
+        return dr.opaque(mi.UInt32, self.tracer.projector.n**2)
 
     def _keep_projector(
         self, paths: State, active: mi.Bool, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32, order: mi.UInt32

@@ -230,7 +230,7 @@ class _OneConnection:
     def fetch(self, held: Held, kinds: Sequence[str], also: object = ()) -> list[PathSamples]:
         """Light of some ``kinds`` on the host; what it takes is worked out with that of ``also``: apart, each would
         follow all paths again."""
-        dr.eval([held[kind] for kind in kinds], also)
+        dr.eval([held[kind] for kind in kinds], self._anchor if kinds else (), also)
         return [PathSamples.fetch(held[kind], KINDS[kind], self._anchor) for kind in kinds]
 
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import drjit as dr
 import mitsuba as mi
 
-from mitsim.core.environment import keep_scenes
+from mitsim.core.environment import compiled_kernels, keep_scenes
 from mitsim.transport.connect import OpticalSetup, SensorPoints
 from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT, PathSamples
 
@@ -150,6 +150,8 @@ class Tracer(ABC):
         for tracer in self.per_wavelength:
             for sample, index in launches(self.paths_per_sample // count, first, samples, at_once):
                 parts += tracer._launch(InFlight(dr.opaque(mi.UInt32, seed), sample, index), accumulator)
+        if accumulator is None:  # all is fetched, and there is nothing to wait for
+            compiled_kernels()
         return PathSamples.join(parts)
 
 

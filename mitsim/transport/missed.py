@@ -573,9 +573,10 @@ class _Lobes:
         )
         # Whole numbers, whose sums in any order are the same.
         dr.scatter_reduce(dr.ReduceOp.Add, turned, met.turns, pixel, met.turns > 0)
-        dr.eval(met, turned)
         # Few rays meet the sensor: of the others nothing is fetched. What is not a number is no zero either.
-        lit = dr.compress(~(met.mean == 0))
+        lit = ~(met.mean == 0)
+        dr.eval(met, turned, lit)
+        lit = dr.compress(lit)
         number = np.array(dr.gather(mi.UInt32, pixel, lit), dtype=np.int64)
         mean, product, density = (
             np.array(dr.gather(mi.Float, values, lit), dtype=np.float64)

@@ -1,0 +1,100 @@
+"""A tracer is one kernel, whatever it is told: numbers of paths, anchors and pixels are data, not code.
+
+(Planted: ``dr.mean`` in `panchromatic`, which writes the number of lanes into the kernel; a sensor's centre without the
+table of anchors; a literal number of the projector's pixels.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from mitsim.api.bench import Bench, open_bench
+from mitsim.core.environment import CompiledKernels, compiled_kernels
+from mitsim.core.job import Clock
+from mitsim.light.settings import Settings
+from mitsim.light.simulation import Simulation
+from mitsim.transport import integrator
+from mitsim.transport.connect import SensorPoints
+from mitsim.transport.direct import DirectTracer
+from mitsim.transport.from_camera import FromCameraTracer
+from mitsim.transport.indirect import IndirectTracer
+from mitsim.transport.integrator import Paths, Tracer
+
+SHINY = """<shape type="sphere"><point name="center" x="0" y="0" z="380"/><float name="radius" value="6"/>
+    <bsdf type="roughconductor"><float name="alpha" value="0.2"/></bsdf></shape>"""
+LAMP = '<emitter type="point"><point name="position" x="-60" y="30" z="50"/><rgb name="intensity" value="3"/></emitter>'
+PATHS = Paths(interreflection=True)
+
+
+@pytest.fixture
+def kernels(monkeypatch: pytest.MonkeyPatch, variant: str) -> Iterator[Callable[[Tracer, int], set[str]]]:
+    """Kernels, by the hash of their text, that trace so many samples of a tracer."""
+    monkeypatch.setattr(integrator, "compiled_kernels", lambda: None)  # which would take the history
+
+    def launched(tracer: Tracer, samples: int) -> set[str]:
+        tracer.trace(5, 0, 1)  # what is prepared once
+        dr.kernel_history_clear()
+        tracer.trace(5, 0, samples)
+        return {launch["hash"] for launch in dr.kernel_history([dr.KernelType.JIT])}
+
+    yield launched
+    dr.kernel_history_clear()
+
+
+def open_scene(scene: Callable[..., Path], name: str, **numbers: object) -> Bench:
+    return open_bench(scene(name, extra=SHINY + LAMP, **numbers))
+
+
+def points_of(bench: Bench, *choices: tuple[int, bool]) -> list[SensorPoints]:
+    return [SensorPoints(bench.geometry.half_width, anchors, spread) for anchors, spread in choices]
+
+
+def test_direct_light_is_one_kernel(
+    small_scene: Callable[..., Path], kernels: Callable[[Tracer, int], set[str]]
+) -> None:
+    bench, found = open_scene(small_scene, "one", n=6), set()
+    for anchors, spread, pixels in ((1, False, None), (1, True, None), (3, False, None), (5, False, np.arange(7))):
+        for samples in (1, 3):
+            found |= kernels(DirectTracer(bench.setup, anchors, spread, pixels), samples)
+    assert len(found) == 1
+
+
+def test_light_over_several_surfaces_is_one_kernel_to_a_point_and_one_to_anchors(
+    small_scene: Callable[..., Path], kernels: Callable[[Tracer, int], set[str]]
+) -> None:
+    bench = open_scene(small_scene, "one", n=6)
+    centre, spread, three, four = points_of(bench, (1, False), (1, True), (3, False), (4, False))
+    to_point = [kernels(IndirectTracer(bench.setup, PATHS, point), n) for point, n in ((centre, 1), (spread, 3))]
+    assert len(set().union(*to_point)) == 1
+    # And a small one that unpacks them.
+    to_anchors = [kernels(IndirectTracer(bench.setup, PATHS, points), n) for points, n in ((three, 1), (four, 2))]
+    assert len(set().union(*to_anchors)) == 2
+
+
+def test_light_from_the_camera_is_one_kernel_for_every_projector(
+    small_scene: Callable[..., Path], kernels: Callable[[Tracer, int], set[str]]
+) -> None:
+    found = set()
+    for name, n in (("one", 6), ("other", 7)):
+        bench = open_scene(small_scene, name, n=n)
+        grid = Simulation(bench, Settings(bench.geometry.scene_distance)).aim
+        paths = Paths(interreflection=True, emitters=tuple(bench.loaded.scene.emitters())[1:])
+        for points, samples in zip(points_of(bench, (1, False), (1, True), (2, False)), (1, 2, 3), strict=True):
+            found |= kernels(FromCameraTracer(bench.setup, grid, paths, points), samples)
+    assert len(found) == 1
+
+
+def test_a_clock_counts_the_kernels_that_no_cache_held(variant: str) -> None:
+    from mitsuba import Float
+
+    clock, earlier = Clock(), compiled_kernels()
+    dr.eval(dr.arange(Float, 9) * float(np.random.default_rng().uniform()))
+    found = clock.kernels()
+    assert found["number"] == 1 and found["seconds"] > 0
+    assert compiled_kernels().since(earlier) == CompiledKernels(**found)
+    assert Clock().kernels() == {"number": 0, "seconds": 0.0}
