@@ -98,17 +98,32 @@ class ProjectorOptics:
         """A pinhole with sharp pixels."""
         return self.aperture == 0 and self.blur == 0
 
-    def canvas_point(self, row: Numbers, column: Numbers) -> tuple[Numbers, Numbers]:
-        """Canvas coordinates (u, v), 0..1, of the window's point ``row``, ``column`` in pixels."""
-        return (column + self.first_column) / self.canvas[1], (row + self.first_row) / self.canvas[0]
+    def canvas_point(
+        self, row: Numbers, column: Numbers, number: Callable[[float], Numbers] = float
+    ) -> tuple[Numbers, Numbers]:
+        """Canvas coordinates (u, v), 0..1, of the window's point ``row``, ``column`` in pixels.
+
+        Parameters
+        ----------
+        row, column
+            in the window.
+        number
+            turns the window's numbers into numbers of their kind.
+        """
+        rows, columns, first_row, first_column = map(number, (*self.canvas, self.first_row, self.first_column))
+        return (column + first_column) / columns, (row + first_row) / rows
 
     def pixel_at(self, uv: mi.Point2f) -> mi.UInt32:
         """The window's pixel (row-major) at canvas point ``uv``; outside of the window, the nearest."""
-        (rows, columns), (row_part, first_row) = self.canvas, math.modf(self.first_row)
-        column_part, first_column = math.modf(self.first_column)
-        row = dr.clip(dr.floor(uv.y * rows - row_part) - first_row, 0, self.n - 1)
-        column = dr.clip(dr.floor(uv.x * columns - column_part) - first_column, 0, self.n - 1)
-        return mi.UInt32(row * self.n + column)
+        n = _opaque(self.n)
+        row, column = (
+            dr.clip(dr.floor(place * _opaque(count) - _opaque(part)) - _opaque(first), 0, n - 1)
+            for place, count, (part, first) in (
+                (uv.y, self.canvas[0], math.modf(self.first_row)),
+                (uv.x, self.canvas[1], math.modf(self.first_column)),
+            )
+        )
+        return mi.UInt32(row * n + column)
 
     def pixel_size(self) -> tuple[float, float]:
         """Size (x, y) of a pixel on the plane at unit distance [mm], as the emitter's own float32 tells it.
@@ -206,8 +221,7 @@ class ProjectorRays:
             disk = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(rng.next_float32(), rng.next_float32()))
             lens = mi.Vector3f(disk.x, disk.y, 0) * dr.opaque(mi.Float, projector.aperture)
             image = image - lens / dr.opaque(mi.Float, projector.focus)
-        turn = mi.Matrix3f(self._map.turn.tolist())
-        return mi.Ray3f(self._origin + turn @ lens, dr.normalize(turn @ image), 0.0, wavelengths)
+        return mi.Ray3f(self._origin + self._turn @ lens, dr.normalize(self._turn @ image), 0.0, wavelengths)
 
     def flux(self, pixel: mi.UInt32, wavelengths: mi.Color0f) -> mi.Spectrum:
         """Flux of each ``pixel`` at ``wavelengths`` [W m^-2 mm^2]: irradiance at unit distance times area there."""
@@ -215,19 +229,28 @@ class ProjectorRays:
         centre = self._image(mi.Float(pixel // n) + 0.5, mi.Float(pixel % n) + 0.5)
         at = dr.zeros(mi.SurfaceInteraction3f)
         at.wavelengths = wavelengths
-        at.p = self._origin + mi.Matrix3f(self._map.turn.tolist()) @ (centre * _FAR)
+        at.p = self._origin + self._turn @ (centre * _FAR)
         _, weight = self.projector.emitter.sample_direction(at, mi.Point2f(0.5), True)
-        area = self._map.pixel_area(self.projector.canvas) * self.projector.share
+        area = _opaque(self._map.pixel_area(self.projector.canvas) * self.projector.share)
         return weight * (_FAR**2 * dr.rsqrt(dr.squared_norm(centre)) * area)
 
-    @property
+    @cached_property
     def _origin(self) -> mi.Point3f:
-        return mi.Point3f(self._map.origin.tolist())
+        return mi.Point3f(*map(_opaque, self._map.origin))
+
+    @cached_property
+    def _turn(self) -> mi.Matrix3f:
+        return mi.Matrix3f(*map(_opaque, self._map.turn.ravel()))
 
     def _image(self, row: mi.Float, column: mi.Float) -> mi.Vector3f:
         """Where a point of the window lies on the plane at unit distance, in the projector's frame."""
-        canvas_point = self.projector.canvas_point(row, column)
-        return mi.Vector3f(*self._map.tangents(*canvas_point, lambda value: dr.opaque(mi.Float, value)), 1)
+        canvas_point = self.projector.canvas_point(row, column, _opaque)
+        return mi.Vector3f(*self._map.tangents(*canvas_point, _opaque), 1)
+
+
+def _opaque(value: float) -> mi.Float:
+    """A number that is data of a kernel, not part of its code."""
+    return dr.opaque(mi.Float, float(value))
 
 
 def line_wavelengths(lines: Lines) -> tuple[mi.Color0f, FloatArray]:

@@ -1,12 +1,15 @@
 """A tracer is one kernel, whatever it is told: numbers of paths, anchors and pixels are data, not code.
 
+Not so the number of objects of all scenes that are open: Dr.Jit (1.5.0) writes it into every call of one.
+
 (Planted: ``dr.mean`` in `panchromatic`, which writes the number of lanes into the kernel; a sensor's centre without the
-table of anchors; a literal number of the projector's pixels.)
+table of anchors; literal numbers of the projector's window.)
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -76,17 +79,29 @@ def test_light_over_several_surfaces_is_one_kernel_to_a_point_and_one_to_anchors
     assert len(set().union(*to_anchors)) == 2
 
 
-def test_light_from_the_camera_is_one_kernel_for_every_projector(
+def test_light_from_the_camera_is_one_kernel(
     small_scene: Callable[..., Path], kernels: Callable[[Tracer, int], set[str]]
 ) -> None:
-    found = set()
-    for name, n in (("one", 6), ("other", 7)):
-        bench = open_scene(small_scene, name, n=n)
-        grid = Simulation(bench, Settings(bench.geometry.scene_distance)).aim
-        paths = Paths(interreflection=True, emitters=tuple(bench.loaded.scene.emitters())[1:])
-        for points, samples in zip(points_of(bench, (1, False), (1, True), (2, False)), (1, 2, 3), strict=True):
-            found |= kernels(FromCameraTracer(bench.setup, grid, paths, points), samples)
+    bench, found = open_scene(small_scene, "one", n=6), set()
+    grid = Simulation(bench, Settings(bench.geometry.scene_distance)).aim
+    paths = Paths(interreflection=True, emitters=tuple(bench.loaded.scene.emitters())[1:])
+    for points, samples in zip(points_of(bench, (1, False), (1, True), (2, False)), (1, 2, 3), strict=True):
+        found |= kernels(FromCameraTracer(bench.setup, grid, paths, points), samples)
     assert len(found) == 1
+
+
+def test_another_projector_is_no_other_kernel(
+    small_scene: Callable[..., Path], kernels: Callable[[Tracer, int], set[str]]
+) -> None:
+    """Its window, that is: what Mitsuba knows of it is Mitsuba's."""
+    bench = open_scene(small_scene, "one", n=6)
+    grid = Simulation(bench, Settings(bench.geometry.scene_distance)).aim
+    part = replace(bench.setup.projector, n=5, first_row=0.5, first_column=6.25, share=0.9)
+    direct, camera = set(), set()
+    for setup in (bench.setup, replace(bench.setup, projector=part)):
+        direct |= kernels(DirectTracer(setup, 1), 1)
+        camera |= kernels(FromCameraTracer(setup, grid, PATHS), 1)
+    assert len(direct) == len(camera) == 1
 
 
 def test_a_clock_counts_the_kernels_that_no_cache_held(variant: str) -> None:
