@@ -378,11 +378,17 @@ def render(
 
 
 @verb
-def doctor(common: Common) -> int:
+def doctor(
+    common: Common,
+    warm: Annotated[bool, typer.Option("--warm", help="compile the usual kernels into Dr.Jit's cache: a minute")] = False,
+) -> int:
     """What works on this machine, and the one command that mends what does not."""
     from mitsim.core.environment import doctor as run_doctor
+    from mitsim.core.environment import warm_up
 
     checks = run_doctor()
+    if warm and all(check.ok for check in checks):
+        checks.append(warm_up(common.variant))
     lines = [
         f"{'ok  ' if check.ok else 'FAIL'} {check.name}: {check.detail}"
         + (f"\n     mend with: {check.remedy}" if check.remedy and not check.ok else "")

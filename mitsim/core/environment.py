@@ -12,7 +12,9 @@ import site
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
@@ -21,7 +23,7 @@ from types import ModuleType
 
 from mitsim.core.errors import MitsimError, reason_of
 from mitsim.core.files import write_json
-from mitsim.core.worker import held_back
+from mitsim.core.worker import held_back, workers
 from mitsim.version import __version__
 
 DEFAULT_VARIANT = "llvm_ad_mono"
@@ -32,8 +34,14 @@ VARIANTS = ("llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral")
 
 _CHILD_SECONDS = 120
 """Longest time for a check; chosen so: all of them take some ten, on a busy machine several times that."""
+_WARM_SECONDS = 1800
+"""The same for a capture that warms the cache; chosen so: the longest takes 20 on two idle cores."""
+_WARM_ACCURACY = "3e-3"
+"""Three times the default, in half the time: plans then have the effects of the default still on."""
 _FEWEST_THREADS = 2
 """With a pool of one thread, Mitsuba 3.9.1 waits for ever when it reads an OpenEXR file."""
+_CACHE = "DRJIT_CACHE_DIR"
+"""Environment variable that names the folder of Dr.Jit's compiled kernels; without it, ~/.drjit."""
 _DRIVERS, _DRIVER_FOLDERS = ("libcuda.so", "libcuda.so.1"), ("x86_64-linux-gnu", "aarch64-linux-gnu", "wsl/lib")
 """Names and folders in which Dr.Jit 1.4 looks for the driver."""
 
@@ -229,6 +237,43 @@ def doctor() -> list[Check]:
     return checks
 
 
+USUAL_SCENES = "cookie_bag", "gift_card", "metal_blade", "lamp_bench", "cards", "photograph"
+"""Shipped scenes whose captures compile the usual kernels, the longest first: glossy meshes over several surfaces,
+print under varnish, a mirror, lamps, several prints, and one."""
+
+
+def warm_up(variant: str = DEFAULT_VARIANT, scenes: Sequence[str] = USUAL_SCENES) -> Check:
+    """Compile the usual kernels into Dr.Jit's cache, where later runs find them.
+
+    Each of the ``scenes`` is captured by a process of its own, one for each processor at a time: in one process Dr.Jit
+    compiles a kernel after the other, whatever the threads. Some 90 processor seconds where none is compiled yet.
+
+    Parameters
+    ----------
+    variant
+        of Mitsuba.
+    scenes
+        shipped ones, or files.
+    """
+
+    def capture(scene: str) -> float:
+        with tempfile.TemporaryDirectory() as folder:
+            words = "-m", "mitsim", "capture", scene, "--patterns", "dots:7", "--accuracy", _WARM_ACCURACY, "--json"
+            command = [sys.executable, *words, "--quiet", "--variant", variant, "--output", f"{folder}/run"]
+            done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=_WARM_SECONDS)
+        if done.returncode not in (0, 1):
+            raise MitsimError(f"{scene}: {(done.stderr.strip().splitlines() or ['no message'])[-1]}")
+        return float(json.loads(done.stdout)["kernels"]["number"])
+
+    def look() -> str:
+        started = time.perf_counter()
+        with ThreadPoolExecutor(workers()) as pool:
+            number = sum(pool.map(capture, scenes))
+        return f"{number:.0f} usual ones compiled in {time.perf_counter() - started:.0f} s, all others were there"
+
+    return _attempt("kernels", look, "mitsim doctor")
+
+
 def _python() -> Check:
     detail = f"Python {platform.python_version()} at {sys.executable}"
     new_enough = sys.version_info >= (3, 10)
@@ -263,10 +308,10 @@ def _openexr() -> Check:
 
 
 def _kernel_cache() -> Check:
-    folder = Path.home() / ".drjit"
+    folder = Path(os.environ.get(_CACHE) or Path.home() / ".drjit")
 
     def look() -> str:
-        folder.mkdir(exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             return f"{folder} is writable: compiled kernels are kept"
 
@@ -276,7 +321,7 @@ def _kernel_cache() -> Check:
 def _attempt(name: str, look: Callable[[], str], remedy: str) -> Check:
     try:
         return Check(name, True, look())
-    except (MitsimError, OSError, ImportError) as error:
+    except (MitsimError, OSError, ImportError, subprocess.TimeoutExpired) as error:
         return Check(name, False, reason_of(error), remedy)
 
 
@@ -380,9 +425,9 @@ def run_child(program: str, seconds: float, variables: Mapping[str, str] | None 
 
 def probe(path: Path | str) -> Probe:
     """Compile and run a small program with the library at ``path`` in a child process."""
-    # A home of its own: a kernel that a good LLVM left in ~/.drjit would make any other look good.
+    # A cache of its own: a kernel that a good LLVM left in the usual one would make any other look good.
     with tempfile.TemporaryDirectory() as home:
-        variables = {VARIABLE: str(path), "PYTHONUSERBASE": site.getuserbase(), "HOME": home}
+        variables = {VARIABLE: str(path), "PYTHONUSERBASE": site.getuserbase(), "HOME": home, _CACHE: home}
         return run_child(_PROBE_PROGRAM, _PROBE_SECONDS, variables)
 
 

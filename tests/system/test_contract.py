@@ -49,7 +49,8 @@ def assert_seconds(seconds: dict[str, object], *stages: str) -> None:
 def test_plan(call: Callable[..., Any], lab: Any) -> None:
     options = "--patterns", "dots:4", "--json", "--quiet", "--variant", "llvm_ad_mono"
     plan = call("plan", *lab.arguments, *options).payload
-    assert {"effects", "accuracy", "predicted_seconds", "predicted_range"} <= plan.keys()
+    assert {"effects", "accuracy", "predicted_seconds", "predicted_range", "kernels"} <= plan.keys()
+    assert plan["kernels"].keys() == {"number", "seconds"}
     assert plan["accuracy"] == 0.005 and number(plan["predicted_seconds"], 1e-6)
     assert len({effect["name"] for effect in plan["effects"]}) == len(plan["effects"]) >= 5
     for effect in plan["effects"]:
@@ -71,6 +72,7 @@ def test_capture(lab: Any) -> None:
     assert (captured["frames"], captured["shape"]) == (16, [64, 64])
     assert (captured["variant"], captured["seed"], captured["output"]) == ("llvm_ad_mono", 0, str(lab.run))
     assert_seconds(captured["seconds"], "transport", "optics", "sensor", "write")
+    assert number(captured["kernels"]["number"]) and number(captured["kernels"]["seconds"])
     assert number(captured["mc_error"], 1e-9, 0.005)
     assert len(list(lab.run.glob("*.exr"))) == 17, "16 frames and the truth"
 
@@ -78,7 +80,7 @@ def test_capture(lab: Any) -> None:
 def test_calibrate(lab: Any) -> None:
     found = lab.calibrated.payload
     keys = {"n", "frames", "separability_residual", "phi_error", "condition", "seconds", "output"}
-    keys |= {"predicted", "predicted_seconds", "predicted_memory_bytes", "memory_bytes"}
+    keys |= {"predicted", "predicted_seconds", "predicted_memory_bytes", "memory_bytes", "kernels"}
     assert keys <= found.keys()
     assert (found["n"], found["output"]) == (16, str(lab.calibration))
     assert found["frames"] == 2 * 2 * 16, "n horizontal and n vertical patterns, two captures each"

@@ -1,3 +1,4 @@
+import json
 import os
 import subprocess
 import sys
@@ -90,6 +91,22 @@ def test_the_doctor_names_one_command_for_all_that_fails(monkeypatch: pytest.Mon
     assert "llvm_ad_rgb is broken" in checks["render llvm_ad_rgb"].detail
     assert "signal 6" in checks["matplotlib"].detail
     assert set(broken) | {"python", "openexr", "mitsuba"} == set(checks)
+
+
+def test_warming_up_captures_the_usual_scenes_and_counts_their_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """(Planted: a capture that failed taken for one that was done.)"""
+
+    def run(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        scene = command[command.index("capture") + 1]
+        text = json.dumps({"kernels": {"number": {"cards": 2, "photograph": 10}.get(scene, 0), "seconds": 1.5}})
+        status = {"glass": 2, "photograph": 1}.get(scene, 0)  # a flagged run is a run
+        return subprocess.CompletedProcess(command, status, text, "first\nmitsim: no glass here\n")
+
+    monkeypatch.setattr(environment.subprocess, "run", run)
+    found = environment.warm_up(scenes=("photograph", "cards", "mirror"))
+    assert found.ok and found.detail.startswith("12 usual ones compiled in ")
+    found = environment.warm_up(scenes=("cards", "glass"))
+    assert not found.ok and found.detail == "glass: mitsim: no glass here" and found.remedy
 
 
 READ = """
