@@ -380,7 +380,9 @@ def render(
 @verb
 def doctor(
     common: Common,
-    warm: Annotated[bool, typer.Option("--warm", help="compile the usual kernels into Dr.Jit's cache: a minute")] = False,
+    warm: Annotated[
+        bool, typer.Option("--warm", help="compile the usual kernels into Dr.Jit's cache: half a minute")
+    ] = False,
 ) -> int:
     """What works on this machine, and the one command that mends what does not."""
     from mitsim.core.environment import doctor as run_doctor

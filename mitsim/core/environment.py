@@ -246,7 +246,7 @@ def warm_up(variant: str = DEFAULT_VARIANT, scenes: Sequence[str] = USUAL_SCENES
     """Compile the usual kernels into Dr.Jit's cache, where later runs find them.
 
     Each of the ``scenes`` is captured by a process of its own, one for each processor at a time: in one process Dr.Jit
-    compiles a kernel after the other, whatever the threads. Some 90 processor seconds where none is compiled yet.
+    compiles a kernel after the other, whatever the threads. 66 kernels, 37 processor seconds with all that they serve.
 
     Parameters
     ----------

@@ -120,7 +120,8 @@ def rigidity_error(turn: FloatArray) -> float:
 # unbiased. The other dimensions are plain random numbers.
 
 _SEQUENCE_BITS = 20
-"""Bits of a sample's number that count: 2^20 samples of a stream differ; each bit costs every sample a step."""
+"""Bits of a sample's number that count in the second dimension: chosen for 2^20 samples of a stream, more than a pass
+takes of one."""
 
 
 def generator(seed: mi.UInt32, stream: mi.UInt32) -> mi.PCG32:
@@ -166,11 +167,14 @@ def shuffle(index: mi.UInt32, rng: mi.PCG32) -> mi.UInt32:
 
 
 def _second_dimension(index: mi.UInt32) -> mi.UInt32:
-    """Dimension 2 of Sobol's sequence, 32-bit fixed point: direction numbers of the polynomial x + 1."""
-    result, direction = mi.UInt32(0), 1 << 31
-    for bit in range(_SEQUENCE_BITS):
-        result = dr.select((index & (1 << bit)) != 0, result ^ direction, result)
-        direction ^= direction >> 1
+    """Dimension 2 of Sobol's sequence, 32-bit fixed point: direction numbers of the polynomial x + 1.
+
+    Bit b of the index counts (1 + S)^b, with S the shift by one digit. So the reversed bits are a polynomial in S that
+    is taken at 1 + S: as (1 + S)^k is 1 + S^k for k = 2^j, modulo 2, of 2 k coefficients the upper k add to the lower.
+    """
+    result = dr.brev(index & (2**_SEQUENCE_BITS - 1))
+    for k, upper in ((16, 0x0000FFFF), (8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
+        result ^= (result & upper) << k
     return result
 
 
