@@ -100,6 +100,8 @@ class DeviceAccumulator:
         ((places * rows + 1) * lines,) on the device, in units. A place's rows lie side by side: neighbouring pixels,
         which are of different rows, bring light to one place at a time. So do the lines of an entry: a path brings
         light of every line, and memory that is not at hand is fetched once for all of them.
+    traced
+        how often a tracer has added light.
     """
 
     def __init__(self, bundle: Bundle, labels: Labels, one: float, lines: int = 1) -> None:
@@ -110,6 +112,7 @@ class DeviceAccumulator:
         # A last entry that counts what is no light.
         self._entries = self._rows * self._width + 1
         self.sums = dr.zeros(mi.UInt64, self._entries * lines)
+        self.traced = 0
 
     def _of_line(self, line: int, entries: mi.UInt32 | None = None) -> mi.UInt64:
         """Sums of a ``line``, of some ``entries`` or of all."""

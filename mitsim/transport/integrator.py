@@ -48,6 +48,8 @@ finite only while rho^2 < chance. A chance of 0.95 at most lost 10 % of the ligh
 """
 ANY = 2**31
 """More surfaces than any path meets; one more fits 32 bits."""
+_NOTED = 32
+"""Traces after which Dr.Jit's history of kernels is taken, whose texts are then 10 MB; it waits for the last of them."""
 _LEAST_CHANCE = 1e-6
 """Throughput is divided by no less than this: paths of chance 0 have ended, and 1/0 must not be worked out for them."""
 
@@ -150,7 +152,10 @@ class Tracer(ABC):
         for tracer in self.per_wavelength:
             for sample, index in launches(self.paths_per_sample // count, first, samples, at_once):
                 parts += tracer._launch(InFlight(dr.opaque(mi.UInt32, seed), sample, index), accumulator)
-        if accumulator is None:  # all is fetched, and there is nothing to wait for
+        if accumulator is not None:
+            accumulator.traced += 1
+        # Where all is fetched, there is nothing to wait for.
+        if accumulator is None or accumulator.traced % _NOTED == 0:
             compiled_kernels()
         return PathSamples.join(parts)
 
