@@ -261,6 +261,14 @@ def test_plan_shows_costs_where_there_are_any_and_no_column_of_zeros(page: str) 
     assert ">Cost<" not in R.render_html(replace(example(), families=example().families[:1], effects=free))
 
 
+@pytest.mark.usefixtures("unpainted")
+def test_the_page_tells_a_first_run_from_later_ones() -> None:
+    first, later = ({"number": 12, "seconds": 3.5}, {"number": 0, "seconds": 0.0})
+    alone = replace(example(), families=example().families[:1])
+    assert "3.50 s went into\n12 kernels" in R.render_html(replace(alone, kernels=first))
+    assert "kernels" not in R.render_html(replace(alone, kernels=later))
+
+
 def test_time_outside_all_stages_is_not_hidden() -> None:
     assert R._stages({"a": 1.0, "b": 2.0, "total": 5.0}) == {"a": 1.0, "b": 2.0, "all else": 2.0}
     assert R._stages({"a": 1.0, "b": 0.006, "c": 0.009, "total": 1.015}) == {"a": 1.0, "all else": pytest.approx(0.015)}
