@@ -135,7 +135,7 @@ def compiled_kernels() -> CompiledKernels:
     """
     global _compiled
     drjit = sys.modules.get("drjit")
-    if hasattr(drjit, "kernel_history"):
+    if drjit is not None and hasattr(drjit, "kernel_history"):
         new = [
             launch["backend_time"] / 1000
             for launch in drjit.kernel_history([drjit.KernelType.JIT])
