@@ -10,6 +10,7 @@ from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.sensor import moments
 from mitsim.sensor.chain import poisson_quantile
+from mitsim.sensor.specimen import specimen
 from tests.invented import sensor
 
 
@@ -96,6 +97,19 @@ def test_moments_of_linear_noise_are_those_without_short_cuts() -> None:
             assert moments.mean_variance(part, 0.0, model) == pytest.approx(mean, rel=1e-12)
         seen += 1
     assert seen > 80
+
+
+def test_a_pixel_whose_offset_lies_far_below_the_adc_reads_zero() -> None:
+    """(Found: what is more than 10 deviations beyond either end of the ADC was its largest code.)
+
+    Against black level and offset, cut; one electron of noise moves the mean of a cut pixel by 0.4 DN at most.
+    """
+    model = sensor(bits=8, read_noise_e=1.0, black_level_dn=4.0, dsnu_pixel_e=100.0)
+    offset = specimen(model, (20, 30)).offset_e
+    assert offset is not None and offset.min() < -100 and offset.max() > 300
+    mean, variance = moments.frame_moments(np.zeros((20, 30)), 0.0, model)
+    np.testing.assert_allclose(mean, np.clip(4 + offset, 0, 255), atol=0.5)
+    assert not variance[offset < -20].any()
 
 
 def test_the_shipped_camera_s_noise_is_linear_from_the_dark_to_a_percent_below_its_well() -> None:
