@@ -188,6 +188,27 @@ def test_a_board_of_uneven_lines_is_no_flicker() -> None:
     assert found.lamp.for_manifest() is None and not found.faults
 
 
+@pytest.mark.parametrize("start", [0, 2, 20, 40])
+@pytest.mark.parametrize("step", [1, -1])
+def test_frames_that_are_one_step_out_of_order_are_refused_as_that(start: int, step: int) -> None:
+    """From some frame on, each has the name of the next one or the last. Most pairs then add up to something else, so
+    that none is unlike the others. (Planted: looked for where many pairs stand out alone, which took 2 and 20 for a
+    good session with a few wrong frames, and factors 140 % off for good to 0.25 %.)"""
+    shown = frames()
+    names, moved = ORDER[start:], np.roll(np.arange(start, len(ORDER)), step)
+    late = {**shown, **{name: shown[ORDER[place]] for name, place in zip(names, moved, strict=True)}}
+    side = SIDES[0] if start < N else SIDES[1]
+    with pytest.raises(MitsimError, match=f"{side} stripes .* one step out of order; correct their names"):
+        judged(late)
+
+
+def test_frames_in_no_order_are_refused_with_their_number() -> None:
+    """(Planted: said to be one step out of order.)"""
+    shown, places = frames(noise=1e-2), np.random.default_rng(1).permutation(len(ORDER))
+    with pytest.raises(MitsimError, match=r"of \d+ of 64 patterns do not add up .*; check the order of the frames"):
+        judged({name: shown[ORDER[place]] for name, place in zip(ORDER, places, strict=True)})
+
+
 def test_a_wrong_uniform_frame_without_pairs_is_refused() -> None:
     """(Planted: the last column is looked at.)"""
     uniform = {("horizontal", 0, 0): 0.95 * frames()["horizontal", 0, 1]}
