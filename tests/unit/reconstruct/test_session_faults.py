@@ -46,9 +46,9 @@ def frames(
     return found
 
 
-def judged(shown: Frames, pairs: bool = True, step: float = 0.0) -> CheckedSession:
-    """What is said of frames whose numbers are a ``step`` apart; not ``pairs``: each response is of its +1 frame and
-    that of all light."""
+def judged(shown: Frames, pairs: bool = True, step: float = 0.0, **wrong: Half) -> CheckedSession:
+    """What is said of frames whose numbers are a ``step`` apart, of which some are known to be ``wrong``, why: which;
+    not ``pairs``: each response is of its +1 frame and that of all light."""
 
     def pair(side: str, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         one, other = shown[side, index, 1], shown[side, index, -1]
@@ -60,7 +60,9 @@ def judged(shown: Frames, pairs: bool = True, step: float = 0.0) -> CheckedSessi
         for index in range(1, N):
             response, light = pair(own.side, index)
             own.put(own.fit_response(response, index, light))
-    return check_session(sums, SIGNS, SessionConditions(ORDER, step=step))
+    return check_session(
+        sums, SIGNS, SessionConditions(ORDER, step=step, wrong={half: why for why, half in wrong.items()})
+    )
 
 
 def error(found: CheckedSession) -> tuple[float, float]:
@@ -111,6 +113,59 @@ def test_a_wrong_frame_is_named_and_predicted_by_the_other_of_its_pair(
     assert (fault.side, fault.index, fault.sign, fault.kind) == (*half, kind)
     actual, stated = error(found)
     assert actual < 1.3 * stated < 0.05
+
+
+@pytest.mark.parametrize(
+    ("half", "other"),
+    [
+        (("horizontal", 5, 1), ("horizontal", 4, -1)),
+        (("horizontal", 5, -1), ("horizontal", 5, 1)),
+        (("vertical", 20, -1), ("vertical", 0, 1)),
+    ],
+)
+def test_a_frame_of_a_pair_that_repeats_another_is_named_with_that(half: Half, other: Half) -> None:
+    """Of any other pattern, of its own, or that of all light. (Planted: dark frames alone are looked at.)"""
+    shown = frames()
+    (fault,) = (found := judged({**shown, half: shown[other]})).faults
+    assert (fault.side, fault.index, fault.sign, fault.kind, fault.other) == (*half, "repeated", other)
+    assert error(found)[0] < 1.3 * error(found)[1] < 0.01
+
+
+@pytest.mark.parametrize("half", [("horizontal", 5, 1), ("vertical", 20, -1)])
+def test_a_frame_that_is_known_to_be_wrong_is_left_out_whatever_it_shows(half: Half) -> None:
+    """With why it is; the other frame of its pair predicts it. (Planted: only what looks wrong; the other frame.)"""
+    (fault,) = (found := judged(frames(), unlike=half)).faults
+    assert (fault.side, fault.index, fault.sign, fault.detail) == (*half, "is wrong: unlike") and sum(
+        found.left_out
+    ) == 1
+    assert error(found)[0] < 1.3 * error(found)[1] < 0.01
+    other = *half[:2], -half[2]
+    (fault,) = (found := judged(frames(), unlike=half, missing=other)).faults
+    assert fault.sign is None and "is wrong: " in fault.detail and fault.repair == "both are left out"
+    assert 0.01 < 1.3 * error(found)[1] < 0.03 and error(found)[0] < 1.3 * error(found)[1]
+
+
+@pytest.mark.parametrize(
+    ("half", "kind", "change"),
+    [
+        (("vertical", 0, 1), "dim", lambda lit, dark: lit / 2),
+        (("horizontal", 0, 1), "black", lambda lit, dark: dark),
+        (("horizontal", 0, 1), "half lost", lambda lit, dark: np.where(np.arange(PIXELS[1]) < 50, lit, 0.0)),
+        (("vertical", 0, -1), "repeated", lambda lit, dark: lit),
+    ],
+)
+def test_a_wrong_uniform_frame_is_named_and_the_other_sides_is_right(
+    half: Half, kind: str, change: Callable[[np.ndarray, np.ndarray], np.ndarray]
+) -> None:
+    """Nothing else is judged by it. (Planted: the dark frame of its pair is expected to be lit.)"""
+    shown = frames()
+    lit, dark = (shown[half[0], 0, sign] for sign in (1, -1))
+    (fault,) = (found := judged({**shown, half: change(lit, dark)})).faults
+    assert (fault.side, fault.index, fault.sign, fault.kind) == (*half, kind)
+    assert found.right_uniform() == SIDES[1 - SIDES.index(half[0])]
+    (fault,) = (found := judged({**shown, (half[0], 0, 1): dark, (half[0], 0, -1): lit})).faults
+    assert (fault.side, fault.index, fault.kind) == (half[0], 0, "exchanged")
+    assert found.right_uniform() == SIDES[1 - SIDES.index(half[0])]
 
 
 @pytest.mark.parametrize(("half", "number"), [(("horizontal", 5), 0), (("vertical", 20), 1)])
@@ -251,7 +306,8 @@ def test_a_wrong_uniform_frame_without_pairs_is_refused() -> None:
 
 def test_a_drifting_lamp_is_divided_out() -> None:
     found = judged(frames(lambda place: 1 + 0.05 * (place / len(ORDER) - 0.5)))
-    assert not found.faults and found.lamp.drift == pytest.approx(0.05, rel=0.05)
+    assert not found.faults and found.lamp.drift == pytest.approx(0.05, rel=0.05) and not found.lamp.flicker
+    assert found.lamp.drift_cost == pytest.approx(0.05 / np.sqrt(12) * np.sqrt(2), rel=0.2), "of both sides"
     actual, stated = error(found)
     assert actual < 1.3 * stated
 
