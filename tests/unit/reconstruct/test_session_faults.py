@@ -135,10 +135,8 @@ def test_a_frame_of_a_pair_that_repeats_another_is_named_with_that(half: Half, o
 def test_a_frame_that_is_known_to_be_wrong_is_left_out_whatever_it_shows(half: Half) -> None:
     """With why it is; the other frame of its pair predicts it. (Planted: only what looks wrong; the other frame.)"""
     (fault,) = (found := judged(frames(), unlike=half)).faults
-    assert (fault.side, fault.index, fault.sign, fault.detail) == (*half, "is wrong: unlike") and sum(
-        found.left_out
-    ) == 1
-    assert error(found)[0] < 1.3 * error(found)[1] < 0.01
+    assert (fault.side, fault.index, fault.sign, fault.detail) == (*half, "is wrong: unlike")
+    assert sum(found.left_out) == 1 and error(found)[0] < 1.3 * error(found)[1] < 0.01
     other = *half[:2], -half[2]
     (fault,) = (found := judged(frames(), unlike=half, missing=other)).faults
     assert fault.sign is None and "is wrong: " in fault.detail and fault.repair == "both are left out"
@@ -195,6 +193,27 @@ def test_exchanged_frames_and_swapped_patterns_are_put_back() -> None:
     (fault,) = (found := judged(shown)).faults
     assert (fault.kind, fault.index, fault.other) == ("swapped", 9, ("horizontal", 21, 0))
     assert error(found)[0] < 1.1 * clean
+
+
+def named(half: Half) -> str:
+    """The file of a frame."""
+    return f"{half[0][0]}{half[1]}{'+' if half[2] > 0 else '-'}"
+
+
+def test_faults_are_told_by_the_files_of_their_frames_and_what_they_cost() -> None:
+    """Of two patterns those of both, the first in the sentence's place; one that is put right costs nothing."""
+    shown = frames()
+    for sign in (1, -1):
+        one, other = ("horizontal", 9, sign), ("horizontal", 21, sign)
+        shown[one], shown[other] = shown[other], shown[one]
+    shown["vertical", 5, 1] = shown["vertical", 4, -1]
+    found = judged(shown)
+    swapped, repeated = found.warnings(named)
+    assert swapped.startswith("frames: h9+ and h9-: in the place of horizontal stripes 21, and those in theirs")
+    assert swapped.endswith("(h21+ and h21-); both count in their right order")
+    assert repeated.startswith("frames: v5+: repeats vertical stripes 4 of sign -1 (v4-); it is left out")
+    assert repeated.endswith(f"at a factor error of {found.faults[1].cost:.1e}") and found.faults[1].cost > 1e-5
+    assert [each["frames"] for each in found.faults_for_manifest(named)] == [["h9+", "h9-"], ["v5+"]]
 
 
 @pytest.mark.parametrize("index", [1, 2, 3, 7])
