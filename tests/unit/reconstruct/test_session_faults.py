@@ -143,6 +143,20 @@ def test_a_frame_that_is_known_to_be_wrong_is_left_out_whatever_it_shows(half: H
     assert 0.01 < 1.3 * error(found)[1] < 0.03 and error(found)[0] < 1.3 * error(found)[1]
 
 
+def test_frames_without_pairs_that_are_known_to_be_wrong_are_left_out() -> None:
+    """Of each side its own; without a uniform frame nothing can be told. (Planted: those of the first side alone.)"""
+    known: dict[str, Half] = {"unlike": ("vertical", 20, 1), "missing": ("horizontal", 5, 1)}
+    found = judged(frames(), pairs=False, **known)
+    expected = [
+        (("horizontal", 5, 1), "wrong", "is wrong: missing"),
+        (("vertical", 20, 1), "wrong", "is wrong: unlike"),
+    ]
+    assert [((fault.side, fault.index, fault.sign), fault.kind, fault.detail) for fault in found.faults] == expected
+    assert found.left_out == (1, 1) and error(found)[0] < 1.3 * error(found)[1] < 0.03
+    with pytest.raises(MitsimError, match=r"^vertical stripes: of their uniform frame, unlike; take the session again"):
+        judged(frames(), pairs=False, unlike=("vertical", 0, 0))
+
+
 @pytest.mark.parametrize(
     ("half", "kind", "change"),
     [
