@@ -5,6 +5,7 @@ between files. Imports in functions and those for type checkers count. docs/arch
 """
 
 import ast
+import importlib.machinery
 import io
 import pkgutil
 import re
@@ -541,6 +542,16 @@ def test_a_file_name_means_one_thing() -> None:
     assert shared == ALIKE, shared ^ ALIKE
     planted = rooms_by_file(["mitsim.cli.run", "mitsim.core.run", "mitsim.core", "mitsim.cli.inner.run", "mitsim.run"])
     assert planted == {"run": {"cli", "core"}}
+
+
+def test_no_benchmark_hides_a_library_by_its_name() -> None:
+    """A script's folder is the first place where Python looks. (Seen: benchmarks/colour.py in place of colour-science,
+    for every benchmark that asked for it.)"""
+    folder = Path(__file__).resolve().parents[1] / "benchmarks"
+    elsewhere = [place for place in sys.path if Path(place).resolve() != folder]
+    for name in (file.stem for file in folder.glob("*.py")):
+        assert importlib.machinery.PathFinder.find_spec(name, elsewhere) is None, name
+    assert importlib.machinery.PathFinder.find_spec("colour", elsewhere) is not None
 
 
 def test_no_more_functions_are_named_by_participles() -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitsim.bench.apparatus import Apparatus
+from mitsim.bench.effects import names, present
 from mitsim.bench.request import FEWEST_PASSES, REFERENCE, check_accuracy, check_samples
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import DEFAULT_VARIANT, keep_scenes, load_variant, versions
@@ -47,7 +48,8 @@ class Rendered:
     mean, error
         (m, m', channels) irradiance, and its standard error.
     facts
-        estimator, spp (None: factored), seconds, variant, seed, and notes of what the scene's objects were changed in.
+        estimator, spp (None: factored), seconds, variant, seed, and notes: what the scene's objects were changed in,
+        and which effects of the bench the reference leaves out.
     warnings
         why the frame is flagged.
     """
@@ -234,9 +236,10 @@ def render(
     job = job or Job()
     spp = _samples(bench, estimator, spp)
     check_accuracy(accuracy)
-    warnings: tuple[str, ...] = ()
+    warnings, notes = tuple[str, ...](), bench.loaded.notes
     started = time.perf_counter()
     if estimator == REFERENCE:
+        notes += _of_the_factored(bench)
         mean, error = reference(bench.loaded, spp, seed, job)
         warnings = (bench.loaded.unfit.caustics,) if bench.loaded.unfit.caustics else ()
         warnings += _of_sampler(bench.loaded)
@@ -259,9 +262,18 @@ def render(
         "seconds": time.perf_counter() - started,
         "variant": bench.variant,
         "seed": seed,
-        "notes": bench.loaded.notes,
+        "notes": notes,
     }
     return Rendered(mean, error, facts, warnings)
+
+
+def _of_the_factored(bench: Apparatus) -> tuple[str, ...]:
+    """A note of the effects that the ``bench`` has and the reference has not; of a white picture, without its black."""
+    if bench.loaded.projector is None:
+        return ()
+    absent = names(lambda effect: effect.in_frames and not effect.in_reference) - {"black-level"}
+    left_out = [name for name in present(bench) if name in absent]
+    return (f"the reference leaves out {', '.join(left_out)}; --estimator factored does not",) if left_out else ()
 
 
 def rendered_psf(

@@ -104,7 +104,7 @@ _MANY_ENTRIES = 1.2
 """An entry of a geometric shadow of many terms over one of a wave-optical one (benchmarks/masks.py)."""
 _FURTHER_LINE = 0.2
 """What tracing takes more for each further line: 0.15 of a mono capture's seconds, 0.3 of one line's (three lines of
-photograph, benchmarks/colour.py)."""
+photograph, benchmarks/colour_lines.py)."""
 _PASSED = 0.4
 """A place of an accumulator, which is emptied and looked through, over an entry of light that is accumulated (corner in
 three lines: 4e-9 s)."""

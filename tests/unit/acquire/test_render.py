@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -53,3 +54,18 @@ def test_a_sampler_of_dependent_numbers_is_flagged(small_scene: Callable[..., Pa
     scene.write_text(scene.read_text().replace('type="independent"', 'type="multijitter"'))
     (warning,) = open_bench(scene, for_render=True).render(spp=4).warnings
     assert "MultijitterSampler" in warning and '<sampler type="independent"/>' in warning
+
+
+def test_what_the_reference_leaves_out_is_said(small_scene: Callable[..., Path], tmp_path: Path) -> None:
+    """(Seen failing: a projector's glare and blur were missing from the frame, and nothing said so.)"""
+    soft_file = tmp_path / "soft.toml"
+    soft_file.write_text('name = "soft"\neffective_wavelength_nm = 562.0\nblur_pixels = 0.8\nansi_contrast = 40.0\n')
+    scene = small_scene(mask="open")
+    plain, soft = (open_bench(scene, projector=file, for_render=True) for file in (None, soft_file))
+    assert plain.render(spp=4).facts["notes"] == (
+        "the reference leaves out diffraction; --estimator factored does not",
+    )
+    assert "leaves out diffraction, blur, glare;" in soft.render(spp=4).facts["notes"][0]
+    assert not soft.render("factored", accuracy=1e-2).facts["notes"]
+    unlit = dataclasses.replace(soft, loaded=dataclasses.replace(soft.loaded, projector=None))
+    assert not unlit.render(spp=4).facts["notes"]
