@@ -177,8 +177,7 @@ def demo(
 @verb
 def plan(scene: Scene, sampling: OfPatterns, devices: Coloured, common: Common) -> int:
     """What will be simulated, why, and what it costs, before any long work."""
-    from mitsim.core.environment import compiled_kernels
-    from mitsim.core.job import running_seconds
+    from mitsim.core.job import compiled_kernels, running_seconds
 
     request = request_of(sampling)
     devices.check_colour(common.variant, sampling.seconds)

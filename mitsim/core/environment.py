@@ -105,44 +105,11 @@ def _set_variant(name: str) -> ModuleType:
         raise MitsimError(f"variant {name}: cannot be loaded ({reason_of(error)}); run: mitsim doctor") from error
     import drjit
 
-    drjit.set_flag(drjit.JitFlag.KernelHistory, True)  # for compiled_kernels; it costs 3 ms a run
+    drjit.set_flag(drjit.JitFlag.KernelHistory, True)  # for core.job.compiled_kernels; it costs 3 ms a run
     if drjit.thread_count() < _FEWEST_THREADS:
         drjit.set_thread_count(_FEWEST_THREADS)
     module: ModuleType = mitsuba
     return module
-
-
-@dataclass(frozen=True)
-class CompiledKernels:
-    """Kernels that were in no cache: their ``number``, and the wall ``seconds`` that it took to compile them."""
-
-    number: int = 0
-    seconds: float = 0.0
-
-    def since(self, earlier: CompiledKernels) -> CompiledKernels:
-        """Those of them that were compiled after ``earlier``."""
-        return CompiledKernels(self.number - earlier.number, self.seconds - earlier.seconds)
-
-
-_compiled = CompiledKernels()
-
-
-def compiled_kernels() -> CompiledKernels:
-    """All kernels that this process has compiled. Waits for those that were launched, and takes Dr.Jit's history.
-
-    Dr.Jit keeps a copy of each launched kernel's text, some 0.2 MB, until it is asked: who launches many asks now and
-    then, where there is nothing to wait for.
-    """
-    global _compiled
-    drjit = sys.modules.get("drjit")
-    if drjit is not None and hasattr(drjit, "kernel_history"):
-        new = [
-            launch["backend_time"] / 1000
-            for launch in drjit.kernel_history([drjit.KernelType.JIT])
-            if not (launch["cache_hit"] or launch["cache_disk"])
-        ]
-        _compiled = CompiledKernels(_compiled.number + len(new), _compiled.seconds + sum(new))
-    return _compiled
 
 
 @contextmanager

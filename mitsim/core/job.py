@@ -15,7 +15,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import FrameType
 
-from mitsim.core.environment import compiled_kernels
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields, cut
 from mitsim.core.worker import OutOfTime, is_stopped
 
@@ -25,6 +24,39 @@ Progress = Callable[[str, float], None]
 
 def silent(stage: str, fraction: float) -> None:
     """Ignore the progress of ``stage``, its finished ``fraction``: the :data:`Progress` of who wants none."""
+
+
+@dataclass(frozen=True)
+class CompiledKernels:
+    """Kernels that were in no cache: their ``number``, and the wall ``seconds`` that it took to compile them."""
+
+    number: int = 0
+    seconds: float = 0.0
+
+    def since(self, earlier: CompiledKernels) -> CompiledKernels:
+        """Those of them that were compiled after ``earlier``."""
+        return CompiledKernels(self.number - earlier.number, self.seconds - earlier.seconds)
+
+
+_compiled = CompiledKernels()
+
+
+def compiled_kernels() -> CompiledKernels:
+    """All kernels that this process has compiled. Waits for those that were launched, and takes Dr.Jit's history.
+
+    Dr.Jit keeps a copy of each launched kernel's text, some 0.2 MB, until it is asked: who launches many asks now and
+    then, where there is nothing to wait for.
+    """
+    global _compiled
+    drjit = sys.modules.get("drjit")
+    if drjit is not None and hasattr(drjit, "kernel_history"):
+        new = [
+            launch["backend_time"] / 1000
+            for launch in drjit.kernel_history([drjit.KernelType.JIT])
+            if not (launch["cache_hit"] or launch["cache_disk"])
+        ]
+        _compiled = CompiledKernels(_compiled.number + len(new), _compiled.seconds + sum(new))
+    return _compiled
 
 
 @checked_fields

@@ -21,8 +21,8 @@ import numpy.typing as npt
 from scipy import sparse
 
 from mitsim.core.arrays import FloatArray, Labels
-from mitsim.core.environment import compiled_kernels
 from mitsim.core.errors import MitsimError
+from mitsim.core.job import compiled_kernels
 from mitsim.transport.records import Bundle, CellAxis, Sightings
 
 MOST_PLACES = 2**26

@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import drjit as dr
 import mitsuba as mi
 
-from mitsim.core.environment import compiled_kernels, keep_scenes
+from mitsim.core.environment import keep_scenes
+from mitsim.core.job import compiled_kernels
 from mitsim.transport.connect import OpticalSetup, SensorPoints
 from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT, PathSamples
 
@@ -49,7 +50,7 @@ finite only while rho^2 < chance. A chance of 0.95 at most lost 10 % of the ligh
 ANY = 2**31
 """More surfaces than any path meets; one more fits 32 bits."""
 _NOTED = 32
-"""Traces after which Dr.Jit's history of kernels is taken, whose texts are then 10 MB; it waits for the last of them."""
+"""Traces after which Dr.Jit's history of kernels is taken, which waits for the last of them: their texts are 10 MB."""
 _LEAST_CHANCE = 1e-6
 """Throughput is divided by no less than this: paths of chance 0 have ended, and 1/0 must not be worked out for them."""
 

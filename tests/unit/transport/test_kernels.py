@@ -17,8 +17,7 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.core.environment import CompiledKernels, compiled_kernels
-from mitsim.core.job import Clock
+from mitsim.core.job import Clock, CompiledKernels, compiled_kernels
 from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation
 from mitsim.transport import integrator
