@@ -29,6 +29,7 @@ from typing import Any
 from unittest import mock
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 import mitsim as ms
@@ -36,8 +37,9 @@ from mitsim.api.bench import Bench
 from mitsim.devices.patterns import PatternFamily, parse_patterns
 from mitsim.light.grids import LightEstimate
 from mitsim.light.simulation import Simulation, expected_of
-from mitsim.transport.direct import DirectTracer
+from mitsim.transport.connect import SensorPoints
 from mitsim.transport.indirect import adaptive_counts, block_moments
+from mitsim.transport.plugins.base import generator
 from mitsim.transport.records import INDIRECT
 
 ROOT = Path(__file__).parents[1]
@@ -98,10 +100,13 @@ def traced(
     return light
 
 
-def plain_points(self: DirectTracer, row: Any, column: Any, sample: Any, shared: Any, rng: Any) -> Any:
-    """Points of the sensor as they were in 0.3.0."""
-    del sample, shared
-    return self.points.at(row, column, rng)
+EVEN_POINTS = SensorPoints.chosen
+
+
+def plain_points(self: SensorPoints, row: Any, column: Any, point: Any) -> Any:
+    """Points of the sensor as they were in 0.3.0: random numbers that even ``point`` coordinates are hashed to."""
+    rng = generator(*(dr.reinterpret_array(mi.UInt32, part) for part in (point.x, point.y)))
+    return EVEN_POINTS(self, row, column, mi.Point2f(rng.next_float32(), rng.next_float32()))
 
 
 def measured(
@@ -118,8 +123,7 @@ def measured(
         for group in range(options.groups):
             for name, way in found.items():
                 samples = max(1, round(options.samples * way.part))
-                points = DirectTracer._sensor if way.even else plain_points
-                with mock.patch.object(DirectTracer, "_sensor", points):
+                with mock.patch.object(SensorPoints, "chosen", EVEN_POINTS if way.even else plain_points):
                     assert kind in simulations[name].passes, "prepared before the clock starts"
                     started = time.perf_counter()
                     light = traced(simulations[name], kind, labels, group, samples, way.device)
