@@ -100,7 +100,7 @@ def traced(
     return light
 
 
-EVEN_POINTS = SensorPoints.chosen
+EVEN_POINTS = SensorPoints.place
 
 
 def plain_points(self: SensorPoints, row: Any, column: Any, point: Any) -> Any:
@@ -123,7 +123,7 @@ def measured(
         for group in range(options.groups):
             for name, way in found.items():
                 samples = max(1, round(options.samples * way.part))
-                with mock.patch.object(SensorPoints, "chosen", EVEN_POINTS if way.even else plain_points):
+                with mock.patch.object(SensorPoints, "place", EVEN_POINTS if way.even else plain_points):
                     assert kind in simulations[name].passes, "prepared before the clock starts"
                     started = time.perf_counter()
                     light = traced(simulations[name], kind, labels, group, samples, way.device)

@@ -81,9 +81,9 @@ class SensorPoints:
             draws the random points, and nothing else.
         """
         spread = dr.opaque(mi.Bool, self.spread)
-        return self.chosen(row, column, mi.Point2f(rng.next_float32(spread), rng.next_float32(spread)))
+        return self.place(row, column, mi.Point2f(rng.next_float32(spread), rng.next_float32(spread)))
 
-    def chosen(self, row: mi.UInt32, column: mi.UInt32, point: mi.Point2f) -> mi.Point3f:
+    def place(self, row: mi.UInt32, column: mi.UInt32, point: mi.Point2f) -> mi.Point3f:
         """The same, where random points are told: one kernel serves the centre, anchors, and random points.
 
         Parameters

@@ -81,7 +81,7 @@ class DirectTracer(Tracer):
         wavelengths, spectral = sample_wavelengths(self.setup.camera, rng, self.projector.lines)
         ray = self.setup.rays.sample(pixel, jitter, rng, wavelengths)
         # A sixth of the variance of plain random points in compact_disc, half in gift_card (32 samples a pixel).
-        sensor = self.points.chosen(row, column, sobol_point(shuffle(flight.sample, shared), shared))
+        sensor = self.points.place(row, column, sobol_point(shuffle(flight.sample, shared), shared))
         flux = self.setup.rays.flux(pixel, wavelengths) * spectral * (weight * share)
 
         def add_light(at: Arrival, state: tuple[Sightings, mi.PCG32]) -> tuple[Sightings, mi.PCG32]:
