@@ -241,7 +241,7 @@ class _AnchorConnections(_OneConnection):
     """
 
     def __init__(self, points: SensorPoints, emission: Emission) -> None:
-        self._points, self._pixel, self._rng = points, emission.pixel, emission.rng
+        self._points, self._pixel = points, emission.pixel
         self._side, self._count = (dr.opaque(mi.UInt32, each) for each in (points.anchors, points.count))
 
     def none(self, kinds: Sequence[str], by_line: bool) -> Held:
@@ -253,7 +253,7 @@ class _AnchorConnections(_OneConnection):
         return number // self._side, number % self._side
 
     def sensor(self, number: mi.UInt32) -> mi.Point3f:
-        return self._points.at(*self.anchor(number), self._rng)
+        return self._points.place(*self.anchor(number), mi.Point2f(0))
 
     def load(self, held: Held, kind: str, number: mi.UInt32) -> Sightings:
         return _sightings(self._pixel, [held[kind][number * self._numbers + place] for place in range(self._numbers)])
