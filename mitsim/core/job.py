@@ -38,7 +38,7 @@ class CompiledKernels:
         return CompiledKernels(self.number - earlier.number, self.seconds - earlier.seconds)
 
 
-_compiled = CompiledKernels()
+_compiled, _counting = CompiledKernels(), threading.Lock()
 
 
 def compiled_kernels() -> CompiledKernels:
@@ -49,14 +49,15 @@ def compiled_kernels() -> CompiledKernels:
     """
     global _compiled
     drjit = sys.modules.get("drjit")
-    if drjit is not None and hasattr(drjit, "kernel_history"):
-        new = [
-            launch["backend_time"] / 1000
-            for launch in drjit.kernel_history([drjit.KernelType.JIT])
-            if not (launch["cache_hit"] or launch["cache_disk"])
-        ]
-        _compiled = CompiledKernels(_compiled.number + len(new), _compiled.seconds + sum(new))
-    return _compiled
+    with _counting:
+        if drjit is not None and hasattr(drjit, "kernel_history"):
+            new = [
+                launch["backend_time"] / 1000
+                for launch in drjit.kernel_history([drjit.KernelType.JIT])
+                if not (launch["cache_hit"] or launch["cache_disk"])
+            ]
+            _compiled = CompiledKernels(_compiled.number + len(new), _compiled.seconds + sum(new))
+        return _compiled
 
 
 @checked_fields

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import compiled_arrays
 from mitsim.core.errors import MitsimError
+from mitsim.core.job import compiled_kernels
 from mitsim.devices.sensor import SensorModel
 from mitsim.sensor.specimen import neighbours, specimen
 
@@ -446,6 +447,7 @@ def _run(
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):  # which each thread has for itself
         dr.eval(filled)
     dr.sync_thread()
+    compiled_kernels()
     for k, part in enumerate(filled):
         room = result[k * quarter : (k + 1) * quarter]
         room[...] = np.asarray(part)[: len(room)]
