@@ -239,7 +239,7 @@ def test_bad_arguments_are_refused(change: dict[str, object], message: str) -> N
 
 
 def test_a_beam_that_passes_the_sensors_corner_lights_no_pixel() -> None:
-    """Its bounding box meets the sensor, none of its light does. (Planted: boxes that are on the sensor in one axis.)"""
+    """Its bounding box meets the sensor, none of its light does. (Planted: boxes on the sensor in one axis.)"""
     thin = np.array([[[0.35, 0.74], [0.36, 0.75]], [[0.74, 0.35], [0.75, 0.36]]])
     found = specular_frames(beams(thin), geometry(), geometric_samplers(geometry()), LABELS)
     assert (found.flux, found.lit_pixels.tolist(), found.classes.tolist()) == (0, [], [])
