@@ -155,6 +155,7 @@ def test_a_bad_verdict_of_the_solver_stays() -> None:
     twin.left[:, 1] = twin.left[:, 0]
     lost = reconstruct(bench(SHIFT).run("uniform", picture(), 0), twin, 0)
     assert lost.status.verdict is Verdict.RANK_DEFICIENT
+    assert lost.rank_sides == (N - 1, N)
 
 
 def test_no_more_data_than_unknowns_tell_no_misfit() -> None:
