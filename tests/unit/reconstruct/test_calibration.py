@@ -1,5 +1,7 @@
 """Factors come back from striped light: exactly without noise, with the predicted error under noise."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.linalg import hadamard
@@ -301,5 +303,5 @@ def test_a_large_sensor_s_light_is_kept_by_groups_of_rows() -> None:
     sums, _ = stripe_sums(np.ones((rows, 4)), np.ones((rows, 4)), 2)
     pair = sums.fit_response(light / 2, 1, light).pair
     ends = np.arange(513) * rows // 512
-    means = np.array([np.arange(first, last).mean() for first, last in zip(ends[:-1], ends[1:], strict=True)])
+    means = np.array([np.arange(first, last).mean() for first, last in pairwise(ends)])
     np.testing.assert_allclose(pair.rows, [0.75 * means, 0.25 * means], rtol=1e-12)

@@ -384,9 +384,7 @@ def test_an_oblong_window_has_a_depth_for_each_pixel() -> None:
     square = calibrated(above)
     assert square.manifest.parallax is not None
     first, last = square.manifest.parallax.column_tan
-    parallax = square.manifest.parallax.model_copy(
-        update={"column_tan": (first, first + (last - first) * COLUMNS / N)}
-    )
+    parallax = square.manifest.parallax.model_copy(update={"column_tan": (first, first + (last - first) * COLUMNS / N)})
     manifest = square.manifest.model_copy(update={"parallax": parallax})
     factors = replace(square, right=square.right[:, :COLUMNS], manifest=manifest)
     assert best_depth(run, factors).mm == pytest.approx(430, abs=1)

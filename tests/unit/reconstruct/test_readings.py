@@ -214,3 +214,11 @@ def test_the_light_around_a_reading_is_not_its_own() -> None:
     alone[5, 5] = 1.0
     found = light_around(alone)
     assert found[5, 5] == pytest.approx(0, abs=1e-12) and found[3:8, 3:8].sum() == pytest.approx(24 / 25)
+
+
+def test_noise_of_the_factors_is_no_other_cause() -> None:
+    """Turned frames against factors of a fiftieth's error: what that leaves of them as they were is expected.
+    (Planted: taken off what is expected; depth.)"""
+    shots = with_frames(CAMERA.run("dots:4", picture(1), 1), lambda frames: [np.flipud(frame) for frame in frames])
+    misfit = reconstruct(shots, CAMERA.calibrated(1, 0.02)).misfit
+    assert misfit is not None and misfit.cause is Cause.ORIENTATION
