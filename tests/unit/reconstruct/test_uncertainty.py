@@ -415,3 +415,8 @@ def test_a_scene_s_frequencies_are_cosines_over_its_pixels() -> None:
     side = prepare(np.eye(8), np.eye(8), np.ones((8, 1)), np.ones((8, 1))).left
     found, half = _cosines(side), np.cos(np.pi * (np.arange(8) + 0.5) / 8)
     np.testing.assert_allclose(found[:, :2], np.stack([np.full(8, 8**-0.5), half / 2], axis=1), atol=1e-12)
+
+
+def test_print_is_as_likely_to_have_hard_edges_as_none() -> None:
+    """Its energy is half way between that of the ramps that an image shows, 1, and that of edges. (Planted: 2.)"""
+    assert pytest.approx(EDGES - PRINT) == PRINT - 1
