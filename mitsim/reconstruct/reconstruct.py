@@ -17,7 +17,7 @@ from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.exr import write_frame
 from mitsim.core.files import output_folder, plain, read_json, whole_file, write_json
 from mitsim.core.images import card, normalise, png, span
-from mitsim.core.job import Clock, Cost, Limits
+from mitsim.core.job import Clock, Cost, Job, Limits
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulation import Accumulation, accumulate, check_factorising
@@ -253,6 +253,7 @@ def reconstruct(
     focus: float | Literal["auto", "map"] | None = None,
     margin: int = 0,
     depth_range: tuple[float, float] | None = None,
+    job: Job | None = None,
 ) -> Reconstruction:
     """Recover the image from a capture and a calibration alone.
 
@@ -278,6 +279,8 @@ def reconstruct(
     depth_range
         nearest and farthest depth [mm] that ``auto`` and ``map`` look for; None: a quarter of 1/z either way of the
         calibrated depth.
+    job
+        whose clock is told of the stages, which have their own here.
 
     Raises
     ------
@@ -297,7 +300,8 @@ def reconstruct(
     check_factorising(shots, factors, solver)
     if cost:
         Cost(sum(cost.seconds.values()), cost.memory_bytes).check(f"{shots.name}: its image", Limits())
-    clock = Clock()
+    clock = (job or Job()).apart("").clock
+    clock.predict(cost.seconds if cost else {})
     depth, shots, factors, doubts = _focus(shots, factors, request, clock)
     with clock.stage("accumulate"):
         data = accumulate(shots, factors, method)

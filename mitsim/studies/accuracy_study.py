@@ -68,23 +68,29 @@ def measure(bench: Apparatus, request: Request, job: Job) -> AccuracyFindings:
     opening = {name: seconds for name, seconds in job.clock.seconds().items() if name in ("start", "open scene")}
     stand = Stand(bench, bench.family(request.patterns, request.seed), request.seed, job, QUOTED)
     job.progress("judge", 0.1)
-    started = time.perf_counter()
-    looked = stand.pilot_runs.seconds
-    budget.saw(time.perf_counter() - started, max(looked, _SHORTEST_PILOT_S))
-    judge = Judge.trace(stand, stand.plan(QUOTED), _JUDGE_PART * budget.left / budget.slower)
+    with job.clock.stage("judge"):
+        started = time.perf_counter()
+        looked = stand.pilot_runs.seconds
+        budget.saw(time.perf_counter() - started, max(looked, _SHORTEST_PILOT_S))
+        judge = Judge.trace(stand, stand.plan(QUOTED), _JUDGE_PART * budget.left / budget.slower)
     runs, parts = Runs(stand, request, judge, sum(opening.values())), Parts(stand, judge)
     job.progress("whole runs", 0.3)
-    runs.measure(ACCURACIES, budget, 1.0, whatever_it_takes=QUOTED)
+    with job.clock.stage("whole runs"):
+        runs.measure(ACCURACIES, budget, 1.0, whatever_it_takes=QUOTED)
     job.progress("parts", 0.4)
-    parts.measure(budget, _PARTS_PART)
     orders = Orders(stand, judge, parts)
-    orders.measure(budget, _ORDERS_PART)
+    with job.clock.stage("parts"):
+        parts.measure(budget, _PARTS_PART)
+        orders.measure(budget, _ORDERS_PART)
     job.progress("whole runs", 0.6)
-    runs.measure(ACCURACIES, budget, _FRONT_PART)
+    with job.clock.stage("whole runs"):
+        runs.measure(ACCURACIES, budget, _FRONT_PART)
     job.progress("reference", 0.7)
-    reference = list(judge.reference(budget))
+    with job.clock.stage("reference"):
+        reference = list(judge.reference(budget))
     job.progress("repeats", 0.8)
-    budget.repeat([*runs.timed, *parts.timed, *orders.timed])
+    with job.clock.stage("repeats"):
+        budget.repeat([*runs.timed, *parts.timed, *orders.timed])
     rows = _mark_front(runs.rows)
     quoted = next(row for row in rows if QUOTED in row.accuracies)
     slow = reference[-1] if reference else None

@@ -24,7 +24,7 @@ from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import Channel, read_frame
 from mitsim.core.files import write_json
-from mitsim.core.job import Clock, Job
+from mitsim.core.job import Job
 from mitsim.core.recorders import frame_name
 from mitsim.core.runs import Capture
 from mitsim.devices.session import load_recipe
@@ -120,7 +120,7 @@ def _run(bench: Bench, folder: Path, request: Request, names: tuple[str, ...], j
         plan = bench.plan(**request.model_dump())
     light = trace_request(bench, plan, job)
     shots = expose(light, request.patterns, folder / "run", job)
-    session = replace(job, clock=Clock())
+    session = job.apart("calibration ")
     factors = bench.calibrate(request.seed, request.accuracy, output=folder / "calibration", job=session)
     job.clock.add(session.clock.seconds(), "calibration ")
     comparison, families = Comparison(light, factors), {}
