@@ -54,7 +54,7 @@ _NEAR_DB = 0.05
 _STEP = 8.0
 """By which light is changed until the wanted PSNR lies between two sessions: some 6 dB."""
 _TRIED = 0.1
-"""Part of a search that a session is: ten are about the most (4 to 9 of dots:7 at 20 to 45 dB)."""
+"""Part of a search that a session is: nine are the most, five the middle (images whose error falls to a floor)."""
 _DIGITS = 3
 """Of an exposure fraction: a thousandth of the light is 0.004 dB."""
 

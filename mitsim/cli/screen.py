@@ -183,7 +183,8 @@ class _Rows(Watch):
         for row in rows:
             over = self._is_over(row)
             part = 1.0 if over else row.finished(now)
-            bar = ProgressBar(1.0, part or 0.0, _BAR, pulse=part is None)
+            # With 16 colours rich's own for what is finished is that of what is not begun.
+            bar = ProgressBar(1.0, part or 0.0, _BAR, pulse=part is None, finished_style="green")
             elapsed, left = row.elapsed(now), 0.0 if over else row.left(now)
             table.add_row(Text(printable(row.words)), bar, _text(elapsed) if elapsed else "", _left_text(left))
         table.add_row("total", "", _text(now - self._started), _left_text(self._left(now)))

@@ -17,7 +17,7 @@ What the solver's precision costs is no matter of the scene: `mitsim study solve
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -73,7 +73,7 @@ def measure(bench: Apparatus, request: Request, job: Job) -> AccuracyFindings:
         looked = stand.pilot_runs.seconds
         budget.saw(time.perf_counter() - started, max(looked, _SHORTEST_PILOT_S))
         judge = Judge.trace(stand, stand.plan(QUOTED), _JUDGE_PART * budget.left / budget.slower)
-    runs, parts = Runs(stand, request, judge, sum(opening.values())), Parts(stand, judge)
+    runs, parts = Runs(stand, request, judge, opening), Parts(stand, judge)
     job.progress("whole runs", 0.3)
     with job.clock.stage("whole runs"):
         runs.measure(ACCURACIES, budget, 1.0, whatever_it_takes=QUOTED)
@@ -119,11 +119,11 @@ def _mark_front(rows: list[Row]) -> list[Row]:
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """One run and its repeats: the ``accuracies`` that lead to it, its frames' error, and seconds of light alone."""
+    """One run and its repeats: the ``accuracies`` that lead to it, its frames' error, and seconds by stage."""
 
     accuracies: tuple[float, ...]
     timed: Timed
-    light: list[float]
+    stages: list[dict[str, float]]
     found: list[tuple[float, float]]
 
 
@@ -138,7 +138,7 @@ class Runs:
         seconds that count for every run.
     """
 
-    def __init__(self, stand: Stand, request: Request, judge: Judge, opening: float) -> None:
+    def __init__(self, stand: Stand, request: Request, judge: Judge, opening: Mapping[str, float]) -> None:
         self._stand, self._judge, self._opening = stand, judge, opening
         # Speckle is drawn anew in every frame and is no error of the light.
         off = {"speckle": False} if "speckle" in present(stand.bench) else {}
@@ -184,16 +184,18 @@ class Runs:
                 "factored",
                 "accuracy",
                 f"accuracy {_list(run.accuracies)}",
-                run.timed.spread + self._opening,
+                run.timed.spread + sum(self._opening.values()),
                 *run.found[0],
                 accuracies=run.accuracies,
+                stages={**self._opening, **{name: median(each[name] for each in run.stages) for name in run.stages[0]}},
             )
             for run in sorted(self._runs, key=lambda run: -min(run.accuracies))
         ]
 
     def light_seconds(self, accuracy: float) -> float:
         """Seconds of transport and optics of the run at an ``accuracy``."""
-        return next(median(run.light) for run in self._runs if accuracy in run.accuracies)
+        run = next(run for run in self._runs if accuracy in run.accuracies)
+        return median(each["transport"] + each["optics"] for each in run.stages)
 
     def _groups(self, accuracies: Sequence[float]) -> Iterator[tuple[tuple[float, ...], float]]:
         """Accuracies by the settings that they lead to, and the seconds that a run of them is predicted to take."""
@@ -215,7 +217,7 @@ class Runs:
     def _begin(self, accuracies: tuple[float, ...]) -> _Run:
         """A run at the tightest of its ``accuracies`` that was not made yet."""
         request = self._request.with_values(accuracy=min(accuracies))
-        light: list[float] = []
+        stages: list[dict[str, float]] = []
         found: list[tuple[float, float]] = []
 
         def again() -> float:
@@ -228,10 +230,11 @@ class Runs:
                 if not found:
                     error = self._judge.error(self._irradiance(shots))
                     found.append((error, shots.manifest.mc_error or 0.0))
-            light.append(seconds["transport"] + seconds["optics"])
-            return seconds["total"]
+            total = seconds.pop("total")
+            stages.append(seconds)
+            return total
 
-        return _Run(accuracies, Timed(again), light, found)
+        return _Run(accuracies, Timed(again), stages, found)
 
     def _irradiance(self, shots: Capture) -> FloatArray:
         """(shots, pixels, pixels) expected irradiance that a capture was exposed to [W m^-2]."""
