@@ -12,7 +12,7 @@ where this one's error, over all seeds, is the larger, its light is counted for 
 equal; where it is the smaller, nothing is. The plan is a stage of its own; the *floor* beside it is what this version's
 kernels and products take alone (:mod:`floors`). ``predicted``: seconds that the plan foretold over those it took, of
 every run. ``--own``: the same of this version alone on ten scenes that are no shipped ones (:mod:`foreign_scenes`), at
-1e-2, without errors and floors. ``--quick``: one pair of the photograph, against a noisy answer. What FILE holds
+1e-2, without errors and floors. ``--quick``: one pair of one scene, against a noisy answer. What FILE holds
 already is not repeated. A line in the end says of every limit whether it is kept.
 """
 
@@ -57,7 +57,7 @@ Run = Mapping[str, Any]
 def worktree(folder: Path, commit: str) -> Path:
     """The ``commit`` in a worktree of its own in ``folder``, where it is not there."""
     if not folder.exists():
-        command = ["git", "-C", str(accuracy.ROOT), "worktree", "add", "--quiet", "--detach", str(folder), commit]
+        command = ["git", "-C", str(accuracy.ROOT), "worktree", "add", "-f", "--quiet", "--detach", str(folder), commit]
         subprocess.run(command, check=True)
     return folder.resolve()
 
@@ -211,7 +211,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true")
     options = parser.parse_args()
     if options.quick:
-        options.scene, options.pairs = options.scene or ["photograph"], 1
+        options.scene, options.pairs = options.scene or ([] if options.own else ["photograph"]), 1
         options.noise = max(options.noise, QUICK_NOISE)
     results: dict[str, Any] = json.loads(options.json.read_text()) if options.json.exists() else {"cases": {}}
     results |= {"machine": f"{platform.machine()}, {os.cpu_count()} processors", "old": options.old}

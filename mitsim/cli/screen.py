@@ -92,7 +92,7 @@ class _Row:
     part: float | None = None
     ends: float | None = None
 
-    def elapsed(self, now: float) -> float:
+    def seconds(self, now: float) -> float:
         """Its seconds until ``now``."""
         return self.spent + (0.0 if self.begun is None else now - self.begun)
 
@@ -102,21 +102,21 @@ class _Row:
 
     def reach(self, part: float, now: float) -> None:
         """So much is finished ``now``; what is left takes as long as that did."""
-        self.part, taken = part, self.elapsed(now) - self.origin
+        self.part, taken = part, self.seconds(now) - self.origin
         if part > 0 and taken > 0:
             self.ends = self.origin + taken / part
 
-    def finished(self, now: float) -> float | None:
+    def part_at(self, now: float) -> float | None:
         """Part that is finished, by time as far as it is known; None where nothing tells it."""
         if self.last is None:
             return 0.0
-        if left := self.left(now):
-            return 1 - left / (left + self.elapsed(now) - self.origin)
+        if left := self.rest(now):
+            return 1 - left / (left + self.seconds(now) - self.origin)
         return self.part
 
-    def left(self, now: float) -> float:
+    def rest(self, now: float) -> float:
         """Seconds that it goes on; 0 where nothing tells them, as once it takes longer than was predicted."""
-        return 0.0 if self.ends is None else max(self.ends - self.elapsed(now), 0.0)
+        return 0.0 if self.ends is None else max(self.ends - self.seconds(now), 0.0)
 
 
 class _Rows(Watch):
@@ -161,7 +161,7 @@ class _Rows(Watch):
             row.begin(now)
             self._loop = row
             for each in self._rows.values():
-                each.origin = each.elapsed(now)
+                each.origin = each.seconds(now)
         for each in self._in_loop() if row is self._loop else [row]:
             each.reach(fraction, now)
         if row is self._loop and fraction >= 1:
@@ -182,12 +182,12 @@ class _Rows(Watch):
             rows = [row for row in rows if not self._is_over(row)][:most]
         for row in rows:
             over = self._is_over(row)
-            part = 1.0 if over else row.finished(now)
+            part = 1.0 if over else row.part_at(now)
             # With 16 colours rich's own for what is finished is that of what is not begun.
             bar = ProgressBar(1.0, part or 0.0, _BAR, pulse=part is None, finished_style="green")
-            elapsed, left = row.elapsed(now), 0.0 if over else row.left(now)
-            table.add_row(Text(printable(row.words)), bar, _text(elapsed) if elapsed else "", _left_text(left))
-        table.add_row("total", "", _text(now - self._started), _left_text(self._left(now)))
+            elapsed, left = row.seconds(now), 0.0 if over else row.rest(now)
+            table.add_row(Text(printable(row.words)), bar, _text(elapsed) if elapsed else "", _rest_text(left))
+        table.add_row("total", "", _text(now - self._started), _rest_text(self._rest(now)))
         yield table
 
     def _row(self, stage: str) -> _Row:
@@ -202,26 +202,26 @@ class _Rows(Watch):
 
     def _end_loop(self, now: float) -> None:
         if self._loop is not None:
-            self._loop.spent, self._loop.begun, self._loop = self._loop.elapsed(now), None, None
+            self._loop.spent, self._loop.begun, self._loop = self._loop.seconds(now), None, None
 
     def _is_over(self, row: _Row) -> bool:
         return row.last is not None and row.begun is None and not any(row is each for each in self._in_loop())
 
     def _is_shown(self, row: _Row, now: float) -> bool:
-        length = row.elapsed(now) if row.last is not None else row.left(now)
+        length = row.seconds(now) if row.last is not None else row.rest(now)
         return row.begun is not None or length >= _SHORTEST_S
 
-    def _left(self, now: float) -> float:
+    def _rest(self, now: float) -> float:
         """Seconds that are left of everything: of all stages, or of a loop where nothing is known of these; 0 where one
         goes on for nobody knows how long."""
         loop = self._loop
         rows = [row for row in list(self._rows.values()) if not self._is_over(row)]
-        if any(row.begun is not None and row is not loop and not row.left(now) for row in rows):
+        if any(row.begun is not None and row is not loop and not row.rest(now) for row in rows):
             rows = []
-        return sum(row.left(now) for row in rows if row is not loop) or (loop.left(now) if loop else 0.0)
+        return sum(row.rest(now) for row in rows if row is not loop) or (loop.rest(now) if loop else 0.0)
 
 
-def _left_text(seconds: float) -> str:
+def _rest_text(seconds: float) -> str:
     return f"{_text(seconds)} left" if seconds >= _SHORTEST_S else ""
 
 

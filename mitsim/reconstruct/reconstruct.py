@@ -243,7 +243,6 @@ _OF_THE_SCENE = Cause.GLOSS, Cause.INDIRECT, Cause.DETAIL, Cause.UNKNOWN, Cause.
 """Causes that light of a depth beyond the searched range is taken for."""
 
 
-@single_threaded_blas()
 @check_arguments
 def reconstruct(
     shots: Capture,
@@ -253,7 +252,6 @@ def reconstruct(
     focus: float | Literal["auto", "map"] | None = None,
     margin: int = 0,
     depth_range: tuple[float, float] | None = None,
-    job: Job | None = None,
 ) -> Reconstruction:
     """Recover the image from a capture and a calibration alone.
 
@@ -279,8 +277,6 @@ def reconstruct(
     depth_range
         nearest and farthest depth [mm] that ``auto`` and ``map`` look for; None: a quarter of 1/z either way of the
         calibrated depth.
-    job
-        whose clock is told of the stages, which have their own here.
 
     Raises
     ------
@@ -288,8 +284,24 @@ def reconstruct(
         for a capture and factors that do not fit each other, a frame that cannot be read, more memory than is free,
         another lambda, method, focus, margin or range, or a calibration that does not state its parallax.
     """
-    request = ImageRequest(lam, method, focus, margin, depth_range)
-    solver, asked = SOLVERS[method], request.inputs(shots, factors)
+    return reconstruct_request(shots, factors, ImageRequest(lam, method, focus, margin, depth_range))
+
+
+@single_threaded_blas()
+def reconstruct_request(
+    shots: Capture, factors: Factors, request: ImageRequest, job: Job | None = None
+) -> Reconstruction:
+    """The image that a request asks for, as :func:`reconstruct`.
+
+    Parameters
+    ----------
+    shots, factors, request
+        as there.
+    job
+        of whose work it is a part: its watch is told of the stages, and the image has their seconds.
+    """
+    solver, asked = SOLVERS[request.method], request.inputs(shots, factors)
+    lam, method, margin = request.lam, request.method, request.margin
     factors.check_fit(shots)
     beside = Margin(margin) if margin else None
     if beside:

@@ -21,8 +21,7 @@ from mitsim.core.spectral_manifests import IMAGE, is_coloured, is_mosaic, read_c
 from mitsim.devices.chart import ChartPlace
 from mitsim.metrics import Quality, summary_of, truth_error_for, truth_for
 from mitsim.reconstruct.factors import load_calibration
-from mitsim.reconstruct.reconstruct import Reconstruction, may_replace
-from mitsim.reconstruct.reconstruct import reconstruct as solve
+from mitsim.reconstruct.reconstruct import Reconstruction, may_replace, reconstruct_request
 from mitsim.reconstruct.request import ImageRequest
 
 if TYPE_CHECKING:
@@ -47,10 +46,9 @@ def reconstruct(
     calibration: Path | str,
     output: Path | str,
     lam: float | Literal["auto"] = "auto",
-    method: str = "tikhonov",
     overwrite: bool = False,
     job: Job | None = None,
-    **place: Any,
+    **options: Any,
 ) -> Judged:
     """Recover the image of a run with a calibration; writes image.exr, image.png and result.json.
 
@@ -61,25 +59,25 @@ def reconstruct(
     ----------
     run, calibration, output
         RUN and CAL folders, and one for the image: new or empty, or with an earlier image of the same inputs.
-    lam, method
+    lam
         as for :func:`mitsim.reconstruct.reconstruct.reconstruct`.
     overwrite
         whether an earlier image of other inputs may be replaced.
     job
         its clock.
-    **place
-        ``focus``, ``margin`` and ``depth_range``, as there.
+    **options
+        ``method``, ``focus``, ``margin`` and ``depth_range``, as there.
     """
-    started, job = time.perf_counter(), job or Job()
+    started, job, request = time.perf_counter(), job or Job(), ImageRequest(lam, **options)
     with job.clock.stage("read"):
         shots, factors = load_run(run), load_calibration(calibration)
         factors.check_fit(shots)
         board = factors.manifest.board_reflectance
         truth, truth_error = truth_for(shots, board), truth_error_for(shots, board)
-    replaces = may_replace(Path(output), ImageRequest(lam, method, **place).inputs(shots, factors), overwrite)
+    replaces = may_replace(Path(output), request.inputs(shots, factors), overwrite)
     with output_folder(output, overwrite=replaces) as folder:
         read = time.perf_counter() - started
-        image = solve(shots, factors, lam, method, **place, job=job)
+        image = reconstruct_request(shots, factors, request, job)
         judged = Judged(
             reconstruction=replace(image, seconds={"read": read, **image.seconds}),
             quality=None if truth is None else Quality.of(image.image, truth, truth_error),
