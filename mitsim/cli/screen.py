@@ -129,6 +129,7 @@ class _Rows(Watch):
     def __init__(self, start: float) -> None:
         self._rows: dict[str, _Row] = {}
         self._loop: _Row | None = None
+        self._first = 0.0
         self._started = time.monotonic() - start
 
     def begin(self, stage: str) -> None:
@@ -159,11 +160,15 @@ class _Rows(Watch):
         if row.begun is None:
             self._end_loop(now)
             row.begin(now)
-            self._loop = row
+            self._loop, self._first = row, min(fraction, 0.999)  # a loop that is over when it begins
             for each in self._rows.values():
                 each.origin = each.seconds(now)
-        for each in self._in_loop() if row is self._loop else [row]:
-            each.reach(fraction, now)
+        if row is self._loop:  # which may go on from where an earlier run left it
+            done = (fraction - self._first) / (1 - self._first)
+            for each in self._in_loop():
+                each.reach(done, now)
+        else:
+            row.reach(fraction, now)
         if row is self._loop and fraction >= 1:
             self._end_loop(now)
 

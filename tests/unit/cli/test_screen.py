@@ -131,6 +131,14 @@ def test_stages_that_take_turns_are_as_far_as_their_loop(terminal: Terminal) -> 
     assert terminal.shown == {**over, "total": "16.0 s"}
 
 
+def test_a_loop_that_goes_on_has_the_rate_of_what_it_did(terminal: Terminal) -> None:
+    """Stripes of an interrupted session take no time. (Planted: they do.)"""
+    terminal.rows.report("stripes", 0.75)
+    terminal.now += 1
+    terminal.rows.report("stripes", 0.8)
+    assert terminal.shown["stripes"] == "1.0 s, 4.0 s left"
+
+
 def test_work_within_work_has_rows_of_its_own(terminal: Terminal) -> None:
     """Of its own seconds, and of the same watch. (Planted: reports without the prefix.)"""
     job = Job(terminal.clock, terminal.rows.report)
