@@ -164,7 +164,7 @@ class _Rows(Watch):
             for each in self._rows.values():
                 each.origin = each.seconds(now)
         if row is self._loop:  # which may go on from where an earlier run left it
-            done = (fraction - self._first) / (1 - self._first)
+            done = max(fraction - self._first, 0.0) / (1 - self._first)
             for each in self._in_loop():
                 each.reach(done, now)
         else:

@@ -127,7 +127,7 @@ def _run(bench: Bench, folder: Path, request: Request, names: tuple[str, ...], j
     with job.clock.stage("compare families"):
         for index, name in enumerate(names):
             families[name] = comparison.family(name, shots if name == request.patterns else None)
-            job.progress(label(name), (index + 1) / len(names))
+            job.progress(f"compare families: {label(name)}", (index + 1) / len(names))
     with job.clock.stage("views"):
         view = pinhole_view(bench, load_recipe().board_reflectance, request.seed)
         frames = {_caption("uniform", 0, 1): comparison.white(), **_frames(shots, folder / "run", request.patterns)}
