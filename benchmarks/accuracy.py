@@ -6,7 +6,7 @@ The answer is light of two other seeds with every effect of the scene, one step 
 coarse cells than the plan at 3e-4. With r1, r2 its two halves, <a - r1, a - r2> / <r1, r2> is the
 squared error of all frames a without the noise of the answer; its standard error is the jackknife's over shots.
 Captures are processes of their own, from the shell to their exit. ``--old`` names a checkout of an earlier version,
-with its environment in ``.venv``, to be timed and judged beside this one. What FILE and the answers beside it hold
+to be timed and judged beside this one with the same packages. What FILE and the answers beside it hold
 already is not repeated, so the work can be cut short at any time; ``--answers`` makes those alone, which need no idle
 machine. ``--seeds N`` tells of how many captures with other seeds the error lies within the accuracy, and below the
 bound that the run states; it is not timed. ``--equal N`` compares seconds at equal measured errors: with each of N
@@ -20,6 +20,7 @@ import argparse
 import json
 import math
 import os
+import resource
 import statistics
 import subprocess
 import sys
@@ -49,6 +50,7 @@ SCENES = (
     *("photograph", "colour_chart", "resolution_target", "keystone", "gift_card", "corner", "cards", "metal_blade"),
     *("compact_disc", "mirror", "lamp_bench", "cookie_bag"),
 )
+ROOT = Path(__file__).parents[1]
 PATTERNS, ACCURACIES = "dots:7", (1e-2, 3e-3, 1e-3, 3e-4)
 FINEST, NOISE = 3e-4, 1e-3
 """Accuracy whose settings the answer goes one step beyond, and the Monte Carlo error of each of its halves, whose own
@@ -77,23 +79,33 @@ def answer(scene: str, noise: float) -> npt.NDArray[np.float32]:
     return np.array(halves)
 
 
-def captured(scene: str, accuracy: float, tree: Path | None, seed: int = SEED) -> dict[str, Any]:
-    """Seconds and manifest of a capture by the version in ``tree`` (this one without), and its frames."""
+def captured(
+    scene: str, accuracy: float, tree: Path | None, seed: int = SEED, home: Path | None = None
+) -> dict[str, Any]:
+    """Seconds and manifest of a capture by the version in ``tree`` (this one without), and its frames.
+
+    ``home``: where its kernels are kept, instead of the user's home.
+    """
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
-        command = [str(tree / ".venv" / "bin" / "mitsim")] if tree else [sys.executable, "-m", "mitsim"]
-        command += ["capture", scene, "--patterns", PATTERNS, "--seed", str(seed)]
+        command = [sys.executable, "-m", "mitsim", "capture", scene, "--patterns", PATTERNS, "--seed", str(seed)]
         command += ["--accuracy", str(accuracy), "-o", str(run), "--json"]
-        plain = {name: value for name, value in os.environ.items() if not tree or name != "PYTHONPATH"}
-        started = time.perf_counter()
-        done = subprocess.run(command, capture_output=True, text=True, env=plain, cwd=folder)
-        seconds = time.perf_counter() - started
+        environment = {**os.environ, "PYTHONPATH": str(tree or ROOT)}
+        environment.pop("PYTHONDONTWRITEBYTECODE", None)
+        if home:
+            kept = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")  # which LLVM there is stands there
+            environment |= {"HOME": str(home), "XDG_CACHE_HOME": kept}
+        before, started = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=folder)
+        seconds, after = time.perf_counter() - started, resource.getrusage(resource.RUSAGE_CHILDREN)
+        processor = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
         if not (run / "manifest.json").exists():
             raise SystemExit(f"{scene} at {accuracy:g}: {done.stderr}")
         manifest = json.loads((run / "manifest.json").read_text())
         frames = [read_frame(run / shot["file"])[0]["electrons"] for shot in manifest["patterns"]["captures"]]
     exposure = manifest.get("digital", manifest)["exposure_s"]
-    return {"seconds": seconds, "manifest": manifest, "frames": np.stack(frames), "exposure_s": exposure}
+    found = {"seconds": seconds, "processor_seconds": processor, "manifest": manifest, "exposure_s": exposure}
+    return found | {"frames": np.stack(frames)}
 
 
 def shares(frames: Frames, halves: Frames) -> npt.NDArray[np.floating[Any]]:
@@ -120,7 +132,11 @@ def bracketed(products: Frames, energies: Frames) -> dict[str, float]:
 
 def judged(scene: str, accuracy: float, halves: Frames, tree: Path | None, seed: int = SEED) -> dict[str, Any]:
     """One capture, held against the answer."""
-    run = captured(scene, accuracy, tree, seed)
+    return held_against(halves, scene, captured(scene, accuracy, tree, seed))
+
+
+def held_against(halves: Frames, scene: str, run: Mapping[str, Any]) -> dict[str, Any]:
+    """What :func:`captured` gave of a ``scene``, and its error against the answer's ``halves``."""
     bench = ms.open_bench(scene)
     unit = float(Exposer(bench.devices, run["exposure_s"], 0).electrons(_Unit()))
     of_shots = shares(run["frames"] / unit, halves)
@@ -130,6 +146,7 @@ def judged(scene: str, accuracy: float, halves: Frames, tree: Path | None, seed:
         **bracketed(*of_shots),
         "shares": of_shots.tolist(),
         "seconds": run["seconds"],
+        "processor_seconds": run["processor_seconds"],
         "predicted_seconds": plan["predicted_seconds"],
         **{name: manifest.get(name) for name in ("total_error", "total_error_bound", "mc_error", "warnings")},
         "stages": manifest["seconds"],

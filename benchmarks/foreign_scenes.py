@@ -116,11 +116,9 @@ def scenes() -> dict[str, str]:
     }
 
 
-def main() -> None:
-    """Write the scenes."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path)
-    folder = parser.parse_args().folder
+def write(folder: Path) -> dict[str, Path]:
+    """The scene files, by name, made in ``folder``."""
+    found = {}
     squares = np.random.default_rng(2).random((16, 16)) > 0.5
     for name, extra in scenes().items():
         here = folder / name
@@ -129,7 +127,16 @@ def main() -> None:
             shutil.copy(beside, here / beside.name)
         io.imsave(here / "leaf.png", np.kron(squares, np.full((4, 4), 255)).astype(np.uint8), check_contrast=False)
         text = (BENCH / "scene.xml").read_text(encoding="utf-8")
-        (here / f"{name}.xml").write_text(text.replace("</scene>", f"{extra}</scene>"), encoding="utf-8")
+        found[name] = here / f"{name}.xml"
+        found[name].write_text(text.replace("</scene>", f"{extra}</scene>"), encoding="utf-8")
+    return found
+
+
+def main() -> None:
+    """Write the scenes."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    write(parser.parse_args().folder)
 
 
 if __name__ == "__main__":

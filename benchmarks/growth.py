@@ -16,6 +16,8 @@ import argparse
 import json
 import os
 import platform
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -27,7 +29,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from versions import drawn
+import numpy as np
+from skimage import io
 
 ROOT = Path(__file__).parents[1]
 STAGES: Mapping[str, tuple[str, ...]] = {
@@ -59,6 +62,33 @@ CASES: Mapping[str, Case] = {
     **{f"image, sensor {pixels}": Case(sensor=pixels, verbs=_IMAGE) for pixels in (256, 512, 1024, 2048)},
     **{f"image, projector {pixels}": Case(projector=pixels, verbs=_IMAGE) for pixels in (256, 512)},
 }
+
+
+def drawn(folder: Path, scenes: Path, pixels: int | None = None, window: int | None = None) -> tuple[Path, Path]:
+    """Scene and camera file of the photograph with other numbers of pixels on the same areas, made in ``folder``.
+
+    Parameters
+    ----------
+    folder, scenes
+        where they are made, and the shipped scenes, beside which the shipped cameras lie.
+    pixels, window
+        of the sensor and of the projector, a side; those of the photograph where not given.
+    """
+    shutil.copytree(scenes / "photograph", folder / "scene")
+    path, camera = folder / "scene" / "scene.xml", folder / "camera.toml"
+    text, shipped = path.read_text(), (scenes.parent / "calibration" / "imx249.toml").read_text()
+    if pixels:
+        text = re.sub(r'name="(width|height)" value="512"', rf'name="\1" value="{pixels}"', text)
+        text = text.replace('value="0.01172"', f'value="{0.01172 * 512 / pixels!r}"')
+        # The same well and noise on other pixels, so that frames of all sizes are as noisy.
+        shipped = shipped.replace("pixel_pitch_um = 5.86", f"pixel_pitch_um = {5.86 * 512 / pixels!r}")
+    if window:
+        canvas = np.zeros((window, 2 * window), np.uint8)
+        canvas[:, window:] = 255
+        io.imsave(folder / "scene" / "projector.png", canvas, check_contrast=False)
+    path.write_text(text)
+    camera.write_text(shipped)
+    return path, camera
 
 
 def measured(case: Case, limit: float) -> dict[str, Any]:

@@ -1,13 +1,19 @@
-"""Version 0.3.0 and this checkout on the same machine, side by side: seconds, memory and errors of the same commands.
+"""Commit ca61f08 and this checkout in turn: seconds of first and later captures by stage, at their measured errors.
 
-    python benchmarks/versions.py --json FILE [--case NAME ...] [--repeat 5] [--old FOLDER]
+    python benchmarks/versions.py --json FILE [--scene NAME ...] [--own] [--pairs 5] [--old COMMIT] [--quick]
 
-0.3.0 is commit 2be4e7e, cloned into FOLDER and installed there by its own set-up when FOLDER does not exist. Both
-versions run the scene files of 0.3.0, each command as a process of its own from the shell to its exit, in turn, after
-one run of each that compiles kernels and byte code and is not counted. Of ``--repeat`` pairs the least and the median
-are stated, of wall seconds, processor seconds, and memory of the largest process; `ratio` is the median over pairs.
-What FILE holds already is not repeated. Cases named *warm* are later captures of one process. Equal seconds are not
-equal errors: 0.3.0 promises the error of sampling, later versions all of it; `benchmarks/accuracy.py --old` tells both.
+The earlier version runs from a worktree beside FILE with the packages of this one's environment. Of each pair, seeds 0
+to 4, either version captures dots:7 at 1e-3 three times in processes of their own, from the shell to their exit, with
+a home of its own that holds no kernels: the *first* run compiles them, the second is not counted, the third is the
+*later* one. Which version begins changes from pair to pair. What LLVM there is, and byte code, are known before. The
+error is that of :mod:`accuracy`, against the same answer for both, which stands beside FILE and is made where it is
+missing. ``equal`` is how many times the later run of the earlier version is longer than this one's at equal error:
+where this one's error, over all seeds, is the larger, its light is counted for as many more samples as would make it
+equal; where it is the smaller, nothing is. The plan is a stage of its own; the *floor* beside it is what this version's
+kernels and products take alone (:mod:`floors`). ``predicted``: seconds that the plan foretold over those it took, of
+every run. ``--own``: the same of this version alone on ten scenes that are no shipped ones (:mod:`foreign_scenes`), at
+1e-2, without errors and floors. ``--quick``: one pair of one scene, against a noisy answer. What FILE holds
+already is not repeated. A line in the end says of every limit whether it is kept.
 """
 
 from __future__ import annotations
@@ -16,273 +22,221 @@ import argparse
 import json
 import os
 import platform
-import re
-import shutil
-import signal
 import statistics
 import subprocess
 import sys
 import tempfile
-import threading
-import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-OLD_COMMIT, ROOT = "2be4e7e", Path(__file__).parents[1]
-OLD_FOLDER = Path.home() / ".cache" / "mitsim-benchmarks" / "0.3.0"
-LIMIT = 600.0
-"""Seconds that a command may take before it is killed, and its case says so."""
-_WARM = """
-import sys, time, json, tempfile, pathlib
-scene, repeat = sys.argv[1], int(sys.argv[2])
-{imports}
-with tempfile.TemporaryDirectory() as folder:
-    seconds, stages = [], []
-    for index in range(repeat + 1):
-        started = time.perf_counter()
-        bench = {open}
-        run = {capture}
-        seconds.append(time.perf_counter() - started)
-        stages.append(dict(run.seconds))
-print(json.dumps({{"each": seconds[1:], "seconds": stages[-1]}}))
-"""
-_WARM_OLD = _WARM.format(
-    imports="from mitsim.capture.bench import open_bench\nfrom mitsim.capture.run import capture",
-    open="open_bench(pathlib.Path(scene))",
-    capture="capture(bench, 'dots:7', pathlib.Path(folder) / str(index), 1e-3)",
+import accuracy
+import floors
+import foreign_scenes
+import numpy as np
+
+OLD_COMMIT = "ca61f08"
+WHOLE = {
+    "photograph": 1.6, "gift_card": 3.2, "compact_disc": 3.2, "metal_blade": 3.2, "corner": 6.5, "cookie_bag": 8.5,
+}  # fmt: skip
+"""Scenes, and the seconds below which their later runs are to stay."""
+PLAN_PART, PLAN_S = 0.15, 1.0
+"""Of a later run, and seconds, that its plan may take."""
+FIRST_TIMES, FIRST_S = 1.5, 1.0
+"""Times a later run, and seconds beyond, that a first one may take."""
+PREDICTED = 0.67, 1.5
+"""Predicted over taken seconds."""
+OWN = (
+    *("half_card", "leaf", "window", "two_balls", "plate_0.01", "cylinder", "lamp_behind_pane", "mirror_strip"),
+    *("instances", "bumps"),
 )
-_WARM_NEW = _WARM.format(
-    imports="import mitsim as ms",
-    open="ms.open_bench(scene)",
-    capture="bench.capture('dots:7', pathlib.Path(folder) / str(index), accuracy=1e-3).manifest",
-)
+OWN_ACCURACY, QUICK_NOISE = 1e-2, 5e-3
+Run = Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class Version:
-    """An installed version: its name, its interpreter, and the script of warm captures."""
-
-    name: str
-    python: Path
-    warm: str
-
-    def command(self, arguments: Sequence[str]) -> list[str]:
-        """What the shell would be given for ``mitsim`` with these ``arguments``, or for the interpreter."""
-        if arguments[0] == "python":
-            return [str(self.python), *arguments[1:]]
-        if arguments[0] == "warm":
-            return [str(self.python), "-c", self.warm, *arguments[1:]]
-        return [str(self.python.with_name("mitsim")), *arguments]
-
-
-@dataclass(frozen=True)
-class Case:
-    """A command of both versions.
-
-    Attributes
-    ----------
-    arguments
-        of ``mitsim``; or after ``python`` those of the interpreter, after ``warm`` scene and number of captures.
-        ``OUT`` is a new folder, ``SCENES`` that of 0.3.0's scenes.
-    status
-        that it may end with.
-    aim
-        seconds that the case should take today.
-    window, pixels
-        projector and sensor pixels a side of a scene that is drawn for the case, in place of the photograph's.
-    """
-
-    arguments: tuple[str, ...]
-    status: tuple[int, ...] = (0, 1)
-    aim: float | None = None
-    window: int | None = None
-    pixels: int | None = None
-
-
-def _capture(scene: str, patterns: str = "dots:7", **facts: Any) -> Case:
-    return Case(("capture", f"SCENES/{scene}/scene.xml", "--patterns", patterns, "-o", "OUT", "--json"), **facts)
-
-
-CASES: Mapping[str, Case] = {
-    "photograph": _capture("photograph", aim=3.5),
-    "cookie_bag": _capture("cookie_bag", aim=9.0),
-    **{name: _capture(name) for name in ("corner", "gift_card", "metal_blade", "compact_disc")},
-    "photograph warm": Case(("warm", "SCENES/photograph/scene.xml", "3"), aim=1.5),
-    "plan photograph": Case(("plan", "SCENES/photograph/scene.xml", "--json")),
-    "demo": Case(("demo", "-o", "OUT"), aim=20.0),
-    "import": Case(("python", "-c", "import mitsim.cli"), aim=1.0),
-    "help": Case(("--help",), aim=1.0),
-    "scene misspelt": Case(("capture", "phtograph", "--patterns", "dots:7", "-o", "OUT"), (2,), aim=0.3),
-    "patterns misspelt": Case(("capture", "photograph", "--patterns", "dost:7", "-o", "OUT"), (2,), aim=0.3),
-    "patterns of no dots": Case(("capture", "photograph", "--patterns", "dots:0", "-o", "OUT"), (2,), aim=0.3),
-    "accuracy of zero": Case(("plan", "photograph", "--accuracy", "0"), (2,), aim=0.3),
-    "run missing": Case(("reconstruct", "nothing", "--calibration", "nothing"), (2,), aim=0.3),
-    "scene broken": Case(("plan", "OUT.xml"), (2,), aim=1.0),
-    "sensor 512": _capture("drawn", pixels=512),
-    "sensor 1024": _capture("drawn", pixels=1024),
-    "sensor 2048": _capture("drawn", pixels=2048),
-    "projector 256": _capture("drawn", window=256),
-    "projector 512": _capture("drawn", window=512),
-    "frames 256": _capture("photograph", "dots:16"),
-    "frames 1024": _capture("photograph", "dots:32"),
-    "study accuracy": Case(("study", "accuracy", "SCENES/photograph/scene.xml", "-o", "OUT"), aim=120.0),
-}
-
-
-def installed(folder: Path) -> Version:
-    """0.3.0 in an environment of its own in ``folder``, made by its own set-up where it is not there."""
+def worktree(folder: Path, commit: str) -> Path:
+    """The ``commit`` in a worktree of its own in ``folder``, where it is not there."""
     if not folder.exists():
-        part = folder.with_name(folder.name + ".part")
-        shutil.rmtree(part, ignore_errors=True)
-        subprocess.run(["git", "clone", "--quiet", str(ROOT), str(part)], check=True)
-        subprocess.run(["git", "-C", str(part), "checkout", "--quiet", OLD_COMMIT], check=True)
-        part.rename(folder)
-    python = folder / ".venv" / "bin" / "python"
-    if not python.with_name("mitsim").exists():
-        subprocess.run(["make", "-C", str(folder), "setup"], check=True)
-    return Version("0.3.0", python, _WARM_OLD)
+        command = ["git", "-C", str(accuracy.ROOT), "worktree", "add", "-f", "--quiet", "--detach", str(folder), commit]
+        subprocess.run(command, check=True)
+    return folder.resolve()
 
 
-def measured(version: Version, case: Case, scenes: Path) -> dict[str, Any]:
-    """Wall and processor seconds and memory of one run; where it prints JSON, its stages."""
-    with tempfile.TemporaryDirectory() as folder:
-        inside = Path(folder)
-        (inside / "OUT.xml").write_text("<scene version='3.0.0'><sensor type='mitsim_lensless'")
-        words = [word.replace("OUT", str(inside / "OUT")) for word in case.arguments]
-        if case.window or case.pixels:
-            scene, camera = drawn(inside, scenes, case.pixels, case.window)
-            words = [str(scene) if "/drawn/" in word else word for word in (*words, "--camera", str(camera))]
-        words = [word.replace("SCENES", str(scenes)) for word in words]
-        printed, reported = inside / "stdout", inside / "stderr"
-        environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONDONTWRITEBYTECODE")}
-        started = time.perf_counter()
-        with printed.open("wb") as out, reported.open("wb") as err:
-            process = subprocess.Popen(
-                version.command(words), stdout=out, stderr=err, cwd=folder, env=environment, start_new_session=True
-            )
-        stop = threading.Timer(LIMIT, os.killpg, (process.pid, signal.SIGKILL))
-        stop.start()
-        _, ended, usage = os.wait4(process.pid, 0)
-        stop.cancel()
-        process.returncode = os.waitstatus_to_exitcode(ended)
-        seconds = time.perf_counter() - started
-        found: dict[str, Any] = {
-            "seconds": seconds,
-            "processor_seconds": usage.ru_utime + usage.ru_stime,
-            "memory_mib": usage.ru_maxrss / 1024,
-        }
-        if process.returncode in (-signal.SIGKILL, 137) and seconds >= LIMIT:
-            return {**found, "killed": True}
-        if process.returncode not in case.status:
-            raise SystemExit(
-                f"{version.name} ended with {process.returncode}: {' '.join(words)}\n{reported.read_text()}"
-            )
-        try:
-            payload = json.loads(printed.read_text())
-        except ValueError:
-            return found
-        if "each" in payload:
-            found["seconds"] = statistics.median(payload["each"])
-        if isinstance(payload.get("seconds"), dict):
-            found["stages"] = payload["seconds"]
-        for key in ("mc_error", "total_error", "predicted_seconds"):
-            if payload.get(key) is not None:
-                found[key] = payload[key]
-        return found
+def turns(scene: str, wanted: float, tree: Path | None, seed: int) -> Iterator[dict[str, Any]]:
+    """The first and the later run of the version in ``tree`` (this one without), as :func:`accuracy.captured`."""
+    with tempfile.TemporaryDirectory() as home:
+        for counted in (True, False, True):
+            run = accuracy.captured(scene, wanted, tree, seed, Path(home))
+            if counted:
+                yield run
 
 
-def drawn(folder: Path, scenes: Path, pixels: int | None = None, window: int | None = None) -> tuple[Path, Path]:
-    """Scene and camera file of the photograph with other numbers of pixels on the same areas, made in ``folder``.
-
-    Parameters
-    ----------
-    folder, scenes
-        where they are made, and the shipped scenes, beside which the shipped cameras lie.
-    pixels, window
-        of the sensor and of the projector, a side; those of the photograph where not given.
-    """
-    import numpy as np
-    from skimage import io
-
-    shutil.copytree(scenes / "photograph", folder / "scene")
-    path, camera = folder / "scene" / "scene.xml", folder / "camera.toml"
-    text, shipped = path.read_text(), (scenes.parent / "calibration" / "imx249.toml").read_text()
-    if pixels:
-        text = re.sub(r'name="(width|height)" value="512"', rf'name="\1" value="{pixels}"', text)
-        text = text.replace('value="0.01172"', f'value="{0.01172 * 512 / pixels!r}"')
-        # The same well and noise on other pixels, so that frames of all sizes are as noisy.
-        shipped = shipped.replace("pixel_pitch_um = 5.86", f"pixel_pitch_um = {5.86 * 512 / pixels!r}")
-    if window:
-        canvas = np.zeros((window, 2 * window), np.uint8)
-        canvas[:, window:] = 255
-        io.imsave(folder / "scene" / "projector.png", canvas, check_contrast=False)
-    path.write_text(text)
-    camera.write_text(shipped)
-    return path, camera
+def facts_of(run: Run) -> dict[str, Any]:
+    """Seconds of a run by stage, predicted and taken; ``whole`` from the shell to its exit."""
+    manifest = run["manifest"]
+    stages, predicted = manifest["seconds"], manifest["plan"]["predicted_seconds"]
+    return {
+        "whole": run["seconds"],
+        "processor": run["processor_seconds"],
+        "plan": stages["plan"],
+        "stages": stages,
+        "predicted": predicted / stages["total"],
+        "predicted_stages": manifest["plan"]["predicted"],
+    }
 
 
-def summary(pairs: Sequence[Mapping[str, dict[str, Any]]]) -> dict[str, Any]:
-    """Least and median of both versions, and the median ratio of the pairs."""
-    found: dict[str, Any] = {}
-    for name in ("0.3.0", "today"):
-        runs = [pair[name] for pair in pairs]
-        found[name] = {
-            "least": min(run["seconds"] for run in runs),
-            "median": statistics.median(run["seconds"] for run in runs),
-            "processor_median": statistics.median(run["processor_seconds"] for run in runs),
-            "memory_mib": max(run["memory_mib"] for run in runs),
-            "killed": any(run.get("killed", False) for run in runs),
-        }
-        if "stages" in runs[-1]:
-            stages = [run["stages"] for run in runs]
-            found[name]["stages"] = {key: statistics.median(each[key] for each in stages) for key in stages[0]}
-            found[name]["light"] = statistics.median(each["transport"] + each["optics"] for each in stages)
-    found["ratio"] = statistics.median(pair["0.3.0"]["seconds"] / pair["today"]["seconds"] for pair in pairs)
+def measured(scene: str, wanted: float, tree: Path | None, seed: int, halves: Any) -> dict[str, Any]:
+    """First and later run of one version, with the later one's error where there is an answer, ``halves``."""
+    first, later = turns(scene, wanted, tree, seed)
+    found: dict[str, Any] = {"first": facts_of(first), "later": facts_of(later)}
+    if halves is not None:
+        found["shares"] = accuracy.held_against(halves, scene, later)["shares"]
     return found
 
 
-def table(results: Mapping[str, Any]) -> str:
-    """One line a case, for people."""
-    lines = [
-        f"{'case':<22} {'0.3.0 least, median s':>24} {'today least, median s':>24} {'ratio':>6} {'aim s':>6}  light s"
-    ]
-    for name, case in CASES.items():
-        if name not in results["cases"]:
-            continue
-        row = results["cases"][name]["summary"]
-        sides = [f"{row[v]['least']:.2f}, {row[v]['median']:.2f}" for v in ("0.3.0", "today")]
-        sides = [
-            side + (" killed" if row[v]["killed"] else "") for side, v in zip(sides, ("0.3.0", "today"), strict=True)
-        ]
-        light = " -> ".join(f"{row[v]['light']:.1f}" for v in ("0.3.0", "today") if "light" in row[v])
-        lines.append(f"{name:<22} {sides[0]:>24} {sides[1]:>24} {row['ratio']:6.2f} {case.aim or '':>6}  {light}")
+def summary(pairs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Medians over pairs of each version's first and later runs, their errors over all, and how they compare."""
+    found: dict[str, Any] = {}
+    for name in pairs[0]:
+        runs = [pair[name] for pair in pairs]
+        found[name] = {kind: _medians([run[kind] for run in runs]) for kind in ("first", "later")}
+        if "shares" in runs[0]:
+            found[name] |= accuracy.bracketed(*np.mean([run["shares"] for run in runs], axis=0))
+    if "old" in found:
+        more = max(1.0, (found["new"]["error"] / found["old"]["error"]) ** 2) if found["old"]["error"] else 1.0
+        found["ratios"] = {kind: _ratio(pairs, kind) for kind in ("first", "later")}
+        found["ratios"] |= {"equal": _ratio(pairs, "later", more), "more_samples": more}
+    return found
+
+
+def _medians(runs: Sequence[Run]) -> dict[str, Any]:
+    names = [name for name in runs[0]["stages"] if all(name in run["stages"] for run in runs)]
+    predicted = [run["predicted"] for run in runs]
+    return {
+        **{key: statistics.median(run[key] for run in runs) for key in ("whole", "processor", "plan", "predicted")},
+        "plan_part": statistics.median(run["plan"] / run["whole"] for run in runs),
+        "predicted_range": [min(predicted), max(predicted)],
+        "stages": {name: statistics.median(run["stages"][name] for run in runs) for name in names},
+    }
+
+
+def _ratio(pairs: Sequence[Mapping[str, Any]], kind: str, more: float = 1.0) -> float:
+    """Median over ``pairs`` of the earlier version's seconds over this one's with ``more`` samples."""
+    ratios = []
+    for pair in pairs:
+        new = pair["new"][kind]
+        ratios.append(pair["old"][kind]["whole"] / (new["whole"] + (more - 1) * new["stages"]["transport"]))
+    return statistics.median(ratios)
+
+
+def limits(scene: str, found: Mapping[str, Any]) -> dict[str, tuple[float, bool]]:
+    """What of this version has a limit in a ``scene``: its value, and whether it keeps it."""
+    first, later = found["new"]["first"], found["new"]["later"]
+    kept = {"first - 1.5 later": (first["whole"] - FIRST_TIMES * later["whole"], FIRST_S)}
+    if scene in WHOLE:
+        kept |= {
+            "plan": (later["plan"], PLAN_S),
+            "plan part": (later["plan_part"], PLAN_PART),
+            "whole": (later["whole"], WHOLE[scene]),
+        }
+    checked = {name: (value, value <= most) for name, (value, most) in kept.items()}
+    for kind, runs in (("first", first), ("later", later)):
+        least, most = runs["predicted_range"]
+        checked[f"predicted, {kind}"] = runs["predicted"], PREDICTED[0] <= least and most <= PREDICTED[1]
+    return checked
+
+
+def table(cases: Mapping[str, Any]) -> str:
+    """A line for each version of each scene, its floor, and the limits, for people."""
+    heads = f"{'scene':<22}{'first: plan / all':>19}{'later: plan / all':>19}{'processor':>11}{'plan part':>11}"
+    lines = [f"{heads}{'predicted':>11}{'error':>9}{'floor':>7}"]
+    for scene, case in cases.items():
+        found = case["summary"]
+        for name in (each for each in ("old", "new") if each in found):
+            row = found[name]
+            pairs = (f"{row[kind]['plan']:.2f} / {row[kind]['whole']:.2f}" for kind in ("first", "later"))
+            later = row["later"]
+            floor = f"{case['floor']['floor']:.2f}" if name == "new" and "floor" in case else ""
+            error = f"{row['error']:.1e}" if "error" in row else ""
+            lines.append(
+                f"{f'{scene} {name}':<22}{''.join(f'{pair:>19}' for pair in pairs)}{later['processor']:>11.2f}"
+                f"{later['plan_part']:>11.0%}{later['predicted']:>11.2f}{error:>9}{floor:>7}"
+            )
+        if "ratios" in found:
+            ratios = found["ratios"]
+            lines.append(
+                f"  {len(case['pairs'])} pairs: first {ratios['first']:.2f}, later {ratios['later']:.2f}, at equal "
+                f"error {ratios['equal']:.2f} times as fast"
+            )
+        told = (f"{name} {value:.2f} {'kept' if kept else 'NOT KEPT'}" for name, (value, kept) in
+                limits(scene, found).items())  # fmt: skip
+        lines.append(f"  {', '.join(told)}")
     return "\n".join(lines)
 
 
+def answer_of(scene: str, file: Path, noise: float) -> Any:
+    """What frames of a ``scene`` are held against, as :mod:`accuracy` keeps it beside ``file``."""
+    kept = file.with_suffix(f".{scene}.npy")
+    if not kept.exists():
+        np.save(kept, accuracy.answer(scene, noise))
+    return np.load(kept)
+
+
+def _pairs(
+    case: dict[str, Any], scene: str, wanted: float, trees: Mapping[str, Path | None], count: int, halves: Any,
+    save: Callable[[], None],
+) -> None:  # fmt: skip
+    """Run the pairs of a ``case`` that are missing, with seeds 0, 1, ...; ``save`` after each."""
+    pairs = case.setdefault("pairs", [])
+    while len(pairs) < count:
+        seed = len(pairs)
+        order = list(trees) if seed % 2 == 0 else list(reversed(trees))
+        found = {name: measured(scene, wanted, trees[name], seed, halves) for name in order}
+        pairs.append({name: found[name] for name in trees})
+        case["summary"] = summary(pairs)
+        save()
+        taken = ", ".join(f"{name} {found[name]['later']['whole']:.1f} s" for name in trees)
+        print(f"{scene}, pair {len(pairs)}: {taken}", file=sys.stderr, flush=True)
+
+
 def main() -> None:
+    """Measure what is asked for, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path, required=True)
-    parser.add_argument("--case", action="append", default=[], choices=list(CASES), metavar="NAME")
-    parser.add_argument("--repeat", type=int, default=5)
-    parser.add_argument("--old", type=Path, default=OLD_FOLDER)
+    parser.add_argument("--scene", action="append", default=[], choices=list(WHOLE), metavar="NAME")
+    parser.add_argument("--own", action="store_true")
+    parser.add_argument("--pairs", type=int, default=5)
+    parser.add_argument("--old", default=OLD_COMMIT, metavar="COMMIT")
+    parser.add_argument("--noise", type=float, default=accuracy.NOISE)
+    parser.add_argument("--quick", action="store_true")
     options = parser.parse_args()
-    versions = installed(options.old), Version("today", Path(sys.executable), _WARM_NEW)
-    scenes = options.old / "scenes"
+    if options.quick:
+        options.scene, options.pairs = options.scene or ([] if options.own else ["photograph"]), 1
+        options.noise = max(options.noise, QUICK_NOISE)
     results: dict[str, Any] = json.loads(options.json.read_text()) if options.json.exists() else {"cases": {}}
-    results["machine"] = f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores"
-    for name in options.case or CASES:
-        kept = results["cases"].setdefault(name, {"pairs": []})
-        if len(kept["pairs"]) < options.repeat and not kept["pairs"]:
-            for version in versions:
-                measured(version, CASES[name], scenes)
-        while len(kept["pairs"]) < options.repeat:
-            kept["pairs"].append({version.name: measured(version, CASES[name], scenes) for version in versions})
-            kept["summary"] = summary(kept["pairs"])
-            options.json.write_text(json.dumps(results, indent=1) + "\n")
-        print(f"{name}: {kept['summary']['ratio']:.2f} times", file=sys.stderr, flush=True)
-    print(table(results))
+    results |= {"machine": f"{platform.machine()}, {os.cpu_count()} processors", "old": options.old}
+    cases = results["cases"]
+
+    def save() -> None:
+        options.json.write_text(json.dumps(results, indent=1) + "\n")
+
+    shipped = options.scene or (() if options.own else WHOLE)
+    trees: dict[str, Path | None] = {"new": None}
+    if shipped:
+        trees = {"old": worktree(options.json.with_suffix(f".{options.old}"), options.old), "new": None}
+    for tree in trees.values():
+        accuracy.captured("photograph", OWN_ACCURACY, tree)  # writes byte code
+    own = foreign_scenes.write(options.json.with_suffix(".scenes")) if options.own else {}
+    for name in (OWN[:1] if options.quick else OWN) if own else ():
+        _pairs(cases.setdefault(name, {}), str(own[name]), OWN_ACCURACY, {"new": None}, options.pairs, None, save)
+    for scene in shipped:
+        case = cases.setdefault(scene, {})
+        halves = answer_of(scene, options.json, options.noise)
+        _pairs(case, scene, accuracy.PROMISED, trees, options.pairs, halves, save)
+        if "floor" not in case:
+            case["floor"] = floors.measured(scene, accuracy.PATTERNS, accuracy.PROMISED)
+            save()
+    print(table(cases))
 
 
 if __name__ == "__main__":

@@ -125,6 +125,7 @@ def trace_request(bench: Apparatus, plan: Plan, job: Job | None = None) -> Light
     if plan.cost:
         plan.cost.check(request.patterns, job.limits)
     lighting = bench.family(request.patterns, request.seed).lighting
+    job.clock.predict({"transport": plan.predicted["transport"]})
     with job.clock.stage("transport"):
         light = trace_light(bench, plan, lighting, request.seed, progress=job.progress)
     return Light(**{each.name: getattr(light, each.name) for each in fields(light)})
@@ -213,7 +214,8 @@ def capture(
     lighting = bench.whole.family(request.patterns, request.seed).lighting
     lines, readings = len(bench.benches), bench.readings
     colours = None if bench.whole.filters else bench.manifest  # of a folder of each line's
-    exposing = sum(frame_seconds(bench.whole, len(readings) * len(lighting.weights)).values())
+    exposed = frame_seconds(bench.whole, len(readings) * len(lighting.weights))
+    exposing = sum(exposed.values())
     with ExitStack() as places:
         names = bench.names if colours else ("",)
         folders = [task.output and task.output / name for name in names]
@@ -236,6 +238,7 @@ def capture(
         with job.planning(request.patterns):
             plan = (lights[0].plan if lights else plan or bench.plan(request)).taking(start=starting)
         check(plan.settings, exposing if lights else plan.predicted_seconds)
+        job.clock.predict(exposed if lights else plan.predicted)
         if not lights:
             with job.clock.stage("transport"):
                 sampling = bench.sampling(request)

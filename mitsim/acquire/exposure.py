@@ -395,6 +395,7 @@ class Shooting:
         Files are written while the next chunk is formed and exposed: ``write`` is the time that work waits for them.
         """
         chunks = in_chunks(zip(range(len(expected)), self.family.shots, expected, strict=True))
+        job.progress("frames", 0.0)
         with Behind(self._record) as writing:
             while True:
                 with job.clock.stage("optics"):

@@ -139,6 +139,7 @@ def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) 
     total: FloatArray | float = 0.0
     squares: FloatArray | float = 0.0
     started = time.perf_counter()
+    job.progress("reference", 0.0)
     for index in range(passes):
         child = integer(seed, "reference", index)
         loaded.camera.stratify((integer(seed, "reference points", index), each))
@@ -249,7 +250,9 @@ def render(
         with job.planning(str(bench.loaded.path)):
             plan = make_plan(bench, uniform, accuracy, seed, effects)
         frames_cost(bench, plan.settings, uniform, plan.predicted_seconds).check(str(bench.loaded.path), job.limits)
-        light = trace_light(bench, plan, uniform, seed, Sampling(by_pixel=False), job.progress)
+        job.clock.predict({"transport": plan.predicted["transport"]})
+        with job.clock.stage("transport"):
+            light = trace_light(bench, plan, uniform, seed, Sampling(by_pixel=False), job.progress)
         warnings = light.warnings
         frame = next(iter(light.frames(uniform, seed)))
         mean = frame.irradiance[..., None]

@@ -200,6 +200,7 @@ class Session:
         plan = plan.taking(start=starting, truth=0.0, **seconds)
         cost = session_cost(self.board, count, plan.settings, plan.predicted_seconds, exposures)
         cost.check("calibration", job.limits)
+        job.clock.predict(plan.predicted)
         return replace(plan, cost=cost)
 
     def trace(self, plan: Plan, job: Job) -> SampledLight:

@@ -32,7 +32,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import deciding_versions, versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import output_folder, whole_folder
-from mitsim.core.job import Clock, Cost, Job, Limits
+from mitsim.core.job import Cost, Job, Limits
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
@@ -103,7 +103,7 @@ def calibrate_depths(bench: Apparatus, request: SessionRequest, task: Task) -> d
     with nullcontext() if task.output is None else output_folder(task.output, overwrite=task.resume) as folder:
         for depth in recipe.depths:
             session = Session(bench, recipe, integer(request.seed, "depth", f"{depth:g}"), depth)
-            own = replace(task, job=replace(task.job, clock=Clock()))
+            own = replace(task, job=task.job.apart(f"{depth:g} mm "))
             (found[depth],) = _run_sessions([session], request, own, [folder and folder / f"{depth:g}"])
     return found
 

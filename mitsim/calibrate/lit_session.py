@@ -155,6 +155,7 @@ class LitSession:
             number, frame = item
             return use((number, self._with_leak(frame) if number else frame))
 
+        job.progress(f"{side} stripes", first / self.session.signs.shape[1])
         chunks = in_chunks(self._stripes(side, first))
         while True:
             with job.clock.stage("optics"):

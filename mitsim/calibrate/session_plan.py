@@ -32,7 +32,7 @@ from mitsim.calibrate.calibrate import NOISE_FREE, session_sums
 from mitsim.calibrate.lit_session import LitSession
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError, check_arguments
-from mitsim.core.job import Clock, Job
+from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
@@ -53,6 +53,8 @@ _NEAR_DB = 0.05
 """Beyond the wanted PSNR, at which no less light is looked for."""
 _STEP = 8.0
 """By which light is changed until the wanted PSNR lies between two sessions: some 6 dB."""
+_TRIED = 0.1
+"""Part of a search that a session is: nine are the most, five the middle (images whose error falls to a floor)."""
 _DIGITS = 3
 """Of an exposure fraction: a thousandth of the light is 0.004 dB."""
 
@@ -223,9 +225,9 @@ def plan_calibration(
         request = Request.of(patterns=patterns, seed=seed, accuracy=accuracy)
         shots = capture(SpectralBench(bench), request).runs[0]
     session = Session(bench, recipe, seed)
-    job.progress("session", 0.2)
+    job.progress("session", 0.0)
     with job.clock.stage("session"):
-        own = replace(job, clock=Clock())
+        own = job.apart("session ")
         plan = session.plan(accuracy, own)
         predicted = PredictedSession.of(LitSession.of(session, session.trace(plan, own), own), own)
     search = _Search(shots, predicted, recipe, job)
@@ -281,7 +283,7 @@ class _Search:
         def quality(dose: float) -> float:
             if dose not in trials:
                 trials[dose] = self.trial(self._by(dose))
-                self.job.progress(f"session {len(trials)}", min(0.4 + 0.06 * len(trials), 0.98))
+                self.job.progress(f"solve: {len(trials)} sessions", min(_TRIED * len(trials), 1.0))
             return trials[dose].psnr_db
 
         out_of_reach = quality(1.0) < wanted and ceiling.psnr_db < wanted

@@ -182,9 +182,11 @@ def plan(scene: Scene, sampling: OfPatterns, devices: Coloured, common: Common) 
     request = request_of(sampling)
     devices.check_colour(common.variant, sampling.seconds)
     devices.check(scene, sampling.patterns)
-    bench = devices.open(scene, devices.traced_in(common.variant))
-    starting = running_seconds()
-    found = _plan_of(bench, devices.colour, request).taking(start=starting)
+    with common.job() as job:
+        bench = devices.open(scene, devices.traced_in(common.variant), job)
+        starting = running_seconds()
+        with job.planning(sampling.patterns):
+            found = _plan_of(bench, devices.colour, request).taking(start=starting)
     if not common.as_json:
         print_plan(found)
     kernels = asdict(compiled_kernels())

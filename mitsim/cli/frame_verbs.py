@@ -120,7 +120,7 @@ def reconstruct(
             options = _mosaic_options(options, colours.mosaic or JOINT)
         elif colours.mosaic is not None:
             raise MitsimError(f"--mosaic {colours.mosaic}: {run} has a run for each line; leave out --mosaic")
-        return _reconstruct_colours(run, calibration, output, colours.chart, options, common.as_json)
+        return _reconstruct_colours(run, calibration, output, colours.chart, options, common)
     for name, value in vars(colours).items():
         if value is not None:
             raise MitsimError(f"--{name} {value}: {run} is not coloured; leave out --{name}")
@@ -134,7 +134,8 @@ def reconstruct(
     from mitsim.report.quality import reconstruct as reconstruct_folder
 
     held = memory_from_here()
-    result = reconstruct_folder(run, calibration, output, **options, overwrite=overwrite)
+    with common.job() as job:
+        result = reconstruct_folder(run, calibration, output, **options, overwrite=overwrite, job=job)
     payload = {**result.summary(), "memory_bytes": memory_since(held)}
     lines = [
         payload["status"],
@@ -166,7 +167,7 @@ def _mosaic_options(options: dict[str, Any], way: str) -> dict[str, Any]:
 
 
 def _reconstruct_colours(
-    run: Path, calibration: Path, output: Path, chart: str | None, options: dict[str, Any], as_json: bool
+    run: Path, calibration: Path, output: Path, chart: str | None, options: dict[str, Any], common: Common
 ) -> int:
     """The image of every line of a coloured run, each solved with ``options``, and one in colour."""
     from mitsim.core.files import check_output
@@ -189,9 +190,10 @@ def _reconstruct_colours(
     from mitsim.report.quality import reconstruct_colours
 
     held = memory_from_here()
-    found = reconstruct_colours(run, calibration, output, place, **options)
+    with common.job() as job:
+        found = reconstruct_colours(run, calibration, output, place, job=job, **options)
     payload = {**found.summary(), "memory_bytes": memory_since(held)}
-    return finish(as_json, payload, [*found.sentences, found.output], found.warnings)
+    return finish(common.as_json, payload, [*found.sentences, found.output], found.warnings)
 
 
 def _two_depths(text: str) -> tuple[float, float]:

@@ -137,9 +137,9 @@ class Common:
         """A job of the verb's limits, with progress on stderr while the context lasts."""
         from mitsim.core.job import Clock, Job
 
-        limits = self.limits
-        with showing_progress(self.quiet or self.as_json) as progress:
-            yield Job(Clock(running_seconds()), progress, limits)
+        limits, start = self.limits, running_seconds()
+        with showing_progress(self.quiet or self.as_json, start) as watch:
+            yield Job(Clock(start, watch), watch.report, limits)
 
     @property
     def limits(self) -> Limits:

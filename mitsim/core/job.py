@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from types import FrameType
 
@@ -60,26 +60,61 @@ def compiled_kernels() -> CompiledKernels:
         return _compiled
 
 
+class Watch:
+    """Who is told what work is at, as the rows on a terminal are. This one ignores it all."""
+
+    def begin(self, stage: str) -> None:
+        """The ``stage`` goes on from here."""
+
+    def end(self, stage: str, seconds: float) -> None:
+        """The ``stage`` is over, or waits for its next turn; ``seconds`` all in all so far."""
+
+    def predict(self, seconds: Mapping[str, float]) -> None:
+        """What stages to come are predicted to take, ``seconds`` by name."""
+
+    def report(self, stage: str, fraction: float) -> None:
+        """The finished ``fraction``, 0 to 1, of a ``stage``, or of a loop over several: a :data:`Progress`."""
+
+
 @checked_fields
 class Clock:
     """Seconds by stage, in the order of first use.
 
-    ``start``: seconds that the program has run already, which count as a stage of that name.
+    Parameters
+    ----------
+    start
+        seconds that the program has run already, which count as a stage of that name.
+    watch
+        who is told of stages.
+    prefix
+        before their names, there.
     """
 
-    def __init__(self, start: float = 0.0) -> None:
-        self._started = time.perf_counter() - start
-        self._stages: dict[str, float] = {"start": start} if start else {}
+    def __init__(self, start: float = 0.0, watch: Watch | None = None, prefix: str = "") -> None:
+        self._started, self._watch, self._prefix = time.perf_counter() - start, watch or Watch(), prefix
+        self._stages: dict[str, float] = {}
+        if start:
+            self._add("start", start)
         self._compiled = compiled_kernels()
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Adds the time spent inside the context to ``name``."""
         started = time.perf_counter()
+        self._watch.begin(self._prefix + name)
         try:
             yield
         finally:
-            self._stages[name] = self._stages.get(name, 0.0) + time.perf_counter() - started
+            self._add(name, time.perf_counter() - started)
+
+    @check_arguments
+    def predict(self, stages: Mapping[str, float]) -> None:
+        """Tell who watches what ``stages`` [s] are predicted to take; those that have begun are left out."""
+        self._watch.predict({self._prefix + name: own for name, own in stages.items() if name not in self._stages})
+
+    def apart(self, prefix: str) -> Clock:
+        """A clock of its own for a part of the work, watched by the same with ``prefix`` before its stages' names."""
+        return Clock(0.0, self._watch, self._prefix + prefix)
 
     @check_arguments
     def add(self, stages: Mapping[str, float], prefix: str = "") -> None:
@@ -90,7 +125,7 @@ class Clock:
             raise ArgumentError("stages", f"{cut(repr(stages))}: give seconds by name") from None
         for name, seconds in stages.items():
             if name != "total":
-                self._stages[prefix + name] = self._stages.get(prefix + name, 0.0) + seconds
+                self._add(prefix + name, seconds)
 
     def seconds(self) -> dict[str, float]:
         """Stages and ``total`` since the clock was made [s]."""
@@ -100,6 +135,10 @@ class Clock:
         """``number`` of kernels that were compiled since the clock was made, and ``seconds`` that it took: later runs
         find them in Dr.Jit's cache, and are the faster by so much."""
         return asdict(compiled_kernels().since(self._compiled))
+
+    def _add(self, name: str, seconds: float) -> None:
+        self._stages[name] = self._stages.get(name, 0.0) + seconds
+        self._watch.end(self._prefix + name, self._stages[name])
 
 
 # ---- What work may take ----
@@ -185,6 +224,12 @@ class Job:
     clock: Clock = field(default_factory=Clock)
     progress: Progress = silent
     limits: Limits = field(default_factory=Limits)
+
+    def apart(self, prefix: str) -> Job:
+        """The same for a part of the work whose seconds are its own, ``prefix`` before its stages' names."""
+        return replace(
+            self, clock=self.clock.apart(prefix), progress=lambda stage, part: self.progress(prefix + stage, part)
+        )
 
     @contextmanager
     def planning(self, what: str) -> Iterator[None]:

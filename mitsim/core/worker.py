@@ -44,6 +44,10 @@ def workers() -> int:
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
+_WHOLE = "\r\x1b[J\x1b[?25h"
+"""What a terminal is left with when the worker could not: a free line, and a cursor that is seen."""
+
+
 class OutOfTime(BaseException):
     """Raised in work whose time is over (:mod:`mitsim.core.job`); no Exception, so that nothing in it takes it for
     a failure that it may go on from."""
@@ -139,6 +143,11 @@ def held_back() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         if kept:
             signal.raise_signal(kept[0])
+
+
+def has_rows() -> bool:
+    """Whether standard error is a terminal on which rows of progress can be written again."""
+    return sys.stderr is not None and sys.stderr.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
 
 
 def is_stopped() -> bool:
@@ -286,6 +295,9 @@ def _watch(child: int) -> NoReturn:
             os.kill(child, signal.SIGKILL if asked else number)
             asked.append(number)
     status = ended[1]
+    if (asked or os.WIFSIGNALED(status)) and has_rows():
+        sys.stderr.write(_WHOLE)
+        sys.stderr.flush()
     if os.WIFEXITED(status):
         os._exit(os.WEXITSTATUS(status))
     killer = os.WTERMSIG(status)

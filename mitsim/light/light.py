@@ -324,9 +324,9 @@ def trace_lines(
     labels = np.arange(bench.n**2) if sampling.by_pixel else lighting.labels
     followed = any(not each.row.even for each in simulation.passes.values())
     groups = Group.all_of(simulation, labels, seed, sampling.purpose, len(benches))
-    samples = first_samples(simulation)
+    samples, reached = first_samples(simulation), 0.0
     while True:
-        trace_groups(groups, samples)
+        trace_groups(groups, samples, partial(_report, progress, reached))
         lines = [_line_of(groups, line, each, plan, seed) for line, each in enumerate(own)]
         last = lines[0].paths >= MOST_PATHS
         enough = math.inf if last or sampling.excess or sampling.target else plan.sampling_target
@@ -348,7 +348,7 @@ def trace_lines(
         progress("transport", near)
         if last or all(light.reached for light in lights.values()):
             return [lights[line] for line in range(len(own))]
-        samples = next_samples(simulation, samples, checks[worst].variances, excess)
+        samples, reached = next_samples(simulation, samples, checks[worst].variances, excess), near
         # What the next round replaces is not held beside it: new memory is dear.
         del lines, checks, check, lights, light
 
@@ -370,6 +370,11 @@ def traced_again(light: SampledLight, simulation: Simulation, purpose: str = "sc
     trace_groups(groups, light.samples)
     estimates = tuple(group.light() for group in groups)
     return replace(light, groups=estimates, simulation=simulation, flux=np.mean(_flux(estimates, light.flux), axis=0))
+
+
+def _report(progress: Progress, reached: float, part: float) -> None:
+    """Tell ``progress`` that a ``part`` of a round is traced, which is to bring what was ``reached`` to the whole."""
+    progress("transport", reached + (1 - reached) * part)
 
 
 def _line_of(groups: Sequence[Group], line: int, simulation: Simulation, plan: Plan, seed: int) -> SampledLight:

@@ -126,10 +126,22 @@ class Group:
         return self._means[line][name]
 
 
-def trace_groups(groups: Sequence[Group], wanted: Mapping[str, int]) -> None:
-    """Trace until all ``groups`` have as many samples as are ``wanted`` of each pass by its name, accumulated."""
+def trace_groups(
+    groups: Sequence[Group], wanted: Mapping[str, int], report: Callable[[float], None] = lambda part: None
+) -> None:
+    """Trace until all groups have as many samples as are wanted, accumulated.
+
+    Parameters
+    ----------
+    groups, wanted
+        what is traced, and samples of each pass by its name.
+    report
+        is called with the part that is traced, between groups.
+    """
     with Behind[Accumulation](lambda accumulation: accumulation()) as accumulating:
-        for group in groups:
+        for number, group in enumerate(groups):
+            if number:
+                report(number / len(groups))
             group.trace(wanted, accumulating)
         accumulating.wait()
 

@@ -17,7 +17,7 @@ from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.exr import write_frame
 from mitsim.core.files import output_folder, plain, read_json, whole_file, write_json
 from mitsim.core.images import card, normalise, png, span
-from mitsim.core.job import Clock, Cost, Limits
+from mitsim.core.job import Clock, Cost, Job, Limits
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulation import Accumulation, accumulate, check_factorising
@@ -243,7 +243,6 @@ _OF_THE_SCENE = Cause.GLOSS, Cause.INDIRECT, Cause.DETAIL, Cause.UNKNOWN, Cause.
 """Causes that light of a depth beyond the searched range is taken for."""
 
 
-@single_threaded_blas()
 @check_arguments
 def reconstruct(
     shots: Capture,
@@ -285,8 +284,24 @@ def reconstruct(
         for a capture and factors that do not fit each other, a frame that cannot be read, more memory than is free,
         another lambda, method, focus, margin or range, or a calibration that does not state its parallax.
     """
-    request = ImageRequest(lam, method, focus, margin, depth_range)
-    solver, asked = SOLVERS[method], request.inputs(shots, factors)
+    return reconstruct_request(shots, factors, ImageRequest(lam, method, focus, margin, depth_range))
+
+
+@single_threaded_blas()
+def reconstruct_request(
+    shots: Capture, factors: Factors, request: ImageRequest, job: Job | None = None
+) -> Reconstruction:
+    """The image that a request asks for, as :func:`reconstruct`.
+
+    Parameters
+    ----------
+    shots, factors, request
+        as there.
+    job
+        of whose work it is a part: its watch is told of the stages, and the image has their seconds.
+    """
+    solver, asked = SOLVERS[request.method], request.inputs(shots, factors)
+    lam, method, margin = request.lam, request.method, request.margin
     factors.check_fit(shots)
     beside = Margin(margin) if margin else None
     if beside:
@@ -297,7 +312,8 @@ def reconstruct(
     check_factorising(shots, factors, solver)
     if cost:
         Cost(sum(cost.seconds.values()), cost.memory_bytes).check(f"{shots.name}: its image", Limits())
-    clock = Clock()
+    clock = (job or Job()).apart("").clock
+    clock.predict(cost.seconds if cost else {})
     depth, shots, factors, doubts = _focus(shots, factors, request, clock)
     with clock.stage("accumulate"):
         data = accumulate(shots, factors, method)

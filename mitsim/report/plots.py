@@ -203,6 +203,31 @@ def bars(kinds: Mapping[str, Mapping[str, Mean]], x: str) -> Figure:
     return figure
 
 
+def stacked_bars(rows: Mapping[str, Mapping[str, float]], x: str) -> Figure:
+    """A bar for each row, the first on top, that its parts make up in their order.
+
+    Parameters
+    ----------
+    rows
+        the parts' values >= 0 by name, by the rows' names.
+    x
+        name of the axis, with its unit.
+    """
+    parts = list(dict.fromkeys(part for row in rows.values() for part in row))
+    figure, axes = figure_of(1.6 + ROW * len(rows))
+    places, ends = np.arange(len(rows))[::-1], np.zeros(len(rows))
+    for number, part in enumerate(parts):
+        own = np.array([row.get(part, 0.0) for row in rows.values()])
+        row, column = divmod(number, len(_PALETTE))
+        style = {"color": _PALETTE[column], "hatch": "//" * row, "edgecolor": "white"}
+        axes.barh(places, own, 0.66, left=ends, label=part, **style)
+        ends += own
+    axes.set_yticks(places, list(rows), fontsize=FONT)
+    label_axes(axes, x, "", grid="x")
+    legend_below(figure, 4, *axes.get_legend_handles_labels())
+    return figure
+
+
 def singular_values(curves: Mapping[str, npt.ArrayLike]) -> Figure:
     """Singular values of each family's system, {family: values in any order}, log scale over rank in percent.
 

@@ -15,13 +15,13 @@ import numpy as np
 
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.files import output_folder
+from mitsim.core.job import Job
 from mitsim.core.runs import load_run
 from mitsim.core.spectral_manifests import IMAGE, is_coloured, is_mosaic, read_colours, same_lines
 from mitsim.devices.chart import ChartPlace
 from mitsim.metrics import Quality, summary_of, truth_error_for, truth_for
 from mitsim.reconstruct.factors import load_calibration
-from mitsim.reconstruct.reconstruct import Reconstruction, may_replace
-from mitsim.reconstruct.reconstruct import reconstruct as solve
+from mitsim.reconstruct.reconstruct import Reconstruction, may_replace, reconstruct_request
 from mitsim.reconstruct.request import ImageRequest
 
 if TYPE_CHECKING:
@@ -46,9 +46,9 @@ def reconstruct(
     calibration: Path | str,
     output: Path | str,
     lam: float | Literal["auto"] = "auto",
-    method: str = "tikhonov",
     overwrite: bool = False,
-    **place: Any,
+    job: Job | None = None,
+    **options: Any,
 ) -> Judged:
     """Recover the image of a run with a calibration; writes image.exr, image.png and result.json.
 
@@ -59,28 +59,32 @@ def reconstruct(
     ----------
     run, calibration, output
         RUN and CAL folders, and one for the image: new or empty, or with an earlier image of the same inputs.
-    lam, method
+    lam
         as for :func:`mitsim.reconstruct.reconstruct.reconstruct`.
     overwrite
         whether an earlier image of other inputs may be replaced.
-    **place
-        ``focus``, ``margin`` and ``depth_range``, as there.
+    job
+        its clock.
+    **options
+        ``method``, ``focus``, ``margin`` and ``depth_range``, as there.
     """
-    started = time.perf_counter()
-    shots, factors = load_run(run), load_calibration(calibration)
-    factors.check_fit(shots)
-    board = factors.manifest.board_reflectance
-    truth, truth_error = truth_for(shots, board), truth_error_for(shots, board)
-    replaces = may_replace(Path(output), ImageRequest(lam, method, **place).inputs(shots, factors), overwrite)
+    started, job, request = time.perf_counter(), job or Job(), ImageRequest(lam, **options)
+    with job.clock.stage("read"):
+        shots, factors = load_run(run), load_calibration(calibration)
+        factors.check_fit(shots)
+        board = factors.manifest.board_reflectance
+        truth, truth_error = truth_for(shots, board), truth_error_for(shots, board)
+    replaces = may_replace(Path(output), request.inputs(shots, factors), overwrite)
     with output_folder(output, overwrite=replaces) as folder:
         read = time.perf_counter() - started
-        image = solve(shots, factors, lam, method, **place)
+        image = reconstruct_request(shots, factors, request, job)
         judged = Judged(
             reconstruction=replace(image, seconds={"read": read, **image.seconds}),
             quality=None if truth is None else Quality.of(image.image, truth, truth_error),
             output=str(folder),
         )
-        judged.reconstruction.write(folder, judged.summary())
+        with job.clock.stage("write"):
+            judged.reconstruction.write(folder, judged.summary())
     return judged
 
 
@@ -91,6 +95,7 @@ def reconstruct_colours(
     output: Path | str,
     chart: ChartPlace | None = None,
     overwrite: bool = False,
+    job: Job | None = None,
     **options: Any,
 ) -> JudgedColours:
     """Recover the image of every line of a coloured run, and bring them together.
@@ -108,6 +113,8 @@ def reconstruct_colours(
         chart's spectra at the lines.
     overwrite
         whether an earlier image of other inputs may be replaced.
+    job
+        its clock.
     **options
         of :func:`reconstruct`, for every line; of a run behind colour filters, ``way`` and
         ``lam`` as for :func:`mitsim.report.mosaic_images.reconstruct_mosaic`.
@@ -120,15 +127,18 @@ def reconstruct_colours(
     from mitsim.report.colour_image import ColourImage, JudgedColours, board_of
     from mitsim.report.mosaic_images import reconstruct_mosaic
 
-    run, calibration, output = Path(run), Path(calibration), Path(output)
+    run, calibration, output, job = Path(run), Path(calibration), Path(output), job or Job()
     if is_mosaic(run):
-        return reconstruct_mosaic(run, calibration, output, chart, overwrite, **options)
+        with job.clock.stage("images"):
+            return reconstruct_mosaic(run, calibration, output, chart, overwrite, **options)
     lines = same_lines(run, calibration)
     held = is_coloured(output)
     earlier = held and read_colours(output, IMAGE).names == lines.names
     with output_folder(output, overwrite=earlier or (overwrite and held)) as folder:
         images = {
-            name: reconstruct(run / name, calibration / name, folder / name, overwrite=overwrite, **options)
+            name: reconstruct(
+                run / name, calibration / name, folder / name, overwrite=overwrite, job=job.apart(f"{name} "), **options
+            )
             for name in lines.names
         }
         solved = {name: judged.reconstruction for name, judged in images.items()}

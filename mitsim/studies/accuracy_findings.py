@@ -15,6 +15,7 @@ from mitsim.report.plots import (
     Cost,
     costs,
     error_bars,
+    stacked_bars,
 )
 from mitsim.studies.framework.run import Findings
 
@@ -40,6 +41,8 @@ class Row:
         "" where all was measured; else what was not.
     on_front
         no other measured row is as good in less time.
+    stages
+        of a whole run: seconds by stage, the median of each; those of starting and opening first.
     """
 
     estimator: str
@@ -51,6 +54,7 @@ class Row:
     accuracies: tuple[float, ...] = ()
     extrapolated: str = ""
     on_front: bool = False
+    stages: Mapping[str, float] = field(default_factory=dict)
 
     def seconds_at(self, error: float) -> float:
         """Seconds of an unbiased estimator for another ``error``: it falls with 1/sqrt(samples)."""
@@ -71,10 +75,11 @@ class Row:
 
     def line(self) -> str:
         """For people."""
+        plan = f", plan {self.stages['plan']:.2g} s of it" if "plan" in self.stages else ""
         note = f"  extrapolated: {self.extrapolated}" if self.extrapolated else "  *" if self.on_front else ""
         return (
             f"{self.estimator:>9} {self.setting:<28} {self.spread!s:<36} error {self.error:.1e}  "
-            f"Monte Carlo {self.mc_error:.1e}{note}"
+            f"Monte Carlo {self.mc_error:.1e}{plan}{note}"
         )
 
 
@@ -237,7 +242,7 @@ class AccuracyFindings(Findings):
         ]
 
     def figures(self) -> dict[str, Figure]:
-        """Error against the time of whole runs, and what each part buys for how much."""
+        """Error against the time of whole runs, the stages of these, and what each part buys for how much."""
         panels: dict[str, list[Cost]] = {}
         for row in self.rows:
             whole = row.estimator == "factored"
@@ -254,6 +259,8 @@ class AccuracyFindings(Findings):
         levels = {"error of what all is compared with": self.judge.error}
         levels |= {"sensor noise, exposure equal peak": self.sensor_noise} if self.sensor_noise else {}
         drawn = {"accuracy.png": costs(panels, "relative error of the frames [1]", levels)}
+        runs = {row.setting: row.stages for row in self.rows if row.stages}
+        drawn |= {"stages.png": stacked_bars(runs, "wall time [s]")}
         return drawn | {"effects.png": part_chart(self.effects, self.parts_accuracy)}
 
 

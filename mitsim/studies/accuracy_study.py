@@ -17,7 +17,7 @@ What the solver's precision costs is no matter of the scene: `mitsim study solve
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -68,23 +68,29 @@ def measure(bench: Apparatus, request: Request, job: Job) -> AccuracyFindings:
     opening = {name: seconds for name, seconds in job.clock.seconds().items() if name in ("start", "open scene")}
     stand = Stand(bench, bench.family(request.patterns, request.seed), request.seed, job, QUOTED)
     job.progress("judge", 0.1)
-    started = time.perf_counter()
-    looked = stand.pilot_runs.seconds
-    budget.saw(time.perf_counter() - started, max(looked, _SHORTEST_PILOT_S))
-    judge = Judge.trace(stand, stand.plan(QUOTED), _JUDGE_PART * budget.left / budget.slower)
-    runs, parts = Runs(stand, request, judge, sum(opening.values())), Parts(stand, judge)
+    with job.clock.stage("judge"):
+        started = time.perf_counter()
+        looked = stand.pilot_runs.seconds
+        budget.saw(time.perf_counter() - started, max(looked, _SHORTEST_PILOT_S))
+        judge = Judge.trace(stand, stand.plan(QUOTED), _JUDGE_PART * budget.left / budget.slower)
+    runs, parts = Runs(stand, request, judge, opening), Parts(stand, judge)
     job.progress("whole runs", 0.3)
-    runs.measure(ACCURACIES, budget, 1.0, whatever_it_takes=QUOTED)
+    with job.clock.stage("whole runs"):
+        runs.measure(ACCURACIES, budget, 1.0, whatever_it_takes=QUOTED)
     job.progress("parts", 0.4)
-    parts.measure(budget, _PARTS_PART)
     orders = Orders(stand, judge, parts)
-    orders.measure(budget, _ORDERS_PART)
+    with job.clock.stage("parts"):
+        parts.measure(budget, _PARTS_PART)
+        orders.measure(budget, _ORDERS_PART)
     job.progress("whole runs", 0.6)
-    runs.measure(ACCURACIES, budget, _FRONT_PART)
+    with job.clock.stage("whole runs"):
+        runs.measure(ACCURACIES, budget, _FRONT_PART)
     job.progress("reference", 0.7)
-    reference = list(judge.reference(budget))
+    with job.clock.stage("reference"):
+        reference = list(judge.reference(budget))
     job.progress("repeats", 0.8)
-    budget.repeat([*runs.timed, *parts.timed, *orders.timed])
+    with job.clock.stage("repeats"):
+        budget.repeat([*runs.timed, *parts.timed, *orders.timed])
     rows = _mark_front(runs.rows)
     quoted = next(row for row in rows if QUOTED in row.accuracies)
     slow = reference[-1] if reference else None
@@ -113,11 +119,11 @@ def _mark_front(rows: list[Row]) -> list[Row]:
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """One run and its repeats: the ``accuracies`` that lead to it, its frames' error, and seconds of light alone."""
+    """One run and its repeats: the ``accuracies`` that lead to it, its frames' error, and seconds by stage."""
 
     accuracies: tuple[float, ...]
     timed: Timed
-    light: list[float]
+    stages: list[dict[str, float]]
     found: list[tuple[float, float]]
 
 
@@ -132,7 +138,7 @@ class Runs:
         seconds that count for every run.
     """
 
-    def __init__(self, stand: Stand, request: Request, judge: Judge, opening: float) -> None:
+    def __init__(self, stand: Stand, request: Request, judge: Judge, opening: Mapping[str, float]) -> None:
         self._stand, self._judge, self._opening = stand, judge, opening
         # Speckle is drawn anew in every frame and is no error of the light.
         off = {"speckle": False} if "speckle" in present(stand.bench) else {}
@@ -178,16 +184,18 @@ class Runs:
                 "factored",
                 "accuracy",
                 f"accuracy {_list(run.accuracies)}",
-                run.timed.spread + self._opening,
+                run.timed.spread + sum(self._opening.values()),
                 *run.found[0],
                 accuracies=run.accuracies,
+                stages={**self._opening, **{name: median(each[name] for each in run.stages) for name in run.stages[0]}},
             )
             for run in sorted(self._runs, key=lambda run: -min(run.accuracies))
         ]
 
     def light_seconds(self, accuracy: float) -> float:
         """Seconds of transport and optics of the run at an ``accuracy``."""
-        return next(median(run.light) for run in self._runs if accuracy in run.accuracies)
+        run = next(run for run in self._runs if accuracy in run.accuracies)
+        return median(each["transport"] + each["optics"] for each in run.stages)
 
     def _groups(self, accuracies: Sequence[float]) -> Iterator[tuple[tuple[float, ...], float]]:
         """Accuracies by the settings that they lead to, and the seconds that a run of them is predicted to take."""
@@ -209,7 +217,7 @@ class Runs:
     def _begin(self, accuracies: tuple[float, ...]) -> _Run:
         """A run at the tightest of its ``accuracies`` that was not made yet."""
         request = self._request.with_values(accuracy=min(accuracies))
-        light: list[float] = []
+        stages: list[dict[str, float]] = []
         found: list[tuple[float, float]] = []
 
         def again() -> float:
@@ -222,10 +230,11 @@ class Runs:
                 if not found:
                     error = self._judge.error(self._irradiance(shots))
                     found.append((error, shots.manifest.mc_error or 0.0))
-            light.append(seconds["transport"] + seconds["optics"])
-            return seconds["total"]
+            total = seconds.pop("total")
+            stages.append(seconds)
+            return total
 
-        return _Run(accuracies, Timed(again), light, found)
+        return _Run(accuracies, Timed(again), stages, found)
 
     def _irradiance(self, shots: Capture) -> FloatArray:
         """(shots, pixels, pixels) expected irradiance that a capture was exposed to [W m^-2]."""

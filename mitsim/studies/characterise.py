@@ -460,15 +460,20 @@ class Frames:
     def measure(self, job: Job) -> Session:
         """What the frames say, which are taken one after the other; ``job`` is told how far it is."""
         job.progress("light", 0.0)
-        steps = in_threads(
-            lambda step: self._pair(step[1], self.exposure_s, "ladder", step[0]), [*enumerate(self.electrons)]
-        )
+        with job.clock.stage("light"):
+            steps = in_threads(
+                lambda step: self._pair(step[1], self.exposure_s, "ladder", step[0]), [*enumerate(self.electrons)]
+            )
         job.progress("dark", 0.4)
-        dark = in_threads(lambda step: self._pair(0.0, step[1], "dark series", step[0]), [*enumerate(self.dark_times)])
+        with job.clock.stage("dark"):
+            dark = in_threads(
+                lambda step: self._pair(0.0, step[1], "dark series", step[0]), [*enumerate(self.dark_times)]
+            )
         job.progress("stacks", 0.5)
-        stacks = in_threads(
-            lambda light: emva.stack_of(self._frames(*light)), [(0.0, "dark stack"), (self.half, "bright stack")]
-        )
+        with job.clock.stage("stacks"):
+            stacks = in_threads(
+                lambda light: emva.stack_of(self._frames(*light)), [(0.0, "dark stack"), (self.half, "bright stack")]
+            )
         return Session(
             shape=self.shape,
             photons=self.photons,

@@ -24,7 +24,7 @@ from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import Channel, read_frame
 from mitsim.core.files import write_json
-from mitsim.core.job import Clock, Job
+from mitsim.core.job import Job
 from mitsim.core.recorders import frame_name
 from mitsim.core.runs import Capture
 from mitsim.devices.session import load_recipe
@@ -122,14 +122,14 @@ def _run(bench: Bench, folder: Path, request: Request, names: tuple[str, ...], j
         plan = bench.plan(**request.model_dump())
     light = trace_request(bench, plan, job)
     shots = expose(light, request.patterns, folder / "run", job)
-    session = replace(job, clock=Clock())
+    session = job.apart("calibration ")
     factors = bench.calibrate(request.seed, request.accuracy, output=folder / "calibration", job=session)
     job.clock.add(session.clock.seconds(), "calibration ")
     comparison, families = Comparison(light, factors), {}
     with job.clock.stage("compare families"):
         for index, name in enumerate(names):
             families[name] = comparison.family(name, shots if name == request.patterns else None)
-            job.progress(label(name), (index + 1) / len(names))
+            job.progress(f"compare families: {label(name)}", (index + 1) / len(names))
     with job.clock.stage("views"):
         view = pinhole_view(bench, load_recipe().board_reflectance, request.seed)
         frames = {_caption("uniform", 0, 1): comparison.white(), **_frames(shots, folder / "run", request.patterns)}

@@ -177,7 +177,8 @@ def measure(bench: Bench, request: Request, job: Job) -> DiffractionFindings:
         shadows += [shadow_row(name, cameras) for name in cameras]
         quality += list(trials.idealised_rows(cameras))
     job.progress("rendered session", 0.0)
-    quality += list(trials.rendered_rows(light, request.accuracy, job))
+    with job.clock.stage("rendered session"):
+        quality += list(trials.rendered_rows(light, request.accuracy, job))
     return DiffractionFindings(bench, request.patterns, tuple(shadows), tuple(quality))
 
 

@@ -11,6 +11,7 @@ import re
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -183,7 +184,7 @@ def test_study_accuracy(call: Callable[..., Any], lab: Any, tmp_path: Path, monk
     assert (study["scene"], study["patterns"], study["output"]) == (str(lab.scene), "uniform", str(tmp_path / "study"))
     assert study["rows"] and study["left_out"] and number(study["took"])
     written = {path.name for path in (tmp_path / "study").iterdir()}
-    assert written == {"accuracy.json", "accuracy.png", "effects.png"}
+    assert written == {"accuracy.json", "accuracy.png", "stages.png", "effects.png"}
 
 
 def test_study_solver(call: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -370,24 +371,58 @@ def on_a_terminal(
     return capsys.readouterr().out, b"".join(seen).decode()
 
 
-@pytest.mark.parametrize("verb", ["capture", "calibrate", "render"])
-def test_a_terminal_sees_a_bar_that_goes_away(
+@pytest.mark.parametrize("verb", ["plan", "capture", "calibrate", "render", "reconstruct"])
+def test_a_terminal_sees_rows_that_go_away(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], lab: Any, tmp_path: Path, verb: str
 ) -> None:
     arguments = {
+        "plan": ("plan", *lab.arguments, "--patterns", "dots:4"),
         "capture": ("capture", *lab.arguments, "--patterns", "dots:4", "-o"),
         "calibrate": ("calibrate", *lab.arguments, "-o"),
         "render": ("render", lab.scene, "--spp", 256, "-o"),
+        "reconstruct": ("reconstruct", lab.run, "--calibration", lab.calibration, "-o"),
     }[verb]
-    out, err = on_a_terminal(monkeypatch, capsys, *arguments, tmp_path / "loud.exr")
-    assert "\x1b" not in out and str(tmp_path / "loud.exr") in out
-    last = {"capture": "frames", "calibrate": "vertical stripes", "render": "reference"}[verb]
-    assert last in err and "━" in err
-    assert err.rstrip().endswith("\x1b[2K"), "the bar's line is erased"
+
+    monkeypatch.setattr("mitsim.cli.screen._SHORTEST_S", 0.0)  # the laboratory's stages take no time
+
+    def call(name: str, *options: str) -> tuple[str, str]:
+        place = () if verb == "plan" else (tmp_path / name,)
+        return on_a_terminal(monkeypatch, capsys, *arguments, *place, *options)
+
+    out, err = call("loud.exr")
+    assert "\x1b" not in out and (verb == "plan" or str(tmp_path / "loud.exr") in out)
+    rows = {
+        "plan": ("open scene", "plan"),
+        "capture": ("plan", "transport", "frames"),
+        "calibrate": ("plan", "transport", "vertical stripes"),
+        "render": ("reference",),
+        "reconstruct": ("read", "accumulate", "solve"),
+    }[verb]
+    assert all(re.search(rf"{row} [^\n]*━[^\n]* s", err) for row in rows) and "total" in err, "each stage has its row"
+    assert verb not in ("capture", "calibrate") or " s left" in err
+    assert err.rstrip().endswith("\x1b[2K"), "the rows' lines are erased"
+    assert err.count("\x1b[?25l") == err.count("\x1b[?25h") == 1, "and the cursor is there again"
     for option in ("--quiet", "--json"):
-        out, err = on_a_terminal(monkeypatch, capsys, *arguments, tmp_path / f"{option}.exr", option)
+        out, err = call(f"{option}.exr", option)
         assert err == ""
         assert out.startswith("{") == (option == "--json")
+
+
+def test_an_interrupt_leaves_the_terminal_whole(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], lab: Any
+) -> None:
+    """Rows are gone, the cursor is there, and one line says what happened. (Planted: rows that stay.)"""
+
+    def interrupt(*_: object) -> None:
+        time.sleep(0.3)  # a few refreshes
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mitsim.cli._plan_of", interrupt)
+    out, err = on_a_terminal(monkeypatch, capsys, "plan", *lab.arguments)
+    shown, _, after = err.rpartition("\x1b[?25h")
+    assert out == "" and "plan" in shown and "mitsim: interrupted" in after
+    assert re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", after).strip() == "mitsim: interrupted"
+    assert "\x1b[2K" in after
 
 
 def test_a_refusal_on_a_terminal_leaves_one_line(

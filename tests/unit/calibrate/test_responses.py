@@ -140,7 +140,7 @@ def test_progress_of_each_side_rises_to_the_whole() -> None:
     reported: list[tuple[str, float]] = []
     estimate(lit_session(29), Job(progress=lambda stage, part: reported.append((stage, part))))
     for side in SIDES:  # 16 patterns at once, of 32 less the first, which is the uniform one
-        assert [part for stage, part in reported if stage == f"{side} stripes"] == [17 / 32, 1.0]
+        assert [part for stage, part in reported if stage == f"{side} stripes"] == [1 / 32, 17 / 32, 1.0]
 
 
 # ---- shots -----------------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import pty
 import signal
 import subprocess
 import sys
@@ -167,6 +168,25 @@ def test_control_c_on_a_terminal_reaches_both_and_stops_once() -> None:
     os.kill(worker, signal.SIGINT)
     out, err = process.communicate(timeout=20)
     assert (out, err, process.returncode) == ("cleaned up\n", "", 0)
+
+
+def test_a_killed_worker_leaves_the_terminal_whole() -> None:
+    """The cursor that its rows of progress hid is there again, and the line is free. (Planted: nothing written.)"""
+    hidden = "sys.stderr.write('\\x1b[?25lrows'); sys.stderr.flush(); os.kill(os.getpid(), signal.SIGKILL)"
+    command = [sys.executable, "-c", PROGRAM.format(work=hidden)]
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(command, stderr=theirs, env={**os.environ, "TERM": "xterm"})
+    os.close(theirs)
+    seen = b""
+    with contextlib.suppress(OSError):  # the terminal's end, once nobody holds the other one
+        while data := os.read(ours, 4096):
+            seen += data
+    os.close(ours)
+    assert process.wait(timeout=20) == 128 + signal.SIGKILL
+    before, _, after = seen.decode().partition("rows")
+    assert before == "\x1b[?25l" and after.startswith(
+        "\r\x1b[J\x1b[?25hmitsim: the worker process was ended by SIGKILL"
+    )
 
 
 def test_a_second_signal_stops_a_worker_that_does_not_listen() -> None:

@@ -293,7 +293,7 @@ def test_the_folders_are_refused_before_work(
     folders = shots.save(tmp_path / "run"), factors.save(tmp_path / "cal"), tmp_path / "image"
     reconstruct_folders(*folders, 1.0)
     reconstruct_folders(*folders, 1.0)
-    monkeypatch.setattr("mitsim.report.quality.solve", lambda *_: pytest.fail("work was done first"))
+    monkeypatch.setattr("mitsim.report.quality.reconstruct_request", lambda *_: pytest.fail("work was done first"))
     with pytest.raises(MitsimError, match=r"other inputs \(lambda differ\).*overwrite=True"):
         reconstruct_folders(*folders, 2.0)
     (tmp_path / "image" / "result.json").unlink()

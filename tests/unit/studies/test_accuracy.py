@@ -154,7 +154,7 @@ def test_the_front_is_marked_among_what_was_measured(study: AccuracyFindings) ->
 
 
 def test_what_is_written(result: StudyResult, study: AccuracyFindings, folder: Path) -> None:
-    assert {path.name for path in folder.iterdir()} == {"accuracy.json", "accuracy.png", "effects.png"}
+    assert {path.name for path in folder.iterdir()} == {"accuracy.json", "accuracy.png", "stages.png", "effects.png"}
     assert result.payload()["output"] == str(folder) and result.payload()["patterns"] == PATTERNS
     kept = json.loads((folder / "accuracy.json").read_text())
     assert len(kept["rows"]) == len(study.rows) and kept["judge"]["seed"] == SEED + 1
@@ -173,6 +173,21 @@ def test_what_is_written(result: StudyResult, study: AccuracyFindings, folder: P
         "diffraction                 error without it" in text and "judge's own error" in text and str(folder) in text
     )
     assert "extrapolated: one of 4 frames" in text and "mitsim study solver" in text
+
+
+def test_the_plan_is_a_stage_of_its_own(study: AccuracyFindings) -> None:
+    """Stages make up a run's time, and each is a part of its bar. (Planted: the plan left out; starting left
+    out.)"""
+    runs = [row for row in study.rows if row.estimator == "factored"]
+    for row in runs:
+        assert row.stages["start"] == OPENING and row.stages["plan"] > 0
+        assert sum(row.stages.values()) == pytest.approx(row.spread.median, rel=0.1)
+        assert "plan" in row.line()
+    (axes,) = study.figures()["stages.png"].axes
+    names = [bars.get_label() for bars in axes.containers]
+    assert {"plan", "transport", "optics"} <= {*names}
+    for bars, name in zip(axes.containers, names, strict=True):
+        assert [bar.get_width() for bar in bars] == [row.stages.get(name, 0.0) for row in runs]
 
 
 def test_extrapolated_points_are_hollow(study: AccuracyFindings) -> None:
