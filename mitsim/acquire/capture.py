@@ -6,6 +6,7 @@ behind colour filters: :class:`mitsim.acquire.spectral.SpectralBench` says which
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -111,7 +112,7 @@ class Light(SampledLight):
         return Path(path)
 
 
-def trace_request(bench: Apparatus, plan: Plan, job: Job | None = None) -> Light:
+def trace_request(bench: Apparatus, plan: Plan, job: Job | None = None, seed: int | None = None) -> Light:
     """Light by projector pixel, as a plan asks.
 
     Parameters
@@ -120,13 +121,15 @@ def trace_request(bench: Apparatus, plan: Plan, job: Job | None = None) -> Light
         what is traced, and a plan of it.
     job
         clock, progress and limits; MitsimError for work beyond them.
+    seed
+        root of the light's random streams; None: the plan's.
     """
-    job, request = job or Job(), _request(plan)
+    job, request = job or Job(), plan.known_request
     if plan.cost:
         plan.cost.check(request.patterns, job.limits)
     lighting = bench.family(request.patterns, request.seed).lighting
     with job.clock.stage("transport"):
-        light = trace_light(bench, plan, lighting, request.seed, progress=job.progress)
+        light = trace_light(bench, plan, lighting, request.seed if seed is None else seed, progress=job.progress)
     return Light(**{each.name: getattr(light, each.name) for each in fields(light)})
 
 
@@ -142,7 +145,7 @@ def expose(
     patterns, output, job, request
         as for :meth:`Light.expose`, which has the errors raised as well.
     """
-    own = replace(light.plan, request=request_of(light.plan, {}).with_values(patterns=patterns))
+    own = replace(light.plan, request=light.plan.known_request.with_values(patterns=patterns, seed=light.seed))
     bench = SpectralBench(light.bench)
     return capture(bench, request_of(own, request), Task.of(output, job=job), lights=[light]).runs[0]
 
@@ -156,19 +159,36 @@ def request_of(plan: Plan | str, changes: Mapping[str, Any]) -> Request:
         if "patterns" in changes:
             raise ArgumentError("patterns", f"{cut(repr(changes['patterns']))}: beside the plan {plan!r}; give one")
         return Request.of(patterns=plan, **changes)
-    request = _request(plan).with_values(**changes)
-    for name in ("patterns", "accuracy", "seconds", "effects"):
-        if getattr(request, name) != getattr(_request(plan), name):
-            raise ArgumentError(
-                name, f"{changes[name]!r}: the plan was made for {getattr(plan.request, name)!r}; plan anew"
-            )
-    return request
+    return plan.request_with(changes)
 
 
-def _request(plan: Plan) -> Request:
-    if plan.request is None:
-        raise ArgumentError("plan", "was decided without a request; make it by bench.plan")
-    return plan.request
+def check_plan(plan: Plan, bench: SpectralBench, request: Request) -> None:
+    """Refuse a plan that is not one of this bench and request, for which it would be wrong in silence.
+
+    Parameters
+    ----------
+    plan
+        that was made already.
+    bench, request
+        what it is to serve. Another seed does, and other patterns that light the same classes of pixels alike.
+
+    Raises
+    ------
+    ArgumentError
+        with what differs.
+    """
+    plan.check_made_of(bench.whole.deciding)
+    planned = plan.known_request
+    made, asked = (bench.whole.family(each.patterns, each.seed).lighting for each in (planned, request))
+    if not (np.array_equal(made.labels, asked.labels) and np.array_equal(made.weights, asked.weights)):
+        if planned.patterns == request.patterns:
+            raise ArgumentError("seed", f"{request.seed}: draws other {request.patterns}; {plan.made_for('seed')}")
+        raise ArgumentError("patterns", f"{request.patterns!r}: {plan.made_for('patterns')}")
+    settings, n = plan.settings, bench.whole.n
+    blocks = math.isqrt(len(settings.repeats))
+    beyond = max((*settings.occluded, *(settings.sharp.pixels if settings.sharp else ())), default=0) >= n * n
+    if beyond or (blocks and (blocks**2 != len(settings.repeats) or n % blocks)):
+        raise ArgumentError("plan", f"has settings of projector pixels that are not there; there are {n} x {n}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,8 +227,10 @@ def capture(
     """
     task = task or Task()
     job, spent = task.job, task.job.clock.seconds()
-    starting = spent["total"] - spent.get("plan", 0.0)  # a plan that was made already has its own seconds
+    starting = spent["total"] - spent.get("plan", 0.0)
     bench.check(request)
+    if plan is not None:
+        check_plan(plan, bench, request)
     bench = bench.lit_by_lamps(request.effects, request.seed)
     lighting = bench.whole.family(request.patterns, request.seed).lighting
     lines, readings = len(bench.benches), bench.readings
@@ -228,13 +250,17 @@ def capture(
         if colours:
             places.enter_context(colour_folder(task, colours))
         asked = {**request.deciding, "versions": deciding_versions()}
+        if plan is not None and plan.known_request.seed != request.seed:
+            asked["plan_seed"] = plan.known_request.seed  # frames hang on it, and a run is resumed by the same alone
         heads = [RunHead.of({**each.provenance(), **each.identity(), **asked}) for each in readings]
         recorders = [
             places.enter_context(claim_run(place, head, task.resume)) if place else Recorder()
             for place, head in zip(folders, heads, strict=True)
         ]
         with job.planning(request.patterns):
-            plan = (lights[0].plan if lights else plan or bench.plan(request)).taking(start=starting)
+            made = lights[0].plan if lights else plan or bench.plan(request)
+        known = {"plan": spent.get("plan", 0.0)} if plan is not None else {}  # what this run took to have it
+        plan = made.taking(start=starting, **known)
         check(plan.settings, exposing if lights else plan.predicted_seconds)
         if not lights:
             with job.clock.stage("transport"):
@@ -344,17 +370,17 @@ def capture_lines(bench: Apparatus, request: Request, task: Task, plan: Plan | N
     return dict(zip(lines.names, capture(lines, request, task, plan).runs, strict=True))
 
 
-def capture_mosaic(bench: Apparatus, request: Request, task: Task) -> MosaicCapture:
+def capture_mosaic(bench: Apparatus, request: Request, task: Task, plan: Plan | None = None) -> MosaicCapture:
     """A run of all lines at once.
 
     Parameters
     ----------
-    bench, request, task
+    bench, request, task, plan
         as for :meth:`mitsim.api.bench.Bench.capture_mosaic`, which has the errors raised as well.
     """
     lines = SpectralBench.of(bench, MOSAIC)
     assert isinstance(lines.manifest, MosaicManifest)
-    captured, board = capture(lines, request, task), load_recipe().board_reflectance
+    captured, board = capture(lines, request, task, plan), load_recipe().board_reflectance
     each = [LineTruth(truth.reflectance, truth.standard_error, board) for truth in captured.truths]
     found = MosaicCapture(captured.runs[0], lines.manifest, dict(zip(lines.names, each, strict=True)))
     if found.shots.folder is not None:
