@@ -6,7 +6,6 @@ behind colour filters: :class:`mitsim.acquire.spectral.SpectralBench` says which
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -41,7 +40,7 @@ from mitsim.core.spectral_manifests import MOSAIC, RUN, ColourManifest, MosaicMa
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import load_recipe
 from mitsim.light.light import SampledLight, trace_light, trace_lines
-from mitsim.light.light_file import write_light
+from mitsim.light.light_file import read_light, write_light
 from mitsim.light.memory import frame_seconds, frames_cost
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, Settings
@@ -100,6 +99,26 @@ class Light(SampledLight):
             for patterns that do not fit, an output that cannot be written, or a field that would need other light.
         """
         return expose(self, patterns, output, job, **request)
+
+    @staticmethod
+    @check_arguments
+    def load(path: Path | str, bench: Apparatus) -> Light:
+        """The light in a file that :meth:`save` or ``mitsim transport`` wrote, to single precision.
+
+        Parameters
+        ----------
+        path
+            of the file.
+        bench
+            that the light was traced on.
+
+        Raises
+        ------
+        MitsimError
+            for a file that cannot be read or holds no such light, and light of another bench, with what differs.
+        """
+        light = read_light(Path(path), bench)
+        return Light(**{each.name: getattr(light, each.name) for each in fields(light)})
 
     @check_arguments
     def save(self, path: Path | str) -> Path:
@@ -184,11 +203,6 @@ def check_plan(plan: Plan, bench: SpectralBench, request: Request) -> None:
         if planned.patterns == request.patterns:
             raise ArgumentError("seed", f"{request.seed}: draws other {request.patterns}; {plan.made_for('seed')}")
         raise ArgumentError("patterns", f"{request.patterns!r}: {plan.made_for('patterns')}")
-    settings, n = plan.settings, bench.whole.n
-    blocks = math.isqrt(len(settings.repeats))
-    beyond = max((*settings.occluded, *(settings.sharp.pixels if settings.sharp else ())), default=0) >= n * n
-    if beyond or (blocks and (blocks**2 != len(settings.repeats) or n % blocks)):
-        raise ArgumentError("plan", f"has settings of projector pixels that are not there; there are {n} x {n}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,6 +266,8 @@ def capture(
         asked = {**request.deciding, "versions": deciding_versions()}
         if plan is not None and plan.known_request.seed != request.seed:
             asked["plan_seed"] = plan.known_request.seed  # frames hang on it, and a run is resumed by the same alone
+        if lights and lights[0].plan.request is not None:
+            asked["light"] = {"patterns": lights[0].plan.request.patterns, "seed": lights[0].seed}
         heads = [RunHead.of({**each.provenance(), **each.identity(), **asked}) for each in readings]
         recorders = [
             places.enter_context(claim_run(place, head, task.resume)) if place else Recorder()

@@ -203,11 +203,7 @@ class Plan:
 
         MitsimError for a plan that was decided without a request, and where the file cannot be written.
         """
-        request = self.known_request
-        settings = {**asdict(self.settings), "effects": sorted(self.settings.effects)}
-        asked = request.model_dump(mode="json", exclude_unset=True)
-        own = plain({**asdict(replace(self, request=None)), "settings": settings, "request": asked})
-        text = json_text({"kind": "plan", "format": FORMAT, "sha256": _digest(own), "plan": own})
+        text = self.as_text()
         if len(text) > MOST_BYTES:
             raise MitsimError(f"plan {path}: would take {len(text)} bytes, and at most {MOST_BYTES} are read; keep it")
         write_text(path, text)
@@ -218,15 +214,23 @@ class Plan:
     def load(path: Path | str) -> Plan:
         """The plan in the file ``path`` that :meth:`save` or ``mitsim plan -o`` wrote.
 
-        MitsimError for a file that cannot be read, is none of a plan or of a later format, breaks a rule of it, or was
-        changed since.
+        MitsimError for a file that cannot be read, is none of a plan or of another version of mitsim, breaks a rule of
+        the format, or was changed since.
         """
-        where, data = f"plan {path}", read_json(path)
+        return Plan.of_data(read_json(path), f"plan {path}")
+
+    def as_text(self) -> str:
+        """The plan as its file has it; ArgumentError for one that was decided without a request."""
+        asked = self.known_request.model_dump(mode="json", exclude_unset=True)
+        settings = {**asdict(self.settings), "effects": sorted(self.settings.effects)}
+        own = plain({**asdict(replace(self, request=None)), "settings": settings, "request": asked})
+        return json_text({"kind": "plan", "format": FORMAT, "sha256": _digest(own), "plan": own})
+
+    @staticmethod
+    def of_data(data: Any, where: str) -> Plan:
+        """The plan of a file's JSON ``data``, which is found ``where``, for messages; MitsimError as :meth:`load`."""
         if not isinstance(data, dict) or data.get("kind") != "plan":
             raise MitsimError(f"{where}: is no file of a plan; give one that `mitsim plan -o` wrote")
-        version = data.get("format")
-        if isinstance(version, int) and version > FORMAT:
-            raise MitsimError(f"{where}: is of format {version}, and {FORMAT} is read here; plan anew")
         writer = _writer(data)
         if writer != __version__:
             raise MitsimError(f"{where}: was made by mitsim {writer}, and this is {__version__}; plan anew")
@@ -241,7 +245,7 @@ class Plan:
             raise MitsimError(f"{where}: plan.settings.effects: no effect {cut(unknown[0])!r}; plan anew")
         if file.sha256 != _digest(data["plan"]):
             raise MitsimError(
-                f"{where}: was changed since it was written; plan anew, or change it in Python and save it"
+                f"{where}: was changed since mitsim wrote it; plan anew, or change it in Python and save it"
             )
         return file.plan
 
@@ -273,27 +277,41 @@ class Plan:
         request = planned.with_values(**changes)
         for name in ("accuracy", "seconds", "effects"):
             if getattr(request, name) != getattr(planned, name):
-                raise ArgumentError(name, f"{changes[name]!r}: {self.made_for(name)}")
+                raise ArgumentError(name, f"{_words(getattr(request, name))}: {self.made_for(name)}")
         return request
 
     def made_for(self, name: str) -> str:
         """That another value of a field ``name`` of the request needs another plan."""
-        return f"the plan was made for {getattr(self.known_request, name)!r}; plan anew"
+        return f"the plan was made for {_words(getattr(self.known_request, name))}; plan anew"
 
     @check_arguments
-    def check_made_of(self, deciding: Mapping[str, Any]) -> None:
-        """ArgumentError where the plan was made of another bench than that of ``deciding``, as
-        :attr:`mitsim.bench.apparatus.Apparatus.deciding` has it: with what differs."""
+    def check_made_of(self, deciding: Mapping[str, Any], argument: str = "plan") -> None:
+        """Refuse a plan of another bench.
+
+        Parameters
+        ----------
+        deciding
+            of this bench (:attr:`mitsim.bench.apparatus.Apparatus.deciding`).
+        argument
+            that brought the plan.
+
+        Raises
+        ------
+        ArgumentError
+            with what differs.
+        """
         if self.made_of is None:
-            raise ArgumentError("plan", "was decided without a bench; make it by bench.plan")
+            raise ArgumentError(argument, "was decided without a bench; make it by bench.plan")
         for what, here in deciding.items():
             differs = _difference(self.made_of.get(what), here)
             if differs is not None:
                 place, planned, found = differs
+                values = f"{place}{_shown(planned)} there, {_shown(found)} here"
+                differs_by = f"the content of {place.strip()} differs" if what == "scene" else values
                 raise ArgumentError(
-                    "plan",
-                    f"was made of another {what}: {place}{_shown(planned)} there, {_shown(found)} here; give what it "
-                    "was made of, or plan anew (seed, exposure, sensor noise and output may differ)",
+                    argument,
+                    f"was made of another {what}: {differs_by}; give what it was made of, or make it anew "
+                    "(seed, exposure, sensor noise and output may differ)",
                 )
 
     def payload(self) -> dict[str, Any]:
@@ -382,6 +400,13 @@ def _difference(one: Any, other: Any, place: str = "") -> tuple[str, Any, Any] |
         each = (_difference(one.get(name), other.get(name), f"{name} ") for name in dict.fromkeys([*one, *other]))
         return next(filter(None, each), None)
     return None if one == other else (place, one, other)
+
+
+def _words(value: Any) -> str:
+    """A value of a request's field in a message."""
+    if isinstance(value, dict):
+        return ",".join(f"{'+' if on else '-'}{name}" for name, on in value.items()) or "none"
+    return repr(value)
 
 
 def _shown(value: Any) -> str:
