@@ -37,6 +37,7 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.recorders import AMBIENT, Recorder, claim_run, frame_name
 from mitsim.core.runs import Capture, LineTruth, MosaicCapture
 from mitsim.core.spectral_manifests import MOSAIC, RUN, ColourManifest, MosaicManifest, write_colours
+from mitsim.devices.patterns import Lighting
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import load_recipe
 from mitsim.light.light import SampledLight, trace_light, trace_lines
@@ -65,6 +66,9 @@ than was asked for. It is stated in all runs; lamp_bench as shipped has 7."""
 _NOISIER = 2.0
 """Monte Carlo error of a family's frames over that of the family the light was traced for, above which that is said:
 6 dB of an image. Families whose shots light as many pixels are alike to a tenth."""
+_AS_DENSE = 0.45
+"""Part of the pixels that a shot lights, over that of the shots that light was planned for, from which the plan's
+systematic error holds: half at least, as of signed patterns beside uniform ones (docs/decisions/0017-sparser-families.md)."""
 _NEGLIGIBLE = 0.1
 """Part of the accuracy below which it does not matter what the Monte Carlo error is made of."""
 
@@ -99,6 +103,14 @@ class Light(SampledLight):
             for patterns that do not fit, an output that cannot be written, or a field that would need other light.
         """
         return expose(self, patterns, output, job, **request)
+
+    @check_arguments
+    def check_serves(self, patterns: str) -> None:
+        """ArgumentError for a family whose total error the light's plan does not tell: one whose shots light fewer
+        pixels than those that it was planned for."""
+        sparser = _sparser(self, self.bench.family(patterns, self.seed).lighting)
+        if sparser:
+            raise ArgumentError("patterns", f"{patterns!r}: {sparser}; trace light for {patterns}, which serves both")
 
     @staticmethod
     @check_arguments
@@ -164,6 +176,8 @@ def expose(
     patterns, output, job, request
         as for :meth:`Light.expose`, which has the errors raised as well.
     """
+    if request.get("noise_fraction") is not None:
+        raise ArgumentError("noise_fraction", f"{request['noise_fraction']}: light is traced already; leave it out")
     own = replace(light.plan, request=light.plan.known_request.with_values(patterns=patterns, seed=light.seed))
     bench = SpectralBench(light.bench)
     return capture(bench, request_of(own, request), Task.of(output, job=job), lights=[light]).runs[0]
@@ -436,13 +450,32 @@ def _warnings(light: SampledLight, totals: Totals, shooting: Shooting, request: 
 
 
 def _foreign(light: SampledLight, totals: Totals, request: Request) -> str:
-    """Why frames are noisier than the light was planned for, and what to do; empty where they are not."""
+    """Why frames are noisier than the light was planned for, or their error is not known, and what to do; empty where
+    neither is so."""
     traced = light.plan.request.patterns if light.plan.request else request.patterns
-    if traced == request.patterns or totals.mc_error <= _NOISIER * light.sampling_error:
+    if traced == request.patterns:
+        return ""
+    if totals.mc_error > _NOISIER * light.sampling_error:
+        return (
+            f"the light was traced for {traced}, whose frames it leaves {light.sampling_error:.1e} off, those of "
+            f"{request.patterns} {totals.mc_error:.1e}, and their image as much noisier; trace it for "
+            f"{request.patterns}"
+        )
+    sparser = _sparser(light, light.bench.family(request.patterns, request.seed).lighting)
+    return f"{sparser}; trace it for {request.patterns}" if sparser else ""
+
+
+def _sparser(light: SampledLight, lighting: Lighting) -> str:
+    """That shots of a ``lighting`` light fewer pixels than those that a ``light`` was planned for, so that more of what
+    the plan left out shows; empty where they do not."""
+    planned = light.plan.known_request.patterns
+    both = light.bench.family(planned, light.seed).lighting, lighting
+    made, other = (float(each.weights.mean(axis=0)[each.labels].mean()) for each in both)
+    if other >= _AS_DENSE * made:
         return ""
     return (
-        f"the light was traced for {traced}, whose frames it leaves {light.sampling_error:.1e} off, those of "
-        f"{request.patterns} {totals.mc_error:.1e}, and their image as much noisier; trace it for {request.patterns}"
+        f"its shots light {other:.2g} of the pixels, those of {planned}, which the light was planned for, {made:.2g}: "
+        "what the plan left out shows more in them, by how much it does not tell"
     )
 
 

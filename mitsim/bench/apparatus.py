@@ -318,18 +318,19 @@ class Apparatus:
         folder, own = self.loaded.path.parent, self.counting.model_dump(include=_OF_COLOURS, exclude_none=True)
         files = {os.path.relpath(path, folder): checksum(path) for path in self.loaded.files[1:]}
         lit = self.projector.model_dump(mode="json", exclude={"contrast_ratio", *_NOT_SIMULATED})
-        return plain(
+        stated: dict[str, Any] = plain(
             {
                 "version": deciding_versions(),
                 "colour": None if self.lines is None else {"filters": self.filters is not None, **asdict(self.lines)},
                 "variant": self.variant,
-                "scene": {"itself": checksum(self.loaded.path), **files},
+                "scene": {"its XML": checksum(self.loaded.path), **files},
                 "parameter": self.defines,
                 "board": self.board,
                 "camera": {**self.geometry.identity, **own},
                 "projector": {**lit, "black_level": self.projector.black_level},
             }
         )
+        return stated
 
     @check_arguments
     def in_bands(self, count: int) -> Self:

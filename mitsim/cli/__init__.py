@@ -61,6 +61,8 @@ from mitsim.devices.patterns import pattern_names
 
 if TYPE_CHECKING:
     from mitsim.api.bench import Bench
+    from mitsim.bench.request import Task
+    from mitsim.core.job import Job
     from mitsim.light.plan import Plan
 
 app = typer.Typer(
@@ -249,11 +251,16 @@ class Made:
     """What is there already."""
 
     plan: Path | None = option(None, "file of `mitsim plan -o`: nothing is planned again", "--plan", metavar="FILE")
+    light: Path | None = option(
+        None, "file of `mitsim transport`: nothing is traced again", "--light", metavar="FILE.h5"
+    )
 
-    def known(self, request: Mapping[str, Any]) -> Plan | None:
-        """The plan; None without one. MitsimError for a ``request`` beside it that needs another."""
+    def known_plan(self, request: Mapping[str, Any]) -> Plan | None:
+        """The plan in its file; None without one. MitsimError for a ``request`` beside it that needs another."""
         if self.plan is None:
             return None
+        if self.light is not None:
+            raise MitsimError(f"--plan {self.plan}: light in a file has a plan of its own; leave out --plan or --light")
         found = mitsim.Plan.load(self.plan)
         found.request_with(request)
         return found
@@ -272,6 +279,7 @@ def capture(
     limited: Limited,
 ) -> int:
     """Render, expose and write one frame for each pattern; in colour, for each pattern and line of the projector."""
+    from mitsim.bench.request import Task
     from mitsim.core.job import memory_from_here, memory_since
     from mitsim.core.manifests import MANIFEST
 
@@ -280,7 +288,9 @@ def capture(
     if capturing.ambient_frame == "no":
         refuse_unused(context, ["ambient_shots"], "with --ambient-frame no")
     request = _request_beside(context, capturing, made)
-    known = made.known(request)
+    known = made.known_plan(request)
+    if made.light is not None:
+        refuse_unused(context, ["resume", "colour"], "on --light, which is of all lines and soon exposed")
     asked = mitsim.Request.of(**request) if known is None else known.request_with(request)
     if known is not None and devices.colour == AUTO:
         devices = replace(devices, colour=_chosen_colour(known))
@@ -297,28 +307,61 @@ def capture(
     with limited.job() as job:
         bench = devices.open(scene, variant, job)
         held = memory_from_here()
-        what: Plan | str = known or request.pop("patterns")
-        options = request
-        if colour == AUTO:
-            assert isinstance(what, str), "a plan has chosen"
-            with job.planning(what):
-                chosen = bench.choose_colour(patterns=what, **options)
-            bench, what, options, colour = chosen.bench, chosen.plan, {}, NO if chosen.mono else LINES
-        if by_line(colour):
-            runs = in_colour(bench, colour).capture_lines(what, output, resume, job, **options)
-            payload = payload_of_lines(RUN, {name: run.summary() for name, run in runs.items()}, output)
+        if made.light is not None:
+            payload = _expose(made.light, bench, request, output, job)
         else:
-            take = bench.capture_mosaic if colour == MOSAIC else bench.capture
-            payload = take(what, output, resume, job, **options).summary()
+            payload = _capture(bench, colour, known or request.pop("patterns"), request, Task(output, resume, job))
     payload["memory_bytes"] = memory_since(held)
     return finish(limited.as_json, payload, _capture_lines(payload), payload["warnings"])
 
 
+def _capture(bench: Bench, colour: str, what: Plan | str, request: dict[str, Any], task: Task) -> dict[str, Any]:
+    """JSON of a capture.
+
+    Parameters
+    ----------
+    bench, colour, task
+        what is captured, by which word of --colour, and where it goes.
+    what, request
+        a family or a plan, and fields of the request beside it.
+    """
+    output, resume, job = task.output, task.resume, task.job
+    assert output is not None, "the command line writes a folder"
+    if colour == AUTO:
+        assert isinstance(what, str), "a plan has chosen"
+        with job.planning(what):
+            chosen = bench.choose_colour(patterns=what, **request)
+        bench, what, request, colour = chosen.bench, chosen.plan, {}, NO if chosen.mono else LINES
+    if by_line(colour):
+        runs = in_colour(bench, colour).capture_lines(what, output, resume, job, **request)
+        return payload_of_lines(RUN, {name: run.summary() for name, run in runs.items()}, output)
+    take = bench.capture_mosaic if colour == MOSAIC else bench.capture
+    return take(what, output, resume, job, **request).summary()
+
+
+def _expose(path: Path, bench: Bench, request: dict[str, Any], output: Path, job: Job) -> dict[str, Any]:
+    """JSON of a capture in light of a file.
+
+    Parameters
+    ----------
+    path, bench
+        the file, and what its light was traced on.
+    request, output, job
+        fields of the request, the folder, and clock, progress and limits.
+    """
+    with job.clock.stage("transport"):
+        light = mitsim.Light.load(path, bench)
+        light.check_serves(request["patterns"])
+    return light.expose(request.pop("patterns"), output, job, **request).summary()
+
+
 def _request_beside(context: typer.Context, capturing: Capturing, made: Made) -> dict[str, Any]:
-    """Checked fields of the request: all of them, or those that are given beside a plan that is ``made``."""
+    """Checked fields of the request: all of them, or those that are given beside a plan or light that is ``made``."""
     fields = vars(replace(capturing, exposure=number_of("exposure", capturing.exposure)))
+    if made.plan is not None or made.light is not None:
+        fields = {name: value for name, value in fields.items() if is_given(context, name)}
     if made.plan is not None:
-        return request_of(**{name: value for name, value in fields.items() if is_given(context, name)})
+        return request_of(**fields)
     if capturing.patterns is None:
         raise MitsimError("Missing option '--patterns': give it, or a plan with --plan")
     return request_of(**fields)

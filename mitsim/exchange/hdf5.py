@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitsim.core.arrays import whole_hdf5
+from mitsim.core.arrays import hdf5_errors, whole_hdf5
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.exr import Channels, Metadata, Value
 from mitsim.core.files import FRAME_LIMITS, MOST_BYTES, MOST_PIXELS, check_plain, fits_a_frame, parse_json
