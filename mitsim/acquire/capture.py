@@ -68,7 +68,7 @@ _NOISIER = 2.0
 6 dB of an image. Families whose shots light as many pixels are alike to a tenth."""
 _AS_DENSE = 0.45
 """Part of the pixels that a shot lights, over that of the shots that light was planned for, from which the plan's
-systematic error holds: half at least, as of signed patterns beside uniform ones (docs/decisions/0017-sparser-families.md)."""
+systematic error holds: half at least, as of signed patterns beside uniform ones (docs/decisions, 0017)."""
 _NEGLIGIBLE = 0.1
 """Part of the accuracy below which it does not matter what the Monte Carlo error is made of."""
 

@@ -169,8 +169,9 @@ def _groups_of(light: h5py.Group, lamps: h5py.Group, name: str, size: int, count
 
 def _read_matrix(group: h5py.Group, shape: tuple[int, int]) -> sparse.csr_array:
     """The matrix of that ``shape`` in a ``group``; ValueError for another, or a damaged one."""
-    if tuple(group.attrs["shape"]) != shape:
-        raise ValueError(f"{group.name} is {tuple(group.attrs['shape'])}, and the plan has {shape}")
+    stored = tuple(group.attrs["shape"].tolist())
+    if stored != shape:
+        raise ValueError(f"{group.name} is {stored}, and the plan has {shape}")
     entries = group["indices"].shape
     parts = _numbers(group["data"], entries), group["indices"][:], group["indptr"][:]
     matrix = sparse.csr_array(parts, shape=shape)
