@@ -67,8 +67,8 @@ _NOISIER = 2.0
 """Monte Carlo error of a family's frames over that of the family the light was traced for, above which that is said:
 6 dB of an image. Families whose shots light as many pixels are alike to a tenth."""
 _AS_DENSE = 0.45
-"""Part of the pixels that a shot lights, over that of the shots that light was planned for, from which the plan's
-systematic error holds: half at least, as of signed patterns beside uniform ones (docs/decisions, 0017)."""
+"""Part of the pixels that a shot lights, over that of the shots that light was planned for, from which the plan's bound
+tells what it leaves: at a half what was left came to 1.04 of it, at a quarter to 1.14 (docs/decisions, 0017)."""
 _NEGLIGIBLE = 0.1
 """Part of the accuracy below which it does not matter what the Monte Carlo error is made of."""
 
@@ -106,7 +106,7 @@ class Light(SampledLight):
 
     @check_arguments
     def check_serves(self, patterns: str) -> None:
-        """ArgumentError for a family whose total error the light's plan does not tell: one whose shots light fewer
+        """ArgumentError for ``patterns`` whose total error the light's plan does not tell: their shots light fewer
         pixels than those that it was planned for."""
         sparser = _sparser(self, self.bench.family(patterns, self.seed).lighting)
         if sparser:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 from collections.abc import Iterable, Mapping
@@ -331,6 +332,21 @@ class Apparatus:
             }
         )
         return stated
+
+    @cached_property
+    def devices_digest(self) -> str:
+        """SHA-256 of the devices, where they are, and the projector's light: all that a board in the scene's place
+        shows. Scenes that differ in surfaces and lamps alone have the same."""
+        import mitsuba as mi
+        import numpy as np
+
+        light, pose = mi.traverse(self.loaded.projector), self.loaded.camera.world_transform()
+        said = self.variant, self.geometry.identity, self.sensor, self.projector, self.lines, self.loaded.pixels
+        digest = hashlib.sha256(repr(said).encode())
+        for name, value in (*light.items(), ("camera", pose)):
+            values = np.asarray(getattr(value, "matrix", value))
+            digest.update(f"{name} {values.dtype} {values.shape}".encode() + values.tobytes())
+        return digest.hexdigest()
 
     @check_arguments
     def in_bands(self, count: int) -> Self:

@@ -234,6 +234,9 @@ def _plan_of(bench: Bench, colour: str, request: dict[str, Any]) -> Plan:
     return SpectralBench.of(in_colour(bench, colour), kind).plan(Request.of(**request))
 
 
+# ---- `mitsim capture` ------------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True, kw_only=True)
 class Capturing(Sampling):
     """What is captured, and how long it is exposed: fields of a request."""
@@ -254,6 +257,7 @@ class Made:
     light: Path | None = option(
         None, "file of `mitsim transport`: nothing is traced again", "--light", metavar="FILE.h5"
     )
+    resume: Resume = False
 
     def known_plan(self, request: Mapping[str, Any]) -> Plan | None:
         """The plan in its file; None without one. MitsimError for a ``request`` beside it that needs another."""
@@ -275,7 +279,6 @@ def capture(
     capturing: Capturing,
     made: Made,
     devices: Coloured,
-    resume: Resume = False,
     limited: Limited,
 ) -> int:
     """Render, expose and write one frame for each pattern; in colour, for each pattern and line of the projector."""
@@ -298,7 +301,7 @@ def capture(
     if known is not None and colour != NO and request.pop("patterns", asked.patterns) != known.known_request.patterns:
         raise ArgumentError("patterns", f"{asked.patterns}: {known.made_for('patterns')}")
     begun_in_one = (output / MANIFEST).is_file()  # which auto may decide for
-    check_work(output, resume, "capture", several=by_line(colour) or (colour == AUTO and not begun_in_one))
+    check_work(output, made.resume, "capture", several=by_line(colour) or (colour == AUTO and not begun_in_one))
     devices.check_colour(limited.variant, asked.seconds)
     if colour != MOSAIC:
         devices.check_exposure(asked.timing)
@@ -310,7 +313,7 @@ def capture(
         if made.light is not None:
             payload = _expose(made.light, bench, request, output, job)
         else:
-            payload = _capture(bench, colour, known or request.pop("patterns"), request, Task(output, resume, job))
+            payload = _capture(bench, colour, known or request.pop("patterns"), request, Task(output, made.resume, job))
     payload["memory_bytes"] = memory_since(held)
     return finish(limited.as_json, payload, _capture_lines(payload), payload["warnings"])
 
@@ -431,6 +434,9 @@ def _ambient_lines(payload: Mapping[str, Any]) -> list[str]:
         f"{ambient['part']:.1%} of the frames' light is ambient, noise {ambient['noise']:.2g} of the projector's, "
         f"total error up to {payload['total_error_of_projector']:.1e} of it"
     ]
+
+
+# ---- `mitsim render` and `doctor` ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

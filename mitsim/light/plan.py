@@ -306,7 +306,7 @@ class Plan:
             differs = _difference(self.made_of.get(what), here)
             if differs is not None:
                 place, planned, found = differs
-                values = f"{place}{_shown(planned)} there, {_shown(found)} here"
+                values = f"{place}{_value_text(planned)} there, {_value_text(found)} here"
                 differs_by = f"the content of {place.strip()} differs" if what == "scene" else values
                 raise ArgumentError(
                     argument,
@@ -409,6 +409,6 @@ def _words(value: Any) -> str:
     return repr(value)
 
 
-def _shown(value: Any) -> str:
+def _value_text(value: Any) -> str:
     """A value of JSON in a message."""
     return "none" if value is None else cut(value if isinstance(value, str) else json.dumps(value), 40)

@@ -13,13 +13,11 @@ from mitsim.acquire import spectral
 from mitsim.acquire.capture import Light, check_plan
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import Bench, open_bench
-from mitsim.bench.request import Request
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.runs import Capture
-from mitsim.core.spectral_manifests import RUN, ColourManifest
 from mitsim.devices.projector import Lines
 from mitsim.light.plan import Plan
-from mitsim.light.settings import GROUPS, Settings
+from mitsim.light.settings import GROUPS
 from tests.conftest import write_small_scene
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
@@ -162,28 +160,6 @@ def test_light_of_a_plan_is_that_of_its_request(bench: Bench, file: Path, monkey
     assert first.seed == SEED and other.seed == 6 and (first.flux != other.flux).any()
     assert first.expose("dots:3").manifest.configuration["seed"] == SEED
     assert other.expose("dots:3").manifest.configuration["seed"] == 6
-
-
-def test_a_plan_of_lines_is_of_all_of_them(bench: Bench, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Though it is made on the roughest line alone, and for the request as it was asked, whatever is switched on for
-    lamps. (Planted: what that line is made of; what was switched on.)"""
-    request, lines = Request.of(accuracy=ACCURACY, patterns="dots:3"), Lines((445.0, 638.0), (0.5, 0.5))
-    whole = replace(bench, lines=lines)
-    manifest = ColourManifest.model_validate({"kind": RUN, "channels": [{"name": "445nm", "wavelength_nm": 445.0}]})
-    plan = replace(Plan.load(file), settings=Settings(400.0))
-    asked = list[Request]()
-
-    def plan_request(bench: Bench, request: Request, *_: object) -> Plan:
-        asked.append(request)
-        return replace(plan, request=request, made_of=bench.deciding)
-
-    monkeypatch.setattr(spectral, "plan_request", plan_request)
-    alone = replace(spectral.line_alone(whole, lines.single[1]), counted_lamps=object())  # type: ignore[arg-type]
-    for name, value in {"check": None, "lit_by_lamps": SpectralBench(whole, manifest), "roughest": alone}.items():
-        monkeypatch.setattr(SpectralBench, name, lambda *_, value=value: value)
-    found = SpectralBench(whole, manifest).plan(request)
-    assert [each.effects for each in asked] == [{}, {"ambient": True}] and found.request == request
-    assert found.made_of == whole.deciding != alone.deciding
 
 
 # ---- light in a file
