@@ -29,6 +29,7 @@ from mitsim.devices.lamps import SPECTRA_NM, CountedLamps, Response
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum
 from mitsim.light.grids import Grid
+from mitsim.light.plan import Plan
 from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation, expected_of
 from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer, LampTracer
@@ -309,7 +310,8 @@ def test_lamps_light_that_is_not_counted_flags_a_run(part: float, flagged: bool)
 
 def test_lines_are_planned_with_their_lamps_lit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wherever they are planned: `mitsim plan` has not lit them before. The plan is of all lines together, though it is
-    made on one, and for what was asked. (Planted: planned as they are; what one line is made of; what is switched on.)"""
+    made on one, and for what was asked. (Planted: planned as they are; what one line is made of; what is switched
+    on.)"""
     planned: list[Any] = []
     alone, whole = (
         SimpleNamespace(counted_lamps=object()),
