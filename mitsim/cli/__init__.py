@@ -143,7 +143,7 @@ def _root(
         raise typer.Exit
 
 
-# ---- verbs of a scene ------------------------------------------------------------------------------------------------
+# ---- demo and plan ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,7 @@ def _plan_of(bench: Bench, colour: str, request: dict[str, Any]) -> Plan:
     return SpectralBench.of(in_colour(bench, colour), kind).plan(Request.of(**request))
 
 
-# ---- `mitsim capture` ------------------------------------------------------------------------------------------------
+# ---- capture ---------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -436,7 +436,7 @@ def _ambient_lines(payload: Mapping[str, Any]) -> list[str]:
     ]
 
 
-# ---- `mitsim render` and `doctor` ------------------------------------------------------------------------------------
+# ---- render and doctor -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

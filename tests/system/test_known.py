@@ -44,11 +44,13 @@ def test_a_plan_is_written_and_captured(
         (("--patterns", "dots:2"), ("--patterns 'dots:2': the plan was made for 'dots:4'; plan anew",)),
         (("--accuracy", "1e-3"), ("--accuracy 0.001: the plan was made for 0.005",)),
         (("--effects=-diffraction",), ("--effects -diffraction: the plan was made for none",)),
-        (("-D", "albedo=0.5"), ("--plan was made of another parameter: albedo none there, 0.5 here",)),
         (("--colour", "auto"), ("--colour auto: the plan was made with another word",)),
         (("--light", "light.h5"), ("--plan", "leave out --plan or --light")),
     ):
         mentions(refused("capture", *devices, "--plan", file, *options, "-o", tmp_path / "new"), *fragments)
+    other = lab.write_scene("laboratory_moved", sheet_z=390)
+    line = refused("capture", other, *devices[1:], "--plan", file, "-o", tmp_path / "new")
+    mentions(line, "--plan was made of another scene: the content of its XML differs")
 
 
 def test_light_is_written_and_captured(
@@ -65,6 +67,7 @@ def test_light_is_written_and_captured(
         (("--patterns", "dots:8"), ("--patterns 'dots:8': its shots light", "trace light for dots:8")),
         (("--patterns", "dots:2", "--accuracy", "1e-3"), ("--accuracy 0.001",)),
         (("--patterns", "dots:2", "--noise-fraction", "0.1"), ("--noise-fraction 0.1: light is traced already",)),
-        (("--patterns", "dots:2", "-D", "albedo=0.4"), ("--light was made of another parameter: albedo",)),
     ):
         mentions(refused("capture", *devices, "--light", file, *options, "-o", tmp_path / "new"), *fragments)
+    lit = refused("capture", lab.scene, "--light", file, "--patterns", "dots:2", "-o", tmp_path / "new")
+    mentions(lit, "--light was made of another projector: ")
