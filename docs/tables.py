@@ -36,6 +36,7 @@ from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.projector import Coherence, ProjectorModel
 from mitsim.devices.sensor import EfficiencyCurve, SensorModel
 from mitsim.devices.session import BoardShape, Drift, SessionRecipe
+from mitsim.light.plan import PlanFile
 
 FORMATS = Path(__file__).with_name("formats.md")
 MODELS = (
@@ -46,6 +47,7 @@ MODELS = (
     *(FrameList, StripeFile, DarkFile, Raw),
     *(ColourManifest, Line, ChartPlace),
     MosaicManifest,
+    PlanFile,
 )
 _PLAIN = {"string": "text", "boolean": "true or false", "integer": "whole number", "number": "number"}
 

@@ -37,10 +37,11 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.recorders import AMBIENT, Recorder, claim_run, frame_name
 from mitsim.core.runs import Capture, LineTruth, MosaicCapture
 from mitsim.core.spectral_manifests import MOSAIC, RUN, ColourManifest, MosaicManifest, write_colours
+from mitsim.devices.patterns import Lighting
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import load_recipe
 from mitsim.light.light import SampledLight, trace_light, trace_lines
-from mitsim.light.light_file import write_light
+from mitsim.light.light_file import read_light, write_light
 from mitsim.light.memory import frame_seconds, frames_cost
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, Settings
@@ -65,6 +66,9 @@ than was asked for. It is stated in all runs; lamp_bench as shipped has 7."""
 _NOISIER = 2.0
 """Monte Carlo error of a family's frames over that of the family the light was traced for, above which that is said:
 6 dB of an image. Families whose shots light as many pixels are alike to a tenth."""
+_AS_DENSE = 0.45
+"""Part of the pixels that a shot lights, over that of the shots that light was planned for, from which the plan's bound
+tells what it leaves: at a half what was left came to 1.04 of it, at a quarter to 1.14 (docs/decisions, 0017)."""
 _NEGLIGIBLE = 0.1
 """Part of the accuracy below which it does not matter what the Monte Carlo error is made of."""
 
@@ -101,6 +105,34 @@ class Light(SampledLight):
         return expose(self, patterns, output, job, **request)
 
     @check_arguments
+    def check_serves(self, patterns: str) -> None:
+        """ArgumentError for ``patterns`` whose total error the light's plan does not tell: their shots light fewer
+        pixels than those that it was planned for."""
+        sparser = _sparser(self, self.bench.family(patterns, self.seed).lighting)
+        if sparser:
+            raise ArgumentError("patterns", f"{patterns!r}: {sparser}; trace light for {patterns}, which serves both")
+
+    @staticmethod
+    @check_arguments
+    def load(path: Path | str, bench: Apparatus) -> Light:
+        """The light in a file that :meth:`save` or ``mitsim transport`` wrote, to single precision.
+
+        Parameters
+        ----------
+        path
+            of the file.
+        bench
+            that the light was traced on.
+
+        Raises
+        ------
+        MitsimError
+            for a file that cannot be read or holds no such light, and light of another bench, with what differs.
+        """
+        light = read_light(Path(path), bench)
+        return Light(**{each.name: getattr(light, each.name) for each in fields(light)})
+
+    @check_arguments
     def save(self, path: Path | str) -> Path:
         """Write the light to the HDF5 file ``path``, which is replaced; returns it. Frames are formed of it without
         mitsim, as docs/exchange.md shows.
@@ -111,7 +143,7 @@ class Light(SampledLight):
         return Path(path)
 
 
-def trace_request(bench: Apparatus, plan: Plan, job: Job | None = None) -> Light:
+def trace_request(bench: Apparatus, plan: Plan, job: Job | None = None, seed: int | None = None) -> Light:
     """Light by projector pixel, as a plan asks.
 
     Parameters
@@ -120,14 +152,16 @@ def trace_request(bench: Apparatus, plan: Plan, job: Job | None = None) -> Light
         what is traced, and a plan of it.
     job
         clock, progress and limits; MitsimError for work beyond them.
+    seed
+        root of the light's random streams; None: the plan's.
     """
-    job, request = job or Job(), _request(plan)
+    job, request = job or Job(), plan.known_request
     if plan.cost:
         plan.cost.check(request.patterns, job.limits)
     lighting = bench.family(request.patterns, request.seed).lighting
     job.clock.predict({"transport": plan.predicted["transport"]})
     with job.clock.stage("transport"):
-        light = trace_light(bench, plan, lighting, request.seed, progress=job.progress)
+        light = trace_light(bench, plan, lighting, request.seed if seed is None else seed, progress=job.progress)
     return Light(**{each.name: getattr(light, each.name) for each in fields(light)})
 
 
@@ -143,7 +177,9 @@ def expose(
     patterns, output, job, request
         as for :meth:`Light.expose`, which has the errors raised as well.
     """
-    own = replace(light.plan, request=request_of(light.plan, {}).with_values(patterns=patterns))
+    if request.get("noise_fraction") is not None:
+        raise ArgumentError("noise_fraction", f"{request['noise_fraction']}: light is traced already; leave it out")
+    own = replace(light.plan, request=light.plan.known_request.with_values(patterns=patterns, seed=light.seed))
     bench = SpectralBench(light.bench)
     return capture(bench, request_of(own, request), Task.of(output, job=job), lights=[light]).runs[0]
 
@@ -157,19 +193,31 @@ def request_of(plan: Plan | str, changes: Mapping[str, Any]) -> Request:
         if "patterns" in changes:
             raise ArgumentError("patterns", f"{cut(repr(changes['patterns']))}: beside the plan {plan!r}; give one")
         return Request.of(patterns=plan, **changes)
-    request = _request(plan).with_values(**changes)
-    for name in ("patterns", "accuracy", "seconds", "effects"):
-        if getattr(request, name) != getattr(_request(plan), name):
-            raise ArgumentError(
-                name, f"{changes[name]!r}: the plan was made for {getattr(plan.request, name)!r}; plan anew"
-            )
-    return request
+    return plan.request_with(changes)
 
 
-def _request(plan: Plan) -> Request:
-    if plan.request is None:
-        raise ArgumentError("plan", "was decided without a request; make it by bench.plan")
-    return plan.request
+def check_plan(plan: Plan, bench: SpectralBench, request: Request) -> None:
+    """Refuse a plan that is not one of this bench and request, for which it would be wrong in silence.
+
+    Parameters
+    ----------
+    plan
+        that was made already.
+    bench, request
+        what it is to serve. Another seed does, and other patterns that light the same classes of pixels alike.
+
+    Raises
+    ------
+    ArgumentError
+        with what differs.
+    """
+    plan.check_made_of(bench.whole.deciding)
+    planned = plan.known_request
+    made, asked = (bench.whole.family(each.patterns, each.seed).lighting for each in (planned, request))
+    if not (np.array_equal(made.labels, asked.labels) and np.array_equal(made.weights, asked.weights)):
+        if planned.patterns == request.patterns:
+            raise ArgumentError("seed", f"{request.seed}: draws other {request.patterns}; {plan.made_for('seed')}")
+        raise ArgumentError("patterns", f"{request.patterns!r}: {plan.made_for('patterns')}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,8 +256,10 @@ def capture(
     """
     task = task or Task()
     job, spent = task.job, task.job.clock.seconds()
-    starting = spent["total"] - spent.get("plan", 0.0)  # a plan that was made already has its own seconds
+    starting = spent["total"] - spent.get("plan", 0.0)
     bench.check(request)
+    if plan is not None:
+        check_plan(plan, bench, request)
     bench = bench.lit_by_lamps(request.effects, request.seed)
     lighting = bench.whole.family(request.patterns, request.seed).lighting
     lines, readings = len(bench.benches), bench.readings
@@ -230,13 +280,19 @@ def capture(
         if colours:
             places.enter_context(colour_folder(task, colours))
         asked = {**request.deciding, "versions": deciding_versions()}
+        if plan is not None and plan.known_request.seed != request.seed:
+            asked["plan_seed"] = plan.known_request.seed  # frames hang on it, and a run is resumed by the same alone
+        if lights and lights[0].plan.request is not None:
+            asked["light"] = {"patterns": lights[0].plan.request.patterns, "seed": lights[0].seed}
         heads = [RunHead.of({**each.provenance(), **each.identity(), **asked}) for each in readings]
         recorders = [
             places.enter_context(claim_run(place, head, task.resume)) if place else Recorder()
             for place, head in zip(folders, heads, strict=True)
         ]
         with job.planning(request.patterns):
-            plan = (lights[0].plan if lights else plan or bench.plan(request)).taking(start=starting)
+            made = lights[0].plan if lights else plan or bench.plan(request)
+        known = {"plan": spent.get("plan", 0.0)} if plan is not None else {}  # what this run took to have it
+        plan = made.taking(start=starting, **known)
         check(plan.settings, exposing if lights else plan.predicted_seconds)
         job.clock.predict(exposed if lights else plan.predicted)
         if not lights:
@@ -348,17 +404,17 @@ def capture_lines(bench: Apparatus, request: Request, task: Task, plan: Plan | N
     return dict(zip(lines.names, capture(lines, request, task, plan).runs, strict=True))
 
 
-def capture_mosaic(bench: Apparatus, request: Request, task: Task) -> MosaicCapture:
+def capture_mosaic(bench: Apparatus, request: Request, task: Task, plan: Plan | None = None) -> MosaicCapture:
     """A run of all lines at once.
 
     Parameters
     ----------
-    bench, request, task
+    bench, request, task, plan
         as for :meth:`mitsim.api.bench.Bench.capture_mosaic`, which has the errors raised as well.
     """
     lines = SpectralBench.of(bench, MOSAIC)
     assert isinstance(lines.manifest, MosaicManifest)
-    captured, board = capture(lines, request, task), load_recipe().board_reflectance
+    captured, board = capture(lines, request, task, plan), load_recipe().board_reflectance
     each = [LineTruth(truth.reflectance, truth.standard_error, board) for truth in captured.truths]
     found = MosaicCapture(captured.runs[0], lines.manifest, dict(zip(lines.names, each, strict=True)))
     if found.shots.folder is not None:
@@ -398,13 +454,32 @@ def _warnings(light: SampledLight, totals: Totals, shooting: Shooting, request: 
 
 
 def _foreign(light: SampledLight, totals: Totals, request: Request) -> str:
-    """Why frames are noisier than the light was planned for, and what to do; empty where they are not."""
+    """Why frames are noisier than the light was planned for, or their error is not known, and what to do; empty where
+    neither is so."""
     traced = light.plan.request.patterns if light.plan.request else request.patterns
-    if traced == request.patterns or totals.mc_error <= _NOISIER * light.sampling_error:
+    if traced == request.patterns:
+        return ""
+    if totals.mc_error > _NOISIER * light.sampling_error:
+        return (
+            f"the light was traced for {traced}, whose frames it leaves {light.sampling_error:.1e} off, those of "
+            f"{request.patterns} {totals.mc_error:.1e}, and their image as much noisier; trace it for "
+            f"{request.patterns}"
+        )
+    sparser = _sparser(light, light.bench.family(request.patterns, request.seed).lighting)
+    return f"{sparser}; trace it for {request.patterns}" if sparser else ""
+
+
+def _sparser(light: SampledLight, lighting: Lighting) -> str:
+    """That shots of a ``lighting`` light fewer pixels than those that a ``light`` was planned for, so that more of what
+    the plan left out shows; empty where they do not."""
+    planned = light.plan.known_request.patterns
+    both = light.bench.family(planned, light.seed).lighting, lighting
+    made, other = (float(each.weights.mean(axis=0)[each.labels].mean()) for each in both)
+    if other >= _AS_DENSE * made:
         return ""
     return (
-        f"the light was traced for {traced}, whose frames it leaves {light.sampling_error:.1e} off, those of "
-        f"{request.patterns} {totals.mc_error:.1e}, and their image as much noisier; trace it for {request.patterns}"
+        f"its shots light {other:.2g} of the pixels, those of {planned}, which the light was planned for, {made:.2g}: "
+        "what the plan left out shows more in them, by how much it does not tell"
     )
 
 

@@ -164,9 +164,9 @@ class SpectralBench:
         plan = plan_request(roughest, request, len(self.benches))
         if roughest.counted_lamps is not None and "ambient" not in plan.settings.effects:
             # Beside a weaker line lamps may count.
-            request = request.with_values(effects={**request.effects, "ambient": True})
-            plan = plan_request(roughest, request, len(self.benches))
-        return plan
+            switched = request.with_values(effects={**request.effects, "ambient": True})
+            plan = replace(plan_request(roughest, switched, len(self.benches)), request=request)
+        return replace(plan, made_of=self.whole.deciding)
 
     def roughest(self, seed: int, lit: float = 1.0) -> Apparatus:
         """The line that is planned for: that whose light differs most between neighbouring pixels of the projector,
@@ -235,7 +235,7 @@ def plan_request(bench: Apparatus, request: Request, lines: int = 1) -> Plan:
         plan = plan_within(bench, lighting, request.seconds, request.seed, effects)
     plan = plan.taking(**exposing)
     cost = frames_cost(bench, plan.settings, lighting, plan.predicted_seconds, lines=lines)
-    return replace(plan, request=request, cost=cost)
+    return replace(plan, request=request, cost=cost, made_of=bench.deciding)
 
 
 # -------- All lines at once behind colour filters

@@ -104,25 +104,29 @@ class Bench(Apparatus):
         return plan_request(self, Request.of(patterns=patterns, **request))
 
     @check_arguments
-    def light(self, patterns: str = "dots:7", job: Job | None = None, **request: Any) -> Light:
+    def light(self, patterns: Plan | str = "dots:7", job: Job | None = None, **request: Any) -> Light:
         """Light of the scene by projector pixel, traced once, from which any family can be exposed. MitsimError as
         :meth:`plan`.
 
         Parameters
         ----------
         patterns
-            the family whose frames are to have the accuracy.
+            the family whose frames are to have the accuracy, or a plan of this bench.
         job
             clock, progress and limits.
         **request
             other fields of :class:`mitsim.bench.request.Request`.
         """
-        from mitsim.acquire.capture import trace_request
+        from mitsim.acquire.capture import check_plan, request_of, trace_request
+        from mitsim.acquire.spectral import SpectralBench, plan_request
 
-        job = job or Job()
-        with job.planning(patterns):
-            plan = self.plan(patterns, **request)
-        return trace_request(self, plan, job)
+        job, asked = job or Job(), request_of(patterns, request)
+        if isinstance(patterns, str):
+            with job.planning(patterns):
+                patterns = plan_request(self, asked)
+        else:
+            check_plan(patterns, SpectralBench(self), asked)
+        return trace_request(self, patterns, job, asked.seed)
 
     # ---- Captures ----
 
@@ -148,7 +152,8 @@ class Bench(Apparatus):
         job
             clock, progress and limits.
         **request
-            other fields of :class:`mitsim.bench.request.Request`; of a plan, all but patterns, accuracy and effects.
+            other fields of :class:`mitsim.bench.request.Request`; of a plan, all but accuracy, seconds and effects, and
+            of patterns and seeds such as light the same pixels together.
 
         Raises
         ------
@@ -265,7 +270,7 @@ class Bench(Apparatus):
     @check_arguments
     def capture_mosaic(
         self,
-        patterns: str = "dots:7",
+        patterns: Plan | str = "dots:7",
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
@@ -278,7 +283,7 @@ class Bench(Apparatus):
         Parameters
         ----------
         patterns
-            name of the family.
+            name of the family, or a plan of this bench.
         output
             RUN folder, with the lines' truths and colour.json beside; None keeps all in memory.
         resume, job
@@ -294,9 +299,10 @@ class Bench(Apparatus):
         """
         task = Task.of(output, resume, job)
         with task.importing():
-            from mitsim.acquire.capture import capture_mosaic
+            from mitsim.acquire.capture import capture_mosaic, request_of
 
-        return capture_mosaic(self, Request.of(patterns=patterns, **request), task)
+        known = None if isinstance(patterns, str) else patterns
+        return capture_mosaic(self, request_of(patterns, request), task, known)
 
     @check_arguments
     def calibrate_mosaic(

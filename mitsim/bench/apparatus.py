@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -10,8 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from mitsim.core.configuration import DEFAULT_CAMERA, load_model, locate
-from mitsim.core.environment import DEFAULT_VARIANT, load_variant
+from mitsim.core.environment import DEFAULT_VARIANT, deciding_versions, load_variant
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
+from mitsim.core.files import plain
 from mitsim.devices.patterns import read_name
 from mitsim.scene.outline import Outline, SceneFiles, lit_side
 
@@ -32,6 +35,13 @@ if TYPE_CHECKING:
     from mitsim.transport.transmission import Contact
 
 
+_OF_COLOURS = {"quantum_efficiency_curve", "mosaic", "mosaic_curves"}
+"""Fields of a sensor that weigh light of some wavelengths against that of others."""
+_NOT_SIMULATED = {
+    "name", "luminous_flux_lm", "luminous_efficacy_lm_per_w", "radiant_flux_w", "throw_ratio", "columns", "rows",
+    "pixel_aspect", "laser_class", "assumed", "derived", "source",
+}  # fmt: skip
+"""Fields of a projector that say what it is, and change no light."""
 _SPECKLED_SHOTS = 8
 """Shots whose contrast stands for a family's: those of dots differ by less than a percent, by where the window ends."""
 
@@ -67,6 +77,8 @@ class Apparatus:
     filters
         the camera with its colour filters, which are put over frames; the sensor in ``devices`` then has none, and
         makes one electron of a photon. None: frames are as the sensor has them.
+    board
+        reflectance, depth and shape of the board that stands in the scene's place; None: the scene itself.
     """
 
     loaded: LoadedScene
@@ -76,6 +88,7 @@ class Apparatus:
     lines: Lines | None = None
     counted_lamps: CountedLamps | None = None
     filters: SensorModel | None = None
+    board: Mapping[str, Any] | None = None
 
     @property
     def geometry(self) -> CameraGeometry:
@@ -288,6 +301,7 @@ class Apparatus:
             "scene_files": {str(path): checksum(path) for path in self.loaded.files[1:]},
             "defines": self.defines,
             "variant": self.variant,
+            **({} if self.board is None else {"board": dict(self.board)}),
             **({} if self.lines is None else {"lines": asdict(self.lines)}),
             **({} if self.counted_lamps is None else {"lamps_nm": list(self.counted_lamps.range_nm)}),
             "projector_model": {
@@ -295,6 +309,44 @@ class Apparatus:
                 "black_level": self.projector.black_level,
             },
         }
+
+    @property
+    def deciding(self) -> dict[str, Any]:
+        """All that a plan of it hangs on, by name, as JSON has it: neither where files lie, nor what only
+        exposes frames: the sensor's noise, its full well, and an efficiency that is one number."""
+        from mitsim.core.exr import checksum
+
+        folder, own = self.loaded.path.parent, self.counting.model_dump(include=_OF_COLOURS, exclude_none=True)
+        files = {os.path.relpath(path, folder): checksum(path) for path in self.loaded.files[1:]}
+        lit = self.projector.model_dump(mode="json", exclude={"contrast_ratio", *_NOT_SIMULATED})
+        stated: dict[str, Any] = plain(
+            {
+                "version": deciding_versions(),
+                "colour": None if self.lines is None else {"filters": self.filters is not None, **asdict(self.lines)},
+                "variant": self.variant,
+                "scene": {"its XML": checksum(self.loaded.path), **files},
+                "parameter": self.defines,
+                "board": self.board,
+                "camera": {**self.geometry.identity, **own},
+                "projector": {**lit, "black_level": self.projector.black_level},
+            }
+        )
+        return stated
+
+    @cached_property
+    def devices_digest(self) -> str:
+        """SHA-256 of the devices, where they are, and the projector's light: all that a board in the scene's place
+        shows. Scenes that differ in surfaces and lamps alone have the same."""
+        import mitsuba as mi
+        import numpy as np
+
+        light, pose = mi.traverse(self.loaded.projector), self.loaded.camera.world_transform()
+        said = self.variant, self.geometry.identity, self.sensor, self.projector, self.lines, self.loaded.pixels
+        digest = hashlib.sha256(repr(said).encode())
+        for name, value in (*light.items(), ("camera", pose)):
+            values = np.asarray(getattr(value, "matrix", value))
+            digest.update(f"{name} {values.dtype} {values.shape}".encode() + values.tobytes())
+        return digest.hexdigest()
 
     @check_arguments
     def in_bands(self, count: int) -> Self:

@@ -48,13 +48,14 @@ def before_board(
     """
     if not 0 <= reflectance <= 1:
         raise ArgumentError("reflectance", f"{reflectance:g}: give a number from 0 to 1")
-    where = bench.geometry.scene_distance if depth is None else check_depth(depth)
-    board = board_object(bench, reflectance, shape or BoardShape(), where)
+    where, shape = bench.geometry.scene_distance if depth is None else check_depth(depth), shape or BoardShape()
+    board = board_object(bench, reflectance, shape, where)
     loaded = bench.loaded
     scene = mi.load_dict({"type": "scene", "camera": loaded.camera, "projector": loaded.projector, "board": board})
     bare = replace(loaded, scene=scene, lamps=(), small_lamps=(), mirrors=False, glossy=False)
     alone = replace(bare, unfit=Unfit(), shapes=(), coloured=(), parting=())
-    return replace(bench, loaded=alone)
+    stated = {"reflectance": reflectance, "depth_mm": where, **shape.model_dump()}
+    return replace(bench, loaded=alone, board=stated)
 
 
 def board_object(bench: Apparatus, reflectance: float, shape: BoardShape, depth: float) -> Any:

@@ -10,6 +10,7 @@ import errno
 import signal
 import sys
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -33,6 +34,7 @@ from mitsim.cli.options import (
     Limited,
     LitScene,
     OfPatterns,
+    Overwrite,
     Patterns,
     Resume,
     Sampling,
@@ -51,13 +53,16 @@ from mitsim.cli.options import (
 )
 from mitsim.cli.screen import finish, kernel_lines, payload_of_lines, print_plan, total_of_lines
 from mitsim.cli.study_verb import study
-from mitsim.core.errors import MitsimError, printable
-from mitsim.core.spectral_manifests import LINES, RUN
+from mitsim.core.errors import ArgumentError, MitsimError, printable
+from mitsim.core.spectral_manifests import LINES, MONO, RUN
 from mitsim.core.spectral_manifests import MOSAIC as MOSAIC_RUN
 from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped, end_uncaught, is_stopped
+from mitsim.devices.patterns import pattern_names
 
 if TYPE_CHECKING:
     from mitsim.api.bench import Bench
+    from mitsim.bench.request import Task
+    from mitsim.core.job import Job
     from mitsim.light.plan import Plan
 
 app = typer.Typer(
@@ -138,7 +143,7 @@ def _root(
         raise typer.Exit
 
 
-# ---- verbs of a scene ------------------------------------------------------------------------------------------------
+# ---- demo and plan ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -175,22 +180,40 @@ def demo(
 
 
 @verb
-def plan(scene: Scene, sampling: OfPatterns, devices: Coloured, common: Common) -> int:
+def plan(
+    scene: Scene,
+    sampling: OfPatterns,
+    devices: Coloured,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="file to make, for capture --plan", metavar="FILE.json")
+    ] = None,
+    overwrite: Overwrite = False,
+    *,
+    common: Common,
+) -> int:
     """What will be simulated, why, and what it costs, before any long work."""
+    from mitsim.core.files import check_apart, output_file
     from mitsim.core.job import compiled_kernels, running_seconds
 
     request = request_of(sampling)
     devices.check_colour(common.variant, sampling.seconds)
     devices.check(scene, sampling.patterns)
-    with common.job() as job:
-        bench = devices.open(scene, devices.traced_in(common.variant), job)
+    variant = devices.traced_in(common.variant)
+    with nullcontext() if output is None else output_file(output, overwrite) as place, common.job() as job:
+        bench = devices.open(scene, variant, job)
+        if place is not None:
+            check_apart(place, bench.loaded.files)
         starting = running_seconds()
         with job.planning(sampling.patterns):
             found = _plan_of(bench, devices.colour, request).taking(start=starting)
+        if place is not None:
+            found.save(place)
     if not common.as_json:
         print_plan(found)
+    written = {} if output is None else {"output": str(output)}
     kernels = asdict(compiled_kernels())
-    return finish(common.as_json, {**found.payload(), "kernels": kernels}, kernel_lines(kernels), found.warnings)
+    lines = [*(f"Plan: {text}" for text in written.values()), *kernel_lines(kernels)]
+    return finish(common.as_json, {**found.payload(), **written, "kernels": kernels}, lines, found.warnings)
 
 
 def _plan_of(bench: Bench, colour: str, request: dict[str, Any]) -> Plan:
@@ -212,16 +235,40 @@ def _plan_of(bench: Bench, colour: str, request: dict[str, Any]) -> Plan:
     return SpectralBench.of(in_colour(bench, colour), kind).plan(Request.of(**request))
 
 
+# ---- capture ---------------------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True, kw_only=True)
 class Capturing(Sampling):
     """What is captured, and how long it is exposed: fields of a request."""
 
-    patterns: Patterns
+    patterns: str | None = option(None, pattern_names(), show_default="those of --plan")
     exposure: str = option("auto", "seconds a frame, or auto", metavar="auto|SECONDS")
     exposure_fraction: ExposureFraction = 0.8
     noise_fraction: float | None = option(None, "stop sampling at this part of the sensor's noise", metavar="PART")
     ambient_frame: str = option("auto", "take a frame with the projector off and lamps on", metavar="auto|yes|no")
     ambient_shots: int | None = option(None, "shots of that frame; by the patterns if not given", metavar="N")
+
+
+@dataclass(frozen=True)
+class Made:
+    """What is there already."""
+
+    plan: Path | None = option(None, "file of `mitsim plan -o`: nothing is planned again", "--plan", metavar="FILE")
+    light: Path | None = option(
+        None, "file of `mitsim transport`: nothing is traced again", "--light", metavar="FILE.h5"
+    )
+    resume: Resume = False
+
+    def known_plan(self, request: Mapping[str, Any]) -> Plan | None:
+        """The plan in its file; None without one. MitsimError for a ``request`` beside it that needs another."""
+        if self.plan is None:
+            return None
+        if self.light is not None:
+            raise MitsimError(f"--plan {self.plan}: light in a file has a plan of its own; leave out --plan or --light")
+        found = mitsim.Plan.load(self.plan)
+        found.request_with(request)
+        return found
 
 
 @verb
@@ -231,11 +278,12 @@ def capture(
     scene: Scene,
     output: Annotated[Path, typer.Option("-o", "--output", help="run folder to make", metavar="RUN")],
     capturing: Capturing,
+    made: Made,
     devices: Coloured,
-    resume: Resume = False,
     limited: Limited,
 ) -> int:
     """Render, expose and write one frame for each pattern; in colour, for each pattern and line of the projector."""
+    from mitsim.bench.request import Task
     from mitsim.core.job import memory_from_here, memory_since
     from mitsim.core.manifests import MANIFEST
 
@@ -243,32 +291,91 @@ def capture(
         refuse_unused(context, ["exposure_fraction"], "on an --exposure in seconds")
     if capturing.ambient_frame == "no":
         refuse_unused(context, ["ambient_shots"], "with --ambient-frame no")
-    exposure, colour = number_of("exposure", capturing.exposure), devices.colour
-    request = request_of(replace(capturing, exposure=exposure))
-    variant = devices.traced_in(limited.variant)
+    request = _request_beside(context, capturing, made)
+    known = made.known_plan(request)
+    if made.light is not None:
+        refuse_unused(context, ["resume", "colour"], "on --light, which is of all lines and soon exposed")
+    asked = mitsim.Request.of(**request) if known is None else known.request_with(request)
+    if known is not None and devices.colour == AUTO:
+        devices = replace(devices, colour=_chosen_colour(known))
+    colour, variant = devices.colour, devices.traced_in(limited.variant)
+    if known is not None and colour != NO and request.pop("patterns", asked.patterns) != known.known_request.patterns:
+        raise ArgumentError("patterns", f"{asked.patterns}: {known.made_for('patterns')}")
     begun_in_one = (output / MANIFEST).is_file()  # which auto may decide for
-    check_work(output, resume, "capture", several=by_line(colour) or (colour == AUTO and not begun_in_one))
-    devices.check_colour(limited.variant, capturing.seconds)
+    check_work(output, made.resume, "capture", several=by_line(colour) or (colour == AUTO and not begun_in_one))
+    devices.check_colour(limited.variant, asked.seconds)
     if colour != MOSAIC:
-        devices.check_exposure(mitsim.Request.of(**request).timing)
-    devices.check(scene, capturing.patterns)
+        devices.check_exposure(asked.timing)
+    devices.check(scene, asked.patterns)
     advise(RESUME)
     with limited.job() as job:
         bench = devices.open(scene, variant, job)
         held = memory_from_here()
-        what, options = request.pop("patterns"), request
-        if colour == AUTO:
-            with job.planning(what):
-                chosen = bench.choose_colour(patterns=what, **options)
-            bench, what, options, colour = chosen.bench, chosen.plan, {}, NO if chosen.mono else LINES
-        if by_line(colour):
-            runs = in_colour(bench, colour).capture_lines(what, output, resume, job, **options)
-            payload = payload_of_lines(RUN, {name: run.summary() for name, run in runs.items()}, output)
+        if made.light is not None:
+            payload = _expose(made.light, bench, request, output, job)
         else:
-            take = bench.capture_mosaic if colour == MOSAIC else bench.capture
-            payload = take(what, output, resume, job, **options).summary()
+            payload = _capture(bench, colour, known or request.pop("patterns"), request, Task(output, made.resume, job))
     payload["memory_bytes"] = memory_since(held)
     return finish(limited.as_json, payload, _capture_lines(payload), payload["warnings"])
+
+
+def _capture(bench: Bench, colour: str, what: Plan | str, request: dict[str, Any], task: Task) -> dict[str, Any]:
+    """JSON of a capture.
+
+    Parameters
+    ----------
+    bench, colour, task
+        what is captured, by which word of --colour, and where it goes.
+    what, request
+        a family or a plan, and fields of the request beside it.
+    """
+    output, resume, job = task.output, task.resume, task.job
+    assert output is not None, "the command line writes a folder"
+    if colour == AUTO:
+        assert isinstance(what, str), "a plan has chosen"
+        with job.planning(what):
+            chosen = bench.choose_colour(patterns=what, **request)
+        bench, what, request, colour = chosen.bench, chosen.plan, {}, NO if chosen.mono else LINES
+    if by_line(colour):
+        runs = in_colour(bench, colour).capture_lines(what, output, resume, job, **request)
+        return payload_of_lines(RUN, {name: run.summary() for name, run in runs.items()}, output)
+    take = bench.capture_mosaic if colour == MOSAIC else bench.capture
+    return take(what, output, resume, job, **request).summary()
+
+
+def _expose(path: Path, bench: Bench, request: dict[str, Any], output: Path, job: Job) -> dict[str, Any]:
+    """JSON of a capture in light of a file.
+
+    Parameters
+    ----------
+    path, bench
+        the file, and what its light was traced on.
+    request, output, job
+        fields of the request, the folder, and clock, progress and limits.
+    """
+    with job.clock.stage("transport"):
+        light = mitsim.Light.load(path, bench)
+        light.check_serves(request["patterns"])
+    return light.expose(request.pop("patterns"), output, job, **request).summary()
+
+
+def _request_beside(context: typer.Context, capturing: Capturing, made: Made) -> dict[str, Any]:
+    """Checked fields of the request: all of them, or those that are given beside a plan or light that is ``made``."""
+    fields = vars(replace(capturing, exposure=number_of("exposure", capturing.exposure)))
+    if made.plan is not None or made.light is not None:
+        fields = {name: value for name, value in fields.items() if is_given(context, name)}
+    if made.plan is not None:
+        return request_of(**fields)
+    if capturing.patterns is None:
+        raise MitsimError("Missing option '--patterns': give it, or a plan with --plan")
+    return request_of(**fields)
+
+
+def _chosen_colour(known: Plan) -> str:
+    """The word of --colour that a plan of --colour auto chose; MitsimError for another plan."""
+    if known.colour is None:
+        raise MitsimError("--colour auto: the plan was made with another word of --colour; give that")
+    return NO if known.colour.chosen == MONO else known.colour.chosen
 
 
 def _capture_lines(payload: Mapping[str, Any]) -> list[str]:
@@ -329,6 +436,9 @@ def _ambient_lines(payload: Mapping[str, Any]) -> list[str]:
         f"{ambient['part']:.1%} of the frames' light is ambient, noise {ambient['noise']:.2g} of the projector's, "
         f"total error up to {payload['total_error_of_projector']:.1e} of it"
     ]
+
+
+# ---- render and doctor -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -190,6 +190,15 @@ def whole_hdf5(path: Path | str) -> Iterator[h5py.File]:
             raise kept.error
 
 
+@contextmanager
+def hdf5_errors(path: Path) -> Iterator[None]:
+    """What h5py finds wrong with the file ``path``, in one line."""
+    try:
+        yield
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+        raise MitsimError(f"{path}: damaged, or no HDF5 file ({reason_of(error)}); write or copy it again") from error
+
+
 class _FirstErrorFile:
     """A file whose first error in writing is kept as ``error``: what follows is dropped, as if it were written."""
 

@@ -120,8 +120,8 @@ def _complaint(model: type[pydantic.BaseModel], problem: Any) -> str:
         return f"{field}: {problem['ctx']['error']}" if field else str(problem["ctx"]["error"])
     rule = problem["msg"][0].lower() + problem["msg"][1:]
     hint = _range(model, problem["loc"])
-    if problem["type"] in ("extra_forbidden", "missing"):
-        known = [*_holder(model, problem["loc"][:-1]).model_fields]
+    if problem["type"] in ("extra_forbidden", "missing") and (holder := _holder(model, problem["loc"][:-1])):
+        known = [*holder.model_fields]
         meant = near_name(str(problem["loc"][-1]), known) if problem["type"] == "extra_forbidden" else ""
         rule = "no such field" if problem["type"] == "extra_forbidden" else rule
         hint = f"; {meant}known fields: {', '.join(known)}"
@@ -129,14 +129,17 @@ def _complaint(model: type[pydantic.BaseModel], problem: Any) -> str:
     return f"{field or 'contents'}: got {value}, {rule}{hint}; correct this field"
 
 
-def _holder(model: type[pydantic.BaseModel], place: tuple[str | int, ...]) -> type[pydantic.BaseModel]:
-    """The model of the part at ``place`` inside a ``model``."""
+def _holder(model: type[pydantic.BaseModel], place: tuple[str | int, ...]) -> type[pydantic.BaseModel] | None:
+    """The model of the part at ``place`` inside a ``model``; None for another kind of part."""
     for name in place:
         if isinstance(name, str) and name in model.model_fields:
             kinds = [model.model_fields[name].annotation]
             for kind in kinds:  # grows: a part may stand in a tuple, or be optional
                 kinds += get_args(kind)
-            model = next(kind for kind in kinds if isinstance(kind, type) and issubclass(kind, pydantic.BaseModel))
+            models = [kind for kind in kinds if isinstance(kind, type) and issubclass(kind, pydantic.BaseModel)]
+            if not models:
+                return None
+            model = models[0]
     return model
 
 

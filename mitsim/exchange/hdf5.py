@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitsim.core.arrays import whole_hdf5
-from mitsim.core.errors import ArgumentError, MitsimError, reason_of
+from mitsim.core.arrays import hdf5_errors, whole_hdf5
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.exr import Channels, Metadata, Value
 from mitsim.core.files import FRAME_LIMITS, MOST_BYTES, MOST_PIXELS, check_plain, fits_a_frame, parse_json
 from mitsim.core.job import Cost, Limits
@@ -146,10 +146,10 @@ def open_folders(path: Path | str) -> Iterator[tuple[Run, Calibration | None]]:
 
     path = Path(path)
     check_plain(path)
-    with _in_one_line(path):
+    with hdf5_errors(path):
         file = h5py.File(path, "r")
     with file:
-        with _in_one_line(path):
+        with hdf5_errors(path):
             layout = file.attrs.get("mitsim_exchange")
             if not isinstance(layout, (int, np.integer)) or not 1 <= layout <= LAYOUT:
                 raise MitsimError(
@@ -294,7 +294,7 @@ def _run(file: h5py.Group, path: Path) -> Packed[RunManifest]:
     others = ({ambient.file: "ambient"} if ambient else {}) | ({TRUTH: "truth"} if "truth" in group else {})
 
     def read(name: str) -> tuple[Channels, Metadata]:
-        with _in_one_line(path):
+        with hdf5_errors(path):
             if name in others:
                 return _frame(_group(group, others[name], path), path)
             number = index[name]
@@ -309,7 +309,7 @@ def _calibration(file: h5py.Group, path: Path) -> Packed[CalibrationManifest]:
     text = _text_in(group, "manifest", path)
 
     def read(name: str) -> tuple[Channels, Metadata]:
-        with _in_one_line(path):
+        with hdf5_errors(path):
             return _frame(_group(group, Path(name).stem, path), path)
 
     return Packed(unpack(text, CalibrationManifest, path), text, FACTORS, read, path)
@@ -396,12 +396,3 @@ def _inside(parent: h5py.Group, name: str, kind: Callable[..., Any], path: Path)
     if not isinstance(item, kind):  # type: ignore[arg-type]
         raise MitsimError(f"{path}: {item.name} is a {type(item).__name__.lower()}; export it again")
     return item
-
-
-@contextmanager
-def _in_one_line(path: Path) -> Iterator[None]:
-    """What h5py finds wrong with a file, in one line."""
-    try:
-        yield
-    except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
-        raise MitsimError(f"{path}: damaged, or no HDF5 file ({reason_of(error)}); write or copy it again") from error

@@ -1,9 +1,9 @@
-"""Light by projector pixel in, an HDF5 file out, of which NumPy and SciPy form the frame of any pattern.
+"""Light by projector pixel in, an HDF5 file out, of which NumPy and SciPy form the frame of any pattern; and back.
 
 A frame is dense: through a mask each projector pixel lights most of the sensor. What is sparse is the light before the
 mask, from each projector pixel to the directions and depths at which it is seen. The file holds that as sparse
 matrices, and the mask's shadow as pairs of dense factors. docs/exchange.md has the layout, and the lines that make a
-frame of it.
+frame of it. Beside them it keeps the plan and what else a bench needs to expose the light again.
 """
 
 from __future__ import annotations
@@ -15,10 +15,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import sparse
 
-from mitsim.core.arrays import FloatArray, whole_hdf5
+from mitsim.bench.apparatus import Apparatus
+from mitsim.core.arrays import FloatArray, hdf5_errors, whole_hdf5
 from mitsim.core.errors import MitsimError
-from mitsim.light.grids import GRIDS, Grid
+from mitsim.core.files import check_plain, parse_json
+from mitsim.core.job import Cost, Limits
+from mitsim.light.grids import GRIDS, Grid, LightEstimate
 from mitsim.light.light import SampledLight
+from mitsim.light.plan import Plan
+from mitsim.light.settings import GROUPS
+from mitsim.light.simulation import Simulation
 from mitsim.optics.image_formation import anchor_positions, anchor_weights
 from mitsim.optics.terms import shadow_terms
 from mitsim.sensor.chain import electrons_from_irradiance
@@ -33,6 +39,10 @@ LAYOUT, LAYOUT_OF_TWO_SIDES = 1, 2
 weights for columns too, where these do not lie as rows do."""
 _PACKED: dict[str, Any] = {"shuffle": True, "compression": "gzip", "compression_opts": 1, "fletcher32": True}
 """Filters that every HDF5 library has, and a checksum for each chunk."""
+_KEPT = "kept"
+"""Group of what only mitsim reads."""
+_COPIES = 4
+"""Bytes of memory that a byte of the file takes: numbers of 32 bits become such of 64, and rows are joined."""
 _SPECULAR_BYTES = 2**31
 """Frames of light over mirrors that are formed at once, one a projector pixel."""
 
@@ -69,6 +79,112 @@ def write_light(path: Path, light: SampledLight) -> None:
             file.create_dataset("ambient", data=_ambient(light).astype(np.float32), **_PACKED)
         if specular is not None:
             _write_matrix(file.create_group("glint", track_order=True), specular)
+        if light.plan.request is not None:
+            _keep(file.create_group(_KEPT, track_order=True), light)
+
+
+def _keep(group: h5py.Group, light: SampledLight) -> None:
+    """What a bench needs to expose a ``light`` again, in a ``group``."""
+    group.attrs.update({"paths": light.paths, "reached": light.reached, "samples": json.dumps(dict(light.samples))})
+    for name in ("flux", "flux_error"):
+        group.create_dataset(name, data=getattr(light, name), **_PACKED)
+    for name in ("received", "outside"):
+        group.create_dataset(name, data=[getattr(each, name) for each in light.groups])
+    group.create_dataset("plan", data=light.plan.as_text())
+    for name in GRIDS:
+        lamps = sparse.vstack([each[name][[light.bench.n**2]] for each in light.groups], format="csr")
+        if lamps.nnz:
+            _write_matrix(group.create_group(GRIDS[name].key, track_order=True), sparse.csr_array(lamps))
+
+
+def read_light(path: Path, bench: Apparatus) -> SampledLight:
+    """The light of a file that :func:`write_light` made, to single precision.
+
+    Parameters
+    ----------
+    path
+        of the file.
+    bench
+        that the light was traced on.
+
+    Raises
+    ------
+    MitsimError
+        for a file that cannot be read or is none of light, and light of another bench or version of mitsim.
+    """
+    import h5py  # here: it takes 50 ms to import, and most work reads none
+
+    check_plain(path, "light")
+    with hdf5_errors(path), h5py.File(path, "r") as file:
+        if _KEPT not in file:
+            raise MitsimError(f"light {path}: is no file of this version's `mitsim transport`; trace it again")
+        kept, count = file[_KEPT], bench.n**2
+        bytes_held = list[int]()
+        file.visititems(lambda _, each: bytes_held.append(each.nbytes) if isinstance(each, h5py.Dataset) else None)
+        Cost(memory_bytes=_COPIES * sum(bytes_held)).check(f"light {path}", Limits())
+        plan = Plan.of_data(parse_json(kept["plan"][()].decode()), f"light {path}")
+        plan.check_made_of(bench.deciding, "light")
+        simulation = Simulation(bench, plan.settings)
+        light = {
+            name: _groups_of(file["light"], kept, name, grid.bundle.size, count)
+            for name, grid in simulation.grids.items()
+        }
+        facts = zip(kept["received"][:GROUPS].tolist(), kept["outside"][:GROUPS].tolist(), strict=True)
+        groups = [
+            LightEstimate({name: each[number] for name, each in light.items()}, *totals)
+            for number, totals in enumerate(facts)
+        ]
+        flux, flux_error = (_numbers(kept[name], (count,)) for name in ("flux", "flux_error"))
+        return SampledLight(
+            tuple(groups), simulation, plan, int(file.attrs["seed"]), np.arange(count), flux, flux_error,
+            int(kept.attrs["paths"]), float(file.attrs["mc_error"]), bool(kept.attrs["reached"]),
+            {str(name): int(samples) for name, samples in json.loads(kept.attrs["samples"]).items()},
+        )  # fmt: skip
+
+
+def _groups_of(light: h5py.Group, lamps: h5py.Group, name: str, size: int, count: int) -> list[sparse.csr_array]:
+    """The light of each group in the cells of a grid.
+
+    Parameters
+    ----------
+    light, lamps
+        of the projector's pixels and of lamps, each by grid, where there is any.
+    name, size
+        of the grid, and its cells.
+    count
+        projector pixels.
+    """
+    key, rows = GRIDS[name].key, (count, 1)
+    parts = [
+        _read_matrix(place[key], (GROUPS * each, size)) if key in place else sparse.csr_array((GROUPS * each, size))
+        for place, each in zip((light, lamps), rows, strict=True)
+    ]
+    return [
+        sparse.csr_array(
+            sparse.vstack([part[number * each : (number + 1) * each] for part, each in zip(parts, rows, strict=True)])
+        )
+        for number in range(GROUPS)
+    ]
+
+
+def _read_matrix(group: h5py.Group, shape: tuple[int, int]) -> sparse.csr_array:
+    """The matrix of that ``shape`` in a ``group``; ValueError for another, or a damaged one."""
+    stored = tuple(group.attrs["shape"].tolist())
+    if stored != shape:
+        raise ValueError(f"{group.name} is {stored}, and the plan has {shape}")
+    entries = group["indices"].shape
+    parts = _numbers(group["data"], entries), group["indices"][:], group["indptr"][:]
+    matrix = sparse.csr_array(parts, shape=shape)
+    matrix.check_format(full_check=True)
+    return matrix
+
+
+def _numbers(values: h5py.Dataset, shape: tuple[int, ...]) -> FloatArray:
+    """Finite numbers of that ``shape``; ValueError for others."""
+    found = np.asarray(values[:], dtype=np.float64)
+    if found.shape != shape or not np.isfinite(found).all():
+        raise ValueError(f"{values.name} holds other than {shape} finite numbers")
+    return found
 
 
 def _facts(light: SampledLight) -> dict[str, Any]:

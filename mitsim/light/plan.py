@@ -1,20 +1,27 @@
-"""The effect plan: what was chosen and predicted in; what people and the command line read of it out."""
+"""The effect plan: what was chosen and predicted in; what people, the command line and files read of it out."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from pathlib import Path
+from typing import Any, Literal
 
+import pydantic
+
+from mitsim.bench.effects import EFFECTS
 from mitsim.bench.request import Request
-from mitsim.core.errors import MitsimError, check_arguments
+from mitsim.core.configuration import Configuration, refusal
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
+from mitsim.core.files import MOST_BYTES, json_text, plain, read_json, write_text
 from mitsim.core.images import table
+from mitsim.core.job import Cost
 from mitsim.core.spectral_manifests import MONO
 from mitsim.light.settings import Estimate, Settings
-
-if TYPE_CHECKING:
-    from mitsim.core.job import Cost
+from mitsim.version import __version__
 
 State = Literal["exact", "approximate", "off"]
 _REPORTED = (
@@ -22,6 +29,8 @@ _REPORTED = (
     "sampling_target", "systematic_error", "systematic_bound", "asked_seconds", "colour",
 )  # fmt: skip
 """What the command line says of a plan, besides bytes."""
+FORMAT = 1
+"""Version of a plan's file."""
 
 
 @dataclass(frozen=True)
@@ -126,6 +135,9 @@ class Plan:
         known; None where ``predicted_seconds`` tells it.
     request, cost
         what it is for, and what that takes; None where it was decided without them.
+    made_of
+        what it hangs on of the bench, by name, as :attr:`mitsim.bench.apparatus.Apparatus.deciding` has it; None where
+        it was decided without a request.
     asked_seconds
         for the whole run, of which the accuracy is the finest that they buy; None where the accuracy was asked for.
     colour
@@ -146,6 +158,7 @@ class Plan:
     cost: Cost | None = None
     asked_seconds: float | None = None
     colour: ColourChoice | None = None
+    made_of: Mapping[str, Any] | None = None
 
     @check_arguments
     def row(self, name: str) -> PlanRow:
@@ -179,8 +192,127 @@ class Plan:
         samples = {row.samples_key: row.predicted_samples(self.settings) for row in PASSES.values()}
         settings = {**asdict(replace(self.settings, samples={})), "effects": sorted(self.settings.effects), **samples}
         del settings["samples"]
-        own = replace(self, request=None, cost=None, colour=self.colour or self._uncoloured)
+        own = replace(self, request=None, cost=None, made_of=None, colour=self.colour or self._uncoloured)
         return {**{name: value for name, value in asdict(own).items() if value is not None}, "settings": settings}
+
+    # ---- In a file, and for another bench
+
+    @check_arguments
+    def save(self, path: Path | str) -> Path:
+        """Write the plan to the JSON file ``path``, which is replaced, whole or not at all; returns it.
+
+        MitsimError for a plan that was decided without a request, and where the file cannot be written.
+        """
+        text = self.as_text()
+        if len(text) > MOST_BYTES:
+            raise MitsimError(f"plan {path}: would take {len(text)} bytes, and at most {MOST_BYTES} are read; keep it")
+        write_text(path, text)
+        return Path(path)
+
+    @staticmethod
+    @check_arguments
+    def load(path: Path | str) -> Plan:
+        """The plan in the file ``path`` that :meth:`save` or ``mitsim plan -o`` wrote.
+
+        MitsimError for a file that cannot be read, is none of a plan or of another version of mitsim, breaks a rule of
+        the format, or was changed since.
+        """
+        return Plan.of_data(read_json(path), f"plan {path}")
+
+    def as_text(self) -> str:
+        """The plan as its file has it; ArgumentError for one that was decided without a request."""
+        asked = self.known_request.model_dump(mode="json", exclude_unset=True)
+        settings = {**asdict(self.settings), "effects": sorted(self.settings.effects)}
+        own = plain({**asdict(replace(self, request=None)), "settings": settings, "request": asked})
+        return json_text({"kind": "plan", "format": FORMAT, "sha256": _digest(own), "plan": own})
+
+    @staticmethod
+    def of_data(data: Any, where: str) -> Plan:
+        """The plan of a file's JSON ``data``, which is found ``where``, for messages; MitsimError as :meth:`load`."""
+        if not isinstance(data, dict) or data.get("kind") != "plan":
+            raise MitsimError(f"{where}: is no file of a plan; give one that `mitsim plan -o` wrote")
+        writer = _writer(data)
+        if writer != __version__:
+            raise MitsimError(f"{where}: was made by mitsim {writer}, and this is {__version__}; plan anew")
+        try:
+            file = PlanFile.model_validate_json(json.dumps(data))
+        except pydantic.ValidationError as error:
+            raise refusal(PlanFile, error, where) from error
+        except MitsimError as error:  # of the request
+            raise MitsimError(f"{where}: plan.request: {error}") from error
+        unknown = sorted(file.plan.settings.effects - set(EFFECTS))
+        if unknown:
+            raise MitsimError(f"{where}: plan.settings.effects: no effect {cut(unknown[0])!r}; plan anew")
+        if file.sha256 != _digest(data["plan"]):
+            raise MitsimError(
+                f"{where}: was changed since mitsim wrote it; plan anew, or change it in Python and save it"
+            )
+        return file.plan
+
+    @property
+    def known_request(self) -> Request:
+        """What it is for; ArgumentError for a plan that was decided without a request."""
+        if self.request is None:
+            raise ArgumentError("plan", "was decided without a request; make it by bench.plan")
+        return self.request
+
+    @check_arguments
+    def request_with(self, changes: Mapping[str, Any]) -> Request:
+        """What it is for with other values of some fields; those that the plan hangs on may only be said again.
+
+        Parameters
+        ----------
+        changes
+            values by field of :class:`mitsim.bench.request.Request`.
+
+        Raises
+        ------
+        MitsimError
+            for a value that a field cannot have, or that needs another plan.
+        """
+        planned = self.known_request
+        left = self.colour.taken.error or 0.0 if self.colour else 0.0
+        if left and math.isclose(changes.get("accuracy") or 0.0, math.hypot(planned.accuracy, left)):
+            changes = {**changes, "accuracy": planned.accuracy}  # what colours leave of the accuracy asked for
+        request = planned.with_values(**changes)
+        for name in ("accuracy", "seconds", "effects"):
+            if getattr(request, name) != getattr(planned, name):
+                raise ArgumentError(name, f"{_words(getattr(request, name))}: {self.made_for(name)}")
+        return request
+
+    def made_for(self, name: str) -> str:
+        """That another value of a field ``name`` of the request needs another plan."""
+        return f"the plan was made for {_words(getattr(self.known_request, name))}; plan anew"
+
+    @check_arguments
+    def check_made_of(self, deciding: Mapping[str, Any], argument: str = "plan") -> None:
+        """Refuse a plan of another bench.
+
+        Parameters
+        ----------
+        deciding
+            of this bench (:attr:`mitsim.bench.apparatus.Apparatus.deciding`).
+        argument
+            that brought the plan.
+
+        Raises
+        ------
+        ArgumentError
+            with what differs.
+        """
+        if self.made_of is None:
+            raise ArgumentError(argument, "was decided without a bench; make it by bench.plan")
+        for what, here in deciding.items():
+            differs = _difference(self.made_of.get(what), here)
+            if differs is not None:
+                place, planned, found = differs
+                values = f"{place}{_value_text(planned)} there, {_value_text(found)} here"
+                differs_by = f"the content of {place.strip()} differs" if what == "scene" else values
+                raise ArgumentError(
+                    argument,
+                    f"was made of another {what}: {differs_by}; give what it was made of, or make it anew "
+                    "(seed, exposure, sensor noise and output may differ)",
+                )
 
     def payload(self) -> dict[str, Any]:
         """What the command line reports."""
@@ -232,3 +364,51 @@ class Plan:
         )
         headings = ("effect", "state", "reason", "error if off", "time [s]")
         return table(f"Plan at accuracy {self.accuracy:g}", headings, cells, (*facts, *self.warnings), numbers=2)
+
+
+# ---- Files of plans
+
+
+class PlanFile(Configuration, defer_build=True):
+    """A plan as JSON keeps it."""
+
+    kind: Literal["plan"]
+    """What the file is."""
+    format: int = pydantic.Field(ge=1, le=FORMAT)
+    """Version of this format."""
+    sha256: str
+    """Of `plan` as JSON with sorted keys; a file that was changed is refused."""
+    plan: Plan
+    """Fields of `mitsim.Plan`: those above, what it is for, and what it was made of."""
+
+
+def _writer(data: Any) -> str:
+    """Version of mitsim that wrote the JSON ``data`` of a file, as far as it says so."""
+    for name in ("plan", "made_of", "version", "mitsim"):
+        data = data.get(name) if isinstance(data, dict) else None
+    return cut(str(data))
+
+
+def _digest(own: Any) -> str:
+    """SHA-256 of JSON data."""
+    return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()
+
+
+def _difference(one: Any, other: Any, place: str = "") -> tuple[str, Any, Any] | None:
+    """Where JSON data first differs: the place, and what either has there; None for equal data."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        each = (_difference(one.get(name), other.get(name), f"{name} ") for name in dict.fromkeys([*one, *other]))
+        return next(filter(None, each), None)
+    return None if one == other else (place, one, other)
+
+
+def _words(value: Any) -> str:
+    """A value of a request's field in a message."""
+    if isinstance(value, dict):
+        return ",".join(f"{'+' if on else '-'}{name}" for name, on in value.items()) or "none"
+    return repr(value)
+
+
+def _value_text(value: Any) -> str:
+    """A value of JSON in a message."""
+    return "none" if value is None else cut(value if isinstance(value, str) else json.dumps(value), 40)

@@ -6,14 +6,20 @@ import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.configuration import NonNegative, Positive
 from mitsim.core.parallel import single_threaded_blas
 
 Number = float | FloatArray
+Count = Annotated[int, Field(ge=1, le=4096)]
+"""Of a plan's file: anchors, cells or pixels a side; the largest projector has as many pixels."""
+Index = Annotated[int, Field(ge=0, lt=4096**2)]
+"""The same of its pixels."""
 GROUPS = 4
 """Independent estimates of the light, whose spread is the Monte Carlo error: of light of many paths, whose noise is of
 many kinds, four tell it as well as more (docs/physics.md), and each takes its own accumulating, forming and probing."""
@@ -49,10 +55,10 @@ class SharpPixels:
         error that interpolation between these points leaves, relative to all light.
     """
 
-    pixels: tuple[int, ...]
-    anchors: int
+    pixels: tuple[Index, ...]
+    anchors: Count
     window: tuple[float, float, float, float]
-    left: float = 0.0
+    left: NonNegative = 0.0
 
 
 @dataclass(frozen=True)
@@ -101,24 +107,24 @@ class Settings:
         cells of that raster along a pixel; 0: as few as a raster has.
     """
 
-    depth: float
-    anchors: int = 1
-    layers: tuple[float, ...] = ()
-    subdivision: int = 1
+    depth: Positive
+    anchors: Count = 1
+    layers: tuple[Positive, ...] = ()
+    subdivision: Count = 1
     effects: frozenset[str] = frozenset()
-    samples: Mapping[str, float] = field(default_factory=dict, hash=False)
-    followed_anchors: int = 1
-    followed_width: int = 1
-    coarse_cells: int = 1
+    samples: Mapping[str, NonNegative] = field(default_factory=dict, hash=False)
+    followed_anchors: Count = 1
+    followed_width: Count = 1
+    coarse_cells: Count = 1
     coarse_layers: bool = False
     shared: bool = False
-    repeats: tuple[int, ...] = ()
-    reach: float | None = None
+    repeats: tuple[Index, ...] = ()
+    reach: Positive | None = None
     sharp: SharpPixels | None = None
-    occluded: tuple[int, ...] = ()
-    occluded_anchors: int = 1
+    occluded: tuple[Index, ...] = ()
+    occluded_anchors: Count = 1
     raster: bool = False
-    raster_cells: int = 0
+    raster_cells: Index = 0
 
     @property
     def depths(self) -> tuple[float, ...]:

@@ -546,10 +546,9 @@ def _session(studio: Studio, point: Point, recipe: SessionRecipe, drift: Drift) 
     seed, own = int(point["seed"]), recipe.model_copy(update={"drift": drift})
     if own.model_copy(update={"source": ""}) == load_recipe().model_copy(update={"source": ""}):
         return studio.factors(point.setup, seed)
-    blank = point.setup.with_print(None)
-    return studio.once(
-        "drifting session", 2, (blank, seed, own), lambda: studio.bench(blank).calibrate(seed, recipe=own)
-    )
+    bench = studio.bench(point.setup)
+    key = bench.devices_digest, seed, own
+    return studio.once("drifting session", 2, key, lambda: bench.calibrate(seed, recipe=own))
 
 
 def _move_projector(lit: LitScene, drift: Drift) -> LitScene:

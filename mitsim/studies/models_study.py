@@ -109,14 +109,16 @@ def _measure(studio: Studio, point: Point) -> Found:
 def _session(studio: Studio, setup: Setup, recipe: SessionRecipe) -> PredictedSession:
     """The session of the camera as built, by a recipe's way of signed patterns; its light and responses are kept."""
 
+    bench = studio.bench(setup)
+
     def form() -> PredictedSession:
-        bench, job = studio.bench(setup.with_print(None)), Job()
+        job = Job()
         planned = Session(bench, load_recipe(), 0)
         light = planned.trace(planned.plan(setup.accuracy, job), job)
         session = Session(as_built(bench), load_recipe(), 0)
         return PredictedSession.of(LitSession.of(session, light.behind(session.board), job), job)
 
-    kept: PredictedSession = studio.once("session as built", 1, setup.with_print(None), form)
+    kept: PredictedSession = studio.once("session as built", 1, (bench.devices_digest, setup.accuracy), form)
     return PredictedSession(kept.by(recipe), kept.sums)
 
 

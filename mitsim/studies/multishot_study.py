@@ -119,10 +119,9 @@ def _factors(studio: Studio, point: Point, lit: LitScene) -> Places:
     """Of a camera with its mask at seven places, the middle one on the axis."""
     places = _spread(7, lit.bench.geometry.mask_feature)
     if point["model"] == RENDERED:
-        blank, seed = point.setup.with_print(None), int(point["seed"])  # whatever is printed
-        return studio.once(
-            "places", 1, (blank, places, seed), lambda: calibrated_places(studio.bench(blank), places, seed)
-        )
+        bench, seed = lit.bench, int(point["seed"])
+        key = bench.devices_digest, places, seed  # what a session sees, whatever is printed
+        return studio.once("places", 1, key, lambda: calibrated_places(bench, places, seed))
     return ideal_places(lit.bench, places, lit.board_flux)
 
 

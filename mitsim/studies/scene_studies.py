@@ -41,7 +41,6 @@ from mitsim.light.light import SampledLight
 from mitsim.metrics import psnr
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.reconstruct.background import separate
-from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import FactorOfDepths, parallax_of
 from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import Accumulator, Prepared
@@ -52,7 +51,7 @@ from mitsim.report.plots import curves, image_grid
 from mitsim.sensor.moments import frame_moments
 from mitsim.studies.framework import claims
 from mitsim.studies.framework.claims import Holds
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope, Setup
+from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope
 from mitsim.studies.framework.studio import Studio
 
 # -------- Light of a glossy scene and of its matt twin in
@@ -172,7 +171,6 @@ AS_MATT = "as the matt scene"
 EXPOSURES = (EQUAL_PEAK, AS_MATT)
 _ACCURACY = 3e-3
 """Of the light: a tenth of the artefacts that matter, and of global light, in a third of the time of 1e-3."""
-_VARIED = ("finish", "roughness", "shape", "z")  # of a scene, but not of its devices
 _TRUTHS = ("matt paint", "apparent")
 _GREY = 0.5  # of no error
 _ROUNDING = 1e-12
@@ -209,7 +207,7 @@ def _reflectivity_points(scope: Scope) -> Sequence[Point]:
 
 def _reflectivity_measure(studio: Studio, point: Point) -> Found:
     seed = int(point["seed"])
-    factors = _factors(studio, point.setup, seed)
+    factors = studio.factors(point.setup, seed)
     twin = studio.lit_scene(point.setup.with_parameters(finish="matt"))
     lit = studio.lit_scene(point.setup)
     rows, images = [], dict(zip(_TRUTHS, (twin.truth, lit.truth), strict=True))
@@ -232,13 +230,6 @@ def _reflectivity_measure(studio: Studio, point: Point) -> Found:
             if (name, exposure) == _DRAWN:
                 images |= found.parts
     return Found(tuple(rows), claims.single_precision(images))
-
-
-def _factors(studio: Studio, setup: Setup, seed: int) -> Factors:
-    """A calibration before a board, which does not see what is varied; the shipped three share their devices."""
-    parameters = tuple(each for each in setup.parameters if each[0] not in _VARIED)
-    scene = CARD if setup.scene in SHIPPED and not parameters else setup.scene
-    return studio.factors(replace(setup, scene=scene, parameters=parameters), seed)
 
 
 def _decibels(error: FloatArray) -> float | None:

@@ -256,7 +256,8 @@ def _measure(studio: Studio, point: Point) -> Found:
     setup, seed, way, effect = point.setup, int(point["seed"]), point["way"], str(point["effect"])
     lit = studio.lit_scene(setup)
     scene_ablation = studio.once("ablation", 1, setup, lambda: Ablation.of(lit.light))
-    sessions = studio.once("sessions", 1, (setup, seed), lambda: Sessions(lit.bench, seed))
+    stand = lit.bench.devices_digest, seed  # what a session sees, whatever is printed
+    sessions = studio.once("sessions", 1, stand, lambda: Sessions(lit.bench, seed))
     levels = studio.once(
         "levels", 1, (setup, seed), lambda: Levels(lit, scene_ablation, sessions, str(point["patterns"]), seed)
     )

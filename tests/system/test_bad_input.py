@@ -126,6 +126,13 @@ def test_reconstruct_refuses(refused: Refused, lab: Any, options: list[str], fra
         (["doctor", "--variant", "llvm_ad_grey"], ["llvm_ad_grey", "llvm_ad_mono"]),
         (["develop"], ["develop"]),
         (["capture", "photograph"], ["--output"]),
+        (["capture", "photograph", *NEW], ["--patterns", "a plan with --plan"]),
+        (["capture", "photograph", *NEW, "--plan", "none.json"], ["none.json", "No such file"]),
+        (
+            ["capture", "photograph", *NEW, "--light", "a.h5", "--patterns", "dots:2", "--resume"],
+            ["--resume", "--light"],
+        ),
+        (["capture", "photograph", *NEW, "--light", "a.h5", "--patterns", "dots:2", "--colour", "lines"], ["--colour"]),
         (["reconstruct"], ["RUN"]),
         (["plan"], ["SCENE"]),
     ],

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Where:
     """Where points are measured: which part of them, by how many processes here, or by a Dask scheduler; ``shared`` is
-    a folder of calibrations that studies share."""
+    a folder of plans and calibrations that studies share."""
 
     shard: Shard = field(default_factory=Shard)
     jobs: int | None = None
@@ -338,7 +338,7 @@ def measure_point(name: str, point: Point, shared: str | None = None) -> Found:
     name, point
         of the experiment, and where it is measured.
     shared
-        folder of calibrations that processes share; None: this process keeps its own.
+        folder of plans and calibrations that processes share; None: this process keeps its own.
     """
     return find_experiment(name).measure(cast("Studio", _Studio(shared)), point)
 
@@ -359,7 +359,7 @@ def in_processes(
     jobs
         processes at a time.
     shared
-        folder of calibrations that they share with others; None: with each other alone.
+        folder of plans and calibrations that they share with others; None: with each other alone.
     """
     waiting, tries = deque(batches), dict[Point, int]()
     # Processes are ended, not asked to end: what they leave in their temporary folder goes with it.

@@ -20,6 +20,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import locate
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import PatternFamily
+from mitsim.light.plan import Plan
 from mitsim.metrics import Quality
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.misfit import Misfit
@@ -31,6 +32,8 @@ from mitsim.report.pages import Value
 from mitsim.studies.framework.experiment import Point, Setup, picture
 
 Kept = TypeVar("Kept")
+_KEY_DIGITS = 16
+"""Of a calibration's name: as of a point's."""
 _PRINT = "reflectance.png"
 """What a scene with a print of its own has beside it."""
 
@@ -101,6 +104,19 @@ def reason_of(status: Status, misfit: Misfit | None = None) -> str:
     return "; ".join((*own, *(text.partition(". ")[0].rstrip(".").replace("; ", ", ") for text in status.flags)))
 
 
+def _made_once(place: Path, make: Callable[[Path], object]) -> Path:
+    """A ``place`` that several processes share, with what the first of them ``make``s there: whole or not at all, for
+    it may be ended meanwhile."""
+    place.parent.mkdir(exist_ok=True)
+    with FileLock(place.with_suffix(".lock")):
+        if not place.exists():
+            part = place.with_suffix(".part")
+            shutil.rmtree(part, ignore_errors=True)
+            make(part)
+            part.rename(place)
+    return place
+
+
 class Studio:
     """Benches, their light and their factors, the last few of each; a temporary folder holds scenes with other prints.
 
@@ -109,11 +125,11 @@ class Studio:
     Parameters
     ----------
     shared
-        folder of calibrations that several studios share; None: this one's are its own.
+        folder of plans and calibrations that several studios share; None: this one's are its own.
     """
 
     def __init__(self, shared: str | None = None) -> None:
-        self._shared = None if shared is None else Path(shared) / "calibrations"
+        self._shared = None if shared is None else Path(shared)
         self._folder = tempfile.TemporaryDirectory(prefix="mitsim-study-")
         self._kept: dict[str, OrderedDict[Hashable, Any]] = {}
 
@@ -140,12 +156,12 @@ class Studio:
 
     def lit_scene(self, setup: Setup) -> LitScene:
         """The scene of a ``setup`` in its light."""
-        return self.once("light", 1, setup, lambda: LitScene(self.bench(setup).light(accuracy=setup.accuracy)))
+        return self.once("light", 1, setup, lambda: LitScene(self.bench(setup).light(self._plan(setup))))
 
     def factors(self, setup: Setup, seed: int) -> Factors:
-        """What a session with the camera of a ``setup`` estimates, its noise from ``seed``; whatever is printed."""
-        blank = setup.with_print(None)
-        return self.once("factors", 4, (blank, seed), lambda: self._calibrate(blank, seed))
+        """What a session with the devices of a ``setup`` estimates, its noise from ``seed``; whatever the scene is."""
+        bench = self.bench(setup)
+        return self.once("factors", 4, (bench.devices_digest, seed), lambda: self._calibrate(bench, seed))
 
     def frames(self, setup: Setup, model: str, patterns: str | PatternFamily, seed: int = 0) -> Unexposed:
         """Frames of a family before any exposure.
@@ -207,18 +223,22 @@ class Studio:
         reason = reason_of(found.status, misfit)
         return Image(found.image, quality, found.lam, count, shots.exposure_s, not found.ok, trust, reason)
 
-    def _calibrate(self, blank: Setup, seed: int) -> Factors:
-        """By this studio, or by another that was first: factors in memory are as a file has them."""
+    def _plan(self, setup: Setup) -> Plan:
+        """That of a ``setup``, made by this studio or by another that was first: one in a file is as one in memory."""
+
+        def make() -> Plan:
+            return self.bench(setup).plan(accuracy=setup.accuracy)
+
         if self._shared is None:
-            return self.bench(blank).calibrate(seed)
-        place = self._shared / Point.of(blank, seed=seed).key
-        place.parent.mkdir(exist_ok=True)
-        with FileLock(place.with_suffix(".lock")):
-            if not place.exists():
-                part = place.with_suffix(".part")  # whole or not at all: this process may be ended
-                shutil.rmtree(part, ignore_errors=True)
-                self.bench(blank).calibrate(seed).save(part).rename(place)
-            return load_calibration(place)
+            return make()
+        return Plan.load(_made_once(self._shared / "plans" / Point.of(setup).key, lambda part: make().save(part)))
+
+    def _calibrate(self, bench: Bench, seed: int) -> Factors:
+        """The same of factors."""
+        if self._shared is None:
+            return bench.calibrate(seed)
+        place = self._shared / "calibrations" / f"{bench.devices_digest[:_KEY_DIGITS]}-{seed}"
+        return load_calibration(_made_once(place, lambda part: bench.calibrate(seed).save(part)))
 
     def _open(self, setup: Setup) -> Bench:
         path = setup.scene if setup.picture is None else self._copy_with_print(setup.scene, setup.picture)

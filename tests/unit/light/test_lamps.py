@@ -29,6 +29,7 @@ from mitsim.devices.lamps import SPECTRA_NM, CountedLamps, Response
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum
 from mitsim.light.grids import Grid
+from mitsim.light.plan import Plan
 from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation, expected_of
 from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer, LampTracer
@@ -308,12 +309,15 @@ def test_lamps_light_that_is_not_counted_flags_a_run(part: float, flagged: bool)
 
 
 def test_lines_are_planned_with_their_lamps_lit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wherever they are planned: `mitsim plan` has not lit them before. (Planted: planned as they are.)"""
+    """Wherever they are planned: `mitsim plan` has not lit them before. The plan is of all lines together, though it is
+    made on one, and for what was asked. (Planted: planned as they are; what one line is made of; what is switched
+    on.)"""
     planned: list[Any] = []
     alone, whole = (
         SimpleNamespace(counted_lamps=object()),
         SimpleNamespace(
-            family=lambda patterns, seed: SimpleNamespace(lighting=Lighting(np.zeros(4, int), np.ones((1, 1))))
+            family=lambda patterns, seed: SimpleNamespace(lighting=Lighting(np.zeros(4, int), np.ones((1, 1)))),
+            deciding={"colour": "all lines"},
         ),
     )
     lit = SimpleNamespace(roughest=lambda seed, part: alone)
@@ -328,8 +332,10 @@ def test_lines_are_planned_with_their_lamps_lit(monkeypatch: pytest.MonkeyPatch)
 
     def plan_request(bench: Any, request: Any, lines: int) -> Any:
         planned.append((bench, dict(request.effects), lines))
-        return SimpleNamespace(settings=SimpleNamespace(effects=frozenset()))
+        return Plan(1e-3, (), 1.0, Settings(400.0), 1e-3, 0.0, 0.0, (), request=request, made_of={"colour": "one"})
 
     monkeypatch.setattr("mitsim.acquire.spectral.plan_request", plan_request)
-    SpectralBench.plan(colours, Request.of(patterns="uniform"))
+    asked = Request.of(patterns="uniform")
+    plan = SpectralBench.plan(colours, asked)
+    assert plan.request == asked and plan.made_of == whole.deciding
     assert planned == [(alone, {}, 3), (alone, {"ambient": True}, 3)]

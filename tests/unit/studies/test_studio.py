@@ -109,6 +109,31 @@ def test_studios_share_their_calibrations(studio: Studio, setup: Setup, tmp_path
     assert len([path for path in (tmp_path / "calibrations").iterdir() if path.is_dir()]) == 2
 
 
+def test_scenes_of_the_same_devices_share_factors(studio: Studio, setup: Setup) -> None:
+    """Whatever stands before them; another mask, or a projector that is a micrometre off, is another. (Planted: the
+    scene's parameters in the key; the projector's place left out of it.)"""
+    path = Path(setup.scene)
+    turned, moved, masked = (path.with_name(f"{name}.xml") for name in ("turned", "moved", "masked"))
+    turned.write_text(path.read_text().replace('z="1" angle="180"', 'z="1" angle="170"'))
+    assert studio.factors(replace(setup, scene=str(turned)), 3) is studio.factors(setup, 3)
+    moved.write_text(path.read_text().replace('<translate x="60"/>', '<translate x="60.001"/>'))
+    masked.write_text(path.read_text().replace('mask_distance" value="2"', 'mask_distance" value="2.001"'))
+    digests = {studio.bench(replace(setup, scene=str(each))).devices_digest for each in (path, moved, masked)}
+    assert len(digests) == 3
+
+
+def test_studios_share_their_plans(setup: Setup, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Light of a plan in a file is that of one in memory. (Planted: each plans for itself.)"""
+    with Studio(str(tmp_path)) as first, Studio(str(tmp_path)) as second, Studio() as alone:
+        own = alone.lit_scene(setup).light
+        found = first.lit_scene(setup).light
+        monkeypatch.setattr("mitsim.acquire.spectral.make_plan", lambda *_: 1 / 0)
+        again = second.lit_scene(setup).light
+    assert all(
+        np.array_equal(each.flux, own.flux) and each.sampling_error == own.sampling_error for each in (found, again)
+    )
+
+
 @pytest.mark.slow
 def test_another_picture_is_on_the_print(studio: Studio, shared_scene: Callable[..., Path], variant: str) -> None:
     """Its truth is the picture, averaged over pixels; the scene's own files are as they were."""

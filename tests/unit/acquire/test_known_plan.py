@@ -1,0 +1,230 @@
+"""Captures by a plan that is there already: what planning anew would give, or a refusal that names what differs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsim.acquire import spectral
+from mitsim.acquire.capture import Light, check_plan
+from mitsim.acquire.spectral import SpectralBench
+from mitsim.api.bench import Bench, open_bench
+from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.runs import Capture
+from mitsim.devices.projector import Lines
+from mitsim.light.plan import Plan
+from mitsim.light.settings import GROUPS
+from tests.conftest import write_small_scene
+
+pytestmark = pytest.mark.usefixtures("kept_plans")
+ACCURACY, SEED = 2e-2, 5
+LAMP = '<emitter type="constant"><spectrum name="radiance" value="0.01"/></emitter>'
+
+
+@pytest.fixture(scope="module")
+def bench(shared_scene: Callable[..., Path], variant: str) -> Bench:
+    return open_bench(shared_scene("known_plan", extra=LAMP), variant, albedo=0.4)
+
+
+@pytest.fixture(scope="module")
+def file(bench: Bench, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    plan = bench.plan("dots:3", accuracy=ACCURACY, seed=SEED)
+    return plan.save(tmp_path_factory.mktemp("plan") / "plan.json")
+
+
+@pytest.fixture(scope="module")
+def captured(bench: Bench) -> Capture:
+    return bench.capture("dots:3", accuracy=ACCURACY, seed=SEED)
+
+
+@pytest.fixture
+def no_plans(monkeypatch: pytest.MonkeyPatch) -> None:
+    def make(*_: object) -> None:
+        raise AssertionError("planned again")
+
+    monkeypatch.setattr(spectral, "make_plan", make)
+
+
+@pytest.mark.usefixtures("no_plans")
+def test_frames_are_those_of_a_capture_that_plans_itself(bench: Bench, captured: Capture, file: Path) -> None:
+    """Bit for bit, under the same configuration; what planning took is not this run's. (Planted: the request's seed in
+    place of the plan's; samples of one.)"""
+    shots = bench.capture(Plan.load(file))
+    assert all(np.array_equal(getattr(shots, name), getattr(captured, name)) for name in ("dn", "electrons", "truth"))
+    assert shots.manifest.configuration == captured.manifest.configuration
+    assert shots.manifest.plan is not None and captured.manifest.plan is not None
+    assert shots.manifest.plan["settings"] == captured.manifest.plan["settings"]
+    assert shots.manifest.plan["predicted"]["plan"] == 0 < captured.manifest.plan["predicted"]["plan"]
+
+
+@pytest.mark.usefixtures("no_plans")
+def test_another_seed_exposure_and_the_same_classes_may_be_asked_for(bench: Bench, file: Path, tmp_path: Path) -> None:
+    """The plan's own seed stands in the configuration then, so that no other plan goes on with the run. (Planted: it
+    does not.)"""
+    plan, run = Plan.load(file), tmp_path / "run"
+    shots = bench.capture(plan, run, seed=6, exposure=0.01, patterns="dots:3x3")
+    configuration = shots.manifest.configuration
+    assert configuration["seed"] == 6 and configuration["plan_seed"] == SEED and configuration["exposure"] == 0.01
+    again = replace(plan, request=plan.known_request.with_values(seed=6))
+    with pytest.raises(MitsimError, match="another configuration"):
+        bench.capture(again, run, resume=True, exposure=0.01, patterns="dots:3x3")
+    (run / "frame_00003.exr").unlink()
+    resumed = bench.capture(plan, run, resume=True, seed=6, exposure=0.01, patterns="dots:3x3")
+    assert np.array_equal(resumed.dn, shots.dn)
+
+
+@pytest.mark.usefixtures("no_plans")
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"patterns": "dots:5"}, "^patterns 'dots:5': the plan was made for 'dots:3'; plan anew"),
+        ({"patterns": "hadamard:4"}, "^patterns 'hadamard:4': the plan was made for 'dots:3'"),
+        ({"accuracy": 1e-3}, "^accuracy 0.001: the plan was made for 0.02; plan anew"),
+        ({"effects": "-ambient"}, "^effects -ambient: the plan was made for none"),
+        ({"seconds": 4.0}, "^seconds 4: the accuracy is what they buy"),
+    ],
+)
+def test_what_needs_another_plan_is_refused(
+    bench: Bench, file: Path, tmp_path: Path, changes: dict[str, object], sentence: str
+) -> None:
+    with pytest.raises(ArgumentError, match=sentence):
+        bench.capture(Plan.load(file), tmp_path / "run", **changes)
+    if "patterns" not in changes:
+        with pytest.raises(ArgumentError, match=sentence):
+            bench.light(Plan.load(file), **changes)
+    assert not (tmp_path / "run").exists()
+
+
+def test_patterns_that_another_seed_draws_are_others(bench: Bench) -> None:
+    """(Planted: only the family's name is held against the plan's.)"""
+    plan = bench.plan("random:4", accuracy=0.1, seed=1)
+    check_plan(plan, SpectralBench(bench), plan.known_request)
+    with pytest.raises(ArgumentError, match=r"^seed 2: draws other random:4; the plan was made for 1; plan anew"):
+        bench.capture(plan, seed=2)
+
+
+@pytest.mark.usefixtures("no_plans")
+def test_a_scene_that_changed_by_a_number_is_another(
+    bench: Bench, file: Path, variant: str, tmp_path: Path, captured: Capture
+) -> None:
+    """Wherever it lies: a copy of the same content is the same. (Planted: paths are compared, and not the content.)"""
+    plan, path = Plan.load(file), write_small_scene(tmp_path, "known_plan", extra=LAMP)
+    moved = open_bench(path, variant, albedo=0.4)
+    assert np.array_equal(moved.capture(plan).dn, captured.dn)
+    path.write_text(path.read_text().replace('value="0.01"', 'value="0.011"'))
+    with pytest.raises(ArgumentError, match=r"^plan was made of another scene: the content of its XML differs"):
+        open_bench(path, variant, albedo=0.4).capture(plan)
+    write_small_scene(tmp_path, "known_plan", extra=LAMP, canvas=np.full((16, 32), 255) * (np.arange(32) > 15) * 254)
+    with pytest.raises(ArgumentError, match=r"the content of known_plan_projector\.png differs"):
+        open_bench(path, variant, albedo=0.4).capture(plan)
+
+
+@pytest.mark.usefixtures("no_plans")
+def test_other_devices_are_refused_where_they_matter(bench: Bench, file: Path, variant: str) -> None:
+    """The sensor's noise, its full well and where its numbers come from do not; colour filters, a curve of its
+    efficiency and a board do. (Planted: noise that is refused; a curve, or a board, that is not.)"""
+    plan, devices = Plan.load(file), bench.devices
+    noisier = devices.sensor.model_copy(update={"read_noise_e": 50.0, "full_well_e": 1e6, "source": "elsewhere"})
+    bench.capture(plan)
+    replace(bench, devices=replace(devices, sensor=noisier)).capture(plan)
+    others = {
+        r"parameter: albedo 0\.4 there, 0\.5 here": replace(bench, defines={"albedo": "0.5"}),
+        "projector: blur_pixels 0.0 there, 0.5 here": replace(
+            bench, devices=replace(devices, projector=devices.projector.model_copy(update={"blur_pixels": 0.5}))
+        ),
+        "camera: mask_distance 2.0 there, 1.5 here": replace(
+            bench, devices=replace(devices, camera=devices.camera.model_copy(update={"mask_distance": 1.5}))
+        ),
+        "board: none there": bench.with_board(0.9),
+        "variant: llvm_ad_mono there": replace(bench, variant="llvm_ad_rgb"),
+        "colour: none there": replace(bench, lines=Lines((445.0, 638.0), (0.5, 0.5))),
+        "camera: mosaic none there, RGGB here": replace(
+            bench, filters=devices.sensor.model_copy(update={"mosaic": "RGGB"})
+        ),
+    }
+    for sentence, other in others.items():
+        with pytest.raises(ArgumentError, match=f"^plan was made of another {sentence}"):
+            other.capture(plan)
+        with pytest.raises(ArgumentError, match=f"^plan was made of another {sentence}"):
+            other.light(plan)
+
+
+@pytest.mark.usefixtures("no_plans")
+def test_light_of_a_plan_is_that_of_its_request(bench: Bench, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = Plan.load(file)
+    first, other = bench.light(plan), bench.light(plan, seed=6)
+    assert first.seed == SEED and other.seed == 6 and (first.flux != other.flux).any()
+    assert first.expose("dots:3").manifest.configuration["seed"] == SEED
+    assert other.expose("dots:3").manifest.configuration["seed"] == 6
+
+
+# ---- light in a file
+
+
+@pytest.fixture(scope="module")
+def light(bench: Bench) -> Light:
+    return bench.light("dots:3", accuracy=ACCURACY, seed=SEED)
+
+
+@pytest.mark.usefixtures("no_plans")
+def test_light_of_a_file_is_exposed_as_it_was_traced(bench: Bench, light: Light, tmp_path: Path) -> None:
+    """Frames of another family, its lamps' light and truth, and the errors that are stated. (Planted: lamps left out;
+    the second group for the first; the flux's error left out.)"""
+    path = light.save(tmp_path / "light.h5")
+    found = Light.load(path, bench)
+    assert found.plan == light.plan and len(found.groups) == GROUPS and found.summary() == light.summary()
+    for patterns in ("dots:3", "dots:2", "hadamard:4"):
+        first, second = light.expose(patterns), found.expose(patterns)
+        assert np.abs(second.electrons - first.electrons).max() < 1e-6 * first.electrons.max()
+        assert np.array_equal(first.truth, second.truth)
+        for name in ("mc_error", "total_error_bound", "heaviest_group"):
+            assert getattr(second.manifest, name) == pytest.approx(getattr(first.manifest, name), rel=1e-5)
+        assert second.manifest.configuration == first.manifest.configuration
+        assert second.manifest.configuration["light"] == {"patterns": "dots:3", "seed": SEED}
+
+
+@pytest.mark.usefixtures("no_plans")
+def test_light_that_does_not_fit_is_refused(bench: Bench, light: Light, tmp_path: Path) -> None:
+    """(Planted: another bench is not looked at; a matrix of other cells is read.)"""
+    import h5py
+
+    path = light.save(tmp_path / "light.h5")
+    with pytest.raises(ArgumentError, match=r"^light was made of another parameter: albedo"):
+        Light.load(path, replace(bench, defines={}))
+    found = Light.load(path, bench)
+    with pytest.raises(ArgumentError, match=r"^patterns 'dots:5': its shots light 0\.0\d+ of the pixels"):
+        found.check_serves("dots:5")
+    for patterns in ("dots:3", "dots:2", "uniform", "hadamard:4"):
+        found.check_serves(patterns)
+    with pytest.raises(ArgumentError, match=r"^noise_fraction 0\.1: light is traced already"):
+        found.expose("dots:2", noise_fraction=0.1)
+    with pytest.raises(ArgumentError, match=r"^accuracy 0\.001"):
+        found.expose("dots:2", accuracy=1e-3)
+
+    def damaged(edit: Callable[[h5py.File], object], sentence: str) -> None:
+        light.save(path)
+        with h5py.File(path, "r+") as file:
+            edit(file)
+        with pytest.raises(MitsimError, match=sentence) as refusal:
+            Light.load(path, bench)
+        assert len(str(refusal.value).splitlines()) == 1
+
+    damaged(lambda file: file.pop("kept"), "is no file of this version's `mitsim transport`; trace it again")
+    damaged(lambda file: file["kept"].pop("flux"), "damaged")
+    damaged(lambda file: file["light/fine"].attrs.update(shape=(4, 5)), r"damaged.*/light/fine is \(4, 5\)")
+    damaged(lambda file: file["kept/flux"].write_direct(np.full(256, np.nan)), "finite numbers")
+    damaged(lambda file: file["light/fine/indices"].write_direct(
+        np.full(file["light/fine/indices"].shape, 2**30, np.int32)), "damaged")  # fmt: skip
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(MitsimError, match="damaged, or no HDF5 file"):
+        Light.load(path, bench)
+
+
+def test_light_without_a_request_is_written_and_not_read(bench: Bench, light: Light, tmp_path: Path) -> None:
+    bare = replace(light, plan=replace(light.plan, request=None))
+    with pytest.raises(MitsimError, match="trace it again"):
+        Light.load(bare.save(tmp_path / "light.h5"), bench)
