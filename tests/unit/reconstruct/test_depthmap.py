@@ -340,7 +340,7 @@ def test_columns_that_change_as_a_cubic_are_exact_and_so_are_their_slopes() -> N
 
 def test_an_image_at_given_depths_is_the_tikhonov_image_of_them() -> None:
     """In closed form, at a lambda that takes half of it; and what it leaves, over the data less two unknowns a pixel.
-    (Planted: lambda taken off; one unknown a pixel.)"""
+    (Planted: lambda taken off.)"""
     depths, image = Cubic(4, 2), np.random.default_rng(10).random((4, 4)) + 0.5
     depths.frames = tuple(depths.frame(image, 2e-5, *key) for key in np.ndindex(2, 2))
     model, expected, left = PixelDepths(depths, depths.limit, 2.5e-5), np.zeros((4, 4)), 3.0  # type: ignore[arg-type]
