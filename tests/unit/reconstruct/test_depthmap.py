@@ -216,6 +216,12 @@ def test_a_range_may_be_narrower_than_the_period(patterns: str) -> None:
     assert not reconstruct(flat(380.0, patterns), factors, focus="map", depth_range=(390.0, 440.0)).ok
 
 
+def test_a_range_may_be_narrower_than_a_pixel_of_parallax() -> None:
+    """Of 0.9 pixels. (Planted: no displacement but the range's middle.)"""
+    found = depth_map(flat(380.0, "dots:4"), calibrated(), depth_range=(372.0, 388.0))
+    assert not found.doubt and np.median(np.abs(found.mm - 380)) < 1
+
+
 def test_dark_pixels_have_no_confidence() -> None:
     dark = np.where(np.arange(N) < 12, 0.0, 1.0)
     bench = Layers(*sides(400.0, BESIDE), surfaces=((dark * np.ones((N, 1)), *sides(380.0, BESIDE)),))
