@@ -123,7 +123,7 @@ class DirectRuns:
         found |= {Approximation("cells", count): change for count, change in cells.items()}
         if len(self.layers) > 1:
             first = _FIRST_JUDGES["layers"]
-            layers = ladder(self.layers, lambda count: self._frames(self.layers[count], 2), first, tolerance)
+            layers = ladder(self.layers, lambda count: self._frames(self.layers[count], 2, True), first, tolerance)
             found |= {Approximation("layers", count): change for count, change in layers.items()}
         return found
 
@@ -223,9 +223,11 @@ class DirectRuns:
         places = [np.flatnonzero(shot) if isinstance(shot, np.ndarray) else shot.indices for shot in shots]
         return max(1.0, float(np.mean([len(np.unique(place // width)) for place in places])))
 
-    def _frames(self, layers: tuple[float, ...], subdivision: int) -> FloatArray:
+    def _frames(self, layers: tuple[float, ...], subdivision: int, one_line: bool = False) -> FloatArray:
+        """Frames in so many layers and cells; of the mean wavelength alone where that tells enough: few layers then
+        leave 1.1 to 1.4 times as much (gift_card, metal_blade, corner, cookie_bag, cards), in a third of the time."""
         settings = replace(self.base, layers=layers, subdivision=subdivision)
-        simulation = self.sample.simulation(self.bench, settings)
+        simulation = self.sample.simulation(self.bench, settings, one_line)
         return self._form(simulation, self._path_samples, self.sample.fine, self._sharp)
 
     def _form(
