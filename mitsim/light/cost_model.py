@@ -185,10 +185,12 @@ def unit_costs_of(pilot_result: PilotResult) -> UnitCosts:
     """Those that the ``pilot_result`` measured, where it measured any."""
     forming = pilot_result.forming
     products = float(_products(forming, Numbers.coarsest(), (forming.lit, forming.lit), 1.0, 1.0, 1.0))
-    slower = forming.seconds / (FIXED.frame + FIXED.product * products) if forming.seconds else 1.0
+    timed = forming.seconds / (FIXED.frame + FIXED.product * products)
+    slower = timed or (forming.product or FIXED.product) / FIXED.product
     product = forming.product or slower * FIXED.product
     # The frame that the pilot forms is small: beside its products there is what every frame takes.
-    frame = max(forming.seconds - product * products, 0.0) if forming.product else slower * FIXED.frame
+    both = forming.product and forming.seconds
+    frame = max(forming.seconds - product * products, 0.0) if both else slower * FIXED.frame
     measured = {
         name: sample_cost.seconds for name, sample_cost in pilot_result.sample_costs.items() if sample_cost.seconds
     }

@@ -15,12 +15,10 @@ from mitsim.bench.apparatus import Apparatus
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.parallel import in_threads
 from mitsim.core.seeds import integer
-from mitsim.core.worker import workers
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum
 from mitsim.light.memory import cells_to_choose, drawing_seconds
 from mitsim.light.settings import (
-    GROUPS,
     REPLICATES,
     Approximation,
     Drawn,
@@ -32,8 +30,6 @@ from mitsim.light.settings import (
 )
 from mitsim.light.simulation import Simulation, emission
 from mitsim.optics.fft_shadow import cells_per_pixel
-from mitsim.optics.forming import AccumulatedLight
-from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.image_formation import raster_error
 from mitsim.planner.pilot_samples import EVEN_CELLS, GOOD_ENOUGH, Sample, ladder, noise, norm
 from mitsim.transport.direct import DirectTracer
@@ -168,15 +164,10 @@ class DirectRuns:
         return noise(many), noise(self._form(self._simulation, few, self._fewer))
 
     def forming(self, family: Lighting) -> Forming:
-        """What forming frames of a ``family`` takes; timed with one cell a pixel, its optics prepared."""
+        """What forming frames of a ``family`` takes."""
         simulation = Simulation(self.bench, self.base)
-        rows, weights = self.sample.rows, self.sample.lighting.weights
         fine = simulation.grids["fine"]
         light = fine.bundle.accumulate(self._path_samples[0], self.sample.lighting.labels, self.sample.fine)
-        accumulated, timed = AccumulatedLight(fine.optics, (light[: len(rows)],) * GROUPS), weights[: workers()]
-        started = time.perf_counter()
-        list(ExpectedFrames([accumulated], Lighting(rows, timed), 0))
-        seconds = (time.perf_counter() - started) / len(timed)
         cells = max(fine.bundle.cells)
         geometry = self.bench.geometry
         waves = self.bench.waves
@@ -187,7 +178,6 @@ class DirectRuns:
             terms=float(len(self.bench.spectrum.weights) * geometry.mask_terms),
             shots=len(family.weights),
             classes=family.weights.shape[1],
-            seconds=seconds,
             product=_product_seconds(),
             geometric_terms=float(geometry.mask_terms),
             correlated=(geometry.is_drawn(waves=False), geometry.is_drawn(geometry.diffracts)),
@@ -272,9 +262,9 @@ def tracer_of(simulation: Simulation, pixels: Labels, anchors: int, spread: bool
 _ANCHORS, SMOOTH = 5, 3
 """Anchors a side that tell where light is rough over the sensor, and how many hold all of what is smooth: what a
 polynomial of that many coefficients leaves. Falloff leaves 1e-7 of three (`cards`, `cookie_bag`), an edge a third."""
-_FIRST, _NEAR = 4, 16
+_FIRST, _NEAR = 2, 16
 """Rays of every pixel, and of each near one that is hidden in part: sixteen meet an edge that crosses a tenth of it
-four times in five."""
+four times in five; of every pixel two do, as an edge crosses many in a row."""
 _LEFT = 0.1
 """Part of the accuracy that may stay on the other pixels."""
 _MOST = 1 / 16

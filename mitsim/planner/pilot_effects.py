@@ -34,6 +34,11 @@ _FOLLOWED = tuple(name for name, row in PASSES.items() if not (row.even or row.a
 _WORTH_REPEATING = 0.85
 """Variance times paths, over that of even ones, below which blocks are followed unevenly: short replicates tell it so
 well."""
+_OF_INDIRECT = 0.2
+"""Part of what indirect light is predicted to take that closer replicates of it may take at most."""
+_WORTH_SHARING_S = 0.5
+"""Seconds of indirect light, at fixed unit costs, from which it is looked at whether shared paths take fewer: to see
+that takes 0.13 to 0.28 processor seconds (metal_blade, corner, cookie_bag), and where they do, they save half."""
 _OPEN = 0.1
 """Part of the accuracy that noise may leave open of what coarse cells for indirect light change: a hundredth of the
 budget's square. Where more is, the capture follows ten times as many paths as the closer replicates, or more (corner at
@@ -123,11 +128,19 @@ class EffectRuns:
         seen = coarsening_changes("indirect", partial(self._indirect, self._first_bounced, samples), ())
         value, bound = ErrorCovariance.between(seen, self.light**2).estimate(seen)
         wanted = math.ceil(samples * (bound**2 - value**2) / (_OPEN * self.accuracy) ** 2)
-        more = min(wanted, self.sample.closer(tracer.paths_per_sample))
+        most = _OF_INDIRECT * self._indirect_samples(replicates, samples) / REPLICATES
+        more = min(wanted, self.sample.closer(tracer.paths_per_sample), math.ceil(most))
         if more <= samples:
             return replicates, samples
         # Seeds of their own: that the first replicates are vague says nothing of these.
         return [tracer.trace(integer(seed, "closer"), 0, more) for seed in self.seeds], more
+
+    def _indirect_samples(self, replicates: Sequence[PathSamples], samples: int) -> float:
+        """Samples of all groups that the projector's side's light takes, as noisy as in ``replicates`` of so many
+        ``samples``."""
+        seen = self._form(self.simulation, followed=self._by_kind({"indirect": list(replicates)}), samples=samples)
+        cost = SampleCost.relative(noise(seen), self.light, samples, 1)
+        return float(cost.noise.samples_for(self.accuracy))
 
     @property
     def received(self) -> float:
@@ -188,8 +201,12 @@ class EffectRuns:
     @cached_property
     def _shared_or_not(self) -> tuple[SampleCost, bool]:
         """What light over several surfaces takes, and whether it is shared."""
-        plain, tracer = self.sample_cost("indirect"), self._sharing.indirect
-        if not plain.noise.error or not isinstance(tracer, PathReuseTracer) or not tracer.shares():
+        plain = self.sample_cost("indirect")
+        taken = plain.noise.samples_for(self.accuracy) * plain.paths * PASSES["indirect"].unit_cost
+        if not plain.noise.error or taken < _WORTH_SHARING_S:
+            return plain, False
+        tracer = self._sharing.indirect
+        if not isinstance(tracer, PathReuseTracer) or not tracer.shares():
             return plain, False
         samples = max(1, self._closer[1] // SHARED_COST)
         seen = [tracer.trace(integer(seed, "shared"), 0, samples) for seed in self.seeds]
@@ -332,6 +349,8 @@ class AnchorRuns:
         depths [mm] that judge one layer; none for a flat scene.
     lit
         whether other replicates found any such light, where that is not certain.
+    known
+        the same of more pixels, or of fewer samples, whose light is not traced again.
     """
 
     _pass = PASSES["anchor_residual"]
@@ -350,9 +369,11 @@ class AnchorRuns:
         seed: int,
         layers: tuple[float, ...] = (),
         lit: bool = True,
+        known: AnchorRuns | None = None,
     ) -> None:
         self.bench, self.base, self.sample, self.tolerance = bench, base, sample, tolerance
         self.layers, self._lit = layers, lit
+        self._traced = known.traced_of(base) if known else {}
         self._seeds = [integer(seed, "pilot", self._stream, replicate) for replicate in range(REPLICATES)]
         self._frames: Callable[[int], FloatArray] = cache(self._at_anchors)
         self._beyond_mean: Callable[..., FloatArray] = cache(self._in_cells)
@@ -362,6 +383,15 @@ class AnchorRuns:
         """Pixels that are followed, and samples of each in a replicate."""
         self.pixels = np.setdiff1d(shown_pixels(self.base, sample), self.base.occluded)
         self._samples, self._lanes = sample.anchored, self.bench.n**2 - len(self.base.occluded)
+
+    def traced_of(self, base: Settings) -> dict[int, list[PathSamples]]:
+        """Light to every number of anchors that was tried, replicate by replicate, but for pixels that are occluded in
+        the ``base``."""
+        occluded = np.array(base.occluded, dtype=np.int64)
+        return {
+            anchors: [light.where(~np.isin(light.pixel, occluded)) for light in replicates]
+            for anchors, replicates in self._traced.items()
+        }
 
     @property
     def paths(self) -> int:
@@ -436,8 +466,10 @@ class AnchorRuns:
     def _trace(self, simulation: Simulation) -> list[PathSamples]:
         """Light to every anchor, replicate by replicate."""
         anchors = self._grids(simulation)[0].bundle.anchors
-        tracer = tracer_of(simulation, self.pixels, anchors)
-        return [tracer.trace(seed, 0, self._samples) for seed in self._seeds]
+        if anchors not in self._traced:
+            tracer = tracer_of(simulation, self.pixels, anchors)
+            self._traced[anchors] = [tracer.trace(seed, 0, self._samples) for seed in self._seeds]
+        return self._traced[anchors]
 
     def _form(self, grids: Sequence[Grid], replicates: Sequence[PathSamples], samples: int | None = None) -> FloatArray:
         """(replicates, shots, places, places) frames of light in ``grids``; of so many ``samples``, if not of as many

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import drjit as dr
@@ -44,6 +44,8 @@ _REHEARSED = 2**16
 _SELDOM = 3.0
 """What knowing for certain saves at most, over what a closer look may take for it: the look seldom turns out as hoped
 (corner and cookie_bag at 1e-3: four looks of 1 to 13 s, and no run was the faster for them)."""
+_OF_RUN = 0.2
+"""Part of the light's and the frames' work that closer looks may take, all together."""
 _MORE, _OF_ALL, _TIMED = 4, 0.1, 0.02
 """Times as many paths as before that tell noise, or a unit cost, next, and the parts of all planned that they are at
 most: noise decides how many are planned, a unit cost only what is said of their seconds."""
@@ -99,14 +101,30 @@ def make_plan(
     _refuse_unfit(bench, switches or {})
     started = time.perf_counter()
     runs = pilot.PilotRuns(bench, lighting, accuracy, seed, lines)
+    notes = tuple(_refine(runs, accuracy, switches or {}))
+    plan = _decide(runs, accuracy, switches or {}).taking(plan=time.perf_counter() - started)
+    return replace(plan, notes=notes)
+
+
+def _refine(runs: pilot.PilotRuns, accuracy: float, switches: Mapping[str, bool]) -> Iterator[str]:
+    """Let ``runs`` look closer as long as that is worth it; what is to be said where they may not, as that would be a
+    large part of the run."""
+    spent = 0.0
     while True:
-        pilot_result = runs.pilot_result
-        worth, part = value_of_refining(accuracy, pilot_result, switches or {})
+        worth, part = value_of_refining(accuracy, runs.pilot_result, switches)
         run = pilot.run_of(part)
-        if _SELDOM * runs.work(run) > worth:
-            break
+        work = runs.work(run)
+        if _SELDOM * work > worth:
+            return
+        spent += work
+        whole = cheapest(accuracy, runs.pilot_result, switches).work
+        if spent > _OF_RUN * whole:
+            yield (
+                f"{part.name.replace('_', ' ')} and all that hangs on them are chosen safely: to look closer would "
+                f"take {spent:.1f} s, more than a fifth of the {whole:.1f} s of light and frames"
+            )
+            return
         runs.refine(run)
-    return _decide(runs, accuracy, switches or {}).taking(plan=time.perf_counter() - started)
 
 
 @single_threaded_blas()
