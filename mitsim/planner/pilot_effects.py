@@ -39,6 +39,10 @@ _OF_INDIRECT = 0.2
 _WORTH_SHARING_S = 0.5
 """Seconds of indirect light, at fixed unit costs, from which it is looked at whether shared paths take fewer: to see
 that takes 0.13 to 0.28 processor seconds (metal_blade, corner, cookie_bag), and where they do, they save half."""
+_SHARING = 2
+"""Replicates that tell whether shared paths take fewer: what two of them differ by, in some 10^4 pixels, tells the
+variance to a fifth (corner 0.27, 0.32 and 0.34 of that of others, where four tell 0.31, 0.30 and 0.34); where the other
+way would have been better by less, little is lost."""
 _OPEN = 0.1
 """Part of the accuracy that noise may leave open of what coarse cells for indirect light change: a hundredth of the
 budget's square. Where more is, the capture follows ten times as many paths as the closer replicates, or more (corner at
@@ -104,9 +108,10 @@ class EffectRuns:
     def _indirect(
         self, bounced: Sequence[PathSamples], samples: int, cells: int, layers: tuple[float, ...]
     ) -> FloatArray:
-        """Frames of ``bounced`` light in so many samples, in coarse cells and layers."""
+        """Frames of ``bounced`` light in so many samples, in coarse cells and layers; of the mean wavelength alone, as
+        those of :class:`AnchorRuns`."""
         coarse = replace(self.everything, coarse_cells=cells, coarse_layers=bool(layers), layers=layers)
-        simulation = self.sample.simulation(self.bench, coarse)
+        simulation = self.sample.simulation(self.bench, coarse, one_line=True)
         return self._form(simulation, followed={"indirect": bounced}, samples=samples)
 
     @cached_property
@@ -209,9 +214,10 @@ class EffectRuns:
         if not isinstance(tracer, PathReuseTracer) or not tracer.shares():
             return plain, False
         samples = max(1, self._closer[1] // SHARED_COST)
-        seen = [tracer.trace(integer(seed, "shared"), 0, samples) for seed in self.seeds]
-        error = noise(self._form(self._sharing, followed=self._by_kind({"indirect": seen}), samples=samples))
-        shared = SampleCost.relative(error, self.light, samples, SHARED_COST * tracer.paths_per_sample)
+        seen = [tracer.trace(integer(seed, "shared"), 0, samples) for seed in self.seeds[:_SHARING]]
+        seen += [PathSamples.none()] * (REPLICATES - _SHARING)
+        frames = self._form(self._sharing, followed=self._by_kind({"indirect": seen}), samples=samples)[:_SHARING]
+        shared = SampleCost.relative(noise(frames), self.light, samples, SHARED_COST * tracer.paths_per_sample)
         less = shared.variance * shared.paths < plain.variance * plain.paths
         return (shared, True) if less else (plain, False)
 
