@@ -234,4 +234,6 @@ class Plan:
             f"{self.systematic_error:.1e}, at most {self.systematic_bound:.1e}.",
         )
         headings = ("effect", "state", "reason", "error if off", "time [s]")
-        return table(f"Plan at accuracy {self.accuracy:g}", headings, cells, (*facts, *self.notes, *self.warnings), numbers=2)
+        return table(
+            f"Plan at accuracy {self.accuracy:g}", headings, cells, (*facts, *self.notes, *self.warnings), numbers=2
+        )
