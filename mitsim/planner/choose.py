@@ -159,7 +159,13 @@ class Candidates:
         return min(found, key=lambda each: each[0].rank(each[1]))
 
     def choice(self, accuracy: float, sure: float = SURE) -> Candidate:
-        """The same, and what it is predicted to leave and to take."""
+        """The same, and what it is predicted to leave and to take.
+
+        Parameters
+        ----------
+        accuracy, sure
+            as for :func:`cheapest`.
+        """
         table, index = self.best(accuracy, sure)
         return table.alone(index).candidate
 
@@ -254,7 +260,7 @@ class _Table:
 
         To be called before anything else is asked of the table.
         """
-        self._squared_of_given  # noqa: B018 - found once, and copied
+        self._squares_of_given  # noqa: B018 - found once, and copied
         again = copy.copy(self)
         again.accuracy, again.sure = accuracy, sure
         return again
@@ -355,14 +361,14 @@ class _Table:
         cells = self.raster_cells
         of_raster = self.pilot_result.raster[in_waves(self.effects)].error_left(cells) if cells else None
         drawn += [of_raster[sure > 0] ** 2] if of_raster else []
-        squared, spread = self._squared_of_given if ignored == self.given else self._squared(ignored)
+        squared, spread = self._squares_of_given if ignored == self.given else self._squares(ignored)
         return np.asarray(np.sqrt(np.maximum(np.maximum(squared, 0) + sure * spread, 0) + sum(drawn)))
 
     @cached_property
-    def _squared_of_given(self) -> tuple[FloatArray, FloatArray]:
-        return self._squared(self.given)
+    def _squares_of_given(self) -> tuple[FloatArray, FloatArray]:
+        return self._squares(self.given)
 
-    def _squared(self, ignored: frozenset[Approximation]) -> tuple[FloatArray, FloatArray]:
+    def _squares(self, ignored: frozenset[Approximation]) -> tuple[FloatArray, FloatArray]:
         """(m,) square of what all that changes the frames adds up to, but for parts that are ``ignored``, and its
         standard error."""
         changes = self.pilot_result.changes

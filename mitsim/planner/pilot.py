@@ -144,8 +144,10 @@ class PilotRuns:
         # Unless the sample's shots show some of either kind, nobody knows how many anchors each takes.
         if shown.any() and not shown.all():
             self._base = replace(self._base, occluded=occluded)
-            self._measure("anchors", self.anchored)
-            self._measure("occluded")
+            known = self.anchored
+            for run in ("anchors", "occluded"):
+                self._measure(run)
+            self.anchored.take_over(known)
 
     # ---- More samples: their work, and where they are called for ----
 
@@ -211,7 +213,7 @@ class PilotRuns:
 
     # ---- What is measured, and how frames are formed for it ----
 
-    def _measure(self, run: str, known: AnchorRuns | None = None) -> None:
+    def _measure(self, run: str) -> None:
         bench, base, sample, seed = self.bench, self._base, self.samples[run], self.seed
         if run == "cells":
             self.fine = DirectRuns(bench, base, sample, self.accuracy, seed)
@@ -225,8 +227,7 @@ class PilotRuns:
             if base.occluded:
                 self.occluded = PenumbraRuns(bench, base, sample, self._tolerance(), seed, self.fine.judging)
         else:
-            own = self._tolerance(), seed, self.fine.judging
-            self.anchored = AnchorRuns(bench, base, sample, *own, known=known)
+            self.anchored = AnchorRuns(bench, base, sample, self._tolerance(), seed, self.fine.judging)
 
     def _tolerance(self, part: float = GOOD_ENOUGH) -> float:
         """Norm of that ``part`` of all light that the capture may leave out."""

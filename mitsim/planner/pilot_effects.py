@@ -355,8 +355,6 @@ class AnchorRuns:
         depths [mm] that judge one layer; none for a flat scene.
     lit
         whether other replicates found any such light, where that is not certain.
-    known
-        the same of more pixels, or of fewer samples, whose light is not traced again.
     """
 
     _pass = PASSES["anchor_residual"]
@@ -375,11 +373,10 @@ class AnchorRuns:
         seed: int,
         layers: tuple[float, ...] = (),
         lit: bool = True,
-        known: AnchorRuns | None = None,
     ) -> None:
         self.bench, self.base, self.sample, self.tolerance = bench, base, sample, tolerance
         self.layers, self._lit = layers, lit
-        self._traced = known.traced_of(base) if known else {}
+        self._traced: dict[int, list[PathSamples]] = {}
         self._seeds = [integer(seed, "pilot", self._stream, replicate) for replicate in range(REPLICATES)]
         self._frames: Callable[[int], FloatArray] = cache(self._at_anchors)
         self._beyond_mean: Callable[..., FloatArray] = cache(self._in_cells)
@@ -390,14 +387,10 @@ class AnchorRuns:
         self.pixels = np.setdiff1d(shown_pixels(self.base, sample), self.base.occluded)
         self._samples, self._lanes = sample.anchored, self.bench.n**2 - len(self.base.occluded)
 
-    def traced_of(self, base: Settings) -> dict[int, list[PathSamples]]:
-        """Light to every number of anchors that was tried, replicate by replicate, but for pixels that are occluded in
-        the ``base``."""
-        occluded = np.array(base.occluded, dtype=np.int64)
-        return {
-            anchors: [light.where(~np.isin(light.pixel, occluded)) for light in replicates]
-            for anchors, replicates in self._traced.items()
-        }
+    def take_over(self, known: AnchorRuns) -> None:
+        """Use light of as many samples that is ``known`` of all these pixels, and of others, and trace it no more."""
+        for anchors, replicates in known._traced.items():
+            self._traced[anchors] = [light.where(np.isin(light.pixel, self.pixels)) for light in replicates]
 
     @property
     def paths(self) -> int:

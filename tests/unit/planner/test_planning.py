@@ -154,6 +154,7 @@ class Refined:
         return self.cost
 
     def refine(self, run: str) -> None:
+        assert len(self.refined) < 9, "no end"
         self.refined.append(run)
 
 
