@@ -173,10 +173,12 @@ def notes_of(folder: Path, test: str) -> Path:
 
 
 def telling(mutant: Mutant, lines: dict[str, set[str]]) -> Tests:
-    """Files of tests that can see a ``mutant``: those that run its line or, where it is one of none of them (a module's
-    constant), its module. ``lines``: what each runs."""
+    """Files of tests that can see a ``mutant``: those that run its line or, where it is one of none of them or of no
+    function (a module's constant, which runs in the test that happens to import it first), its module. ``lines``: what
+    each runs."""
     line = f"{mutant.module}:{mutant.line}"
-    here = tuple(test for test, run in lines.items() if line in run)
+    in_function = not mutant.key.startswith(f"{mutant.module} module: ")
+    here = tuple(test for test, run in lines.items() if in_function and line in run)
     return here or tuple(test for test, run in lines.items() if runs(f"{mutant.module}:", run))
 
 
