@@ -39,10 +39,10 @@ _OF_INDIRECT = 0.2
 _WORTH_SHARING_S = 0.5
 """Seconds of indirect light, at fixed unit costs, from which it is looked at whether shared paths take fewer: to see
 that takes 0.13 to 0.28 processor seconds (metal_blade, corner, cookie_bag), and where they do, they save half."""
-_SHARING = 2
-"""Replicates that tell whether shared paths take fewer: what two of them differ by, in some 10^4 pixels, tells the
-variance to a fifth (corner 0.27, 0.32 and 0.34 of that of others, where four tell 0.31, 0.30 and 0.34); where the other
-way would have been better by less, little is lost."""
+_SHARING, _CLEARLY = 2, 0.7
+"""Replicates that tell whether shared paths take fewer, and the part of others' variance times paths below which they
+are taken to: two tell it to a fifth (corner 0.27, 0.32, 0.34, where four tell 0.31, 0.30, 0.34), and may miss heavy
+paths (cookie_bag 0.98, and the run took 24 processor seconds in place of 20)."""
 _OPEN = 0.1
 """Part of the accuracy that noise may leave open of what coarse cells for indirect light change: a hundredth of the
 budget's square. Where more is, the capture follows ten times as many paths as the closer replicates, or more (corner at
@@ -218,7 +218,7 @@ class EffectRuns:
         seen += [PathSamples.none()] * (REPLICATES - _SHARING)
         frames = self._form(self._sharing, followed=self._by_kind({"indirect": seen}), samples=samples)[:_SHARING]
         shared = SampleCost.relative(noise(frames), self.light, samples, SHARED_COST * tracer.paths_per_sample)
-        less = shared.variance * shared.paths < plain.variance * plain.paths
+        less = shared.variance * shared.paths < _CLEARLY * plain.variance * plain.paths
         return (shared, True) if less else (plain, False)
 
     @cached_property
