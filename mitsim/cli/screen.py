@@ -263,6 +263,8 @@ def _print_plan(plan: Plan) -> None:
     console.print(f"Predicted time from start to finish: {plan.predicted_seconds:.2f} s ({stages})")
     if plan.range_words:
         console.print(plan.range_words)
+    for note in plan.notes:
+        console.print(note)
     if plan.colour is not None:
         console.print(plan.colour.words)
     if plan.asked_seconds is not None:

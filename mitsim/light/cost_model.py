@@ -183,23 +183,19 @@ def in_waves(effects: frozenset[str]) -> bool:
 
 def unit_costs_of(pilot_result: PilotResult) -> UnitCosts:
     """Those that the ``pilot_result`` measured, where it measured any."""
-    forming = pilot_result.forming
-    products = float(_products(forming, Numbers.coarsest(), (forming.lit, forming.lit), 1.0, 1.0, 1.0))
-    slower = forming.seconds / (FIXED.frame + FIXED.product * products) if forming.seconds else 1.0
-    product = forming.product or slower * FIXED.product
-    # The frame that the pilot forms is small: beside its products there is what every frame takes.
-    frame = max(forming.seconds - product * products, 0.0) if forming.product else slower * FIXED.frame
+    # All that processors do with matrices is as much slower or faster as their products.
+    slower = (pilot_result.forming.product or FIXED.product) / FIXED.product
     measured = {
         name: sample_cost.seconds for name, sample_cost in pilot_result.sample_costs.items() if sample_cost.seconds
     }
     return UnitCosts(
         passes={**FIXED.passes, **measured},
-        frame=float(frame),
-        product=float(product),
-        entry=float(product / FIXED.product * FIXED.entry),
-        accumulated=float(product / FIXED.product * FIXED.accumulated),
+        frame=slower * FIXED.frame,
+        product=slower * FIXED.product,
+        entry=slower * FIXED.entry,
+        accumulated=slower * FIXED.accumulated,
         ray=pilot_result.spread.seconds * FIXED.ray / FIXED.passes["direct"] or FIXED.ray,
-        pixel=float(product / FIXED.product * FIXED.pixel),
+        pixel=slower * FIXED.pixel,
     )
 
 

@@ -26,7 +26,7 @@ from mitsim.version import __version__
 State = Literal["exact", "approximate", "off"]
 _REPORTED = (
     "effects", "accuracy", "predicted_seconds", "predicted", "settings", "warnings", "predicted_range",
-    "sampling_target", "systematic_error", "systematic_bound", "asked_seconds", "colour",
+    "sampling_target", "systematic_error", "systematic_bound", "asked_seconds", "colour", "notes",
 )  # fmt: skip
 """What the command line says of a plan, besides bytes."""
 FORMAT = 1
@@ -142,6 +142,8 @@ class Plan:
         for the whole run, of which the accuracy is the finest that they buy; None where the accuracy was asked for.
     colour
         what was weighed for the light's colours; None where that was not asked for.
+    notes
+        what was chosen without looking as closely as it could be, and why.
     """
 
     accuracy: float
@@ -158,6 +160,7 @@ class Plan:
     cost: Cost | None = None
     asked_seconds: float | None = None
     colour: ColourChoice | None = None
+    notes: tuple[str, ...] = ()
     made_of: Mapping[str, Any] | None = None
 
     @check_arguments
@@ -363,7 +366,9 @@ class Plan:
             f"{self.systematic_error:.1e}, at most {self.systematic_bound:.1e}.",
         )
         headings = ("effect", "state", "reason", "error if off", "time [s]")
-        return table(f"Plan at accuracy {self.accuracy:g}", headings, cells, (*facts, *self.warnings), numbers=2)
+        return table(
+            f"Plan at accuracy {self.accuracy:g}", headings, cells, (*facts, *self.notes, *self.warnings), numbers=2
+        )
 
 
 # ---- Files of plans

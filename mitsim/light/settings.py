@@ -307,8 +307,6 @@ class Forming:
         of the wave-optical shadow, and of the geometric one.
     shots, classes
         of the family.
-    seconds
-        that the pilot measured for a frame of one anchor, layer and cell a pixel, with a wave-optical shadow.
     product
         seconds of a multiplication in a large product of matrices, on all processors; 0 where nobody has timed it.
     correlated
@@ -332,7 +330,6 @@ class Forming:
     terms: float
     shots: int
     classes: int
-    seconds: float = 0.0
     product: float = 0.0
     geometric_terms: float = 1.0
     correlated: tuple[bool, bool] = (False, False)

@@ -125,20 +125,20 @@ def cheapest(accuracy: float, pilot_result: PilotResult, switches: Mapping[str, 
     sure
         standard errors that are added to an estimate.
     """
-    table, index = Candidates(pilot_result, switches, sure).best(accuracy)
-    return table.candidate(index)
+    return Candidates(pilot_result, switches).choice(accuracy, sure)
 
 
 class Candidates:
-    """All combinations that the pilot result lets choose from, at any accuracy: what they leave is added up once.
+    """All combinations that the pilot result lets choose from, at any accuracy and however sure: what they leave is
+    added up once.
 
     Parameters
     ----------
-    pilot_result, switches, sure
+    pilot_result, switches
         as for :func:`cheapest`.
     """
 
-    def __init__(self, pilot_result: PilotResult, switches: Mapping[str, bool], sure: float = SURE) -> None:
+    def __init__(self, pilot_result: PilotResult, switches: Mapping[str, bool]) -> None:
         self.pilot_result = pilot_result
         counts = [_choices(pilot_result, name, switches) for name in COUNTED]
         rows = np.array(list(product(*counts, _COARSE_CELLS, (0, 1))), dtype=np.float64)
@@ -148,15 +148,26 @@ class Candidates:
             rows = rows[(rows[:, 0] > 1) == (rows[:, 4] > 1)]
         given = _omissions(switches)
         self._tables = [
-            _Table(math.nan, pilot_result, (effects, cells), rows, given, sure)
+            _Table(math.nan, pilot_result, (effects, cells), rows, given)
             for effects in _subsets(pilot_result, switches)
             for cells in pilot_result.forms(in_waves(effects))
         ]
 
-    def best(self, accuracy: float) -> tuple[_Table, int]:
-        """The table and row of the choice that :func:`cheapest` makes at an ``accuracy``."""
-        found = [(table, table.best) for table in (each.at(accuracy) for each in self._tables)]
+    def best(self, accuracy: float, sure: float = SURE) -> tuple[_Table, int]:
+        """The table and row of the choice that :func:`cheapest` makes at an ``accuracy``, ``sure`` as it takes it."""
+        found = [(table, table.best) for table in (each.at(accuracy, sure) for each in self._tables)]
         return min(found, key=lambda each: each[0].rank(each[1]))
+
+    def choice(self, accuracy: float, sure: float = SURE) -> Candidate:
+        """The same, and what it is predicted to leave and to take.
+
+        Parameters
+        ----------
+        accuracy, sure
+            as for :func:`cheapest`.
+        """
+        table, index = self.best(accuracy, sure)
+        return table.alone(index).candidate
 
     def seconds(self, accuracy: float) -> tuple[float, bool]:
         """Seconds at fixed unit costs of that choice and of its truth, and whether it keeps the ``accuracy``."""
@@ -177,11 +188,11 @@ def predicted_candidate(
     settings
         effects and numbers.
     """
-    return _table_of(accuracy, pilot_result, settings, switches, SURE).candidate(0)
+    return _table_of(accuracy, pilot_result, settings, switches).candidate
 
 
 def _table_of(
-    accuracy: float, pilot_result: PilotResult, settings: Settings, switches: Mapping[str, bool], sure: float
+    accuracy: float, pilot_result: PilotResult, settings: Settings, switches: Mapping[str, bool], sure: float = SURE
 ) -> _Table:
     """Predictions of ``settings`` alone; all else as for :func:`cheapest`."""
     row = np.array([[*counts_of(settings), settings.coarse_cells, settings.coarse_layers]], dtype=np.float64)
@@ -200,12 +211,13 @@ def value_of_refining(
     accuracy, pilot_result, switches
         as for :func:`cheapest`.
     """
-    careful, hopeful = (cheapest(accuracy, pilot_result, switches, sure) for sure in (SURE, 0.0))
+    candidates = Candidates(pilot_result, switches)
+    careful, hopeful = (candidates.choice(accuracy, sure) for sure in (SURE, 0.0))
     unsure = _table_of(accuracy, pilot_result, hopeful.settings, switches, 0.0).unsure
     worst = max(sorted(unsure), key=lambda part: unsure[part], default=Approximation("cells", 1))
     if careful.fits:
         return careful.work - hopeful.work, worst
-    lucky = cheapest(accuracy, pilot_result, switches, _LUCKY)
+    lucky = candidates.choice(accuracy, _LUCKY)
     return lucky.work if lucky.fits else 0.0, worst
 
 
@@ -235,22 +247,28 @@ class _Table:
         form: tuple[frozenset[str], int],
         rows: FloatArray,
         given: frozenset[Approximation],
-        sure: float,
+        sure: float = SURE,
     ) -> None:
         self.effects, self.raster_cells = form
         self.accuracy, self.pilot_result, self.rows = accuracy, pilot_result, rows
         self.given, self.sure = given, sure
         self.numbers = Numbers.of_counts([*rows.T], self.effects, len(pilot_result.occluded), self.raster_cells)
 
-    def at(self, accuracy: float) -> _Table:
-        """The same combinations at an ``accuracy``: what does not depend on it is shared.
+    def at(self, accuracy: float, sure: float = SURE) -> _Table:
+        """The same combinations at an ``accuracy``, ``sure`` as :func:`cheapest` takes it: what does not depend on
+        either is shared.
 
         To be called before anything else is asked of the table.
         """
-        self._avoidable  # noqa: B018 - found once, and copied
+        self._squares_of_given  # noqa: B018 - found once, and copied
         again = copy.copy(self)
-        again.accuracy = accuracy
+        again.accuracy, again.sure = accuracy, sure
         return again
+
+    def alone(self, index: int) -> _Table:
+        """A row on its own."""
+        form = self.effects, self.raster_cells
+        return _Table(self.accuracy, self.pilot_result, form, self.rows[[index]], self.given, self.sure)
 
     def rank(self, index: int) -> tuple[bool, float, float]:
         """What makes one choice better than another: that it fits, less work, less error."""
@@ -293,8 +311,9 @@ class _Table:
             raster_cells=self.raster_cells,
         )
 
-    def candidate(self, index: int) -> Candidate:
-        """The choice of a row."""
+    @property
+    def candidate(self) -> Candidate:
+        """The choice of the only row."""
         pilot_result = self.pilot_result
         lacking = {
             "light over sharp lobes": pilot_result.unresolved,
@@ -303,19 +322,19 @@ class _Table:
         }
         missing = min(sum(lacking.values()), 1.0)
         # Errors of the light that is there count for its part of all.
-        rest = [float(self._systematic(sure, frozenset())[index]) for sure in (0.0, SURE)]
+        rest = [float(self._systematic(sure, frozenset())[0]) for sure in (0.0, SURE)]
         if not math.isinf(self.pilot_result.hits):
-            one_hit = 1 / (self.pilot_result.hits * float(self.samples["direct"][index]))
+            one_hit = 1 / (self.pilot_result.hits * float(self.samples["direct"][0]))
             rest = [math.hypot(error, hits * one_hit) for error, hits in zip(rest, _OFF_BY_HITS, strict=True)]
         value, bound = (missing + (1 - missing) * error for error in rest)
         return Candidate(
-            settings=self.settings(index),
+            settings=self.settings(0),
             systematic=Estimate(value, bound),
             lacking=lacking,
-            target=float(self.target[index]),
-            noise=float(self.noise[index]),
-            fits=bool(self.fits[index]),
-            work=float(self.work[index]),
+            target=float(self.target[0]),
+            noise=float(self.noise[0]),
+            fits=bool(self.fits[0]),
+            work=float(self.work[0]),
         )
 
     # ---- errors
@@ -334,8 +353,7 @@ class _Table:
 
     def _systematic(self, sure: float, ignored: frozenset[Approximation]) -> FloatArray:
         """(m,) what all that is left out or made coarse adds up to, but for parts that are ``ignored``."""
-        changes, apart = self.pilot_result.changes, self.pilot_result.apart
-        chosen = np.stack([self._weight(part) * (part not in ignored) for part in changes.parts], axis=1)
+        apart = self.pilot_result.apart
         drawn = [
             size**2 for name, size in apart.items() if name not in self.effects and Approximation(name) not in ignored
         ]
@@ -343,8 +361,20 @@ class _Table:
         cells = self.raster_cells
         of_raster = self.pilot_result.raster[in_waves(self.effects)].error_left(cells) if cells else None
         drawn += [of_raster[sure > 0] ** 2] if of_raster else []
-        squared, spread = changes.squared_errors(chosen)
+        squared, spread = self._squares_of_given if ignored == self.given else self._squares(ignored)
         return np.asarray(np.sqrt(np.maximum(np.maximum(squared, 0) + sure * spread, 0) + sum(drawn)))
+
+    @cached_property
+    def _squares_of_given(self) -> tuple[FloatArray, FloatArray]:
+        return self._squares(self.given)
+
+    def _squares(self, ignored: frozenset[Approximation]) -> tuple[FloatArray, FloatArray]:
+        """(m,) square of what all that changes the frames adds up to, but for parts that are ``ignored``, and its
+        standard error."""
+        changes = self.pilot_result.changes
+        return changes.squared_errors(
+            np.stack([self._weight(part) * (part not in ignored) for part in changes.parts], axis=1)
+        )
 
     def _weight(self, part: Approximation) -> FloatArray:
         """(m,) how much of a part's change each row leaves."""

@@ -144,8 +144,10 @@ class PilotRuns:
         # Unless the sample's shots show some of either kind, nobody knows how many anchors each takes.
         if shown.any() and not shown.all():
             self._base = replace(self._base, occluded=occluded)
+            known = self.anchored
             for run in ("anchors", "occluded"):
                 self._measure(run)
+            self.anchored.take_over(known)
 
     # ---- More samples: their work, and where they are called for ----
 

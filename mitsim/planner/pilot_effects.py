@@ -34,6 +34,15 @@ _FOLLOWED = tuple(name for name, row in PASSES.items() if not (row.even or row.a
 _WORTH_REPEATING = 0.85
 """Variance times paths, over that of even ones, below which blocks are followed unevenly: short replicates tell it so
 well."""
+_OF_INDIRECT = 0.2
+"""Part of what indirect light is predicted to take that closer replicates of it may take at most."""
+_WORTH_SHARING_S = 0.5
+"""Seconds of indirect light, at fixed unit costs, from which it is looked at whether shared paths take fewer: to see
+that takes 0.13 to 0.28 processor seconds (metal_blade, corner, cookie_bag), and where they do, they save half."""
+_SHARING, _CLEARLY = 2, 0.7
+"""Replicates that tell whether shared paths take fewer, and the part of others' variance times paths below which they
+are taken to: two tell it to a fifth (corner 0.27, 0.32, 0.34, where four tell 0.31, 0.30, 0.34), and may miss heavy
+paths (cookie_bag 0.98, and the run took 24 processor seconds in place of 20)."""
 _OPEN = 0.1
 """Part of the accuracy that noise may leave open of what coarse cells for indirect light change: a hundredth of the
 budget's square. Where more is, the capture follows ten times as many paths as the closer replicates, or more (corner at
@@ -99,9 +108,10 @@ class EffectRuns:
     def _indirect(
         self, bounced: Sequence[PathSamples], samples: int, cells: int, layers: tuple[float, ...]
     ) -> FloatArray:
-        """Frames of ``bounced`` light in so many samples, in coarse cells and layers."""
+        """Frames of ``bounced`` light in so many samples, in coarse cells and layers; of the mean wavelength alone, as
+        those of :class:`AnchorRuns`."""
         coarse = replace(self.everything, coarse_cells=cells, coarse_layers=bool(layers), layers=layers)
-        simulation = self.sample.simulation(self.bench, coarse)
+        simulation = self.sample.simulation(self.bench, coarse, one_line=True)
         return self._form(simulation, followed={"indirect": bounced}, samples=samples)
 
     @cached_property
@@ -123,11 +133,19 @@ class EffectRuns:
         seen = coarsening_changes("indirect", partial(self._indirect, self._first_bounced, samples), ())
         value, bound = ErrorCovariance.between(seen, self.light**2).estimate(seen)
         wanted = math.ceil(samples * (bound**2 - value**2) / (_OPEN * self.accuracy) ** 2)
-        more = min(wanted, self.sample.closer(tracer.paths_per_sample))
+        most = _OF_INDIRECT * self._indirect_samples(replicates, samples) / REPLICATES
+        more = min(wanted, self.sample.closer(tracer.paths_per_sample), math.ceil(most))
         if more <= samples:
             return replicates, samples
         # Seeds of their own: that the first replicates are vague says nothing of these.
         return [tracer.trace(integer(seed, "closer"), 0, more) for seed in self.seeds], more
+
+    def _indirect_samples(self, replicates: Sequence[PathSamples], samples: int) -> float:
+        """Samples of all groups that the projector's side's light takes, as noisy as in ``replicates`` of so many
+        ``samples``."""
+        seen = self._form(self.simulation, followed=self._by_kind({"indirect": list(replicates)}), samples=samples)
+        cost = SampleCost.relative(noise(seen), self.light, samples, 1)
+        return float(cost.noise.samples_for(self.accuracy))
 
     @property
     def received(self) -> float:
@@ -188,14 +206,19 @@ class EffectRuns:
     @cached_property
     def _shared_or_not(self) -> tuple[SampleCost, bool]:
         """What light over several surfaces takes, and whether it is shared."""
-        plain, tracer = self.sample_cost("indirect"), self._sharing.indirect
-        if not plain.noise.error or not isinstance(tracer, PathReuseTracer) or not tracer.shares():
+        plain = self.sample_cost("indirect")
+        taken = plain.noise.samples_for(self.accuracy) * plain.paths * PASSES["indirect"].unit_cost
+        if not plain.noise.error or taken < _WORTH_SHARING_S:
+            return plain, False
+        tracer = self._sharing.indirect
+        if not isinstance(tracer, PathReuseTracer) or not tracer.shares():
             return plain, False
         samples = max(1, self._closer[1] // SHARED_COST)
-        seen = [tracer.trace(integer(seed, "shared"), 0, samples) for seed in self.seeds]
-        error = noise(self._form(self._sharing, followed=self._by_kind({"indirect": seen}), samples=samples))
-        shared = SampleCost.relative(error, self.light, samples, SHARED_COST * tracer.paths_per_sample)
-        less = shared.variance * shared.paths < plain.variance * plain.paths
+        seen = [tracer.trace(integer(seed, "shared"), 0, samples) for seed in self.seeds[:_SHARING]]
+        seen += [PathSamples.none()] * (REPLICATES - _SHARING)
+        frames = self._form(self._sharing, followed=self._by_kind({"indirect": seen}), samples=samples)[:_SHARING]
+        shared = SampleCost.relative(noise(frames), self.light, samples, SHARED_COST * tracer.paths_per_sample)
+        less = shared.variance * shared.paths < _CLEARLY * plain.variance * plain.paths
         return (shared, True) if less else (plain, False)
 
     @cached_property
@@ -353,6 +376,7 @@ class AnchorRuns:
     ) -> None:
         self.bench, self.base, self.sample, self.tolerance = bench, base, sample, tolerance
         self.layers, self._lit = layers, lit
+        self._traced: dict[int, list[PathSamples]] = {}
         self._seeds = [integer(seed, "pilot", self._stream, replicate) for replicate in range(REPLICATES)]
         self._frames: Callable[[int], FloatArray] = cache(self._at_anchors)
         self._beyond_mean: Callable[..., FloatArray] = cache(self._in_cells)
@@ -362,6 +386,11 @@ class AnchorRuns:
         """Pixels that are followed, and samples of each in a replicate."""
         self.pixels = np.setdiff1d(shown_pixels(self.base, sample), self.base.occluded)
         self._samples, self._lanes = sample.anchored, self.bench.n**2 - len(self.base.occluded)
+
+    def take_over(self, known: AnchorRuns) -> None:
+        """Use light of as many samples that is ``known`` of all these pixels, and of others, and trace it no more."""
+        for anchors, replicates in known._traced.items():
+            self._traced[anchors] = [light.where(np.isin(light.pixel, self.pixels)) for light in replicates]
 
     @property
     def paths(self) -> int:
@@ -436,8 +465,10 @@ class AnchorRuns:
     def _trace(self, simulation: Simulation) -> list[PathSamples]:
         """Light to every anchor, replicate by replicate."""
         anchors = self._grids(simulation)[0].bundle.anchors
-        tracer = tracer_of(simulation, self.pixels, anchors)
-        return [tracer.trace(seed, 0, self._samples) for seed in self._seeds]
+        if anchors not in self._traced:
+            tracer = tracer_of(simulation, self.pixels, anchors)
+            self._traced[anchors] = [tracer.trace(seed, 0, self._samples) for seed in self._seeds]
+        return self._traced[anchors]
 
     def _form(self, grids: Sequence[Grid], replicates: Sequence[PathSamples], samples: int | None = None) -> FloatArray:
         """(replicates, shots, places, places) frames of light in ``grids``; of so many ``samples``, if not of as many

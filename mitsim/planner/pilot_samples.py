@@ -256,9 +256,9 @@ def ladder(
     frames
         (replicates, ...) of a step.
     first
-        index of the step that judges at first; finer ones are tried until the one before the judge is good enough.
+        index of the step that judges at first; finer ones are tried until what the judge leaves is good enough.
     tolerance
-        norm of the change by a finer step below which none is tried.
+        norm of the change by all finer steps below which none is tried.
     least_gain
         what a step leaves at least of the one before, where that is known.
     """
@@ -269,7 +269,8 @@ def ladder(
         last = tried[judge] - tried[before]
         gain = _gain(norm(last), norm(tried[before] - tried[earlier[-1]])) if earlier else _UNKNOWN_GAIN
         rest = max(gain, least_gain) / (1 - max(gain, least_gain))
-        if (1 + rest) * norm(last) <= tolerance or judge == counts[-1]:
+        # Two steps tell what the judge leaves; one alone, what the step before it does.
+        if (rest if earlier else 1 + rest) * norm(last) <= tolerance or judge == counts[-1]:
             break
         following = counts[counts.index(judge) + 1]
         tried[following] = frames(following)

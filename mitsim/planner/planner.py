@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import drjit as dr
@@ -44,9 +44,14 @@ _REHEARSED = 2**16
 _SELDOM = 3.0
 """What knowing for certain saves at most, over what a closer look may take for it: the look seldom turns out as hoped
 (corner and cookie_bag at 1e-3: four looks of 1 to 13 s, and no run was the faster for them)."""
-_MORE, _OF_ALL = 4, 0.1
-"""Times as many paths as before that tell a unit cost, or noise, next, and the part of all planned that they are at
-most."""
+_OF_RUN = 0.2
+"""Part of the light's and the frames' work that closer looks may take, all together."""
+_MORE, _OF_ALL, _TIMED = 4, 0.1, 0.02
+"""Times as many paths as before that tell noise, or a unit cost, next, and the parts of all planned that they are at
+most: noise decides how many are planned, a unit cost only what is said of their seconds."""
+_MOSTLY = 0.75
+"""Part of the tracing that is timed, at fixed unit costs: unit costs of the rest are off by 2 at most, which moves what
+is said of all by less than predictions are good to."""
 _LEAST_SLOPE = 0.25
 """Part of a path's seconds in a launch that are its own at least, whatever shorter launches seem to say."""
 _HEAVY_PATHS, _MOST_HEAVY_PATHS = 2**19, 2**23
@@ -96,14 +101,30 @@ def make_plan(
     _refuse_unfit(bench, switches or {})
     started = time.perf_counter()
     runs = pilot.PilotRuns(bench, lighting, accuracy, seed, lines)
+    notes = tuple(_refine(runs, accuracy, switches or {}))
+    plan = _decide(runs, accuracy, switches or {}).taking(plan=time.perf_counter() - started)
+    return replace(plan, notes=notes)
+
+
+def _refine(runs: pilot.PilotRuns, accuracy: float, switches: Mapping[str, bool]) -> Iterator[str]:
+    """Let ``runs`` look closer as long as that is worth it; what is to be said where they may not, as that would be a
+    large part of the run."""
+    spent = 0.0
     while True:
-        pilot_result = runs.pilot_result
-        worth, part = value_of_refining(accuracy, pilot_result, switches or {})
+        worth, part = value_of_refining(accuracy, runs.pilot_result, switches)
         run = pilot.run_of(part)
-        if _SELDOM * runs.work(run) > worth:
-            break
+        work = runs.work(run)
+        if _SELDOM * work > worth:
+            return
+        spent += work
+        whole = cheapest(accuracy, runs.pilot_result, switches).work
+        if spent > _OF_RUN * whole:
+            yield (
+                f"{part.name.replace('_', ' ')} and all that hangs on them are chosen safely: to look closer would "
+                f"take {spent:.1f} s, more than a fifth of the {whole:.1f} s of light and frames"
+            )
+            return
         runs.refine(run)
-    return _decide(runs, accuracy, switches or {}).taking(plan=time.perf_counter() - started)
 
 
 @single_threaded_blas()
@@ -232,21 +253,41 @@ def _seconds(simulation: Simulation, name: str, seed: int, labels: Labels, sampl
 
 def _time_paths(pilot_result: PilotResult, simulation: Simulation, labels: Labels, seed: int) -> PilotResult:
     """The ``pilot_result`` with the seconds that a path takes to be traced and accumulated in a ``simulation`` of the
-    choice."""
-    own, found, spread = integer(seed, "pilot", "paces"), {}, pilot_result.spread
-    for name, each in simulation.passes.items():
-        seconds, longest = _pace(simulation, name, labels, own)
-        sample_cost = pilot_result.sample_costs.get(name, SampleCost.none())
+    choice: timed of the passes that take most, and as much slower or faster than the fixed ones of the others."""
+    own, spread = integer(seed, "pilot", "paces"), pilot_result.spread
+    fixed = {name: 0.0 for name in simulation.passes} | tracing_seconds(pilot_result, simulation.settings, FIXED)
+    timed, ratios, ray = dict[str, float](), dict[str, float](), 0.0
+    for name in sorted(simulation.passes, key=lambda name: -fixed[name]):
+        if timed and sum(fixed[other] for other in timed) >= _MOSTLY * sum(fixed.values()):
+            break
         # A path of shared light counts for several.
-        paths = sample_cost.paths if name == "indirect" else each.tracer.paths_per_sample
-        found[name] = replace(sample_cost, seconds=seconds / paths)
+        paths = pilot_result.sample_costs[name].paths if name == "indirect" else _paths_of(simulation, name)
+        seconds, alone = _pace(simulation, name, labels, own)
+        timed[name], ratios[name] = seconds / paths, seconds / paths / FIXED.passes[name]
         if name == "direct":
-            spread = replace(spread, seconds=longest / paths)
+            ray = alone / paths
+    whole = sum(fixed[name] for name in timed)
+    # Where nothing takes any time, what was timed counts alike.
+    by = {name: fixed[name] / whole if whole else 1 / len(timed) for name in timed}
+    slower = sum(by[name] * ratio for name, ratio in ratios.items())
+    found = {
+        name: replace(
+            pilot_result.sample_costs.get(name, SampleCost.none()),
+            seconds=timed.get(name, slower * FIXED.passes[name]),
+        )
+        for name in simulation.passes
+    }
+    spread = replace(spread, seconds=ray or slower * FIXED.passes["direct"])
     return replace(pilot_result.with_sample_costs(found), spread=spread)
 
 
+def _paths_of(simulation: Simulation, name: str) -> int:
+    """Paths, or connections, of a sample of a pass."""
+    return simulation.passes[name].tracer.paths_per_sample
+
+
 def _pace(simulation: Simulation, name: str, labels: Labels, seed: int) -> tuple[float, float]:
-    """Seconds of a sample of a pass in a run, and in the longest launches that were timed.
+    """Seconds of a sample of a pass in a run, and of its paths alone.
 
     Launches of more and more paths, up to those of the run itself, tell what each launch takes besides its paths.
 
@@ -264,17 +305,17 @@ def _pace(simulation: Simulation, name: str, labels: Labels, seed: int) -> tuple
     def once(samples: int) -> float:
         seconds = _seconds(simulation, name, seed, labels, samples)
         # What disturbs a moment would be multiplied.
-        again = samples <= _OF_ALL * every
+        again = samples <= _TIMED * every
         return min(seconds, _seconds(simulation, name, seed, labels, samples)) if again else seconds
 
     _seconds(simulation, name, seed, labels, 1)  # compiles the kernel
     launch, samples = once(1), max(1, _REHEARSED // paths_per_sample)
     longest = once(samples) if samples > 1 else launch
     least = longest / samples
-    while _MORE * samples * paths_per_sample <= at_once and _MORE * samples <= _OF_ALL * every:
+    while _MORE * samples * paths_per_sample <= at_once and _MORE * samples <= _TIMED * every:
         samples *= _MORE
         longest = once(samples)
         least = min(least, longest / samples)
     slope = min(max((longest - launch) / (samples - 1), _LEAST_SLOPE * least), least) if samples > 1 else launch
     launches = math.ceil(planned / max(1, at_once // paths_per_sample))
-    return slope + max(launch - slope, 0.0) * launches / planned, least
+    return slope + max(launch - slope, 0.0) * launches / planned, slope

@@ -200,10 +200,11 @@ def test_names_in_a_plan_are_no_markup(capsys: pytest.CaptureFixture[str]) -> No
         accuracy, effects, predicted, predicted_seconds = 1e-3, (Row,), {"plan": 1.0}, 1.0
         range_words = "nine of ten such runs take 1 to 5 s."
         colour = asked_seconds = cost = None
+        notes = ("cells are chosen safely",)
 
     screen.print_plan(cast(Any, Plan))
     out = capsys.readouterr().out
-    assert "\x1b]" not in out and "[/]" in out.replace("\n", "") and Plan.range_words in out
+    assert "\x1b]" not in out and "[/]" in out.replace("\n", "") and Plan.range_words in out and Plan.notes[0] in out
 
 
 def test_output_that_nobody_reads_ends_as_by_a_signal(monkeypatch: pytest.MonkeyPatch) -> None:

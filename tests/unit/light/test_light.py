@@ -16,10 +16,12 @@ import pytest
 
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.effects import EFFECTS
+from mitsim.core.arrays import Labels
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import Lighting, parse_patterns
 from mitsim.light import light as module
 from mitsim.light import memory
+from mitsim.light.cost_model import FIXED
 from mitsim.light.light import SampledLight, Sampling, trace_light
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, PilotResult, Settings
@@ -382,16 +384,21 @@ def test_a_heavy_path_in_a_shot_that_is_not_checked_is_seen() -> None:
 
 
 def test_unit_costs_are_measured_of_what_was_chosen_alone(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Direct light and its anchors, of a machine that takes 0.1 us a path; other kinds keep what they had. (Planted:
-    seconds of a sample, not of a path.)"""
-    monkeypatch.setattr(
-        planner,
-        "_seconds",
-        lambda made, name, seed, labels, samples: 1e-7 * made.passes[name].tracer.paths_per_sample * samples,
-    )
+    """Direct light and its anchors, of a machine half as fast as the fixed one: only what takes most is timed, and the
+    other is taken to be as slow. Other kinds keep what they had. (Planted: seconds of a sample, not of a path; fixed
+    seconds for what is not timed.)"""
+    timed_passes = set()
+
+    def seconds(made: Simulation, name: str, seed: int, labels: Labels, samples: int) -> float:
+        timed_passes.add(name)
+        return 2 * FIXED.passes[name] * made.passes[name].tracer.paths_per_sample * samples
+
+    monkeypatch.setattr(planner, "_seconds", seconds)
     simulation = Simulation(bench, Settings(depth=400.0, anchors=2))
     timed = planner._time_paths(PILOT_RESULT, simulation, np.arange(bench.n**2), 0)
+    assert len(timed_passes) == 1
     for name in ("direct", "anchor_residual"):
-        assert timed.sample_costs[name].seconds == pytest.approx(1e-7)
+        assert timed.sample_costs[name].seconds == pytest.approx(2 * FIXED.passes[name])
+    assert timed.spread.seconds == pytest.approx(2 * FIXED.passes["direct"])
     for name in ("indirect", "indirect_residual"):
         assert timed.sample_costs[name] == PILOT_RESULT.sample_costs[name]

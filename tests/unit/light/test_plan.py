@@ -224,7 +224,7 @@ def test_settings_do_not_depend_on_the_machines_pace() -> None:
         name: replace(PILOT_RESULT.sample_costs[name], seconds=1e-4)
         for name in ("direct", "anchor_residual", "indirect", "from_camera")
     }
-    slow = replace(PILOT_RESULT.with_sample_costs(sample_costs), forming=replace(PILOT_RESULT.forming, seconds=1.0))
+    slow = replace(PILOT_RESULT.with_sample_costs(sample_costs), forming=replace(PILOT_RESULT.forming, product=1e-8))
     for accuracy in ACCURACIES:
         one, other = plan(accuracy), plan(accuracy, slow)
         assert one.settings == other.settings and one.sampling_target == other.sampling_target

@@ -34,25 +34,18 @@ def products(rows: float, terms: float = 1.0) -> float:
     return terms * (50 * rows * rows + 50 * 50 * rows + probes)
 
 
-def test_the_frame_that_the_pilot_measured_takes_what_it_took() -> None:
-    measured = replace(PILOT_RESULT, forming=replace(PILOT_RESULT.forming, seconds=0.125))
-    assert forming_seconds(measured.forming, ONE, 1.0, unit_costs_of(measured)) == pytest.approx(0.125, rel=1e-12)
-    none = replace(
+def test_a_slower_machine_is_slower_in_all_that_it_does_with_matrices() -> None:
+    """As much as its products are. (Planted: a frame's own seconds left as they are.)"""
+    nothing = replace(
         PILOT_RESULT.with_sample_costs({"direct": replace(PILOT_RESULT.sample_costs["direct"], seconds=0.0)}),
-        forming=replace(PILOT_RESULT.forming, seconds=0.0),
+        forming=replace(PILOT_RESULT.forming, product=0.0),
     )
-    assert (
-        unit_costs_of(none).passes["direct"] == FIXED.passes["direct"] and unit_costs_of(none).product == FIXED.product
-    )
-    slower = {
-        name: getattr(unit_costs_of(measured), name) / getattr(FIXED, name)
-        for name in ("frame", "entry", "accumulated")
-    }
-    assert slower == pytest.approx(dict.fromkeys(slower, unit_costs_of(measured).product / FIXED.product))
-    timed = replace(measured, forming=replace(measured.forming, product=FIXED.product / 6))
-    assert forming_seconds(timed.forming, ONE, 1.0, unit_costs_of(timed)) == pytest.approx(0.125, rel=1e-12)
-    assert unit_costs_of(timed).product == FIXED.product / 6, "large products are not slower because small frames are"
-    assert unit_costs_of(timed).entry == pytest.approx(FIXED.entry / 6)
+    names = "frame", "product", "entry", "accumulated", "pixel"
+    assert unit_costs_of(nothing).passes["direct"] == FIXED.passes["direct"]
+    assert [getattr(unit_costs_of(nothing), name) for name in names] == [getattr(FIXED, name) for name in names]
+    slow = replace(PILOT_RESULT, forming=replace(PILOT_RESULT.forming, product=6 * FIXED.product))
+    slower = [getattr(unit_costs_of(slow), name) / getattr(FIXED, name) for name in names]
+    assert slower == pytest.approx([6.0] * len(names))
     other = PILOT_RESULT.with_sample_costs({"direct": replace(PILOT_RESULT.sample_costs["direct"], seconds=5e-6)})
     assert unit_costs_of(other).passes["direct"] == 5e-6
 

@@ -74,7 +74,7 @@ PILOT_RESULT = PilotResult(
         "camera_residual": SampleCost.none(),
     },
     spread=SampleCost(Noise(2e-3, 16, 0.8), 16_384, 1e-7),
-    forming=Forming(pixels=512, cells=150, lit=0.2, terms=3.0, shots=49, classes=49, seconds=2e-3),
+    forming=Forming(pixels=512, cells=150, lit=0.2, terms=3.0, shots=49, classes=49),
     apart=APART,
 )
 ONE_CLASS = replace(PILOT_RESULT, forming=replace(PILOT_RESULT.forming, shots=1, classes=1))

@@ -97,7 +97,7 @@ def test_what_is_measured(bench: Bench, pilot_result: PilotResult) -> None:
     widths = ladders["followed_width"]
     assert tuple(widths) == pilot_effects.WIDTHS and widths[1].value < widths[2].value < widths[4].value
     assert {1, 2} <= set(ladders["followed_anchors"]) <= set(FollowedRuns.ladder)
-    assert 0 < pilot_result.forming.seconds < 1
+    assert 0 < pilot_result.forming.product < 1e-6
     assert (
         pilot_result.sample_costs["direct"].paths
         == pilot_result.sample_costs["indirect"].paths
@@ -299,6 +299,38 @@ def test_followed_light_of_either_side_has_its_own_noise(bench: Bench) -> None:
     both = pilot_samples.noise(found._beyond_mean())
     assert math.hypot(indirect.noise.error, camera.noise.error) == pytest.approx(both, rel=0.3)
     assert (indirect.paths, camera.paths) == tuple(tracer.paths_per_sample for tracer in found._simulation().at_anchors)
+
+
+def test_a_ladder_ends_where_its_last_step_leaves_little() -> None:
+    """As far as two steps tell: of changes that fall by a quarter, 1/16 is left after three. One step alone tells what
+    the step before it leaves. (Planted: a further step to judge the last one; one step trusted as two are.)"""
+    tried = list[int]()
+
+    def step(count: int) -> np.ndarray:
+        tried.append(count)
+        return np.full((REPLICATES, 1), 0.25 ** [1, 2, 4, 8].index(count))
+
+    found = pilot_samples.ladder((1, 2, 4, 8), step, 1, 0.07)
+    assert tried == [1, 2, 4] and [float(change[0, 0]) for change in found.values()] == [-1, -0.25, -0.0625]
+    tried.clear()
+    pilot_samples.ladder((1, 2, 4, 8), step, 1, 1.0)
+    assert tried == [1, 2, 4], "0.75 of one step may leave as much again, which is more than 1.0 with it"
+    tried.clear()
+    pilot_samples.ladder((1, 2, 4, 8), step, 1, 1.6)
+    assert tried == [1, 2]
+
+
+def test_what_costs_more_to_ask_than_it_saves_is_not_asked(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether paths are shared, where indirect light takes little; and no closer look than a part of that light.
+    (Planted: always asked; a closer look whatever it takes.)"""
+    lighting = parse_patterns("dots:4", N).lighting
+    sample = pilot_samples.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
+    everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
+    monkeypatch.setattr(pilot_effects, "_OF_INDIRECT", 1e-12)
+    loose, close = (EffectRuns(bench, everything, sample, 5, (450.0, 330.0), reported) for reported in (1.0, 1e-7))
+    for found, asked in ((loose, False), (close, True)):
+        found.indirect_cost()
+        assert ("_sharing" in vars(found)) == asked and found._closer[1] == sample.followed
 
 
 def test_indirect_light_is_looked_at_closer_where_noise_hides_what_coarse_cells_change(bench: Bench) -> None:

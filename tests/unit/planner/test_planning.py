@@ -15,7 +15,7 @@ import pytest
 from mitsim.devices.patterns import Lighting
 from mitsim.light.cost_model import FIXED
 from mitsim.light.plan import Plan
-from mitsim.light.settings import GROUPS, MOST_PATHS, REPLICATES, Noise, SampleCost
+from mitsim.light.settings import GROUPS, MOST_PATHS, REPLICATES, Approximation, Noise, SampleCost
 from mitsim.optics.forming import bound_of
 from mitsim.planner import pilot, planner
 from mitsim.planner.choose import _BOUND_OVER_ERROR, FIRST_ACCURACY, Candidate, _samples_for, cheapest
@@ -140,6 +140,37 @@ def test_a_finer_look_that_finds_no_accuracy_kept_takes_none_away(runs: CountedR
     runs.kept = 1.0
     found = within(11.01)
     assert len(runs.asked) == 2 and found.accuracy == 1e-3 and found.warnings == (OWN,)
+
+
+class Refined:
+    """Looks of which each closer one costs the same, and of which none tells more."""
+
+    pilot_result = ONE_CLASS
+
+    def __init__(self, work: float) -> None:
+        self.cost, self.refined = work, list[str]()
+
+    def work(self, run: str) -> float:
+        return self.cost
+
+    def refine(self, run: str) -> None:
+        assert len(self.refined) < 9, "no end"
+        self.refined.append(run)
+
+
+@pytest.mark.parametrize(("part", "closer"), [(0.21, 0), (0.19, 1), (0.06, 3), (0.04, 5)])
+def test_closer_looks_take_a_fifth_of_the_run_at_most(
+    monkeypatch: pytest.MonkeyPatch, part: float, closer: int
+) -> None:
+    """However much they promise; and the plan says so. (Planted: each of them for itself.)"""
+    whole = cheapest(3e-3, ONE_CLASS, {}).work
+    looked: Any = Refined(part * whole)
+    monkeypatch.setattr(planner, "value_of_refining", lambda *_: (math.inf, Approximation("followed_anchors", 2)))
+    (note,) = planner._refine(looked, 3e-3, {})
+    assert looked.refined == ["followed"] * closer
+    assert "followed anchors and all that hangs on them are chosen safely" in note and f"the {whole:.1f} s" in note
+    monkeypatch.setattr(planner, "value_of_refining", lambda *_: (0.0, Approximation("followed_anchors", 2)))
+    assert not list(planner._refine(looked, 3e-3, {})), "worth nothing"
 
 
 LAUNCH_S, PATH_S = 0.02, 1e-7
