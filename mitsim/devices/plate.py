@@ -20,12 +20,20 @@ from mitsim.core.arrays import ByValue, FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.imagelist import Wanted
 from mitsim.core.images import image_size, own_end, read_image
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import stream
 from mitsim.devices.mask import NO_FLAWS, BoolArray, Flaws, Term, draw_dust, mean_opening
 
 LEFT_OUT = 1e-7
 """Part of a transmission, rms, that singular vectors may leave: a tenth of the finest accuracy that a plan takes."""
-RASTER_LEFT_OUT = 1e-4
-"""The same of light on a raster, which is no more exact itself."""
+RASTER_LEFT_OUT = 3e-4
+"""The same of light on a raster, of single pixels; of frames it leaves 1e-5 and less
+(tests/unit/optics/test_correlation.py)."""
+_SKETCHES = 96, 192, 384, 640
+"""Directions in which the largest terms are looked for, until they hold all but that: a disc of 64 features has 45 terms
+at 512 pixels, a zone plate of 512 has 460. Where the last are too few, a sum would take longer than a correlation."""
+_TURNS = 2
+"""Times that a sketch is turned toward the largest terms: a third changes their number by one in a hundred."""
 FEW = 2
 """Terms that are looked for as exact crosses: FlatCam's, of whose fields diffraction makes four terms."""
 LARGEST = 4096
@@ -56,6 +64,9 @@ class Plate(ByValue):
         what else is wrong with it.
     irradiance
         whether values are the light behind it, of any finite size, instead: waves are in them already.
+    averaged
+        features along a sensor pixel, over which light is averaged wherever it is asked for: finer structure makes no
+        terms.
     """
 
     feature_mm: float
@@ -64,6 +75,7 @@ class Plate(ByValue):
     lines_mm: FloatArray | None = field(default=None, repr=False)
     flaws: Flaws = NO_FLAWS
     irradiance: bool = False
+    averaged: int = 1
 
     def __post_init__(self) -> None:
         values = np.array(self.values, dtype=np.float64)
@@ -81,7 +93,7 @@ class Plate(ByValue):
             self._hold(lines_mm=np.array(self.lines_mm, dtype=np.float64))
 
     def _values(self) -> tuple[object, ...]:
-        return self.feature_mm, self.words, self.digest, self.flaws, self.irradiance
+        return self.feature_mm, self.words, self.digest, self.flaws, self.irradiance, self.averaged
 
     @cached_property
     def digest(self) -> str:
@@ -166,12 +178,17 @@ class Plate(ByValue):
         if self.crosses is not None:
             return self.crosses, 0.0
         if self.irradiance:
-            return _large_terms(self.values)
+            return self.largest.terms(), self.largest.left_out
         rows, columns, left, singular, right = _factors(self.values, self.lines_mm)
         beyond = np.sqrt(np.cumsum(np.square(singular[::-1]))[::-1])  # what the terms from each on hold
         count = int(np.count_nonzero(beyond > LEFT_OUT * beyond[0]))
         terms = tuple((float(singular[k]), left[rows, k], right[k, columns]) for k in range(count))
         return terms, float(beyond[count] / beyond[0]) if count < len(beyond) else 0.0
+
+    @cached_property
+    def largest(self) -> LargestTerms:
+        """Terms of the light that pixels see of large values."""
+        return LargestTerms(self.values, self.averaged)
 
     @cached_property
     def residuals(self) -> tuple[float, float]:
@@ -309,14 +326,63 @@ def _factors(
     return row.ravel(), column.ravel(), left / weights[0], singular, right / weights[1]
 
 
-def _large_terms(values: FloatArray) -> tuple[tuple[Term, ...], float]:
-    """Terms of large ``values`` by their Gram matrix, in a fifth of the time; what they leave is told to 1e-8."""
-    squared, turn = np.linalg.eigh(values.T @ values)
-    within = np.cumsum(np.maximum(squared, 0))  # what smaller ones hold
-    kept = np.flatnonzero(within > RASTER_LEFT_OUT**2 * within[-1])[::-1]
-    left = values @ turn[:, kept]
-    rest = float(np.sqrt(within[kept[-1] - 1] / within[-1])) if kept[-1] else 0.0
-    return tuple((1.0, left[:, k], turn[:, place]) for k, place in enumerate(kept)), rest
+class LargestTerms:
+    """The terms of large ``values`` (N, N) that hold their means over squares of ``averaged`` values a side, but for
+    3e-4 of them, rms.
+
+    With S the means along an axis, a third of a square apart, and U sigma W^T the singular vectors of S V S^T that are
+    kept, the terms are V S^T W sigma^-1 U^T S V, whose means are U sigma W^T: the best of so few (Nystroem's
+    approximation, from both sides). Half a square apart would leave a thousand times as much between the squares.
+    Vectors come from a sketch in random directions (Halko, Martinsson and Tropp, SIAM Review 53, 217, 2011).
+
+    Attributes
+    ----------
+    count
+        of the terms.
+    left_out
+        of the means, root mean square, as a part of all; above 3e-4 where so many terms are too few.
+    """
+
+    def __init__(self, values: FloatArray, averaged: int = 1) -> None:
+        self._values, self._averaged = values, averaged
+        self._starts = np.arange(1 - averaged, len(values), max(averaged // 3, 1))
+        with single_threaded_blas():
+            seen = self._seen = self._means(self._means(values).T).T
+            whole = float(np.square(seen).sum())
+            for size in _SKETCHES:
+                directions = stream(0, "terms").standard_normal((len(seen), min(size, len(seen))))
+                for _ in range(_TURNS):
+                    directions = np.linalg.qr(seen.T @ (seen @ directions))[0]
+                along = seen @ directions
+                squared, turn = np.linalg.eigh(along.T @ along)
+                held = np.cumsum(squared[::-1])
+                rest = np.sqrt(np.maximum(whole - held, 0) / whole)
+                enough = np.flatnonzero(rest <= RASTER_LEFT_OUT)
+                if len(enough) or size >= len(seen):
+                    break
+        self.count = int(enough[0]) + 1 if len(enough) else len(held)
+        self.left_out = float(rest[self.count - 1])
+        self._squared, self._turn = squared[::-1][: self.count], directions @ turn[:, ::-1][:, : self.count]
+
+    def terms(self) -> tuple[Term, ...]:
+        """The terms (weight, row profile (N,), column profile (N,))."""
+        with single_threaded_blas():
+            left = self._values @ self._spread(self._turn)
+            right = (self._spread(self._seen @ self._turn) / self._squared).T @ self._values
+        return tuple((1.0, left[:, k], right[k]) for k in range(self.count))
+
+    def _means(self, values: FloatArray) -> FloatArray:
+        """(starts, m) means S ``values`` of (N, m), beyond which there is no light."""
+        below = np.concatenate((np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)))
+        ends = np.minimum(self._starts + self._averaged, len(values))
+        return np.asarray((below[ends] - below[np.maximum(self._starts, 0)]) / self._averaged)
+
+    def _spread(self, means: FloatArray) -> FloatArray:
+        """(N, k) S^T ``means`` of (starts, k)."""
+        below = np.concatenate((np.zeros((1, means.shape[1])), np.cumsum(means, axis=0)))
+        places = np.arange(len(self._values))
+        first, beyond = (np.searchsorted(self._starts, places - less, "right") for less in (self._averaged, 0))
+        return np.asarray((below[beyond] - below[first]) / self._averaged)
 
 
 def _beyond_one(values: FloatArray, lines: FloatArray | None) -> float:

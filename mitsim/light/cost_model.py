@@ -18,6 +18,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.devices.plate import FEW
 from mitsim.light.passes import PASSES
 from mitsim.light.settings import GROUPS, Forming, Number, PilotResult, SampleCost, Settings
+from mitsim.optics.fft_shadow import CORRELATION
 from mitsim.optics.forming import PROBES
 from mitsim.optics.frames import formed_frames, mixes
 from mitsim.transport.accumulator import MOST_PLACES
@@ -96,10 +97,6 @@ FIXED = UnitCosts(
 """Chosen near what was measured, as the table's; only their ratios decide."""
 
 
-_CORRELATION = 125.0
-"""Multiplications a pixel that each phase of a correlation with a raster takes as long as, for each pair of anchors and
-layer: 0.08 to 0.13 processor seconds of 512 x 512 pixels and 36 phases, where sums take 8e-11 a multiplication
-(benchmarks/masks.py)."""
 _MANY_ENTRIES = 1.2
 """An entry of a geometric shadow of many terms over one of a wave-optical one (benchmarks/masks.py)."""
 _FURTHER_LINE = 0.2
@@ -245,7 +242,7 @@ def _products(
     pixels = forming.pixels
     if _by_fft(forming, numbers):
         phases = _phases(forming, numbers)
-        return cast(Number, _CORRELATION * phases * layers * np.square(anchors) * (1 + GROUPS) * pixels**2 + 0 * rows)
+        return cast(Number, CORRELATION * phases * layers * np.square(anchors) * (1 + GROUPS) * pixels**2 + 0 * rows)
     probes = GROUPS * (PROBES + 1) * (np.minimum(columns, pixels) + pixels) * rows
     terms = forming.geometric_terms + (forming.terms - forming.geometric_terms) * numbers.waves
     # The shorter side is multiplied out first.

@@ -27,13 +27,14 @@ from scipy import fft
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import in_threads
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask import NO_FLAWS, Flaws, Mask
+from mitsim.devices.mask import NO_FLAWS, Flaws, Mask, Term
 from mitsim.devices.plate import Plate
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.diffraction import EdgeWaves, grid_step, wave_profiles
 from mitsim.optics.edge_profile import Steps, blurred_step
-from mitsim.optics.shadow import Directions, ShadowGeometry
+from mitsim.optics.shadow import Directions, Places, SeparableTerms, ShadowGeometry
 
 _CELLS_PER_PIXEL = 6
 """Raster cells along a pixel: at 4 a raster leaves twice as much (tests/physics/test_raster.py), for which a plan at an
@@ -58,11 +59,18 @@ _GRID_CELLS = 3
 """Cells of the field's grid from point to point at least."""
 _AROUND = 8
 """Cells that a raster is wider than its turned one, for the splines' ends."""
+CORRELATION = 125.0
+"""Multiplications a pixel that each phase of a correlation with a raster takes as long as, for each pair of anchors and
+layer: 0.08 to 0.13 processor seconds of 512 x 512 pixels and 36 phases, where sums take 8e-11 a multiplication
+(benchmarks/masks.py)."""
+KEPT = 8
+"""The last rasters, and what was prepared of them: layers of a scene, with waves and without; some 100 MiB each at 512
+pixels."""
 _AT_ONCE = 2**20
 """Points asked for at a time, 8 MiB of each of some ten arrays."""
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=KEPT)
 def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = None) -> Plate:
     """The shadow of a point at one depth, as a plate of square cells about the mask's centre.
 
@@ -98,7 +106,11 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
         values = sharpen(means(mask, step, count))
     else:
         values = sharpen(_waves(replace(shadow, mask=mask.amplitude), spectrum, step, count))
-    return Plate(step, values, mask.words, flaws=Flaws(mask.blur_mm if spectrum is None else 0.0), irradiance=True)
+    flaws, active = (
+        Flaws(mask.blur_mm if spectrum is None else 0.0),
+        int(min(geometry.active_sides) / geometry.pixel_pitch * cells_per_pixel(geometry)),
+    )
+    return Plate(step, values, mask.words, flaws=flaws, irradiance=True, averaged=max(active, 1))
 
 
 def cells_a_side(geometry: CameraGeometry, spectrum: Spectrum | None) -> int:
@@ -296,7 +308,7 @@ class Correlation:
     """
 
     def __init__(self, shadow: ShadowGeometry, rows: Directions, columns: Directions, fill_factor: float = 1.0) -> None:
-        sides = [_Side.of(*shadow.from_mask(directions, axis)) for axis, directions in enumerate((rows, columns))]
+        sides = _Side.both(shadow, rows, columns)
         self.shape = sides[0].pixels, sides[1].pixels
         self._phases = sides[0].phases, sides[1].phases
         self._spread = [side.weights for side in sides]
@@ -339,6 +351,11 @@ class _Side:
     weights: FloatArray
 
     @classmethod
+    def both(cls, shadow: ShadowGeometry, rows: Directions, columns: Directions) -> list[_Side]:
+        """Those of rows and of columns."""
+        return [cls.of(*shadow.from_mask(directions, axis)) for axis, directions in enumerate((rows, columns))]
+
+    @classmethod
     def of(cls, shadow: ShadowGeometry, directions: Directions) -> _Side:
         pixels = len(shadow.pixel_centres_mm)
         length = shadow.pixel_centres_mm[-1] - shadow.pixel_centres_mm[0]
@@ -356,6 +373,35 @@ class _Side:
         edges = first + np.arange(count + 1)
         below = blurred_step(edges[:, None] - crossings, halves[0], halves[1], blur / cell)
         return cls(pixels, phases, first, np.diff(below, axis=0))
+
+    def factor(self, profile: FloatArray, places: npt.NDArray[np.intp]) -> FloatArray:
+        """(places, c) means of a ``profile`` of the raster that some of the pixels see from each direction."""
+        seen = _part(profile[:, None], self.first, self.phases * (self.pixels - 1) + len(self.weights))[:, 0]
+        windows = np.lib.stride_tricks.sliding_window_view(seen, len(self.weights))
+        return np.asarray(windows[self.phases * places] @ self.weights)
+
+
+def terms_of_raster(
+    shadow: ShadowGeometry, rows: Directions, columns: Directions, fill_factor: float, places: Places | None
+) -> SeparableTerms:
+    """The largest separable terms of a raster's shadow, [(left (m, r), right (m', c)), ...].
+
+    Parameters
+    ----------
+    shadow, rows, columns, fill_factor
+        as for :class:`Correlation`.
+    places
+        rows and columns of a frame; None: all.
+    """
+    sides = _Side.both(shadow, rows, columns)
+    at = [np.arange(side.pixels) if places is None else np.asarray(places[axis]) for axis, side in enumerate(sides)]
+
+    def factors(term: Term) -> tuple[FloatArray, FloatArray]:
+        weight, *profiles = term
+        left, right = (side.factor(*each) for side, *each in zip(sides, profiles, at, strict=True))
+        return fill_factor * weight * left, right
+
+    return in_threads(factors, shadow.mask.terms)
 
 
 def _mask_values(shadow: ShadowGeometry) -> FloatArray:
