@@ -30,8 +30,8 @@ RASTER_LEFT_OUT = 3e-4
 """The same of light on a raster, of single pixels; of frames it leaves 1e-5 and less
 (tests/unit/optics/test_correlation.py)."""
 _SKETCHES = 96, 192, 384, 640
-"""Directions in which the largest terms are looked for, until they hold all but that: a disc of 64 features has 45 terms
-at 512 pixels, a zone plate of 512 has 460. Where the last are too few, a sum would take longer than a correlation."""
+"""Directions in which the largest terms are looked for, until they hold all but that: at 512 pixels a disc of 64
+features has 45 terms, a zone plate of 512 has 460. Where the last are too few, sums take longer than correlations."""
 _TURNS = 2
 """Times that a sketch is turned toward the largest terms: a third changes their number by one in a hundred."""
 FEW = 2

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.plate import FEW
+from mitsim.devices.plate import FEW, RASTER_LEFT_OUT, Plate
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.fft_shadow import CORRELATION, KEPT, Correlation, cells_per_pixel, raster, terms_of_raster
 from mitsim.optics.shadow import Directions, Places, SeparableTerms, ShadowGeometry, lagrange_weights
@@ -35,7 +35,7 @@ _FILLED = 1 / 8
 """Part of all places from which light is laid out whole: of places at random, an eighth lights every row and column."""
 _keep_shadow = lru_cache(maxsize=24)(shadow_terms)
 """The last shadows, a few MiB each: a plan asks for some ten of them again and again."""
-_SUMMED_BYTES = 2**28
+SUMMED_BYTES = 2**28
 """Memory that the terms of a raster may take, and those of the rows and columns that are lit."""
 
 _JUDGED = 64
@@ -159,7 +159,7 @@ class _Raster:
             for places, each in zip((lit.rows, lit.columns), both, strict=True)
         )
         correlation = CORRELATION * pairs * cells_per_pixel(geometry) ** 2 * math.prod(geometry.frame_shape)
-        return held <= _SUMMED_BYTES and len(summed.terms) * near * (far + rows) * across < correlation
+        return held <= SUMMED_BYTES and len(summed.terms) * near * (far + rows) * across < correlation
 
     def _image(self, lit: _Lit, light: FloatArray) -> FloatArray:
         """(m, m') irradiance of a ``light`` (r, c)."""
@@ -370,6 +370,11 @@ def raster_error(
     return error, known
 
 
+def number_of_terms(drawn: Plate) -> float:
+    """Terms that hold the shadow that is ``drawn`` on a raster; infinite where too many were looked for."""
+    return drawn.largest.count if drawn.largest.left_out <= RASTER_LEFT_OUT else math.inf
+
+
 def _largest_terms(
     geometry: CameraGeometry,
     rows: Directions,
@@ -383,7 +388,7 @@ def _largest_terms(
     drawn = raster(geometry, depth, spectrum)
     shape = geometry.frame_shape if places is None else map(len, places)
     sides = sum(side * len(each.centres) for side, each in zip(shape, (rows, columns), strict=True))
-    if 8 * drawn.largest.count * sides > _SUMMED_BYTES:
+    if 8 * number_of_terms(drawn) * sides > SUMMED_BYTES:
         return None
     shadow = replace(ShadowGeometry.of(geometry, depth), mask=drawn)
     return terms_of_raster(shadow, rows, columns, geometry.pixel_fill_factor, places)
