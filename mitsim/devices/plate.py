@@ -221,6 +221,12 @@ class Plate(ByValue):
         return bool(np.isin(self.values, (0, 1)).all())
 
     @property
+    def mirrored(self) -> tuple[bool, bool]:
+        """Whether it is its own mirror image along rows, and along columns."""
+        even = self.lines_mm is None or np.array_equal(self.lines_mm, -self.lines_mm[::-1])
+        return tuple(even and np.array_equal(self.values, np.flip(self.values, axis)) for axis in (0, 1))  # type: ignore[return-value]
+
+    @property
     def diffracts(self) -> bool:
         """Whether its diffraction is worked out: not of light that has gone through it, nor behind blurred edges of
         more than one separable term."""

@@ -66,6 +66,8 @@ layer: 0.08 to 0.13 processor seconds of 512 x 512 pixels and 36 phases, where s
 KEPT = 8
 """The last rasters, and what was prepared of them: layers of a scene, with waves and without; some 100 MiB each at 512
 pixels."""
+_FIELDS_AT_ONCE = 8
+"""Fields that are worked out side by side."""
 _AT_ONCE = 2**20
 """Points asked for at a time, 8 MiB of each of some ten arrays."""
 
@@ -206,9 +208,9 @@ def _waves(shadow: ShadowGeometry, spectrum: Spectrum, step: float, count: int) 
         even = replace(shadow, mask=replace(mask, flaws=NO_FLAWS))
         whole = 2 * int(np.ceil(count / 2**0.5)) + _AROUND
         return _turn_light(_waves(even, spectrum, step, whole), count, mask.flaws)
-    total = np.zeros((count, count))
+    total, mirrored = np.zeros((count, count)), mask.mirrored
     for wavelength, share in zip(spectrum.wavelengths_nm, spectrum.weights, strict=True):
-        total += share * _intensity(*_fields(shadow, float(wavelength), step, count))
+        total += share * _intensity(*_fields(shadow, float(wavelength), step, count), mirrored)
     return total
 
 
@@ -239,14 +241,17 @@ def _fields(
     between = max(int(np.ceil(step / points / grid_step(shadow, wavelength_nm))), _GRID_CELLS)
     half = count * step / 2
     span = half + shadow.mask.extent_mm / 2 + step
-    waves = EdgeWaves(wavelength_nm, distance, step / points / between, count * points * between, span)
+    waves = EdgeWaves(wavelength_nm, distance, step / points / between, count * points * between, span, single=True)
     terms, lines = shadow.mask.terms, shadow.mask.lines
+    profiles = [Steps.between(profile, lines) for place in (1, 2) for profile in [term[place] for term in terms]]
 
-    def field(profile: FloatArray) -> npt.NDArray[np.complex64]:
-        return _means_at_points(waves.field(Steps.between(profile, lines), -half), between).astype(np.complex64)
+    def fields(start: int) -> npt.NDArray[np.complex64]:
+        several = waves.fields(profiles[start : start + _FIELDS_AT_ONCE], -half)
+        return np.stack([_means_at_points(field, between).astype(np.complex64) for field in several])
 
-    rows = np.stack([np.complex64(weight) * field(row) for weight, row, _ in terms], axis=1)
-    return rows, np.stack([field(column) for *_, column in terms]), points
+    seen = np.concatenate(in_threads(fields, range(0, len(profiles), _FIELDS_AT_ONCE)))
+    weights = np.array([weight for weight, *_ in terms], dtype=np.complex64)
+    return (weights[:, None] * seen[: len(terms)]).T, seen[len(terms) :], points
 
 
 def _means_at_points(field: npt.NDArray[np.complex128], between: int) -> npt.NDArray[np.complex128]:
@@ -261,22 +266,34 @@ def _means_at_points(field: npt.NDArray[np.complex128], between: int) -> npt.NDA
     return np.asarray(means * (np.square(np.abs(field)).mean() / power) ** 0.5) if power else means
 
 
-def _intensity(rows: npt.NDArray[np.complex64], columns: npt.NDArray[np.complex64], points: int) -> FloatArray:
-    """(cells, cells) mean |U|^2 of U = ``rows`` ``columns`` at ``points`` x ``points`` points of each cell."""
-    count = len(rows) // points
-    means = np.empty((count, count))
-    at_once = max(1, _AT_ONCE // len(rows) // points)
-    for start in range(0, count, at_once):
-        stop = min(start + at_once, count)
-        field = rows[start * points : stop * points] @ columns
-        means[start:stop] = _blocks(np.square(field.real) + np.square(field.imag), points)
-    return means
+def _intensity(
+    rows: npt.NDArray[np.complex64],
+    columns: npt.NDArray[np.complex64],
+    points: int,
+    mirrored: tuple[bool, bool] = (False, False),
+) -> FloatArray:
+    """(cells, cells) mean |U|^2 of U = ``rows`` ``columns`` at ``points`` x ``points`` points of each cell; of an axis
+    along which the mask is ``mirrored``, half is worked out."""
+    whole = len(rows) // points, columns.shape[1] // points
+    kept = [count // 2 if half else count for count, half in zip(whole, mirrored, strict=True)]
+    columns = columns[:, : kept[1] * points]
+    means = np.empty(kept)
+    at_once = max(1, _AT_ONCE // max(columns.shape[1], 1) // points)
+
+    def square(start: int) -> None:
+        field = rows[start * points : min(start + at_once, kept[0]) * points] @ columns
+        means[start : start + at_once] = _blocks(np.square(field.real) + np.square(field.imag), points)
+
+    in_threads(square, range(0, kept[0], at_once))
+    if mirrored[0]:
+        means = np.concatenate((means, means[::-1]))
+    return np.concatenate((means, means[:, ::-1]), axis=1) if mirrored[1] else means
 
 
-def _blocks(values: npt.NDArray[np.floating], side: int) -> FloatArray:
-    """Means of ``values`` over squares of so many a ``side``."""
-    rows, columns = (size // side for size in values.shape)
-    return np.asarray(values.reshape(rows, side, columns, side).mean(axis=(1, 3), dtype=np.float64))
+def _blocks(values: npt.NDArray[np.float32], side: int) -> FloatArray:
+    """Means of ``values`` over squares of so many a ``side``, of few enough to be added up in single precision."""
+    rows = values.reshape(-1, side, values.shape[1]).sum(axis=1)
+    return np.asarray(sum(rows[:, place::side].astype(np.float64) for place in range(side)) / side**2)
 
 
 # -------- Frames behind a mask drawn on a raster
