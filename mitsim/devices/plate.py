@@ -36,6 +36,9 @@ _TURNS = 2
 """Times that a sketch is turned toward the largest terms: a third changes their number by one in a hundred."""
 FEW = 2
 """Terms that are looked for as exact crosses: FlatCam's, of whose fields diffraction makes four terms."""
+_MOST_DECOMPOSED = 1024
+"""Distinct rows and columns of which singular vectors are worked out: those of 4096 take six minutes and 2 GB, and no
+sum of so many terms is faster than a correlation."""
 LARGEST = 4096
 """Features a side: a transmission takes 128 MiB."""
 _MOST_LINES = 2 * LARGEST
@@ -179,11 +182,29 @@ class Plate(ByValue):
             return self.crosses, 0.0
         if self.irradiance:
             return self.largest.terms(), self.largest.left_out
-        rows, columns, left, singular, right = _factors(self.values, self.lines_mm)
+        if self.many:
+            patterns, which = np.unique(self.values, axis=0, return_inverse=True)
+            return tuple((1.0, (which.ravel() == k) * 1.0, pattern) for k, pattern in enumerate(patterns)), 0.0
+        (rows, columns), weights, weighted = _distinct(self.values, self.lines_mm)
+        left, singular, right = np.linalg.svd(weighted, full_matrices=False)
+        left, right = left / weights[0], right / weights[1]
         beyond = np.sqrt(np.cumsum(np.square(singular[::-1]))[::-1])  # what the terms from each on hold
         count = int(np.count_nonzero(beyond > LEFT_OUT * beyond[0]))
         terms = tuple((float(singular[k]), left[rows, k], right[k, columns]) for k in range(count))
         return terms, float(beyond[count] / beyond[0]) if count < len(beyond) else 0.0
+
+    @cached_property
+    def most_terms(self) -> int:
+        """Its distinct rows or columns, whichever are fewer: terms that it takes at most."""
+        if self.crosses is not None:
+            return len(self.crosses)
+        both = self.values, np.ascontiguousarray(self.values.T)
+        return min(len({line.tobytes() for line in lines}) for lines in both)
+
+    @property
+    def many(self) -> bool:
+        """Whether it has so many terms that its frames are never their sum."""
+        return self.most_terms > _MOST_DECOMPOSED
 
     @cached_property
     def largest(self) -> LargestTerms:
@@ -312,24 +333,22 @@ def within(plate: Plate, reach_mm: float) -> Plate:
     return plate
 
 
-def _factors(
+def _distinct(
     values: FloatArray, lines: FloatArray | None = None
-) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], FloatArray, FloatArray, FloatArray]:
-    """Singular value decomposition of ``values`` by their distinct rows and columns, of which drawings have few.
-
-    Rows and columns count by their widths between ``lines``, where these are not even.
+) -> tuple[tuple[npt.NDArray[np.intp], ...], tuple[FloatArray, ...], FloatArray]:
+    """Distinct rows and columns of ``values``, of which drawings have few; they count by their number, and by their
+    widths between ``lines`` where these are not even.
 
     Returns
     -------
-    (N,) which distinct row and which distinct column each is, their factors (rows, k) and (k, columns), and (k,)
-    singular values between them.
+    (N,) which distinct row and which distinct column each is; roots of what these count, (rows, 1) and (columns,); and
+    (rows, columns) values times both.
     """
     widths = np.ones(len(values)) if lines is None else np.diff(lines) * (len(lines) / np.ptp(lines))
     rows, row = np.unique(values, axis=0, return_inverse=True)
     columns, column = np.unique(rows, axis=1, return_inverse=True)
     weights = np.sqrt(np.bincount(row.ravel(), widths))[:, None], np.sqrt(np.bincount(column.ravel(), widths))
-    left, singular, right = np.linalg.svd(weights[0] * columns * weights[1], full_matrices=False)
-    return row.ravel(), column.ravel(), left / weights[0], singular, right / weights[1]
+    return (row.ravel(), column.ravel()), weights, weights[0] * columns * weights[1]
 
 
 class LargestTerms:
@@ -393,9 +412,17 @@ class LargestTerms:
 
 def _beyond_one(values: FloatArray, lines: FloatArray | None) -> float:
     """What the best separable product leaves of ``values`` between ``lines``, root mean square, as a part of them."""
-    singular = _factors(values, lines)[3]
-    total = np.square(singular).sum()
-    rest = float(np.sqrt(np.square(singular[1:]).sum() / total)) if total else 0.0
+    *_, weighted = _distinct(values, lines)
+    total = np.linalg.norm(weighted)
+    if not total:
+        return 0.0
+    if min(weighted.shape) > _MOST_DECOMPOSED:
+        from scipy.sparse.linalg import svds  # here: only the largest masks need it
+
+        left, singular, right = svds(weighted, k=1, v0=np.ones(min(weighted.shape)))
+        return float(np.linalg.norm(weighted - singular * left * right) / total)
+    singular = np.linalg.svd(weighted, compute_uv=False)
+    rest = float(np.linalg.norm(singular[1:]) / total)
     return rest if rest > _ROUNDING * len(values) else 0.0
 
 

@@ -53,6 +53,8 @@ _POINTS_PER_FRESNEL_LENGTH = 80
 3.2e-4 and 2.2e-4 off its closed form, at 60 5.8e-4 and 6.8e-4, evenly (tests/physics/test_raster.py)."""
 _MOST_WAVE_POINTS = 1 << 16
 """Points a side at most: 4e9 of them take a minute for each line, and some seconds more for each term."""
+_MOST_WAVE_TERMS = 2.0**39
+"""Points times terms at most: 40 processor seconds for each line, at 8e-11 s each (mitsim.light.memory)."""
 _LEAST_WAVE_POINTS = 2
 """Points along a cell at least."""
 _GRID_CELLS = 3
@@ -140,6 +142,25 @@ def _cells(geometry: CameraGeometry, mask: Plate, step: float, spectrum: Spectru
         product = float(spectrum.wavelengths_nm.max()) * 1e-6 * geometry.mask_distance
         half += product / (np.pi**2 * mask.opening_mm * _LEFT_BEYOND)
     return 2 * int(np.ceil(min(geometry.mask_reach, half) / step))
+
+
+def check_waves(geometry: CameraGeometry, spectrum: Spectrum) -> None:
+    """MitsimError, before anything is drawn, for waves of a ``spectrum`` behind a mask of so many terms that drawing
+    them would take longer than a minute a line."""
+    mask = geometry.build_mask()
+    if not isinstance(mask, Plate) or mask.irradiance or not geometry.is_drawn(waves=True):
+        return
+    step = geometry.pixel_pitch / cells_per_pixel(geometry)
+    points = cells_a_side(geometry, spectrum) * max(
+        points_per_cell(float(line), geometry.mask_distance, step) for line in spectrum.wavelengths_nm
+    )
+    terms = mask.amplitude.most_terms
+    if terms * float(points) ** 2 * 0.5 ** sum(mask.mirrored) > _MOST_WAVE_TERMS:
+        raise MitsimError(
+            f"{mask.words}: {len(mask.values)} features a side are in sight, of {terms} terms, and their waves are "
+            f"added up at {points} points a side: minutes for each line of light, before anything is known; use "
+            "--effects=-diffraction for its geometric shadow, or give larger features or fewer pixels"
+        )
 
 
 def points_per_cell(wavelength_nm: float, distance_mm: float, step_mm: float) -> int:
