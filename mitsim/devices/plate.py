@@ -9,6 +9,7 @@ those of :mod:`mitsim.devices.mask`.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -181,7 +182,10 @@ class Plate(ByValue):
         if self.crosses is not None:
             return self.crosses, 0.0
         if self.irradiance:
-            return self.largest.terms(), self.largest.left_out
+            found = self.largest
+            if found.left_out > RASTER_LEFT_OUT:
+                found = LargestTerms(self.values, self.averaged, sizes=(len(self.values),))
+            return found.terms(), found.left_out
         if self.many:
             patterns, which = np.unique(self.values, axis=0, return_inverse=True)
             return tuple((1.0, (which.ravel() == k) * 1.0, pattern) for k, pattern in enumerate(patterns)), 0.0
@@ -208,7 +212,7 @@ class Plate(ByValue):
 
     @cached_property
     def largest(self) -> LargestTerms:
-        """Terms of the light that pixels see of large values."""
+        """Terms of the light that pixels see of large values, where some hundreds hold it."""
         return LargestTerms(self.values, self.averaged)
 
     @cached_property
@@ -368,13 +372,13 @@ class LargestTerms:
         of the means, root mean square, as a part of all; above 3e-4 where so many terms are too few.
     """
 
-    def __init__(self, values: FloatArray, averaged: int = 1) -> None:
+    def __init__(self, values: FloatArray, averaged: int = 1, sizes: Sequence[int] = _SKETCHES) -> None:
         self._values, self._averaged = values, averaged
         self._starts = np.arange(1 - averaged, len(values), max(averaged // 3, 1))
         with single_threaded_blas():
             seen = self._seen = self._means(self._means(values).T).T
             whole = float(np.square(seen).sum())
-            for size in _SKETCHES:
+            for size in sizes:
                 directions = stream(0, "terms").standard_normal((len(seen), min(size, len(seen))))
                 for _ in range(_TURNS):
                     directions = np.linalg.qr(seen.T @ (seen @ directions))[0]

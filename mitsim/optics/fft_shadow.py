@@ -74,7 +74,6 @@ _AT_ONCE = 2**20
 """Points asked for at a time, 8 MiB of each of some ten arrays."""
 
 
-@lru_cache(maxsize=KEPT)
 def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = None) -> Plate:
     """The shadow of a point at one depth, as a plate of square cells about the mask's centre.
 
@@ -92,6 +91,14 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
     MitsimError
         for a raster of too many cells, or a mask whose waves are not worked out.
     """
+    # However it was chosen to be drawn: a run then has its plan's.
+    chosen = {"mask_fft": False, "mask_cells": cells_per_pixel(geometry)}
+    return draw_raster(geometry.model_copy(update=chosen), depth, spectrum)
+
+
+@lru_cache(maxsize=KEPT)
+def draw_raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None) -> Plate:
+    """As :func:`raster`, for a camera whose cells are stated; the last ones are kept."""
     mask, shadow = geometry.build_mask(), ShadowGeometry.of(geometry, depth)
     if not isinstance(mask, Plate):
         raise MitsimError(f"{geometry.mask_words}: its shadow has a closed form; take that")

@@ -356,13 +356,18 @@ def raster_error(
     def frame(finer: int) -> FloatArray:
         drawn = few.model_copy(update={"mask_cells": finer * cells_per_pixel(few)})
         shadow = replace(ShadowGeometry.of(drawn, depth), mask=raster(drawn, depth, spectrum))
+        if finer == 1 and not known and math.isfinite(number_of_terms(raster(drawn, depth, spectrum))):
+            # As runs may form it: what its largest terms leave out is then part of what is told.
+            return summed(terms_of_raster(shadow, rows, columns, drawn.pixel_fill_factor, None))
         return Correlation(shadow, rows, columns, drawn.pixel_fill_factor).image(light, row, column)
+
+    def summed(terms: SeparableTerms) -> FloatArray:
+        return np.asarray(sum(left @ light @ right.T for left, right in terms))
 
     known = not few.is_drawn(spectrum is not None)
     coarse = frame(1)
     if known:
-        terms = shadow_terms(few, rows, columns, depth, spectrum)
-        judge = np.asarray(sum(left @ light @ right.T for left, right in terms))
+        judge = summed(shadow_terms(few, rows, columns, depth, spectrum))
     else:
         judge = frame(_FINER)
     energy = float(np.square(judge).sum())

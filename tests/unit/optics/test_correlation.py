@@ -137,23 +137,21 @@ def test_a_mirrored_drawings_waves_are_those_of_its_half(monkeypatch: pytest.Mon
         plate = Plate(0.05, values, "zones")
         camera = BARE.model_copy(update={"mask": "plate", "mask_plate": plate})
         assert plate.mirrored == mirrored
-        rasters.raster.cache_clear()
+        rasters.draw_raster.cache_clear()
         drawn = rasters.raster(camera, 300.0, lines).values
         with monkeypatch.context() as whole:
             whole.setattr(Plate, "mirrored", (False, False))
-            rasters.raster.cache_clear()
+            rasters.draw_raster.cache_clear()
             expected = rasters.raster(camera, 300.0, lines).values
         np.testing.assert_allclose(drawn, expected, rtol=0, atol=1e-5 * expected.mean())
-    rasters.raster.cache_clear()
+    rasters.draw_raster.cache_clear()
 
 
 def test_waves_of_large_drawings_are_refused_before_they_are_drawn() -> None:
     """4096 features a side would take minutes for each line; their geometric shadow is drawn. (Planted: no check.)"""
     values = np.random.default_rng(0).integers(0, 2, (4096, 4096)).astype(np.float64)
     camera = CameraGeometry(mask="plate", mask_plate=Plate(0.003, values, "drawing noise.png"))
-    with pytest.raises(
-        MitsimError, match=r"drawing noise\.png: .* use --effects=-diffraction"
-    ):
+    with pytest.raises(MitsimError, match=r"drawing noise\.png: .* use --effects=-diffraction"):
         rasters.check_waves(camera, Spectrum(np.array([500.0]), np.ones(1)))
     assert camera.is_drawn(waves=False) and camera.mask_terms == 1
 
