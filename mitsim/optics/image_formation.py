@@ -366,10 +366,7 @@ def raster_error(
 
     known = not few.is_drawn(spectrum is not None)
     coarse = frame(1)
-    if known:
-        judge = summed(shadow_terms(few, rows, columns, depth, spectrum))
-    else:
-        judge = frame(_FINER)
+    judge = summed(shadow_terms(few, rows, columns, depth, spectrum)) if known else frame(_FINER)
     energy = float(np.square(judge).sum())
     error = float(np.sqrt(np.square(coarse - judge).sum() / energy)) if energy else 0.0
     return error, known

@@ -237,8 +237,8 @@ def test_what_a_raster_leaves_is_predicted(mask: dict[str, object]) -> None:
 
 
 def test_each_line_of_a_raster_has_its_own_shadow() -> None:
-    """The frame of two lines is theirs, by their shares, and a shadow drawn for one is not taken for another. (Planted:
-    rasters kept by mask and depth alone.)"""
+    """The frame of two lines is theirs, by their shares, but for what the largest terms of each leave, and a shadow drawn
+    for one is not taken for another. (Planted: rasters kept by mask and depth alone.)"""
     camera = made(kind="random", features=31)
     at, light = Directions.cells(np.linspace(-0.15, 0.15, 81)), np.zeros((80, 80))
     light[3::20, 5::20] = 1
@@ -248,7 +248,7 @@ def test_each_line_of_a_raster_has_its_own_shadow() -> None:
 
     lines = [Spectrum(LINES.wavelengths_nm[k : k + 1], np.ones(1)) for k in (0, 1)]
     blue, red = (frame(line) for line in lines)
-    np.testing.assert_allclose(frame(LINES), 0.4 * blue + 0.6 * red, rtol=0, atol=1e-6 * blue.mean())
+    np.testing.assert_allclose(frame(LINES), 0.4 * blue + 0.6 * red, rtol=0, atol=3e-4 * blue.mean())
     assert np.linalg.norm(blue - red) > 0.01 * np.linalg.norm(red)
 
 
