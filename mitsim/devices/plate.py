@@ -27,12 +27,12 @@ from mitsim.devices.mask import NO_FLAWS, BoolArray, Flaws, Term, draw_dust, mea
 
 LEFT_OUT = 1e-7
 """Part of a transmission, rms, that singular vectors may leave: a tenth of the finest accuracy that a plan takes."""
-RASTER_LEFT_OUT = 3e-4
-"""The same of light on a raster, of single pixels; of frames it leaves 1e-5 and less
+RASTER_LEFT_OUT = 1e-4
+"""The same of light on a raster, of single pixels; of frames of dots it leaves 1e-5 and less
 (tests/unit/optics/test_correlation.py)."""
 _SKETCHES = 96, 192, 384, 640
 """Directions in which the largest terms are looked for, until they hold all but that: at 512 pixels a disc of 64
-features has 45 terms, a zone plate of 512 has 460. Where the last are too few, sums take longer than correlations."""
+features has 59 terms, a zone plate of 512 has 535. Where the last are too few, sums take longer than correlations."""
 _TURNS = 2
 """Times that a sketch is turned toward the largest terms: a third changes their number by one in a hundred."""
 FEW = 2
@@ -357,7 +357,7 @@ def _distinct(
 
 class LargestTerms:
     """The terms of large ``values`` (N, N) that hold their means over squares of ``averaged`` values a side, but for
-    3e-4 of them, rms.
+    1e-4 of them, rms.
 
     With S the means along an axis, a third of a square apart, and U sigma W^T the singular vectors of S V S^T that are
     kept, the terms are V S^T W sigma^-1 U^T S V, whose means are U sigma W^T: the best of so few (Nystroem's
@@ -369,7 +369,7 @@ class LargestTerms:
     count
         of the terms.
     left_out
-        of the means, root mean square, as a part of all; above 3e-4 where so many terms are too few.
+        of the means, root mean square, as a part of all; above 1e-4 where so many terms are too few.
     """
 
     def __init__(self, values: FloatArray, averaged: int = 1, sizes: Sequence[int] = _SKETCHES) -> None:
