@@ -1,6 +1,7 @@
 """What three lines cost in the time of one: `capture --colour lines` beside captures of one line, side by side.
 
-    python benchmarks/colour_lines.py --json FILE [--scene photograph ...] [--patterns dots:7] [--accuracy 1e-3] [--repeat 5]
+    python benchmarks/colour_lines.py --json FILE [--scene photograph ...] [--patterns dots:7] [--accuracy 1e-3]
+        [--repeat 5]
 
 Each command is a process of its own from the shell to its exit: ``mono``, all lines as one light; ``one line``, a
 projector of its longest line alone; ``lines``, each line in a folder. They run in turn, ``--repeat`` times, after one

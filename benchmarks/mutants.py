@@ -2,10 +2,10 @@
 
     python benchmarks/mutants.py [--room optics] [--json FILE] [--again FILE] [--jobs 2] [--seed 0]
 
-`mutants.json` has, for every module of every room, how many mutants are drawn and the tests that must see them, fast
-ones first, and the survivors that are explained (reason: [mutants]). Which are drawn hangs on the seed and on each
-change alone: the same code gives the same mutants, and an edit moves only those of the lines that it touches. Each runs
-in a copy of the tree up to the first failure or a time limit.
+`mutants.json` has, for every room, the tests that must see its mutants, how many are drawn of each module, and the
+survivors that are explained (reason: [mutants]). Which are drawn hangs on the seed and on each change alone: the same
+code gives the same mutants, and an edit moves only those of the lines that it touches. Each runs in a copy of the tree
+up to the first failure or a time limit.
 
 Exit status: 0; 1 when a mutant survives that is not explained, or one that is explained does not; 2 when the tests
 fail as they are.
@@ -29,7 +29,7 @@ import tempfile
 import threading
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -118,8 +118,8 @@ class Notes:
 
 
 class Order:
-    """Plugin of the run with a mutant: first the tests that run its line, those of fast files before; then those that
-    run its module; others cannot see it."""
+    """Plugin of the run with a mutant: tests that run its line before those that run its module, fast ones first;
+    others cannot see it."""
 
     def __init__(self, mutant: Mutant, paths: list[Path]) -> None:
         self.module, self.line = f"{mutant.module}:", f"{mutant.module}:{mutant.line}"
@@ -129,19 +129,24 @@ class Order:
             self.lines |= notes[1]
 
     def pytest_collection_modifyitems(self, items: list[Any]) -> None:
-        first, then = defaultdict[str, list[Any]](list), []
+        cost = defaultdict[str, float](float)
         for item in items:
-            lines = {*self.lines.get(item.nodeid, ()), *self.lines.get(file_of(item.nodeid), ())}
-            if self.line in lines:
-                first[file_of(item.nodeid)].append(item)
-            elif any(line.startswith(self.module) for line in lines):
-                then.append(item)
+            cost[file_of(item.nodeid)] += self.seconds.get(item.nodeid, 0.0)
 
-        def cost(tests: list[Any]) -> float:
-            return sum(self.seconds.get(item.nodeid, 0.0) for item in tests)
+        def order(item: Any) -> tuple[bool, float, float]:
+            return (
+                self.line not in self._lines(item), cost[file_of(item.nodeid)], self.seconds.get(item.nodeid, 0.0),
+            )  # fmt: skip
 
-        files = sorted(first.values(), key=cost)
-        items[:] = [item for tests in files for item in sorted(tests, key=lambda item: cost([item]))] + then
+        items[:] = sorted((item for item in items if runs(self.module, self._lines(item))), key=order)
+
+    def _lines(self, item: Any) -> list[str]:
+        return [*self.lines.get(item.nodeid, ()), *self.lines.get(file_of(item.nodeid), ())]
+
+
+def runs(module: str, lines: Iterable[str]) -> bool:
+    """Whether some of the ``lines`` are of a ``module:``."""
+    return any(line.startswith(module) for line in lines)
 
 
 def file_of(test: str) -> str:
@@ -151,16 +156,30 @@ def file_of(test: str) -> str:
 
 def judged(mutant: Mutant | None, tests: Tests, limit_s: float) -> tuple[str, float]:
     """Verdict on a ``mutant`` (None: the code as it is, by one file) by ``tests``, and their processor time [s]."""
-    notes = [_copy.parent / f"{test.replace('/', '-')}.json" for test in tests]
     if mutant is None:
-        return _verdict(tests, limit_s, Notes(notes[0]))
+        return _verdict(tests, limit_s, Notes(notes_of(_copy.parent, *tests)))
     path = _copy / "mitsim" / mutant.module
     source, written = path.read_text(encoding="utf-8"), path.stat()
     path.write_text(mutated(source, mutant.place), encoding="utf-8")
-    verdict = _verdict(tests, limit_s, Order(mutant, notes))
+    verdict = _verdict(tests, limit_s, Order(mutant, [notes_of(_copy.parent, test) for test in tests]))
     path.write_text(source, encoding="utf-8")
     os.utime(path, ns=(written.st_atime_ns, written.st_mtime_ns))  # its compiled form is valid again
     return verdict
+
+
+def notes_of(folder: Path, test: str) -> Path:
+    """Where what a file of tests runs is noted, in the ``folder`` of the copies."""
+    return folder / f"{test.replace('/', '-')}.json"
+
+
+def telling(mutant: Mutant, lines: dict[str, set[str]]) -> Tests:
+    """Files of tests that can see a ``mutant``: those that run its line or, where it is one of none of them or of no
+    function (a module's constant, which runs in the test that happens to import it first), its module. ``lines``: what
+    each runs."""
+    line = f"{mutant.module}:{mutant.line}"
+    in_function = not mutant.key.startswith(f"{mutant.module} module: ")
+    here = tuple(test for test, run in lines.items() if in_function and line in run)
+    return here or tuple(test for test, run in lines.items() if runs(f"{mutant.module}:", run))
 
 
 def _verdict(tests: Tests, limit_s: float, plugin: Notes | Order) -> tuple[str, float]:
@@ -221,13 +240,18 @@ def main() -> int:
     ):
         files = list(dict.fromkeys(test for *_, tests in work for test in tests))
         bare = pool.map(judged, [None] * len(files), [(file,) for file in files], [3600] * len(files))
-        usual = {}
+        usual = dict[str, float]()
         for file, (verdict, seconds) in zip(files, bare, strict=True):
             if verdict != "survived":
                 print(f"tests fail without a mutant: {file}")
                 return 2
             usual[file] = seconds
-        tasks = [(mutant, tests, SLOWER * sum(map(usual.get, tests)) + LATER_S) for _, mutant, tests in work]
+        read = {file: json.loads(notes_of(Path(parent), file).read_text())[1] for file in files}
+        lines = {file: set().union(*by_test.values()) for file, by_test in read.items()}
+        tasks = []
+        for _, mutant, tests in work:
+            own = telling(mutant, {test: lines[test] for test in tests})
+            tasks.append((mutant, own, SLOWER * sum(usual[test] for test in own) + LATER_S))
         results = []
         for (room, mutant, _), (verdict, seconds) in zip(work, pool.map(judged, *zip(*tasks)), strict=True):  # noqa: B905
             where = f"mitsim/{mutant.module}:{mutant.line}"
@@ -237,12 +261,14 @@ def main() -> int:
 
 
 def _drawn(room: str, seed: int, again: set[str] | None) -> list[tuple[str, Mutant, Tests]]:
-    """(room, mutant, tests) of a room; only those whose keys are in ``again``, if given."""
-    work = []
-    for module, (count, names) in SETTINGS["rooms"][room].items():
+    """(room, mutant, files of tests) of a room; only those whose keys are in ``again``, if given."""
+    work, listed = [], SETTINGS["rooms"][room]
+    paths = [ROOT / "tests" / name for name in listed["tests"]]
+    files = [file for path in paths for file in (sorted(path.glob("test_*.py")) if path.is_dir() else [path])]
+    tests = tuple(dict.fromkeys(file.relative_to(ROOT / "tests").as_posix() for file in files))
+    for module, count in listed["modules"].items():
         found = mutants(module, (ROOT / "mitsim" / module).read_text(encoding="utf-8"))
         chosen = drawn(found, count, seed) if again is None else [one for one in found if one.key in again]
-        tests = tuple(dict.fromkeys(test for name in names for test in SETTINGS["tests"].get(name, [name])))
         work += [(room, mutant, tests) for mutant in chosen]
     return work
 
@@ -260,14 +286,14 @@ def _report(results: list[dict[str, object]], path: Path, complete: bool) -> int
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps({"rooms": rooms, "mutants": results}, indent=1), encoding="utf-8")
     survived = {str(one["key"]): one["where"] for one in results if one["verdict"] == "survived"}
-    modules = tuple(f"{module} " for room in rooms for module in SETTINGS["rooms"][room])
+    modules = tuple(f"{module} " for room in rooms for module in SETTINGS["rooms"][room]["modules"])
     left = survived.keys() - explained
     gone = {key for key in explained - survived.keys() if key.startswith(modules)} if complete else set()
     for key in sorted(left):
         print(f"survived, not explained: {survived[key]}  {key}")
     for key in sorted(gone):
         print(f"explained, but killed or not drawn: {key}")
-    listed = {module for modules in SETTINGS["rooms"].values() for module in modules}
+    listed = {module for room in SETTINGS["rooms"].values() for module in room["modules"]}
     there = {f"{room}/{path.name}" for room in WHOLE for path in (ROOT / "mitsim" / room).glob("[a-z]*.py")}
     there -= {module for modules in SETTINGS["left_out"].values() for module in modules}
     for module in sorted(there - listed):

@@ -89,18 +89,34 @@ def test_an_edit_moves_only_the_mutants_of_its_own_lines(mutations: ModuleType) 
     assert drawn[0] != {mutant.key for mutant in mutations.drawn(before, 8, 1)}, "another seed draws others"
 
 
+def test_a_constant_is_met_by_all_files_that_run_its_module(mutations: ModuleType) -> None:
+    """Its line is run by whichever test imports the module first, which may say nothing of it. (Planted: that file
+    alone.)"""
+    spec = importlib.util.spec_from_file_location("benchmark_mutants", BENCHMARKS / "mutants.py")
+    module = importlib.util.module_from_spec(spec)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "mutations", mutations)
+        spec.loader.exec_module(module)
+    found = {mutant.key.partition(": ")[0]: mutant for mutant in mutations.mutants("a.py", SOURCE)}
+    lines = {"first.py": {"a.py:3", "a.py:6"}, "own.py": {"a.py:8"}, "other.py": {"b.py:3"}}
+    assert module.telling(found["a.py module"], lines) == ("first.py", "own.py")
+    in_function = next(one for one in mutations.mutants("a.py", SOURCE) if one.line == 8)
+    assert module.telling(in_function, lines) == ("own.py",)
+
+
 def test_the_list_names_modules_and_tests_that_are_there() -> None:
     """All that has moved is told at once, with where a file of that name is now."""
     settings = json.loads((BENCHMARKS / "mutants.json").read_text(encoding="utf-8"))
-    listed = {module: names for room in settings["rooms"].values() for module, (_, names) in room.items()}
+    listed = {module for room in settings["rooms"].values() for module in room["modules"]}
     explained = {key.partition(" ")[0] for keys in settings["explained"].values() for key in keys}
-    tests = {test for names in listed.values() for name in names for test in settings["tests"].get(name, [name])}
-    tests |= {test for names in settings["tests"].values() for test in names}
+    tests = {test for room in settings["rooms"].values() for test in room["tests"]}
     left_out = {module for modules in settings["left_out"].values() for module in modules}
     moved = moves("mitsim", {*listed, *explained, *left_out}) + moves("tests", tests)
     assert not moved, "\n".join(moved)
-    assert {module.partition("/")[0] for module in listed} >= {"sensor", "optics", "reconstruct", "light", "planner"}
-    assert sum(count for room in settings["rooms"].values() for count, _ in room.values()) >= 300
+    assert {*settings["rooms"]} >= {"sensor", "optics", "reconstruct", "light", "planner"}
+    for name, room in settings["rooms"].items():
+        assert {module.partition("/")[0] for module in room["modules"]} == {name}
+    assert sum(count for room in settings["rooms"].values() for count in room["modules"].values()) >= 300
     assert explained <= {*listed} and all(len(reason) > 20 for reason in settings["explained"])
 
 
@@ -118,7 +134,7 @@ def moves(folder: str, names: set[str]) -> list[str]:
 
 def test_every_module_of_whole_rooms_is_listed() -> None:
     settings = json.loads((BENCHMARKS / "mutants.json").read_text(encoding="utf-8"))
-    listed = {module for room in settings["rooms"].values() for module in room}
+    listed = {module for room in settings["rooms"].values() for module in room["modules"]}
     listed |= {module for modules in settings["left_out"].values() for module in modules}
     whole = re.search(r"^WHOLE = \((.*)\)$", (BENCHMARKS / "mutants.py").read_text(encoding="utf-8"), flags=re.M)
     for room in re.findall(r"\w+", whole[1]):

@@ -95,9 +95,8 @@ class ModelledCamera:
 
     def factors(self, placement: Placement) -> tuple[FloatArray, FloatArray]:
         """(m, n) left and (m', n) right factor [sqrt(electrons / s)] of the mask at a ``placement``, but not turned."""
-        left, right = self._cached_factors(
-            placement.move({"gain": 1 - placement.gain, "mask_rotation": -placement.mask_rotation})
-        )
+        built = self.built
+        left, right = self._cached_factors(replace(placement, gain=built.gain, mask_rotation=built.mask_rotation))
         root = np.sqrt(placement.gain)
         return left * root, right * root
 

@@ -442,9 +442,8 @@ def terms_of_raster(
     at = [np.arange(side.pixels) if places is None else np.asarray(places[axis]) for axis, side in enumerate(sides)]
 
     def factors(term: Term) -> tuple[FloatArray, FloatArray]:
-        weight, *profiles = term
-        left, right = (side.factor(*each) for side, *each in zip(sides, profiles, at, strict=True))
-        return fill_factor * weight * left, right
+        weight, row, column = term
+        return fill_factor * weight * sides[0].factor(row, at[0]), sides[1].factor(column, at[1])
 
     return in_threads(factors, shadow.mask.terms)
 

@@ -239,7 +239,7 @@ def pair_shots(weights: FloatArray) -> tuple[FloatArray, Mixture] | None:
         return None
     chosen: dict[bytes, int] = {}
     kept: list[npt.NDArray[np.bool_]] = []
-    numbers, left = np.zeros(len(weights), int), np.zeros(len(weights), bool)
+    numbers, left = np.empty(len(weights), int), np.empty(len(weights), bool)
     for shot, row in enumerate(lit):
         key, other = row.tobytes(), (~row).tobytes()
         if key not in chosen and other not in chosen:

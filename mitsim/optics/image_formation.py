@@ -225,7 +225,7 @@ class FrameOptics:
             if geometry.is_correlated(spectrum is not None):
                 shadow = geometry, rows, columns, depth, spectrum
                 summed = _largest_terms(*shadow, places) if geometry.is_drawn(spectrum is not None) else None
-                return _Raster(shadow, weights, places, summed and _Terms(summed, weights))
+                return _Raster(shadow, weights, places, None if summed is None else _Terms(summed, weights))
             return _Terms(_shadow(geometry, rows, columns, depth, spectrum, places), weights)
 
         self._layers = [layer(depth) for depth in depths]

@@ -375,7 +375,9 @@ def lagrange_weights(places: FloatArray, nodes: FloatArray) -> list[FloatArray]:
     weights = []
     for node in nodes:
         others = nodes[nodes != node]
-        weights.append(np.prod([(places - other) / (node - other) for other in others], axis=0) * np.ones_like(places))
+        weights.append(
+            np.prod([np.ones_like(places), *((places - other) / (node - other) for other in others)], axis=0)
+        )
     return weights
 
 

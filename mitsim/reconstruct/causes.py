@@ -395,6 +395,11 @@ class _Held:
     weights: FloatArray
 
 
+def light_around(light: FloatArray) -> FloatArray:
+    """The mean ``light`` around each reading, less its own, whose noise it does not know of."""
+    return np.asarray(uniform_filter(light, _AROUND) - light / _AROUND**2)
+
+
 def _shots(measurement: Measurement) -> tuple[FloatArray, ...]:
     """Light of each shot of a ``measurement``."""
     if measurement.shots == 1:
@@ -542,8 +547,7 @@ class Readings:
         parts = np.zeros((2, _CURVE_PARTS))
         for each in self._linear(curve):
             residual = prepared.as_solved(each.frame) - prepared.frame(weights, each.pattern)
-            # By the light around a reading, which does not know of its noise.
-            near = uniform_filter(each.light, _AROUND) - each.light / _AROUND**2
+            near = light_around(each.light)
             part = np.searchsorted(np.quantile(near, np.arange(1, _CURVE_PARTS) / _CURVE_PARTS), near.ravel())
             variance = np.maximum(self._digital.variance(each.light, each.shots), _TINY).ravel()
             for energy, values in zip(parts, (np.square(residual).ravel(), variance), strict=True):

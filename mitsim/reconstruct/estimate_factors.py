@@ -370,10 +370,10 @@ def factors_of_sums(
             error = float(np.hypot(error, np.sqrt(more / count) / np.linalg.norm(factor)))
         predicted.append(error)
         rank.append(values.rank(factor, error))
-    n = phi[0].shape[1], phi[1].shape[1]
+    n = len(signs)
     figures = (
         f"Factor error {predicted[0]:.1e} and {predicted[1]:.1e}, "
-        f"rank {rank[0]} of {n[0]} and {rank[1]} of {n[1]}, condition {condition:.1e}."
+        f"rank {rank[0]} of {n} and {rank[1]} of {n}, condition {condition:.1e}."
     )
     return Estimate(
         left=phi[0],
@@ -384,7 +384,7 @@ def factors_of_sums(
         noise=noise,
         predicted_error=(predicted[0], predicted[1]),
         rank=(rank[0], rank[1]),
-        status=_status(unexplained > allowed, unexplained, max(predicted), (n[0] - rank[0], n[1] - rank[1]), figures),
+        status=_status(unexplained > allowed, unexplained, max(predicted), (n - rank[0], n - rank[1]), figures),
     )
 
 

@@ -151,7 +151,7 @@ class Misfit:
 
     def judge(self, status: Status) -> Status:
         """The ``status`` of a solution with this misfit."""
-        if not self.flagged or self.cause is None:
+        if self.cause is None:
             return status
         if self.faults:
             more = f"; and {len(self.faults) - _SHOWN} more" if len(self.faults) > _SHOWN else ""

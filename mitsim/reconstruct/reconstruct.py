@@ -409,11 +409,11 @@ def _without_defects(
         rest, without, solution = left_out(found)
         now = find_misfit(without, solution) or now
     # What bright ones put into other pixels is none of these: they are taken in again.
+    changed = False
     while found and (own := found.beyond_chance(rest, data.noise)) and len(own.rows) < len(found.rows):
-        found = own
+        found, changed = own, True
         rest, without, solution = left_out(found)
-        now = find_misfit(without, solution, with_defects=False) or now
-    if now.flagged:
+    if changed or now.flagged:
         now = find_misfit(without, solution, with_defects=False) or now
     if now.flagged and now.unexplained > _BETTER * misfit.unexplained:
         solution = data.solution(lam)

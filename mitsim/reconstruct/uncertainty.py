@@ -235,8 +235,9 @@ def _group(seen: FloatArray, shares: FloatArray, data: FloatArray) -> tuple[Floa
     octaves = len(shares) // 2
     whole = np.maximum(shares.sum(axis=0), 1e-300)
     middle, along = (np.arange(len(shares)) % octaves) @ shares / whole, shares[:octaves].sum(axis=0) / whole
-    keys = (np.rint(2 * np.log2(seen)) * 2 * len(shares) + np.rint(2 * middle)) * 4 + np.rint(3 * along)
-    _, group = np.unique(keys, return_inverse=True)
+    keys = np.rint([2 * np.log2(seen), 2 * middle, 3 * along]).astype(np.int64)
+    keys -= keys.min(axis=1, keepdims=True)
+    _, group = np.unique(np.ravel_multi_index(tuple(keys), keys.max(axis=1) + 1), return_inverse=True)
     counts = np.bincount(group)
     told = np.stack([np.bincount(group, seen * share) / counts for share in shares], axis=1)
     return told, counts.astype(np.float64), np.bincount(group, data) / counts

@@ -130,16 +130,19 @@ def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Se
     size = min(_CELL, (WIDTH - _LABEL) / len(columns))
     inches = (size + _CAPTION) * len(rows) + 0.3, size * len(columns) + _LABEL
     figure, cells = panels_of(len(rows), len(columns), *inches, layout="compressed")
+
+    def wrap(text: str) -> str:
+        return "\n".join(fill(line, int(size / _LETTER)) for line in text.split("\n"))
+
     for index, (name, images) in enumerate(rows.items()):
         line = cells[index]
         for axes, (image, caption), column in zip(line, images, columns, strict=True):
             axes.imshow(lightness(image), cmap="gray", vmin=0, vmax=1, interpolation="none")
             axes.set(xticks=[], yticks=[])
             axes.spines[:].set_visible(True)
-            axes.set_xlabel(caption, fontsize=FONT - 2)
+            axes.set_xlabel(wrap(caption), fontsize=FONT - 2)
             if index == 0:
-                lines = [fill(line, int(size / _LETTER)) for line in column.split("\n")]
-                axes.set_title("\n".join(lines), fontsize=FONT - 1)
+                axes.set_title(wrap(column), fontsize=FONT - 1)
         fits = len(name) * _LETTER <= size + _CAPTION
         line[0].set_ylabel(name if fits else name.replace(", ", ",\n"), fontsize=FONT - 1)
     if title:

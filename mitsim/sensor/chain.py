@@ -196,7 +196,7 @@ def most_gathered(expected_electrons: FloatArray, exposure_s: float, model: Sens
     Parameters
     ----------
     expected_electrons, exposure_s, model
-        as :func:`gathered` has them.
+        as :func:`mean_electrons` has them.
     """
     if model.has_fixed_pattern or model.crosstalk:
         light, dark = mean_electrons(expected_electrons, exposure_s, model)

@@ -281,7 +281,7 @@ def _cut(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArr
     hard = (room < 8 * deviation) | (np.where(dim | some | full, read, deviation) < _DITHERED)
     total = np.asarray(noise + 1 / 12)
     gone = room < -10 * deviation
-    mean[gone], total[gone] = model.largest_dn, 0.0
+    mean[gone], total[gone] = np.clip(mean[gone], 0, model.largest_dn), 0.0
     return _sum_counts(expected, (dim, some), hard & ~gone, (mean, total), model)
 
 

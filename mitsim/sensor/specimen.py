@@ -123,7 +123,7 @@ def _defects(model: SensorModel, shape: tuple[int, int], kind: str) -> Map | Non
         return None
     count = math.prod(shape)
     pixels = count * model.binning**2
-    chosen = stream(model.pattern_seed, kind).choice(pixels, round(part * pixels), replace=False, shuffle=False)
+    chosen = stream(model.pattern_seed, kind).choice(pixels, round(part * pixels), replace=False)
     return np.bincount(chosen % count, minlength=count).reshape(shape).astype(np.float32)
 
 

@@ -406,7 +406,7 @@ def _images(results: Results) -> Figure:
     for family in FAMILIES:
         rows = results.table.where(way=OWN, patterns=family)
         image = results.array(rows.rows[0], _IMAGE)
-        caption = f"{rows.rows[0]['psnr_db']:.1f} dB, mean Delta E {rows.mean('delta_e').value:.2f}"
+        caption = f"{rows.rows[0]['psnr_db']:.1f} dB,\nmean Delta E {rows.mean('delta_e').value:.2f}"
         cells += [(linear_srgb(image), caption)] if image is not None else []
     return image_grid({OWN: cells}, [label(family) for family in FAMILIES])
 

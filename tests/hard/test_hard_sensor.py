@@ -225,6 +225,7 @@ def test_saturation_is_seen_where_it_is() -> None:
         ({"bits": 1}, 5.0, True),  # a 1 is the ADC's end
         ({"bits": 1}, 0.0, False),
         ({"dark_current_e_per_s": 1500.0}, 0.0, True),
+        ({"dark_current_e_per_s": 1500.0, "prnu_pixel": 0.01}, 0.0, True),
     ):
         camera, light = exposer(**changes), np.full(shape, mean)
         assert camera.saturates(camera.digital(light, "any"), light) == expected, (changes, mean)

@@ -25,6 +25,7 @@ from mitsim.devices.projector import Spectrum
 from mitsim.light.memory import cells_to_choose
 from mitsim.optics import fft_shadow as rasters
 from mitsim.optics import image_formation
+from mitsim.optics.diffraction import grid_step
 from mitsim.optics.fft_shadow import Correlation, raster
 from mitsim.optics.image_formation import FrameOptics, raster_error
 from mitsim.optics.shadow import Directions, ShadowGeometry
@@ -266,3 +267,41 @@ def test_a_plan_may_choose_cells_that_memory_holds() -> None:
     camera = turned_by_a_degree(40)
     six, twelve = (raster(camera.model_copy(update={"mask_cells": cells}), 400.0).feature_mm for cells in (0, 12))
     assert six == pytest.approx(2 * twelve)
+
+
+def test_what_a_raster_leaves_of_other_rows_than_columns_and_of_no_light() -> None:
+    """Judged by the light's own rows and columns; a black frame has no error. (Planted: columns are rows; all.)"""
+    camera = made(kind="random", features=31)
+    rows, columns = Directions.cells(np.linspace(-0.15, 0.1, 7)), Directions.cells(np.linspace(-0.05, 0.15, 5))
+    error, known = raster_error(camera, rows, columns, 400.0, None, np.random.default_rng(0).random((6, 4)))
+    assert known and 0 < error < 1e-3
+    assert raster_error(camera, rows, columns, 400.0, None, np.zeros((6, 4))) == (0.0, True)
+
+
+def test_a_mask_turned_by_all_but_a_right_angle_is_drawn_as_by_it() -> None:
+    """About its centre, edges to a sixteenth of a cell, sharpened; the other's features are counted turned. (Planted:
+    cells counted from the middle on; turned the other way.)"""
+    right, nearly, other = (
+        raster(made(kind="random", features=11, over_etch_um=1.0, rotation_deg=turn), 400.0).values
+        for turn in (90.0, 90 - 1e-6, -90.0)
+    )
+    np.testing.assert_allclose(nearly, right, rtol=0, atol=0.2)
+    assert np.abs(other - right).max() > 0.9
+
+
+def test_fields_have_a_grid_as_fine_as_waves_need(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Far behind a mask, where points at which waves are squared are many of the grid's cells apart. (Planted: as many
+    cells from point to point wherever the mask is.)"""
+
+    class Asked(Exception):
+        """For waves on a grid; which takes long."""
+
+    def ask(_: float, __: float, step_mm: float, *others: float) -> None:
+        raise Asked(step_mm)
+
+    monkeypatch.setattr(rasters, "EdgeWaves", ask)
+    bare = CameraGeometry(pixels=4, pixel_pitch=0.03, mask_distance=20.0)
+    camera = MaskProfile(kind="separable", feature_mm=0.06, order=2, over_etch_um=1e-9).put_on(bare, Path())
+    with pytest.raises(Asked) as asked:
+        raster(camera, 400.0, Spectrum(np.array([550.0]), np.ones(1)))
+    assert asked.value.args[0] <= grid_step(ShadowGeometry.of(camera, 400.0), 550.0)

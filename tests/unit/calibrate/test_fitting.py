@@ -214,3 +214,16 @@ def test_words_are_checked() -> None:
             Modelling(**wrong)  # type: ignore[arg-type]
     assert Modelling("wave", fitted=("magnification",)).free == ("magnification", "gain")
     assert tuple(UNITS) == tuple(Placement.__dataclass_fields__)
+
+
+def test_a_turn_acts_where_rays_cross_the_mask() -> None:
+    """From the mask's centre, on the line from a pixel to a point of the board; a factor's part by that coordinate.
+    (Planted: pixels that are seen larger than they are.)"""
+    model, placement = camera(None, depth=8.0), Placement(2.01, 0.02, -0.03, gain=5.0)
+    left, right = model.factors(placement)
+    (_, by_columns), (by_rows, _) = model.rotation_terms(placement)
+    pixels, edges = model.geometry.pixel_centres[:, None], np.linspace(-0.15, 0.15, N + 1)
+    board = 8.0 * (edges[:-1] + edges[1:]) / 2
+    crossing = pixels + (board - pixels) * 2.01 / 8.0
+    np.testing.assert_allclose(by_columns, (crossing + 0.03) * right, rtol=0, atol=1e-12 * right.max())
+    np.testing.assert_allclose(by_rows, -(crossing - 0.02) * left, rtol=0, atol=1e-12 * left.max())

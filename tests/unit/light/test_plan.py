@@ -9,7 +9,7 @@ import pytest
 from mitsim.bench.effects import EFFECTS, SWITCHES
 from mitsim.bench.request import check_accuracy
 from mitsim.core.errors import MitsimError
-from mitsim.light.plan import Plan
+from mitsim.light.plan import ColourCandidate, ColourChoice, Plan, PlanRow
 from mitsim.light.settings import Approximation, Drawn, Estimate
 from tests.unit.planner.invented_pilot_result import (
     ACCURACIES,
@@ -108,6 +108,21 @@ def test_a_plan_is_json_with_the_promised_keys() -> None:
     assert all(set(effect) == {"name", "state", "reason", "error_if_off", "seconds"} for effect in block["effects"])
 
 
+def test_frames_in_grey_are_the_only_way_where_no_other_was_asked_for() -> None:
+    """A plan as JSON always says what was taken of colours; light of some lines has nothing to choose from. (Planted:
+    monochrome for lines too.)"""
+    grey = plan()
+    only = {"name": "mono", "error": 0.0, "seconds": grey.predicted_seconds}
+    assert grey.row("spectrum").state == "off" and grey.block()["colour"] == {"chosen": "mono", "candidates": (only,)}
+    lines = plan(facts=replace(FACTS, spectrum=PlanRow("spectrum", "exact", "at 450, 620 nm", None, 0.0)))
+    assert "colour" not in lines.block() and "colour" not in replace(grey, effects=()).block()
+
+
+def test_the_way_that_is_taken_is_the_one_of_its_name() -> None:
+    ways = ColourCandidate("mono", 0.1, 1.0), ColourCandidate("bands:3", 0.01, 3.0), ColourCandidate("lines", 0.0, 9.0)
+    assert [ColourChoice(way.name, ways).taken for way in ways] == [*ways]
+
+
 @pytest.mark.parametrize(
     ("keystone", "state", "words"), [(0.0, "off", "squarely"), (2.5, "exact", "2.5 of its pixels")]
 )
@@ -180,6 +195,8 @@ def test_a_raster_has_as_many_cells_as_the_accuracy_needs() -> None:
     row = found[2e-3].row("mask-shadow")
     assert "12 cells a pixel" in row.reason and "leaves 1.1e-03, 6 3.0e-03" in row.reason and row.seconds > 0
     assert found[2e-3].block()["settings"]["raster_cells"] == 12
+    fewest = found[1e-2].row("mask-shadow")
+    assert fewest.reason.endswith("that leaves 3.0e-03") and fewest.seconds == 0, "with none to compare with"
     (warning,) = plan(1e-3, drawn).warnings
     assert "the mask's raster, 1.4e-03" in warning
 

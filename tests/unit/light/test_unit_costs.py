@@ -13,6 +13,7 @@ from mitsim.light.cost_model import (
     entries,
     forming_seconds,
     optics_seconds,
+    predicted_rays,
     tracing_seconds,
     truth_seconds,
     unit_costs_of,
@@ -68,6 +69,7 @@ def test_the_frame_that_the_pilot_measured_takes_what_it_took() -> None:
         ({"indirect": 1.0, "coarse_cells": 2.0}, products(5, 3) + products(20, 3)),
         ({"followed_anchors": 3.0, "coarse_cells": 2.0}, products(5, 3) + products(60, 3)),
         ({"followed_anchors": 3.0, "followed_width": 2.0, "all_layers": 1.0}, products(5, 3) + products(15, 3)),
+        ({"occluded_anchors": 4.0}, products(5, 3)),
         ({"occluded": 1.0, "occluded_anchors": 4.0}, products(5, 3) + products(2, 3)),
         ({"occluded": 90.0, "occluded_anchors": 4.0, "coarse_cells": 2.0}, products(5, 3) + products(40, 3)),
         ({"mixed": 1.0}, products(5, 3) + 4 * 50**2),
@@ -174,6 +176,14 @@ def test_lines_share_paths_and_form_and_file_each_its_own() -> None:
     one, several = (tracing_seconds(pilot_result, settings, FIXED) for pilot_result in (PILOT_RESULT, three))
     assert several == pytest.approx({name: 1.4 * each for name, each in one.items()})
     assert truth_seconds(three, settings, FIXED) == pytest.approx(1.4 * truth_seconds(PILOT_RESULT, settings, FIXED))
+
+
+@pytest.mark.parametrize(("rate", "times"), [(0.5, 36), (1.0, 6)])
+def test_truth_takes_rays_until_it_is_off_by_a_sixth_of_what_the_frames_are(rate: float, times: int) -> None:
+    """By as many times the frames' samples, of which choosing where they go saves half; and those it begins with, 16 a
+    pixel and 8 of a board in each of four groups. (Planted: a sixth of the samples; none saved.)"""
+    assert predicted_rays(1000, 5.0, rate) == pytest.approx(4 * 1000 * (16 + 8) + 0.5 * 4 * 1000 * 5 * times)
+    assert predicted_rays(1000, 1e6, rate) == 2**22 and predicted_rays(10**6, 1e6, rate) == 128 * 10**6
 
 
 def test_an_accumulator_is_emptied_and_looked_through_where_it_has_room() -> None:

@@ -7,7 +7,7 @@ from scipy.linalg import hadamard
 
 from mitsim.optics import forming
 from mitsim.optics import frames as frames_module
-from mitsim.optics.forming import AccumulatedLight, _product, pair_shots
+from mitsim.optics.forming import AccumulatedLight, _product, form_frames, pair_shots, probe_frames, probe_vectors
 from mitsim.optics.frames import ClassFrames, ExpectedFrames, Frame, at_once, formed_frames, frames_in_memory, mixes
 from mitsim.optics.image_formation import FrameOptics
 from tests.unit.optics.small_camera import (
@@ -315,3 +315,54 @@ def test_frames_of_pairs_are_those_of_classes() -> None:
         assert np.array_equal(one.irradiance, other.irradiance) and one.variance == other.variance
     assert np.array_equal(paired.probed, probed)
     assert paired._pairs is not None
+
+
+# ---- what frames are, besides their light
+
+
+@pytest.mark.parametrize("family", BESIDE)
+def test_shots_in_a_dark_room_are_those_without_lamps(family: str) -> None:
+    """Also where frames with lamps were formed before, which stay. (Planted: lamps left on.)"""
+    labels, weights = BESIDE[family]
+    optics, groups, lamps = small_optics(8), random_groups(3, 7, 0.2), ambient_groups(3)
+    lit = expected_frames(optics, groups, labels, weights, 5, ambient=[AccumulatedLight(optics, lamps)])
+    before = [frame.irradiance.copy() for frame in lit]
+    dark, plain = lit.of_projector, expected_frames(optics, groups, labels, weights, 5)
+    alike(dark, plain)
+    assert lit.has_ambient and not dark.has_ambient and not dark.projector_off.irradiance.any()
+    assert all(np.array_equal(frame.irradiance, light) for frame, light in zip(lit, before, strict=True))
+
+
+@pytest.mark.parametrize("sign", [1, -1], ids=["light", "below zero"])
+def test_frames_are_read_only_and_have_no_heavy_group_without_noise(sign: int) -> None:
+    """(Planted: frames that a reader may change for the next one; a heaviest group among equal ones.)"""
+    light = [sparse.csr_array(sign * random_groups(1, 7, 0.0)[0])]
+    for frame in expected_frames(small_optics(8), light * 2, LABELS, np.eye(4), 0):
+        assert frame.variance == frame.heaviest == 0 and frame.irradiance.any() == (sign > 0)
+        with pytest.raises(ValueError, match="read-only"):
+            frame.irradiance[0, 0] = 1
+
+
+def test_replicates_of_which_one_group_is_dark_are_seen() -> None:
+    """As they are beside the frames. (Planted: left out unless all groups hold light.)"""
+    optics, (group,) = small_optics(8), random_groups(1, 7)
+    lights = [AccumulatedLight(optics, (group, sparse.csr_array(group.shape)))]
+    basis, probes = sparse.eye_array(2, PIXELS, format="csr"), probe_vectors(8, 0)
+    probed, noise = probe_frames(lights, basis, probes)
+    assert np.array_equal(probed, form_frames(lights, basis, probes)[1]) and (noise > 0).all()
+
+
+def test_no_product_is_taken_over_more_than_four_million_places() -> None:
+    """SciPy would take 16 bytes for each. (Planted: a bound of 3^22.)"""
+    widths = []
+
+    class Watched(sparse.csr_array):
+        def __matmul__(self, other: sparse.csr_array) -> sparse.csr_array:
+            widths.append(other.shape[1])
+            return super().__matmul__(other)
+
+    for places in (2**22, 2**22 + 1):
+        light = sparse.csr_array(([1.0, 2.0], ([0, 1], [5, places - 1])), shape=(2, places))
+        found = _product(Watched(np.array([[1.0, 1.0]])), light)
+        assert found.shape == (1, places) and found.nnz == 2 and found.max() == 2
+    assert widths == [2**22, 2]

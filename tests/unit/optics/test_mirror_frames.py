@@ -7,7 +7,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.fft_shadow import ProfileSampler, geometric_samplers, wave_samplers
-from mitsim.optics.mirror_frames import Beams, _bilinear, _cuts, _gradients, specular_frames
+from mitsim.optics.mirror_frames import Beams, SpecularLight, _bilinear, _cuts, _gradients, specular_frames
 
 PITCH = 0.05
 LABELS = np.arange(9) % 3
@@ -236,3 +236,48 @@ def test_bad_arguments_are_refused(change: dict[str, object], message: str) -> N
     arguments = {"labels": LABELS, **change}
     with pytest.raises(MitsimError, match=message):
         specular_frames(beams(turned(0, 0.4)), geometry(), geometric_samplers(geometry()), **arguments)
+
+
+def test_a_beam_that_passes_the_sensors_corner_lights_no_pixel() -> None:
+    """Its bounding box meets the sensor, none of its light does. (Planted: boxes on the sensor in one axis.)"""
+    thin = np.array([[[0.35, 0.74], [0.36, 0.75]], [[0.74, 0.35], [0.75, 0.36]]])
+    found = specular_frames(beams(thin), geometry(), geometric_samplers(geometry()), LABELS)
+    assert (found.flux, found.lit_pixels.tolist(), found.classes.tolist()) == (0, [], [])
+
+
+def test_the_virtual_source_is_that_at_an_uneven_beams_middle() -> None:
+    """By differences there, of a beam whose tan-angles are not linear in place. (Planted: at its last corner.)"""
+    rng, half, step = np.random.default_rng(6), np.array([0.5]), 1e-6
+    uneven = beams(turned(0.3, 0.4) + 0.05 * rng.normal(size=(2, 2, 2)), tangent=0.01 * rng.normal(size=(1, 2, 2, 2)))
+    by_a, by_b = (
+        [
+            (_bilinear(corners, half + step * a, half + step * b) - _bilinear(corners, half, half))[0, 0, 0] / step
+            for corners in (uneven.sensor, uneven.tangent)
+        ]
+        for a, b in ((1, 0), (0, 1))
+    )
+    (u_a, t_a), (u_b, t_b) = by_a, by_b
+    slopes = np.stack([t_a, t_b], axis=1) @ np.linalg.inv(np.stack([u_a, u_b], axis=1))
+    np.testing.assert_allclose(uneven.inverse_depth[0], -np.diag(slopes), rtol=1e-4)
+
+
+def test_mean_irradiance_is_that_of_beams_on_the_sensor() -> None:
+    """One on it, one beside its columns; what lacks is in one beam, what may be off a point of one of 256 pixels.
+    (Planted: the mean over one side of a beam and both its coordinates.)"""
+    met, beside = beams(square((-0.1, -0.1), (0.1, 0.1))), beams(square((-0.1, 0.5), (0.1, 0.7)), flux=5.0)
+    both = Beams(*(np.concatenate([getattr(b, name) for b in (met, beside)]) for name in ORDER), 0.3, 0.025)
+    irradiance, unsure = SpecularLight(both).irradiance(geometry())
+    assert irradiance == pytest.approx(2.0 / (16 * PITCH) ** 2, rel=1e-12)
+    assert unsure == pytest.approx(0.5 / (16 * PITCH) ** 2, rel=1e-12)
+
+
+def test_parallel_light_has_waves_of_a_far_source() -> None:
+    """(Planted: a depth of one over nothing.)"""
+    spectrum, camera = Spectrum(np.array([550.0]), np.array([1.0])), geometry("separable", mask_order=8)
+    corners = square((-0.4, -0.4), (0.4, 0.4))
+    parallel, far = (
+        SpecularLight(one).frames(LABELS, camera, spectrum).irradiance
+        for one in (beams(corners, tangent=np.zeros((1, 2, 2, 2))), beams(corners, depth=1e9))
+    )
+    np.testing.assert_allclose(parallel, far, rtol=0, atol=1e-6 * far.max())
+    assert far.std() > 0.1 * far.mean()

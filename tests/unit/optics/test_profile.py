@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
-from mitsim.optics.edge_profile import Steps, sampled_box_means
+from mitsim.optics.edge_profile import Steps, blurred_step, sampled_box_means
 from mitsim.optics.shadow import scene_factor
 
 
@@ -58,3 +59,21 @@ def test_the_second_difference_loses_nothing_that_matters() -> None:
     fine = steps.cell_means(-3.6, 2.5e-4, 28_800)
     found = sampled_box_means(fine[None], -3.6, 2.5e-4, centres, half_pixel, half_cell)[0]
     assert np.abs(found - expected).max() < 1e-11
+
+
+def test_a_blurred_step_is_a_normal_law_and_its_means() -> None:
+    """Over a box, over none, and nothing infinitely far before it. (Planted: the far side of both bounds.)"""
+    x, blur, middle = np.linspace(-1.5, 1.5, 31), 0.2, (np.arange(2000) + 0.5) / 1000 - 1
+    expected = ndtr((x[:, None] + 0.3 * middle) / blur).mean(axis=1)
+    np.testing.assert_allclose(blurred_step(x, 0.3, 0.0, blur), expected, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(blurred_step(x, 0.0, 0.0, blur), ndtr(x / blur), rtol=0, atol=1e-15)
+    assert blurred_step(np.array([-np.inf, -50.0]), 0.3, 0.0, blur) == pytest.approx([0, 0], abs=1e-15)
+
+
+def test_a_blurred_fields_factor_is_the_root_of_blurred_power() -> None:
+    """Cell by cell, against its mean at 100 points of each. (Planted: the mean over the cells.)"""
+    blur, step, count = 0.05, 0.02, 80
+    s = -0.3 + step / 100 * (np.arange(100 * count) + 0.5)
+    power = 4 * (ndtr(s / blur) - ndtr((s - 1) / blur))
+    found = Steps(np.array([0.0, 1.0]), np.array([2.0]), blur).amplitude_means(-0.3, step, count)
+    np.testing.assert_allclose(found, np.sqrt(power).reshape(count, 100).mean(axis=1), rtol=0, atol=2e-4)

@@ -10,7 +10,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.camera import CameraGeometry, Devices
 from mitsim.devices.projector import Coherence, ProjectorModel
-from mitsim.optics.speckle import contrast_of
+from mitsim.optics.speckle import _between_pixels, contrast_of
 from tests.invented import sensor
 
 N, POINTS, SIDE = 8, 6, 0.5  # projector pixels a side, points a pixel, a pixel's side [mm]
@@ -151,3 +151,18 @@ def test_pixels_that_are_tall_leave_what_wide_ones_leave_of_turned_light() -> No
         )
     )
     assert tall == pytest.approx(wide, rel=1e-9) and tall < 0.9 * square
+
+
+def test_partly_polarised_light_is_between() -> None:
+    """(1 + P^2) / 2 of a point's variance (Goodman, 3.3). (Planted: the cube of P.)"""
+    found = contrast_of(devices(pitch=1e-6, polarisation=0.5), (SIDE, SIDE), np.ones((N, N)))
+    assert found**2 == pytest.approx((1 + 0.5**2) / 2, rel=1e-6)
+
+
+def test_pairs_of_points_are_weighed_as_often_as_they_are_apart() -> None:
+    """Two kernels' mean over points of two pixels, 300 of each. (Planted: a scale, which contrast does not show.)"""
+    points = (np.arange(300) + 0.5) / 300 * SIDE
+    found = _between_pixels((np.cos, lambda distance: np.exp(-np.square(distance))), SIDE, 3)
+    for lag, value in zip((0, 1, 2, -3, -2, -1), found, strict=True):
+        apart = lag * SIDE + points[:, None] - points
+        assert value == pytest.approx((np.cos(apart) * np.exp(-np.square(apart))).mean(), abs=1e-5), lag

@@ -8,6 +8,7 @@ import pytest
 
 from mitsim.bench.effects import parse_switches
 from mitsim.light.cost_model import FIXED, Numbers, entries
+from mitsim.light.passes import PASSES
 from mitsim.light.settings import (
     COUNTED,
     GROUPS,
@@ -20,6 +21,7 @@ from mitsim.light.settings import (
     Settings,
     SharpPixels,
 )
+from mitsim.optics.forming import bound_over_error
 from mitsim.planner.choose import cheapest, counts_of, predicted_candidate, value_of_refining
 from mitsim.planner.pilot import run_of
 from tests.unit.planner.invented_pilot_result import (
@@ -292,6 +294,45 @@ def test_wide_cells_hold_light_of_many_anchors() -> None:
     assert cheapest(1e-2, found, {}).settings.followed_width == 1, "one anchor sees nothing beyond its mean"
     wide_ones, narrow_ones = (rows(each)["followed-anchors"].reason for each in (plan(5e-4, found), plan(1e-4)))
     assert "8x8 in cells of 2x2 pixels leave" in wide_ones and ": 2x2 leave" in narrow_ones
+
+
+def test_one_hit_of_a_small_target_is_a_quarter_of_the_noise_and_counts_beside_it() -> None:
+    """Of few hits a group is off by 0.75 rms, by 1.5 at most: what is left out and that are in quadrature. (Planted:
+    1.5 for both; samples whatever the hits.)"""
+    few = replace(PILOT_RESULT, hits=0.5)
+    chosen = cheapest(1e-2, few, {})
+    one_hit = 1 / (few.hits * float(PASSES["direct"].whole(chosen.settings.samples["direct"])))
+    assert chosen.settings.samples["direct"] > 4 * cheapest(1e-2, PILOT_RESULT, {}).settings.samples["direct"]
+    assert 0.2 < one_hit / chosen.target <= 0.25
+    rest = predicted_candidate(1e-2, PILOT_RESULT, chosen.settings, {}).systematic
+    assert chosen.systematic.value == pytest.approx(math.hypot(rest.value, 0.75 * one_hit))
+    assert chosen.systematic.bound == pytest.approx(math.hypot(rest.bound, 1.5 * one_hit))
+    assert chosen.fits and chosen.total.bound <= 1e-2
+
+
+def test_doubt_of_the_pilot_is_in_the_bound_alone() -> None:
+    """The error that is predicted is the best estimate, its bound 2.35 standard errors of the square above it.
+    (Planted: one standard error in both.)"""
+    doubtful = replace(PILOT_RESULT, changes=changes(SIZES, 2e-3), apart={})
+    bare = replace(cheapest(0.1, doubtful, {}).settings, effects=frozenset({"blur", "diffraction"}), layers=())
+    bare = replace(bare, anchors=1, followed_anchors=1, subdivision=1)
+    left = {Approximation("anchors", 1), Approximation("layers", 1), Approximation("cells", 1)}
+    left |= {Approximation("interreflection"), Approximation("ambient")}
+    found = predicted_candidate(0.1, doubtful, bare, {}).systematic
+    assert found == pytest.approx(doubtful.changes.estimate(left)) and found.bound > 1.002 * found.value
+
+
+def test_noise_of_few_heavy_paths_takes_samples_until_its_bound_is_the_target() -> None:
+    """The bound lies the further above the error the fewer paths make it. (Planted: twice as
+    many samples at least; the bound of many paths.)"""
+    heavy = replace(PILOT_RESULT.sample_costs["indirect"], noise=Noise(0.3, 2, 0.5, spread=60.0))
+    silent = {name: replace(cost, noise=Noise(0.0, 1, 0.5)) for name, cost in PILOT_RESULT.sample_costs.items()}
+    uneven = PILOT_RESULT.with_sample_costs({**silent, "indirect": heavy})
+    uneven = replace(uneven, spread=replace(PILOT_RESULT.spread, noise=Noise(0.0, 1, 0.5)))
+    found = cheapest(1e-2, uneven, parse_switches("+interreflection"))
+    spread = 60.0 * 2 / found.settings.samples["indirect"]
+    assert 0.05 < spread < 0.2
+    assert found.noise * bound_over_error(spread, GROUPS) == pytest.approx(found.target, rel=2e-3)
 
 
 def test_the_value_of_refining_coarse_cells_names_them() -> None:

@@ -14,11 +14,26 @@ from mitsim.light.settings import Approximation, PilotResult, Settings
 from mitsim.planner.explain import SceneFacts, explain_plan
 from mitsim.scene.limits import Unfit
 from mitsim.scene.outline import Tag
-from tests.unit.planner.invented_pilot_result import PILOT_RESULT, SIZES, changes, plan, rows, stages, with_occluded
+from tests.unit.planner.invented_pilot_result import (
+    ONE_CLASS,
+    PILOT_RESULT,
+    SIZES,
+    changes,
+    plan,
+    rows,
+    stages,
+    with_occluded,
+)
 
 
 def bench(
-    cuts: bool = False, shift: float = 0.0, feature: float = 0.06, glare: float = 0.0, mirrors: bool = False
+    cuts: bool = False,
+    shift: float = 0.0,
+    feature: float = 0.06,
+    glare: float = 0.0,
+    mirrors: bool = False,
+    curve: object = None,
+    coloured: tuple[Tag, ...] = (),
 ) -> Bench:
     geometry = SimpleNamespace(
         wall_shift_features=shift, mask_thickness=0.5, mask_feature=feature, diffracts=True, mask_plate=None,
@@ -35,12 +50,12 @@ def bench(
             shapes=(),
             mirrors=mirrors,
             small_lamps=(),
-            coloured=(),
+            coloured=coloured,
             parting=(),
         ),
         lines=None,
         projector=SimpleNamespace(glare=glare),
-        sensor=SimpleNamespace(quantum_efficiency_curve=None),
+        sensor=SimpleNamespace(quantum_efficiency_curve=curve),
     )
 
 
@@ -69,6 +84,20 @@ def test_devices_are_flagged_where_their_model_ends(
         assert part in warning
 
 
+def test_what_grey_frames_leave_of_colours_is_none_where_nothing_differs_by_wavelength(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where surfaces or the camera may differ, nobody predicted it. (Planted: the camera's curve is read as none.)"""
+    monkeypatch.setattr("mitsim.planner.explain.EFFECTS", {})
+    red = Tag(Path("a.xml"), 7, "rgb", {})
+    grey, camera, surfaces = (
+        SceneFacts.of(each).spectrum for each in (bench(), bench(curve=1), bench(coloured=(red,)))
+    )
+    assert (grey.state, grey.error_if_off, grey.seconds) == ("off", 0, 0) and "camera" not in grey.reason
+    assert (camera.state, camera.error_if_off) == ("off", None) and "but the camera does" in camera.reason
+    assert (surfaces.state, surfaces.error_if_off) == ("off", None) and "the first a.xml:7" in surfaces.reason
+
+
 def test_light_over_mirrors_that_is_not_resolved_is_told_with_their_kinds_and_the_first() -> None:
     mirrors = tuple(Tag(Path("a.xml"), line, "shape", {"type": kind}) for line, kind in ((7, "disk"), (9, "sphere")))
     facts = SceneFacts({}, 0.0, mirrors=(*mirrors, mirrors[1]))
@@ -76,6 +105,10 @@ def test_light_over_mirrors_that_is_not_resolved_is_told_with_their_kinds_and_th
     assert warning.startswith("a.xml:7: shape: got 'disk'")
     assert "0.2 of the light" in warning and "2 sphere, 1 disk" in warning
     assert not explain_plan(1e-2, replace(PILOT_RESULT, unresolved_specular=1e-4), facts).warnings
+    (other,) = explain_plan(1e-6, ONE_CLASS, facts).warnings
+    assert "largest: followed anchors" in other, "mirrors whose light is all resolved are no reason"
+    (nameless,) = explain_plan(1e-2, replace(PILOT_RESULT, unresolved_specular=0.2), SceneFacts({}, 0.0)).warnings
+    assert "largest: light over small mirrors alone (not resolved), 2.0e-01" in nameless
 
 
 def test_light_that_is_lost_over_a_mirror_is_told_with_its_place() -> None:

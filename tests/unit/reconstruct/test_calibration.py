@@ -1,5 +1,7 @@
 """Factors come back from striped light: exactly without noise, with the predicted error under noise."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.linalg import hadamard
@@ -12,9 +14,12 @@ from mitsim.reconstruct.estimate_factors import (
     StripeSums,
     _rank_one_split,
     estimate_factors,
+    factors_of_sums,
     predicted_error,
     squared_condition,
+    stripe_sums,
 )
+from mitsim.reconstruct.solution import Verdict
 from mitsim.reconstruct.solver import prepare
 
 N, M = 16, 40
@@ -248,3 +253,55 @@ def test_a_response_of_several_parts_is_summed_as_a_whole(side):
     np.testing.assert_allclose(sums.vectors[:, 0], vector, rtol=1e-10, atol=1e-12)
     assert sums.misfit == pytest.approx(np.square(values - np.outer(vector, common)).sum(), rel=1e-12)
     assert sums.energy == pytest.approx(np.square(values).sum(), rel=1e-12) and sums.done == 1
+
+
+def test_noise_of_either_side_counts() -> None:
+    """Responses to one orientation have noise of 1, those to the other none: half as much in all. (Planted: one side's
+    misfit twice.)"""
+    rng = np.random.default_rng(3)
+    horizontal, vertical = responses(*factors())
+
+    def noisy(frames):
+        return [frame + rng.normal(size=frame.shape) for frame in frames]
+
+    for sides in ((noisy(horizontal), vertical), (horizontal, noisy(vertical))):
+        # 28 800 numbers tell it to half a per cent.
+        assert estimate_factors(*sides, H, uniform=horizontal[0]).noise == pytest.approx(0.5**0.5, rel=0.02)
+
+
+@pytest.mark.parametrize("extra", [(300.0, 0.0), (0.0, 300.0)])
+def test_the_worse_factor_tells_whether_both_can_be_used(extra: tuple[float, float]) -> None:
+    """(Planted: the better one.)"""
+    horizontal, vertical = responses(*(balanced(*factors())))
+    sums = stripe_sums(horizontal[0], vertical[0], N)
+    for side, rest in zip(sums, (horizontal, vertical), strict=True):
+        for response in rest[1:]:
+            side.add(response)
+    assert factors_of_sums(*sums, H).ok
+    found = factors_of_sums(*sums, H, extra=extra)
+    assert max(found.predicted_error) > 0.1 > min(found.predicted_error)
+    assert found.status.verdict is Verdict.MOSTLY_NOISE
+
+
+def test_responses_that_are_missing_are_counted() -> None:
+    """(Planted: from one.)"""
+    horizontal, vertical = responses(*factors())
+    for sides in (([], vertical), (horizontal, [])):
+        with pytest.raises(MitsimError, match="only 0"):
+            estimate_factors(*sides, H)
+
+
+def test_the_flux_of_an_even_response_is_its_light() -> None:
+    """Of a sensor that is not square. (Planted: the windows' sums divided by each other.)"""
+    sums, _ = stripe_sums(np.ones((M, M + 5)), np.ones((M, M + 5)), 2)
+    assert sums.fit_response(np.full((M, M + 5), 3.0), 1).flux == pytest.approx(3.0, rel=1e-12)
+
+
+def test_a_large_sensor_s_light_is_kept_by_groups_of_rows() -> None:
+    """1030 rows in 512 groups of two and three, of the +1 and of the -1 frame."""
+    rows, light = 1030, np.tile(np.arange(1030.0)[:, None], (1, 4))
+    sums, _ = stripe_sums(np.ones((rows, 4)), np.ones((rows, 4)), 2)
+    pair = sums.fit_response(light / 2, 1, light).pair
+    ends = np.arange(513) * rows // 512
+    means = np.array([np.arange(first, last).mean() for first, last in pairwise(ends)])
+    np.testing.assert_allclose(pair.rows, [0.75 * means, 0.25 * means], rtol=1e-12)

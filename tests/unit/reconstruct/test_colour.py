@@ -63,3 +63,10 @@ def test_lines_that_no_eye_sees_are_refused() -> None:
         ColourModel.fit(LINES, chart().at(LINES[:2]), "a picture")
     with pytest.raises(MitsimError, match="with 1 values that are not finite"):
         ColourModel.fit(LINES, np.where(np.arange(72).reshape(24, 3) == 5, np.nan, 0.5), "a picture")
+
+
+def test_reflectances_are_the_charts_own_and_straight_between() -> None:
+    """(Planted: twice as much.)"""
+    waves, spectra = chart().wavelengths_nm, chart().spectra
+    assert np.array_equal(chart().at(waves), spectra)
+    np.testing.assert_allclose(chart().at((waves[1:] + waves[:-1]) / 2), (spectra[:, 1:] + spectra[:, :-1]) / 2)

@@ -7,17 +7,20 @@ or above it, too. At 370 mm light lies 1.6 pixels beside where it was calibrated
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.runs import Capture
+from mitsim.core.runs import Capture, Measurement
+from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.accumulation import accumulate
 from mitsim.reconstruct.causes import Cause
-from mitsim.reconstruct.depth import CommonBasis, Depth
-from mitsim.reconstruct.depth_map import PixelDepths, depth_map
+from mitsim.reconstruct.depth import CommonBasis, Depth, best_depth
+from mitsim.reconstruct.depth_map import Arrivals, DepthMap, PixelDepths, depth_map
 from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.focus import DerivedCapture
 from mitsim.reconstruct.reconstruct import reconstruct
 from tests.ideal_sessions import PEAK, Bench, picture
 from tests.ideal_sessions import shadow as plain_shadow
@@ -294,3 +297,108 @@ def test_other_methods_have_no_depths() -> None:
         reconstruct(shots(np.full((N, N), 400.0), "dots:4"), calibrated(), method="tv", focus="map")
     with pytest.raises(MitsimError, match="does not state its parallax"):
         depth_map(shots(cards(), "dots:4"), Bench(*sides(400.0, BESIDE)).calibrated(0))
+
+
+def test_the_summary_leaves_a_hundredth_out_at_either_end() -> None:
+    """Of 0 to 100 mm: 1, 50 and 99."""
+    mm = np.arange(101.0)[None]
+    found = DepthMap(mm, mm, np.ones_like(mm), 0.0, 1.0, 1.0, 1000, 1.0).summary()
+    assert (found["least_mm"], found["median_mm"], found["most_mm"]) == (1.0, 50.0, 99.0)
+
+
+class Cubic(SimpleNamespace):
+    """Factors that change with depth as a cubic does, which is what lies between those that are computed."""
+
+    limit = 1e-4
+
+    def __init__(self, size: int, period: int) -> None:
+        rng = np.random.default_rng(8)
+        self.parts = [rng.random((4, 24, size)) for _ in range(2)]
+        family = parse_patterns(f"dots:{period}", size)
+        super().__init__(patterns=(family.left.astype(float), family.right.astype(float)), data=10_000, outside=3.0)
+
+    def side(self, axis: int, shift: float) -> np.ndarray:
+        return np.tensordot((shift / self.limit) ** np.arange(4), self.parts[axis], axes=1)
+
+    def frame(self, image: np.ndarray, shift: float, row: int, column: int) -> Measurement:
+        left, right = (self.side(axis, shift) for axis in (0, 1))
+        light = left @ (np.outer(self.patterns[0][:, row], self.patterns[1][:, column]) * image) @ right.T
+        return Measurement(light, row, column, light, 1, 0)
+
+
+def test_columns_that_change_as_a_cubic_are_exact_and_so_are_their_slopes() -> None:
+    """Between those that are computed. (Planted: the cubic's slope of a line.)"""
+    depths, pixels, shift = Cubic(6, 3), np.arange(6), np.linspace(-9e-5, 9e-5, 6)
+    model = PixelDepths(depths, depths.limit, 2.5e-5)  # type: ignore[arg-type]
+    powers, place = np.arange(4), shift / depths.limit
+    for axis in (0, 1):
+        exact = np.einsum("kp,krp->pr", place ** powers[:, None], depths.parts[axis])
+        slopes = np.einsum("kp,krp->pr", powers[1:, None] * place ** powers[:-1, None], depths.parts[axis][1:])
+        np.testing.assert_allclose(model._columns(axis, pixels, shift), exact, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(model._columns(axis, pixels, shift, slope=True), slopes / depths.limit, rtol=1e-9)
+
+
+def test_an_image_at_given_depths_is_the_tikhonov_image_of_them() -> None:
+    """In closed form, at a lambda that takes half of it; and what it leaves, over the data less two unknowns a pixel.
+    (Planted: lambda taken off; one unknown a pixel.)"""
+    depths, image = Cubic(4, 2), np.random.default_rng(10).random((4, 4)) + 0.5
+    depths.frames = tuple(depths.frame(image, 2e-5, *key) for key in np.ndindex(2, 2))
+    model, expected, left = PixelDepths(depths, depths.limit, 2.5e-5), np.zeros((4, 4)), 3.0  # type: ignore[arg-type]
+    for each in depths.frames:
+        lit = np.ix_(np.arange(each.row, 4, 2), np.arange(each.column, 4, 2))
+        columns = np.kron(depths.side(0, 2e-5)[:, each.row :: 2], depths.side(1, 2e-5)[:, each.column :: 2])
+        part = np.linalg.solve(columns.T @ columns + 50 * np.eye(4), columns.T @ each.frame.ravel())
+        expected[lit] = part.reshape(2, 2)
+        left += float(np.square(each.frame.ravel() - columns @ part).sum())
+    found = model.solve(np.full((4, 4), 2e-5), 50.0)
+    np.testing.assert_allclose(found.image, expected, rtol=1e-9)
+    assert found.left_over == pytest.approx(left, rel=1e-9)
+    assert model.variance(found) == pytest.approx(left / (10_000 - 2 * 16), rel=1e-9)
+
+
+def test_frames_of_too_many_pixels_are_refused() -> None:
+    """65 x 65 of a frame are lit by the first of two dots along 130 pixels."""
+    with pytest.raises(MitsimError, match="4225 pixels are lit at a time"):
+        PixelDepths(Cubic(130, 2), 1e-4, 1e-4)  # type: ignore[arg-type]
+
+
+class Narrow(DerivedCapture):
+    """Of a window of fewer columns: the others are black."""
+
+    @property
+    def patterns(self) -> tuple[np.ndarray, np.ndarray]:
+        left, right = self.whole.patterns
+        return left, right[:COLUMNS]
+
+
+COLUMNS = 32
+
+
+def test_an_oblong_window_has_a_depth_for_each_pixel() -> None:
+    """40 x 32 pixels at 430 mm, by one depth and by one for each; the projector above the camera, so that columns tell
+    none. (Planted: as many columns as rows; rows' singular values for columns'; columns without parallax apart.)"""
+    above = BASELINE[1], 0.0
+    scene = np.where(np.arange(N) < COLUMNS, PRINT, 0.0)
+    surface = ((np.ones((N, N), bool), *sides(430.0, above)),)
+    run = Narrow(Layers(*sides(400.0, above), surfaces=surface).run("dots:8x4", scene, 0))
+    square = calibrated(above)
+    assert square.manifest.parallax is not None
+    first, last = square.manifest.parallax.column_tan
+    parallax = square.manifest.parallax.model_copy(update={"column_tan": (first, first + (last - first) * COLUMNS / N)})
+    manifest = square.manifest.model_copy(update={"parallax": parallax})
+    factors = replace(square, right=square.right[:, :COLUMNS], manifest=manifest)
+    assert best_depth(run, factors).mm == pytest.approx(430, abs=1)
+    found = depth_map(run, factors)
+    assert found.mm.shape == (N, COLUMNS) and not found.doubt
+    assert np.median(np.abs(found.mm - 430)) < 2
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_pixel_of_parallax_is_that_of_the_axis_that_moves_more(axis: int) -> None:
+    """The window as wide along both axes, of 40 rows and 32 columns. (Planted: columns as narrow as rows.)"""
+    baseline = (60.0, 0.0) if axis == 0 else (0.0, 60.0)
+    square = calibrated(baseline)
+    factors = replace(square, right=square.right[:, :COLUMNS])
+    run = Narrow(shots(np.full((N, N), 400.0), "dots:8", baseline))
+    pixel = 0.3 / (N, COLUMNS)[axis] / 60
+    assert Arrivals(run, factors, (-2e-4, 2e-4), 0.0).pixel == pytest.approx(pixel)

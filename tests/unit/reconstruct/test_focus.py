@@ -24,7 +24,7 @@ from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.depth import CommonBasis, Depth, best_depth
 from mitsim.reconstruct.factorisation import group_pixels
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import FactorOfDepths, move_factors
+from mitsim.reconstruct.focus import ColumnSpline, FactorOfDepths, move_factors
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
 from mitsim.reconstruct.solver import prepare, project_frames
 from tests.ideal_sessions import PEAK, PITCH, PIXELS, Bench, picture
@@ -411,3 +411,36 @@ def test_dots_own_basis_leaves_as_much_as_the_common_one(patterns: str, own: boo
             sides = prepare(depths.side(0, shift), depths.side(1, shift), *run.patterns)
             left.append(depths.energy - float(np.square(project_frames(sides.left, sides.right, depths.stack)).sum()))
         assert left[1] == pytest.approx(left[0], abs=1e-7 * one.energy)
+
+
+def test_a_part_of_an_oblong_sensor() -> None:
+    """Frames must have the calibration's shape, rows and columns. (Planted: the rows' number for both.)"""
+    factors = calibrated()
+    oblong = replace(factors, right=factors.right[8:-8])  # the middle stays where it is
+    for depth in (380.0, 400.0):
+        assert move_factors(oblong, depth).sensor == (PIXELS, PIXELS - 16)
+
+
+def test_columns_that_the_stop_cuts_at_the_sensor_s_edge_are_taken_as_they_are() -> None:
+    """The outermost column is seen at a tangent of 0.1463 from the sensor's middle and 0.0024 more from its edge, and
+    has a half of 0.0038 itself. (Planted: less from the edge.)"""
+    for stop, cut in ((0.150, False), (0.153, True)):
+        side = FactorOfDepths(shadow(400.0, 1), PARALLAX.model_copy(update={"stop_tan": stop}), 1)
+        assert side.hidden_part(1 / 330 - 1 / 400).any() == cut
+
+
+def test_a_shadow_that_a_pixel_s_step_moves_beyond_all_columns_is_not_known() -> None:
+    """Four columns, and sensor pixels so wide that the next sees five further. (Planted: two columns more.)"""
+    wide = PARALLAX.model_copy(update={"pixel_pitch_mm": 5 * WINDOW / 4 / (1 / 2 - 1 / 400)})
+    side = FactorOfDepths(np.ones((3, 4)), wide, 1)
+    assert side.at(1 / 360 - 1 / 400)[1] == slice(0, 0)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, 5, 9])
+def test_few_rows_are_each_given_those_there_are(rows: int) -> None:
+    """A ramp is told exactly. (Planted: rows beyond the last.)"""
+    ramp = np.arange(12.0) + 0.5 * np.arange(rows)[:, None]
+    spline = ColumnSpline(ramp, 0.5)
+    column = np.linspace(0, 11, 45)
+    found = spline.at(np.repeat(np.arange(rows)[:, None], 45, axis=1), np.tile(column, (rows, 1)))
+    np.testing.assert_allclose(found, column + 0.5 * np.arange(rows)[:, None], atol=1e-6)

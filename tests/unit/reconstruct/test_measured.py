@@ -300,24 +300,26 @@ def repeated(folder: Path, listed: dict[str, Any], shots: list[tuple[int, float]
 
 
 @pytest.mark.parametrize(
-    ("listed", "shots", "words"),
+    ("listed", "shots", "wrong", "words"),
     [
         (
             {"repeats": 2},
             [(0, 1.0), (1, 1.0)],
+            1,
             "f_10.png and 1 more (horizontal stripes 2 of sign -1): is wrong: f_11.png",
         ),
-        ({"repeats": 3}, [(0, 1.0), (1, 1.0), (2, 1.0)], "is wrong: f_16.png has 0.5"),
-        ({"exposure_ladder": [1, 2]}, [(0, 1.0), (1, 2.0)], "is wrong: f_11.png has 0.5"),
+        ({"repeats": 3}, [(0, 1.0), (1, 1.0), (2, 1.0)], 1, "is wrong: f_16.png has 0.5"),
+        ({"repeats": 3}, [(0, 1.0), (1, 1.0), (2, 1.0)], 0, "is wrong: f_15.png has 0.5"),
+        ({"exposure_ladder": [1, 2]}, [(0, 1.0), (1, 2.0)], 1, "is wrong: f_11.png has 0.5"),
     ],
 )
 def test_a_wrong_repeat_or_exposure_is_named(
-    tmp_path: Path, listed: dict[str, Any], shots: list[tuple[int, float]], words: str
+    tmp_path: Path, listed: dict[str, Any], shots: list[tuple[int, float]], wrong: int, words: str
 ) -> None:
-    """(Planted: repeats, and exposures, are compared with themselves.)"""
+    """(Planted: repeats, and exposures, are compared with themselves; twice the part of a first one.)"""
     good = repeated(tmp_path / "good", listed, shots, (-1, -1))
     assert good.ok, good.warnings
-    bad = repeated(tmp_path / "bad", listed, shots, (5, 1))
+    bad = repeated(tmp_path / "bad", listed, shots, (5, wrong))
     assert not bad.ok and len(bad.warnings) == 1 and words in bad.warnings[0], bad.warnings
     assert max(error(bad, RealSession())) < 0.05
 

@@ -17,7 +17,8 @@ from mitsim.reconstruct.misfit import CHANCE, UNEXPLAINED, Misfit, chi_square_te
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
 from mitsim.reconstruct.solution import Status, Verdict
 from mitsim.reconstruct.solver import Prepared
-from tests.ideal_sessions import PIXELS, Bench, N, bench, picture, shadow
+from tests.ideal_sessions import BLACK, PIXELS, Bench, N, bench, picture, shadow
+from tests.unit.reconstruct.test_faults import with_frames
 
 DATA = PIXELS**2
 """Data of a frame."""
@@ -155,6 +156,7 @@ def test_a_bad_verdict_of_the_solver_stays() -> None:
     twin.left[:, 1] = twin.left[:, 0]
     lost = reconstruct(bench(SHIFT).run("uniform", picture(), 0), twin, 0)
     assert lost.status.verdict is Verdict.RANK_DEFICIENT
+    assert lost.rank_sides == (N - 1, N)
 
 
 def test_no_more_data_than_unknowns_tell_no_misfit() -> None:
@@ -241,3 +243,21 @@ def test_both_halves_of_a_pair_count_alike() -> None:
 def test_chi_square_as_people_read_it(chi_square: float, text: str) -> None:
     """The third decimal where fitting images differ, three digits beyond. (Planted: 10 with three decimals.)"""
     assert chi_square_text(chi_square) == text
+
+
+@pytest.mark.parametrize("unit", [0.01, 1.0])
+def test_a_frame_at_fault_is_told_beside_total_variation_in_any_unit(unit: float) -> None:
+    """Of factors: the other frames predict its brightness at a lambda of their own scale. (Planted: of its inverse, by
+    which one holds 3e5 of its light.)"""
+
+    def dimmed(frames: list[np.ndarray]) -> list[np.ndarray]:
+        return [BLACK + (frame - BLACK) * (0.7 if number == 5 else 1) for number, frame in enumerate(frames)]
+
+    factors = bench().calibrated(0)
+    assert factors.manifest.noise is not None
+    noise = {side: getattr(factors.manifest.noise, side) * unit for side in ("left", "right")}
+    manifest = factors.manifest.model_copy(update={"noise": factors.manifest.noise.model_copy(update=noise)})
+    other = replace(factors, left=factors.left * unit, right=factors.right * unit, manifest=manifest)
+    found = misfit(reconstruct(with_frames(bench().run("dots:4", picture(), 0), dimmed), other, method="tv"))
+    (reported,) = found.faults
+    assert reported.numbers == (5,) and "holds 0.68 of the light" in reported.words

@@ -46,12 +46,12 @@ def test_the_adjoint_is_exact(patterns: str) -> None:
 
 
 def test_a_pixel_sees_its_own_filter_alone() -> None:
-    """By hand: light of one line at the pixels of one plane."""
+    """By hand: light of one line at the pixels of one plane, row by row. (Planted: a plane that begins elsewhere.)"""
     mosaic, images = model("uniform"), np.zeros((LINES, N, N))
     images[1] = np.arange(N * N).reshape(N, N)
     frame = mosaic.frame(images, 0, 0)
     whole = mosaic.lefts[1] @ images[1] @ mosaic.rights[1].T
-    for plane, (a, b) in enumerate(PLANES):
+    for plane, (a, b) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
         assert np.allclose(frame[a::2, b::2], mosaic.weights[plane, 1] * whole[a::2, b::2])
 
 
@@ -71,6 +71,13 @@ def test_it_is_the_dense_solution(patterns: str) -> None:
 def test_equal_factors_are_solved_in_one_step() -> None:
     mosaic, rng = model(equal=True), np.random.default_rng(3)
     assert mosaic.solve(rng.standard_normal(mosaic.shape), 1e-3).iterations == 1
+
+
+def test_lambda_is_relative_to_the_largest_eigenvalue() -> None:
+    """Where the preconditioner is the model itself. (Planted: the least eigenvalue of its rows.)"""
+    mosaic = model(equal=True)
+    dense = operator_of(mosaic) @ np.eye(int(np.prod(mosaic.shape)))
+    assert mosaic.scale == pytest.approx(np.linalg.norm(dense, 2) ** 2, rel=1e-9)
 
 
 def test_what_does_not_fit_is_refused() -> None:

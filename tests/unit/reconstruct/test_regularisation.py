@@ -348,3 +348,12 @@ def test_behind_a_centred_mask_the_steadiest_image_is_not_black(photograph, patt
             light = brightest * shown.sum() + signed @ shown @ signed.T
             sums.add(light * (veil + 0.003 * rng.normal(size=light.shape)), i, j)
     assert lost(prepared, sums, image, explained=False)[0] < 1.5
+
+
+def test_the_steadiest_of_two_is_looked_for():
+    """Nearly all of the data is noise: lambda is three quarters of the largest sigma^2, and one candidate lies beyond.
+    (Planted: the third last of what two images move.)"""
+    data = np.full((8, 8), np.sqrt(1 + 1 / 0.75))
+    problem = DiagonalProblem(np.ones((8, 8)), data, float(np.square(data).sum()) + 1000.0, 1064)
+    assert automatic_lambda(problem) == pytest.approx(0.75, rel=0.05)
+    assert 0.7 < automatic_lambda(problem, explained=False) <= 1

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from mitsim.core.manifests import Digital, FactorNoise, Patterns
+from mitsim.core.runs import Measurement
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct import misfit
 from mitsim.reconstruct.accumulation import FrameNoise, factor_energy
 from mitsim.reconstruct.causes import Evidence
-from mitsim.reconstruct.misfit import Residuals
+from mitsim.reconstruct.misfit import Balance, Residuals
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.subpixel import LitFrame, Model, orthonormal
 from mitsim.reconstruct.uncertainty import Propagation
@@ -140,3 +141,51 @@ def test_noisy_factors_add_the_same_energy_whichever_side_is_called_left() -> No
     turned = prepare(*sides[::-1], *patterns[::-1])
     other = factor_energy(turned, tuple(patterns[::-1]), FactorNoise(left=0.3, right=0.1, unexplained=0.0), image.T)
     assert one == pytest.approx(other, rel=1e-12) and one > 0
+
+
+def oblong_residuals(noise: SimpleNamespace) -> Residuals:
+    rng = np.random.default_rng(6)
+    prepared = prepare(rng.random((16, 3)), rng.random((24, 2)), np.ones((3, 1)), np.ones((2, 1)))
+    return Residuals(prepared, np.zeros((3, 2)), noise, SimpleNamespace(add=lambda *_: None))  # type: ignore[arg-type]
+
+
+def test_tiles_of_an_oblong_sensor_hold_their_own_pixels() -> None:
+    """Of 2 x 3 pixels each. (Planted: rows cut where columns are.)"""
+    sums = oblong_residuals(SimpleNamespace())
+    sums.squares[:] = np.arange(16 * 24).reshape(16, 24)
+    np.testing.assert_allclose(sums.residual, sums.squares.reshape(8, 2, 8, 3).sum(axis=(1, 3)))
+
+
+@pytest.mark.parametrize("shots", [1, 2])
+def test_power_is_that_of_the_shots(shots: int) -> None:
+    """Of two halves, whose sum and difference are known: (sum^2 + difference^2) / 2. (Planted: the sum's for both.)"""
+    rng = np.random.default_rng(7)
+    light, frame = rng.random((16, 24)), rng.random((16, 24))
+    noise = SimpleNamespace(light=light, means=np.zeros((1, 1)), of=lambda *_: 0.0)
+    sums, measurement = oblong_residuals(noise), Measurement(frame, 0, 0, light, shots, 0)
+    sums.add(measurement)
+    assert sums.power.sum() == pytest.approx(measurement.power, rel=1e-12)
+    assert sums.energy.sum() == pytest.approx(np.square(frame).sum(), rel=1e-12)
+
+
+def test_what_is_quieter_than_the_sensor() -> None:
+    """384 data less 6 unknowns of variance 1: three in a hundred may be missing, and three deviations of chance.
+    (Planted: unknowns that add to the data; two deviations.)"""
+    sums = oblong_residuals(SimpleNamespace(variance=np.ones((1, 1))))
+    sums.variance = sums.pixels.copy()
+    limit = (384 - 6) * (1 - 0.03 - 3 * np.sqrt(2 / 384))
+    for part, quiet in ((0.99, True), (1.01, False)):
+        sums.squares[:] = part * limit / 384
+        assert sums.quiet == quiet
+
+
+@pytest.mark.parametrize(("above", "flagged"), [(0.9, False), (1.1, True)])
+def test_chance_is_that_of_all_data(above: float, flagged: bool) -> None:
+    """Six deviations of 64 x 100 data, as much in each tile. (Planted: of a tile's.)"""
+    expected = np.full((8, 8), 100.0)
+    residual = expected * (1 + above * 6 * np.sqrt(2 / 6400))
+    # A tenth and more of 10^5 in all is unexplained, less than 2 % of a tile.
+    balance = Balance(residual, expected * 1e3, expected, np.full((8, 8), 100.0), True)
+    noise = SimpleNamespace(stated=True, variance=np.ones((1, 1)))
+    found, _ = balance.misfit(noise, 0.0)  # type: ignore[arg-type]
+    assert found.unexplained > 3.5e-3 and found.worst_tile < 2e-2 and found.flagged == flagged

@@ -146,3 +146,21 @@ def test_frames_of_nothing_have_no_residual() -> None:
     prepared, sums = seen(np.eye(SIZE), np.eye(SIZE), np.zeros((SIZE, SIZE)))
     found = solve_tv(prepared, sums, 0.1)
     assert found.residual == 0.0 and not found.image.any()
+
+
+def test_without_weight_what_no_frame_measures_is_zero() -> None:
+    """Least squares of least norm. (Planted: coefficients of 1 there.)"""
+    scene = np.repeat(np.linspace(0.2, 0.9, SIZE)[:, None], SIZE, axis=1)
+    blind = np.delete(np.eye(SIZE), 4, axis=0)
+    found = solve_tv(*seen(np.eye(SIZE), blind, scene @ blind.T), 0.0)
+    np.testing.assert_allclose(found.image, np.where(np.arange(SIZE) == 4, 0.0, scene), atol=1e-12)
+
+
+def test_the_objective_is_half_the_misfit_and_the_weighted_variation() -> None:
+    """Of the image that is given, with what no image explains: a sensor of more rows than the scene has."""
+    left = np.random.default_rng(2).random((SIZE + 6, SIZE))
+    frame = left @ blocks() + 0.1 * np.random.default_rng(3).normal(size=(SIZE + 6, SIZE))
+    found = solve_tv(*seen(left, np.eye(SIZE), frame), 0.1)
+    down, across = (np.diff(found.image, axis=axis, append=found.image.take([-1], axis)) for axis in (0, 1))
+    expected = np.square(frame - left @ found.image).sum() / 2 + 0.1 * np.hypot(down, across).sum()
+    assert found.objective == pytest.approx(expected, rel=1e-9)

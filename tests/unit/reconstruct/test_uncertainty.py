@@ -19,7 +19,7 @@ from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.regularisation import DiagonalProblem, automatic_lambda
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.subpixel import EDGES, PRINT, Model, print_energy
-from mitsim.reconstruct.uncertainty import Propagation, scene_spectrum
+from mitsim.reconstruct.uncertainty import Propagation, _cosines, scene_spectrum
 from tests.ideal_sessions import CALIBRATION_ERROR, Bench, bench, picture, shadow
 
 N, PIXELS = 6, 14
@@ -408,3 +408,15 @@ def test_the_uncertainty_is_written(tmp_path: Path) -> None:
     other.save(tmp_path / "image", overwrite=True)
     assert other.uncertainty is None and not (tmp_path / "image" / "uncertainty.exr").exists()
     assert json.loads((tmp_path / "image" / "result.json").read_text())["uncertainty"] is None
+
+
+def test_a_scene_s_frequencies_are_cosines_over_its_pixels() -> None:
+    """The first even, the second half a period. (Planted: pixels and frequencies exchanged.)"""
+    side = prepare(np.eye(8), np.eye(8), np.ones((8, 1)), np.ones((8, 1))).left
+    found, half = _cosines(side), np.cos(np.pi * (np.arange(8) + 0.5) / 8)
+    np.testing.assert_allclose(found[:, :2], np.stack([np.full(8, 8**-0.5), half / 2], axis=1), atol=1e-12)
+
+
+def test_print_is_as_likely_to_have_hard_edges_as_none() -> None:
+    """Its energy is half way between that of the ramps that an image shows, 1, and that of edges. (Planted: 2.)"""
+    assert pytest.approx(EDGES - PRINT) == PRINT - 1

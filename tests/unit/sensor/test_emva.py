@@ -40,6 +40,19 @@ def test_a_stack_tells_rows_columns_and_pixels_apart_and_takes_off_what_noise_is
     assert noisy.total == pytest.approx(exact[0], abs=5 * np.sqrt((2 * left**2 + 4 * left * exact[0]) / image.size))
 
 
+def test_what_noise_leaves_in_the_mean_of_a_stack_is_taken_off_all_its_parts() -> None:
+    """Frames of noise alone: sigma^2/L of it is left in their mean, 1/N of that in rows and 1/M in columns.
+
+    A mean of n squares is known to sqrt(2/n), five of which are a quarter to a third of what is taken off. (Planted:
+    rows' part N^2 times as large; any one of the three not taken off.)
+    """
+    rng, shape, count = stream(4, "noise"), (400, 300), 4
+    found = stack_of(rng.normal(0, 3, shape) for _ in range(count))
+    left = 9 / count
+    for name, part, size in (("total", 1, 400 * 300), ("rows", 300, 400), ("columns", 400, 300)):
+        assert getattr(found, name) == pytest.approx(0, abs=5 * left / part * np.sqrt(2 / size)), name
+
+
 def test_a_stack_needs_two_frames() -> None:
     with pytest.raises(ValueError, match="1 frames tell no temporal noise"):
         stack_of([np.zeros((4, 4))])
@@ -52,7 +65,7 @@ def test_figures_of_an_ideal_camera_are_its_numbers() -> None:
     light = np.minimum(electrons, full)
     variance = np.where(electrons < full, electrons, 0) * gain**2 + gain**2 * read**2 + 1 / 12
     times = np.linspace(0, 10, 6)
-    still, none = np.full(6, gain**2 * read**2 + 1 / 12), np.zeros(())
+    still, rows = np.full(6, gain**2 * read**2 + 1 / 12), np.asarray(gain**2 * 2.5)
     spatial = {"total": 14.0, "row": 4.0, "column": 1.0}
 
     def stack(light: float) -> Stack:
@@ -67,7 +80,7 @@ def test_figures_of_an_ideal_camera_are_its_numbers() -> None:
         shape=(100, 200),
         photons=electrons / efficiency,
         ladder=Pair(100 + gain * light, variance, np.zeros(50)),
-        dark=Pair(np.asarray(100.0), still[0], none),
+        dark=Pair(np.asarray(100.0), still[0], rows),
         overexposed=np.asarray(100 + gain * full),
         dark_times=times,
         dark_series=Pair(100 + gain * dark * times, still + gain**2 * dark * times, np.zeros(6)),
@@ -80,7 +93,7 @@ def test_figures_of_an_ideal_camera_are_its_numbers() -> None:
         "saturation_capacity": electrons[electrons < full].max(),
         "dark_current": dark, "dark_current_by_variance": dark,
         "dsnu_row": 4.0, "dsnu_column": 1.0, "dsnu_pixel": 9.0, "prnu_row": 0.01**2 * 4 / 14,
-        "prnu_pixel": 0.01**2 * 9 / 14, "row_noise": 0.0, "linearity_min": 0.0, "linearity_max": 0.0,
+        "prnu_pixel": 0.01**2 * 9 / 14, "row_noise": 2.5, "linearity_min": 0.0, "linearity_max": 0.0,
     }  # fmt: skip
     for name, value in expected.items():
         assert found[name] == pytest.approx(value, rel=1e-9, abs=1e-12), name

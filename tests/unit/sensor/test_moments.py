@@ -1,5 +1,7 @@
 """Closed forms of the sensor's noise, where a wrong term is smaller than the tolerances of measured frames."""
 
+import math
+
 import mpmath
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.sensor import moments
 from mitsim.sensor.chain import poisson_quantile
+from mitsim.sensor.specimen import specimen
 from tests.invented import sensor
 
 
@@ -37,14 +40,17 @@ def test_a_poisson_probability_has_twelve_digits_on_both_sides_of_the_change_of_
     np.testing.assert_allclose(moments._poisson(count, means), exact, rtol=1e-12)
 
 
-@pytest.mark.parametrize("black", [0.0, 0.25, 0.5])
-def test_electrons_that_fill_the_well_are_one_code_and_not_dithered(black: float) -> None:
+@pytest.mark.parametrize(
+    ("black", "well", "light"), [(0.0, 10_000, 1e4), (0.25, 10_000, 1e4), (0.5, 10_000, 1e4), (0.25, 10_100, 1e4)]
+)
+def test_electrons_that_fill_the_well_are_one_code_and_not_dithered(black: float, well: int, light: float) -> None:
     """Half of the light's distribution lies at the full well, where 0.1 DN of read noise does not dither the rounding.
 
     The other half spreads over 20 codes, so shot noise seems to dither all: a well's worth of 1000.25 DN that is read
-    as 1000 moves the mean by 0.12 DN. Compared with the sum over all counts; 129 points stand for them to 2e-3 DN.
+    as 1000 moves the mean by 0.12 DN, and by 0.04 DN where the light is a deviation below the well. Compared with the
+    sum over all counts; 129 points stand for them to 0.01 DN. (Planted: light fills the well within 0.08 electrons.)
     """
-    well, gain, read = 10_000, 0.1, 1.0
+    gain, read = 0.1, 1.0
     model = SensorModel(
         name="coarse",
         pixel_pitch_um=5,
@@ -57,13 +63,13 @@ def test_electrons_that_fill_the_well_are_one_code_and_not_dithered(black: float
         source="chosen",
     )
     counts = np.arange(9000, 11_000)
-    weights = stats.poisson.pmf(counts, well)
+    weights = stats.poisson.pmf(counts, light)
     signal, codes = np.minimum(counts, well) * gain + black, np.arange(850, 1060)
     edges = special.ndtr((codes[None, :] + 0.5 - signal[:, None]) / (read * gain))
     share = weights @ np.diff(edges, axis=1)
     mean = share @ codes[1:]
     variance = share @ np.square(codes[1:] - mean)
-    ours = moments.frame_moments(np.array([float(well)]), 0.0, model)
+    ours = moments.frame_moments(np.array([light]), 0.0, model)
     assert ours[0][0] == pytest.approx(mean, abs=0.01)
     assert ours[1][0] == pytest.approx(variance, rel=0.01)
 
@@ -96,6 +102,76 @@ def test_moments_of_linear_noise_are_those_without_short_cuts() -> None:
             assert moments.mean_variance(part, 0.0, model) == pytest.approx(mean, rel=1e-12)
         seen += 1
     assert seen > 80
+
+
+@pytest.mark.parametrize(("read_e", "black"), [(4.0, 5.0), (1.5, 0.0), (1.5, 15.0)])
+def test_linear_noise_begins_and_ends_eight_deviations_from_the_adc(read_e: float, black: float) -> None:
+    """Nearer the short cut is wrong, and farther off every frame pays for the sums over counts that it need not have.
+
+    (Planted: the black level added to the least signal, not taken off.)
+    """
+    model = sensor(bits=10, full_well_e=math.inf, gain_dn_per_e=2.0, read_noise_e=read_e, black_level_dn=black)
+    first, last = moments._linear(model)
+    assert 0 < first < last
+    for light, room in ((first, black + 2 * first), (last, 1023 - black - 2 * last)):
+        assert room == pytest.approx(8 * 2 * math.sqrt(light + read_e**2), rel=1e-9)
+
+
+@pytest.mark.parametrize("read", [0.25, 1.0, 4.0])
+def test_an_offset_is_another_black_level_to_1_500_of_the_noise_of_reading(read: float) -> None:
+    """Pixels whose offsets differ, from the ADC's dark end to its bright one, against a camera each.
+
+    Their moments are formed at offsets an eighth of the noise apart and are linear between; variances to 1e-3, or 1/300
+    of the noise's own or of 1 DN^2. (Planted: steps of 1/8 DN over the noise in place of times; no end of the ADC near;
+    sums that begin at 1.)
+    """
+    model = sensor(
+        bits=8,
+        read_noise_e=2 * read,
+        gain_dn_per_e=0.5,
+        black_level_dn=3 * read,
+        dsnu_pixel_e=4 * read,
+        full_well_e=510,
+    )
+    shape = 10, 20
+    light = stream(5, "light").choice([0.0, 1.0, 20.0, 70.0, 300.0, 500.0, 600.0], shape)
+    found = moments.frame_moments(light, 0.0, model)
+    offset = specimen(model, shape).offset_e
+    assert offset is not None
+    for place in np.ndindex(shape):
+        changes = {"dsnu_pixel_e": 0.0, "black_level_dn": 3 * read + 0.5 * float(offset[place])}
+        mean, variance = moments.frame_moments(light[place], 0.0, model.model_copy(update=changes))
+        assert found[0][place] == pytest.approx(float(mean), abs=read / 500)
+        assert found[1][place] == pytest.approx(float(variance), rel=1e-3, abs=max(read**2, 1) / 300)
+
+
+def test_without_noise_an_offset_is_rounded_with_the_pixel_s_signal() -> None:
+    """Dark pixels that nothing blurs read the code next to black level and offset, but for 1/64 DN around a tie.
+
+    (Planted: offsets 1/32 DN apart.)
+    """
+    model = sensor(bits=8, black_level_dn=4.0, dsnu_pixel_e=2.0)
+    offset = specimen(model, (40, 50)).offset_e
+    assert offset is not None
+    signal = 4 + offset.astype(np.float64)
+    clear = np.abs(signal - np.floor(signal) - 0.5) > 1 / 64
+    mean, variance = moments.frame_moments(np.zeros((40, 50)), 0.0, model)
+    np.testing.assert_array_equal(mean[clear], np.clip(np.rint(signal), 0, 255)[clear])
+    assert not variance[clear].any()
+    assert clear.mean() > 0.95
+
+
+def test_a_pixel_whose_offset_lies_far_below_the_adc_reads_zero() -> None:
+    """(Found: what is more than 10 deviations beyond either end of the ADC was its largest code.)
+
+    Against black level and offset, cut; one electron of noise moves the mean of a cut pixel by 0.4 DN at most.
+    """
+    model = sensor(bits=8, read_noise_e=1.0, black_level_dn=4.0, dsnu_pixel_e=100.0)
+    offset = specimen(model, (20, 30)).offset_e
+    assert offset is not None and offset.min() < -100 and offset.max() > 300
+    mean, variance = moments.frame_moments(np.zeros((20, 30)), 0.0, model)
+    np.testing.assert_allclose(mean, np.clip(4 + offset, 0, 255), atol=0.5)
+    assert not variance[offset < -20].any()
 
 
 def test_the_shipped_camera_s_noise_is_linear_from_the_dark_to_a_percent_below_its_well() -> None:

@@ -127,11 +127,17 @@ def test_the_pixels_of_a_row_share_its_noise_and_rows_do_not() -> None:
 
 
 def test_row_noise_leaves_other_draws_as_they_were() -> None:
-    """A row's noise has a stream of its own: what is left when it is taken off is the frame without it."""
-    expected = np.full((SIDE, SIDE), 100.0)
-    plain, noisy = (frames(camera(row_noise_e=noise, bits=None), expected, 3) for noise in (0.0, 4.0))
-    rows = (noisy - plain).std(axis=2)
-    assert rows.max() < 1e-9 and (noisy - plain).mean(axis=2).std() > 3
+    """A row's noise has a stream of its own: taken off, it leaves the frame without it, and fixed offsets leave it.
+
+    (Planted: rows as long as there are rows; the noise of a camera with offsets taken off, not added.)
+    """
+    expected = np.full((SIDE, SIDE + 6), 100.0)
+    noises = []
+    for offsets in ({}, {"dsnu_pixel_e": 6.0}):
+        plain, noisy = (frames(camera(row_noise_e=noise, bits=None, **offsets), expected, 3) for noise in (0.0, 4.0))
+        noises.append(noisy - plain)
+        assert noises[-1].std(axis=2).max() < 1e-9 and noises[-1].mean(axis=2).std() > 3
+    np.testing.assert_allclose(noises[1], noises[0], rtol=0, atol=1e-9)
 
 
 def test_effects_of_zero_are_no_effects() -> None:
@@ -225,6 +231,9 @@ def test_dead_pixels_see_no_light_and_hot_ones_more_dark_current() -> None:
     assert dead.sum() == own.dead == 90 and hot.sum() == own.hot == 90
     expected = (np.where(dead, 0, 500) + np.where(hot, 240, 40)) * 1.5 + 100
     np.testing.assert_allclose(mean, expected)
+    # A tenth of the pixels to the last one, each a superpixel: variances over them are p (1 - p) of a square exactly.
+    assert own.response.var() == pytest.approx(response_variance(model), rel=1e-5)
+    assert own.dark_e_per_s.var() == pytest.approx(dark_current_variance(model), rel=1e-5)
 
 
 def test_crosstalk_shares_light_with_four_neighbours_and_keeps_it() -> None:
@@ -264,6 +273,24 @@ def test_moments_of_a_polynomial_of_counts_equal_the_sum_over_them(
     found = moments.bent_moments(np.array([mean]), model)
     assert found[0][0] == pytest.approx(first, rel=1e-10, abs=1e-12)
     assert found[1][0] == pytest.approx(weights @ (read - first) ** 2, rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize("bits", [None, 12])
+@pytest.mark.parametrize("mean", [40.0, 850.0, 900.0, 1000.0])
+def test_moments_of_a_bent_full_well_equal_the_sum_over_counts(mean: float, bits: int | None) -> None:
+    """A polynomial of min(N, F), then 4.5 DN of read noise, which dithers codes: 1/12 DN^2 where there are any.
+
+    (Planted: mean and variance of a reading without codes exchanged.)
+    """
+    model = camera(linearity=(-0.1,), full_well_e=900.0, bits=bits, dark_current_e_per_s=0.0)
+    counts = np.arange(3000.0)
+    weights = stats.poisson.pmf(counts, mean)
+    read = chain.bend(np.minimum(counts, 900.0), model) * 1.5 + 100
+    first = weights @ read
+    second = weights @ (read - first) ** 2 + 4.5**2 + (1 / 12 if bits else 0)
+    found = moments.frame_moments(np.array([mean]), 0.0, model)
+    assert found[0][0] == pytest.approx(first, rel=1e-9)
+    assert found[1][0] == pytest.approx(second, rel=1e-8)
 
 
 def test_a_full_well_is_read_as_the_polynomial_says() -> None:
