@@ -152,9 +152,16 @@ class Apparatus:
     def waves(self) -> Spectrum | None:
         """Lines of that light whose diffraction at the mask is worked out; None: of none."""
         from mitsim.optics.diffraction import narrowest_mm
+        from mitsim.optics.fft_shadow import check_waves
 
         narrow = self.geometry.build_mask().opening_mm < narrowest_mm(float(self.spectrum.wavelengths_nm.max()))
-        return None if narrow or not self.geometry.diffracts else self.spectrum
+        if narrow or not self.geometry.diffracts:
+            return None
+        try:
+            check_waves(self.geometry, self.spectrum)
+        except MitsimError:  # as with too narrow openings, a plan is refused unless it leaves waves out
+            return None
+        return self.spectrum
 
     @cached_property
     def specular(self) -> SpecularLight:

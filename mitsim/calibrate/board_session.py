@@ -25,13 +25,15 @@ from mitsim.devices.camera import CameraGeometry, side_of
 from mitsim.devices.patterns import Lighting, stripe_signs
 from mitsim.devices.projector import Spectrum
 from mitsim.devices.session import UNIFORM, BoardShape, Half, SessionRecipe, halves_in_order
-from mitsim.light.cost_model import FIXED, Numbers, forming_seconds
+from mitsim.light.cost_model import FIXED, Numbers, forming_seconds, in_waves
 from mitsim.light.light import SampledLight, Sampling, trace_lines
 from mitsim.light.memory import frame_seconds, frames_at_once, light_bytes
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Forming, Settings
 from mitsim.light.simulation import Simulation
+from mitsim.optics.fft_shadow import raster
 from mitsim.optics.frames import Frame, at_once, mixes
+from mitsim.optics.image_formation import number_of_terms
 from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import best_term, centre_terms, shadow_terms
 from mitsim.planner.planner import make_plan
@@ -195,13 +197,21 @@ class Session:
         session_cost(self.board, count, first, sum(seconds.values()), exposures).check("calibration", job.limits)
         with job.planning("calibration"):
             plan = make_plan(self.board, _lines(n), accuracy, self.seed)
-        seconds = session_seconds(self.board, count, self.shots, plan.settings)
+        seconds = session_seconds(self.board, count, self.shots, plan.settings, self._largest_terms(plan.settings))
         # There is no truth to be traced, and other frames are formed than those that the plan looks at.
         plan = plan.taking(start=starting, truth=0.0, **seconds)
         cost = session_cost(self.board, count, plan.settings, plan.predicted_seconds, exposures)
         cost.check("calibration", job.limits)
         job.clock.predict(plan.predicted)
         return replace(plan, cost=cost)
+
+    def _largest_terms(self, settings: Settings) -> float:
+        """Terms of the shadow that ``settings`` have drawn on a raster, which their plan has looked at; 1 of others."""
+        geometry, waves = self.board.geometry, in_waves(settings.effects)
+        if not geometry.is_drawn(waves):
+            return 1.0
+        geometry = geometry.model_copy(update={"mask_cells": settings.raster_cells})
+        return number_of_terms(raster(geometry, self.distance, self.board.waves if waves else None))
 
     def trace(self, plan: Plan, job: Job) -> SampledLight:
         """The board's light, by projector pixel, sampled as the ``plan`` says; ``job`` is told how far it is."""
@@ -256,7 +266,9 @@ _SUMS = 8.0
 and once more while they are saved."""
 
 
-def session_seconds(board: Apparatus, count: int, shots: int, settings: Settings) -> dict[str, float]:
+def session_seconds(
+    board: Apparatus, count: int, shots: int, settings: Settings, largest_terms: float = 1.0
+) -> dict[str, float]:
     """Seconds of forming the stripes of a session, and of exposing its shots and adding up responses.
 
     Parameters
@@ -267,6 +279,8 @@ def session_seconds(board: Apparatus, count: int, shots: int, settings: Settings
         +-1 patterns of a side, and frames of the whole session.
     settings
         what is simulated.
+    largest_terms
+        terms that hold a shadow that must be drawn on a raster; 1, the fewest, before it is known.
     """
     n, pixels = board.n, board.geometry.frame_side
     cells = max(Simulation(board, settings).grids["fine"].bundle.cells)
@@ -281,6 +295,7 @@ def session_seconds(board: Apparatus, count: int, shots: int, settings: Settings
         classes=n,
         geometric_terms=float(board.geometry.mask_terms),
         correlated=(board.geometry.is_drawn(waves=False), board.geometry.is_drawn(board.geometry.diffracts)),
+        largest_terms=(largest_terms,) * 2,
     )
     numbers = replace(Numbers.of(settings), mixed=0.0)  # what black pixels leak is added to frames
     seconds = 2 * float(forming_seconds(forming, numbers, n if mixed else count, _UNIT_COSTS))

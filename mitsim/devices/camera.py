@@ -328,11 +328,13 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
 
     def is_drawn(self, waves: bool) -> bool:
         """Whether the mask's shadow, with ``waves`` or without, is drawn on a raster because it has no short closed
-        form: of what is turned, of a picture of light, and of the waves behind many terms."""
+        form: of what is turned, of a picture of light, of more than a thousand terms, and of the waves behind many
+        terms."""
         mask = self.build_mask()
         if not isinstance(mask, Plate):
             return False
-        return mask.irradiance or bool(mask.flaws.turn_deg) or (waves and mask.amplitude.crosses is None)
+        turned = bool(mask.flaws.turn_deg)
+        return mask.irradiance or turned or mask.many or (waves and mask.amplitude.crosses is None)
 
     @property
     def few_wave_terms(self) -> bool:

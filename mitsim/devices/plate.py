@@ -9,6 +9,7 @@ those of :mod:`mitsim.devices.mask`.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -20,14 +21,25 @@ from mitsim.core.arrays import ByValue, FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.imagelist import Wanted
 from mitsim.core.images import image_size, own_end, read_image
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import stream
 from mitsim.devices.mask import NO_FLAWS, BoolArray, Flaws, Term, draw_dust, mean_opening
 
 LEFT_OUT = 1e-7
 """Part of a transmission, rms, that singular vectors may leave: a tenth of the finest accuracy that a plan takes."""
 RASTER_LEFT_OUT = 1e-4
-"""The same of light on a raster, which is no more exact itself."""
+"""The same of light on a raster, of single pixels; of frames of dots it leaves 1e-5 and less
+(tests/unit/optics/test_correlation.py)."""
+_SKETCHES = 96, 192, 384, 640
+"""Directions in which the largest terms are looked for, until they hold all but that: at 512 pixels a disc of 64
+features has 59 terms, a zone plate of 512 has 535. Where the last are too few, sums take longer than correlations."""
+_TURNS = 2
+"""Times that a sketch is turned toward the largest terms: a third changes their number by one in a hundred."""
 FEW = 2
 """Terms that are looked for as exact crosses: FlatCam's, of whose fields diffraction makes four terms."""
+_MOST_DECOMPOSED = 1024
+"""Distinct rows and columns of which singular vectors are worked out: those of 4096 take six minutes and 2 GB, and no
+sum of so many terms is faster than a correlation."""
 LARGEST = 4096
 """Features a side: a transmission takes 128 MiB."""
 _MOST_LINES = 2 * LARGEST
@@ -56,6 +68,9 @@ class Plate(ByValue):
         what else is wrong with it.
     irradiance
         whether values are the light behind it, of any finite size, instead: waves are in them already.
+    averaged
+        features along a sensor pixel, over which light is averaged wherever it is asked for: finer structure makes no
+        terms.
     """
 
     feature_mm: float
@@ -64,6 +79,7 @@ class Plate(ByValue):
     lines_mm: FloatArray | None = field(default=None, repr=False)
     flaws: Flaws = NO_FLAWS
     irradiance: bool = False
+    averaged: int = 1
 
     def __post_init__(self) -> None:
         values = np.array(self.values, dtype=np.float64)
@@ -81,7 +97,7 @@ class Plate(ByValue):
             self._hold(lines_mm=np.array(self.lines_mm, dtype=np.float64))
 
     def _values(self) -> tuple[object, ...]:
-        return self.feature_mm, self.words, self.digest, self.flaws, self.irradiance
+        return self.feature_mm, self.words, self.digest, self.flaws, self.irradiance, self.averaged
 
     @cached_property
     def digest(self) -> str:
@@ -166,12 +182,38 @@ class Plate(ByValue):
         if self.crosses is not None:
             return self.crosses, 0.0
         if self.irradiance:
-            return _large_terms(self.values)
-        rows, columns, left, singular, right = _factors(self.values, self.lines_mm)
+            found = self.largest
+            if found.left_out > RASTER_LEFT_OUT:
+                found = LargestTerms(self.values, self.averaged, sizes=(len(self.values),))
+            return found.terms(), found.left_out
+        if self.many:
+            patterns, which = np.unique(self.values, axis=0, return_inverse=True)
+            return tuple((1.0, (which.ravel() == k) * 1.0, pattern) for k, pattern in enumerate(patterns)), 0.0
+        (rows, columns), weights, weighted = _distinct(self.values, self.lines_mm)
+        left, singular, right = np.linalg.svd(weighted, full_matrices=False)
+        left, right = left / weights[0], right / weights[1]
         beyond = np.sqrt(np.cumsum(np.square(singular[::-1]))[::-1])  # what the terms from each on hold
         count = int(np.count_nonzero(beyond > LEFT_OUT * beyond[0]))
         terms = tuple((float(singular[k]), left[rows, k], right[k, columns]) for k in range(count))
         return terms, float(beyond[count] / beyond[0]) if count < len(beyond) else 0.0
+
+    @cached_property
+    def most_terms(self) -> int:
+        """Its distinct rows or columns, whichever are fewer: terms that it takes at most."""
+        if self.crosses is not None:
+            return len(self.crosses)
+        both = self.values, np.ascontiguousarray(self.values.T)
+        return min(len({line.tobytes() for line in lines}) for lines in both)
+
+    @property
+    def many(self) -> bool:
+        """Whether it has so many terms that its frames are never their sum."""
+        return self.most_terms > _MOST_DECOMPOSED
+
+    @cached_property
+    def largest(self) -> LargestTerms:
+        """Terms of the light that pixels see of large values, where some hundreds hold it."""
+        return LargestTerms(self.values, self.averaged)
 
     @cached_property
     def residuals(self) -> tuple[float, float]:
@@ -202,6 +244,12 @@ class Plate(ByValue):
     def binary(self) -> bool:
         """Whether every feature is open or closed."""
         return bool(np.isin(self.values, (0, 1)).all())
+
+    @property
+    def mirrored(self) -> tuple[bool, bool]:
+        """Whether it is its own mirror image along rows, and along columns."""
+        even = self.lines_mm is None or np.array_equal(self.lines_mm, -self.lines_mm[::-1])
+        return tuple(even and np.array_equal(self.values, np.flip(self.values, axis)) for axis in (0, 1))  # type: ignore[return-value]
 
     @property
     def diffracts(self) -> bool:
@@ -289,41 +337,96 @@ def within(plate: Plate, reach_mm: float) -> Plate:
     return plate
 
 
-def _factors(
+def _distinct(
     values: FloatArray, lines: FloatArray | None = None
-) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], FloatArray, FloatArray, FloatArray]:
-    """Singular value decomposition of ``values`` by their distinct rows and columns, of which drawings have few.
-
-    Rows and columns count by their widths between ``lines``, where these are not even.
+) -> tuple[tuple[npt.NDArray[np.intp], ...], tuple[FloatArray, ...], FloatArray]:
+    """Distinct rows and columns of ``values``, of which drawings have few; they count by their number, and by their
+    widths between ``lines`` where these are not even.
 
     Returns
     -------
-    (N,) which distinct row and which distinct column each is, their factors (rows, k) and (k, columns), and (k,)
-    singular values between them.
+    (N,) which distinct row and which distinct column each is; roots of what these count, (rows, 1) and (columns,); and
+    (rows, columns) values times both.
     """
     widths = np.ones(len(values)) if lines is None else np.diff(lines) * (len(lines) / np.ptp(lines))
     rows, row = np.unique(values, axis=0, return_inverse=True)
     columns, column = np.unique(rows, axis=1, return_inverse=True)
     weights = np.sqrt(np.bincount(row.ravel(), widths))[:, None], np.sqrt(np.bincount(column.ravel(), widths))
-    left, singular, right = np.linalg.svd(weights[0] * columns * weights[1], full_matrices=False)
-    return row.ravel(), column.ravel(), left / weights[0], singular, right / weights[1]
+    return (row.ravel(), column.ravel()), weights, weights[0] * columns * weights[1]
 
 
-def _large_terms(values: FloatArray) -> tuple[tuple[Term, ...], float]:
-    """Terms of large ``values`` by their Gram matrix, in a fifth of the time; what they leave is told to 1e-8."""
-    squared, turn = np.linalg.eigh(values.T @ values)
-    within = np.cumsum(np.maximum(squared, 0))  # what smaller ones hold
-    kept = np.flatnonzero(within > RASTER_LEFT_OUT**2 * within[-1])[::-1]
-    left = values @ turn[:, kept]
-    rest = float(np.sqrt(within[kept[-1] - 1] / within[-1])) if kept[-1] else 0.0
-    return tuple((1.0, left[:, k], turn[:, place]) for k, place in enumerate(kept)), rest
+class LargestTerms:
+    """The terms of large ``values`` (N, N) that hold their means over squares of ``averaged`` values a side, but for
+    1e-4 of them, rms.
+
+    With S the means along an axis, a third of a square apart, and U sigma W^T the singular vectors of S V S^T that are
+    kept, the terms are V S^T W sigma^-1 U^T S V, whose means are U sigma W^T: the best of so few (Nystroem's
+    approximation, from both sides). Half a square apart would leave a thousand times as much between the squares.
+    Vectors come from a sketch in random directions (Halko, Martinsson and Tropp, SIAM Review 53, 217, 2011).
+
+    Attributes
+    ----------
+    count
+        of the terms.
+    left_out
+        of the means, root mean square, as a part of all; above 1e-4 where so many terms are too few.
+    """
+
+    def __init__(self, values: FloatArray, averaged: int = 1, sizes: Sequence[int] = _SKETCHES) -> None:
+        self._values, self._averaged = values, averaged
+        self._starts = np.arange(1 - averaged, len(values), max(averaged // 3, 1))
+        with single_threaded_blas():
+            seen = self._seen = self._means(self._means(values).T).T
+            whole = float(np.square(seen).sum())
+            for size in sizes:
+                directions = stream(0, "terms").standard_normal((len(seen), min(size, len(seen))))
+                for _ in range(_TURNS):
+                    directions = np.linalg.qr(seen.T @ (seen @ directions))[0]
+                along = seen @ directions
+                squared, turn = np.linalg.eigh(along.T @ along)
+                held = np.cumsum(squared[::-1])
+                rest = np.sqrt(np.maximum(whole - held, 0) / whole)
+                enough = np.flatnonzero(rest <= RASTER_LEFT_OUT)
+                if len(enough) or size >= len(seen):
+                    break
+        self.count = int(enough[0]) + 1 if len(enough) else len(held)
+        self.left_out = float(rest[self.count - 1])
+        self._squared, self._turn = squared[::-1][: self.count], directions @ turn[:, ::-1][:, : self.count]
+
+    def terms(self) -> tuple[Term, ...]:
+        """The terms (weight, row profile (N,), column profile (N,))."""
+        with single_threaded_blas():
+            left = self._values @ self._spread(self._turn)
+            right = (self._spread(self._seen @ self._turn) / self._squared).T @ self._values
+        return tuple((1.0, left[:, k], right[k]) for k in range(self.count))
+
+    def _means(self, values: FloatArray) -> FloatArray:
+        """(starts, m) means S ``values`` of (N, m), beyond which there is no light."""
+        below = np.concatenate((np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)))
+        ends = np.minimum(self._starts + self._averaged, len(values))
+        return np.asarray((below[ends] - below[np.maximum(self._starts, 0)]) / self._averaged)
+
+    def _spread(self, means: FloatArray) -> FloatArray:
+        """(N, k) S^T ``means`` of (starts, k)."""
+        below = np.concatenate((np.zeros((1, means.shape[1])), np.cumsum(means, axis=0)))
+        places = np.arange(len(self._values))
+        first, beyond = (np.searchsorted(self._starts, places - less, "right") for less in (self._averaged, 0))
+        return np.asarray((below[beyond] - below[first]) / self._averaged)
 
 
 def _beyond_one(values: FloatArray, lines: FloatArray | None) -> float:
     """What the best separable product leaves of ``values`` between ``lines``, root mean square, as a part of them."""
-    singular = _factors(values, lines)[3]
-    total = np.square(singular).sum()
-    rest = float(np.sqrt(np.square(singular[1:]).sum() / total)) if total else 0.0
+    *_, weighted = _distinct(values, lines)
+    total = np.linalg.norm(weighted)
+    if not total:
+        return 0.0
+    if min(weighted.shape) > _MOST_DECOMPOSED:
+        from scipy.sparse.linalg import svds  # here: only the largest masks need it
+
+        left, singular, right = svds(weighted, k=1, v0=np.ones(min(weighted.shape)))
+        return float(np.linalg.norm(weighted - singular * left * right) / total)
+    singular = np.linalg.svd(weighted, compute_uv=False)
+    rest = float(np.linalg.norm(singular[1:]) / total)
     return rest if rest > _ROUNDING * len(values) else 0.0
 
 

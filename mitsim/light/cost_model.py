@@ -18,8 +18,10 @@ from mitsim.core.arrays import FloatArray
 from mitsim.devices.plate import FEW
 from mitsim.light.passes import PASSES
 from mitsim.light.settings import GROUPS, Forming, Number, PilotResult, SampleCost, Settings
+from mitsim.optics.fft_shadow import CORRELATION
 from mitsim.optics.forming import PROBES
 from mitsim.optics.frames import formed_frames, mixes
+from mitsim.optics.image_formation import SUMMED_BYTES
 from mitsim.transport.accumulator import MOST_PLACES
 
 ROUNDS, CHECKED_SHOTS = 1.5, 16
@@ -96,12 +98,11 @@ FIXED = UnitCosts(
 """Chosen near what was measured, as the table's; only their ratios decide."""
 
 
-_CORRELATION = 125.0
-"""Multiplications a pixel that each phase of a correlation with a raster takes as long as, for each pair of anchors and
-layer: 0.08 to 0.13 processor seconds of 512 x 512 pixels and 36 phases, where sums take 8e-11 a multiplication
-(benchmarks/masks.py)."""
 _MANY_ENTRIES = 1.2
 """An entry of a geometric shadow of many terms over one of a wave-optical one (benchmarks/masks.py)."""
+_CELL_S = 5e-8
+"""A cell of a raster of light on which waves are squared, beyond these: it is sharpened, and its largest terms are
+looked for (a disc at 512 pixels, 6 to 12 cells a pixel)."""
 _FURTHER_LINE = 0.2
 """What tracing takes more for each further line: 0.15 of a mono capture's seconds, 0.3 of one line's (three lines of
 photograph, benchmarks/colour_lines.py)."""
@@ -239,13 +240,20 @@ def _products(
     """
     rows, columns = (part * forming.cells * cells * anchors for part in lit)
     pixels = forming.pixels
-    if _by_fft(forming, numbers):
-        phases = _phases(forming, numbers)
-        return cast(Number, _CORRELATION * phases * layers * np.square(anchors) * (1 + GROUPS) * pixels**2 + 0 * rows)
-    probes = GROUPS * (PROBES + 1) * (np.minimum(columns, pixels) + pixels) * rows
-    terms = forming.geometric_terms + (forming.terms - forming.geometric_terms) * numbers.waves
     # The shorter side is multiplied out first.
-    return cast(Number, terms * layers * (pixels * rows * columns + pixels**2 * np.minimum(rows, columns) + probes))
+    one_term = layers * (pixels * rows * columns + pixels**2 * np.minimum(rows, columns))
+    of_probes = layers * GROUPS * (PROBES + 1) * (np.minimum(columns, pixels) + pixels) * rows
+    if not _by_fft(forming, numbers):
+        terms = forming.geometric_terms + (forming.terms - forming.geometric_terms) * numbers.waves
+        return cast(Number, terms * (one_term + of_probes))
+    correlation = CORRELATION * _phases(forming, numbers) * layers * np.square(anchors) * pixels**2
+    terms = forming.largest_terms[bool(numbers.waves)]
+    many = np.asarray(terms * 16 * pixels * forming.cells * cells > SUMMED_BYTES)
+    sums, sums_of_probes = (
+        np.where(many, math.inf, count * (terms if math.isfinite(terms) else 0.0)) for count in (one_term, of_probes)
+    )
+    # Frames and what probes see of them each take the cheaper way.
+    return cast(Number, np.minimum(correlation, sums) + np.minimum(GROUPS * correlation, sums_of_probes))
 
 
 def _entries(forming: Forming, numbers: Numbers) -> Number:
@@ -309,6 +317,8 @@ def optics_seconds(forming: Forming, numbers: Numbers, costs: UnitCosts) -> Numb
         drawing = forming.drawing[bool(numbers.waves)] * costs.product / FIXED.product
         if not numbers.waves:  # Waves are squared at as many points whatever the cells.
             drawing *= _phases(forming, numbers) / forming.phases
+        else:
+            drawing += costs.product / FIXED.product * _CELL_S * forming.pixels**2 * _phases(forming, numbers)
         # Coarse light of several layers is seen at a depth of its own.
         shadows = cast(Number, shadows + drawing * (numbers.layers + (np.asarray(numbers.layers) > 1)))
     frames = formed_frames(forming.classes, forming.shots, forming.pixels)

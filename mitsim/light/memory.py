@@ -194,8 +194,9 @@ def drawing_seconds(geometry: CameraGeometry, spectrum: Spectrum | None) -> floa
     assert isinstance(seen, Plate)
     step = geometry.pixel_pitch / cells_per_pixel(geometry)
     points = (points_per_cell(float(line), geometry.mask_distance, step) for line in spectrum.wavelengths_nm)
-    each = _POINT_S + _TERM_S * len(seen.amplitude.terms)
-    return cells * (_AROUND if turned else 1.0) * each * sum(count**2 for count in points)
+    each = _POINT_S + _TERM_S * seen.amplitude.most_terms
+    part = _AROUND if turned else 0.5 ** sum(seen.mirrored)
+    return cells * part * each * sum(count**2 for count in points)
 
 
 def raster_bytes(geometry: CameraGeometry, spectrum: Spectrum | None) -> float:

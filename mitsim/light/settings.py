@@ -314,6 +314,9 @@ class Forming:
         sums of separable terms.
     phases
         raster cells that a pixel has at least, where a shadow is drawn on one.
+    largest_terms
+        terms that hold a shadow that must be drawn on a raster, without diffraction and with it; infinite where they
+        are too many, and where it need not.
     drawing
         seconds of drawing a shadow on as few, without diffraction and with it, for each layer.
     lines
@@ -334,6 +337,7 @@ class Forming:
     geometric_terms: float = 1.0
     correlated: tuple[bool, bool] = (False, False)
     phases: float = 16.0
+    largest_terms: tuple[float, float] = (math.inf, math.inf)
     drawing: tuple[float, float] = (0.0, 0.0)
     lines: int = 1
     parted: bool = False

@@ -23,6 +23,7 @@ clear aperture of both faces, propagated from the exit face: diffraction inside 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain, combinations
@@ -70,9 +71,19 @@ class EdgeWaves:
         width and number of a result's grid cells.
     span_mm
         the greatest distance from a result to an edge that matters.
+    single
+        whether fields are in single precision, which leaves 1e-6 of them in half the time.
     """
 
-    def __init__(self, wavelength_nm: float, distance_mm: float, step_mm: float, count: int, span_mm: float) -> None:
+    def __init__(
+        self,
+        wavelength_nm: float,
+        distance_mm: float,
+        step_mm: float,
+        count: int,
+        span_mm: float,
+        single: bool = False,
+    ) -> None:
         product = wavelength_nm * 1e-6 * distance_mm
         self.step_mm, self._count = step_mm, count
         fade = product / (2 * step_mm)
@@ -89,17 +100,23 @@ class EdgeWaves:
         wave = (0.5 - 0.5j) * (cosine + 1j * sine) - 0.5
         wave *= np.square(np.cos(np.pi / 2 * np.clip(4 * x / fade - 3, 0, 1)))
         self._size = fft.next_fast_len(size - 1)
-        self._kernel = fft.fft(np.concatenate((-wave[::-1], wave)), self._size)
+        kernel = fft.fft(np.concatenate((-wave[::-1], wave)), self._size)
+        self._kernel = kernel.astype(np.complex64) if single else kernel
 
     def field(self, aperture: Steps, start_mm: float) -> ComplexArray:
         """(count,) field behind ``aperture`` at the centres of the cells from ``start_mm`` on, 1 without a mask."""
+        return np.asarray(self.fields([aperture], start_mm)[0])
+
+    def fields(self, apertures: Sequence[Steps], start_mm: float) -> ComplexArray:
+        """(apertures, count) the same of several, side by side: a transform of eight takes half as long as eight."""
         reach, count = self._reach, self._count
-        profile = aperture.amplitude_means(start_mm - reach * self.step_mm, self.step_mm, count + 2 * reach)
-        jumps = fft.fft(np.diff(profile), self._size)
+        start = start_mm - reach * self.step_mm
+        profiles = np.stack([each.amplitude_means(start, self.step_mm, count + 2 * reach) for each in apertures])
+        jumps = fft.fft(np.diff(profiles).astype(self._kernel.real.dtype), self._size)
         jumps *= self._kernel
         # The first 2 reach - 1 values lack jumps on their left, or hold what wrapped around the end.
-        waves = fft.ifft(jumps, overwrite_x=True)[2 * reach - 1 : 2 * reach - 1 + count]
-        return np.asarray(waves + profile[reach : reach + count])
+        waves = fft.ifft(jumps, overwrite_x=True)[:, 2 * reach - 1 : 2 * reach - 1 + count]
+        return np.asarray(waves + profiles[:, reach : reach + count])
 
 
 def wave_terms(shadow: ShadowGeometry, rows: Directions, columns: Directions, spectrum: Spectrum) -> SeparableTerms:

@@ -27,13 +27,14 @@ from scipy import fft
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import in_threads
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.mask import NO_FLAWS, Flaws, Mask
+from mitsim.devices.mask import NO_FLAWS, Flaws, Mask, Term
 from mitsim.devices.plate import Plate
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.diffraction import EdgeWaves, grid_step, wave_profiles
 from mitsim.optics.edge_profile import Steps, blurred_step
-from mitsim.optics.shadow import Directions, ShadowGeometry
+from mitsim.optics.shadow import Directions, Places, SeparableTerms, ShadowGeometry
 
 _CELLS_PER_PIXEL = 6
 """Raster cells along a pixel: at 4 a raster leaves twice as much (tests/physics/test_raster.py), for which a plan at an
@@ -52,17 +53,27 @@ _POINTS_PER_FRESNEL_LENGTH = 80
 3.2e-4 and 2.2e-4 off its closed form, at 60 5.8e-4 and 6.8e-4, evenly (tests/physics/test_raster.py)."""
 _MOST_WAVE_POINTS = 1 << 16
 """Points a side at most: 4e9 of them take a minute for each line, and some seconds more for each term."""
+_MOST_WAVE_TERMS = 2.0**39
+"""Points times terms at most: 40 processor seconds for each line, at 8e-11 s each (mitsim.light.memory)."""
 _LEAST_WAVE_POINTS = 2
 """Points along a cell at least."""
 _GRID_CELLS = 3
 """Cells of the field's grid from point to point at least."""
 _AROUND = 8
 """Cells that a raster is wider than its turned one, for the splines' ends."""
+CORRELATION = 125.0
+"""Multiplications a pixel that each phase of a correlation with a raster takes as long as, for each pair of anchors and
+layer: 0.08 to 0.13 processor seconds of 512 x 512 pixels and 36 phases, where sums take 8e-11 a multiplication
+(benchmarks/masks.py)."""
+KEPT = 8
+"""The last rasters, and what was prepared of them: layers of a scene, with waves and without; some 100 MiB each at 512
+pixels."""
+_FIELDS_AT_ONCE = 8
+"""Fields that are worked out side by side."""
 _AT_ONCE = 2**20
 """Points asked for at a time, 8 MiB of each of some ten arrays."""
 
 
-@lru_cache(maxsize=2)
 def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = None) -> Plate:
     """The shadow of a point at one depth, as a plate of square cells about the mask's centre.
 
@@ -80,6 +91,14 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
     MitsimError
         for a raster of too many cells, or a mask whose waves are not worked out.
     """
+    # However it was chosen to be drawn: a run then has its plan's.
+    chosen = {"mask_fft": False, "mask_cells": cells_per_pixel(geometry)}
+    return draw_raster(geometry.model_copy(update=chosen), depth, spectrum)
+
+
+@lru_cache(maxsize=KEPT)
+def draw_raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None) -> Plate:
+    """As :func:`raster`, for a camera whose cells are stated; the last ones are kept."""
     mask, shadow = geometry.build_mask(), ShadowGeometry.of(geometry, depth)
     if not isinstance(mask, Plate):
         raise MitsimError(f"{geometry.mask_words}: its shadow has a closed form; take that")
@@ -98,7 +117,11 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
         values = sharpen(means(mask, step, count))
     else:
         values = sharpen(_waves(replace(shadow, mask=mask.amplitude), spectrum, step, count))
-    return Plate(step, values, mask.words, flaws=Flaws(mask.blur_mm if spectrum is None else 0.0), irradiance=True)
+    flaws, active = (
+        Flaws(mask.blur_mm if spectrum is None else 0.0),
+        int(min(geometry.active_sides) / geometry.pixel_pitch * cells_per_pixel(geometry)),
+    )
+    return Plate(step, values, mask.words, flaws=flaws, irradiance=True, averaged=max(active, 1))
 
 
 def cells_a_side(geometry: CameraGeometry, spectrum: Spectrum | None) -> int:
@@ -126,6 +149,25 @@ def _cells(geometry: CameraGeometry, mask: Plate, step: float, spectrum: Spectru
         product = float(spectrum.wavelengths_nm.max()) * 1e-6 * geometry.mask_distance
         half += product / (np.pi**2 * mask.opening_mm * _LEFT_BEYOND)
     return 2 * int(np.ceil(min(geometry.mask_reach, half) / step))
+
+
+def check_waves(geometry: CameraGeometry, spectrum: Spectrum) -> None:
+    """MitsimError, before anything is drawn, for waves of a ``spectrum`` behind a mask of so many terms that drawing
+    them would take longer than a minute a line."""
+    mask = geometry.build_mask()
+    if not isinstance(mask, Plate) or mask.irradiance or not geometry.is_drawn(waves=True):
+        return
+    step = geometry.pixel_pitch / cells_per_pixel(geometry)
+    points = cells_a_side(geometry, spectrum) * max(
+        points_per_cell(float(line), geometry.mask_distance, step) for line in spectrum.wavelengths_nm
+    )
+    terms = mask.amplitude.most_terms
+    if terms * float(points) ** 2 * 0.5 ** sum(mask.mirrored) > _MOST_WAVE_TERMS:
+        raise MitsimError(
+            f"{mask.words}: {len(mask.values)} features a side are in sight, of {terms} terms, and their waves are "
+            f"added up at {points} points a side: minutes for each line of light, before anything is known; use "
+            "--effects=-diffraction for its geometric shadow, or give larger features or fewer pixels"
+        )
 
 
 def points_per_cell(wavelength_nm: float, distance_mm: float, step_mm: float) -> int:
@@ -194,9 +236,9 @@ def _waves(shadow: ShadowGeometry, spectrum: Spectrum, step: float, count: int) 
         even = replace(shadow, mask=replace(mask, flaws=NO_FLAWS))
         whole = 2 * int(np.ceil(count / 2**0.5)) + _AROUND
         return _turn_light(_waves(even, spectrum, step, whole), count, mask.flaws)
-    total = np.zeros((count, count))
+    total, mirrored = np.zeros((count, count)), mask.mirrored
     for wavelength, share in zip(spectrum.wavelengths_nm, spectrum.weights, strict=True):
-        total += share * _intensity(*_fields(shadow, float(wavelength), step, count))
+        total += share * _intensity(*_fields(shadow, float(wavelength), step, count), mirrored)
     return total
 
 
@@ -227,14 +269,17 @@ def _fields(
     between = max(int(np.ceil(step / points / grid_step(shadow, wavelength_nm))), _GRID_CELLS)
     half = count * step / 2
     span = half + shadow.mask.extent_mm / 2 + step
-    waves = EdgeWaves(wavelength_nm, distance, step / points / between, count * points * between, span)
+    waves = EdgeWaves(wavelength_nm, distance, step / points / between, count * points * between, span, single=True)
     terms, lines = shadow.mask.terms, shadow.mask.lines
+    profiles = [Steps.between(profile, lines) for place in (1, 2) for profile in [term[place] for term in terms]]
 
-    def field(profile: FloatArray) -> npt.NDArray[np.complex64]:
-        return _means_at_points(waves.field(Steps.between(profile, lines), -half), between).astype(np.complex64)
+    def fields(start: int) -> npt.NDArray[np.complex64]:
+        several = waves.fields(profiles[start : start + _FIELDS_AT_ONCE], -half)
+        return np.stack([_means_at_points(field, between).astype(np.complex64) for field in several])
 
-    rows = np.stack([np.complex64(weight) * field(row) for weight, row, _ in terms], axis=1)
-    return rows, np.stack([field(column) for *_, column in terms]), points
+    seen = np.concatenate(in_threads(fields, range(0, len(profiles), _FIELDS_AT_ONCE)))
+    weights = np.array([weight for weight, *_ in terms], dtype=np.complex64)
+    return (weights[:, None] * seen[: len(terms)]).T, seen[len(terms) :], points
 
 
 def _means_at_points(field: npt.NDArray[np.complex128], between: int) -> npt.NDArray[np.complex128]:
@@ -249,22 +294,34 @@ def _means_at_points(field: npt.NDArray[np.complex128], between: int) -> npt.NDA
     return np.asarray(means * (np.square(np.abs(field)).mean() / power) ** 0.5) if power else means
 
 
-def _intensity(rows: npt.NDArray[np.complex64], columns: npt.NDArray[np.complex64], points: int) -> FloatArray:
-    """(cells, cells) mean |U|^2 of U = ``rows`` ``columns`` at ``points`` x ``points`` points of each cell."""
-    count = len(rows) // points
-    means = np.empty((count, count))
-    at_once = max(1, _AT_ONCE // len(rows) // points)
-    for start in range(0, count, at_once):
-        stop = min(start + at_once, count)
-        field = rows[start * points : stop * points] @ columns
-        means[start:stop] = _blocks(np.square(field.real) + np.square(field.imag), points)
-    return means
+def _intensity(
+    rows: npt.NDArray[np.complex64],
+    columns: npt.NDArray[np.complex64],
+    points: int,
+    mirrored: tuple[bool, bool] = (False, False),
+) -> FloatArray:
+    """(cells, cells) mean |U|^2 of U = ``rows`` ``columns`` at ``points`` x ``points`` points of each cell; of an axis
+    along which the mask is ``mirrored``, half is worked out."""
+    whole = len(rows) // points, columns.shape[1] // points
+    kept = [count // 2 if half else count for count, half in zip(whole, mirrored, strict=True)]
+    columns = columns[:, : kept[1] * points]
+    means = np.empty(kept)
+    at_once = max(1, _AT_ONCE // max(columns.shape[1], 1) // points)
+
+    def square(start: int) -> None:
+        field = rows[start * points : min(start + at_once, kept[0]) * points] @ columns
+        means[start : start + at_once] = _blocks(np.square(field.real) + np.square(field.imag), points)
+
+    in_threads(square, range(0, kept[0], at_once))
+    if mirrored[0]:
+        means = np.concatenate((means, means[::-1]))
+    return np.concatenate((means, means[:, ::-1]), axis=1) if mirrored[1] else means
 
 
-def _blocks(values: npt.NDArray[np.floating], side: int) -> FloatArray:
-    """Means of ``values`` over squares of so many a ``side``."""
-    rows, columns = (size // side for size in values.shape)
-    return np.asarray(values.reshape(rows, side, columns, side).mean(axis=(1, 3), dtype=np.float64))
+def _blocks(values: npt.NDArray[np.float32], side: int) -> FloatArray:
+    """Means of ``values`` over squares of so many a ``side``, of few enough to be added up in single precision."""
+    rows = values.reshape(-1, side, values.shape[1]).sum(axis=1)
+    return np.asarray(sum(rows[:, place::side].astype(np.float64) for place in range(side)) / side**2)
 
 
 # -------- Frames behind a mask drawn on a raster
@@ -296,7 +353,7 @@ class Correlation:
     """
 
     def __init__(self, shadow: ShadowGeometry, rows: Directions, columns: Directions, fill_factor: float = 1.0) -> None:
-        sides = [_Side.of(*shadow.from_mask(directions, axis)) for axis, directions in enumerate((rows, columns))]
+        sides = _Side.both(shadow, rows, columns)
         self.shape = sides[0].pixels, sides[1].pixels
         self._phases = sides[0].phases, sides[1].phases
         self._spread = [side.weights for side in sides]
@@ -339,6 +396,11 @@ class _Side:
     weights: FloatArray
 
     @classmethod
+    def both(cls, shadow: ShadowGeometry, rows: Directions, columns: Directions) -> list[_Side]:
+        """Those of rows and of columns."""
+        return [cls.of(*shadow.from_mask(directions, axis)) for axis, directions in enumerate((rows, columns))]
+
+    @classmethod
     def of(cls, shadow: ShadowGeometry, directions: Directions) -> _Side:
         pixels = len(shadow.pixel_centres_mm)
         length = shadow.pixel_centres_mm[-1] - shadow.pixel_centres_mm[0]
@@ -356,6 +418,34 @@ class _Side:
         edges = first + np.arange(count + 1)
         below = blurred_step(edges[:, None] - crossings, halves[0], halves[1], blur / cell)
         return cls(pixels, phases, first, np.diff(below, axis=0))
+
+    def factor(self, profile: FloatArray, places: npt.NDArray[np.intp]) -> FloatArray:
+        """(places, c) means of a ``profile`` of the raster that some of the pixels see from each direction."""
+        seen = _part(profile[:, None], self.first, self.phases * (self.pixels - 1) + len(self.weights))[:, 0]
+        windows = np.lib.stride_tricks.sliding_window_view(seen, len(self.weights))
+        return np.asarray(windows[self.phases * places] @ self.weights)
+
+
+def terms_of_raster(
+    shadow: ShadowGeometry, rows: Directions, columns: Directions, fill_factor: float, places: Places | None
+) -> SeparableTerms:
+    """The largest separable terms of a raster's shadow, [(left (m, r), right (m', c)), ...].
+
+    Parameters
+    ----------
+    shadow, rows, columns, fill_factor
+        as for :class:`Correlation`.
+    places
+        rows and columns of a frame; None: all.
+    """
+    sides = _Side.both(shadow, rows, columns)
+    at = [np.arange(side.pixels) if places is None else np.asarray(places[axis]) for axis, side in enumerate(sides)]
+
+    def factors(term: Term) -> tuple[FloatArray, FloatArray]:
+        weight, row, column = term
+        return fill_factor * weight * sides[0].factor(row, at[0]), sides[1].factor(column, at[1])
+
+    return in_threads(factors, shadow.mask.terms)
 
 
 def _mask_values(shadow: ShadowGeometry) -> FloatArray:

@@ -9,9 +9,10 @@ hold light enter the product: for k x k shifting dots that is one in k of each. 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import pairwise, starmap
 from typing import Any
 
@@ -21,9 +22,9 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.plate import FEW
+from mitsim.devices.plate import FEW, RASTER_LEFT_OUT, Plate
 from mitsim.devices.projector import Spectrum
-from mitsim.optics.fft_shadow import Correlation, cells_per_pixel, raster
+from mitsim.optics.fft_shadow import CORRELATION, KEPT, Correlation, cells_per_pixel, raster, terms_of_raster
 from mitsim.optics.shadow import Directions, Places, SeparableTerms, ShadowGeometry, lagrange_weights
 from mitsim.optics.terms import shadow_terms
 
@@ -34,8 +35,8 @@ _FILLED = 1 / 8
 """Part of all places from which light is laid out whole: of places at random, an eighth lights every row and column."""
 _keep_shadow = lru_cache(maxsize=24)(shadow_terms)
 """The last shadows, a few MiB each: a plan asks for some ten of them again and again."""
-_KEPT_RASTERS = 8
-"""The last shadows on rasters, some 40 MiB each at 512 pixels: layers of a scene, with one line and with all."""
+SUMMED_BYTES = 2**28
+"""Memory that the terms of a raster may take, and those of the rows and columns that are lit."""
 
 _JUDGED = 64
 """Pixels a side on which a raster is judged: one of half the cells is drawn in a second."""
@@ -109,27 +110,62 @@ class _Terms:
 
 @dataclass(frozen=True, eq=False)
 class _Raster:
-    """One layer behind a mask on a raster: its correlation, the anchors' weights (m, anchors) and (m', anchors), and
-    rows and columns of a frame, None for all."""
+    """One layer behind a mask on a raster: as a sum of the raster's largest terms, or as a correlation, whichever takes
+    less of a light.
 
-    correlation: Correlation
+    Attributes
+    ----------
+    shadow
+        camera, directions of rows and of columns, depth, and lines of the light.
+    weights
+        the anchors' (m, anchors) and (m', anchors).
+    places
+        rows and columns of a frame, None for all.
+    summed
+        the terms; None where they are too many.
+    """
+
+    shadow: tuple[CameraGeometry, Directions, Directions, float, Spectrum | None]
     weights: tuple[FloatArray, FloatArray]
     places: Places | None
-    cells: tuple[int, int]
+    summed: _Terms | None
+
+    @cached_property
+    def correlation(self) -> Correlation:
+        """Prepared when it is first asked for: the few pixels that a plan looks at are sums."""
+        return _correlation(*self.shadow)
 
     def frame(self, lit: _Lit, out: FloatArray | None = None) -> FloatArray:
         """As :meth:`_Terms.frame`."""
+        if self.summed and self._sums_take_less(self.summed, lit):
+            return self.summed.frame(lit, out)
         return np.positive(self._image(lit, lit.mean), out=out)
 
     def probe(self, lit: _Lit, vectors: FloatArray | None) -> FloatArray:
         """As :meth:`_Terms.probe`."""
+        if self.summed and self._sums_take_less(self.summed, lit, vectors):
+            return self.summed.probe(lit, vectors)
         seen = [self._image(lit, light) for light in lit.lights]
         return np.concatenate([frame if vectors is None else frame @ vectors for frame in seen], axis=1)
+
+    def _sums_take_less(self, summed: _Terms, lit: _Lit, vectors: FloatArray | None = None) -> bool:
+        """Whether a frame of a light, or its products with ``vectors``, takes less as a sum of terms."""
+        geometry, *both, _, _ = self.shadow
+        (near, far), (rows, columns) = sorted((len(lit.rows), len(lit.columns))), map(len, self.weights)
+        across = columns if vectors is None else vectors.shape[1]
+        held = 8 * len(summed.terms) * (near + far) * max(rows, columns)
+        pairs = math.prod(
+            len(np.unique(places // len(each.centres)))
+            for places, each in zip((lit.rows, lit.columns), both, strict=True)
+        )
+        correlation = CORRELATION * pairs * cells_per_pixel(geometry) ** 2 * math.prod(geometry.frame_shape)
+        return held <= SUMMED_BYTES and len(summed.terms) * near * (far + rows) * across < correlation
 
     def _image(self, lit: _Lit, light: FloatArray) -> FloatArray:
         """(m, m') irradiance of a ``light`` (r, c)."""
         (row_anchor, row), (column_anchor, column) = (
-            np.divmod(places, cells) for places, cells in zip((lit.rows, lit.columns), self.cells, strict=True)
+            np.divmod(places, len(each.centres))
+            for places, each in zip((lit.rows, lit.columns), self.shadow[1:3], strict=True)
         )
         by_row, by_column = self.weights
         total = np.zeros((len(by_row), len(by_column)))
@@ -187,8 +223,9 @@ class FrameOptics:
 
         def layer(depth: float) -> _Raster | _Terms:
             if geometry.is_correlated(spectrum is not None):
-                correlation = _correlation(geometry, rows, columns, depth, spectrum)
-                return _Raster(correlation, weights, places, self.cells)
+                shadow = geometry, rows, columns, depth, spectrum
+                summed = _largest_terms(*shadow, places) if geometry.is_drawn(spectrum is not None) else None
+                return _Raster(shadow, weights, places, None if summed is None else _Terms(summed, weights))
             return _Terms(_shadow(geometry, rows, columns, depth, spectrum, places), weights)
 
         self._layers = [layer(depth) for depth in depths]
@@ -319,21 +356,47 @@ def raster_error(
     def frame(finer: int) -> FloatArray:
         drawn = few.model_copy(update={"mask_cells": finer * cells_per_pixel(few)})
         shadow = replace(ShadowGeometry.of(drawn, depth), mask=raster(drawn, depth, spectrum))
+        if finer == 1 and not known and math.isfinite(number_of_terms(raster(drawn, depth, spectrum))):
+            # As runs may form it: what its largest terms leave out is then part of what is told.
+            return summed(terms_of_raster(shadow, rows, columns, drawn.pixel_fill_factor, None))
         return Correlation(shadow, rows, columns, drawn.pixel_fill_factor).image(light, row, column)
+
+    def summed(terms: SeparableTerms) -> FloatArray:
+        return np.asarray(sum(left @ light @ right.T for left, right in terms))
 
     known = not few.is_drawn(spectrum is not None)
     coarse = frame(1)
-    if known:
-        terms = shadow_terms(few, rows, columns, depth, spectrum)
-        judge = np.asarray(sum(left @ light @ right.T for left, right in terms))
-    else:
-        judge = frame(_FINER)
+    judge = summed(shadow_terms(few, rows, columns, depth, spectrum)) if known else frame(_FINER)
     energy = float(np.square(judge).sum())
     error = float(np.sqrt(np.square(coarse - judge).sum() / energy)) if energy else 0.0
     return error, known
 
 
-@lru_cache(maxsize=_KEPT_RASTERS)
+def number_of_terms(drawn: Plate) -> float:
+    """Terms that hold the shadow that is ``drawn`` on a raster; infinite where too many were looked for."""
+    return drawn.largest.count if drawn.largest.left_out <= RASTER_LEFT_OUT else math.inf
+
+
+def _largest_terms(
+    geometry: CameraGeometry,
+    rows: Directions,
+    columns: Directions,
+    depth: float,
+    spectrum: Spectrum | None,
+    places: Places | None,
+) -> SeparableTerms | None:
+    """The shadow of a mask that is drawn on a raster, but for 1e-4 of it, as separable terms; None where these would
+    take too much memory."""
+    drawn = raster(geometry, depth, spectrum)
+    shape = geometry.frame_shape if places is None else map(len, places)
+    sides = sum(side * len(each.centres) for side, each in zip(shape, (rows, columns), strict=True))
+    if 8 * number_of_terms(drawn) * sides > SUMMED_BYTES:
+        return None
+    shadow = replace(ShadowGeometry.of(geometry, depth), mask=drawn)
+    return terms_of_raster(shadow, rows, columns, geometry.pixel_fill_factor, places)
+
+
+@lru_cache(maxsize=KEPT)
 def _correlation(
     geometry: CameraGeometry, rows: Directions, columns: Directions, depth: float, spectrum: Spectrum | None
 ) -> Correlation:

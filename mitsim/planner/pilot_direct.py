@@ -29,8 +29,8 @@ from mitsim.light.settings import (
     SharpPixels,
 )
 from mitsim.light.simulation import Simulation, emission
-from mitsim.optics.fft_shadow import cells_per_pixel
-from mitsim.optics.image_formation import raster_error
+from mitsim.optics.fft_shadow import cells_per_pixel, raster
+from mitsim.optics.image_formation import number_of_terms, raster_error
 from mitsim.planner.pilot_samples import EVEN_CELLS, GOOD_ENOUGH, Sample, ladder, noise, norm
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.missed import SharpLight, with_neighbours
@@ -182,9 +182,17 @@ class DirectRuns:
             geometric_terms=float(geometry.mask_terms),
             correlated=(geometry.is_drawn(waves=False), geometry.is_drawn(geometry.diffracts)),
             phases=float(cells_per_pixel(geometry) ** 2),
+            largest_terms=(self._largest_terms(None), self._largest_terms(waves)),
             drawing=(drawing_seconds(geometry, None), drawing_seconds(geometry, waves)),
             parted=bool(self.bench.loaded.parting),
         )
+
+    def _largest_terms(self, spectrum: Spectrum | None) -> float:
+        """Terms of the shadow of the light's depth that must be drawn; infinite where they are too many, or none."""
+        geometry = self.bench.geometry
+        if not geometry.is_drawn(spectrum is not None):
+            return math.inf
+        return number_of_terms(raster(geometry, self.base.depth, spectrum))
 
     def raster(self) -> tuple[Drawn, Drawn]:
         """What a shadow on a raster leaves of a frame, without diffraction and with it."""

@@ -21,6 +21,7 @@ from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, MOST_PATHS, REPLICATES, PilotResult, SampleCost
 from mitsim.light.simulation import Simulation
 from mitsim.optics.diffraction import check_openings
+from mitsim.optics.fft_shadow import check_waves
 from mitsim.planner import pilot
 from mitsim.planner.choose import (
     FIRST_ACCURACY,
@@ -173,6 +174,7 @@ def _refuse_unfit(bench: Apparatus, switches: Mapping[str, bool]) -> None:
         raise bench.loaded.unfit.factored
     if bench.geometry.diffracts and switches.get("diffraction") is not False:
         check_openings(bench.geometry.build_mask(), float(bench.spectrum.wavelengths_nm.max()))
+        check_waves(bench.geometry, bench.spectrum)
 
 
 def _decide(runs: pilot.PilotRuns, accuracy: float, switches: Mapping[str, bool]) -> Plan:

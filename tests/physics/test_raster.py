@@ -24,6 +24,7 @@ from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.projector import Spectrum
 from mitsim.light.memory import cells_to_choose
 from mitsim.optics import fft_shadow as rasters
+from mitsim.optics import image_formation
 from mitsim.optics.diffraction import grid_step
 from mitsim.optics.fft_shadow import Correlation, raster
 from mitsim.optics.image_formation import FrameOptics, raster_error
@@ -151,9 +152,10 @@ def psf_camera(folder: Path, pixel: float = 0.02) -> tuple[CameraGeometry, np.nd
     return MaskProfile.model_validate(table).put_on(bare, folder), light / light.sum()
 
 
-def test_a_picture_of_light_is_the_frame_of_its_point(tmp_path: Path) -> None:
+def test_a_picture_of_light_is_the_frame_of_its_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On the axis, and beside it by whole pixels, the picture itself: irradiance over that without a mask, of which the
     aperture's area lets light through. (Planted: no shrink in the aperture; moved the other way.)"""
+    monkeypatch.setattr(image_formation, "SUMMED_BYTES", -1)  # its largest terms leave 1e-4 of a single point
     camera, light = psf_camera(tmp_path)
     by_pixel = light.reshape(70, 2, 60, 2).sum(axis=(1, 3)) * 1.5 / (0.02 * (1 - 2 / 400)) ** 2
     at = Directions(np.array([0.0, 3 * 0.02 * (1 - 2 / 400) / 2]), 0.0)
@@ -238,8 +240,8 @@ def test_what_a_raster_leaves_is_predicted(mask: dict[str, object]) -> None:
 
 
 def test_each_line_of_a_raster_has_its_own_shadow() -> None:
-    """The frame of two lines is theirs, by their shares, and a shadow drawn for one is not taken for another. (Planted:
-    rasters kept by mask and depth alone.)"""
+    """The frame of two lines is theirs, by their shares, but for what largest terms leave, and a shadow that is drawn
+    for one is not taken for another. (Planted: rasters kept by mask and depth alone.)"""
     camera = made(kind="random", features=31)
     at, light = Directions.cells(np.linspace(-0.15, 0.15, 81)), np.zeros((80, 80))
     light[3::20, 5::20] = 1
@@ -249,7 +251,7 @@ def test_each_line_of_a_raster_has_its_own_shadow() -> None:
 
     lines = [Spectrum(LINES.wavelengths_nm[k : k + 1], np.ones(1)) for k in (0, 1)]
     blue, red = (frame(line) for line in lines)
-    np.testing.assert_allclose(frame(LINES), 0.4 * blue + 0.6 * red, rtol=0, atol=1e-6 * blue.mean())
+    np.testing.assert_allclose(frame(LINES), 0.4 * blue + 0.6 * red, rtol=0, atol=3e-4 * blue.mean())
     assert np.linalg.norm(blue - red) > 0.01 * np.linalg.norm(red)
 
 

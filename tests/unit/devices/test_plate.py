@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from mitsim.core.errors import MitsimError
+from mitsim.devices import plate as plate_module
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import mls_mask
 from mitsim.devices.mask_profile import MaskProfile, load_mask, mura
@@ -55,6 +56,20 @@ def test_any_other_mask_is_its_singular_vectors_but_for_what_is_stated() -> None
     rest = np.linalg.norm(product(plate) - values) / np.linalg.norm(values)
     assert plate.crosses is None and 5 < len(plate.terms) < 12
     assert 0 < plate.left_out <= LEFT_OUT and rest == pytest.approx(plate.left_out, rel=1e-6)
+
+
+def test_masks_of_many_terms_are_not_decomposed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their terms are their distinct rows, exactly, and what the best separable mask leaves is the same. (Planted: a
+    row's number off by one; the product not taken off.)"""
+    values = np.random.default_rng(1).integers(0, 2, (30, 30)).astype(np.float64).repeat(2, axis=0).repeat(3, axis=1)
+    values = values[:, :60]
+    few, many = Plate(0.06, values, "it"), Plate(0.06, values, "it")
+    assert not few.many and few.most_terms == 20
+    left = few.residuals
+    monkeypatch.setattr(plate_module, "_MOST_DECOMPOSED", 19)
+    assert many.many and many.left_out == 0
+    np.testing.assert_array_equal(product(many), values)
+    np.testing.assert_allclose(many.residuals, left, rtol=1e-9)
 
 
 def test_a_mura_has_an_even_periodic_correlation_with_its_decoding_array() -> None:

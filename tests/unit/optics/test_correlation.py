@@ -12,8 +12,10 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask_profile import MaskProfile
-from mitsim.devices.plate import Plate
+from mitsim.devices.plate import RASTER_LEFT_OUT, Plate
+from mitsim.devices.projector import Spectrum
 from mitsim.optics import fft_shadow as rasters
+from mitsim.optics import image_formation
 from mitsim.optics.fft_shadow import Correlation
 from mitsim.optics.image_formation import FrameOptics, anchor_positions, anchor_weights
 from mitsim.optics.shadow import Directions, ShadowGeometry, geometric_terms
@@ -45,6 +47,13 @@ def summed(camera: CameraGeometry, depth: float, light: np.ndarray) -> np.ndarra
     )
 
 
+@pytest.fixture
+def correlated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames are correlations, however few terms hold the raster."""
+    monkeypatch.setattr(image_formation, "SUMMED_BYTES", -1)
+
+
+@pytest.mark.usefixtures("correlated")
 @pytest.mark.parametrize(("bare", "flaws"), [(BARE, {}), (BARE, {"edge_blur_um": 3.0}), (PART, {})])
 def test_a_correlation_is_the_sum_of_all_terms(bare: CameraGeometry, flaws: dict[str, float]) -> None:
     """Off the axis, with a part of each pixel active, blurred. (Planted: a phase's index swapped; X not conjugated; one
@@ -57,6 +66,7 @@ def test_a_correlation_is_the_sum_of_all_terms(bare: CameraGeometry, flaws: dict
     assert expected.std() > 0.1 * expected.mean()
 
 
+@pytest.mark.usefixtures("correlated")
 @pytest.mark.parametrize("bare", [BARE, PART])
 def test_anchors_layers_and_places_are_those_of_separable_frames(bare: CameraGeometry) -> None:
     """(Planted: weights of rows for columns; places of rows for columns; the second layer left out.)"""
@@ -83,6 +93,67 @@ def test_anchors_layers_and_places_are_those_of_separable_frames(bare: CameraGeo
     both, _ = optics.frame_and_products(estimates, None)
     half = optics.frame(*estimates[1])
     np.testing.assert_allclose(both, (frame + half) / 2, rtol=0, atol=1e-12 * expected.mean())
+
+
+@pytest.mark.parametrize(("bare", "flaws"), [(BARE, {}), (BARE, {"edge_blur_um": 3.0}), (PART, {})])
+def test_the_largest_terms_of_a_raster_form_the_correlations_frames(
+    bare: CameraGeometry, flaws: dict[str, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Off the axis, of a part of each pixel, at two anchors and on some pixels: 1e-5 of a frame of all light, and of a
+    single cell's what is stated of single pixels. Few cells are summed and not correlated, as they take less.
+    (Planted: places of rows for columns; a pixel's raster cells one off; means half a square apart; no fill factor.)
+    """
+    camera, random = turned(bare, **flaws), np.random.default_rng(0)
+    light = random.random((2, 9, 2, 11))
+    flat, one = np.arange(light.size), np.array([205])
+
+    def optics(places: object = None) -> FrameOptics:
+        return FrameOptics(camera, ROWS, COLUMNS, (300.0,), 2, places=places)
+
+    summed, some = optics(), optics(((1, 4, 7), (0, 2, 5, 8)))
+    largest = rasters.raster(camera, 300.0).largest
+    assert 40 < largest.count < 120 and RASTER_LEFT_OUT / 3 < largest.left_out <= RASTER_LEFT_OUT
+    with monkeypatch.context() as forced:
+        forced.setattr(image_formation, "CORRELATION", 1e9)
+        frames = [summed.frame(flat, light.ravel()), summed.frame(one, np.ones(1))]
+        few, seen = some.frame(flat, light.ravel()), summed.probe([(flat, light.ravel())], np.eye(len(frames[0].T)))
+    monkeypatch.setattr(image_formation, "SUMMED_BYTES", -1)
+    correlated = optics()
+    expected = [correlated.frame(flat, light.ravel()), correlated.frame(one, np.ones(1))]
+    for frame, exact, left in zip(frames, expected, (1e-5, 2 * RASTER_LEFT_OUT), strict=True):
+        assert 0 < np.linalg.norm(frame - exact) <= left * np.linalg.norm(exact)
+    np.testing.assert_allclose(few, frames[0][np.ix_((1, 4, 7), (0, 2, 5, 8))], rtol=1e-9)
+    np.testing.assert_allclose(seen, frames[0], rtol=1e-9)
+
+
+def test_a_mirrored_drawings_waves_are_those_of_its_half(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a zone plate a quarter is worked out, and of one that is mirrored along its rows a half. (Planted: columns'
+    half for rows'; the mirrored half not turned round.)"""
+    lines, place = Spectrum(np.array([500.0]), np.ones(1)), (np.arange(14) + 0.5 - 7) * 0.05
+    zones = (np.cos(np.pi * (place[:, None] ** 2 + place**2) / 0.15**2) > 0) * 1.0
+    half = zones.copy()
+    half[:, :4] = 0
+    for values, mirrored in ((zones, (True, True)), (half, (True, False)), (half.T, (False, True))):
+        plate = Plate(0.05, values, "zones")
+        camera = BARE.model_copy(update={"mask": "plate", "mask_plate": plate})
+        assert plate.mirrored == mirrored
+        rasters.draw_raster.cache_clear()
+        drawn = rasters.raster(camera, 300.0, lines).values
+        with monkeypatch.context() as whole:
+            whole.setattr(Plate, "mirrored", (False, False))
+            rasters.draw_raster.cache_clear()
+            expected = rasters.raster(camera, 300.0, lines).values
+        np.testing.assert_allclose(drawn, expected, rtol=0, atol=1e-5 * expected.mean())
+    rasters.draw_raster.cache_clear()
+
+
+def test_waves_of_large_drawings_are_refused_before_they_are_drawn() -> None:
+    """4096 features a side would take minutes for each line; their geometric shadow is drawn. (Planted: no check.)"""
+    values = np.random.default_rng(0).integers(0, 2, (4096, 4096)).astype(np.float64)
+    camera = CameraGeometry(mask="plate", mask_plate=Plate(0.003, values, "drawing noise.png"))
+    with pytest.raises(MitsimError, match=r"drawing noise\.png: .* use --effects=-diffraction"):
+        rasters.check_waves(camera, Spectrum(np.array([500.0]), np.ones(1)))
+    assert camera.is_drawn(waves=False) and camera.mask_terms == 1
 
 
 def test_a_raster_of_no_whole_pixel_is_refused() -> None:
