@@ -110,16 +110,17 @@ def test_studios_share_their_calibrations(studio: Studio, setup: Setup, tmp_path
 
 
 def test_scenes_of_the_same_devices_share_factors(studio: Studio, setup: Setup) -> None:
-    """Whatever stands before them; another mask, or a projector that is a micrometre off, is another. (Planted: the
-    scene's parameters in the key; the projector's place left out of it.)"""
+    """Whatever stands before them; another mask, or a projector that is a micrometre off or a little brighter, is
+    another. (Planted: the setup for the key; the projector's light left out of it.)"""
     path = Path(setup.scene)
-    turned, moved, masked = (path.with_name(f"{name}.xml") for name in ("turned", "moved", "masked"))
+    turned, moved, masked, lit = (path.with_name(f"{name}.xml") for name in ("turned", "moved", "masked", "lit"))
     turned.write_text(path.read_text().replace('z="1" angle="180"', 'z="1" angle="170"'))
     assert studio.factors(replace(setup, scene=str(turned)), 3) is studio.factors(setup, 3)
     moved.write_text(path.read_text().replace('<translate x="60"/>', '<translate x="60.001"/>'))
     masked.write_text(path.read_text().replace('mask_distance" value="2"', 'mask_distance" value="2.001"'))
-    digests = {studio.bench(replace(setup, scene=str(each))).devices_digest for each in (path, moved, masked)}
-    assert len(digests) == 3
+    lit.write_text(path.read_text().replace('value="111000"', 'value="111001"'))
+    digests = {studio.bench(replace(setup, scene=str(each))).devices_digest for each in (path, moved, masked, lit)}
+    assert len(digests) == 4
 
 
 def test_studios_share_their_plans(setup: Setup, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
