@@ -91,11 +91,11 @@ class Clock:
     """
 
     def __init__(self, start: float = 0.0, watch: Watch | None = None, prefix: str = "") -> None:
+        self._compiled = compiled_kernels()  # which may wait, and counts as nobody's time
         self._started, self._watch, self._prefix = time.perf_counter() - start, watch or Watch(), prefix
         self._stages: dict[str, float] = {}
         if start:
             self._add("start", start)
-        self._compiled = compiled_kernels()
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

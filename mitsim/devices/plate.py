@@ -355,6 +355,9 @@ def _distinct(
     return (row.ravel(), column.ravel()), weights, weights[0] * columns * weights[1]
 
 
+# -------- The largest terms of a raster
+
+
 class LargestTerms:
     """The terms of large ``values`` (N, N) that hold their means over squares of ``averaged`` values a side, but for
     1e-4 of them, rms.
@@ -363,6 +366,13 @@ class LargestTerms:
     kept, the terms are V S^T W sigma^-1 U^T S V, whose means are U sigma W^T: the best of so few (Nystroem's
     approximation, from both sides). Half a square apart would leave a thousand times as much between the squares.
     Vectors come from a sketch in random directions (Halko, Martinsson and Tropp, SIAM Review 53, 217, 2011).
+
+    Parameters
+    ----------
+    values, averaged
+        as above.
+    sizes
+        numbers of terms that are tried, in this order.
 
     Attributes
     ----------

@@ -108,7 +108,13 @@ class EdgeWaves:
         return np.asarray(self.fields([aperture], start_mm)[0])
 
     def fields(self, apertures: Sequence[Steps], start_mm: float) -> ComplexArray:
-        """(apertures, count) the same of several, side by side: a transform of eight takes half as long as eight."""
+        """(apertures, count) the same of several, side by side: a transform of eight takes half as long as eight.
+
+        Parameters
+        ----------
+        apertures, start_mm
+            what they are, and where the first point is.
+        """
         reach, count = self._reach, self._count
         start = start_mm - reach * self.step_mm
         profiles = np.stack([each.amplitude_means(start, self.step_mm, count + 2 * reach) for each in apertures])

@@ -98,7 +98,13 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
 
 @lru_cache(maxsize=KEPT)
 def draw_raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None) -> Plate:
-    """As :func:`raster`, for a camera whose cells are stated; the last ones are kept."""
+    """As :func:`raster`, for a camera whose cells are stated; the last ones are kept.
+
+    Parameters
+    ----------
+    geometry, depth, spectrum
+        as there.
+    """
     mask, shadow = geometry.build_mask(), ShadowGeometry.of(geometry, depth)
     if not isinstance(mask, Plate):
         raise MitsimError(f"{geometry.mask_words}: its shadow has a closed form; take that")
@@ -153,7 +159,13 @@ def _cells(geometry: CameraGeometry, mask: Plate, step: float, spectrum: Spectru
 
 def check_waves(geometry: CameraGeometry, spectrum: Spectrum) -> None:
     """MitsimError, before anything is drawn, for waves of a ``spectrum`` behind a mask of so many terms that drawing
-    them would take longer than a minute a line."""
+    them would take longer than a minute a line.
+
+    Parameters
+    ----------
+    geometry, spectrum
+        the camera, and lines of the light.
+    """
     mask = geometry.build_mask()
     if not isinstance(mask, Plate) or mask.irradiance or not geometry.is_drawn(waves=True):
         return

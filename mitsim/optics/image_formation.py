@@ -358,15 +358,15 @@ def raster_error(
         shadow = replace(ShadowGeometry.of(drawn, depth), mask=raster(drawn, depth, spectrum))
         if finer == 1 and not known and math.isfinite(number_of_terms(raster(drawn, depth, spectrum))):
             # As runs may form it: what its largest terms leave out is then part of what is told.
-            return summed(terms_of_raster(shadow, rows, columns, drawn.pixel_fill_factor, None))
+            return sum_of(terms_of_raster(shadow, rows, columns, drawn.pixel_fill_factor, None))
         return Correlation(shadow, rows, columns, drawn.pixel_fill_factor).image(light, row, column)
 
-    def summed(terms: SeparableTerms) -> FloatArray:
+    def sum_of(terms: SeparableTerms) -> FloatArray:
         return np.asarray(sum(left @ light @ right.T for left, right in terms))
 
     known = not few.is_drawn(spectrum is not None)
     coarse = frame(1)
-    judge = summed(shadow_terms(few, rows, columns, depth, spectrum)) if known else frame(_FINER)
+    judge = sum_of(shadow_terms(few, rows, columns, depth, spectrum)) if known else frame(_FINER)
     energy = float(np.square(judge).sum())
     error = float(np.sqrt(np.square(coarse - judge).sum() / energy)) if energy else 0.0
     return error, known

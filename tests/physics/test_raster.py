@@ -296,7 +296,7 @@ def test_fields_have_a_grid_as_fine_as_waves_need(monkeypatch: pytest.MonkeyPatc
     class Asked(Exception):
         """For waves on a grid; which takes long."""
 
-    def ask(_: float, __: float, step_mm: float, *others: float) -> None:
+    def ask(_: float, __: float, step_mm: float, *others: float, single: bool) -> None:
         raise Asked(step_mm)
 
     monkeypatch.setattr(rasters, "EdgeWaves", ask)

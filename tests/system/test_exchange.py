@@ -81,7 +81,7 @@ def test_light_in_a_file_makes_the_frames_of_a_capture(call: Callable[..., Any],
         payload = done.payload
         assert payload.keys() == {
             *("n", "shape", "entries", "accuracy", "mc_error", "total_error_bound", "lost_light", "paths", "seed"),
-            *("variant", "bytes", "seconds", "warnings", "output"),
+            *("variant", "bytes", "seconds", "warnings", "output", "kernels"),
         }
         assert payload["shape"] == [64, 64] and payload["mc_error"] < payload["total_error_bound"] <= 0.005
     with h5py.File(tmp_path / "0.h5") as file:
