@@ -324,14 +324,23 @@ def estimates(
     )
     with job.clock.stage("estimate"):
         judged = [
-            check_session(sums, session.signs, taken) if kind == NOISY else CheckedSession(sums)
-            for kind, sums in found.sums.items()
+            _check(session, sums, taken) if kind == NOISY else CheckedSession(sums) for kind, sums in found.sums.items()
         ]
         factors = [
             each.estimate(session.signs, lit.response_noise if kind == NOISY else None)
             for kind, each in zip(kinds, judged, strict=True)
         ]
     return factors, found.saturated, judged[0]
+
+
+def _check(session: Session, sums: tuple[StripeSums, StripeSums], taken: SessionConditions) -> CheckedSession:
+    """:func:`check_session`, which takes stripes for wrong behind a mask that is not separable: that is said first."""
+    try:
+        return check_session(sums, session.signs, taken)
+    except MitsimError as error:
+        if session.mask_warnings:
+            raise MitsimError(f"{session.mask_warnings[0]}; its stripes have no shape in common: {error}") from None
+        raise
 
 
 def session_sums(lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Checkpoint | None = None) -> SessionSums:

@@ -335,3 +335,14 @@ def test_the_reference_sees_the_same_random_grey_mask(
     slope, error, reference, factored = slope_of_reference(bench)
     assert error < 0.05 and abs(slope - 1) < 5 * error
     assert reference == pytest.approx(factored, rel=0.02)
+
+
+def test_a_session_behind_a_slanted_bar_is_refused_for_its_mask(
+    small_scene: Callable[..., Path], variant: str, tmp_path: Path
+) -> None:
+    """Its stripes have no shape in common. (Seen failing: frames were said to be wrong, in a simulated session.)"""
+    along = np.arange(16) - 7.5
+    path = camera_file(tmp_path, "bar", (np.abs(along[:, None] - along) < 2).astype(float))
+    bench = open_bench(small_scene(mask_order=8), variant, path)
+    with pytest.raises(MitsimError, match=r"^the mask \(drawing bar.npy\) is not separable: [^\n]*no shape in common"):
+        bench.calibrate(accuracy=0.02)
