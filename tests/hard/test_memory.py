@@ -14,14 +14,14 @@ import sys
 from pathlib import Path
 from mitsim.api.bench import open_bench
 from mitsim.light.memory import frames_cost
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_path
 
 def used():
     # Not getrusage: its peak is inherited from the process that started this one.
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) * 1024.0 for line in lines if line.startswith("VmHWM"))
 
-bench = open_bench(shipped("scenes", sys.argv[1], "scene.xml"))
+bench = open_bench(shipped_path("scenes", sys.argv[1], "scene.xml"))
 before = used()
 plan = bench.plan(sys.argv[2], accuracy=float(sys.argv[4]))
 bench.capture(plan, sys.argv[3])

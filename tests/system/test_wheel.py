@@ -53,7 +53,7 @@ def test_demo_from_the_wheel_in_an_empty_folder(wheel: Path, tmp_path: Path) -> 
     empty.mkdir()
     zipfile.ZipFile(wheel).extractall(site)
     environment = {**os.environ, "PYTHONPATH": str(site)}
-    program = "from mitsim.core.configuration import shipped; print(shipped('scenes'))"
+    program = "from mitsim.core.configuration import shipped_path; print(shipped_path('scenes'))"
     place = subprocess.run(
         [sys.executable, "-c", program], cwd=empty, env=environment, capture_output=True, text=True, check=True
     )
