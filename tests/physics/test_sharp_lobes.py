@@ -253,7 +253,8 @@ def test_a_small_mesh(traced: Callable[..., SampledLight], tmp_path: Path, rings
     faces = f'<boolean name="face_normals" value="{str(flat).lower()}"/>'
     shape = f'<shape type="obj"><string name="filename" value="ball.obj"/>{faces}{metal}</shape>'
     light = check_against(traced, shape, lambda sensor: cast(alpha, sensor, surface))
-    assert light.plan.settings.sharp is not None
+    # A flat face is a mirror of one brightness, which ordinary samples tell as cheaply (also at 0.5.0).
+    assert flat or light.plan.settings.sharp is not None
 
 
 # ---- what stands before a sharp lobe
