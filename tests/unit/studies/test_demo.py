@@ -59,7 +59,7 @@ def test_the_scene_is_traced_once_and_a_speckled_projector_shows_in_every_family
     bench = open_bench(shared_scene("speckled", n=16, reflectance=print_), variant, projector=projector)
     traced = []
 
-    def counted(*arguments: Any, **options: Any) -> light.Light:
+    def counted(*arguments: Any, **options: Any) -> light.SampledLight:
         traced.append(arguments)
         return light.trace_light(*arguments, **options)
 
