@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -47,9 +47,6 @@ from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, Settings
 from mitsim.light.truth import Truth
 from mitsim.planner.explain import known_losses
-
-if TYPE_CHECKING:
-    pass
 
 _FIREFLIES = 0.72
 """Part of the variance in one of four groups: a single heavy path gives 0.75, and ordinary noise 0.3 to 0.5.

@@ -105,7 +105,7 @@ class Recorder:
 
 
 class RunFolder(Recorder):
-    """Keeps a run in a folder, whole, resumable and checked; made by :func:`claimed`.
+    """Keeps a run in a folder, whole, resumable and checked; made by :func:`claim_run`.
 
     A frame is kept on resume when it is the one that a finished run's checksum names, or, in an interrupted run, when
     it is readable, carries this run's digest, and its pixels have the checksum that was noted with it.
