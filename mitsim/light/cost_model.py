@@ -18,7 +18,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.devices.plate import FEW
 from mitsim.light.passes import PASSES
 from mitsim.light.settings import GROUPS, Forming, Number, PilotResult, SampleCost, Settings
-from mitsim.optics.fft_shadow import CORRELATION
+from mitsim.optics.fft_shadow import CORRELATION_PRODUCTS
 from mitsim.optics.forming import PROBES
 from mitsim.optics.frames import formed_frames, mixes
 from mitsim.optics.image_formation import SUMMED_BYTES
@@ -246,7 +246,7 @@ def _products(
     if not _by_fft(forming, numbers):
         terms = forming.geometric_terms + (forming.terms - forming.geometric_terms) * numbers.waves
         return cast(Number, terms * (one_term + of_probes))
-    correlation = CORRELATION * _phases(forming, numbers) * layers * np.square(anchors) * pixels**2
+    correlation = CORRELATION_PRODUCTS * _phases(forming, numbers) * layers * np.square(anchors) * pixels**2
     terms = forming.largest_terms[bool(numbers.waves)]
     many = np.asarray(terms * 16 * pixels * forming.cells * cells > SUMMED_BYTES)
     sums, sums_of_probes = (

@@ -61,11 +61,11 @@ _GRID_CELLS = 3
 """Cells of the field's grid from point to point at least."""
 _AROUND = 8
 """Cells that a raster is wider than its turned one, for the splines' ends."""
-CORRELATION = 125.0
+CORRELATION_PRODUCTS = 125.0
 """Multiplications a pixel that each phase of a correlation with a raster takes as long as, for each pair of anchors and
 layer: 0.08 to 0.13 processor seconds of 512 x 512 pixels and 36 phases, where sums take 8e-11 a multiplication
 (benchmarks/masks.py)."""
-KEPT = 8
+RASTERS_KEPT = 8
 """The last rasters, and what was prepared of them: layers of a scene, with waves and without; some 100 MiB each at 512
 pixels."""
 _FIELDS_AT_ONCE = 8
@@ -96,7 +96,7 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
     return draw_raster(geometry.model_copy(update=chosen), depth, spectrum)
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=RASTERS_KEPT)
 def draw_raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None) -> Plate:
     """As :func:`raster`, for a camera whose cells are stated; the last ones are kept.
 

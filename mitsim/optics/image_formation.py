@@ -24,7 +24,14 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.plate import FEW, RASTER_LEFT_OUT, Plate
 from mitsim.devices.projector import Spectrum
-from mitsim.optics.fft_shadow import CORRELATION, KEPT, Correlation, cells_per_pixel, raster, terms_of_raster
+from mitsim.optics.fft_shadow import (
+    CORRELATION_PRODUCTS,
+    RASTERS_KEPT,
+    Correlation,
+    cells_per_pixel,
+    raster,
+    terms_of_raster,
+)
 from mitsim.optics.shadow import Directions, Places, SeparableTerms, ShadowGeometry, lagrange_weights
 from mitsim.optics.terms import shadow_terms
 
@@ -158,7 +165,7 @@ class _Raster:
             len(np.unique(places // len(each.centres)))
             for places, each in zip((lit.rows, lit.columns), both, strict=True)
         )
-        correlation = CORRELATION * pairs * cells_per_pixel(geometry) ** 2 * math.prod(geometry.frame_shape)
+        correlation = CORRELATION_PRODUCTS * pairs * cells_per_pixel(geometry) ** 2 * math.prod(geometry.frame_shape)
         return held <= SUMMED_BYTES and len(summed.terms) * near * (far + rows) * across < correlation
 
     def _image(self, lit: _Lit, light: FloatArray) -> FloatArray:
@@ -396,7 +403,7 @@ def _largest_terms(
     return terms_of_raster(shadow, rows, columns, geometry.pixel_fill_factor, places)
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=RASTERS_KEPT)
 def _correlation(
     geometry: CameraGeometry, rows: Directions, columns: Directions, depth: float, spectrum: Spectrum | None
 ) -> Correlation:

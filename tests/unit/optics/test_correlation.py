@@ -114,7 +114,7 @@ def test_the_largest_terms_of_a_raster_form_the_correlations_frames(
     largest = rasters.raster(camera, 300.0).largest
     assert 40 < largest.count < 120 and RASTER_LEFT_OUT / 3 < largest.left_out <= RASTER_LEFT_OUT
     with monkeypatch.context() as forced:
-        forced.setattr(image_formation, "CORRELATION", 1e9)
+        forced.setattr(image_formation, "CORRELATION_PRODUCTS", 1e9)
         frames = [summed.frame(flat, light.ravel()), summed.frame(one, np.ones(1))]
         few, seen = some.frame(flat, light.ravel()), summed.probe([(flat, light.ravel())], np.eye(len(frames[0].T)))
     monkeypatch.setattr(image_formation, "SUMMED_BYTES", -1)
