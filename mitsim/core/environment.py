@@ -129,24 +129,6 @@ def keep_scenes() -> Iterator[None]:
             gc.enable()
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Have Dr.Jit work in this thread alone while the context lasts: what it adds up in 32 bits, in the lanes' order.
-
-    Mitsuba must not read OpenEXR files meanwhile, see ``_FEWEST_THREADS``.
-    """
-    import drjit
-
-    threads = drjit.thread_count()
-    drjit.sync_thread()
-    drjit.set_thread_count(1)
-    try:
-        yield
-        drjit.sync_thread()
-    finally:
-        drjit.set_thread_count(threads)
-
-
 @cache
 def compiled_arrays() -> tuple[ModuleType, ModuleType]:
     """Dr.Jit's functions, and its arrays on this machine's processors: the same numbers whatever the variant is.
