@@ -4,7 +4,7 @@ Rationale. Random numbers, paths and bookkeeping are of the variant's own types,
 but for float32's last digits (a GPU's reciprocals are approximate). The direct light of a flat sheet, of which no ray
 passes an edge, agrees to 1e-5 of the total; frames, and light that goes between walls, whose paths may part at an edge,
 within five times the Monte Carlo error that they state. On the GPU itself a seed gives the same factored frame twice,
-bit for bit: light is added up in whole numbers, or on the host.
+bit for bit: light is added up in whole numbers, or on the host, and so are the normals of a mesh that has none.
 
 Each backend runs in a process of its own. The slow test needs no GPU: the processor with another seed stands in for it,
 which shows that the check passes on equal light, and that it fails on 2 % of planted light.
@@ -23,6 +23,8 @@ SIGMAS, FLOAT = 5.0, 1e-5
 WALL = """<shape type="rectangle"><transform name="to_world">
     <scale x="64" y="30"/> <rotate x="1" angle="-90"/> <translate y="-50" z="370"/></transform>
     <bsdf type="twosided"><bsdf type="diffuse"><spectrum name="reflectance" value="0.8"/></bsdf></bsdf></shape>"""
+BUMPS = """<shape type="ply"><string name="filename" value="bumps.ply"/>
+    <bsdf type="twosided"><bsdf type="diffuse"/></bsdf></shape>"""
 BOUNCES = '<integer name="max_depth" value="-1"/>'
 PROGRAM = """
 import sys
@@ -51,6 +53,8 @@ def traced(shared_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathF
     """Light that a variant and a seed find in two scenes: totals, frames and their relative errors."""
     folder = tmp_path_factory.mktemp("backends")
     scenes = [shared_scene("sheet"), shared_scene("walls", extra=WALL, integrator_options=BOUNCES)]
+    scenes.append(shared_scene("bumps", extra=BUMPS))
+    write_bumps(scenes[-1].parent / "bumps.ply")
 
     @cache
     def get(variant: str, seed: int, run: int = 0) -> Light:
@@ -62,6 +66,21 @@ def traced(shared_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathF
             return dict(arrays)
 
     return get
+
+
+def write_bumps(path: Path, side: int = 60) -> None:
+    """A rough sheet without normals before the scene's, its faces in a random order."""
+    rng = np.random.default_rng(3)
+    y, x = np.mgrid[:side, :side] * (40 / side) - 20
+    at = np.arange(side * side).reshape(side, side)
+    halves = [at[:-1, :-1], at[:-1, 1:], at[1:, :-1]], [at[1:, :-1], at[:-1, 1:], at[1:, 1:]]
+    faces = rng.permutation(np.concatenate([np.stack(half, axis=-1).reshape(-1, 3) for half in halves]))
+    points = np.stack([x, y, 340 + rng.uniform(-0.1, 0.1, x.shape)], axis=-1).reshape(-1, 3)
+    lines = ["ply", "format ascii 1.0", f"element vertex {len(points)}"]
+    lines += [*(f"property float {axis}" for axis in "xyz"), f"element face {len(faces)}"]
+    lines += ["property list uchar int vertex_indices", "end_header"]
+    lines += [" ".join(map(str, (*row,))) for row in points] + [" ".join(map(str, (3, *row))) for row in faces]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def differences(one: Light, other: Light) -> list[str]:
@@ -101,7 +120,7 @@ def test_a_gpu_finds_the_light_that_the_processor_finds(traced: Trace) -> None:
     on_gpu = traced("cuda_ad_mono", 0)
     assert not differences(traced("llvm_ad_mono", 0), on_gpu)
     again = traced("cuda_ad_mono", 0, 1)
-    for name in ("sheet factored", "walls factored"):
+    for name in ("sheet factored", "walls factored", "bumps factored"):
         assert np.array_equal(on_gpu[name], again[name]), "a seed's frame differs from itself"
 
 
