@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import ByValue, FloatArray
 
 _FEW = 4
 """Edges in the narrower box that are taken one by one; with more, the box is wide enough for a second difference to
@@ -39,7 +39,7 @@ _PER_CELL = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Steps:
+class Steps(ByValue):
     """A piecewise constant function: ``values[k]`` from ``edges[k]`` to ``edges[k + 1]`` [mm], 0 outside.
 
     Attributes
@@ -166,7 +166,7 @@ class Steps:
         inside = self.edges[(self.edges > low) & (self.edges < high)]
         edges = np.concatenate(([low], inside, [high]))
         values = self.at((edges[:-1] + edges[1:]) / 2)
-        return np.asarray(_Antiderivative(edges, values[None]).means(centres, half_pixel, half_cell)[0])
+        return np.asarray(Antiderivative(edges, values[None]).means(centres, half_pixel, half_cell)[0])
 
 
 def blurred_step(x: FloatArray, half: FloatArray | float, other: float, blur: float) -> FloatArray:
@@ -226,27 +226,7 @@ def sampled_box_means(
     centres, half_pixel, half_cell
         of the boxes, as in :meth:`Steps.box_means`.
     """
-    edges = start + step * np.arange(values.shape[1] + 1)
-    return _Antiderivative(edges, values, step).means(centres, half_pixel, half_cell)
-
-
-def smooth_box_means(
-    values: FloatArray, start: float, step: float, centres: FloatArray, half_pixel: float, half_cell: float
-) -> FloatArray:
-    """The same of functions without jumps, as fields of waves are: many points are interpolated between cells.
-
-    Parameters
-    ----------
-    values, start, step, centres, half_pixel, half_cell
-        as for :func:`sampled_box_means`.
-    """
-    low = float(centres.min())
-    count = int((float(centres.max()) - low) / step) + 4
-    if centres.size < _DENSE * count or half_pixel * half_cell < _WIDE * step**2:
-        return sampled_box_means(values, start, step, centres, half_pixel, half_cell)
-    nodes = low + step * (np.arange(count) - 1)
-    means = sampled_box_means(values, start, step, np.asarray(nodes), half_pixel, half_cell)
-    return _cubic(means, (centres - low) / step)
+    return Antiderivative.sampled(values, start, step).means(centres, half_pixel, half_cell)
 
 
 def _cubic(nodes: FloatArray, places: FloatArray) -> FloatArray:
@@ -269,7 +249,7 @@ def _cubic(nodes: FloatArray, places: FloatArray) -> FloatArray:
     return result
 
 
-class _Antiderivative:
+class Antiderivative:
     """First and second antiderivative of piecewise constant functions with their means taken off."""
 
     def __init__(self, edges: FloatArray, values: FloatArray, step: float | None = None) -> None:
@@ -284,6 +264,11 @@ class _Antiderivative:
         middle = self._first[:, :-1] + self._first[:, 1:]
         middle *= width / 2
         self._second = self._sums(middle)
+
+    @classmethod
+    def sampled(cls, values: FloatArray, start: float, step: float) -> Antiderivative:
+        """Those of ``values`` (functions, n) on equal cells from ``start`` on, ``step`` wide [mm]."""
+        return cls(start + step * np.arange(values.shape[1] + 1), values, step)
 
     @staticmethod
     def _sums(parts: FloatArray) -> FloatArray:
@@ -300,6 +285,23 @@ class _Antiderivative:
         total /= 2 * wide
         total += self._mean.reshape(-1, *[1] * centres.ndim)
         return total
+
+    def smooth_means(self, centres: FloatArray, half_pixel: float, half_cell: float) -> FloatArray:
+        """The same of sampled functions without jumps, as fields of waves are: many points are interpolated between
+        cells.
+
+        Parameters
+        ----------
+        centres, half_pixel, half_cell
+            of the boxes, as in :meth:`Steps.box_means`.
+        """
+        step, low = self._step, float(centres.min())
+        assert step is not None, "on equal cells"
+        count = int((float(centres.max()) - low) / step) + 4
+        if centres.size < _DENSE * count or half_pixel * half_cell < _WIDE * step**2:
+            return self.means(centres, half_pixel, half_cell)
+        nodes = self.means(np.asarray(low + step * (np.arange(count) - 1)), half_pixel, half_cell)
+        return _cubic(nodes, (centres - low) / step)
 
     def _ends(self, points: FloatArray, half: float) -> FloatArray:
         """(functions, *points.shape) means of the first antiderivative over [points - half, points + half]."""

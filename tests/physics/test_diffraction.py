@@ -14,7 +14,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.diffraction import EdgeWaves, grid_step, wave_profiles
-from mitsim.optics.edge_profile import Steps, sampled_box_means, smooth_box_means
+from mitsim.optics.edge_profile import Antiderivative, Steps, sampled_box_means
 from mitsim.optics.shadow import Directions, ShadowGeometry
 from mitsim.optics.terms import shadow_terms
 
@@ -370,6 +370,7 @@ def test_interpolated_shadows_are_as_good_as_their_grid(kind: str, distance: flo
     directions = Directions.cells(np.linspace(-0.15, 0.15, 128 * cells + 1))
     parts, start, step = wave_profiles(shadow, 520.0, -4.4, 4.4, 0.0)
     values = np.stack([profile for _, profile in parts])
-    where = values, start, step, shadow.crossings(directions), shadow.half_pixel, shadow.half_cell(directions)
-    exact, found = sampled_box_means(*where), smooth_box_means(*where)
+    boxes = shadow.crossings(directions), shadow.half_pixel, shadow.half_cell(directions)
+    exact = sampled_box_means(values, start, step, *boxes)
+    found = Antiderivative.sampled(values, start, step).smooth_means(*boxes)
     assert 0 < np.linalg.norm(found - exact) / np.linalg.norm(exact) < 4e-5
