@@ -264,7 +264,7 @@ class EffectRuns:
         return self._form(simulation, direct, followed, sharp)
 
     def _direct(self, simulation: Simulation) -> list[PathSamples]:
-        return [simulation.direct.trace(seed, 0, self.sample.direct) for seed in self.seeds]
+        return simulation.direct.replicates(self.seeds, self.sample.direct)[0]
 
     def _follow(self, simulation: Simulation, name: str) -> list[PathSamples]:
         """Light of the pass ``name``, replicate by replicate."""
@@ -286,7 +286,7 @@ class EffectRuns:
         tracer, samples = simulation.sharp, self.sample.sharp(simulation)
         if tracer is None:
             return []
-        return [tracer.trace(integer(seed, "sharp"), 0, samples) for seed in self.seeds]
+        return tracer.replicates([integer(seed, "sharp") for seed in self.seeds], samples)[0]
 
     def _form(
         self,
@@ -355,10 +355,15 @@ class AnchorRuns:
         depths [mm] that judge one layer; none for a flat scene.
     lit
         whether other replicates found any such light, where that is not certain.
+
+    Attributes
+    ----------
+    traced
+        light by number of anchors, replicate by replicate.
     """
 
     _pass = PASSES["anchor_residual"]
-    _stream = "anchors"
+    _stream = "fine"
     ladder: tuple[int, ...] = (1, 2, 3, 5, 8)
     """Numbers that are tried, each step about half the error of the one before or less."""
     few = 3
@@ -376,7 +381,7 @@ class AnchorRuns:
     ) -> None:
         self.bench, self.base, self.sample, self.tolerance = bench, base, sample, tolerance
         self.layers, self._lit = layers, lit
-        self._traced: dict[int, list[PathSamples]] = {}
+        self.traced: dict[int, list[PathSamples]] = {}
         self._seeds = [integer(seed, "pilot", self._stream, replicate) for replicate in range(REPLICATES)]
         self._frames: Callable[[int], FloatArray] = cache(self._at_anchors)
         self._beyond_mean: Callable[..., FloatArray] = cache(self._in_cells)
@@ -387,10 +392,11 @@ class AnchorRuns:
         self.pixels = np.setdiff1d(shown_pixels(self.base, sample), self.base.occluded)
         self._samples, self._lanes = sample.anchored, self.bench.n**2 - len(self.base.occluded)
 
-    def take_over(self, known: AnchorRuns) -> None:
-        """Use light of as many samples that is ``known`` of all these pixels, and of others, and trace it no more."""
-        for anchors, replicates in known._traced.items():
-            self._traced[anchors] = [light.where(np.isin(light.pixel, self.pixels)) for light in replicates]
+    def take_over(self, known: Mapping[int, Sequence[PathSamples]]) -> None:
+        """Use light of as many samples that is ``known`` by anchors, of all these pixels and of others, and trace it no
+        more."""
+        for anchors, replicates in known.items():
+            self.traced[anchors] = [light.where(np.isin(light.pixel, self.pixels)) for light in replicates]
 
     @property
     def paths(self) -> int:
@@ -465,10 +471,10 @@ class AnchorRuns:
     def _trace(self, simulation: Simulation) -> list[PathSamples]:
         """Light to every anchor, replicate by replicate."""
         anchors = self._grids(simulation)[0].bundle.anchors
-        if anchors not in self._traced:
+        if anchors not in self.traced:
             tracer = tracer_of(simulation, self.pixels, anchors)
-            self._traced[anchors] = [tracer.trace(seed, 0, self._samples) for seed in self._seeds]
-        return self._traced[anchors]
+            self.traced[anchors] = tracer.replicates(self._seeds, self._samples)[0]
+        return self.traced[anchors]
 
     def _form(self, grids: Sequence[Grid], replicates: Sequence[PathSamples], samples: int | None = None) -> FloatArray:
         """(replicates, shots, places, places) frames of light in ``grids``; of so many ``samples``, if not of as many
