@@ -230,6 +230,7 @@ class PilotRuns:
             self.anchored = AnchorRuns(bench, base, sample, self._tolerance(), seed, self.fine.judging)
             if sample.anchored == self.samples["cells"].anchored:
                 self.anchored.take_over({1: self.fine.first})
+            self.anchored.coarse = self.fine.coarse
 
     def _tolerance(self, part: float = GOOD_ENOUGH) -> float:
         """Norm of that ``part`` of all light that the capture may leave out."""

@@ -38,6 +38,7 @@ from mitsim.transport.records import PathSamples
 
 LAYER_LADDER, CELL_LADDER = (1, 2, 3, 4, 6, 8, 12), (1, 2, 4, 8)
 """Numbers that are tried, each step about half the error of the one before or less."""
+_CELL, _LAYER = Approximation("cells", 1), Approximation("layers", 1)
 _FIRST_JUDGES = {"layers": 2, "cells": 1}
 """Indices of the numbers that judge at first: two steps, or one where it is known how the error falls."""
 _JUDGING = 4
@@ -127,6 +128,13 @@ class DirectRuns:
             layers = ladder(self.layers, lambda count: self._frames(self.layers[count], 2, True), first, tolerance)
             found |= {Approximation("layers", count): change for count, change in layers.items()}
         return found
+
+    @property
+    def coarse(self) -> tuple[float, float]:
+        """Parts that one cell a pixel, and one layer, leave of the light."""
+        whole = norm(self._whole)
+        cells, layer = (norm(self.changes[part]) if part in self.changes else 0.0 for part in (_CELL, _LAYER))
+        return (cells / whole, layer / whole) if whole else (math.inf, math.inf)
 
     def sample_cost(self, light: float) -> SampleCost:
         """Monte Carlo error of one estimate of the light at the sensor's centre, relative to all ``light``; how fast it

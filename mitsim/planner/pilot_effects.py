@@ -31,6 +31,8 @@ from mitsim.transport.records import PathSamples
 
 _FOLLOWED = tuple(name for name, row in PASSES.items() if not (row.even or row.anchors))
 """Passes of light that is followed to one point of the sensor."""
+_OVER_SEVERAL = "indirect", "from_camera"
+"""Those of it that hold light over several surfaces, in mirrors and of lamps alone."""
 _WORTH_REPEATING = 0.85
 """Variance times paths, over that of even ones, below which blocks are followed unevenly: short replicates tell it so
 well."""
@@ -268,7 +270,10 @@ class EffectRuns:
 
     def _follow(self, simulation: Simulation, name: str) -> list[PathSamples]:
         """Light of the pass ``name``, replicate by replicate."""
-        tracer = PASSES[name].tracer(simulation)
+        loaded = self.bench.loaded
+        # Light comes over several surfaces only where one sees another.
+        none = name in _OVER_SEVERAL and loaded.one_way and not (loaded.lamps or loaded.mirrors)
+        tracer = None if none else PASSES[name].tracer(simulation)
         if tracer is None:
             return [PathSamples.none()] * REPLICATES
         return [tracer.trace(integer(seed, name), 0, self.sample.followed) for seed in self.seeds]
@@ -330,6 +335,10 @@ WIDTHS = (1, 2, 4)
 as fine as all of it; wider cells hold light of many anchors in memory."""
 _AT_ONCE = 2**20
 """Connections that are traced at a time: 0.5 GB while they are accumulated."""
+_AS_ROUGH, _COUNTS = 20.0, 1 / 3
+"""Part that one cell, or layer, leaves of what a few anchors see beyond their mean, over what it leaves of all their
+light, at most (photograph 0, cards 4.1, corner 5.5, gift_card 5.1, cookie_bag 6.9), and the part of the tolerance up to
+which that is not looked at: a tenth of the accuracy."""
 _FOLLOWED_JUDGE = 1
 """Index of the number that judges at first, for light that is followed."""
 
@@ -360,6 +369,8 @@ class AnchorRuns:
     ----------
     traced
         light by number of anchors, replicate by replicate.
+    coarse
+        parts that one cell a pixel, and one layer, leave of such light as a whole, as far as known.
     """
 
     _pass = PASSES["anchor_residual"]
@@ -382,6 +393,7 @@ class AnchorRuns:
         self.bench, self.base, self.sample, self.tolerance = bench, base, sample, tolerance
         self.layers, self._lit = layers, lit
         self.traced: dict[int, list[PathSamples]] = {}
+        self.coarse = math.inf, math.inf
         self._seeds = [integer(seed, "pilot", self._stream, replicate) for replicate in range(REPLICATES)]
         self._frames: Callable[[int], FloatArray] = cache(self._at_anchors)
         self._beyond_mean: Callable[..., FloatArray] = cache(self._in_cells)
@@ -410,8 +422,14 @@ class AnchorRuns:
 
     @cached_property
     def changes(self) -> dict[Approximation, FloatArray]:
-        """Change of the frames by every number of anchors that was tried, and by coarse cells for what they see."""
-        return {**self._until(self.tolerance), **coarsening_changes(self._pass.name, self._coarsen, self.layers)}
+        """Change of the frames by every number of anchors that was tried, and by coarse cells for what they see beyond
+        their mean, where that may be too much."""
+        changes, most = self._until(self.tolerance), _AS_ROUGH * norm(self._beyond_mean())
+        cells, layer = (most * part > _COUNTS * self.tolerance for part in self.coarse)
+        if not (cells or (layer and self.layers)):
+            return changes
+        layers = self.layers if layer else ()
+        return {**changes, **coarsening_changes(self._pass.name, self._coarsen, layers)}
 
     @property
     def of_few(self) -> dict[Approximation, FloatArray]:
