@@ -483,7 +483,7 @@ class AnchorRuns:
     def _grids(self, simulation: Simulation) -> list[Grid]:
         """Where the light is accumulated, and that of lamps where there are any."""
         name = self._pass.grid
-        lamps = [simulation.ambient[name]] if name in simulation.ambient and self.bench.loaded.lamps else []
+        lamps = [simulation.ambient[name]] if self.bench.loaded.lamps and name in simulation.ambient else []
         return [simulation.grids[name], *lamps]
 
     def _trace(self, simulation: Simulation) -> list[PathSamples]:
