@@ -22,7 +22,7 @@ from mitsim.scene.window import ProjectorGrid, locate_projector
 SENSOR_PLUGIN = "mitsim_lensless"
 _SMALL_LAMPS = ("DirectionalEmitter", "PointLight", "SpotLight")
 """Mitsuba's classes of the lamps that no path runs into."""
-_FLAT, _PARALLEL = ("Rectangle", "Disk"), 1e-6
+_FLAT, _TURNED = ("Rectangle", "Disk"), 1e-6
 """Mitsuba's classes of shapes that have one normal, and by how much normals of parallel ones differ: single precision
 rounds turned ones to 1e-7, and of surfaces that are turned by 1e-6 one sees 1e-12 of the other's light."""
 
@@ -164,7 +164,7 @@ def _faces_one_way(scene: mi.Scene) -> bool:
         if shape.class_name() not in _FLAT or not bsdf or mi.has_flag(bsdf.flags(), mi.BSDFFlags.BackSide):
             return False
         normals.append(np.array(shape.sample_position(0.0, mi.Point2f(0.5)).n).ravel())
-    return bool(normals) and float(np.ptp(normals, axis=0).max()) < _PARALLEL
+    return bool(normals) and float(np.ptp(normals, axis=0).max()) < _TURNED
 
 
 # -------- Values of a loaded scene's bitmaps and meshes
