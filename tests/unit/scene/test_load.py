@@ -48,6 +48,8 @@ def test_a_good_scene_loads(small_scene: Write) -> None:
 
 MATT = '<bsdf type="diffuse"><spectrum name="reflectance" value="0.5"/></bsdf>'
 
+BALL = f'<shape type="sphere"><point name="center" x="0" y="0" z="500"/><float name="radius" value="99"/>{MATT}</shape>'
+
 
 def plate(turned: str, bsdf: str = MATT, shape: str = "rectangle") -> str:
     place = f'<scale x="20" y="20"/><rotate y="1" angle="{turned}"/><translate z="390"/>'
@@ -63,10 +65,7 @@ def plate(turned: str, bsdf: str = MATT, shape: str = "rectangle") -> str:
         (plate("0"), False),
         (plate("180", f'<bsdf type="twosided">{MATT}</bsdf>'), False),
         (plate("180", f'<bsdf type="mask"><float name="opacity" value="0.5"/>{MATT}</bsdf>'), False),
-        (
-            f'<shape type="sphere"><point name="center" x="0" y="0" z="500"/><float name="radius" value="99"/>{MATT}</shape>',
-            False,
-        ),
+        (BALL, False),
     ],
 )
 def test_flat_surfaces_that_turn_one_side_the_same_way_see_none_of_each_other(
