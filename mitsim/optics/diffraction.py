@@ -59,8 +59,8 @@ wavelength is the cutoff of light polarised along them (Jackson, Classical Elect
 any passes that scalar theory would let through."""
 _LARGEST_GRID = 1 << 24
 """Cells of a grid: 256 MiB for each of a few complex arrays."""
-_KEPT, _LARGEST_KEPT = 12, 1 << 18
-"""Shadows of edges that are kept, three lines at four depths, and cells of the largest, of all products: 6 MiB each."""
+_KEPT, _LARGEST_KEPT = 24, 1 << 18
+"""Shadows that are kept, three lines at eight depths, and cells of the largest, of all products: 6 MiB each."""
 _PART_OF_RANGE = 1 / 4
 """A grid that may be kept begins and ends at multiples of this part of its range or less, so that rows, columns, coarse
 and fine cells share it: it is a quarter longer at most, and a fifth on average."""

@@ -212,23 +212,6 @@ def _twice(x: FloatArray, blur: float) -> FloatArray:
     return np.asarray(blur**2 / 2 * ((np.square(z) + 1) * ndtr(z) + z * _density(z)))
 
 
-def sampled_box_means(
-    values: FloatArray, start: float, step: float, centres: FloatArray, half_pixel: float, half_cell: float
-) -> FloatArray:
-    """(functions, *centres.shape) means over two boxes of functions that are constant on equal cells.
-
-    Parameters
-    ----------
-    values
-        (functions, n) on cells that hold every box.
-    start, step
-        first edge and width of the cells [mm].
-    centres, half_pixel, half_cell
-        of the boxes, as in :meth:`Steps.box_means`.
-    """
-    return Antiderivative.sampled(values, start, step).means(centres, half_pixel, half_cell)
-
-
 def _cubic(nodes: FloatArray, places: FloatArray) -> FloatArray:
     """(functions, *places.shape) values between ``nodes`` (functions, n) of functions, by Lagrange's cubic polynomials.
 

@@ -15,7 +15,7 @@ from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Spectrum
 from mitsim.optics import diffraction
 from mitsim.optics.diffraction import EdgeWaves, grid_step, wave_profiles
-from mitsim.optics.edge_profile import Antiderivative, Steps, sampled_box_means
+from mitsim.optics.edge_profile import Antiderivative, Steps
 from mitsim.optics.shadow import Directions, ShadowGeometry
 from mitsim.optics.terms import shadow_terms
 
@@ -372,8 +372,8 @@ def test_interpolated_shadows_are_as_good_as_their_grid(kind: str, distance: flo
     parts, start, step = wave_profiles(shadow, 520.0, -4.4, 4.4, 0.0)
     values = np.stack([profile for _, profile in parts])
     boxes = shadow.crossings(directions), shadow.half_pixel, shadow.half_cell(directions)
-    exact = sampled_box_means(values, start, step, *boxes)
-    found = Antiderivative.sampled(values, start, step).smooth_means(*boxes)
+    sampled = Antiderivative.sampled(values, start, step)
+    exact, found = sampled.means(*boxes), sampled.smooth_means(*boxes)
     assert 0 < np.linalg.norm(found - exact) / np.linalg.norm(exact) < 4e-5
 
 
