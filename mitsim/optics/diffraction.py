@@ -253,7 +253,7 @@ class _Propagation:
 def _integrate(apertures: tuple[Steps, ...], light: _Propagation, low: float, high: float) -> Antiderivative:
     """Antiderivatives of the products of the fields behind ``apertures``, over mask coordinates ``low`` to ``high``."""
     waves, start = light.waves(np.array([low]), np.array([high])), light.start(low)
-    return Antiderivative.sampled(_products([waves.field(each, start) for each in apertures]), start, waves.step_mm)
+    return Antiderivative.of_samples(_products([waves.field(each, start) for each in apertures]), start, waves.step_mm)
 
 
 _keep_integrated = lru_cache(maxsize=_KEPT)(_integrate)
@@ -307,7 +307,7 @@ def _thick_means(
         start = light.start(float(lows[j]))
         clear = shadow.clear(profiles, float(directions.centres[j]))
         products = _products([waves.field(aperture, start) for aperture in clear])
-        integrated = Antiderivative.sampled(products, start, waves.step_mm)
+        integrated = Antiderivative.of_samples(products, start, waves.step_mm)
         return integrated.smooth_means(crossings[:, j], shadow.half_pixel, half_cell)
 
     return np.stack(in_threads(toward, range(crossings.shape[1])), axis=-1)

@@ -236,7 +236,15 @@ class Antiderivative:
     """First and second antiderivative of piecewise constant functions with their means taken off."""
 
     def __init__(self, edges: FloatArray, values: FloatArray, step: float | None = None) -> None:
-        """``edges`` (n + 1,), equally spaced if ``step`` is given; ``values`` (functions, n)."""
+        """Those of (functions, n) values.
+
+        Parameters
+        ----------
+        edges, values
+            (n + 1,) of the pieces [mm], and (functions, n) value of each.
+        step
+            width of all pieces [mm], where they are equal.
+        """
         width = np.diff(edges)
         self._edges, self._step = edges, step
         self._mean = (values @ width) / (edges[-1] - edges[0])
@@ -249,8 +257,16 @@ class Antiderivative:
         self._second = self._sums(middle)
 
     @classmethod
-    def sampled(cls, values: FloatArray, start: float, step: float) -> Antiderivative:
-        """Those of ``values`` (functions, n) on equal cells from ``start`` on, ``step`` wide [mm]."""
+    def of_samples(cls, values: FloatArray, start: float, step: float) -> Antiderivative:
+        """Those of functions that are constant on equal cells.
+
+        Parameters
+        ----------
+        values
+            (functions, n) on cells that hold every box.
+        start, step
+            first edge and width of the cells [mm].
+        """
         return cls(start + step * np.arange(values.shape[1] + 1), values, step)
 
     @staticmethod
@@ -262,7 +278,13 @@ class Antiderivative:
         return sums
 
     def means(self, centres: FloatArray, half_pixel: float, half_cell: float) -> FloatArray:
-        """(functions, *centres.shape) means over a box of each half-width."""
+        """(functions, *centres.shape) means over two boxes, one after the other.
+
+        Parameters
+        ----------
+        centres, half_pixel, half_cell
+            of the boxes, as in :meth:`Steps.box_means`.
+        """
         wide, narrow = max(half_pixel, half_cell), min(half_pixel, half_cell)
         total = self._ends(centres + wide, narrow) - self._ends(centres - wide, narrow)
         total /= 2 * wide

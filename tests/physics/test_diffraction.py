@@ -372,7 +372,7 @@ def test_interpolated_shadows_are_as_good_as_their_grid(kind: str, distance: flo
     parts, start, step = wave_profiles(shadow, 520.0, -4.4, 4.4, 0.0)
     values = np.stack([profile for _, profile in parts])
     boxes = shadow.crossings(directions), shadow.half_pixel, shadow.half_cell(directions)
-    sampled = Antiderivative.sampled(values, start, step)
+    sampled = Antiderivative.of_samples(values, start, step)
     exact, found = sampled.means(*boxes), sampled.smooth_means(*boxes)
     assert 0 < np.linalg.norm(found - exact) / np.linalg.norm(exact) < 4e-5
 
