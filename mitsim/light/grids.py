@@ -117,10 +117,6 @@ class Grids:
         what is simulated of the bench.
     grids
         by name, as :data:`GRIDS` has them.
-    ambient
-        those of all light of lamps.
-    by_band
-        of each row of lamps' light, such grids.
     """
 
     def __init__(
@@ -139,14 +135,23 @@ class Grids:
         if one_line and self.physics.spectrum:
             self.physics = replace(self.physics, spectrum=self.physics.spectrum.mean)
         self._pixels = pixels or bench.n
-        counted_lamps = bench.counted_lamps if self.physics.lamps else None
+        self._counted_lamps = counted_lamps = bench.counted_lamps if self.physics.lamps else None
         self.lamp_rows = len(counted_lamps.bands) if counted_lamps else 1
         # The sensor's centre sees nothing beyond the field stop, so near surfaces ask for no more directions.
         self.aim = self.cells(1, reach=None)
         self.grids = {row.name: self._grid(row) for row in GRIDS.values()}
-        self.ambient = self._of_lamps(counted_lamps.whole if counted_lamps else _bands(*_AMBIENT_NM, _AMBIENT_BANDS))
-        bands = counted_lamps.spectra if counted_lamps else ()
-        self.by_band = tuple(map(self._of_lamps, bands)) or (self.ambient,)
+
+    @cached_property
+    def ambient(self) -> Mapping[str, Grid]:
+        """Grids of all light of lamps, by name."""
+        counted_lamps = self._counted_lamps
+        return self._of_lamps(counted_lamps.whole if counted_lamps else _bands(*_AMBIENT_NM, _AMBIENT_BANDS))
+
+    @cached_property
+    def by_band(self) -> tuple[Mapping[str, Grid], ...]:
+        """Of each row of lamps' light, such grids."""
+        bands = self._counted_lamps.spectra if self._counted_lamps else ()
+        return tuple(map(self._of_lamps, bands)) or (self.ambient,)
 
     def _of_lamps(self, light: Spectrum) -> Mapping[str, Grid]:
         return {row.name: self._grid(row, light) for row in GRIDS.values() if row.lamps}

@@ -23,9 +23,10 @@ clear aperture of both faces, propagated from the exit face: diffraction inside 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from itertools import chain, combinations
 
 import numpy as np
@@ -39,7 +40,7 @@ from mitsim.core.parallel import in_threads
 from mitsim.devices.mask import Mask
 from mitsim.devices.plate import FEW, Plate
 from mitsim.devices.projector import Spectrum
-from mitsim.optics.edge_profile import Steps, smooth_box_means
+from mitsim.optics.edge_profile import Antiderivative, Steps
 from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, both_axes, lagrange_weights, nodes_between
 
 ComplexArray = npt.NDArray[np.complex128]
@@ -58,6 +59,11 @@ wavelength is the cutoff of light polarised along them (Jackson, Classical Elect
 any passes that scalar theory would let through."""
 _LARGEST_GRID = 1 << 24
 """Cells of a grid: 256 MiB for each of a few complex arrays."""
+_KEPT, _LARGEST_KEPT = 24, 1 << 18
+"""Shadows that are kept, three lines at eight depths, and cells of the largest, of all products: 6 MiB each."""
+_PART_OF_RANGE = 1 / 4
+"""A grid that may be kept begins and ends at multiples of this part of its range or less, so that rows, columns, coarse
+and fine cells share it: it is a quarter longer at most, and a fifth on average."""
 
 
 class EdgeWaves:
@@ -171,8 +177,8 @@ def wave_profiles(
     (weight, (cells,) profile) of each separable term, and the start and the step [mm] of the grid.
     """
     shadow = _of_fields(shadow)
-    waves = _prepare(shadow, wavelength_nm, np.array([low_mm]), np.array([high_mm]))
-    start = _start(shadow, waves.step_mm, low_mm)
+    light = _Propagation.of(shadow, wavelength_nm)
+    waves, start = light.waves(np.array([low_mm]), np.array([high_mm])), light.start(low_mm)
     rows = [profile for _, profile, _ in shadow.mask.terms]
     products = _products([waves.field(clear, start) for clear in shadow.clear(rows, tau)])
     return list(zip(_pair_weights(shadow.weights()), products, strict=True)), start, waves.step_mm
@@ -216,18 +222,41 @@ def grid_step(shadow: ShadowGeometry, wavelength_nm: float) -> float:
     return feature / float(np.ceil(feature / widest)) if feature > widest else widest
 
 
-def _prepare(shadow: ShadowGeometry, wavelength_nm: float, lows: FloatArray, highs: FloatArray) -> EdgeWaves:
-    """Waves on a grid that holds each range of mask coordinates [mm], wherever the grid's start is rounded to."""
-    step = grid_step(shadow, wavelength_nm)
-    count = int(np.ceil((highs - lows).max() / step)) + 3
-    span = shadow.mask.extent_mm / 2 + float(max(np.abs(lows).max(), np.abs(highs).max())) + 3 * step
-    return EdgeWaves(wavelength_nm, shadow.distance_mm * shadow.shrink, step, count, span)
+@dataclass(frozen=True)
+class _Propagation:
+    """Light on its way from one axis of a mask to the sensor: wavelength [nm], effective distance, the mask's extent,
+    and the step of the grid [mm]."""
+
+    wavelength_nm: float
+    distance_mm: float
+    extent_mm: float
+    step_mm: float
+
+    @classmethod
+    def of(cls, shadow: ShadowGeometry, wavelength_nm: float) -> _Propagation:
+        """That of a ``shadow``."""
+        distance, step = shadow.distance_mm * shadow.shrink, grid_step(shadow, wavelength_nm)
+        return cls(wavelength_nm, distance, shadow.mask.extent_mm, step)
+
+    def waves(self, lows: FloatArray, highs: FloatArray) -> EdgeWaves:
+        """Waves on a grid that holds each range of mask coordinates [mm], wherever the grid's start is rounded to."""
+        count = int(np.ceil((highs - lows).max() / self.step_mm)) + 3
+        span = self.extent_mm / 2 + float(max(np.abs(lows).max(), np.abs(highs).max())) + 3 * self.step_mm
+        return EdgeWaves(self.wavelength_nm, self.distance_mm, self.step_mm, count, span)
+
+    def start(self, low: float) -> float:
+        """A coordinate at least a cell below ``low`` from which the mask's edges fall between cells."""
+        first = -self.extent_mm / 2
+        return float(first + (np.floor((low - first) / self.step_mm) - 1) * self.step_mm)
 
 
-def _start(shadow: ShadowGeometry, step: float, low: float) -> float:
-    """A coordinate at least a cell below ``low`` from which the mask's edges fall between cells."""
-    first = -shadow.mask.extent_mm / 2
-    return float(first + (np.floor((low - first) / step) - 1) * step)
+def _integrate(apertures: tuple[Steps, ...], light: _Propagation, low: float, high: float) -> Antiderivative:
+    """Antiderivatives of the products of the fields behind ``apertures``, over mask coordinates ``low`` to ``high``."""
+    waves, start = light.waves(np.array([low]), np.array([high])), light.start(low)
+    return Antiderivative.of_samples(_products([waves.field(each, start) for each in apertures]), start, waves.step_mm)
+
+
+_keep_integrated = lru_cache(maxsize=_KEPT)(_integrate)
 
 
 def _thin_means(
@@ -254,11 +283,14 @@ def _thin_means_at(
     """The same of waves from ``beyond`` [mm] the mask's distance."""
     met, half_cell = shadow.on_tilted_mask(directions), shadow.half_cell(directions)
     reach = shadow.half_pixel + half_cell
-    low, high = met.min() - reach, met.max() + reach
-    waves = _prepare(replace(shadow, distance_mm=shadow.distance_mm + beyond), wavelength_nm, low, high)
-    start = _start(shadow, waves.step_mm, float(low))
-    products = _products([waves.field(clear, start) for clear in shadow.clear(profiles, 0.0)])
-    return smooth_box_means(products, start, waves.step_mm, met, shadow.half_pixel, half_cell)
+    low, high = float(met.min() - reach), float(met.max() + reach)
+    light = _Propagation.of(replace(shadow, distance_mm=shadow.distance_mm + beyond), wavelength_nm)
+    kept = len(profiles) ** 2 * (high - low) <= _LARGEST_KEPT * light.step_mm
+    if kept:
+        part = 2.0 ** math.floor(math.log2(_PART_OF_RANGE * (high - low)))
+        low, high = part * math.floor(low / part), part * math.ceil(high / part)
+    integrated = (_keep_integrated if kept else _integrate)(tuple(shadow.clear(profiles, 0.0)), light, low, high)
+    return integrated.smooth_means(met, shadow.half_pixel, half_cell)
 
 
 def _thick_means(
@@ -268,13 +300,15 @@ def _thick_means(
     crossings, half_cell = shadow.crossings(directions), shadow.half_cell(directions)
     reach = shadow.half_pixel + half_cell
     lows, highs = crossings.min(axis=0) - reach, crossings.max(axis=0) + reach
-    waves = _prepare(shadow, wavelength_nm, lows, highs)
+    light = _Propagation.of(shadow, wavelength_nm)
+    waves = light.waves(lows, highs)
 
     def toward(j: int) -> FloatArray:
-        start = _start(shadow, waves.step_mm, float(lows[j]))
+        start = light.start(float(lows[j]))
         clear = shadow.clear(profiles, float(directions.centres[j]))
         products = _products([waves.field(aperture, start) for aperture in clear])
-        return smooth_box_means(products, start, waves.step_mm, crossings[:, j], shadow.half_pixel, half_cell)
+        integrated = Antiderivative.of_samples(products, start, waves.step_mm)
+        return integrated.smooth_means(crossings[:, j], shadow.half_pixel, half_cell)
 
     return np.stack(in_threads(toward, range(crossings.shape[1])), axis=-1)
 

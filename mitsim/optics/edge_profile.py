@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import ByValue, FloatArray
 
 _FEW = 4
 """Edges in the narrower box that are taken one by one; with more, the box is wide enough for a second difference to
@@ -39,7 +39,7 @@ _PER_CELL = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Steps:
+class Steps(ByValue):
     """A piecewise constant function: ``values[k]`` from ``edges[k]`` to ``edges[k + 1]`` [mm], 0 outside.
 
     Attributes
@@ -166,7 +166,7 @@ class Steps:
         inside = self.edges[(self.edges > low) & (self.edges < high)]
         edges = np.concatenate(([low], inside, [high]))
         values = self.at((edges[:-1] + edges[1:]) / 2)
-        return np.asarray(_Antiderivative(edges, values[None]).means(centres, half_pixel, half_cell)[0])
+        return np.asarray(Antiderivative(edges, values[None]).means(centres, half_pixel, half_cell)[0])
 
 
 def blurred_step(x: FloatArray, half: FloatArray | float, other: float, blur: float) -> FloatArray:
@@ -212,43 +212,6 @@ def _twice(x: FloatArray, blur: float) -> FloatArray:
     return np.asarray(blur**2 / 2 * ((np.square(z) + 1) * ndtr(z) + z * _density(z)))
 
 
-def sampled_box_means(
-    values: FloatArray, start: float, step: float, centres: FloatArray, half_pixel: float, half_cell: float
-) -> FloatArray:
-    """(functions, *centres.shape) means over two boxes of functions that are constant on equal cells.
-
-    Parameters
-    ----------
-    values
-        (functions, n) on cells that hold every box.
-    start, step
-        first edge and width of the cells [mm].
-    centres, half_pixel, half_cell
-        of the boxes, as in :meth:`Steps.box_means`.
-    """
-    edges = start + step * np.arange(values.shape[1] + 1)
-    return _Antiderivative(edges, values, step).means(centres, half_pixel, half_cell)
-
-
-def smooth_box_means(
-    values: FloatArray, start: float, step: float, centres: FloatArray, half_pixel: float, half_cell: float
-) -> FloatArray:
-    """The same of functions without jumps, as fields of waves are: many points are interpolated between cells.
-
-    Parameters
-    ----------
-    values, start, step, centres, half_pixel, half_cell
-        as for :func:`sampled_box_means`.
-    """
-    low = float(centres.min())
-    count = int((float(centres.max()) - low) / step) + 4
-    if centres.size < _DENSE * count or half_pixel * half_cell < _WIDE * step**2:
-        return sampled_box_means(values, start, step, centres, half_pixel, half_cell)
-    nodes = low + step * (np.arange(count) - 1)
-    means = sampled_box_means(values, start, step, np.asarray(nodes), half_pixel, half_cell)
-    return _cubic(means, (centres - low) / step)
-
-
 def _cubic(nodes: FloatArray, places: FloatArray) -> FloatArray:
     """(functions, *places.shape) values between ``nodes`` (functions, n) of functions, by Lagrange's cubic polynomials.
 
@@ -269,11 +232,19 @@ def _cubic(nodes: FloatArray, places: FloatArray) -> FloatArray:
     return result
 
 
-class _Antiderivative:
+class Antiderivative:
     """First and second antiderivative of piecewise constant functions with their means taken off."""
 
     def __init__(self, edges: FloatArray, values: FloatArray, step: float | None = None) -> None:
-        """``edges`` (n + 1,), equally spaced if ``step`` is given; ``values`` (functions, n)."""
+        """Those of (functions, n) values.
+
+        Parameters
+        ----------
+        edges, values
+            (n + 1,) of the pieces [mm], and (functions, n) value of each.
+        step
+            width of all pieces [mm], where they are equal.
+        """
         width = np.diff(edges)
         self._edges, self._step = edges, step
         self._mean = (values @ width) / (edges[-1] - edges[0])
@@ -285,6 +256,19 @@ class _Antiderivative:
         middle *= width / 2
         self._second = self._sums(middle)
 
+    @classmethod
+    def of_samples(cls, values: FloatArray, start: float, step: float) -> Antiderivative:
+        """Those of functions that are constant on equal cells.
+
+        Parameters
+        ----------
+        values
+            (functions, n) on cells that hold every box.
+        start, step
+            first edge and width of the cells [mm].
+        """
+        return cls(start + step * np.arange(values.shape[1] + 1), values, step)
+
     @staticmethod
     def _sums(parts: FloatArray) -> FloatArray:
         """(functions, n + 1) running sums of (functions, n), from 0 on."""
@@ -294,12 +278,35 @@ class _Antiderivative:
         return sums
 
     def means(self, centres: FloatArray, half_pixel: float, half_cell: float) -> FloatArray:
-        """(functions, *centres.shape) means over a box of each half-width."""
+        """(functions, *centres.shape) means over two boxes, one after the other.
+
+        Parameters
+        ----------
+        centres, half_pixel, half_cell
+            of the boxes, as in :meth:`Steps.box_means`.
+        """
         wide, narrow = max(half_pixel, half_cell), min(half_pixel, half_cell)
         total = self._ends(centres + wide, narrow) - self._ends(centres - wide, narrow)
         total /= 2 * wide
         total += self._mean.reshape(-1, *[1] * centres.ndim)
         return total
+
+    def smooth_means(self, centres: FloatArray, half_pixel: float, half_cell: float) -> FloatArray:
+        """The same of sampled functions without jumps, as fields of waves are: many points are interpolated between
+        cells.
+
+        Parameters
+        ----------
+        centres, half_pixel, half_cell
+            of the boxes, as in :meth:`Steps.box_means`.
+        """
+        step, low = self._step, float(centres.min())
+        assert step is not None, "on equal cells"
+        count = int((float(centres.max()) - low) / step) + 4
+        if centres.size < _DENSE * count or half_pixel * half_cell < _WIDE * step**2:
+            return self.means(centres, half_pixel, half_cell)
+        nodes = self.means(np.asarray(low + step * (np.arange(count) - 1)), half_pixel, half_cell)
+        return _cubic(nodes, (centres - low) / step)
 
     def _ends(self, points: FloatArray, half: float) -> FloatArray:
         """(functions, *points.shape) means of the first antiderivative over [points - half, points + half]."""

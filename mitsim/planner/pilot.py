@@ -147,7 +147,7 @@ class PilotRuns:
             known = self.anchored
             for run in ("anchors", "occluded"):
                 self._measure(run)
-            self.anchored.take_over(known)
+            self.anchored.take_over(known.traced)
 
     # ---- More samples: their work, and where they are called for ----
 
@@ -228,6 +228,9 @@ class PilotRuns:
                 self.occluded = PenumbraRuns(bench, base, sample, self._tolerance(), seed, self.fine.judging)
         else:
             self.anchored = AnchorRuns(bench, base, sample, self._tolerance(), seed, self.fine.judging)
+            if sample.anchored == self.samples["cells"].anchored:
+                self.anchored.take_over({1: self.fine.first})
+            self.anchored.coarse = self.fine.coarse
 
     def _tolerance(self, part: float = GOOD_ENOUGH) -> float:
         """Norm of that ``part`` of all light that the capture may leave out."""

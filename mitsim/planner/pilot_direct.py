@@ -38,6 +38,7 @@ from mitsim.transport.records import PathSamples
 
 LAYER_LADDER, CELL_LADDER = (1, 2, 3, 4, 6, 8, 12), (1, 2, 4, 8)
 """Numbers that are tried, each step about half the error of the one before or less."""
+_CELL, _LAYER = Approximation("cells", 1), Approximation("layers", 1)
 _FIRST_JUDGES = {"layers": 2, "cells": 1}
 """Indices of the numbers that judge at first: two steps, or one where it is known how the error falls."""
 _JUDGING = 4
@@ -73,20 +74,25 @@ class DirectRuns:
         where the search for enough may stop.
     seed
         root of the random streams.
+
+    Attributes
+    ----------
+    first
+        light of the first samples, as many as tell anchors apart, replicate by replicate.
     """
 
     def __init__(self, bench: Apparatus, base: Settings, sample: Sample, accuracy: float, seed: int) -> None:
         self.bench, self.base, self.sample, self.accuracy = bench, base, sample, accuracy
         self._seeds = [integer(seed, "pilot", "fine", replicate) for replicate in range(REPLICATES)]
         self._simulation = simulation = sample.simulation(bench, base)
-        self._tracer = tracer_of(simulation, shown_pixels(base, sample), base.anchors)
-        self._path_samples = self._trace(self._tracer, sample.fine)
+        tracer = tracer_of(simulation, shown_pixels(base, sample), base.anchors)
+        self.first, self._path_samples = self._trace(tracer)
         apart, samples = simulation.sharp, sample.sharp(simulation)
-        self._sharp = self._trace(apart, samples) if apart else []
+        self._sharp = apart.replicates(self._seeds, samples)[0] if apart else []
 
-    def _trace(self, tracer: DirectTracer, samples: int) -> list[PathSamples]:
-        """Replicates of a tracer's light."""
-        return [tracer.trace(seed, 0, samples) for seed in self._seeds]
+    def _trace(self, tracer: DirectTracer) -> list[list[PathSamples]]:
+        """Replicates of a tracer's light, of few samples and of all."""
+        return tracer.replicates(self._seeds, self.sample.anchored, self.sample.fine)
 
     @property
     def judging(self) -> tuple[float, ...]:
@@ -123,6 +129,13 @@ class DirectRuns:
             found |= {Approximation("layers", count): change for count, change in layers.items()}
         return found
 
+    @property
+    def coarse(self) -> tuple[float, float]:
+        """Parts that one cell a pixel, and one layer, leave of the light."""
+        whole = norm(self._whole)
+        cells, layer = (norm(self.changes[part]) if part in self.changes else 0.0 for part in (_CELL, _LAYER))
+        return (cells / whole, layer / whole) if whole else (math.inf, math.inf)
+
     def sample_cost(self, light: float) -> SampleCost:
         """Monte Carlo error of one estimate of the light at the sensor's centre, relative to all ``light``; how fast it
         falls with samples; and paths of a sample."""
@@ -135,13 +148,9 @@ class DirectRuns:
 
     def _sample_cost(self, noises: tuple[float, float], light: float) -> SampleCost:
         many, few = noises
-        steep = many > 0 and few > 0 and self._fewer < self.sample.fine
-        rate = math.log(few / many) / math.log(self.sample.fine / self._fewer) if steep else 0.5
+        steep = many > 0 and few > 0 and self.sample.anchored < self.sample.fine
+        rate = math.log(few / many) / math.log(self.sample.fine / self.sample.anchored) if steep else 0.5
         return SampleCost.relative(many, light, self.sample.fine, self.bench.n**2, min(max(rate, 0.5), _STEEPEST))
-
-    @property
-    def _fewer(self) -> int:
-        return max(1, self.sample.fine // 4)
 
     @cached_property
     def _whole(self) -> FloatArray:
@@ -150,18 +159,17 @@ class DirectRuns:
 
     @cached_property
     def _noise(self) -> tuple[float, float]:
-        return self._noise_of(self._tracer, self._whole)
+        return self._noise_of(self._whole, self.first)
 
     @cached_property
     def _spread_noise(self) -> tuple[float, float]:
         tracer = tracer_of(self._simulation, shown_pixels(self.base, self.sample), 1, spread=True)
-        seen = self._trace(tracer, self.sample.fine)
-        return self._noise_of(tracer, self._form(self._simulation, seen, self.sample.fine))
+        first, seen = self._trace(tracer)
+        return self._noise_of(self._form(self._simulation, seen, self.sample.fine), first)
 
-    def _noise_of(self, tracer: DirectTracer, many: FloatArray) -> tuple[float, float]:
-        """Error of a replicate of the ``tracer`` whose frames of all samples are ``many``, and of one with fewer."""
-        few = self._trace(tracer, self._fewer)
-        return noise(many), noise(self._form(self._simulation, few, self._fewer))
+    def _noise_of(self, many: FloatArray, first: list[PathSamples]) -> tuple[float, float]:
+        """Error of a replicate whose frames of all samples are ``many``, and of its ``first`` few."""
+        return noise(many), noise(self._form(self._simulation, first, self.sample.anchored))
 
     def forming(self, family: Lighting) -> Forming:
         """What forming frames of a ``family`` takes."""

@@ -28,10 +28,10 @@ Known = dict[Hashable, tuple[Sequence[PathSamples], FloatArray]]
 _SHOTS, _MOST_SHOTS, _SHOWN = 4, 16, 1024
 """Shots of the family that the pilot replicates at: patterns of a family differ little, and each costs its forming; but
 more where they show fewer pixels than this all together, which are no fair sample of the scene, or a mirror does."""
-_PLACES = 128
+_PLACES = 96
 """Rows and columns of pixels that the pilot replicates at: a frame's neighbours are alike, and each costs its forming.
-Where they meet, most changes are told to 2 to 6 % (photograph, gift_card, compact_disc, lamp_bench, against all
-512)."""
+Where they meet, changes are told to 1 to 5 %, as by 128, and by 64 to 1 to 8 % (anchors, layers, cells and effects of
+photograph, gift_card, compact_disc and metal_blade, against all 512)."""
 _GOLDEN = (math.sqrt(5) - 1) / 2
 """Steps by it never meet a mask's features in one phase."""
 _DIGITS = 12

@@ -53,6 +53,8 @@ most: noise decides how many are planned, a unit cost only what is said of their
 _MOSTLY = 0.75
 """Part of the tracing that is timed, at fixed unit costs: unit costs of the rest are off by 2 at most, which moves what
 is said of all by less than predictions are good to."""
+_UNTIMED = 0.15
+"""Part of the run that may be untimed tracing: off by 2 at most, it moves what is said of all by so much."""
 _LEAST_SLOPE = 0.25
 """Part of a path's seconds in a launch that are its own at least, whatever shorter launches seem to say."""
 _HEAVY_PATHS, _MOST_HEAVY_PATHS = 2**19, 2**23
@@ -184,7 +186,8 @@ def _decide(runs: pilot.PilotRuns, accuracy: float, switches: Mapping[str, bool]
     if pilot_result.sharp is not None and Simulation(bench, chosen.settings).from_camera is not None:
         pilot_result, chosen = _with_heavy_paths(runs, accuracy, chosen, switches)
     simulation = Simulation(bench, chosen.settings)
-    timed = _time_paths(pilot_result, simulation, runs.lighting.labels, runs.seed)
+    untimed = _UNTIMED * (OPENING_S + chosen.work)
+    timed = _time_paths(pilot_result, simulation, runs.lighting.labels, runs.seed, untimed)
     plan = explain_plan(accuracy, timed, SceneFacts.of(bench, switches), switches, chosen)
     plan = replace(plan, predicted_range=_range(timed, plan))
     if simulation.physics.mirrors:
@@ -253,14 +256,27 @@ def _seconds(simulation: Simulation, name: str, seed: int, labels: Labels, sampl
     return time.perf_counter() - started
 
 
-def _time_paths(pilot_result: PilotResult, simulation: Simulation, labels: Labels, seed: int) -> PilotResult:
+def _time_paths(
+    pilot_result: PilotResult, simulation: Simulation, labels: Labels, seed: int, untimed: float
+) -> PilotResult:
     """The ``pilot_result`` with the seconds that a path takes to be traced and accumulated in a ``simulation`` of the
-    choice: timed of the passes that take most, and as much slower or faster than the fixed ones of the others."""
+    choice: timed of the passes that take most, and as much slower or faster than the fixed ones of the others.
+
+    Parameters
+    ----------
+    pilot_result, simulation
+        what was found, and what was chosen.
+    labels, seed
+        how light is accumulated, and the root of its random numbers.
+    untimed
+        seconds of tracing at fixed unit costs that are not worth timing.
+    """
     own, spread = integer(seed, "pilot", "paces"), pilot_result.spread
     fixed = {name: 0.0 for name in simulation.passes} | tracing_seconds(pilot_result, simulation.settings, FIXED)
     timed, ratios, ray = dict[str, float](), dict[str, float](), 0.0
     for name in sorted(simulation.passes, key=lambda name: -fixed[name]):
-        if timed and sum(fixed[other] for other in timed) >= _MOSTLY * sum(fixed.values()):
+        rest = sum(seconds for other, seconds in fixed.items() if other not in timed)
+        if rest < untimed or (timed and rest <= (1 - _MOSTLY) * sum(fixed.values())):
             break
         # A path of shared light counts for several.
         paths = pilot_result.sample_costs[name].paths if name == "indirect" else _paths_of(simulation, name)
@@ -271,7 +287,7 @@ def _time_paths(pilot_result: PilotResult, simulation: Simulation, labels: Label
     whole = sum(fixed[name] for name in timed)
     # Where nothing takes any time, what was timed counts alike.
     by = {name: fixed[name] / whole if whole else 1 / len(timed) for name in timed}
-    slower = sum(by[name] * ratio for name, ratio in ratios.items())
+    slower = sum(by[name] * ratio for name, ratio in ratios.items()) if timed else 1.0
     found = {
         name: replace(
             pilot_result.sample_costs.get(name, SampleCost.none()),

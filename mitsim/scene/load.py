@@ -23,6 +23,9 @@ from mitsim.scene.window import ProjectorGrid, locate_projector
 SENSOR_PLUGIN = "mitsim_lensless"
 _SMALL_LAMPS = ("DirectionalEmitter", "PointLight", "SpotLight")
 """Mitsuba's classes of the lamps that no path runs into."""
+_FLAT, _TURNED = ("Rectangle", "Disk"), 1e-6
+"""Mitsuba's classes of shapes that have one normal, and by how much normals of parallel ones differ: single precision
+rounds turned ones to 1e-7, and of surfaces that are turned by 1e-6 one sees 1e-12 of the other's light."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,8 @@ class LoadedScene:
     several; ``small_lamps`` are lamps that no path runs into, with their tags; ``coloured`` are tags of what may
     differ by wavelength, none of a scene in greys, ``parting`` of glass that sends each wavelength its own way;
     ``samples`` is the ``sample_count`` of the camera's sampler, None where it has none; ``notes`` say what was changed
-    of the scene to render it rightly.
+    of the scene to render it rightly; ``one_way`` tells that no surface sees another, as all are flat and turn the only
+    side that reflects the same way.
     """
 
     path: Path
@@ -56,6 +60,7 @@ class LoadedScene:
     parting: tuple[Tag, ...] = ()
     samples: int | None = None
     notes: tuple[str, ...] = ()
+    one_way: bool = False
 
     @property
     def pixels(self) -> ProjectorGrid:
@@ -136,6 +141,7 @@ def load_scene(
         checked.parting,
         checked.samples,
         notes,
+        _faces_one_way(scene),
     )
 
 
@@ -149,6 +155,17 @@ def _mirrors_and_gloss(scene: mi.Scene, unfit: Unfit) -> tuple[bool, bool]:
     mirrors = any(own & mirror for own in flags) or unfit.instances is not None
     hidden = any(shape.class_name() == "Instance" for shape in scene.shapes())
     return mirrors, hidden or any(mi.has_flag(own, mi.BSDFFlags.Glossy) for own in flags)
+
+
+def _faces_one_way(scene: mi.Scene) -> bool:
+    """Whether no surface of the ``scene`` can see the side of another that reflects."""
+    normals = list[npt.NDArray[np.generic]]()
+    for shape in scene.shapes():
+        bsdf = shape.bsdf()
+        if shape.class_name() not in _FLAT or not bsdf or mi.has_flag(bsdf.flags(), mi.BSDFFlags.BackSide):
+            return False
+        normals.append(np.array(shape.sample_position(0.0, mi.Point2f(0.5)).n).ravel())
+    return bool(normals) and float(np.ptp(normals, axis=0).max()) < _TURNED
 
 
 # -------- Values of a loaded scene's bitmaps and meshes

@@ -128,6 +128,17 @@ class Tracer(ABC):
     def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
         """Light of the paths of one kernel, but for what is added up in the ``accumulator``."""
 
+    def _flights(self, seeds: Sequence[int], first: int, samples: int) -> Iterator[InFlight]:
+        """Some samples of each of the ``seeds``, one seed after the other, those of one kernel at a time."""
+        count = self.connections_per_path
+        at_once = max(1, self.paths_per_launch // count)
+        # Looked up, also where there is but one, so that one kernel serves any number; Dr.Jit looks nothing up in one.
+        known, each = mi.UInt32([*seeds, seeds[-1]]), dr.opaque(mi.UInt32, samples)
+        for number, index in launches(self.paths_per_sample // count, 0, len(seeds) * samples, at_once):
+            place = number // each
+            sample = number - place * each + dr.opaque(mi.UInt32, first)
+            yield InFlight(dr.gather(mi.UInt32, known, place), sample, index)
+
     @keep_scenes()
     def trace(
         self, seed: int, first: int = 0, samples: int = 1, accumulator: DeviceAccumulator | None = None
@@ -148,11 +159,10 @@ class Tracer(ABC):
         MitsimError
             when the scene sends NaN or infinite light to the camera.
         """
-        count, parts = self.connections_per_path, list[PathSamples]()
-        at_once = max(1, self.paths_per_launch // count)
+        parts = list[PathSamples]()
         for tracer in self.per_wavelength:
-            for sample, index in launches(self.paths_per_sample // count, first, samples, at_once):
-                parts += tracer._launch(InFlight(dr.opaque(mi.UInt32, seed), sample, index), accumulator)
+            for flight in tracer._flights([seed], first, samples):
+                parts += tracer._launch(flight, accumulator)
         if accumulator is not None:
             accumulator.traced += 1
         # Where all is fetched, there is nothing to wait for.

@@ -166,6 +166,21 @@ class PathSamples:
         MitsimError
             when the light is NaN or infinite.
         """
+        return cls.fetch_parts(seen, kind, np.array([[0, dr.width(seen.value)]]), anchors)[0]
+
+    @classmethod
+    def fetch_parts(
+        cls, seen: Sightings, kind: int, ranges: IntArray, anchors: tuple[mi.UInt32, mi.UInt32] | None = None
+    ) -> list[PathSamples]:
+        """The same of some ranges of lanes.
+
+        Parameters
+        ----------
+        seen, kind, anchors
+            as for :meth:`fetch`.
+        ranges
+            (parts, 2) lane with which each begins, and before which it ends.
+        """
         # Together: one by one, each would trace all paths again.
         dr.eval(seen, anchors)
         light = np.array(seen.value)
@@ -178,7 +193,7 @@ class PathSamples:
             return (found if whole else found[..., lit]).astype(dtype)
 
         none = np.zeros(lit.size, np.int64)
-        return cls(
+        every = cls(
             pixel=lit_ones(seen.pixel, np.int64),
             anchor_row=none if anchors is None else lit_ones(anchors[0], np.int64),
             anchor_column=none if anchors is None else lit_ones(anchors[1], np.int64),
@@ -189,6 +204,7 @@ class PathSamples:
             kind=np.full(lit.size, kind, dtype=np.int16),
             lines=None if seen.lines is None else lit_ones(seen.lines, np.float32),
         )
+        return [every.where(slice(*part)) for part in np.searchsorted(lit, ranges).tolist()]
 
     @classmethod
     def none(cls) -> PathSamples:
@@ -202,8 +218,8 @@ class PathSamples:
         value = self.value * weights[self.anchor_row] * weights[self.anchor_column]
         return replace(self, anchor_row=first, anchor_column=first, value=value)
 
-    def where(self, chosen: npt.NDArray[np.bool_]) -> PathSamples:
-        """The entries that are ``chosen`` (m,)."""
+    def where(self, chosen: npt.NDArray[np.bool_] | slice) -> PathSamples:
+        """The entries that are ``chosen`` (m,); consecutive ones are not copied."""
         lines = None if self.lines is None else self.lines[:, chosen]
         return PathSamples(**{name: getattr(self, name)[chosen] for name in _ARRAYS}, lines=lines)
 

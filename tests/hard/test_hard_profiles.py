@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mitsim.devices.mask import mls_mask
-from mitsim.optics.edge_profile import Steps, sampled_box_means
+from mitsim.optics.edge_profile import Antiderivative, Steps
 from mitsim.optics.fft_shadow import ProfileSampler
 from tests.hard.exact_shadows import EPS, exact_mean, power
 from tests.robustness import Recorder
@@ -44,7 +44,7 @@ def test_means_of_a_fine_grid_equal_fractions(measured: Recorder, a: float, b: f
     values = np.random.default_rng(5).random((1, 1000))
     step = 2.0**-12
     centres = np.array([0.05, 0.0865678, 0.125 - 3e-7])
-    found = sampled_box_means(values, 0.0, step, centres, a, b)[0]
+    found = Antiderivative.of_samples(values, 0.0, step).means(centres, a, b)[0]
     edges = [Fraction(k, 4096) for k in range(1001)]
     exact_values = [Fraction(float(v)) for v in values[0]]
     for centre, mean in zip(centres, found, strict=True):

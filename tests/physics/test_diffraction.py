@@ -13,8 +13,9 @@ from scipy.integrate import quad
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Spectrum
+from mitsim.optics import diffraction
 from mitsim.optics.diffraction import EdgeWaves, grid_step, wave_profiles
-from mitsim.optics.edge_profile import Steps, sampled_box_means, smooth_box_means
+from mitsim.optics.edge_profile import Antiderivative, Steps
 from mitsim.optics.shadow import Directions, ShadowGeometry
 from mitsim.optics.terms import shadow_terms
 
@@ -370,6 +371,40 @@ def test_interpolated_shadows_are_as_good_as_their_grid(kind: str, distance: flo
     directions = Directions.cells(np.linspace(-0.15, 0.15, 128 * cells + 1))
     parts, start, step = wave_profiles(shadow, 520.0, -4.4, 4.4, 0.0)
     values = np.stack([profile for _, profile in parts])
-    where = values, start, step, shadow.crossings(directions), shadow.half_pixel, shadow.half_cell(directions)
-    exact, found = sampled_box_means(*where), smooth_box_means(*where)
+    boxes = shadow.crossings(directions), shadow.half_pixel, shadow.half_cell(directions)
+    sampled = Antiderivative.of_samples(values, start, step)
+    exact, found = sampled.means(*boxes), sampled.smooth_means(*boxes)
     assert 0 < np.linalg.norm(found - exact) / np.linalg.norm(exact) < 4e-5
+
+
+def test_rows_columns_and_cells_of_any_size_share_the_waves_behind_a_mask(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Waves of three lines are worked out once, and to rounding the shadow is what it is without sharing. (Planted:
+    waves kept whatever their wavelength.)"""
+    geometry = CameraGeometry(pixels=64, mask_distance=1.7)  # waves of which no other test has kept
+    lines = Spectrum(np.array([638.0, 520.0, 445.0]), np.array([0.5, 0.3, 0.2]))
+    cells = {
+        count: (
+            Directions.cells(np.linspace(-0.15, 0.15, count + 1)),
+            Directions.cells(np.linspace(-0.14, 0.16, count + 1)),
+        )
+        for count in (16, 32)
+    }
+
+    def shadows() -> list[np.ndarray]:
+        found = [shadow_terms(geometry, rows, columns, 400.0, lines) for rows, columns in cells.values()]
+        return [factor for terms in found for term in terms for factor in term]
+
+    made = list[float]()
+    prepare = EdgeWaves.__init__
+
+    def count(waves: EdgeWaves, wavelength_nm: float, *others: float, **options: bool) -> None:
+        made.append(wavelength_nm)
+        prepare(waves, wavelength_nm, *others, **options)
+
+    monkeypatch.setattr(EdgeWaves, "__init__", count)
+    shared = shadows()
+    assert sorted(made) == [445.0, 520.0, 638.0]
+    monkeypatch.setattr(diffraction, "_LARGEST_KEPT", 0)
+    for one, other in zip(shared, shadows(), strict=True):
+        assert np.allclose(one, other, rtol=0, atol=1e-11)
+    assert len(made) == 3 + 12

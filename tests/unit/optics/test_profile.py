@@ -6,7 +6,7 @@ from scipy.special import ndtr
 
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
-from mitsim.optics.edge_profile import Steps, blurred_step, sampled_box_means
+from mitsim.optics.edge_profile import Antiderivative, Steps, blurred_step
 from mitsim.optics.shadow import scene_factor
 
 
@@ -40,7 +40,7 @@ def test_means_over_two_boxes_equal_quadrature(half_pixel: float, half_cell: flo
     # The midpoint rule places each of four edges to 1/1500 of a box.
     assert np.allclose(steps.box_means(centres, half_pixel, half_cell), steps.at(s).mean(axis=(-2, -1)), atol=5e-3)
     fine = steps.cell_means(-2.2, 1e-3, 4400)
-    sampled = sampled_box_means(np.stack([fine, 2 * fine]), -2.2, 1e-3, centres, half_pixel, half_cell)
+    sampled = Antiderivative.of_samples(np.stack([fine, 2 * fine]), -2.2, 1e-3).means(centres, half_pixel, half_cell)
     assert np.allclose(sampled[0], steps.box_means(centres, half_pixel, half_cell), rtol=0, atol=1e-12)
     assert np.allclose(sampled[1], 2 * sampled[0])
 
@@ -57,7 +57,7 @@ def test_the_second_difference_loses_nothing_that_matters() -> None:
     assert np.abs(steps.box_means(centres, half_pixel, half_cell) - expected).max() < 1e-11
     # The same from 26 000 samples: features hold a whole number of them, so this too is exact.
     fine = steps.cell_means(-3.6, 2.5e-4, 28_800)
-    found = sampled_box_means(fine[None], -3.6, 2.5e-4, centres, half_pixel, half_cell)[0]
+    found = Antiderivative.of_samples(fine[None], -3.6, 2.5e-4).means(centres, half_pixel, half_cell)[0]
     assert np.abs(found - expected).max() < 1e-11
 
 

@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from mitsim.light.simulation import Simulation, expected_of
 from mitsim.optics.frames import monte_carlo_error
 from mitsim.planner import pilot, pilot_direct, pilot_effects, pilot_samples
 from mitsim.planner.pilot_effects import AnchorRuns, EffectRuns, FollowedRuns
+from mitsim.transport.integrator import FollowingTracer, Tracer
 from mitsim.transport.records import PathSamples
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -375,6 +377,43 @@ def test_a_flat_scene_needs_no_layers(small_scene: Callable[..., Path]) -> None:
     found = measured(open_bench(small_scene()), 0)
     assert found.depth == 400.0 and found.ladders["layers"] == {1: (0.0, 0.0)} and found.layers == {1: (400.0,)}
     assert found.effects["interreflection"] == (0, 0) and "ambient" not in found.effects
+
+
+def test_light_is_followed_only_where_surfaces_see_each_other(
+    small_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A sheet, and a plate before it that faces as it does: nothing is followed. Turned by a degree, it is."""
+    followed = list[str]()
+    trace = Tracer.trace
+
+    def count(tracer: Tracer, *arguments: Any, **options: Any) -> PathSamples:
+        followed.extend([type(tracer).__name__] * isinstance(tracer, FollowingTracer))
+        return trace(tracer, *arguments, **options)
+
+    monkeypatch.setattr(Tracer, "trace", count)
+    for angle in (180, 181):
+        place = f'<scale value="20"/><rotate y="1" angle="{angle}"/><translate z="390"/>'
+        bsdf = '<bsdf type="diffuse"><spectrum name="reflectance" value="0.5"/></bsdf>'
+        plate = f'<shape type="rectangle"><transform name="to_world">{place}</transform>{bsdf}</shape>'
+        assert "interreflection" in measured(open_bench(small_scene(extra=plate)), 0).effects
+        assert bool(followed) == (angle == 181)
+
+
+def test_coarse_cells_of_what_anchors_see_are_looked_at_where_they_may_matter(bench: Bench) -> None:
+    """Where one cell, and one layer, leave little of all light, and anchors see little beyond their mean, neither is.
+    (Planted: the part of the mean, not of what is beyond it.)"""
+    runs = pilot.PilotRuns(bench, parse_patterns("dots:4", N).lighting, 1e-2, 3)
+    light, beyond = runs.switched.light, pilot_effects.norm(runs.anchored._beyond_mean())
+    cells, layers = (Approximation(f"anchor_residual {what}", 1) for what in ("cells", "layers"))
+    enough = 1e-3 * light / (20 * beyond)
+    for coarse, looked_at in (
+        ((0.9 * enough, 0.9 * enough), set()),
+        ((1.1 * enough, 0.9 * enough), {cells}),
+        ((0.9 * enough, 1.1 * enough), {cells, layers}),
+    ):
+        runs.anchored.coarse = coarse
+        vars(runs.anchored).pop("changes", None)
+        assert {part for part in runs.anchored.changes if part.name.startswith("anchor_")} == looked_at
 
 
 def test_a_scene_without_light_is_refused(small_scene: Callable[..., Path]) -> None:

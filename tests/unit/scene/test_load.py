@@ -46,6 +46,36 @@ def test_a_good_scene_loads(small_scene: Write) -> None:
     assert geometry.pixel_pitch == pytest.approx(0.01172)
 
 
+MATT = '<bsdf type="diffuse"><spectrum name="reflectance" value="0.5"/></bsdf>'
+
+BALL = f'<shape type="sphere"><point name="center" x="0" y="0" z="500"/><float name="radius" value="99"/>{MATT}</shape>'
+
+
+def plate(turned: str, bsdf: str = MATT, shape: str = "rectangle") -> str:
+    place = f'<scale x="20" y="20"/><rotate y="1" angle="{turned}"/><translate z="390"/>'
+    return f'<shape type="{shape}"><transform name="to_world">{place}</transform>{bsdf}</shape>'
+
+
+@pytest.mark.parametrize(
+    ("extra", "one_way"),
+    [
+        ("", True),
+        (plate("180") + plate("180", shape="disk"), True),
+        (plate("180.01"), False),
+        (plate("0"), False),
+        (plate("180", f'<bsdf type="twosided">{MATT}</bsdf>'), False),
+        (plate("180", f'<bsdf type="mask"><float name="opacity" value="0.5"/>{MATT}</bsdf>'), False),
+        (BALL, False),
+    ],
+)
+def test_flat_surfaces_that_turn_one_side_the_same_way_see_none_of_each_other(
+    small_scene: Write, extra: str, one_way: bool
+) -> None:
+    """Before the sheet: nothing, plates that face as it does, one turned a little, one that faces it, and what reflects
+    or passes light on both sides, or is curved. (Planted: both sides counted as one; any angle below a degree.)"""
+    assert load_scene(small_scene(extra=extra)).one_way is one_way
+
+
 def test_defines_reach_the_scene(small_scene: Write) -> None:
     import mitsuba as mi
 

@@ -4,6 +4,7 @@ Gates on the difference of two means of eight seeds are seven standard errors (t
 6e-6 each), in every one of 3 x 3 anchors and summed over the projector's brightest pixels.
 """
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,8 +12,9 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
+from mitsim.transport import missed
 from mitsim.transport.direct import AimedTracer, DirectTracer
-from mitsim.transport.missed import sharp_light
+from mitsim.transport.missed import SharpLight, sharp_light
 from tests.conftest import write_png
 from tests.physics.test_sharp_lobes import on_ball
 
@@ -120,6 +122,27 @@ def test_lobes_are_found_behind_what_lets_light_pass(
     assert gate < 0.35 * found.irradiance and abs(found.irradiance - part * expected.irradiance) < gate
     assert found.width == pytest.approx(expected.width, rel=0.1)
     assert AimedTracer(bench.setup, 3, pixels)._aims.known.any()
+
+
+def test_broad_lobes_are_told_by_connections(
+    lit: Callable[..., tuple[Bench, np.ndarray]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of lobes that are all broader than the sensor, connections tell the light that the search finds, to five standard
+    errors; one ball with a sharp lobe beside them, and it is searched. (Planted: moments of x, not of x I: hits are off
+    by 1e3. The tenth sharpest lobe, not the sharpest: the ball is overlooked.)"""
+
+    def look(extra: str, broad: float) -> SharpLight:
+        monkeypatch.setattr(missed, "_BROAD", broad)
+        return sharp_light(lit(extra)[0].setup, 5, 2**21 // N**2)
+
+    found, searched = (look(plate(metal(2e-2)), broad) for broad in (0.5, math.inf))
+    assert found.irradiance != searched.irradiance and found.rest == searched.rest
+    gate = 5 * math.hypot(found.error, searched.error)
+    assert abs(found.irradiance - searched.irradiance) < gate < 0.2 * searched.irradiance
+    assert found.hits == pytest.approx(searched.hits, rel=0.3)
+    assert 0.3 * searched.width < found.width < 1.2 * searched.width
+    beside = plate(metal(2e-2)) + ball(metal(1e-3))
+    assert look(beside, 0.5).irradiance == look(beside, math.inf).irradiance
 
 
 @LONGER

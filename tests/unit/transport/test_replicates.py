@@ -53,3 +53,20 @@ def test_light_does_not_hang_on_how_paths_are_launched(
     assert whole[0].value.size and not alike(whole[0], whole[1])
     for seed, found in zip(SEEDS, whole, strict=True):
         assert alike(found, tracer.trace(seed, 0, 3))
+
+
+@pytest.mark.parametrize("name", ["direct", "anchored"])
+def test_replicates_in_one_kernel_are_what_each_seed_traces(
+    bench: Bench, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of each seed the first sample and the first three, to the bit, in launches that end within a seed's samples.
+    (Planted: every part begins with the first seed's; samples that go on from seed to seed.)"""
+    monkeypatch.setattr(Tracer, "paths_per_launch", 5 * 64)
+    settings = Settings(depth=bench.geometry.scene_distance, effects=frozenset(effects.present(bench)), anchors=2)
+    tracer = getattr(Simulation(bench, settings), name)
+    for samples, replicates in zip((1, 3), tracer.replicates(SEEDS, 1, 3), strict=True):
+        for seed, found in zip(SEEDS, replicates, strict=True):
+            expected = tracer.trace(seed, 0, samples)
+            assert len(expected.value) and all(
+                np.array_equal(getattr(found, name), getattr(expected, name)) for name in ("value", "pixel", "row")
+            )
