@@ -16,8 +16,9 @@ ELECTRONS = np.array([[0.1, -1.5, 3e30], [np.inf, 1e-30, 2.0]], dtype=np.float32
 def test_channels_and_metadata_come_back_bit_for_bit(tmp_path: Path) -> None:
     # 2^40 and 0.1 do not fit EXR's own 32-bit header numbers.
     metadata = {"seed": 2**40, "exposure_s": 0.1, "name": 'Zürich\n"x"', "count": np.int64(3)}
-    write_frame(tmp_path / "a.exr", {"DN": DN, "electrons": ELECTRONS}, metadata)
+    stated = write_frame(tmp_path / "a.exr", {"DN": DN, "electrons": ELECTRONS}, metadata)
     channels, read = read_frame(tmp_path / "a.exr")
+    assert stated == checksum(tmp_path / "a.exr")
     assert set(channels) == {"DN", "electrons"}
     assert channels["DN"].dtype == np.uint32 and np.array_equal(channels["DN"], DN)
     assert channels["electrons"].dtype == np.float32 and np.array_equal(channels["electrons"], ELECTRONS)
