@@ -1,3 +1,4 @@
+import errno
 from pathlib import Path
 
 import numpy as np
@@ -44,14 +45,12 @@ def test_a_failed_write_leaves_the_old_frame_and_nothing_else(tmp_path: Path, mo
     write_frame(path, {"DN": DN}, {"version": 1})
     before = checksum(path)
 
-    class Broken:
-        def __init__(self, *_: object) -> None: ...
+    def fail(part: Path, _: object) -> None:
+        with open(part, "wb") as file:
+            file.write(b"half a fra")
+        raise OSError(errno.ENOSPC, "No space left on device")
 
-        def write(self, name: str) -> None:
-            Path(name).write_bytes(b"half a fra")
-            raise RuntimeError("No space left on device")
-
-    monkeypatch.setattr("mitsim.core.exr.OpenEXR.File", Broken)
+    monkeypatch.setattr(Path, "write_bytes", fail)
     with pytest.raises(MitsimError, match=r"a\.exr: cannot be written \(No space left"):
         write_frame(path, {"DN": DN + 1}, {"version": 2})
     assert checksum(path) == before
