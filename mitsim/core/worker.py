@@ -147,7 +147,7 @@ def held_back() -> Iterator[None]:
 
 
 @contextmanager
-def uncollected() -> Iterator[None]:
+def pause_collector() -> Iterator[None]:
     """Python's collector waits while modules are imported: it would go through what they make again and again, for 0.06
     to 0.1 s of a capture. What a worker has by then, it goes past from there on."""
     collecting, known = gc.isenabled(), len(sys.modules)

@@ -446,10 +446,10 @@ def test_a_fault_without_a_place_for_its_traceback(
 
 COLLECTED = """
 import gc
-from mitsim.core.worker import enter_worker, uncollected
+from mitsim.core.worker import enter_worker, pause_collector
 enter_worker()
 for module in ("colorsys", "colorsys", "sys"):  # the first alone is loaded here
-    with uncollected():
+    with pause_collector():
         assert not gc.isenabled()
         __import__(module)
     assert gc.isenabled()
