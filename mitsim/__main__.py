@@ -2,7 +2,7 @@
 
 import os
 
-from mitsim.core.worker import end_stopped, end_uncaught, end_with, enter_worker
+from mitsim.core.worker import end_stopped, end_uncaught, end_with, enter_worker, pause_collector
 
 
 def main() -> None:
@@ -11,8 +11,8 @@ def main() -> None:
         enter_worker()
         # Pydantic would read the entry points of all installed packages, 20 ms, for plugins that nothing here uses.
         os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")
-        from mitsim.cli import run
-
+        with pause_collector():
+            from mitsim.cli import run
         run()
     except SystemExit as ended:
         end_with(ended.code)

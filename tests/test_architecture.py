@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tokenize
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
@@ -210,6 +210,51 @@ def test_what_checks_a_request_imports_no_numpy() -> None:
     rooms = ", ".join(CHECKS_A_REQUEST)
     program = f"import sys, {rooms}; assert 'numpy' not in sys.modules"
     subprocess.run([sys.executable, "-c", program], check=True)
+
+
+SLOW_TO_IMPORT = {
+    "scipy.special",
+    "scipy.fft",
+    "scipy.linalg",
+    "scipy.ndimage",
+    "matplotlib",
+    "skimage",
+    "h5py",
+    "rich",
+}
+"""What a capture can do without: 0.02 to 0.5 s each. scipy.sparse, 0.05 s, holds its light."""
+
+
+def test_what_a_capture_is_made_of_is_soon_imported() -> None:
+    """(Planted: Fresnel's integrals imported from scipy.special.)"""
+    rooms = "mitsim.cli, mitsim.api.bench, mitsim.acquire.spectral, mitsim.acquire.capture, mitsim.transport.plugins"
+    program = f"import sys, {rooms}; assert not {SLOW_TO_IMPORT!r} & set(sys.modules), sys.modules.keys()"
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+@pytest.mark.slow
+def test_a_capture_imports_nothing_slow(small_scene: Callable[..., Path], tmp_path: Path) -> None:
+    """Nor where it is used. (Planted: the same inside the function that uses them.)"""
+    command = (
+        "capture",
+        small_scene(),
+        "--patterns",
+        "dots:2",
+        "--accuracy",
+        "0.01",
+        "-o",
+        tmp_path / "run",
+        "--effects=+diffraction",
+    )
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "mitsim", *map(str, command)], capture_output=True, text=True
+    )
+    assert done.returncode in (0, 1), done.stderr[-1000:]
+    names = [name.split(".") for name in re.findall(r"\| +([\w.]+)$", done.stderr, re.MULTILINE)]
+    imported = {
+        ".".join(name[:parts]) for name in names for parts in (1, 2)
+    }  # packages that are loaded late have no line
+    assert "mitsim.optics" in imported and not SLOW_TO_IMPORT & imported
 
 
 WITHOUT_NUMPY = (

@@ -15,6 +15,7 @@ from mitsim.core.configuration import DEFAULT_CAMERA, load_model, locate
 from mitsim.core.environment import DEFAULT_VARIANT, deciding_versions, load_variant
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.files import plain
+from mitsim.core.worker import pause_collector
 from mitsim.devices.patterns import read_name
 from mitsim.scene.outline import Outline, SceneFiles, lit_side
 
@@ -490,6 +491,7 @@ def _tune(loaded: LoadedScene, projector: ProjectorModel) -> None:
         tune(loaded.scene, projector.effective_wavelength_nm)
 
 
+@pause_collector()
 def _load(variant: str, path: Path, defines: Mapping[str, str], **options: bool) -> LoadedScene:
     """A scene in a variant that is set from then on, as :func:`mitsim.scene.load.load_scene` takes it."""
     mitsuba = load_variant(variant)

@@ -21,6 +21,7 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import check_plain
 from mitsim.core.job import Job
 from mitsim.core.seeds import check_root
+from mitsim.core.worker import pause_collector
 from mitsim.devices.patterns import pattern_names, read_name
 from mitsim.devices.sensor import EXPOSURE_FRACTION, EXPOSURE_S, SensorModel
 
@@ -77,7 +78,7 @@ class Task:
     @contextmanager
     def importing(self) -> Iterator[None]:
         """The stage "imports" of the job's clock."""
-        with self.job.clock.stage("imports"):
+        with self.job.clock.stage("imports"), pause_collector():
             yield
 
 

@@ -48,8 +48,8 @@ Metadata = Mapping[str, Value]
 _PREFIX = "mitsim."
 
 
-def write_frame(path: Path | str, channels: Channels, metadata: Metadata) -> None:
-    """Write a frame, all or nothing: the file appears under its name only when complete.
+def write_frame(path: Path | str, channels: Channels, metadata: Metadata) -> str:
+    """Write a frame, all or nothing: the file appears under its name only when complete. Returns its :func:`checksum`.
 
     Parameters
     ----------
@@ -72,13 +72,16 @@ def write_frame(path: Path | str, channels: Channels, metadata: Metadata) -> Non
     header: dict[str, Any] = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}
     header.update({_PREFIX + key: json.dumps(_scalar(value)) for key, value in metadata.items()})
     pixels = {name: np.ascontiguousarray(values) for name, values in channels.items()}
+    image = io.BytesIO()
     with whole_file(path) as part:
-        # Opened here first: OpenEXR reports a folder it cannot write to on stderr, past any caller.
-        part.touch()
+        # In memory first: to have OpenEXR write the file, and to read that for its checksum, takes twice as long, and
+        # it reports a folder that it cannot write to on stderr, past any caller.
         try:
-            OpenEXR.File(header, pixels).write(str(part))
+            OpenEXR.File(header, pixels).write(image)
         except RuntimeError as error:
             raise OSError(reason_of(error)) from error
+        part.write_bytes(image.getbuffer())
+    return hashlib.sha256(image.getbuffer()).hexdigest()
 
 
 def read_frame(path: Path | str) -> tuple[dict[str, Channel], dict[str, Value]]:

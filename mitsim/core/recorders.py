@@ -161,8 +161,7 @@ class RunFolder(Recorder):
         name, channels, metadata
             as for :meth:`Recorder.write`.
         """
-        write_frame(self.folder / name, channels, metadata)
-        self._note(name, checksum(self.folder / name))
+        self._note(name, write_frame(self.folder / name, channels, metadata))
 
     def _note(self, name: str, value: str) -> None:
         with self._lock:

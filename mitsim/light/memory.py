@@ -35,9 +35,9 @@ meanwhile (74 each); and each cell's part of it, its place, row and light, sorte
 balls)."""
 _TERM_BYTES = 3 * 16.0
 """A pixel and cell of a term of a mask of many: both sides in the shadow, stacked, and picked for a frame."""
-_EXPOSED = 6
+_EXPOSED = 7
 """Frames in double precision that each exposed frame takes as much as: its light, electrons, numbers and squares, and
-electrons and numbers of the chunk before, which is written meanwhile."""
+electrons, numbers and encoded file of the chunk before, which is written meanwhile."""
 _EXPOSING_S, _WRITING_S = 4e-8, 4e-9
 """A pixel: 84 ns of processor time on two, of which a quarter writes files while the next frames are exposed; and what
 there is left to wait for. Measured of 49 frames of 2048 x 2048."""

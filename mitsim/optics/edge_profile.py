@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtr
+import scipy
 
 from mitsim.core.arrays import ByValue, FloatArray
 
@@ -188,7 +188,7 @@ def blurred_step(x: FloatArray, half: FloatArray | float, other: float, blur: fl
     wide = np.asarray(half) > _POINTLIKE * blur
     width = np.where(wide, half, 1.0)
     means = (_once(x + width, blur) - _once(x - width, blur)) / (2 * width)
-    point = ndtr(x / blur) if blur else np.asarray(x >= 0, dtype=np.float64)
+    point = scipy.special.ndtr(x / blur) if blur else np.asarray(x >= 0, dtype=np.float64)
     return np.asarray(np.where(wide, means, point))
 
 
@@ -201,7 +201,7 @@ def _once(x: FloatArray, blur: float) -> FloatArray:
     if not blur:
         return np.asarray(np.maximum(x, 0))
     z = np.maximum(x / blur, -2 * _BEYOND)  # both parts are 0 before
-    return np.asarray(blur * (z * ndtr(z) + _density(z)))
+    return np.asarray(blur * (z * scipy.special.ndtr(z) + _density(z)))
 
 
 def _twice(x: FloatArray, blur: float) -> FloatArray:
@@ -209,7 +209,7 @@ def _twice(x: FloatArray, blur: float) -> FloatArray:
     if not blur:
         return np.asarray(np.square(np.maximum(x, 0)) / 2)
     z = np.maximum(x / blur, -2 * _BEYOND)
-    return np.asarray(blur**2 / 2 * ((np.square(z) + 1) * ndtr(z) + z * _density(z)))
+    return np.asarray(blur**2 / 2 * ((np.square(z) + 1) * scipy.special.ndtr(z) + z * _density(z)))
 
 
 def _cubic(nodes: FloatArray, places: FloatArray) -> FloatArray:

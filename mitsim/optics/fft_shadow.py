@@ -23,7 +23,7 @@ from typing import cast
 
 import numpy as np
 import numpy.typing as npt
-from scipy import fft
+import scipy
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
@@ -256,13 +256,10 @@ def _waves(shadow: ShadowGeometry, spectrum: Spectrum, step: float, count: int) 
 
 def _turn_light(values: FloatArray, count: int, flaws: Flaws) -> FloatArray:
     """(count, count) cells of light (n, n) that is turned about its centre, between its cells by cubic splines."""
-    # Imported here: most masks are not turned.
-    from scipy import ndimage
-
     middles = np.asarray(np.arange(count) + 0.5 - count / 2)
     row, column = flaws.turned_back(middles[:, None], middles)
     places = np.stack([row, column]) + (len(values) - 1) / 2
-    return np.asarray(ndimage.map_coordinates(values, places, order=3, mode="nearest"))
+    return np.asarray(scipy.ndimage.map_coordinates(values, places, order=3, mode="nearest"))
 
 
 def _fields(
@@ -370,10 +367,10 @@ class Correlation:
         self._phases = sides[0].phases, sides[1].phases
         self._spread = [side.weights for side in sides]
         reach = max(len(side.weights) // side.phases for side in sides)
-        self._size = [fft.next_fast_len(side.pixels + reach - 1, real=True) for side in sides]
+        self._size = [scipy.fft.next_fast_len(side.pixels + reach - 1, real=True) for side in sides]
         along = [size * phases for size, phases in zip(self._size, self._phases, strict=True)]
         seen = _part(_part(_mask_values(shadow), sides[0].first, along[0]).T, sides[1].first, along[1]).T
-        self._spectra = fft.rfft2(fill_factor * self._by_phase(seen))
+        self._spectra = scipy.fft.rfft2(fill_factor * self._by_phase(seen))
 
     def image(self, light: FloatArray, rows: npt.ArrayLike, columns: npt.ArrayLike) -> FloatArray:
         """(m, m') irradiance.
@@ -387,9 +384,9 @@ class Correlation:
         """
         left, right = self._spread[0][:, np.asarray(rows)], self._spread[1][:, np.asarray(columns)]
         by_phase = self._by_phase(left @ light @ right.T)
-        seen = fft.fft(fft.rfft(by_phase, self._size[1]), self._size[0], axis=-2)
+        seen = scipy.fft.fft(scipy.fft.rfft(by_phase, self._size[1]), self._size[0], axis=-2)
         total = np.einsum("ijkl,ijkl->kl", self._spectra, np.conjugate(seen, out=seen))
-        return np.asarray(fft.irfft2(total, self._size)[: self.shape[0], : self.shape[1]])
+        return np.asarray(scipy.fft.irfft2(total, self._size)[: self.shape[0], : self.shape[1]])
 
     def _by_phase(self, cells: FloatArray) -> FloatArray:
         """(q, q', m, m') every q-th and q'-th of raster ``cells`` (q m, q' m')."""

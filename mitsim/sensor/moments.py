@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from scipy import special
+import scipy
 
 from mitsim.core.arrays import FloatArray
 from mitsim.devices.sensor import SensorModel
@@ -80,14 +80,15 @@ def _tails(count: int, mean: FloatArray) -> tuple[FloatArray, FloatArray]:
     beyond 4.5 deviations: 3e-9 instead of 2.9e-7 at 1e12.
     """
     if count < 300_000:
-        return special.pdtrc(count - 1, mean), special.pdtr(count - 1, mean)
+        return scipy.special.pdtrc(count - 1, mean), scipy.special.pdtr(count - 1, mean)
     apart = (mean - count) / count
     with np.errstate(divide="ignore"):
         eta = np.sign(apart) * np.sqrt(2 * (apart - np.log1p(apart)))
     small = np.abs(apart) < 1e-4
     first = np.where(small, -1 / 3 + apart / 12, 1 / np.where(small, 1, apart) - 1 / np.where(small, 1, eta))
     shift = np.exp(-count * np.square(eta) / 2) / math.sqrt(2 * math.pi * count) * first
-    above, below = special.ndtr(eta * math.sqrt(count)) - shift, special.ndtr(-eta * math.sqrt(count)) + shift
+    apart = eta * math.sqrt(count)
+    above, below = scipy.special.ndtr(apart) - shift, scipy.special.ndtr(-apart) + shift
     return np.maximum(above, 0.0), np.maximum(below, 0.0)
 
 
@@ -322,7 +323,7 @@ def _sum_about_mean(expected: FloatArray, model: SensorModel) -> tuple[FloatArra
     first, last = np.floor(nodes - reach).clip(0).astype(np.intp), np.ceil(nodes + reach).astype(np.intp)
     counts = np.arange(first.min(), last.max() + 1, dtype=np.float64)
     levels, variances = _read_out(counts, model)
-    logarithms = special.gammaln(counts + 1)
+    logarithms = scipy.special.gammaln(counts + 1)
     mean, variance = np.empty_like(nodes), np.empty_like(nodes)
     for index, node in enumerate(nodes):
         near = slice(first[index] - first.min(), last[index] - first.min() + 1)
@@ -399,7 +400,7 @@ def _cut_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple
     mean, deviation = mean * (narrower / deviation), narrower
     mean = np.clip(mean, -40 * deviation, largest + 40 * deviation)
     low, high = -mean / deviation, (largest - mean) / deviation
-    under, over = special.ndtr(low), special.ndtr(-high)
+    under, over = scipy.special.ndtr(low), scipy.special.ndtr(-high)
     slope_low, slope_high = (np.exp(-np.square(x) / 2) / math.sqrt(2 * math.pi) for x in (low, high))
     first = low * under + high * over + slope_low - slope_high
     second = low**2 * under + high**2 * over + (1 - under - over) + low * slope_low - high * slope_high
@@ -416,8 +417,8 @@ def _code_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tupl
     scale = np.where(deviation > 0, deviation, 1)
     first, second = np.zeros_like(mean), np.zeros_like(mean)
     for step in range(1, 18):
-        up = special.ndtr((mean - (nearest + step - 0.5)) / scale) * (nearest + step <= largest)
-        down = special.ndtr(((nearest - step + 0.5) - mean) / scale) * (nearest - step >= 0)
+        up = scipy.special.ndtr((mean - (nearest + step - 0.5)) / scale) * (nearest + step <= largest)
+        down = scipy.special.ndtr(((nearest - step + 0.5) - mean) / scale) * (nearest - step >= 0)
         first += up - down
         second += (2 * step - 1) * (up + down)
     # Next to no noise resolves a tie as `quantise` does, to the even code.
@@ -443,6 +444,6 @@ def saturated_pixels(digital: Digital, expected_electrons: FloatArray, exposure_
     ends = math.inf if model.largest_dn is None else float(model.largest_dn)
     if np.isfinite(well) and brightest >= np.floor(model.full_well_dn):
         peak = most_gathered(expected_electrons, exposure_s, model)
-        if special.pdtrc(np.ceil(well) - 1, peak) * digital.size >= _CAN_SATURATE:
+        if scipy.special.pdtrc(np.ceil(well) - 1, peak) * digital.size >= _CAN_SATURATE:
             ends = min(ends, float(np.floor(model.full_well_dn)))
     return int(np.count_nonzero(digital >= ends)) if brightest >= ends else 0

@@ -8,13 +8,15 @@ frequency leaves on either side is 3e-4, measured by halving both).
 
 import numpy as np
 import pytest
+from scipy.fft import next_fast_len
 from scipy.integrate import quad
+from scipy.special import fresnel
 
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Spectrum
 from mitsim.optics import diffraction
-from mitsim.optics.diffraction import EdgeWaves, grid_step, wave_profiles
+from mitsim.optics.diffraction import EdgeWaves, edge_wave, fast_length, grid_step, wave_profiles
 from mitsim.optics.edge_profile import Antiderivative, Steps
 from mitsim.optics.shadow import Directions, ShadowGeometry
 from mitsim.optics.terms import shadow_terms
@@ -194,6 +196,18 @@ def test_a_half_plane_has_a_quarter_at_its_geometric_edge_and_1_37_beside_it() -
     unit = (LAMBDA_NM * 1e-6 * 2.0 / 2) ** 0.5
     assert irradiance.max() == pytest.approx(1.3704, abs=1e-4)
     assert irradiance.argmax() * STEP == pytest.approx(1.2172 * unit, abs=STEP)
+
+
+def test_the_wave_from_an_edge_is_fresnels_integrals() -> None:
+    """To rounding, from where the pole makes nearly all of it to thousands of turns away. (Planted: 9 nodes; a phase
+    whose whole turns stay.)"""
+    x = np.concatenate([np.geomspace(1e-9, 1, 500), np.linspace(1, 10, 5000), np.linspace(10, 2000, 5000)])
+    sine, cosine = fresnel(x)
+    assert np.abs(edge_wave(x) - ((0.5 - 0.5j) * (cosine + 1j * sine) - 0.5)).max() < 5e-16
+
+
+def test_lengths_of_transforms_are_scipys() -> None:
+    assert [fast_length(n) for n in (*range(1, 2000), 44063)] == [next_fast_len(n) for n in (*range(1, 2000), 44063)]
 
 
 @pytest.mark.parametrize("s", [0.0, 0.021, 0.03, 0.055, -0.2])

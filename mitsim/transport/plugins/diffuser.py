@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import mitsuba as mi
 import numpy as np
-from scipy import fft
+import scipy
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
@@ -73,15 +73,15 @@ def random_relief(side_mm: float, correlation_mm: float, slope: float, seed: int
             "correlation above 0 and below a quarter of the side, and a slope above 0 and up to 0.5"
         )
     # Twice as wide as it is used, so that it does not repeat.
-    cells = fft.next_fast_len(int(np.ceil(2 * side_mm / correlation_mm * _VERTICES)))
+    cells = scipy.fft.next_fast_len(int(np.ceil(2 * side_mm / correlation_mm * _VERTICES)))
     step = 2 * side_mm / cells
     wave = 2 * np.pi * np.fft.fftfreq(cells, step)
     wave_x, wave_y = wave[:, None], wave[None, :]
-    noise = fft.fft2(stream(seed, "diffuser").standard_normal((cells, cells)))
+    noise = scipy.fft.fft2(stream(seed, "diffuser").standard_normal((cells, cells)))
     spectrum = noise * np.exp(-(correlation_mm**2) * (wave_x**2 + wave_y**2) / 4)
     used = slice(0, cells // 2 + 1)
     height, slope_x, slope_y = (
-        np.asarray(fft.ifft2(spectrum * factor).real[used, used]) for factor in (1, 1j * wave_x, 1j * wave_y)
+        np.asarray(scipy.fft.ifft2(spectrum * factor).real[used, used]) for factor in (1, 1j * wave_x, 1j * wave_y)
     )
     gain = slope / float(np.sqrt((np.square(slope_x).mean() + np.square(slope_y).mean()) / 2))
     return Relief((cells // 2) * step, height * gain, slope_x * gain, slope_y * gain)

@@ -442,3 +442,28 @@ def test_a_fault_without_a_place_for_its_traceback(
         worker.end_uncaught(ValueError("x" * 1000))
     (line,) = capsys.readouterr().err.splitlines()
     assert ended.value.code == 2 and "its traceback could not be kept" in line and len(line) < 500
+
+
+COLLECTED = """
+import gc
+from mitsim.core.worker import enter_worker, pause_collector
+enter_worker()
+for module in ("colorsys", "colorsys", "sys"):  # the first alone is loaded here
+    with pause_collector():
+        assert not gc.isenabled()
+        __import__(module)
+    assert gc.isenabled()
+    print(gc.get_freeze_count() > 0)
+    gc.unfreeze()
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="one process there")
+def test_the_collector_waits_while_modules_are_imported() -> None:
+    """And goes past what they made from then on, in a worker, where any came. (Planted: always frozen; not at all; a
+    collector that stays off.)"""
+    done = subprocess.run([sys.executable, "-c", COLLECTED], capture_output=True, text=True)
+    assert (done.returncode, done.stdout.split()) == (0, ["True", "False", "False"]), done.stderr
+    alone = COLLECTED.replace("enter_worker()\n", "")
+    done = subprocess.run([sys.executable, "-c", alone], capture_output=True, text=True)
+    assert (done.returncode, done.stdout.split()) == (0, ["False"] * 3), done.stderr

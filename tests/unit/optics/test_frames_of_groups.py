@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 from scipy import sparse
+from scipy.special import stdtrit
 
-from mitsim.optics.forming import AccumulatedLight, bound_of, probe_vectors, shares_of_bound
+from mitsim.optics.forming import AccumulatedLight, bound_of, probe_vectors, shares_of_bound, student_quantile
 from mitsim.optics.frames import ClassFrames, monte_carlo_bound, monte_carlo_error
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions
@@ -109,6 +110,13 @@ def test_lights_share_the_square_of_the_bound() -> None:
     assert shares[1] > 0.7 * shares.sum() > 0.7 * parts.sum() and (shares >= 0).all()
     even = np.ones((3, 8)) * [[1], [2], [3]]
     assert shares_of_bound(even) == pytest.approx([8, 16, 24])
+
+
+@pytest.mark.parametrize("freedom", [1, 2, 3, 4, 5, 30, 199])
+def test_students_quantile_is_scipys(freedom: int) -> None:
+    """(Planted: a sum that ends a term early.)"""
+    for chance in (0.5, 0.6, 0.95, 0.999):
+        assert student_quantile(freedom, chance) == pytest.approx(stdtrit(freedom, chance), rel=1e-12, abs=1e-15)
 
 
 def test_one_group_has_no_variance_to_tell() -> None:
