@@ -35,7 +35,7 @@ from mitsim.reconstruct.captured_session import calibrate_frames
 from mitsim.reconstruct.estimate_factors import Estimate
 from mitsim.reconstruct.factors import Factors, load_calibration
 
-pytestmark = pytest.mark.usefixtures("kept_plans")
+pytestmark = pytest.mark.usefixtures("kept_plans", "other_kernels")
 N = 16
 CASES = [("separable", "pair", 16), ("separable", "uniform", 16), ("flatcam", "pair", 16)]
 CASES += [pytest.param("separable", "pair", 13, marks=pytest.mark.slow)]
@@ -293,8 +293,9 @@ def test_frames_that_are_written_give_the_same_factors_bit_for_bit(
 
 # ---- interrupted and resumed -----------------------------------------------------------------------------------------
 
-SECONDS = {"seconds", "predicted", "predicted_seconds"}
-"""Of a result, what differs from session to session: time, taken and predicted with what was taken before."""
+SECONDS = {"seconds", "kernels", "predicted", "predicted_seconds"}
+"""Of a result, what differs from session to session: time, taken and predicted with what was taken before, and kernels
+that an earlier one has left to be compiled."""
 PARTS = ["light.part.npz", "stripes.part.npz"]
 
 
