@@ -191,7 +191,7 @@ def kept_plans(variant: str) -> Iterator[None]:
 
 @pytest.fixture
 def other_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each time it is asked, a clock says another number of compiled kernels, as where Dr.Jit's cache is empty at first.
+    """A clock says another number of compiled kernels each time, as where Dr.Jit's cache is empty at first.
 
     For tests that compare what is said of the same work done twice: of a full cache it is the same by chance."""
     from mitsim.core.job import Clock
