@@ -4,6 +4,7 @@ Everything here uses the variant ``llvm_ad_mono``. Another variant is tested in 
 variant must not be used after switching.
 """
 
+import itertools
 import os
 from collections.abc import Callable, Iterator
 from functools import cache
@@ -186,6 +187,17 @@ def kept_plans(variant: str) -> Iterator[None]:
     """For modules of which no test is about planning: see :mod:`tests.kept_plans`."""
     with plans_kept():
         yield
+
+
+@pytest.fixture
+def other_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A clock says another number of compiled kernels each time, as where Dr.Jit's cache is empty at first.
+
+    For tests that compare what is said of the same work done twice: of a full cache it is the same by chance."""
+    from mitsim.core.job import Clock
+
+    numbers = itertools.count(1)
+    monkeypatch.setattr(Clock, "kernels", lambda _: {"number": next(numbers), "seconds": 0.5})
 
 
 @pytest.fixture(scope="module")

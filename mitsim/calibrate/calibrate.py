@@ -181,6 +181,7 @@ def _by_line(bench: SpectralBench, request: SessionRequest, task: Task) -> dict[
         return dict(zip(names, _run_sessions(sessions, request, task, places), strict=True))
 
 
+@single_threaded_blas()
 def _run_sessions(
     lines: Sequence[Session],
     request: SessionRequest,

@@ -202,6 +202,7 @@ def _response(signs: FloatArray, side: Side, rate: FloatArray, noise: float, cen
     return Shown(signs if across else even, even if across else signs, centre_frame(rate) if centre else rate, noise)
 
 
+@single_threaded_blas()
 def modelled_factors(
     camera: ModelledCamera, fitted: Fitted, frames: int, manifest: CalibrationManifest, job: Job
 ) -> Factors:

@@ -9,36 +9,62 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from mitsim.core.worker import workers
-
-if TYPE_CHECKING:
-    from threadpoolctl import ThreadpoolController
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
+_counting = threading.Lock()
+_inside_blas, _before = 0, list[int]()
+
+
 @contextmanager
 def single_threaded_blas() -> Iterator[None]:
-    """Keep BLAS to one thread inside the context."""
-    with _controller().limit(limits=1, user_api="blas"):
+    """Keep BLAS to one thread inside the context.
+
+    Their number is the process's, and contexts of several threads overlap by chance. So what was found is put back when
+    the last of all is left: at the first one's end BLAS had its threads again while another thread worked.
+    """
+    global _inside_blas, _before
+    with _counting:
+        if _inside_blas == 0:
+            _before = [library.num_threads for library in _libraries()]
+        _inside_blas += 1
+        _set_threads([1] * len(_before))
+    try:
         yield
+    finally:
+        with _counting:
+            _inside_blas -= 1
+            if _inside_blas == 0:
+                _set_threads(_before)
+
+
+def _set_threads(numbers: Sequence[int]) -> None:
+    """Let each library of BLAS have so many threads."""
+    for library, number in zip(_libraries(), numbers, strict=True):
+        # Since 3.8 threadpoolctl heeds one thread's wishes at a time, and ignores those of others in silence.
+        forget = getattr(library, "clear_controlling_thread", lambda **_: None)
+        forget(force=True)
+        library.set_num_threads(number)
+        forget(force=True)
 
 
 @cache
-def _controller() -> ThreadpoolController:
-    """The thread pools of this process; looking for them takes a millisecond, so once."""
+def _libraries() -> tuple[Any, ...]:
+    """Libraries of BLAS in this process; looking for them takes a millisecond, so once."""
     # Imported here: threadpoolctl sets an environment variable when it is imported, and importing mitsim sets none.
     from threadpoolctl import ThreadpoolController
 
-    return ThreadpoolController()
+    return tuple(ThreadpoolController().select(user_api="blas").lib_controllers)
 
 
 def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:

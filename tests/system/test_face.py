@@ -126,10 +126,11 @@ def test_what_a_capture_holds(shots: ms.Capture, bench: ms.Bench) -> None:
     assert (summary["frames"], summary["shape"], summary["seed"], summary["output"]) == (9, (64, 64), SEED, None)
 
 
+@pytest.mark.usefixtures("other_kernels")
 def test_a_saved_capture_is_that_of_the_command_line(
     call: Callable[..., Any], shots: ms.Capture, bench: ms.Bench, tmp_path: Path
 ) -> None:
-    """The same files with the same pixels, and manifests that differ in seconds alone."""
+    """The same files with the same pixels, and manifests that differ in seconds and compiled kernels alone."""
     shots.save(tmp_path / "saved")
     options = "--patterns", "dots:3", "--accuracy", ACCURACY, "--seed", SEED, "-D", f"albedo={ALBEDO}"
     reported = call("capture", bench.loaded.path, *options, "-o", tmp_path / "told", "--json").payload
@@ -147,19 +148,19 @@ def test_a_saved_capture_is_that_of_the_command_line(
     taken = reported.pop("memory_bytes")
     assert 0 <= taken < reported["predicted_memory_bytes"]
     summary = {**shots.summary(), "shape": [64, 64], "warnings": [], "output": reported["output"]}
-    timed = {"seconds": 0, "predicted_seconds": 0, "colour": untimed(tmp_path / "told")["plan"]["colour"]}
+    timed = {"seconds": 0, "kernels": 0, "predicted_seconds": 0, "colour": untimed(tmp_path / "told")["plan"]["colour"]}
     assert {**summary, **timed} == {**reported, **timed}
 
 
 def untimed(folder: Path) -> dict[str, Any]:
-    """The manifest without what the clock says: stages, and the plan's predictions from measured paces."""
+    """The manifest without what the clock says: stages, kernels, and the plan's predictions from measured paces."""
     manifest = json.loads((folder / "manifest.json").read_text())
     plan = manifest["plan"]
     rows = [{**row, "seconds": 0} for row in plan["effects"]]
     candidates = [{**each, "seconds": 0} for each in plan["colour"]["candidates"]]
     own = {"effects": rows, "colour": {**plan["colour"], "candidates": candidates}}
     untimed_plan = {**plan, **own, "predicted_seconds": 0, "predicted": {}}
-    return {**manifest, "seconds": {}, "plan": untimed_plan}
+    return {**manifest, "seconds": {}, "kernels": {}, "plan": untimed_plan}
 
 
 def assert_equal_files(one: Path, other: Path) -> None:

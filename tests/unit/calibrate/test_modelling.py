@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import mitsim as ms
 from mitsim.calibrate.board_session import Session
@@ -48,8 +49,19 @@ def test_a_mask_that_is_off_is_found_in_frames_that_were_traced(bench: Any, kept
         assert getattr(fitted.placement, name) == pytest.approx(getattr(truth, name), abs=allowed), name
 
 
-def test_a_rough_model_is_flagged(bench: Any, kept_plans: None) -> None:
-    factors = ms.calibrate_model(bench, Modelling("geometric", 8, FIT, 5e-3))
+def test_a_rough_model_is_flagged(bench: Any, kept_plans: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And what is said of it is added up by one thread of BLAS: `predicted_phi_error` differed in its last digit.
+    (Planted: so it does.)"""
+    asked: list[set[int]] = []
+
+    def look(_: object) -> float:
+        asked.append({pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"})
+        return 1.0
+
+    monkeypatch.setattr("mitsim.calibrate.model.squared_condition", look)
+    with threadpool_limits(2):
+        factors = ms.calibrate_model(bench, Modelling("geometric", 8, FIT, 5e-3))
+    assert asked == [{1}, {1}]
     assert not factors.ok and "The geometric model does not explain the responses" in factors.warnings[0]
     assert factors.manifest.noise is not None and factors.manifest.noise.unexplained > 0.01
     assert factors.manifest.modelled is not None and factors.manifest.modelled.frames == 8

@@ -1,12 +1,13 @@
-"""Work that goes on behind other work: what is waited for, what is raised, and what an interruption leaves."""
+"""Work in threads: what is waited for, what is raised, what an interruption leaves, and threads of BLAS meanwhile."""
 
 import threading
 import time
 
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.parallel import Behind, in_threads
+from mitsim.core.parallel import Behind, in_threads, single_threaded_blas
 
 
 def test_two_lots_are_held_and_no_more() -> None:
@@ -56,6 +57,31 @@ def test_an_interruption_leaves_begun_items_finished_and_others_undone() -> None
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert sorted(begun) == sorted(finished) and len(finished) < 500
+
+
+def test_blas_has_one_thread_until_the_last_context_is_left() -> None:
+    """Contexts of two threads overlap by chance, and how many threads of BLAS add up shows in last bits. (Planted: each
+    puts back what it found; what is put back by another thread ignored, and one thread ever after.)"""
+
+    def threads_of_blas() -> set[int]:
+        return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+    entered, left, inside = threading.Event(), threading.Event(), []
+
+    def second() -> None:
+        with single_threaded_blas():
+            entered.set()
+            left.wait(10)
+            inside.append(threads_of_blas())
+
+    with threadpool_limits(2):
+        other = threading.Thread(target=second)
+        with single_threaded_blas():
+            other.start()
+            entered.wait(10)
+        left.set()
+        other.join()
+        assert inside == [{1}] and threads_of_blas() == {2}
 
 
 def test_items_of_items_do_not_wait_for_each_other() -> None:
