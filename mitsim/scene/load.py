@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import mitsuba as mi
@@ -62,6 +63,11 @@ class LoadedScene:
         if self.grid is None:
             raise MitsimError(f"{self.path}: the scene was opened without its projector")
         return self.grid
+
+    @cached_property
+    def smoothed(self) -> bool:
+        """Whether a surface has shading normals that are not its own; what an instance hides may have."""
+        return any(_is_smoothed(shape) for shape in self.scene.shapes())
 
 
 @keep_scenes()
@@ -148,6 +154,26 @@ def _mirrors_and_gloss(scene: mi.Scene, unfit: Unfit) -> tuple[bool, bool]:
     mirrors = any(own & mirror for own in flags) or unfit.instances is not None
     hidden = any(shape.class_name() == "Instance" for shape in scene.shapes())
     return mirrors, hidden or any(mi.has_flag(own, mi.BSDFFlags.Glossy) for own in flags)
+
+
+_SMOOTH_BY_CLASS = ("Instance", "SDFGrid")
+"""Mitsuba's classes of shapes whose shading normals are, or may be, interpolated, and which are no meshes."""
+_PARALLEL = 0.9999
+"""Cosine between the normals of a face and of its vertices above which the face is flat to rounding: half a degree."""
+
+
+def _is_smoothed(shape: mi.Shape) -> bool:
+    """Whether a ``shape`` has shading normals that are not its own."""
+    if not shape.is_mesh() or not shape.has_vertex_normals():
+        return shape.class_name() in _SMOOTH_BY_CLASS
+    held = mi.traverse(shape)
+    faces, positions, normals = (
+        np.array(held[name]).reshape(-1, 3) for name in ("faces", "vertex_positions", "vertex_normals")
+    )
+    corners = positions[faces].astype(np.float64)
+    own = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    cosines = np.abs((normals[faces] * own[:, None]).sum(axis=2))
+    return bool((cosines < _PARALLEL * np.linalg.norm(own, axis=1)[:, None]).any())
 
 
 # -------- Values of a loaded scene's bitmaps and meshes
