@@ -34,7 +34,16 @@ PassTracer = DirectTracer | IndirectTracer | FromCamera
 
 
 class Tracers(Grids):
-    """What is traced of a bench with settings; its parameters are those of :class:`mitsim.light.grids.Grids`."""
+    """What is traced of a bench with settings; its parameters are those of :class:`mitsim.light.grids.Grids`.
+
+    Attributes
+    ----------
+    divides
+        whether light that shading normals make heavy is divided between both sides, as it is in a run; of the camera's
+        part a short look would meet a few paths, or none.
+    """
+
+    divides = True
 
     @cached_property
     def setup(self) -> OpticalSetup:
@@ -127,7 +136,7 @@ class Tracers(Grids):
     @property
     def _steep(self) -> bool:
         """Whether shading normals may make light of the projector's side heavy."""
-        return self.physics.interreflection and self.bench.loaded.smoothed
+        return self.divides and self.physics.interreflection and self.bench.loaded.smoothed
 
     def _points(self, anchors: int, spread: bool = False) -> SensorPoints:
         return SensorPoints(self.physics.geometry.half_width, anchors, spread, self.settings.depth)

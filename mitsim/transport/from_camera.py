@@ -53,7 +53,7 @@ from mitsim.transport.transmission import refracted_way
 
 _SELDOM = 0.125
 """Chance that a path goes on whose light its last turn before the sensor leaves to the projector's side: what earlier
-turns leave to this side is some 0.1 % of indirect light."""
+turns leave to this side is some 0.02 % of indirect light."""
 _MARGIN = 1e-4
 """Part of a cell that paths keep clear of its edges: 2e-7 of tan-angle, above float32's rounding of 3e-8."""
 

@@ -40,7 +40,7 @@ _SHARP = 1.0
 Three times a matt surface's 0.32, so that none of its light is, and low enough for connections to hold the rest.
 """
 _STEEP = 64.0
-"""Factor of a later turn's shading normal above which its light is looked for from the camera: 0.2 % of cookie_bag's
+"""Factor of a later turn's shading normal above which its light is looked for from the camera: 0.02 % of cookie_bag's
 indirect light, of which ten of seventeen million paths made half of the variance."""
 _MIRRORS = 16
 """Mirrors that a path meets without the risk to end there: as many as specular chains may have."""
