@@ -166,10 +166,9 @@ def _is_smoothed(shape: mi.Shape) -> bool:
     """Whether a ``shape`` has shading normals that are not its own."""
     if not shape.is_mesh() or not shape.has_vertex_normals():
         return shape.class_name() in _SMOOTH_BY_CLASS
-    held = mi.traverse(shape)
-    faces, positions, normals = (
-        np.array(held[name]).reshape(-1, 3) for name in ("faces", "vertex_positions", "vertex_normals")
-    )
+    # Rectangles and cubes are meshes that tell no parameters of one.
+    held = shape.faces_buffer(), shape.vertex_positions_buffer(), shape.vertex_normals_buffer()
+    faces, positions, normals = (np.array(each).reshape(-1, 3) for each in held)
     corners = positions[faces].astype(np.float64)
     own = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     cosines = np.abs((normals[faces] * own[:, None]).sum(axis=2))
