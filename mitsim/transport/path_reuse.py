@@ -244,10 +244,10 @@ class ReusedPaths(ProjectorPaths):
         self, si: mi.SurfaceInteraction3f, toward: mi.Vector3f, onward: mi.Vector3f, active: mi.Bool
     ) -> ByLine:
         """The same of second surfaces, the part that is followed from here."""
-        kept = self._kept(tilt(si, toward) / tilt(si, onward))
+        kept = self._own_part(tilt(si, toward) / tilt(si, onward))
         return [light * kept for light in self._turn(si, toward, onward, active)]
 
-    def _kept(self, correction: mi.Float) -> mi.Float | int:
+    def _own_part(self, correction: mi.Float) -> mi.Float | int:
         """Part of the light over second surfaces of such a ``correction`` that is followed from here."""
         return projector_part(correction) if self.rules.steep else 1
 
@@ -341,7 +341,7 @@ class ReusedPaths(ProjectorPaths):
             toward = dr.normalize(si.p - second.p)
             way = dr.gather(Way, self.to_sensor_way, at, active)
             reception = self.setup.received(second, toward, replace(way, open=way.open & active))
-            part = (1 - camera_part(reception.pdf)) * self._kept(tilt(second, toward))
+            part = (1 - camera_part(reception.pdf)) * self._own_part(tilt(second, toward))
             connected = self._factors(reception.irradiance * part)
             beyond, turned = (
                 [dr.gather(mi.Float, each, at, active) for each in lines] for lines in (self.beyond, self.own_turn)
