@@ -34,7 +34,16 @@ PassTracer = DirectTracer | IndirectTracer | FromCamera
 
 
 class Tracers(Grids):
-    """What is traced of a bench with settings; its parameters are those of :class:`mitsim.light.grids.Grids`."""
+    """What is traced of a bench with settings; its parameters are those of :class:`mitsim.light.grids.Grids`.
+
+    Attributes
+    ----------
+    divides
+        whether light that shading normals make heavy is divided between both sides, as it is in a run; of the camera's
+        part a short look would meet a few paths, or none.
+    """
+
+    divides = True
 
     @cached_property
     def setup(self) -> OpticalSetup:
@@ -122,7 +131,12 @@ class Tracers(Grids):
 
     @property
     def _from_camera_of_projector(self) -> bool:
-        return self.physics.mirrors or (self.physics.interreflection and self.bench.loaded.glossy)
+        return self.physics.mirrors or (self.physics.interreflection and self.bench.loaded.glossy) or self._steep
+
+    @property
+    def _steep(self) -> bool:
+        """Whether shading normals may make light of the projector's side heavy."""
+        return self.divides and self.physics.interreflection and self.bench.loaded.smoothed
 
     def _points(self, anchors: int, spread: bool = False) -> SensorPoints:
         return SensorPoints(self.physics.geometry.half_width, anchors, spread, self.settings.depth)
@@ -131,7 +145,8 @@ class Tracers(Grids):
         self, points: SensorPoints, shared: bool = False, setup: OpticalSetup | None = None
     ) -> IndirectTracer | None:
         """In the ``setup``, if not in that of all light that the lens does not scatter."""
-        paths = Paths(self.physics.mirrors, self.physics.interreflection)
+        # Light that the lens scatters is followed from the projector alone.
+        paths = Paths(self.physics.mirrors, self.physics.interreflection, steep=self._steep and setup is None)
         if not (paths.mirrors or paths.interreflection):
             return None
         return (PathReuseTracer if shared else IndirectTracer)(setup or self.setup, paths, points)
@@ -141,7 +156,7 @@ class Tracers(Grids):
         of_projector = self._from_camera_of_projector
         if not (physics.lamps or of_projector):
             return None
-        paths = Paths(physics.mirrors, physics.interreflection, physics.lamps)
+        paths = Paths(physics.mirrors, physics.interreflection, physics.lamps, self._steep)
         tracer = FromCameraTracer(self.setup, self.aim, paths, points)
         if counted_lamps is None or not physics.lamps:
             return tracer

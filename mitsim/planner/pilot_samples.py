@@ -153,7 +153,9 @@ class Sample:
         bench, settings, one_line
             as for :class:`mitsim.light.grids.Grids`.
         """
-        return Simulation(bench, settings, one_line=one_line, places=self.places)
+        made = Simulation(bench, settings, one_line=one_line, places=self.places)
+        made.divides = False
+        return made
 
     def frames(
         self,

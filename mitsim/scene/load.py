@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import drjit as dr
@@ -68,6 +69,11 @@ class LoadedScene:
         if self.grid is None:
             raise MitsimError(f"{self.path}: the scene was opened without its projector")
         return self.grid
+
+    @cached_property
+    def smoothed(self) -> bool:
+        """Whether a surface has shading normals that are not its own; what an instance hides may have."""
+        return any(_is_smoothed(shape) for shape in self.scene.shapes())
 
 
 @keep_scenes()
@@ -166,6 +172,25 @@ def _faces_one_way(scene: mi.Scene) -> bool:
             return False
         normals.append(np.array(shape.sample_position(0.0, mi.Point2f(0.5)).n).ravel())
     return bool(normals) and float(np.ptp(normals, axis=0).max()) < _TURNED
+
+
+_SMOOTH_BY_CLASS = ("Instance", "SDFGrid")
+"""Mitsuba's classes of shapes whose shading normals are, or may be, interpolated, and which are no meshes."""
+_PARALLEL = 0.9999
+"""Cosine between the normals of a face and of its vertices above which the face is flat to rounding: half a degree."""
+
+
+def _is_smoothed(shape: mi.Shape) -> bool:
+    """Whether a ``shape`` has shading normals that are not its own."""
+    if not shape.is_mesh() or not shape.has_vertex_normals():
+        return shape.class_name() in _SMOOTH_BY_CLASS
+    # Rectangles and cubes are meshes that tell no parameters of one.
+    held = shape.faces_buffer(), shape.vertex_positions_buffer(), shape.vertex_normals_buffer()
+    faces, positions, normals = (np.array(each).reshape(-1, 3) for each in held)
+    corners = positions[faces].astype(np.float64)
+    own = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    cosines = np.abs((normals[faces] * own[:, None]).sum(axis=2))
+    return bool((cosines < _PARALLEL * np.linalg.norm(own, axis=1)[:, None]).any())
 
 
 # -------- Values of a loaded scene's bitmaps and meshes

@@ -44,11 +44,16 @@ from mitsim.transport.integrator import (
     Turn,
     camera_part,
     is_delta,
+    projector_part,
+    tilt,
 )
 from mitsim.transport.plugins.base import rows_columns, shuffle, sobol_point, streams, x_y
 from mitsim.transport.records import CellAxis, CellGrid, PathSamples, Sightings
 from mitsim.transport.transmission import refracted_way
 
+_SELDOM = 0.125
+"""Chance that a path goes on whose light its last turn before the sensor leaves to the projector's side: what earlier
+turns leave to this side is some 0.02 % of indirect light."""
 _MARGIN = 1e-4
 """Part of a cell that paths keep clear of its edges: 2e-7 of tan-angle, above float32's rounding of 3e-8."""
 
@@ -115,6 +120,8 @@ class CameraState(PathState):
         1/z [1/mm] of the point that their light is seen at.
     part
         of the light over the turn before the sensor that is theirs.
+    kept, turned
+        of the rest of it, the parts that the projector's side keeps over the turns since the last mirror, and the last.
     in_mirror
         whether a mirror made that turn.
     travelled, since
@@ -127,6 +134,8 @@ class CameraState(PathState):
 
     inverse_depth: mi.Float = field(default_factory=lambda: mi.Float(0))
     part: mi.Float = field(default_factory=lambda: mi.Float(1))
+    kept: mi.Float = field(default_factory=lambda: mi.Float(1))
+    turned: mi.Float = field(default_factory=lambda: mi.Float(1))
     in_mirror: mi.Bool = field(default_factory=lambda: mi.Bool(False))
     travelled: mi.Float = field(default_factory=lambda: mi.Float(0))
     since: mi.Float = field(default_factory=lambda: mi.Float(0))
@@ -222,7 +231,7 @@ class CameraPaths(PathIntegrator[State]):
         """
         hit = self.connector.hit(paths.ray, si.t, paths.rng, self._is_foreign(paths), paths.since)
         share = dr.select(paths.by_delta, 1, _share(paths.came_pdf, hit.pdf))
-        light = self._irradiance(paths, hit.radiance) * share
+        light = self._irradiance(paths, hit.radiance) * share * self._part(paths, paths.kept)
         self._keep_projector(paths, hit.met, light, hit.pixel, paths.scattered)
 
     def _is_foreign(self, paths: State) -> mi.Bool:
@@ -262,6 +271,7 @@ class CameraPaths(PathIntegrator[State]):
         else:
             value = bsdf.eval(mi.BSDFContext(), si, toward, active)
         light = self._irradiance(paths, value * connection.weight * passed)
+        light *= self._part(paths, paths.kept * paths.turned)
         self._keep_projector(paths, active, light, connection.pixel, paths.scattered + 1)
 
     def _connection(self, paths: State, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[Connection, mi.Spectrum]:
@@ -302,12 +312,21 @@ class CameraPaths(PathIntegrator[State]):
     def _note_turn(self, paths: State, si: mi.SurfaceInteraction3f, turn: Turn, first: bool) -> mi.Bool:
         """Note a ``turn`` at ``si``; tells which paths may bring light that is not connected."""
         passing, pdf, going = turn.passing, turn.sample.pdf, mi.Bool(True)
+        before_sensor = paths.straight & ~passing
         if first or self.passage.open:
-            before_sensor = paths.straight & ~passing
             paths.in_mirror = dr.select(before_sensor, turn.delta, paths.in_mirror)
             paths.part = dr.select(before_sensor, dr.select(turn.delta, 1, camera_part(pdf)), paths.part)
             if not self.emitters:
                 going = paths.part > 0
+        if self.rules.steep:
+            leaving = dr.select(before_sensor, 1, tilt(si, -paths.ray.d))
+            turned = projector_part(tilt(si, si.to_world(turn.sample.wo)) / leaving)
+            paths.kept = dr.select(turn.delta, 1, dr.select(passing, paths.kept, paths.kept * paths.turned))
+            paths.turned = dr.select(turn.delta, 1, dr.select(passing, paths.turned, turned))
+            # Light that only later turns may leave to this side is little: few paths go on for it.
+            idle = ~going & (turned == 1)
+            going = ~idle | (paths.rng.next_float32() < _SELDOM)
+            paths.throughput *= dr.select(idle, 1 / _SELDOM, 1)
         paths.travelled += si.t
         paths.since = dr.select(passing, paths.since + si.t, 0)
         paths.behind_glass = passing & (paths.behind_glass | is_delta(turn.sample))
@@ -331,9 +350,14 @@ class CameraPaths(PathIntegrator[State]):
         self, paths: State, active: mi.Bool, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32, order: mi.UInt32
     ) -> None:
         active &= self._is_wanted(order)
-        self._keep(paths, "direct", active & (order == 1), light * paths.part, pixel)
+        self._keep(paths, "direct", active & (order == 1), light, pixel)
         if self.rules.interreflection:
-            self._keep(paths, "indirect", active & (order > 1), light * paths.part, pixel)
+            self._keep(paths, "indirect", active & (order > 1), light, pixel)
+
+    def _part(self, paths: State, kept: mi.Float) -> mi.Float:
+        """Of the projector's light, what its own side leaves to ``paths``, of which it keeps so much over turns before
+        the last."""
+        return 1 - (1 - paths.part) * kept if self.rules.steep else paths.part
 
     def _keep(self, paths: State, kind: str, active: mi.Bool, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32) -> None:
         # Accumulated as the sensor's centre sees it.

@@ -28,7 +28,17 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray, mean_of_neighbours
 from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import SensorPoints, Way, sample_wavelengths
-from mitsim.transport.integrator import KINDS, FollowingTracer, InFlight, PathIntegrator, PathState, camera_part
+from mitsim.transport.integrator import (
+    KINDS,
+    FollowingTracer,
+    InFlight,
+    PathIntegrator,
+    PathState,
+    camera_part,
+    is_divided,
+    projector_part,
+    tilt,
+)
 from mitsim.transport.plugins.base import sobol_point, streams
 from mitsim.transport.records import PathSamples, Sightings
 
@@ -163,8 +173,10 @@ class ProjectorPaths(PathIntegrator[PathState]):
         either stands for both. ``at``: what is held of an anchor, and its number."""
         reception = self.setup.received(si, -paths.ray.d, way)
         light = reception.irradiance * self.flux * paths.throughput
-        caustic = paths.scattered == 0
-        light *= dr.select(caustic, 1, 1 - camera_part(reception.pdf))
+        caustic, part = paths.scattered == 0, 1 - camera_part(reception.pdf)
+        if self.rules.steep:
+            part *= dr.select(is_divided(paths), projector_part(tilt(si, -paths.ray.d)), 1)
+        light *= dr.select(caustic, 1, part)
         held, number = at
         for kind, chosen in (("direct", caustic), ("indirect", ~caustic)):
             if kind in held:

@@ -39,6 +39,9 @@ _SHARP = 1.0
 
 Three times a matt surface's 0.32, so that none of its light is, and low enough for connections to hold the rest.
 """
+_STEEP = 64.0
+"""Factor of a later turn's shading normal above which its light is looked for from the camera: 0.02 % of cookie_bag's
+indirect light, of which ten of seventeen million paths made half of the variance."""
 _MIRRORS = 16
 """Mirrors that a path meets without the risk to end there: as many as specular chains may have."""
 _LONGEST = 0.999
@@ -177,12 +180,14 @@ class Paths:
 
     ``mirrors``: over delta reflections and transmissions, from the camera only on its side; ``interreflection``: any
     number of bounces; ``emitters``: other lights of the scene, all of them one class of ambient light, which the camera
-    alone finds.
+    alone finds; ``steep``: whether light that shading normals make heavy is divided between both sides
+    (:func:`projector_part`).
     """
 
     mirrors: bool = False
     interreflection: bool = False
     emitters: tuple[mi.Emitter, ...] = ()
+    steep: bool = False
 
 
 class FollowingTracer(Tracer):
@@ -355,6 +360,9 @@ class PathIntegrator(ABC, Generic[State]):
         if self.IMPORTANCE:
             corrected = shading_correction(si, sample.wo, onward, toward)
             weight *= dr.select(dr.isfinite(corrected), dr.abs(corrected), 0)
+            if rules.steep:
+                divided = is_divided(paths) & ~turn.delta
+                weight *= dr.select(divided, projector_part(corrected), 1)
         paths.throughput *= weight
 
         # ---- Russian roulette; chains of mirrors are short and full of light, and what only passes a surface goes on
@@ -418,6 +426,26 @@ def shading_correction(
     """
     correction = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, onward)
     return correction / (mi.Frame3f.cos_theta(local) * dr.dot(si.n, toward))
+
+
+def tilt(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Float:
+    """Cosine of a ``direction`` to the shading normals at ``si`` over that to the geometric ones."""
+    return dr.dot(si.sh_frame.n, direction) / dr.dot(si.n, direction)
+
+
+def is_divided(paths: PathState) -> mi.Bool:
+    """Whether the next turn of ``paths`` from the projector is divided by :func:`projector_part`: not their first, and
+    none after a mirror, where the camera's side finds nothing."""
+    return (paths.scattered > 0) & (paths.depth == paths.scattered)
+
+
+def projector_part(correction: mi.Float) -> mi.Float:
+    """Part of the light over a turn, but for its first, that is followed from the projector, where a shading normal
+    multiplies it by a ``correction``; the rest is followed from the camera, on whose side no such factor is.
+
+    Grazing light is met in proportion to its cosine, and multiplied by its inverse: the variance would have no end.
+    """
+    return dr.select(dr.abs(correction) > _STEEP, _STEEP / dr.abs(correction), 1)
 
 
 def camera_part(pdf: mi.Float) -> mi.Float:

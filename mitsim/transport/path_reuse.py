@@ -36,7 +36,7 @@ import numpy as np
 from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import Way
 from mitsim.transport.indirect import MEMBERS, SIDE, Emission, IndirectTracer, ProjectorPaths, blocks_of
-from mitsim.transport.integrator import InFlight, camera_part, shading_correction
+from mitsim.transport.integrator import InFlight, camera_part, projector_part, shading_correction, tilt
 from mitsim.transport.plugins.base import generator, sobol_point, split_by_line
 from mitsim.transport.records import INDIRECT, PathSamples, Sightings, check_finite
 
@@ -91,8 +91,8 @@ class PathReuseTracer(IndirectTracer):
 
     @property
     def all_diffuse(self) -> bool:
-        """Whether all surfaces are: pairs then take no look at a material."""
-        return len(self.diffuse) == len(self.setup.scene.shapes())
+        """Whether all surfaces are, and none of their light is divided: pairs then take no look at a material."""
+        return len(self.diffuse) == len(self.setup.scene.shapes()) and not self.paths.steep
 
     def _emission(self, flight: InFlight) -> Emission:
         """Of whole blocks of pixels, the members of each one after the other."""
@@ -199,6 +199,8 @@ class ReusedPaths(ProjectorPaths):
         self.second_hit = self.scene.ray_intersect_preliminary(paths.ray, active=paths.active)
         si = self.second_hit.compute_surface_interaction(paths.ray, active=paths.active)
         paths.active &= si.is_valid()
+        # Outside of a loop what has ended is worked out, too: a throughput of NaN would outlast the light of 0.
+        paths.throughput = dr.select(paths.active, paths.throughput, 0)
         self.shared = paths.active & (paths.scattered == 1)
         self.point, self.normal = mi.Point3f(si.p), mi.Normal3f(si.n)
         number = mi.UInt32(0)
@@ -211,7 +213,7 @@ class ReusedPaths(ProjectorPaths):
         paths.throughput = dr.select(self.follows, 1, paths.throughput)
         self.flux = dr.select(self.follows, 1, self.flux)
         self.scatter(paths, si, False)
-        self.own_turn = self._turn(si, -self.second_ray.d, paths.ray.d, paths.active & self.follows)
+        self.own_turn = self._turn_on(si, -self.second_ray.d, paths.ray.d, paths.active & self.follows)
         self.onward = mi.Vector3f(paths.ray.d)
 
     def _diffuse(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
@@ -237,6 +239,17 @@ class ReusedPaths(ProjectorPaths):
         value = mi.unpolarized_spectrum(si.bsdf().eval(context, si, si.to_local(onward), active))
         value *= dr.abs(mi.Frame3f.cos_theta(si.wi) / dr.dot(si.n, toward))
         return self._factors(dr.select(active & dr.isfinite(value), value, 0))
+
+    def _turn_on(
+        self, si: mi.SurfaceInteraction3f, toward: mi.Vector3f, onward: mi.Vector3f, active: mi.Bool
+    ) -> ByLine:
+        """The same of second surfaces, the part that is followed from here."""
+        kept = self._own_part(tilt(si, toward) / tilt(si, onward))
+        return [light * kept for light in self._turn(si, toward, onward, active)]
+
+    def _own_part(self, correction: mi.Float) -> mi.Float | int:
+        """Part of the light over second surfaces of such a ``correction`` that is followed from here."""
+        return projector_part(correction) if self.rules.steep else 1
 
     def _weights(self) -> tuple[ByLine, mi.Float, mi.Float]:
         """(lanes * members,) what each pixel sends to each second point of its block, negative to its other side, by
@@ -328,13 +341,14 @@ class ReusedPaths(ProjectorPaths):
             toward = dr.normalize(si.p - second.p)
             way = dr.gather(Way, self.to_sensor_way, at, active)
             reception = self.setup.received(second, toward, replace(way, open=way.open & active))
-            connected = self._factors(reception.irradiance * (1 - camera_part(reception.pdf)))
+            part = (1 - camera_part(reception.pdf)) * self._own_part(tilt(second, toward))
+            connected = self._factors(reception.irradiance * part)
             beyond, turned = (
                 [dr.gather(mi.Float, each, at, active) for each in lines] for lines in (self.beyond, self.own_turn)
             )
             handed = [active & (light > 0) & (own > 0) for light, own in zip(beyond, turned, strict=True)]
             onward = dr.gather(mi.Vector3f, self.onward, at, active)
-            others = self._turn(second, toward, onward, reduce(or_, handed))
+            others = self._turn_on(second, toward, onward, reduce(or_, handed))
             further = [light * other / own for light, other, own in zip(beyond, others, turned, strict=True)]
             return connected, [dr.select(some, light, 0) for some, light in zip(handed, further, strict=True)]
 

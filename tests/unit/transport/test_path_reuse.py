@@ -15,8 +15,10 @@ import pytest
 
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
+from mitsim.transport import integrator
 from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import SensorPoints
+from mitsim.transport.from_camera import FromCameraTracer
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.integrator import Paths
 from mitsim.transport.path_reuse import PathReuseTracer
@@ -45,6 +47,11 @@ SCENES = {
     "fins": FIN.format(x=14) + FIN.format(x=-26),
     "mirror wall": MIRROR + WALL.format(turn=-60, x=40, bsdf=MATT),
 }
+BENT_SCENES = {
+    "bent": SCENES["bent wall"],
+    "shiny": OBJECT + WALL.format(turn=-60, x=40, bsdf=SHINY),
+    "mirror": OBJECT + MIRROR.replace('angle="90"', 'angle="-60"').replace('x="-40"', 'x="40"'),
+}
 
 
 def opened(scene: Path) -> Bench:
@@ -53,10 +60,12 @@ def opened(scene: Path) -> Bench:
     return open_bench(scene)
 
 
-def tracers(bench: Bench, spread: bool = False, mirrors: bool = False) -> tuple[IndirectTracer, PathReuseTracer]:
+def tracers(
+    bench: Bench, spread: bool = False, mirrors: bool = False, steep: bool = False
+) -> tuple[IndirectTracer, PathReuseTracer]:
     """Paths of their own, and shared ones."""
     points = SensorPoints(bench.geometry.half_width, spread=spread)
-    parts = bench.setup, Paths(mirrors, True)
+    parts = bench.setup, Paths(mirrors, True, steep=steep)
     return IndirectTracer(*parts, points=points), PathReuseTracer(*parts, points=points)
 
 
@@ -94,6 +103,43 @@ def test_shared_light_is_the_light_of_paths_of_their_own(
     assert (np.abs(means[0] - means[1]) <= bound).all()
     lit = means[0, 0] > 0.01 * means[0, 0].max()
     assert lit.sum() > n / 3 and np.median(bound[0, lit] / means[0, 0, lit]) < 0.3, "of a column's light"
+
+
+@pytest.mark.parametrize(
+    "name", ["bent", *(pytest.param(name, marks=pytest.mark.slow) for name in ("shiny", "mirror"))]
+)
+def test_light_that_shading_normals_make_heavy_is_divided(
+    shared_scene: Callable[..., Path], name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By both sides as much as by the projector's alone, of each column of pixels and place, shared points or not.
+
+    Where a factor of a half is already heavy, nearly all light over the bent wall is divided. (Planted: first turns, or
+    those after a mirror, divided on one side; the way to the sensor not; further paths of shared points not.)
+    """
+    monkeypatch.setattr(integrator, "_STEEP", 0.5)
+    mirrors, samples = "mirror" in name, 512 if "mirror" in name else 256
+    bench = opened(shared_scene(f"steep {name}", extra=BENT_SCENES[name]))
+    grid = aligned_grid(*bench.windows, N, 1, bench.geometry.tan_half_fov)
+    cameras = [FromCameraTracer(bench.setup, grid, Paths(mirrors, True, steep=steep)) for steep in (False, True)]
+    own, shared = tracers(bench, mirrors=mirrors, steep=True)
+    ways = [(tracers(bench, mirrors=mirrors)[0], cameras[0]), (own, cameras[1]), (shared, cameras[1])]
+
+    def light(way: tuple[IndirectTracer, FromCameraTracer], seed: int) -> np.ndarray:
+        traced = PathSamples.join([side.trace(seed, 0, samples) for side in way])
+        return summed(traced.where(traced.kind == INDIRECT), samples, N)
+
+    found = np.array([[light(way, seed) for seed in range(SEEDS)] for way in ways])
+    means, errors = found.mean(axis=1), found.std(axis=1, ddof=1) / np.sqrt(SEEDS)
+    for one in (1, 2):
+        bound = SIGMAS * np.hypot(errors[0], errors[one])
+        assert (np.abs(means[0] - means[one]) <= bound).all()
+        assert (
+            np.abs((means[0] - means[one])[0].sum()) < SIGMAS * np.std(found[[0, one], :, 0].sum(axis=2)) / SEEDS**0.5
+        )
+    lit = means[0, 0] > 0.01 * means[0, 0].max()
+    assert np.median(bound[0, lit] / means[0, 0, lit]) < 0.3, "of a column's light"
+    part = summed(cameras[1].trace(0, 0, samples), samples, N)[0].sum() / means[0, 0].sum()
+    assert part > 0.2, "what is left to the camera's side"
 
 
 def test_each_pixel_lights_a_hollow_sphere_alike(shared_scene: Callable[..., Path]) -> None:
