@@ -262,6 +262,11 @@ class Plate(ByValue):
         return np.array_equal(self.values, self.values.T)
 
     @property
+    def uneven_part(self) -> float:
+        """Part of it that tells all of it: an eighth of a zone plate."""
+        return float(0.5 ** (sum(self.mirrored) + self.symmetric))
+
+    @property
     def diffracts(self) -> bool:
         """Whether its diffraction is worked out: not of light that has gone through it, nor behind blurred edges of
         more than one separable term."""

@@ -64,9 +64,9 @@ _GRID_CELLS = 3
 """Cells of the field's grid from point to point at least."""
 _AROUND = 8
 """Cells that a raster is wider than its turned one, for the splines' ends."""
-CORRELATION_PRODUCTS = 125.0
+CORRELATION_PRODUCTS = 30.0
 """Multiplications a pixel that each phase of a correlation with a raster takes as long as, for each pair of anchors and
-layer: 0.08 to 0.13 processor seconds of 512 x 512 pixels and 36 phases, where sums take 8e-11 a multiplication
+layer: 0.017 processor seconds of 512 x 512 pixels and 36 phases, where sums take 4.5e-11 to 7e-11 a multiplication
 (benchmarks/masks.py)."""
 RASTERS_KEPT = 8
 """The last rasters, and what was prepared of them: layers of a scene, with waves and without; some 100 MiB each at 512
@@ -177,7 +177,7 @@ def check_waves(geometry: CameraGeometry, spectrum: Spectrum) -> None:
         points_per_cell(float(line), geometry.mask_distance, step) for line in spectrum.wavelengths_nm
     )
     terms = mask.amplitude.most_terms
-    if terms * float(points) ** 2 * 0.5 ** sum(mask.mirrored) > _MOST_WAVE_TERMS:
+    if terms * float(points) ** 2 * mask.amplitude.uneven_part > _MOST_WAVE_TERMS:
         raise MitsimError(
             f"{mask.words}: {len(mask.values)} features a side are in sight, of {terms} terms, and their waves are "
             f"added up at {points} points a side: minutes for each line of light, before anything is known; use "
