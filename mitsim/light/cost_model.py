@@ -319,7 +319,8 @@ def optics_seconds(forming: Forming, numbers: Numbers, costs: UnitCosts) -> Numb
             drawing *= _phases(forming, numbers) / forming.phases
         else:
             drawing += costs.product / FIXED.product * _CELL_S * forming.pixels**2 * _phases(forming, numbers)
-        # The pilot has drawn that of one layer in the fewest cells; coarse light of several is seen at a depth of its own.
+        # The pilot has drawn that of one layer in the fewest cells; of several, coarse light is seen at a depth of its
+        # own.
         several = np.asarray(numbers.layers) > 1
         drawn = ~several & (_phases(forming, numbers) == forming.phases)
         shadows = cast(Number, shadows + drawing * (numbers.layers + several - drawn))

@@ -128,8 +128,8 @@ def test_the_largest_terms_of_a_raster_form_the_correlations_frames(
 
 def test_an_even_drawings_waves_are_those_of_its_part(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a zone plate an eighth is worked out, of one that is mirrored along its rows alone a half, and of one whose
-    rows are its columns what is not below its diagonal. (Planted: columns' half for rows'; the mirrored half not turned round; what
-    is below the diagonal left 0; rows' distinct columns in an order of their own.)"""
+    rows are its columns what is not below its diagonal. (Planted: columns' half for rows'; the mirrored
+    half not turned round; what is below the diagonal left 0.)"""
     lines, place = Spectrum(np.array([500.0]), np.ones(1)), (np.arange(14) + 0.5 - 7) * 0.05
     zones = (np.cos(np.pi * (place[:, None] ** 2 + place**2) / 0.15**2) > 0) * 1.0
     half = zones.copy()
@@ -160,7 +160,7 @@ def test_an_even_drawings_waves_are_those_of_its_part(monkeypatch: pytest.Monkey
 
 
 def test_frames_that_are_compared_change_alike_in_fewer_cells() -> None:
-    """What two anchors' light changes a frame by, in a third of the raster cells: to 3e-3. (Planted: a sixth of the cells.)"""
+    """What two anchors' light changes a frame by, in a third of the raster cells: to 3e-3. (Planted: a sixth.)"""
     camera, light = turned(BARE.model_copy(update={"pixels": 64})), np.zeros((2, 9, 2, 11))
     light[0, :5, 1], light[1, :5, 0] = 1.0, -1.0
     flat, few = np.flatnonzero(light), rasters.with_few_cells(camera, None)
