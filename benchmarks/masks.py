@@ -22,6 +22,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from scipy.signal import max_len_seq
 from skimage import io
 
 from mitsim.devices.camera import CameraGeometry
@@ -88,7 +89,7 @@ def draw(folder: Path) -> None:
     """The cases' drawings, and the photograph as sheets of 20 mm and 2 mm."""
     at, fine = np.arange(64) - 32.0, (np.arange(512) + 0.5 - 256) * 0.01
     squared = fine[:, None] ** 2 + fine**2
-    code = np.random.default_rng(0).integers(0, 2, 127)
+    code = max_len_seq(9)[0]
     # Light through a smooth random surface, as a diffuser's caustics.
     waves = np.fft.rfft2(np.random.default_rng(0).normal(size=(600, 600)))
     slow = np.exp(-np.square(np.hypot(np.fft.fftfreq(600)[:, None], np.fft.rfftfreq(600)) / 0.012))
@@ -98,7 +99,7 @@ def draw(folder: Path) -> None:
     drawings = {
         "disc": at[:, None] ** 2 + at**2 <= 14**2,
         "zones": (np.cos(np.pi * squared / 0.23**2) > 0) & (squared < 2.56**2),
-        "code": np.outer(code, np.roll(code, 31)),
+        "code": np.outer(code, code),
         "caustics": np.minimum(caustics / np.quantile(caustics, 0.9999), 1),
     }
     for name, values in drawings.items():

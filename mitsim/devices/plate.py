@@ -32,7 +32,10 @@ RASTER_LEFT_OUT = 1e-4
 (tests/unit/optics/test_correlation.py)."""
 _SKETCHES = 96, 192
 """Directions in which the largest terms are looked for, until they hold all but that: at 512 pixels a disc of 64
-features has 59 terms, a zone plate of 512 has 535. Where the last are too few, sums take longer than correlations."""
+features has 59 terms, a zone plate of 512 has 535. Of more than the last, sums take longer than correlations."""
+_SMALL = 512
+"""Values a side up to which means from every value on are held: of a disc of 5 pixels, points' light a third of a pixel
+apart alone leaves 6e-3 of a frame, and every one 2e-5 (tests/physics/test_raster.py)."""
 _TURNS = 2
 """Times that a sketch is turned toward the largest terms: a third changes their number by one in a hundred."""
 FEW = 2
@@ -380,8 +383,8 @@ class LargestTerms:
     """The terms of large ``values`` (N, N) that hold their means over squares of ``averaged`` values a side, but for
     1e-4 of them, rms.
 
-    With S the means along an axis, a third of a square apart, and U sigma W^T the singular vectors of S V S^T that are
-    kept, the terms are V S^T W sigma^-1 U^T S V, whose means are U sigma W^T: the best of so few (Nystroem's
+    With S the means along an axis, at most a third of a square apart, and U sigma W^T the singular vectors of S V S^T
+    that are kept, the terms are V S^T W sigma^-1 U^T S V, whose means are U sigma W^T: the best of so few (Nystroem's
     approximation, from both sides). Half a square apart would leave a thousand times as much between the squares.
     Vectors come from a sketch in random directions (Halko, Martinsson and Tropp, SIAM Review 53, 217, 2011).
 
@@ -402,7 +405,8 @@ class LargestTerms:
 
     def __init__(self, values: FloatArray, averaged: int = 1, sizes: Sequence[int] = _SKETCHES) -> None:
         self._values, self._averaged = values, averaged
-        self._starts = np.arange(1 - averaged, len(values), max(averaged // 3, 1))
+        apart = max(averaged // 3, 1) if len(values) > _SMALL else 1
+        self._starts = np.arange(1 - averaged, len(values), apart)
         with single_threaded_blas():
             seen = self._seen = self._means(self._means(values).T).T
             whole = float(np.square(seen).sum())
