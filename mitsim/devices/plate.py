@@ -30,9 +30,12 @@ LEFT_OUT = 1e-7
 RASTER_LEFT_OUT = 1e-4
 """The same of light on a raster, of single pixels; of frames of dots it leaves 1e-5 and less
 (tests/unit/optics/test_correlation.py)."""
-_SKETCHES = 96, 192, 384, 640
+_SKETCHES = 96, 192
 """Directions in which the largest terms are looked for, until they hold all but that: at 512 pixels a disc of 64
-features has 59 terms, a zone plate of 512 has 535. Where the last are too few, sums take longer than correlations."""
+features has 59 terms, a zone plate of 512 has 535. Of more than the last, sums take longer than correlations."""
+_SMALL = 512
+"""Values a side up to which means from every value on are held: of a disc of 5 pixels, points' light a third of a pixel
+apart alone leaves 6e-3 of a frame, and every one 2e-5 (tests/physics/test_raster.py)."""
 _TURNS = 2
 """Times that a sketch is turned toward the largest terms: a third changes their number by one in a hundred."""
 FEW = 2
@@ -190,7 +193,12 @@ class Plate(ByValue):
             patterns, which = np.unique(self.values, axis=0, return_inverse=True)
             return tuple((1.0, (which.ravel() == k) * 1.0, pattern) for k, pattern in enumerate(patterns)), 0.0
         (rows, columns), weights, weighted = _distinct(self.values, self.lines_mm)
-        left, singular, right = np.linalg.svd(weighted, full_matrices=False)
+        if self.symmetric:
+            singular, left = np.linalg.eigh(weighted)
+            singular, left = (each[..., np.argsort(-np.abs(singular))] for each in (singular, left))
+            right = left.T
+        else:
+            left, singular, right = np.linalg.svd(weighted, full_matrices=False)
         left, right = left / weights[0], right / weights[1]
         beyond = np.sqrt(np.cumsum(np.square(singular[::-1]))[::-1])  # what the terms from each on hold
         count = int(np.count_nonzero(beyond > LEFT_OUT * beyond[0]))
@@ -250,6 +258,16 @@ class Plate(ByValue):
         """Whether it is its own mirror image along rows, and along columns."""
         even = self.lines_mm is None or np.array_equal(self.lines_mm, -self.lines_mm[::-1])
         return tuple(even and np.array_equal(self.values, np.flip(self.values, axis)) for axis in (0, 1))  # type: ignore[return-value]
+
+    @cached_property
+    def symmetric(self) -> bool:
+        """Whether its rows are its columns; the profiles of each of its singular terms then are the same."""
+        return np.array_equal(self.values, self.values.T)
+
+    @property
+    def uneven_part(self) -> float:
+        """Part of it that tells all of it: an eighth of a zone plate."""
+        return float(0.5 ** (sum(self.mirrored) + self.symmetric))
 
     @property
     def diffracts(self) -> bool:
@@ -349,8 +367,11 @@ def _distinct(
     (rows, columns) values times both.
     """
     widths = np.ones(len(values)) if lines is None else np.diff(lines) * (len(lines) / np.ptp(lines))
-    rows, row = np.unique(values, axis=0, return_inverse=True)
-    columns, column = np.unique(rows, axis=1, return_inverse=True)
+    rows, first, row = np.unique(values, axis=0, return_index=True, return_inverse=True)
+    if np.array_equal(values, values.T):
+        columns, column = rows[:, first], row  # in the rows' order
+    else:
+        columns, column = np.unique(rows, axis=1, return_inverse=True)
     weights = np.sqrt(np.bincount(row.ravel(), widths))[:, None], np.sqrt(np.bincount(column.ravel(), widths))
     return (row.ravel(), column.ravel()), weights, weights[0] * columns * weights[1]
 
@@ -362,8 +383,8 @@ class LargestTerms:
     """The terms of large ``values`` (N, N) that hold their means over squares of ``averaged`` values a side, but for
     1e-4 of them, rms.
 
-    With S the means along an axis, a third of a square apart, and U sigma W^T the singular vectors of S V S^T that are
-    kept, the terms are V S^T W sigma^-1 U^T S V, whose means are U sigma W^T: the best of so few (Nystroem's
+    With S the means along an axis, at most a third of a square apart, and U sigma W^T the singular vectors of S V S^T
+    that are kept, the terms are V S^T W sigma^-1 U^T S V, whose means are U sigma W^T: the best of so few (Nystroem's
     approximation, from both sides). Half a square apart would leave a thousand times as much between the squares.
     Vectors come from a sketch in random directions (Halko, Martinsson and Tropp, SIAM Review 53, 217, 2011).
 
@@ -384,7 +405,8 @@ class LargestTerms:
 
     def __init__(self, values: FloatArray, averaged: int = 1, sizes: Sequence[int] = _SKETCHES) -> None:
         self._values, self._averaged = values, averaged
-        self._starts = np.arange(1 - averaged, len(values), max(averaged // 3, 1))
+        apart = max(averaged // 3, 1) if len(values) > _SMALL else 1
+        self._starts = np.arange(1 - averaged, len(values), apart)
         with single_threaded_blas():
             seen = self._seen = self._means(self._means(values).T).T
             whole = float(np.square(seen).sum())

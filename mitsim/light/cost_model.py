@@ -319,8 +319,12 @@ def optics_seconds(forming: Forming, numbers: Numbers, costs: UnitCosts) -> Numb
             drawing *= _phases(forming, numbers) / forming.phases
         else:
             drawing += costs.product / FIXED.product * _CELL_S * forming.pixels**2 * _phases(forming, numbers)
-        # Coarse light of several layers is seen at a depth of its own.
-        shadows = cast(Number, shadows + drawing * (numbers.layers + (np.asarray(numbers.layers) > 1)))
+        # What must be drawn the pilot has drawn of one layer in the fewest cells; of several, coarse light is seen at a
+        # depth of its own.
+        several = np.asarray(numbers.layers) > 1
+        must = forming.correlated[bool(numbers.waves)] and _phases(forming, numbers) == forming.phases
+        drawn = ~several & must
+        shadows = cast(Number, shadows + drawing * (numbers.layers + several - drawn))
     frames = formed_frames(forming.classes, forming.shots, forming.pixels)
     seen = costs.pixel * forming.shots * forming.pixels**2
     return forming.lines * (shadows + seen) + forming_seconds(forming, numbers, frames, costs)

@@ -22,6 +22,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Spectrum
 from mitsim.light.settings import Settings
+from mitsim.optics.fft_shadow import with_few_cells
 from mitsim.optics.image_formation import FrameOptics, anchor_positions, anchor_weights
 from mitsim.optics.shadow import Places
 from mitsim.transport.records import Bundle, CellGrid, aligned_grid
@@ -107,7 +108,7 @@ class Grids:
         cells a side of the projector's window, instead of one a pixel.
     one_line
         whether diffraction is that of the light's mean wavelength alone: for what hardly hangs on it, in a third of the
-        time.
+        time, and a mask that is drawn on a raster in a third of the cells.
     places
         rows and columns whose frames are formed; None: all.
 
@@ -134,6 +135,8 @@ class Grids:
             self.physics = replace(self.physics, geometry=by_fft)
         if one_line and self.physics.spectrum:
             self.physics = replace(self.physics, spectrum=self.physics.spectrum.mean)
+        if one_line:
+            self.physics = replace(self.physics, geometry=with_few_cells(self.physics.geometry, self.physics.spectrum))
         self._pixels = pixels or bench.n
         self._counted_lamps = counted_lamps = bench.counted_lamps if self.physics.lamps else None
         self.lamp_rows = len(counted_lamps.bands) if counted_lamps else 1

@@ -195,7 +195,7 @@ def drawing_seconds(geometry: CameraGeometry, spectrum: Spectrum | None) -> floa
     step = geometry.pixel_pitch / cells_per_pixel(geometry)
     points = (points_per_cell(float(line), geometry.mask_distance, step) for line in spectrum.wavelengths_nm)
     each = _POINT_S + _TERM_S * seen.amplitude.most_terms
-    part = _AROUND if turned else 0.5 ** sum(seen.mirrored)
+    part = _AROUND if turned else seen.amplitude.uneven_part
     return cells * part * each * sum(count**2 for count in points)
 
 

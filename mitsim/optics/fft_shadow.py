@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -40,6 +40,9 @@ _CELLS_PER_PIXEL = 6
 """Raster cells along a pixel: at 4 a raster leaves twice as much (tests/physics/test_raster.py), for which a plan at an
 accuracy of 1e-3 has no room. Features far below a pixel need no more: of a frame in pixels of 12 um random masks of 1
 and of 4 um leave 2e-4 and 1e-3 in waves at 6 (against 48), 2e-4 and 6e-5 turned."""
+_FEW_CELLS = 2
+"""The same where frames are compared that are formed alike: they change by what they do at 6 but for a few
+thousandths, for a ninth of the work."""
 _LEFT_BEYOND = 1e-3
 """Bound of the part of the light that waves may carry beyond a raster's edge. A third of it is found there, as much as
 the points at which waves are squared leave (3.6e-4, a random mask of 31 features of 60 um)."""
@@ -61,9 +64,9 @@ _GRID_CELLS = 3
 """Cells of the field's grid from point to point at least."""
 _AROUND = 8
 """Cells that a raster is wider than its turned one, for the splines' ends."""
-CORRELATION_PRODUCTS = 125.0
+CORRELATION_PRODUCTS = 30.0
 """Multiplications a pixel that each phase of a correlation with a raster takes as long as, for each pair of anchors and
-layer: 0.08 to 0.13 processor seconds of 512 x 512 pixels and 36 phases, where sums take 8e-11 a multiplication
+layer: 0.017 processor seconds of 512 x 512 pixels and 36 phases, where sums take 4.5e-11 to 7e-11 a multiplication
 (benchmarks/masks.py)."""
 RASTERS_KEPT = 8
 """The last rasters, and what was prepared of them: layers of a scene, with waves and without; some 100 MiB each at 512
@@ -174,7 +177,7 @@ def check_waves(geometry: CameraGeometry, spectrum: Spectrum) -> None:
         points_per_cell(float(line), geometry.mask_distance, step) for line in spectrum.wavelengths_nm
     )
     terms = mask.amplitude.most_terms
-    if terms * float(points) ** 2 * 0.5 ** sum(mask.mirrored) > _MOST_WAVE_TERMS:
+    if terms * float(points) ** 2 * mask.amplitude.uneven_part > _MOST_WAVE_TERMS:
         raise MitsimError(
             f"{mask.words}: {len(mask.values)} features a side are in sight, of {terms} terms, and their waves are "
             f"added up at {points} points a side: minutes for each line of light, before anything is known; use "
@@ -199,6 +202,19 @@ def points_per_cell(wavelength_nm: float, distance_mm: float, step_mm: float) ->
 def cells_per_pixel(geometry: CameraGeometry) -> int:
     """Raster cells along a pixel of ``geometry``: as many as were chosen, else the fewest."""
     return geometry.mask_cells or _CELLS_PER_PIXEL
+
+
+def with_few_cells(geometry: CameraGeometry, spectrum: Spectrum | None) -> CameraGeometry:
+    """A camera whose frames are only compared with each other: of a third of the raster cells a pixel, where its mask
+    is drawn.
+
+    Parameters
+    ----------
+    geometry, spectrum
+        the camera, and lines of its light; None: geometric.
+    """
+    drawn = geometry.is_correlated(spectrum is not None)
+    return geometry.model_copy(update={"mask_cells": _FEW_CELLS}) if drawn else geometry
 
 
 def sharpen(values: FloatArray) -> FloatArray:
@@ -250,7 +266,7 @@ def _waves(shadow: ShadowGeometry, spectrum: Spectrum, step: float, count: int) 
         return _turn_light(_waves(even, spectrum, step, whole), count, mask.flaws)
     total, mirrored = np.zeros((count, count)), mask.mirrored
     for wavelength, share in zip(spectrum.wavelengths_nm, spectrum.weights, strict=True):
-        total += share * _intensity(*_fields(shadow, float(wavelength), step, count), mirrored)
+        total += share * _intensity(*_fields(shadow, float(wavelength), step, count), mirrored, mask.symmetric)
     return total
 
 
@@ -280,7 +296,8 @@ def _fields(
     span = half + shadow.mask.extent_mm / 2 + step
     waves = EdgeWaves(wavelength_nm, distance, step / points / between, count * points * between, span, single=True)
     terms, lines = shadow.mask.terms, shadow.mask.lines
-    profiles = [Steps.between(profile, lines) for place in (1, 2) for profile in [term[place] for term in terms]]
+    axes = (1,) if shadow.mask.symmetric else (1, 2)  # type: ignore[union-attr]
+    profiles = [Steps.between(term[axis], lines) for axis in axes for term in terms]
 
     def fields(start: int) -> npt.NDArray[np.complex64]:
         several = waves.fields(profiles[start : start + _FIELDS_AT_ONCE], -half)
@@ -288,7 +305,7 @@ def _fields(
 
     seen = np.concatenate(in_threads(fields, range(0, len(profiles), _FIELDS_AT_ONCE)))
     weights = np.array([weight for weight, *_ in terms], dtype=np.complex64)
-    return (weights[:, None] * seen[: len(terms)]).T, seen[len(terms) :], points
+    return (weights[:, None] * seen[: len(terms)]).T, seen[-len(terms) :], points
 
 
 def _means_at_points(field: npt.NDArray[np.complex128], between: int) -> npt.NDArray[np.complex128]:
@@ -308,9 +325,11 @@ def _intensity(
     columns: npt.NDArray[np.complex64],
     points: int,
     mirrored: tuple[bool, bool] = (False, False),
+    symmetric: bool = False,
 ) -> FloatArray:
     """(cells, cells) mean |U|^2 of U = ``rows`` ``columns`` at ``points`` x ``points`` points of each cell; of an axis
-    along which the mask is ``mirrored``, half is worked out."""
+    along which the mask is ``mirrored``, half is worked out, and of a ``symmetric`` one what is not below the
+    diagonal."""
     whole = len(rows) // points, columns.shape[1] // points
     kept = [count // 2 if half else count for count, half in zip(whole, mirrored, strict=True)]
     columns = columns[:, : kept[1] * points]
@@ -318,8 +337,11 @@ def _intensity(
     at_once = max(1, _AT_ONCE // max(columns.shape[1], 1) // points)
 
     def square(start: int) -> None:
-        field = rows[start * points : min(start + at_once, kept[0]) * points] @ columns
-        means[start : start + at_once] = _blocks(np.square(field.real) + np.square(field.imag), points)
+        some, beyond = slice(start, min(start + at_once, kept[0])), start if symmetric else 0
+        field = rows[some.start * points : some.stop * points] @ columns[:, beyond * points :]
+        means[some, beyond:] = _blocks(np.square(field.real) + np.square(field.imag), points)
+        if symmetric:
+            means[beyond:, some] = means[some, beyond:].T
 
     in_threads(square, range(0, kept[0], at_once))
     if mirrored[0]:
@@ -341,9 +363,12 @@ def _blocks(values: npt.NDArray[np.float32], side: int) -> FloatArray:
 #
 #     frame[i, j] = sum_ab X[a, b] V[a + q i, b + q j]
 #
-# It is exact for the raster, to rounding, whatever the cells; the sum of separable terms gives the same
-# (tests/unit/optics/test_correlation.py), and takes a product for each of them.
+# It is exact for the raster, to rounding in single precision, 1e-6 of a frame's mean, whatever the cells; the sum of
+# separable terms gives the same (tests/unit/optics/test_correlation.py), and takes a product for each of them.
 
+_APART = 8
+"""Pixels by which the first one that light is spread over moves: light in cells of other sizes then meets the raster's
+spectra as they are."""
 _WHOLE = 1e-6
 """Part of a raster cell by which a pixel may miss a whole number of them: rounding, of a frame 4096 pixels wide too."""
 
@@ -364,13 +389,11 @@ class Correlation:
     def __init__(self, shadow: ShadowGeometry, rows: Directions, columns: Directions, fill_factor: float = 1.0) -> None:
         sides = _Side.both(shadow, rows, columns)
         self.shape = sides[0].pixels, sides[1].pixels
-        self._phases = sides[0].phases, sides[1].phases
-        self._spread = [side.weights for side in sides]
-        reach = max(len(side.weights) // side.phases for side in sides)
-        self._size = [scipy.fft.next_fast_len(side.pixels + reach - 1, real=True) for side in sides]
-        along = [size * phases for size, phases in zip(self._size, self._phases, strict=True)]
-        seen = _part(_part(_mask_values(shadow), sides[0].first, along[0]).T, sides[1].first, along[1]).T
-        self._spectra = scipy.fft.rfft2(fill_factor * self._by_phase(seen))
+        self._phases, self._fill_factor = (sides[0].phases, sides[1].phases), fill_factor
+        firsts, self._spread = zip(*(side.spread(_APART) for side in sides), strict=True)
+        reach = max(len(spread) // phases for spread, phases in zip(self._spread, self._phases, strict=True))
+        self._size = tuple(scipy.fft.next_fast_len(pixels + reach - 1, real=True) for pixels in self.shape)
+        self._spectra = _spectra(cast("Plate", shadow.mask), firsts, self._size, self._phases)
 
     def image(self, light: FloatArray, rows: npt.ArrayLike, columns: npt.ArrayLike) -> FloatArray:
         """(m, m') irradiance.
@@ -383,15 +406,31 @@ class Correlation:
             (r,) and (c,) which cells of the directions these are.
         """
         left, right = self._spread[0][:, np.asarray(rows)], self._spread[1][:, np.asarray(columns)]
-        by_phase = self._by_phase(left @ light @ right.T)
-        seen = scipy.fft.fft(scipy.fft.rfft(by_phase, self._size[1]), self._size[0], axis=-2)
-        total = np.einsum("ijkl,ijkl->kl", self._spectra, np.conjugate(seen, out=seen))
-        return np.asarray(scipy.fft.irfft2(total, self._size)[: self.shape[0], : self.shape[1]])
+        brightest = float(np.abs(light).max()) or 1.0
+        cells = _by_phase(left @ (light / brightest).astype(np.float32) @ right.T, self._phases)
+        total = np.zeros(self._spectra.shape[2:], dtype=np.complex64)
+        # One after the other, each stays in a processor's cache.
+        for phase in np.ndindex(*self._phases):
+            seen = scipy.fft.fft(scipy.fft.rfft(cells[phase], self._size[1]), self._size[0], axis=0, overwrite_x=True)
+            total += np.multiply(np.conjugate(seen, out=seen), self._spectra[phase], out=seen)
+        frame = scipy.fft.irfft2(total, self._size)[: self.shape[0], : self.shape[1]]
+        return np.asarray(frame * np.float64(self._fill_factor * brightest))
 
-    def _by_phase(self, cells: FloatArray) -> FloatArray:
-        """(q, q', m, m') every q-th and q'-th of raster ``cells`` (q m, q' m')."""
-        rows, columns = self._phases
-        return cells.reshape(len(cells) // rows, rows, -1, columns).transpose(1, 3, 0, 2)
+
+def _by_phase(cells: npt.NDArray[Any], phases: tuple[int, int]) -> npt.NDArray[Any]:
+    """(q, q', m, m') every q-th and q'-th of raster ``cells`` (q m, q' m')."""
+    rows, columns = phases
+    return cells.reshape(len(cells) // rows, rows, -1, columns).transpose(1, 3, 0, 2)
+
+
+@lru_cache(maxsize=RASTERS_KEPT)
+def _spectra(
+    drawn: Plate, firsts: tuple[int, int], size: tuple[int, int], phases: tuple[int, int]
+) -> npt.NDArray[np.complex64]:
+    """(q, q', *size) spectra of each phase of a raster from its cells ``firsts`` on."""
+    along = [count * each for count, each in zip(size, phases, strict=True)]
+    seen = _part(_part(drawn.values, firsts[0], along[0]).T, firsts[1], along[1]).T.astype(np.float32)
+    return np.stack([scipy.fft.rfft2(np.ascontiguousarray(row)) for row in _by_phase(seen, phases)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -427,6 +466,13 @@ class _Side:
         edges = first + np.arange(count + 1)
         below = blurred_step(edges[:, None] - crossings, halves[0], halves[1], blur / cell)
         return cls(pixels, phases, first, np.diff(below, axis=0))
+
+    def spread(self, apart: int) -> tuple[int, npt.NDArray[np.float32]]:
+        """The weights, with nothing before and behind them, from a multiple of ``apart`` pixels on; and that cell."""
+        every = apart * self.phases
+        before = self.first % every
+        behind = -(before + len(self.weights)) % every
+        return self.first - before, np.pad(self.weights, ((before, behind), (0, 0))).astype(np.float32)
 
     def factor(self, profile: FloatArray, places: npt.NDArray[np.intp]) -> FloatArray:
         """(places, c) means of a ``profile`` of the raster that some of the pixels see from each direction."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from itertools import pairwise, starmap
 from typing import Any
 
@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import in_threads
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.plate import FEW, RASTER_LEFT_OUT, Plate
 from mitsim.devices.projector import Spectrum
@@ -152,7 +153,7 @@ class _Raster:
         """As :meth:`_Terms.probe`."""
         if self.summed and self._sums_take_less(self.summed, lit, vectors):
             return self.summed.probe(lit, vectors)
-        seen = [self._image(lit, light) for light in lit.lights]
+        seen = in_threads(partial(self._image, lit), lit.lights)
         return np.concatenate([frame if vectors is None else frame @ vectors for frame in seen], axis=1)
 
     def _sums_take_less(self, summed: _Terms, lit: _Lit, vectors: FloatArray | None = None) -> bool:

@@ -58,6 +58,16 @@ def test_any_other_mask_is_its_singular_vectors_but_for_what_is_stated() -> None
     assert 0 < plate.left_out <= LEFT_OUT and rest == pytest.approx(plate.left_out, rel=1e-6)
 
 
+def test_a_mask_whose_rows_are_its_columns_has_terms_of_one_profile() -> None:
+    """(Planted: distinct columns in an order of their own.)"""
+    upper = np.triu(np.random.default_rng(0).integers(0, 2, (14, 14)))
+    values = np.maximum(upper, upper.T).astype(np.float64)
+    plate = Plate(1.0, values, "symmetric")
+    assert plate.symmetric
+    assert all(np.array_equal(row, column) for _, row, column in plate.terms)
+    assert sum(weight * np.outer(row, column) for weight, row, column in plate.terms) == pytest.approx(values)
+
+
 def test_masks_of_many_terms_are_not_decomposed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Their terms are their distinct rows, exactly, and what the best separable mask leaves is the same. (Planted: a
     row's number off by one; the product not taken off.)"""

@@ -9,6 +9,7 @@ import pytest
 from mitsim.bench.effects import EFFECTS, SWITCHES
 from mitsim.bench.request import check_accuracy
 from mitsim.core.errors import MitsimError
+from mitsim.light.cost_model import FIXED, Numbers, optics_seconds
 from mitsim.light.plan import ColourCandidate, ColourChoice, Plan, PlanRow
 from mitsim.light.settings import Approximation, Drawn, Estimate
 from tests.unit.planner.invented_pilot_result import (
@@ -216,6 +217,19 @@ def test_many_terms_are_summed_or_formed_by_fft_whichever_takes_less() -> None:
     row = many.row("mask-shadow")
     assert row.state == "approximate" and "200 separable terms: by FFT" in row.reason
     assert many.block()["settings"]["raster"] is True
+
+
+def test_a_shadow_that_the_pilot_has_drawn_is_not_drawn_again() -> None:
+    """In more cells, or of several layers, it is. (Planted: drawn again; never.)"""
+    forming = replace(PILOT_RESULT.forming, correlated=(True, True), phases=36.0)
+
+    def drawing(**numbers: float) -> float:
+        some = replace(Numbers.coarsest(), **numbers)
+        each = [optics_seconds(replace(forming, drawing=(seconds, seconds)), some, FIXED) for seconds in (5.0, 0.0)]
+        return float(each[0] - each[1])
+
+    assert drawing() == 0
+    assert drawing(raster_cells=8.0) == pytest.approx(5) and drawing(layers=2.0) == pytest.approx(15)
 
 
 def test_settings_do_not_depend_on_the_machines_pace() -> None:

@@ -62,7 +62,7 @@ def test_a_correlation_is_the_sum_of_all_terms(bare: CameraGeometry, flaws: dict
     expected = summed(camera, 300.0, light)
     optics = FrameOptics(camera, ROWS, COLUMNS, (300.0,), 1)
     frame = optics.frame(np.arange(99), light.ravel())
-    np.testing.assert_allclose(frame, expected, rtol=0, atol=1e-11 * expected.mean())
+    np.testing.assert_allclose(frame, expected, rtol=0, atol=1e-6 * expected.mean())
     assert expected.std() > 0.1 * expected.mean()
 
 
@@ -84,15 +84,15 @@ def test_anchors_layers_and_places_are_those_of_separable_frames(bare: CameraGeo
                 expected += by_row[:, row, None] * seen * by_column[:, column]
     flat = np.flatnonzero(light)
     frame = optics.frame(flat, light.ravel()[flat])
-    np.testing.assert_allclose(frame, expected[np.ix_(*places)], rtol=0, atol=1e-11 * expected.mean())
+    np.testing.assert_allclose(frame, expected[np.ix_(*places)], rtol=0, atol=1e-6 * expected.mean())
     vectors = random.random((4, 3))
     estimates = [(flat, light.ravel()[flat]), (flat[::2], light.ravel()[flat[::2]])]
     seen = optics.probe(estimates, vectors)
     assert seen.shape == (3, 6)
-    np.testing.assert_allclose(seen[:, :3], frame @ vectors, rtol=1e-10)
+    np.testing.assert_allclose(seen[:, :3], frame @ vectors, rtol=1e-6)
     both, _ = optics.frame_and_products(estimates, None)
     half = optics.frame(*estimates[1])
-    np.testing.assert_allclose(both, (frame + half) / 2, rtol=0, atol=1e-12 * expected.mean())
+    np.testing.assert_allclose(both, (frame + half) / 2, rtol=0, atol=1e-6 * expected.mean())
 
 
 @pytest.mark.parametrize(("bare", "flaws"), [(BARE, {}), (BARE, {"edge_blur_um": 3.0}), (PART, {})])
@@ -126,25 +126,50 @@ def test_the_largest_terms_of_a_raster_form_the_correlations_frames(
     np.testing.assert_allclose(seen, frames[0], rtol=1e-9)
 
 
-def test_a_mirrored_drawings_waves_are_those_of_its_half(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a zone plate a quarter is worked out, and of one that is mirrored along its rows a half. (Planted: columns'
-    half for rows'; the mirrored half not turned round.)"""
+def test_an_even_drawings_waves_are_those_of_its_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a zone plate an eighth is worked out, of one that is mirrored along its rows alone a half, and of one whose
+    rows are its columns what is not below its diagonal. (Planted: columns' half for rows'; the mirrored
+    half not turned round; what is below the diagonal left 0.)"""
     lines, place = Spectrum(np.array([500.0]), np.ones(1)), (np.arange(14) + 0.5 - 7) * 0.05
     zones = (np.cos(np.pi * (place[:, None] ** 2 + place**2) / 0.15**2) > 0) * 1.0
     half = zones.copy()
     half[:, :4] = 0
-    for values, mirrored in ((zones, (True, True)), (half, (True, False)), (half.T, (False, True))):
-        plate = Plate(0.05, values, "zones")
-        camera = BARE.model_copy(update={"mask": "plate", "mask_plate": plate})
-        assert plate.mirrored == mirrored
-        rasters.draw_raster.cache_clear()
-        drawn = rasters.raster(camera, 300.0, lines).values
+    corner = np.triu(np.random.default_rng(0).integers(0, 2, (14, 14)))
+    monkeypatch.setattr(rasters, "_AT_ONCE", 2**10)  # several blocks along the diagonal
+    for values, mirrored, symmetric in (
+        (zones, (True, True), True),
+        (half, (True, False), False),
+        (half.T, (False, True), False),
+        (np.maximum(corner, corner.T).astype(float), (False, False), True),
+    ):
+
+        def drawn(values: np.ndarray = values) -> np.ndarray:
+            camera = BARE.model_copy(update={"mask": "plate", "mask_plate": Plate(0.05, values, "zones")})
+            rasters.draw_raster.cache_clear()
+            return rasters.raster(camera, 300.0, lines).values
+
+        assert Plate(0.05, values, "zones").mirrored == mirrored
+        assert Plate(0.05, values, "zones").symmetric == symmetric
+        even = drawn()
         with monkeypatch.context() as whole:
             whole.setattr(Plate, "mirrored", (False, False))
-            rasters.draw_raster.cache_clear()
-            expected = rasters.raster(camera, 300.0, lines).values
-        np.testing.assert_allclose(drawn, expected, rtol=0, atol=1e-5 * expected.mean())
+            whole.setattr(Plate, "symmetric", False)
+            expected = drawn()
+        np.testing.assert_allclose(even, expected, rtol=0, atol=1e-5 * expected.mean())
     rasters.draw_raster.cache_clear()
+
+
+def test_frames_that_are_compared_change_alike_in_fewer_cells() -> None:
+    """What two anchors' light changes a frame by, in a third of the raster cells: to 3e-3. (Planted: a sixth.)"""
+    camera, light = turned(BARE.model_copy(update={"pixels": 64})), np.zeros((2, 9, 2, 11))
+    light[0, :5, 1], light[1, :5, 0] = 1.0, -1.0
+    flat, few = np.flatnonzero(light), rasters.with_few_cells(camera, None)
+    assert rasters.cells_per_pixel(few) < rasters.cells_per_pixel(camera)
+    assert rasters.with_few_cells(BARE, None) is BARE
+    fewer, frame = (
+        FrameOptics(each, ROWS, COLUMNS, (300.0,), 2).frame(flat, light.ravel()[flat]) for each in (few, camera)
+    )
+    assert np.linalg.norm(fewer - frame) < 5e-3 * np.linalg.norm(frame)
 
 
 def test_waves_of_large_drawings_are_refused_before_they_are_drawn() -> None:
