@@ -31,6 +31,7 @@ from mitsim.cli.options import (
     Devices,
     Effects,
     ExposureFraction,
+    KnownPlan,
     Limited,
     LitScene,
     OfPatterns,
@@ -42,18 +43,20 @@ from mitsim.cli.options import (
     Seed,
     by_line,
     check_work,
+    given_of,
     in_colour,
     is_given,
     message_of,
     number_of,
     option,
+    pop_patterns,
     refuse_unused,
     request_of,
     verb,
 )
 from mitsim.cli.screen import finish, kernel_lines, payload_of_lines, print_plan, total_of_lines
 from mitsim.cli.study_verb import study
-from mitsim.core.errors import ArgumentError, MitsimError, printable
+from mitsim.core.errors import MitsimError, printable
 from mitsim.core.spectral_manifests import LINES, MONO, RUN
 from mitsim.core.spectral_manifests import MOSAIC as MOSAIC_RUN
 from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped, end_uncaught, is_stopped
@@ -251,24 +254,13 @@ class Capturing(Sampling):
 
 
 @dataclass(frozen=True)
-class Made:
-    """What is there already."""
+class Traced:
+    """What is there already beside a plan."""
 
-    plan: Path | None = option(None, "file of `mitsim plan -o`: nothing is planned again", "--plan", metavar="FILE")
     light: Path | None = option(
         None, "file of `mitsim transport`: nothing is traced again", "--light", metavar="FILE.h5"
     )
     resume: Resume = False
-
-    def known_plan(self, request: Mapping[str, Any]) -> Plan | None:
-        """The plan in its file; None without one. MitsimError for a ``request`` beside it that needs another."""
-        if self.plan is None:
-            return None
-        if self.light is not None:
-            raise MitsimError(f"--plan {self.plan}: light in a file has a plan of its own; leave out --plan or --light")
-        found = mitsim.Plan.load(self.plan)
-        found.request_with(request)
-        return found
 
 
 @verb
@@ -278,7 +270,8 @@ def capture(
     scene: Scene,
     output: Annotated[Path, typer.Option("-o", "--output", help="run folder to make", metavar="RUN")],
     capturing: Capturing,
-    made: Made,
+    planned: KnownPlan,
+    made: Traced,
     devices: Coloured,
     limited: Limited,
 ) -> int:
@@ -291,16 +284,15 @@ def capture(
         refuse_unused(context, ["exposure_fraction"], "on an --exposure in seconds")
     if capturing.ambient_frame == "no":
         refuse_unused(context, ["ambient_shots"], "with --ambient-frame no")
-    request = _request_beside(context, capturing, made)
-    known = made.known_plan(request)
+    request, known = _request_beside(context, capturing, planned, made.light)
     if made.light is not None:
         refuse_unused(context, ["resume", "colour"], "on --light, which is of all lines and soon exposed")
     asked = mitsim.Request.of(**request) if known is None else known.request_with(request)
     if known is not None and devices.colour == AUTO:
         devices = replace(devices, colour=_chosen_colour(known))
     colour, variant = devices.colour, devices.traced_in(limited.variant)
-    if known is not None and colour != NO and request.pop("patterns", asked.patterns) != known.known_request.patterns:
-        raise ArgumentError("patterns", f"{asked.patterns}: {known.made_for('patterns')}")
+    if known is not None and colour != NO:
+        pop_patterns(request, known)
     begun_in_one = (output / MANIFEST).is_file()  # which auto may decide for
     check_work(output, made.resume, "capture", several=by_line(colour) or (colour == AUTO and not begun_in_one))
     devices.check_colour(limited.variant, asked.seconds)
@@ -359,16 +351,17 @@ def _expose(path: Path, bench: Bench, request: dict[str, Any], output: Path, job
     return light.expose(request.pop("patterns"), output, job, **request).summary()
 
 
-def _request_beside(context: typer.Context, capturing: Capturing, made: Made) -> dict[str, Any]:
-    """Checked fields of the request: all of them, or those that are given beside a plan or light that is ``made``."""
+def _request_beside(
+    context: typer.Context, capturing: Capturing, planned: KnownPlan, light: Path | None
+) -> tuple[dict[str, Any], Plan | None]:
+    """Checked fields of the request, and the plan that is there: of all fields, or of those that are given beside it
+    or ``light`` in a file."""
     fields = vars(replace(capturing, exposure=number_of("exposure", capturing.exposure)))
-    if made.plan is not None or made.light is not None:
-        fields = {name: value for name, value in fields.items() if is_given(context, name)}
-    if made.plan is not None:
-        return request_of(**fields)
-    if capturing.patterns is None:
+    if planned.plan is not None and light is not None:
+        raise MitsimError(f"--plan {planned.plan}: light in a file has a plan of its own; leave out --plan or --light")
+    if planned.plan is None and capturing.patterns is None:
         raise MitsimError("Missing option '--patterns': give it, or a plan with --plan")
-    return request_of(**fields)
+    return planned.read(context, fields if light is None else given_of(context, fields))
 
 
 def _chosen_colour(known: Plan) -> str:

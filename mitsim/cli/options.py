@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import inspect
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import MISSING, dataclass, field, is_dataclass
 from pathlib import Path
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from mitsim.api.bench import Bench
     from mitsim.bench.request import Exposure
     from mitsim.core.job import Job
+    from mitsim.light.plan import Plan
 
 _SPELLED = {
     "scene": "SCENE",
@@ -177,6 +178,32 @@ class OfPatterns(Sampling):
     """The same of frames under patterns."""
 
     patterns: Patterns = "dots:7"
+
+
+@dataclass(frozen=True)
+class KnownPlan:
+    """What is planned already."""
+
+    plan: Path | None = option(None, "file of `mitsim plan -o`: nothing is planned again", "--plan", metavar="FILE")
+
+    def read(self, context: typer.Context, fields: Mapping[str, Any]) -> tuple[dict[str, Any], Plan | None]:
+        """Checked fields of a request, and the plan in the file; None without one.
+
+        Parameters
+        ----------
+        context, fields
+            of the command line, and what it asks for; beside a plan that alone which is given.
+
+        Raises
+        ------
+        MitsimError
+            for a value that a field cannot have or that needs another plan, and a file that cannot be read.
+        """
+        if self.plan is None:
+            return request_of(**fields), None
+        request, found = request_of(**given_of(context, fields)), mitsim.Plan.load(self.plan)
+        found.request_with(request)
+        return request, found
 
 
 @dataclass(frozen=True)
@@ -404,6 +431,21 @@ def is_given(context: typer.Context, name: str) -> bool:
     """Whether the command line of a ``context`` names the parameter ``name``."""
     source = context.get_parameter_source(name)
     return source is not None and source.name == "COMMANDLINE"
+
+
+def pop_patterns(request: dict[str, Any], known: Plan | None) -> str:
+    """The patterns of a ``request``, which are taken out of its fields, or of a ``known`` plan; ArgumentError where
+    both have some and they differ."""
+    planned = () if known is None else (known.known_request.patterns,)
+    patterns: str = request.pop("patterns", *planned)
+    if known is not None and patterns != known.known_request.patterns:
+        raise ArgumentError("patterns", f"{patterns!r}: {known.made_for('patterns')}")
+    return patterns
+
+
+def given_of(context: typer.Context, fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Those ``fields`` that the command line of a ``context`` names."""
+    return {name: value for name, value in fields.items() if is_given(context, name)}
 
 
 def refuse_unused(context: typer.Context, names: Sequence[str], where: str) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import pytest
 
 from mitsim.core.exr import read_frame
@@ -15,6 +16,21 @@ from tests.system.refusals import Refused, mentions
 
 def frames_of(run: Path) -> dict[str, bytes]:
     return {path.name: read_frame(path)[0]["DN"].tobytes() for path in sorted(run.glob("frame_*.exr"))}
+
+
+def numbers_of(light: Path) -> dict[str, bytes]:
+    """All that a file of light holds but its plan, which states seconds."""
+    found: dict[str, bytes] = {}
+    with h5py.File(light) as file:
+        file.visititems(
+            lambda name, each: (
+                found.update({name: each[()].tobytes()} if each.dtype.kind in "iuf" else {})
+                if isinstance(each, h5py.Dataset)
+                else None
+            )
+        )
+    assert len(found) > 8
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +64,20 @@ def test_a_plan_is_written_and_captured(
         (("--light", "light.h5"), ("--plan", "leave out --plan or --light")),
     ):
         mentions(refused("capture", *devices, "--plan", file, *options, "-o", tmp_path / "new"), *fragments)
+    traced = [
+        call("transport", *(lab.arguments if "--patterns" in more else devices), *more, "-o", tmp_path / name)
+        for name, more in (("one.h5", ("--patterns", "dots:4")), ("two.h5", ("--plan", file)))
+    ]
+    assert [each.code for each in traced] == [0, 0] and "frames of dots:4" in traced[1].out
+    assert numbers_of(tmp_path / "one.h5") == numbers_of(tmp_path / "two.h5")
+    for options, fragments in (
+        (("--patterns", "dots:2"), ("--patterns 'dots:2': the plan was made for 'dots:4'; plan anew",)),
+        (("--accuracy", "1e-3"), ("--accuracy 0.001: the plan was made for 0.005",)),
+    ):
+        mentions(refused("transport", *devices, "--plan", file, *options, "-o", tmp_path / "new.h5"), *fragments)
     other = lab.write_scene("laboratory_moved", sheet_z=390)
+    line = refused("transport", other, *devices[1:], "--plan", file, "-o", tmp_path / "new.h5")
+    mentions(line, "--plan was made of another scene: the content of its XML differs")
     line = refused("capture", other, *devices[1:], "--plan", file, "-o", tmp_path / "new")
     mentions(line, "--plan was made of another scene: the content of its XML differs")
 
