@@ -274,10 +274,10 @@ class Plan:
             for a value that a field cannot have, or that needs another plan.
         """
         planned = self.known_request
-        left = self.colour.taken.error or 0.0 if self.colour else 0.0
-        if left and math.isclose(changes.get("accuracy") or 0.0, math.hypot(planned.accuracy, left)):
-            changes = {**changes, "accuracy": planned.accuracy}  # what colours leave of the accuracy asked for
         request = planned.with_values(**changes)
+        left = self.colour.taken.error or 0.0 if self.colour else 0.0
+        if left and math.isclose(request.accuracy, math.hypot(planned.accuracy, left)):
+            request = request.with_values(accuracy=planned.accuracy)  # what colours leave of the accuracy asked for
         for name in ("accuracy", "seconds", "effects"):
             if getattr(request, name) != getattr(planned, name):
                 raise ArgumentError(name, f"{_words(getattr(request, name))}: {self.made_for(name)}")

@@ -1,4 +1,4 @@
-"""What is planned or traced already: `capture --plan` and `capture --light` on the command line."""
+"""What is planned or traced already: `--plan` and `--light` on the command line."""
 
 from __future__ import annotations
 
@@ -8,10 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 import pytest
 
 from mitsim.core.exr import read_frame
 from tests.system.refusals import Refused, mentions
+from tests.system.test_colour import LINES, projector
+from tests.system.test_mosaic import camera_behind_filters
+from tests.system.test_mosaic import sheet as coloured_sheet
 
 
 def frames_of(run: Path) -> dict[str, bytes]:
@@ -100,3 +104,99 @@ def test_light_is_written_and_captured(
         mentions(refused("capture", *devices, "--light", file, *options, "-o", tmp_path / "new"), *fragments)
     lit = refused("capture", lab.scene, "--light", file, "--patterns", "dots:2", "-o", tmp_path / "new")
     mentions(lit, "--light was made of another projector: ")
+
+
+# ---- in colour
+
+
+OF_COLOUR = "--patterns", "dots:2", "--accuracy", 0.05, "--json"
+
+
+@pytest.fixture(scope="module")
+def sheet(shared_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[object, ...]:
+    """A scene with a coloured sheet, which two bands tell to the accuracy, and options of a projector of three
+    lines."""
+    lines = projector(tmp_path_factory.mktemp("devices") / "lines.toml", LINES)
+    return coloured_sheet(shared_scene("sheet of a plan")), "--projector", lines
+
+
+@pytest.fixture(scope="module")
+def filters(tmp_path_factory: pytest.TempPathFactory) -> tuple[object, ...]:
+    """Options of a camera behind colour filters."""
+    return "--camera", camera_behind_filters(tmp_path_factory.mktemp("camera") / "filters.toml")
+
+
+def same_run(one: Path, other: Path) -> bool:
+    """Whether frames, truths and configurations are equal, of all lines."""
+    files = [sorted(path.relative_to(run) for path in run.rglob("*.exr")) for run in (one, other)]
+    assert files[0] and files[0] == files[1]
+    stated = [
+        [json.loads(path.read_text())["configuration"] for path in sorted(run.rglob("manifest.json"))]
+        for run in (one, other)
+    ]
+    equal = [read_frame(one / name)[0] for name in files[0]], [read_frame(other / name)[0] for name in files[0]]
+    return stated[0] == stated[1] and all(
+        np.array_equal(first[channel], second[channel])
+        for first, second in zip(*equal, strict=True)
+        for channel in first
+    )
+
+
+def test_what_auto_chose_is_captured_by_its_plan(
+    shell: Callable[..., Any], sheet: tuple[object, ...], tmp_path: Path
+) -> None:
+    """Two bands, and not chosen again; said again or not, they are captured as --colour auto itself does. (Planted:
+    the accuracy that colours left taken for the one asked for; bands captured as lines.)"""
+    file, options = tmp_path / "plan.json", OF_COLOUR
+    assert shell("plan", *sheet, *options, "--colour", "auto", "-o", file).payload["colour"]["chosen"] == "bands:2"
+    known = "capture", *sheet, "--plan", file
+    done = shell(*known, "--colour", "auto", *options, "-o", tmp_path / "run").payload
+    assert [line["wavelength_nm"] for line in done["channels"]] == [490.0, 638.0]
+    assert shell("capture", *sheet, *options, "--colour", "auto", "-o", tmp_path / "own").code == 0
+    assert same_run(tmp_path / "run", tmp_path / "own")
+    refusal = shell(*known, "-o", tmp_path / "none").refusal
+    mentions(refusal, '--plan was made of another colour: {"filters": false', "none here")
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("colour", ["bands:2", "lines", "mosaic"])
+def test_a_plan_in_colour_is_captured_and_serves_no_other_colour(
+    shell: Callable[..., Any], sheet: tuple[object, ...], filters: tuple[object, ...], tmp_path: Path, colour: str
+) -> None:
+    """Frames of each line, and of all lines behind filters, are those of the capture that plans itself. Another word
+    of --colour, and light by pixel, of which none is told apart, are refused in a line before anything is written.
+    (Planted: lines of a plan not compared; light traced in another variant.)"""
+    file, options = tmp_path / "plan.json", (*OF_COLOUR, *(filters if colour == "mosaic" else ()))
+    assert shell("plan", *sheet, *options, "--colour", colour, "-o", file).code == 0
+    for name, more in (("run", ("--plan", file)), ("own", ())):
+        assert shell("capture", *sheet, *options, *more, "--colour", colour, "-o", tmp_path / name).code == 0
+    assert same_run(tmp_path / "run", tmp_path / "own")
+    for other in {"no", "auto", "bands:1", "lines", "mosaic"} - {colour}:
+        devices = filters if other == "mosaic" else ()
+        line = shell("capture", *sheet, "--plan", file, "--colour", other, *devices, "-o", tmp_path / "none").refusal
+        asked_auto = "--colour auto: the plan was made with another word of --colour; give that"
+        mentions(line, asked_auto if other == "auto" else "--plan was made of another colour: ")
+    for variant in ("llvm_ad_mono", "llvm_ad_spectral"):
+        line = shell("transport", *sheet, "--plan", file, "--variant", variant, "-o", tmp_path / "none").refusal
+        mentions(line, "--plan was made of another colour: ")
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.slow
+def test_light_is_of_no_colour(
+    shell: Callable[..., Any], sheet: tuple[object, ...], filters: tuple[object, ...], tmp_path: Path
+) -> None:
+    """What told no line apart is exposed as no line, by no word of --colour and no camera behind filters."""
+    file = tmp_path / "light.h5"
+    assert shell("transport", *sheet, *OF_COLOUR, "-o", file).code == 0
+    known = "capture", *sheet, "--light", file, "--patterns", "dots:2", "-o", tmp_path / "none"
+    for options, sentence in (
+        (("--colour", "lines"), "--colour: has no effect on --light"),
+        (("--colour", "auto"), "--colour: has no effect on --light"),
+        (("--colour", "mosaic", *filters), "--colour: has no effect on --light"),
+        (filters, "has a mosaic GBRG"),
+        (("--variant", "llvm_ad_spectral"), "--light was made of another variant: llvm_ad_mono there"),
+    ):
+        mentions(shell(*known, *options).refusal, sentence)
+    assert not (tmp_path / "none").exists()
