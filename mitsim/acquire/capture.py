@@ -471,7 +471,7 @@ def _sparser(light: SampledLight, lighting: Lighting) -> str:
     the plan left out shows; empty where they do not."""
     planned = light.plan.known_request.patterns
     both = light.bench.family(planned, light.seed).lighting, lighting
-    made, other = (float(each.weights.mean(axis=0)[each.labels].mean()) for each in both)
+    made, other = (each.lit for each in both)
     if other >= _AS_DENSE * made:
         return ""
     return (

@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import signal
 import sys
+import warnings
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
@@ -59,7 +60,7 @@ from mitsim.cli.study_verb import study
 from mitsim.core.errors import MitsimError, printable
 from mitsim.core.spectral_manifests import LINES, MONO, RUN
 from mitsim.core.spectral_manifests import MOSAIC as MOSAIC_RUN
-from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped, end_uncaught, is_stopped
+from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped, end_uncaught, is_stopped, say_note
 from mitsim.devices.patterns import pattern_names
 
 if TYPE_CHECKING:
@@ -90,7 +91,10 @@ def run() -> None:
     except FileNotFoundError:
         _fail("the working folder does not exist any more; change to another one")
     try:
-        code = app(standalone_mode=False)
+        with warnings.catch_warnings(record=True) as found:
+            code = app(standalone_mode=False)
+        for note in dict.fromkeys(str(each.message) for each in found):  # not before: progress is shown meanwhile
+            say_note(note)
     except SystemExit as ended:
         if ended.code == 1:  # click's for a reader that went away
             sys.exit(128 + signal.SIGPIPE)

@@ -202,6 +202,12 @@ def _say(text: str) -> None:
         sys.stderr.flush()
 
 
+def say_note(message: Warning | str, *_: object) -> None:
+    """Tell a reader on stderr, in a line, what a Python warning says: as ``warnings.showwarning`` it gets the category,
+    file and line too, which are nothing to a reader."""
+    _say(f"note: {' '.join(str(message).split())}")
+
+
 def _check_descriptors() -> None:
     """Exit when standard output is closed: a file that is opened later would get its number, and what is printed.
     Closed standard input and error lead to nothing instead."""

@@ -106,6 +106,20 @@ def test_light_is_written_and_captured(
     mentions(lit, "--light was made of another projector: ")
 
 
+def test_what_python_warns_of_is_a_line_of_the_command_line(
+    call: Callable[..., Any], lab: Any, devices: tuple[object, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A note on stderr when all is done, without file and line of a program, and not among the JSON. (Planted: Python's
+    own words, as until 0.6.0 `mitsim demo --patterns dots:2` had them.)"""
+    file = tmp_path / "light.h5"
+    assert call("transport", *lab.arguments, "--patterns", "dots:4", "-o", file).code == 0
+    monkeypatch.setattr("mitsim.acquire.capture._foreign", lambda *_: "these frames are\nnoisier")
+    known = "capture", *devices, "--light", file, "--patterns", "dots:2", "--json", "-o"
+    done = call(*known, tmp_path / "run")
+    assert done.code == 0 and done.payload["frames"] == 4 and done.err == "mitsim: note: these frames are noisier\n"
+    assert len(call(*known, tmp_path / "run").refusal.splitlines()) == 1
+
+
 # ---- in colour
 
 
